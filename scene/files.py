@@ -1,0 +1,78 @@
+"""Files and folders that appear whole or not at all."""
+
+import hashlib
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from scene.errors import OutputError, RecordingError
+
+_CHUNK = 1 << 22
+
+
+def sha256(path: Path) -> str:
+    """Hex digest of a file's bytes."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_CHUNK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def require_input(path: Path) -> Path:
+    """The path itself, once it is known to exist and to be readable.
+
+    Raises:
+        RecordingError: Nothing is there, or it cannot be opened.
+    """
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file or folder")
+    if path.is_file():
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+    return path
+
+
+def require_output_folder(path: Path) -> Path:
+    """The path itself, once it is known that a folder can be written there.
+
+    Raises:
+        OutputError: A file is in the way, there or in a parent.
+    """
+    for place in (path, *path.parents):
+        if place.exists():
+            if not place.is_dir():
+                raise OutputError(f"{place}: is a file, so no folder {path} can be written")
+            break
+    return path
+
+
+@contextmanager
+def replace_folder(path: Path) -> Iterator[Path]:
+    """A folder to write into that takes the place of `path` once the block ends without an error.
+
+    A previous folder at `path` stays whole until then; after an error or an interrupt, nothing of the new one is left.
+
+    Raises:
+        OutputError: `path`, or a parent of it, is a file, or the disk refuses.
+    """
+    require_output_folder(path)
+    fresh, stale = path.with_name(f".{path.name}.partial"), path.with_name(f".{path.name}.stale")
+    try:
+        for leftover in (fresh, stale):
+            shutil.rmtree(leftover, ignore_errors=True)
+        fresh.mkdir(parents=True)
+        yield fresh
+        if path.exists():
+            path.rename(stale)
+        fresh.rename(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+        if not path.exists() and stale.exists():
+            stale.rename(path)
+        shutil.rmtree(stale, ignore_errors=True)

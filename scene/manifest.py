@@ -1,0 +1,43 @@
+"""`manifest.json`: what went in, how it was treated, what came out, and what of it was measured."""
+
+import dataclasses
+import json
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scene.files import sha256
+
+SCHEMA = "subterra.manifest/1"
+_LIBRARIES = ("numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "genz-icp", "plyfile", "pypcd4", "shapely")
+
+
+def input_record(paths: list[Path]) -> list[dict[str, Any]]:
+    """Name, size and hash of each input file; no folder names, so that the manifest does not depend on the place."""
+    return [{"file": path.name, "bytes": path.stat().st_size, "sha256": sha256(path)} for path in paths]
+
+
+def write(path: Path, content: dict[str, Any], config: Any) -> None:
+    """Writes the manifest with schema, config and library versions added; keys sorted, so that bytes repeat."""
+    whole = {
+        "schema": SCHEMA,
+        "config": _plain(dataclasses.asdict(config)),
+        "versions": {name: version(name) for name in _LIBRARIES},
+        **_plain(content),
+    }
+    path.write_text(json.dumps(whole, indent=2, sort_keys=True) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    """The value in JSON's types; floats to 9 digits."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.9g}")
+    if isinstance(value, np.integer):
+        return int(value)
+    return str(value) if isinstance(value, Path) else value

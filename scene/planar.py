@@ -1,0 +1,129 @@
+"""Bore to the planar tunnel: its walls cut at LiDAR height above the track, as polylines."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from manifold3d import Manifold, Mesh64
+
+from scene.axis import Axis, with_frames
+from scene.bore import Bore
+from scene.errors import FitError
+
+SCHEMA = "subterra.tunnel/1"
+_COLLINEAR = 0.0002
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Both walls of one variant at LiDAR height, in the direction of growing station.
+
+    Attributes:
+        left: m, `(k, 2)`.
+        right: m, `(l, 2)`.
+        left_station: Of each vertex, not decreasing, m, `(k,)`.
+        right_station: The same, `(l,)`.
+    """
+
+    left: Float[np.ndarray, "k 2"]
+    right: Float[np.ndarray, "l 2"]
+    left_station: Float[np.ndarray, " k"]
+    right_station: Float[np.ndarray, " l"]
+
+
+def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], height: float) -> Walls:
+    """The walls where a surface `height` above the track meets the solid.
+
+    The solid is levelled first (each vertex lowered by the track's elevation at its station), so that the cut follows the
+    grade.
+
+    Args:
+        solid: The bore, closed at its mouths.
+        bore: For the centreline.
+        elevation: z of the track at each station of the bore, m.
+        height: Of the LiDAR plane above it, m.
+
+    Raises:
+        FitError: There is no wall on both sides at that height.
+    """
+    mesh = solid.to_mesh64()
+    vertices = np.array(mesh.vert_properties[:, :3])
+    axis = bore.axis
+    station = axis.local(vertices)[0]
+    vertices[:, 2] -= np.interp(station, bore.station, elevation)
+    level = Manifold(Mesh64(vertices, np.array(mesh.tri_verts)))
+    polygons = level.slice(height).simplify(_COLLINEAR).to_polygons()
+    if not polygons:
+        raise FitError(f"no wall {height:g} m above the track: the bore is not that high there")
+    outline = max(polygons, key=_area)
+    plan = flat(axis)
+    along, across, _ = plan.local(np.column_stack([outline, np.zeros(len(outline))]))
+    left, right = across > 0, across <= 0
+    if left.sum() < 2 or right.sum() < 2:
+        raise FitError(f"no wall on both sides {height:g} m above the track")
+    # The outline runs counter-clockwise: forward along the right wall, back along the left one.
+    first = int(np.flatnonzero(right & ~np.roll(right, 1))[0])
+    order = np.roll(np.arange(len(outline)), -first)
+    if np.any(np.diff(right[order].astype(int)) > 0):
+        raise FitError(f"{height:g} m above the track the outline crosses the centreline; is there a branch?")
+    right_order, left_order = order[right[order]], order[left[order]][::-1]
+    return Walls(
+        outline[left_order],
+        outline[right_order],
+        np.maximum.accumulate(np.clip(along[left_order], 0.0, bore.length)),
+        np.maximum.accumulate(np.clip(along[right_order], 0.0, bore.length)),
+    )
+
+
+def flat(axis: Axis) -> Axis:
+    """The axis in plan, at its own stations."""
+    tangent = axis.tangent * [1.0, 1.0, 0.0]
+    return with_frames(
+        axis.station, axis.position * [1.0, 1.0, 0.0], tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
+    )
+
+
+def half_widths(walls: Walls, bore: Bore) -> Float[np.ndarray, " n"]:
+    """Half the distance of the walls at each station, m."""
+    plan = flat(bore.axis)
+
+    def across(wall: np.ndarray, station: np.ndarray) -> np.ndarray:
+        return np.interp(bore.station, station, plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1])
+
+    return (across(walls.left, walls.left_station) - across(walls.right, walls.right_station)) / 2
+
+
+def save(
+    path: Path,
+    name: str,
+    provenance: str,
+    bore: Bore,
+    elevation: Float[np.ndarray, " n"],
+    lidar_height: float,
+    variants: dict[str, Walls],
+) -> None:
+    """Writes `tunnel.npz`; docs/formats.md says what each field means. `variants` holds `smooth` first."""
+    plan = flat(bore.axis)
+    fields: dict[str, np.ndarray] = {
+        "schema": np.array(SCHEMA),
+        "name": np.array(name),
+        "provenance": np.array(provenance),
+        "station": bore.station,
+        "centre": plan.position[:, :2],
+        "tangent": plan.tangent[:, :2],
+        "elevation": elevation,
+        "half_width": half_widths(variants["smooth"], bore),
+        "lidar_height": np.array(lidar_height),
+        "lining": np.array(list(variants)),
+    }
+    for variant, walls in variants.items():
+        fields[f"left_{variant}"], fields[f"left_station_{variant}"] = walls.left, walls.left_station
+        fields[f"right_{variant}"], fields[f"right_station_{variant}"] = walls.right, walls.right_station
+        fields[f"furniture_{variant}"] = np.empty((0, 4))
+    np.savez_compressed(path, **fields)  # type: ignore[arg-type]
+
+
+def _area(polygon: Float[np.ndarray, "k 2"]) -> float:
+    x, y = polygon.T
+    return float(np.abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))) / 2)

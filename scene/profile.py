@@ -1,0 +1,59 @@
+"""One section as a star-shaped polygon in polar form: its widths, its heights, its middle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import savgol_filter
+
+N_ANGLES = 360
+_HEIGHT_STEP = 0.05
+_CHORD_WINDOW = 1.0
+# Chords this close to the longest share in the middle, so that noise on one of them does not move it.
+_LONG_CHORD = 0.97
+
+
+@dataclass(frozen=True)
+class Extents:
+    """What a section measures, about the point it is drawn from.
+
+    Attributes:
+        width: Largest inner width, m.
+        height: Floor to crown on the axis, m.
+        middle: Lateral and upward offset of mid-width and mid-height, m.
+    """
+
+    width: float
+    height: float
+    middle: tuple[float, float]
+
+
+def angles(count: int = N_ANGLES) -> Float[np.ndarray, " m"]:
+    """Directions of a section's radii, from lateral (left) towards up, rad, the first at -π."""
+    return -np.pi + 2 * np.pi * np.arange(count) / count
+
+
+def measure(angle: Float[np.ndarray, " m"], radius: Float[np.ndarray, " m"]) -> Extents:
+    """Extents of the polygon `radius(angle)`."""
+    lateral, upward = radius * np.cos(angle), radius * np.sin(angle)
+    height_grid = np.arange(upward.min(), upward.max(), _HEIGHT_STEP)
+    left, right = (_wall(side, lateral, upward, height_grid) for side in (1, -1))
+    chord = left - right
+    width = float(np.minimum(_without_noise(chord), chord.max()).max())
+    long = chord >= _LONG_CHORD * width
+    across = float(np.mean((left + right)[long]) / 2)
+    floor, crown = (_wall(side, upward, lateral, np.array([across]))[0] for side in (-1, 1))
+    return Extents(width, float(crown - floor), (across, float(crown + floor) / 2))
+
+
+def _without_noise(chord: np.ndarray) -> np.ndarray:
+    """Chords over height, each from a parabola through a metre of its neighbours: a maximum of noisy values is too large."""
+    window = min(int(round(_CHORD_WINDOW / _HEIGHT_STEP)) | 1, len(chord) - 1 + len(chord) % 2)
+    return savgol_filter(chord, window, 2) if window > 3 else chord
+
+
+def _wall(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """`across` of the polygon's half on one side, as a function of `along`."""
+    half = np.sign(across) == side
+    order = np.argsort(along[half], kind="stable")
+    return np.interp(at, along[half][order], across[half][order])

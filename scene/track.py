@@ -1,0 +1,146 @@
+"""Sleepers, rails, pads and fasteners, placed by standard and checked against the bore."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d
+
+from scene.bore import Bore
+from scene.errors import FitError
+
+_FLAT = 0.10  # a bed this little above the lowest point of the bore is its floor
+_SMOOTHING = 1.0  # m
+
+
+@dataclass(frozen=True)
+class RailProfile:
+    """A flat-bottom rail, m.
+
+    Source: CHN60 (GB 2585): height, foot and head from suppliers' tables; web and head depth are engineering knowledge.
+    """
+
+    name: str = "CHN60"
+    height: float = 0.176
+    foot_width: float = 0.150
+    foot_height: float = 0.012
+    web_width: float = 0.0165
+    head_width: float = 0.073
+    head_height: float = 0.0485
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Standard-gauge track on concrete monoblock sleepers, m.
+
+    Attributes:
+        gauge: Between the inner faces of the heads. Source: 1.435 m, the paper and every standard.
+        sleeper_spacing: Source: the paper.
+        sleeper_length: Source: suppliers' tables for standard gauge.
+        sleeper_top: Width of the top; the bottom is `sleeper_bottom` wide.
+        sleeper_bottom: Width of the bottom.
+        sleeper_height: Of the whole sleeper; all but `protrusion` lies in the ballast.
+        protrusion: How far sleepers stand out of the bed.
+        pad_thickness: Between sleeper and rail foot.
+        margin: Least distance from the end of a sleeper to the wall.
+        shoulder: Bed left beside the sleepers where the bore is round.
+        min_headroom: No track is laid where less is left between bed and crown.
+        rail: The rail.
+    """
+
+    gauge: float = 1.435
+    sleeper_spacing: float = 0.6
+    sleeper_length: float = 2.5
+    sleeper_top: float = 0.20
+    sleeper_bottom: float = 0.30
+    sleeper_height: float = 0.21
+    protrusion: float = 0.06
+    pad_thickness: float = 0.010
+    margin: float = 0.10
+    shoulder: float = 0.35
+    min_headroom: float = 3.0
+    rail: RailProfile = field(default_factory=RailProfile)
+
+    @property
+    def rail_offset(self) -> float:
+        """From the axis to the middle of a rail's head: half the gauge is face to face, not centre to centre."""
+        return (self.gauge + self.rail.head_width) / 2
+
+
+@dataclass(frozen=True)
+class Track:
+    """The track of one bore.
+
+    Attributes:
+        config: By which it was laid.
+        bed: z of the ballast or slab at each station of the bore, m, `(n,)`.
+        elevation: z of the top of the sleepers, of the floor where there is no track, m, `(n,)`.
+        sleeper_station: m, `(k,)`; empty where the bore is too narrow for a track.
+        clearance: From each sleeper's ends to the wall at its top, the smaller side, m, `(k,)`.
+        raised: Whether the bed is a slab above the floor of the bore (a round bore).
+    """
+
+    config: TrackConfig
+    bed: Float[np.ndarray, " n"]
+    elevation: Float[np.ndarray, " n"]
+    sleeper_station: Float[np.ndarray, " k"]
+    clearance: Float[np.ndarray, " k"]
+    raised: bool
+
+
+def lay(bore: Bore, config: TrackConfig) -> Track:
+    """Lays the track on the flat floor, or on a bed just wide enough where the bore is round.
+
+    Raises:
+        FitError: A sleeper would come closer to the wall than the margin.
+    """
+    wanted = config.sleeper_length / 2 + config.shoulder
+    floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]
+    chord = bore.position[:, 2] + _lowest_chord(bore, wanted)
+    raised = bool(np.median(chord - floor) > _FLAT)
+    bed = chord if raised else floor
+    sigma = _SMOOTHING / (bore.station[1] - bore.station[0])
+    smooth = gaussian_filter1d(bed, sigma, mode="nearest")
+    if np.median(floor + bore.height - bed) < config.min_headroom:
+        level = gaussian_filter1d(floor, sigma, mode="nearest")
+        return Track(config, level, level, np.empty(0), np.empty(0), False)
+    station = np.arange(int(bore.length / config.sleeper_spacing + 1e-6) + 1) * config.sleeper_spacing
+    elevation = smooth + config.protrusion
+    clearance = _clearance(bore, elevation, station) - config.sleeper_length / 2
+    if (clearance < config.margin).any():
+        worst = int(np.argmin(clearance))
+        raise FitError(
+            f"the sleeper at {station[worst]:.1f} m comes within {clearance[worst]:.2f} m of the wall; "
+            f"{config.margin:g} m are needed"
+        )
+    return Track(config, smooth, elevation, station, clearance, raised)
+
+
+def _radius_down(bore: Bore) -> np.ndarray:
+    return np.array([np.interp(-np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
+
+
+def _wall_at(bore: Bore, row: int, height: float | np.ndarray, side: int) -> np.ndarray:
+    """Distance from the axis to the wall on one side at a height above the axis, m."""
+    across, upward = side * bore.radius[row] * np.cos(bore.angle), bore.radius[row] * np.sin(bore.angle)
+    half = across > 0
+    order = np.argsort(upward[half], kind="stable")
+    return np.interp(height, upward[half][order], across[half][order])
+
+
+def _lowest_chord(bore: Bore, half_width: float) -> np.ndarray:
+    """Lowest height above the axis, m, at which both walls are at least `half_width` away; 0 where none is."""
+    down = -_radius_down(bore)
+    levels = np.zeros(len(bore.station))
+    for row in range(len(bore.station)):
+        grid = np.linspace(down[row], 0.0, 300)
+        narrow = np.minimum(_wall_at(bore, row, grid, 1), _wall_at(bore, row, grid, -1))
+        wide = np.flatnonzero(narrow >= half_width)
+        levels[row] = grid[wide[0]] if len(wide) else 0.0
+    return levels
+
+
+def _clearance(bore: Bore, elevation: np.ndarray, station: np.ndarray) -> np.ndarray:
+    rows = np.clip(np.rint(station / (bore.station[1] - bore.station[0])).astype(int), 0, len(bore.station) - 1)
+    level = elevation - bore.position[:, 2]
+    return np.array([min(float(_wall_at(bore, row, level[row], side)) for side in (1, -1)) for row in rows])

@@ -1,0 +1,67 @@
+"""Poses over time: TUM files, and where a sensor was at any moment in between."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from scene.errors import RecordingError
+from scene.files import require_input
+
+_QUATERNION_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Sensor poses in a fixed frame.
+
+    Attributes:
+        times: s, growing, `(n,)`.
+        positions: m, `(n, 3)`.
+        rotations: Sensor to fixed frame, `n` of them.
+        source: Where the poses come from, for messages.
+    """
+
+    times: Float[np.ndarray, " n"]
+    positions: Float[np.ndarray, "n 3"]
+    rotations: Rotation
+    source: str
+
+    def covers(self, start: float, end: float) -> bool:
+        """Whether poses exist over the whole interval, s."""
+        return bool(self.times[0] <= start and end <= self.times[-1])
+
+    def at(self, times: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, "k 3"], Rotation]:
+        """Positions (linear) and rotations (slerp) at the given times, s; outside the span the nearest pose holds."""
+        clipped = np.clip(times, self.times[0], self.times[-1])
+        positions = np.stack([np.interp(clipped, self.times, column) for column in self.positions.T], axis=1)
+        return positions, Slerp(self.times, self.rotations)(clipped)
+
+
+def load_tum(path: Path) -> Trajectory:
+    """Reads `t x y z qx qy qz qw` rows; rows out of order are sorted, repeated times dropped.
+
+    Raises:
+        RecordingError: Unreadable, malformed, or positions without orientation.
+    """
+    require_input(path)
+    try:
+        rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise RecordingError(f"{path}: not a TUM trajectory ({error})") from error
+    if rows.shape[1:] != (8,) or len(rows) < 2:
+        raise RecordingError(f"{path}: a TUM trajectory has at least 2 rows of 8 numbers, found {rows.shape}")
+    if not np.isfinite(rows).all():
+        raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
+    norms = np.linalg.norm(rows[:, 4:], axis=1)
+    if (norms == 0).all():
+        raise RecordingError(f"{path}: holds positions only (every quaternion is zero); poses with orientation are needed")
+    if (np.abs(norms - 1) > _QUATERNION_TOLERANCE).any():
+        row = int(np.argmax(np.abs(norms - 1) > _QUATERNION_TOLERANCE)) + 1
+        raise RecordingError(f"{path}: row {row} has a quaternion of length {norms[row - 1]:.3g}, not 1")
+    rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
+    if len(rows) < 2:
+        raise RecordingError(f"{path}: all rows carry the same time")
+    return Trajectory(rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:]), str(path))

@@ -1,0 +1,112 @@
+"""The wall rolled out flat: a grid over station and angle that holds what the returns say of each cell."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
+
+_RADIUS_STEP = 1.0 / (1 << 14)  # 0.06 mm, so that a cell and a radius fit one sortable word
+_RADIUS_BITS = 20
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells over station and angle; the angle closes on itself.
+
+    Attributes:
+        start: Station of the first cell's near edge, m.
+        step: Length of a cell, m.
+        rows: Cells along the station.
+        columns: Cells around.
+    """
+
+    start: float
+    step: float
+    rows: int
+    columns: int
+
+    @classmethod
+    def over(cls, start: float, end: float, step: float, columns: int) -> "Grid":
+        """The grid that covers an interval of stations, m."""
+        return cls(start, step, max(int(np.ceil((end - start) / step)), 1), columns)
+
+    @property
+    def station(self) -> Float[np.ndarray, " rows"]:
+        """Middle of each row, m."""
+        return self.start + (np.arange(self.rows) + 0.5) * self.step
+
+    @property
+    def angle(self) -> Float[np.ndarray, " columns"]:
+        """Middle of each column, rad in [-π, π)."""
+        return -np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns
+
+    def cell(
+        self, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"]
+    ) -> Int[np.ndarray, " p"]:
+        """Flat index of each point's cell; -1 outside the rows."""
+        row = np.floor((station - self.start) / self.step).astype(np.int64)
+        column = np.floor((angle + np.pi) / (2 * np.pi) * self.columns).astype(np.int64) % self.columns
+        return np.where((row >= 0) & (row < self.rows), row * self.columns + column, -1)
+
+
+def medians(grid: Grid, cell: Int[np.ndarray, " p"], radius: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows cols"]:
+    """Median radius of each cell, m; NaN where nothing was seen."""
+    inside = cell >= 0
+    words = np.minimum(radius[inside] / _RADIUS_STEP, (1 << _RADIUS_BITS) - 1).astype(np.uint64)
+    words |= cell[inside].astype(np.uint64) << np.uint64(_RADIUS_BITS)
+    words.sort()
+    size = grid.rows * grid.columns
+    bounds = np.searchsorted(words, np.arange(size + 1, dtype=np.uint64) << np.uint64(_RADIUS_BITS))
+    count = np.diff(bounds)
+    result = np.full(size, np.nan)
+    seen = count > 0
+    middle = bounds[:-1][seen] + count[seen] // 2
+    result[seen] = (words[middle] & np.uint64((1 << _RADIUS_BITS) - 1)) * _RADIUS_STEP
+    return result.reshape(grid.rows, grid.columns)
+
+
+def means(
+    grid: Grid, cell: Int[np.ndarray, " p"], value: Float[np.ndarray, " p"], weight: Float[np.ndarray, " p"]
+) -> tuple[Float[np.ndarray, "rows cols"], Float[np.ndarray, "rows cols"]]:
+    """Weighted mean of each cell (0 where nothing was seen) and its weight."""
+    inside = cell >= 0
+    size = grid.rows * grid.columns
+    total = np.bincount(cell[inside], weight[inside], size)
+    summed = np.bincount(cell[inside], (weight * value)[inside], size)
+    mean = np.divide(summed, total, out=np.zeros(size), where=total > 0)
+    return mean.reshape(grid.rows, grid.columns), total.reshape(grid.rows, grid.columns)
+
+
+def fill_nearest(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
+    """NaN cells take the value of the nearest known one; the angle wraps. All NaN stays so."""
+    unknown = np.isnan(field)
+    if not unknown.any() or unknown.all():
+        return field
+    columns = field.shape[1]
+    wrapped = np.concatenate([field, field, field], axis=1)
+    nearest = distance_transform_edt(np.isnan(wrapped), return_distances=False, return_indices=True)
+    return wrapped[tuple(nearest)][:, columns : 2 * columns]
+
+
+def median_smooth(field: Float[np.ndarray, "rows cols"], window: tuple[int, int]) -> Float[np.ndarray, "rows cols"]:
+    """Median over a window of cells; the angle wraps, the ends hold."""
+    pad = window[1] // 2
+    wrapped = np.concatenate([field[:, -pad:], field, field[:, :pad]], axis=1)
+    return median_filter(wrapped, window, mode="nearest")[:, pad:-pad]
+
+
+def smooth(
+    value: Float[np.ndarray, "rows cols"], weight: Float[np.ndarray, "rows cols"], sigma: tuple[float, float]
+) -> tuple[Float[np.ndarray, "rows cols"], Float[np.ndarray, "rows cols"]]:
+    """Gaussian mean of the weighted cells, and the weight that each result rests on.
+
+    Args:
+        value: Cells; those of weight 0 are not read.
+        weight: Not negative.
+        sigma: Widths in cells along station and around.
+    """
+    modes = ("nearest", "wrap")
+    total = gaussian_filter(weight, sigma, mode=modes)
+    summed = gaussian_filter(np.where(weight > 0, value, 0.0) * weight, sigma, mode=modes)
+    return np.divide(summed, total, out=np.zeros_like(summed), where=total > 1e-12), total

@@ -1,0 +1,175 @@
+"""Wall polylines cut into short blocks, each in a thin box, so that a ray need only meet the few blocks near its hit.
+
+Everything here runs once, on the host, in float64. Nothing is simplified: a block keeps every segment of its piece of
+wall, and its box encloses them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from subterra_jax.plan import Lining, TunnelPlan, Wall
+
+# Boxes are a little larger than their walls, so that float32 arithmetic on the device cannot shut a wall out of its box.
+BOX_MARGIN = 2e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class Blocks:
+    """Blocks of wall, in order of station.
+
+    Attributes:
+        centre: Middle of each box, m, `(n_blocks, 2)`; exactly representable in float32.
+        half: Half the long axis of each box as a vector, m, `(n_blocks, 2)`.
+        slimness: Half thickness of each box over its half length, `(n_blocks,)`.
+        offset: Vertices of each block from the middle of its box, m, `(n_blocks, m, 2)`; the last one repeated as padding.
+        station: Station of the middle of each block, m, `(n_blocks,)`.
+    """
+
+    centre: np.ndarray
+    half: np.ndarray
+    slimness: np.ndarray
+    offset: np.ndarray
+    station: np.ndarray
+
+
+def _cuts(wall: Wall, clearance: np.ndarray, length: float, max_segments: int) -> list[tuple[int, int]]:
+    """First and last vertex of each block of one wall.
+
+    A block ends at the innermost vertex of the last part of its allowed length: never in a recess, whose mouth would
+    then lie slanted in two thick boxes.
+    """
+    station, cuts, first = wall.station, [], 0
+    while first < len(station) - 1:
+        furthest = int(np.searchsorted(station, station[first] + length + 1e-9, side="right")) - 1
+        furthest = min(max(furthest, first + 1), first + max_segments)
+        earliest = int(np.searchsorted(station, station[first] + 0.65 * (station[furthest] - station[first])))
+        earliest = min(max(earliest, first + 1), furthest)
+        last = earliest + int(np.argmin(clearance[earliest : furthest + 1]))
+        if len(station) - 1 <= furthest:
+            last = len(station) - 1
+        cuts.append((first, last))
+        first = last
+    return cuts
+
+
+def _box(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Centre, half long axis and slimness of a thin box around a few vertices.
+
+    The thinnest box of a polygon lies along one of its hull's edges, so it is enough to try the directions between pairs
+    of vertices.
+    """
+    first, second = np.triu_indices(len(vertex), k=1)
+    edge = vertex[second] - vertex[first]
+    size = np.linalg.norm(edge, axis=1)
+    direction = edge[size > 1e-9] / size[size > 1e-9, None]
+    normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
+    across = vertex @ normal.T
+    along = vertex @ direction.T
+    area = (np.ptp(across, axis=0) + 1e-3) * np.ptp(along, axis=0)
+    best = int(np.argmin(area))
+    middle = 0.5 * (along[:, best].max() + along[:, best].min()) * direction[best]
+    middle = middle + 0.5 * (across[:, best].max() + across[:, best].min()) * normal[best]
+    centre = middle.astype(np.float32).astype(np.float64)
+    half_length = np.abs((vertex - centre) @ direction[best]).max() + BOX_MARGIN
+    half_thickness = np.abs((vertex - centre) @ normal[best]).max() + BOX_MARGIN
+    return centre, half_length * direction[best], float(half_thickness / half_length)
+
+
+def _furniture_runs(furniture: np.ndarray, max_segments: int) -> list[np.ndarray]:
+    """Loose segments joined, where the next begins at the end of the last, into polylines of a few segments."""
+    runs: list[list[np.ndarray]] = []
+    for x0, y0, x1, y1 in furniture:
+        start, end = np.array([x0, y0]), np.array([x1, y1])
+        if runs and len(runs[-1]) <= max_segments and np.allclose(runs[-1][-1], start, rtol=0.0, atol=1e-9):
+            runs[-1].append(end)
+        else:
+            runs.append([start, end])
+    return [np.stack(run) for run in runs]
+
+
+def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: int) -> Blocks:
+    """Cut one lining into blocks.
+
+    Args:
+        plan: The tunnel, for its centreline.
+        lining: The walls and furniture to cut.
+        length: Wanted length of a block, m. A single longer wall segment stays whole.
+        max_segments: Most segments in one block.
+    """
+    pieces: list[np.ndarray] = []
+    stations: list[float] = []
+    for wall in (lining.left, lining.right):
+        centre = np.stack([np.interp(wall.station, plan.station, plan.centre[:, i]) for i in range(2)], axis=-1)
+        for first, last in _cuts(wall, np.linalg.norm(wall.vertex - centre, axis=1), length, max_segments):
+            pieces.append(wall.vertex[first : last + 1])
+            stations.append(0.5 * (wall.station[first] + wall.station[last]))
+    for run in _furniture_runs(lining.furniture, max_segments):
+        pieces.append(run)
+        nearest = np.argmin(np.sum((plan.centre - run.mean(axis=0)) ** 2, axis=1))
+        stations.append(float(plan.station[nearest]))
+    order = np.argsort(stations, kind="stable")
+    n_vertices = max(len(piece) for piece in pieces)
+    boxes = [_box(pieces[i]) for i in order]
+    centre = np.stack([box[0] for box in boxes])
+    padded = np.stack([np.pad(pieces[i], ((0, n_vertices - len(pieces[i])), (0, 0)), mode="edge") for i in order])
+    return Blocks(
+        centre=centre,
+        half=np.stack([box[1] for box in boxes]),
+        slimness=np.array([box[2] for box in boxes]),
+        offset=padded - centre[:, None, :],
+        station=np.asarray(stations)[order],
+    )
+
+
+def _distance_to_segment(point: np.ndarray, middle: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Distance from points to segments `middle ± half`, all `(..., 2)`."""
+    from_middle = point - middle
+    along = np.sum(from_middle * half, axis=-1) / np.maximum(np.sum(half * half, axis=-1), 1e-12)
+    return np.linalg.norm(from_middle - np.clip(along, -1.0, 1.0)[..., None] * half, axis=-1)
+
+
+def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray, int]:
+    """For each node of the chainage grid, the blocks within reach of a robot near that node.
+
+    Args:
+        plan: The tunnel, for its chainage grid.
+        blocks: Its blocks.
+        reach: Distance that the window must cover, m, wherever across the tunnel the robot is and up to half a grid
+            step along it; beyond a mouth, up to 0.5 m outside.
+
+    Returns:
+        First block of each node's window `(n,)`, and the number of blocks in a window, the same for all.
+    """
+    spacing = plan.station[1] - plan.station[0]
+    slack = np.full(len(plan.station), 0.6 * spacing + 0.01)
+    slack[[0, -1]] += 0.5
+    normal = np.stack([-plan.tangent[:, 1], plan.tangent[:, 0]], axis=-1)
+    across = plan.half_width[:, None] * normal
+    node, block = np.nonzero(
+        np.linalg.norm(plan.centre[:, None, :] - blocks.centre[None, :, :], axis=-1)
+        < reach + slack.max() + plan.half_width.max() + np.linalg.norm(blocks.half, axis=1)[None, :] * 1.5
+    )
+    centre, half = plan.centre[node], across[node]
+    box_centre, box_half = blocks.centre[block], blocks.half[block]
+    # Two segments that do not cross are nearest at an end of one of them.
+    distance = np.min(
+        [
+            _distance_to_segment(centre + half, box_centre, box_half),
+            _distance_to_segment(centre - half, box_centre, box_half),
+            _distance_to_segment(box_centre + box_half, centre, half),
+            _distance_to_segment(box_centre - box_half, centre, half),
+        ],
+        axis=0,
+    )
+    thickness = blocks.slimness[block] * np.linalg.norm(box_half, axis=1)
+    within = distance - thickness <= reach + slack[node]
+    node, block = node[within], block[within]
+    first = np.full(len(plan.station), len(blocks.centre) - 1)
+    last = np.zeros(len(plan.station), int)
+    np.minimum.at(first, node, block)
+    np.maximum.at(last, node, block)
+    size = int(np.clip(np.max(last - first) + 1, 1, len(blocks.centre)))
+    return np.clip(first, 0, len(blocks.centre) - size), size

@@ -1,0 +1,101 @@
+"""The robot: a unicycle that does exactly what it is told, and the walls it must not touch."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float
+
+from subterra_jax.tunnel import Tunnel, node_at
+
+
+@struct.dataclass
+class VehicleParams:
+    """Unicycle with a round footprint.
+
+    Attributes:
+        speed_max: Largest forward speed, m/s; the robot cannot reverse.
+        yaw_rate_max: Largest yaw rate to either side, rad/s.
+        radius: Radius of the footprint, m; at most 0.8, the distance at which walls are looked for.
+        period: Control period, s.
+    """
+
+    speed_max: float = 2.0
+    yaw_rate_max: float = 1.5
+    radius: float = 0.4
+    period: float = 0.1
+
+
+def clip_action(action: Float[Array, "2"], params: VehicleParams) -> Float[Array, "2"]:
+    """The command that the robot obeys: `[v, ω]` clipped to its limits, a NaN read as 0.
+
+    Args:
+        action: Wanted forward speed (m/s) and yaw rate (rad/s, counter-clockwise); anything at all.
+        params: The limits.
+    """
+    limit = jnp.stack([params.speed_max, params.yaw_rate_max])
+    floor = jnp.stack([jnp.zeros_like(limit[0]), -limit[1]])
+    return jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), floor, limit)
+
+
+def wrap(angle: Float[Array, ""]) -> Float[Array, ""]:
+    """An angle brought into [-π, π], rad, for angles less than a turn outside."""
+    turn = 2.0 * jnp.pi
+    return jnp.where(angle > jnp.pi, angle - turn, jnp.where(angle < -jnp.pi, angle + turn, angle))
+
+
+def drive(
+    position: Float[Array, "2"], heading: Float[Array, ""], command: Float[Array, "2"], period: Float[Array, ""]
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """Move along the exact arc of a constant command.
+
+    Args:
+        position: Position, tunnel frame, m.
+        heading: Heading, rad.
+        command: Speed (m/s) and yaw rate (rad/s).
+        period: How long it is held, s.
+
+    Returns:
+        Position and heading afterwards. Speed 0 turns on the spot; yaw rate 0 is a straight line, without a division by 0.
+    """
+    half_turn = 0.5 * command[1] * period
+    small = jnp.abs(half_turn) < 1e-2
+    ratio = jnp.where(small, 1.0 - half_turn * half_turn / 6.0, jnp.sin(half_turn) / jnp.where(small, 1.0, half_turn))
+    chord = command[0] * period * ratio
+    direction = heading + half_turn
+    moved = jnp.stack([position[0] + chord * jnp.cos(direction), position[1] + chord * jnp.sin(direction)])
+    return moved, wrap(heading + 2.0 * half_turn)
+
+
+def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array, ""]) -> Float[Array, ""]:
+    """Distance from a point to the nearest wall or furniture segment.
+
+    Args:
+        tunnel: The tunnel.
+        position: The point, tunnel frame, m.
+        station: Its station, m.
+
+    Returns:
+        Distance, m; exact up to 0.8 m, and never below 0.8 m where the truth is beyond.
+    """
+    window = tunnel.contact_first[node_at(tunnel, station)] + jnp.arange(tunnel.n_contact)
+    from_robot = (tunnel.box_centre[window] - position)[:, None, :] + tunnel.vertices[window]
+    x0, y0, x1, y1 = from_robot[:, :-1, 0], from_robot[:, :-1, 1], from_robot[:, 1:, 0], from_robot[:, 1:, 1]
+    edge_x, edge_y = x1 - x0, y1 - y0
+    size = edge_x * edge_x + edge_y * edge_y
+    # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
+    share = jnp.clip(-(x0 * edge_x + y0 * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
+    near_x, near_y = x0 + share * edge_x, y0 + share * edge_y
+    return jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y))
+
+
+def in_contact(
+    tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array, ""], params: VehicleParams
+) -> Bool[Array, ""]:
+    """Whether the footprint touches a wall or furniture, or lies wholly outside one of the mouths.
+
+    It is looked at at the end of each control period; in one period the robot moves at most half its radius, so that
+    it cannot pass through a wall unseen. Leaving through a mouth counts as contact, because no wall goes on there.
+    """
+    outside = (station < -params.radius) | (station > tunnel.length + params.radius)
+    return (clearance(tunnel, position, station) < params.radius) | outside

@@ -1,0 +1,15 @@
+"""What a user of this room can get wrong, as exceptions with one clear sentence."""
+
+from subterra_jax.errors import SubterraError
+
+
+class ConfigError(SubterraError, ValueError):
+    """A setting, or a combination of settings, that no training run can have."""
+
+
+class CheckpointError(SubterraError):
+    """A checkpoint is missing, damaged, or belongs to another network or run."""
+
+
+class RunFolderError(SubterraError):
+    """The output folder cannot be written, or already holds something else."""
