@@ -1,0 +1,302 @@
+"""A written survey, read back by readers of its own."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+from plyfile import PlyData
+from pypcd4 import PointCloud
+from rosbags.rosbag1 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation, Slerp
+
+from scene.survey.__main__ import main
+
+LENGTH, POINTS, EPOCH = 14.0, 2_400, 1_700_000_000
+POINT = np.dtype([("t", "<u4"), ("xyz", "<f4", 3), ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1")])
+
+
+def make(out: Path, *more: str) -> Path:
+    assert main(["--length", str(LENGTH), "--seed", "4", "--point-rate", "24000", "--out", str(out), *more]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make(tmp_path_factory.mktemp("survey"), "--cloud")
+
+
+@pytest.fixture(scope="module")
+def truth(folder: Path) -> dict:
+    return json.loads((folder / "truth.json").read_text())
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    time: np.ndarray
+    position: np.ndarray
+    attitude: Rotation
+
+    def at(self, time: np.ndarray) -> tuple[np.ndarray, Rotation]:
+        position = np.stack([np.interp(time, self.time, p) for p in self.position.T], axis=-1)
+        return position, Slerp(self.time, self.attitude)(time)
+
+
+def read_tum(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    rows = [line.split() for line in path.read_text().splitlines()]
+    return np.array([float(r[0]) for r in rows]), np.array([r[1:] for r in rows], float)
+
+
+@pytest.fixture(scope="module")
+def trajectory(folder: Path) -> Trajectory:
+    time, rows = read_tum(folder / "groundtruth.tum")
+    return Trajectory(time, rows[:, :3], Rotation.from_quat(rows[:, 3:]))
+
+
+@dataclass(frozen=True)
+class Bag:
+    connections: dict
+    lidar: list
+    points: np.ndarray  # (scans, points) of POINT
+    imu: list
+
+
+@pytest.fixture(scope="module")
+def bag(folder: Path) -> Bag:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Reader(folder / "survey.bag") as reader:
+        connections = {c.topic: c for c in reader.connections}
+        custom = connections["/livox/lidar"]
+        store.register(get_types_from_msg(custom.msgdef.data, custom.msgtype))
+        assert store.generate_msgdef(custom.msgtype)[1] == custom.digest
+        raw = [(t, data) for _, t, data in reader.messages([custom])]
+        imu = [
+            store.deserialize_ros1(data, c.msgtype) for c, _, data in reader.messages([connections["/imu/data"]])
+        ]
+        # Object by object only once: the packed array must say the same.
+        whole = store.deserialize_ros1(raw[80][1], custom.msgtype)
+    points = np.array([np.frombuffer(data[-19 * POINTS :], POINT) for _, data in raw])
+    assert [p.x for p in whole.points] == points[80]["xyz"][:, 0].tolist()
+    assert [p.line for p in whole.points] == points[80]["line"].tolist()
+    assert whole.point_num == len(whole.points) == POINTS
+    assert whole.timebase == EPOCH * 10**9 + 8 * 10**9
+    return Bag(connections, raw, points, imu)
+
+
+Cast = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def cast(folder: Path) -> Cast:
+    ply = PlyData.read(folder / "truth.ply")
+    vertices = np.column_stack([ply["vertex"][k] for k in "xyz"])
+    origin = np.floor(vertices[0])
+    scene = EmbreeScene(robust=True)
+    faces = np.vstack(ply["face"]["vertex_indices"])
+    TriangleMesh(scene, (vertices - origin).astype(np.float32), faces.astype(np.int32))
+
+    def distance(start: np.ndarray, ray: np.ndarray) -> np.ndarray:
+        start, ray = np.broadcast_arrays(start - origin, ray)
+        return scene.run(np.array(start, np.float32), np.array(ray, np.float32), query="DISTANCE")
+
+    return distance
+
+
+def frames(truth: dict) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    position, tangent = np.array(truth["position"]), np.array(truth["tangent"])
+    lateral = np.cross([0.0, 0.0, 1.0], tangent)
+    lateral /= np.linalg.norm(lateral, axis=1, keepdims=True)
+    return position, tangent, lateral, np.cross(tangent, lateral)
+
+
+def test_the_same_seed_gives_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    again = make(tmp_path / "again", "--cloud")
+    names = sorted(p.name for p in folder.iterdir())
+    assert names == sorted(p.name for p in again.iterdir())
+    assert names == ["cloud.pcd", "cloud.ply", "groundtruth.tum", "prism.tum", "survey.bag", "truth.json", "truth.ply"]
+    assert all((folder / n).read_bytes() == (again / n).read_bytes() for n in names)
+
+
+def test_the_bag_has_the_topics_types_and_rates_of_geode(bag: Bag) -> None:
+    kinds = {topic: (c.msgtype, c.digest, c.msgcount) for topic, c in bag.connections.items()}
+    scans = len(bag.lidar)
+    assert kinds == {
+        "/livox/lidar": ("livox_ros_driver/msg/CustomMsg", "e4d6829bdfe657cb6c21a746c86b21a6", scans),
+        "/livox/imu": ("sensor_msgs/msg/Imu", "6a62c6daae103f4ff57a132d6f95cec2", 20 * scans),
+        "/imu/data": ("sensor_msgs/msg/Imu", "6a62c6daae103f4ff57a132d6f95cec2", 10 * scans),
+    }
+    times = [t for t, _ in bag.lidar]
+    assert np.unique(np.diff(times)).tolist() == [100_000_000]
+
+
+def test_points_carry_the_marks_of_an_avia(bag: Bag) -> None:
+    offset = bag.points["t"].astype(np.int64)
+    assert (np.diff(offset, axis=1) >= 0).all()
+    assert offset.min() == 0
+    assert 99_900_000 < offset.max() < 100_000_000
+    assert set(np.unique(bag.points["tag"])) == {0x00, 0x10}
+    assert set(np.unique(bag.points["line"])) == set(range(6))
+    lost = (bag.points["xyz"] == 0).all(axis=2)
+    assert 0.02 < lost.mean() < 0.6
+    assert not bag.points["reflectivity"][lost].any()
+
+
+def test_returns_lie_on_the_truth_within_the_range_noise(bag: Bag, trajectory: Trajectory, cast: Cast) -> None:
+    points, scan = bag.points[:, ::7], np.arange(len(bag.points))[:, None]
+    seen = (points["xyz"] != 0).any(axis=2)
+    time = (EPOCH + 0.1 * scan + 1e-9 * points["t"])[seen]
+    position, attitude = trajectory.at(time)
+    local = points["xyz"][seen].astype(float)
+    reach = np.linalg.norm(local, axis=1)
+    error = reach - cast(position, attitude.apply(local / reach[:, None]))
+    # Next to an edge, the rounding of a direction decides which side is hit.
+    close = abs(error) < 0.12
+    assert close.mean() > 0.998
+    assert np.median(abs(error)) == pytest.approx(0.6745 * 0.02, abs=3e-4)
+    assert error[close].std() == pytest.approx(0.02, abs=5e-4)
+    assert error[close].mean() == pytest.approx(0.0, abs=3e-4)
+
+
+def test_the_whole_bore_is_seen_from_mouth_to_mouth(folder: Path, truth: dict) -> None:
+    ply = PlyData.read(folder / "cloud.ply")["vertex"]
+    cloud = np.column_stack([ply[k] for k in "xyz"])
+    position, tangent, lateral, up = frames(truth)
+    for i in range(0, len(position) - 1, 2):
+        away = cloud - position[i]
+        near = away[abs(away @ tangent[i] - 0.25) <= 0.25]
+        turn = np.arctan2(near @ up[i], near @ lateral[i])
+        assert np.histogram(turn, 18, (-np.pi, np.pi))[0].min() >= 4, truth["station"][i]
+
+
+def test_ply_and_pcd_hold_the_returns_of_the_bag(folder: Path, bag: Bag, trajectory: Trajectory) -> None:
+    ply = PlyData.read(folder / "cloud.ply")["vertex"]
+    xyz = np.column_stack([ply[k] for k in "xyz"])
+    pcd = PointCloud.from_path(folder / "cloud.pcd").numpy(("x", "y", "z", "intensity"))
+    seen = (bag.points["xyz"] != 0).any(axis=2)
+    np.testing.assert_allclose(pcd[:, :3], xyz, atol=1e-3)
+    np.testing.assert_array_equal(ply["intensity"], bag.points["reflectivity"][seen])
+    time = (EPOCH + 0.1 * np.arange(len(seen))[:, None] + 1e-9 * bag.points["t"])[seen]
+    position, attitude = trajectory.at(time)
+    np.testing.assert_allclose(position + attitude.apply(bag.points["xyz"][seen]), xyz, atol=2e-3)
+
+
+def test_the_truth_keeps_its_format(truth: dict) -> None:
+    assert (truth["schema"], truth["provenance"], truth["seed"]) == ("subterra.truth/1", "simulated", 4)
+    station, (position, tangent, _, _) = np.array(truth["station"]), frames(truth)
+    np.testing.assert_allclose(station, np.arange(0, LENGTH + 0.1, 0.25))
+    np.testing.assert_allclose(np.linalg.norm(np.diff(position, axis=0), axis=1), 0.25, atol=2e-6)
+    np.testing.assert_allclose(np.gradient(position, 0.25, axis=0)[1:-1], tangent[1:-1], atol=1e-4)
+    assert len(truth["width"]) == len(truth["height"]) == len(station)
+    np.testing.assert_allclose(np.diff(truth["rings"]["station"]), 1.5, atol=1e-5)
+    np.testing.assert_allclose(np.diff(truth["sleepers"]["station"]), 0.6, atol=1e-5)
+    assert {p["side"] for p in truth["pockets"]} == {"left", "right"}
+    assert 0.8 < np.mean([p["open"] for p in truth["pockets"]]) < 1.0
+
+
+def test_width_and_height_are_what_rays_measure(truth: dict, cast: Cast) -> None:
+    position, _, lateral, up = frames(truth)
+    rings = np.array(truth["rings"]["station"])
+    level = np.arange(-3.1, 2.0, 0.01)
+    checked = 0
+    for i, station in enumerate(truth["station"][2:-2], start=2):
+        if abs(abs(station - rings) - 0.22).min() < 0.13:
+            continue  # a ray would measure into a pocket
+        start = position[i] + level[:, None] * up[i]
+        width = (cast(start, lateral[i]) + cast(start, -lateral[i])).max()
+        assert width == pytest.approx(truth["width"][i], abs=1e-3)
+        # Beside the rails' axis the floor lies bare between two sleepers; on the axis it may carry one.
+        beside = position[i] + 1.4 * lateral[i]
+        height = cast(position[i : i + 1], up[i])[0] + cast(beside[None], -up[i])[0]
+        assert height == pytest.approx(truth["height"][i], abs=1e-3)
+        checked += 1
+    assert checked > 20
+
+
+def test_the_gauge_is_between_the_inner_faces(truth: dict, cast: Cast) -> None:
+    tops = [np.array(truth["rails"][side]) for side in ("left", "right")]
+    _, _, lateral, up = frames(truth)
+    for below in (0.014, 0.015, 0.016):
+        start = (0.5 * (tops[0] + tops[1]) - below * up)[1:-1]
+        gap = cast(start, lateral[1:-1]) + cast(start, -lateral[1:-1])
+        np.testing.assert_allclose(gap, 1.435, atol=1e-3)
+    above = 1.0
+    np.testing.assert_allclose(cast(tops[0][1:-1] + above * up[1:-1], -up[1:-1]), above, atol=1e-3)
+
+
+def test_sleepers_stand_above_the_floor_as_told(truth: dict, cast: Cast) -> None:
+    top = np.array(truth["sleepers"]["position"])
+    drop = np.array([0.0, 0.0, -1.0])
+    onto_sleeper = cast(top - drop, drop)
+    between = 0.5 * (top[1:] + top[:-1])
+    onto_floor = cast(between - drop, drop)
+    np.testing.assert_allclose(onto_sleeper, 1.0, atol=1e-3)
+    np.testing.assert_allclose(onto_floor, 1.0 + truth["sleepers"]["top_above_floor"], atol=2e-3)
+
+
+def pocket_rays(pockets: list[dict], truth: dict, shift: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rays that start 0.3 m before the pockets, `shift` off their middle along the girth."""
+    out = np.array([p["outward"] for p in pockets])
+    nearest = [int(np.argmin(abs(np.array(truth["station"]) - p["station"]))) for p in pockets]
+    girth = np.cross(frames(truth)[1][nearest], out)
+    return np.array([p["position"] for p in pockets]) + shift * girth - 0.3 * out, out
+
+
+def test_pockets_are_13_cm_deep_and_filled_ones_are_not(truth: dict, cast: Cast) -> None:
+    for opened, depth in ((True, 0.13), (False, 0.0)):
+        pockets = [p for p in truth["pockets"] if p["open"] == opened]
+        assert pockets
+        within = cast(*pocket_rays(pockets, truth, 0.05))
+        # The lining around has a roughness of 1 cm, which the pocket's floor shares with its mouth.
+        beside = 0.5 * (cast(*pocket_rays(pockets, truth, 0.10)) + cast(*pocket_rays(pockets, truth, -0.10)))
+        assert np.median(within - beside) == pytest.approx(depth, abs=1.5e-3)
+        np.testing.assert_allclose(within - beside, depth, atol=0.012)
+
+
+def test_pockets_have_upright_sides(truth: dict, cast: Cast) -> None:
+    pockets = [p for p in truth["pockets"] if p["open"]]
+    for inside, deep in ((0.088, True), (0.0922, False)):
+        start, out = pocket_rays(pockets, truth, inside)
+        reach = cast(start, out)
+        assert (reach > 0.39).all() if deep else (reach < 0.35).all()
+
+
+def test_nails_cross_the_pockets_that_they_join(truth: dict, cast: Cast) -> None:
+    nailed = [p for p in truth["pockets"] if p["nail"]]
+    assert len(nailed) > 0.8 * len(truth["pockets"])
+    start, out = pocket_rays(nailed, truth, 0.0)
+    along = frames(truth)[1][[int(np.argmin(abs(np.array(truth["station"]) - p["station"]))) for p in nailed]]
+    rings = np.array(truth["rings"]["station"])[[p["ring"] for p in nailed]]
+    towards = np.sign(rings - [p["station"] for p in nailed])[:, None]
+    reach = cast(start + 0.05 * towards * along, out)
+    assert np.median(reach) == pytest.approx(0.3 + 0.06 - 0.014, abs=4e-3)
+
+
+def test_the_prism_is_a_lever_arm_away_from_the_lidar(folder: Path, trajectory: Trajectory) -> None:
+    time, rows = read_tum(folder / "prism.tum")
+    assert (np.diff(time) < 0).sum() >= 1
+    assert not rows[:, 3:].any()
+    assert np.median(np.diff(np.sort(time))) == pytest.approx(1 / 3, abs=0.05)
+    position, attitude = trajectory.at(time)
+    # GEODE's evaluation: T_leica = T_lidar · inv(T), T as printed there.
+    turn, shift = Rotation.from_quat([-0.00492765, 0.00575961, 0.0117651, 0.999901]), [0.00947221, -0.308202, -0.365733]
+    error = rows[:, :3] - (position - attitude.apply(turn.inv().apply(shift)))
+    assert error.std() == pytest.approx(0.0025, abs=6e-4)
+    assert abs(error.mean(axis=0)).max() < 1.5e-3
+
+
+def test_the_external_imu_turns_with_the_lidar(bag: Bag, trajectory: Trajectory) -> None:
+    gyro = np.array([[getattr(m.angular_velocity, k) for k in "xyz"] for m in bag.imu])
+    force = np.array([[getattr(m.linear_acceleration, k) for k in "xyz"] for m in bag.imu])
+    mount = np.array([[0.99962, 0.027463, 0.002445], [-0.027517, 0.999299, 0.025398], [-0.001746, -0.025456, 0.999674]])
+    # Ground truth has two rows for each sample of the IMU.
+    turn = (trajectory.attitude[1:-3:2].inv() * trajectory.attitude[3::2]).as_rotvec() / 0.01
+    error = gyro[1:] - turn[: len(gyro) - 1] @ mount.T
+    assert (error - error.mean(axis=0)).std() == pytest.approx(5.144e-3, rel=0.1)
+    assert abs(error.mean(axis=0)).max() < 0.015
+    up = trajectory.attitude[0 : 2 * len(force) : 2].as_matrix()[:, 2] @ mount.T
+    assert np.mean((force * up).sum(axis=1)) == pytest.approx(9.80665, abs=0.08)

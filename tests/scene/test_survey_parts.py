@@ -1,0 +1,148 @@
+"""The parts of a simulated survey, one by one."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene.survey import avia
+from scene.survey.__main__ import main
+from scene.survey.alignment import draw_alignment
+from scene.survey.bore import draw_bore
+from scene.survey.field import draw_field
+from scene.survey.mesh import Part
+
+SURVEY = Path(__file__).parents[2] / "scene" / "survey"
+
+
+def test_the_survey_imports_nothing_of_the_builder() -> None:
+    for path in SURVEY.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert node.level == 0, path
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            else:
+                continue
+            assert all(n.startswith("scene.survey.") for n in names if n.split(".")[0] == "scene"), path
+
+
+@pytest.mark.parametrize(
+    ("args", "reason"),
+    [
+        (["--length", "10"], "length must be more than 10 m"),
+        (["--length", "nan"], "length must be more than 10 m"),
+        (["--speed", "0"], "speed must lie between"),
+        (["--point-rate", "100"], "point_rate must be a multiple of 60"),
+        (["--seed", "-1"], "seed must not be negative"),
+    ],
+)
+def test_a_wrong_value_is_refused_in_one_sentence(
+    args: list[str], reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--out", str(tmp_path / "out"), *args]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {reason}")
+    assert told.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "out").write_text("")
+    assert main(["--out", str(tmp_path / "out")]) == 2
+    assert "out must be a folder" in capsys.readouterr().err
+
+
+def rosette(begin: float, duration: float) -> np.ndarray:
+    time = begin + np.arange(round(duration * avia.POINT_RATE)) / avia.POINT_RATE
+    return avia.directions(time, np.array([0.3, 1.1]))
+
+
+def angles(ray: np.ndarray) -> np.ndarray:
+    return np.rad2deg(np.stack([np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(ray[:, 2])], axis=-1))
+
+
+def test_the_pattern_fills_its_field_of_view_and_no_more() -> None:
+    ray = rosette(0.0, 2.0)
+    np.testing.assert_allclose(np.linalg.norm(ray, axis=1), 1.0, atol=1e-12)
+    across, upright = abs(angles(ray)).max(axis=0)
+    assert 35.0 < across <= 35.2
+    assert 38.4 < upright <= 38.6
+
+
+def test_the_pattern_does_not_repeat() -> None:
+    def pixels(ray: np.ndarray) -> np.ndarray:
+        return np.unique(np.floor(angles(ray) / 0.2), axis=0)
+
+    once, long = pixels(rosette(0.0, 0.1)), pixels(rosette(0.0, 2.0))
+    assert len(long) > 3 * len(once)
+
+
+def test_points_are_timed_within_their_message() -> None:
+    offset = avia.point_times(240_000)
+    assert (len(offset), offset[0], offset[-1]) == (24_000, 0, 99_995_833)
+    assert (np.diff(offset) >= 0).all()
+
+
+def test_far_and_grazing_pulses_are_lost() -> None:
+    rng = np.random.default_rng(0)
+
+    def share(distance: float, cosine: float) -> float:
+        full = [np.full(4000, v, np.float32) for v in (distance, cosine)]
+        return avia.returned(rng, *full, np.full(4000, Part.LINING, np.uint8)).mean()
+
+    assert share(5.0, 0.5) > 0.99
+    assert share(40.0, 2.8 / 40.0) > 0.9
+    assert 0.3 < share(67.0, 2.8 / 67.0) < 0.7
+    assert share(120.0, 2.8 / 120.0) < 0.03
+    assert share(120.0, 1.0) > 0.99
+    assert share(5.0, -0.5) == share(0.5, 1.0) == share(200.0, 1.0) == share(np.inf, 1.0) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_centreline_bends_as_a_railway_does(seed: int) -> None:
+    alignment = draw_alignment(np.random.default_rng(seed), 200.0)
+    s = np.arange(0.0, 200.0, 0.1)
+    frames = alignment.frames(s)
+    np.testing.assert_allclose(np.gradient(frames.position, 0.1, axis=0)[1:-1], frames.tangent[1:-1], atol=3e-5)
+    np.testing.assert_allclose(np.einsum("nij,nik->njk", frames.matrix, frames.matrix) - np.eye(3), 0.0, atol=1e-12)
+    assert abs(frames.tangent[:, 2]).max() <= 0.01
+    curvature = np.gradient(alignment.heading(s), 0.1)
+    assert 1 / 401 < abs(curvature).max() < 1 / 149
+    assert abs(np.diff(curvature)).max() < 1e-4  # no jump from straight to arc
+
+
+def test_a_field_has_the_spread_and_correlation_asked_for() -> None:
+    rng = np.random.default_rng(1)
+    at = np.array([0.0, 10.0])
+    values = np.array([draw_field(rng, 0.05, 10.0).along(at) for _ in range(4000)])
+    assert values.std() == pytest.approx(0.05, rel=0.03)
+    assert np.corrcoef(values.T)[0, 1] == pytest.approx(np.exp(-1.0), abs=0.04)
+
+
+def test_every_surface_faces_the_air() -> None:
+    bore = draw_bore(np.random.SeedSequence(2), 20.0)
+    mesh = bore.mesh()
+
+    def part(*kinds: Part) -> trimesh.Trimesh:
+        faces = mesh.faces[np.isin(mesh.part, kinds)]
+        return trimesh.Trimesh(mesh.vertices - mesh.vertices.mean(axis=0), faces)
+
+    for solid in (Part.SLEEPER, Part.RAIL, Part.NAIL, Part.FASTENING):
+        one = part(solid)
+        assert one.is_watertight
+        assert one.is_winding_consistent
+        assert one.volume > 0
+    shell = part(Part.LINING, Part.JOINT, Part.POCKET, Part.FLOOR)
+    assert shell.is_winding_consistent
+    assert shell.volume < 0  # normals point inwards
+    # Two mouths, and nothing else, are open.
+    edges = shell.edges_sorted[trimesh.grouping.group_rows(shell.edges_sorted, require_count=1)]
+    from_mouth = np.abs((shell.vertices[edges] + mesh.vertices.mean(axis=0))[:, :, None] - bore.alignment.frames(
+        np.array([0.0, 20.0])
+    ).position).min(axis=2)
+    assert len(edges) > 0
+    assert np.linalg.norm(from_mouth, axis=-1).max() < 4.5
