@@ -7,15 +7,20 @@ from typing import Annotated
 
 import mujoco
 import numpy as np
+import trimesh
 import tyro
 
 from scene import manifest, mesh, mjcf, planar
 from scene.cli import progress_bar, run
+from scene.cloud import thinned
 from scene.errors import FitError
 from scene.files import replace_folder, require_output_folder
 from scene.mjcf import SceneConfig
 from scene.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from scene.track import TrackConfig, lay
+from scene.trajectory import save_tum
+
+_PREVIEW_VOXEL = 0.06
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,10 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
         },
     }
     manifest.write(folder / "manifest.json", content, config)
+    if result.cloud is not None:
+        trimesh.PointCloud(thinned(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+    if result.odometry is not None:
+        save_tum(result.odometry, folder / "odometry.tum")
     _compile(folder / "scene.xml")
 
 
@@ -127,7 +136,7 @@ def main(
     /,
     out: Path,
     trajectory: Path | None = None,
-    config: Annotated[BuildConfig, tyro.conf.arg(name="")] = BuildConfig(),  # noqa: B008 (frozen)
+    config: Annotated[BuildConfig, tyro.conf.arg(name="")] = BuildConfig(),
 ) -> None:
     """Builds a scene from a recording.
 

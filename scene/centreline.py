@@ -28,6 +28,7 @@ _PASSES = 4
 _COARSE_ANGLES = 72
 _POINTS_PER_METRE = 5_000
 _MIN_SEEN = 0.6
+_ELONGATION = 1.6
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,11 @@ def fit_centreline(points: Float[np.ndarray, "n 3"], config: CentrelineConfig) -
     sample = points[::stride].astype(np.float64)
     for _ in range(_PASSES):
         axis = _smooth(_middles(sample, axis), config.cutoff)
+    if axis.length < config.min_length:
+        raise FitError(f"the tunnel is {axis.length:.1f} m long; at least {config.min_length:g} m are needed")
+    across = 2 * float(np.median(np.hypot(*axis.local(sample[:: max(1, len(sample) // 20_000)])[1:])))
+    if axis.length < _ELONGATION * across:
+        raise FitError(f"{axis.length:.0f} m long and {across:.0f} m across: a room, not a tunnel")
     return axis
 
 
@@ -79,7 +85,7 @@ def _skeleton(points: np.ndarray, config: CentrelineConfig) -> Float[np.ndarray,
     from_end = distances(int(np.argmax(from_start)))
     along = (from_start - from_end) / 2  # the half difference is square to the axis where one distance alone is tilted
     if np.ptp(along) < config.min_length:
-        raise FitError(f"the cloud is {np.ptp(along):.1f} m long; a tunnel of at least {config.min_length:g} m is needed")
+        raise FitError(f"the tunnel is {np.ptp(along):.1f} m long; at least {config.min_length:g} m are needed")
     index = np.floor((along - along.min()) / _SLICE).astype(np.intp)
     count = np.bincount(index)
     centres = np.stack([np.bincount(index, nodes[:, axis]) / np.maximum(count, 1) for axis in range(3)], axis=1)
@@ -136,7 +142,7 @@ def _smooth(centres: np.ndarray, cutoff: float) -> Axis:
     A smoothing spline would straighten its ends, by 2 cm on an arc of 150 m; this one has no end condition.
     """
     chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))])
-    pieces = min(max(int(round(2 * chord[-1] / cutoff)), 1), len(chord) // 4)
+    pieces = min(max(round(2 * chord[-1] / cutoff), 1), len(chord) // 4)
     inner = np.linspace(0.0, chord[-1], max(pieces, 1) + 1)[1:-1]
     knots = np.concatenate([[0.0] * 4, inner, [chord[-1]] * 4])
     if len(chord) <= len(inner) + 4:

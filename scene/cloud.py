@@ -20,12 +20,22 @@ class Cloud:
         weights: Returns that each point stands for, `(n,)`.
         origin: Whole-metre offset of the tunnel frame in the input's frame, m, `(3,)`.
         returns: Returns read in all.
+        voxel: Edge length of the voxels, m.
     """
 
     points: Float[np.ndarray, "n 3"]
     weights: Float[np.ndarray, " n"]
     origin: Float[np.ndarray, "3"]
     returns: int
+    voxel: float
+
+
+def thinned(cloud: Cloud, voxel: float) -> Float[np.ndarray, "k 3"]:
+    """The cloud's points in the tunnel frame, one mean a voxel, m."""
+    again = VoxelMean(voxel)
+    again.add(cloud.points.astype(np.float64))
+    coarse = again.cloud()
+    return (coarse.points + coarse.origin).astype(np.float32)
 
 
 class VoxelMean:
@@ -60,13 +70,12 @@ class VoxelMean:
     def cloud(self) -> Cloud:
         """What has been added so far."""
         if not self._parts or self._origin is None:
-            return Cloud(np.empty((0, 3), np.float32), np.empty(0, np.float32), np.zeros(3), 0)
+            return Cloud(np.empty((0, 3), np.float32), np.empty(0, np.float32), np.zeros(3), 0, self.voxel)
         self._compact()
         sums = self._parts[0][1]
         weights = sums[:, 3]
-        return Cloud(
-            (sums[:, :3] / weights[:, None]).astype(np.float32), weights.astype(np.float32), self._origin, self.returns
-        )
+        points = (sums[:, :3] / weights[:, None]).astype(np.float32)
+        return Cloud(points, weights.astype(np.float32), self._origin, self.returns, self.voxel)
 
     def _push(self, key: np.ndarray, sums: np.ndarray) -> None:
         self._parts.append((key, sums))

@@ -11,7 +11,18 @@ import numpy as np
 from scene.files import sha256
 
 SCHEMA = "subterra.manifest/1"
-_LIBRARIES = ("numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "genz-icp", "plyfile", "pypcd4", "shapely")
+_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "trimesh",
+    "manifold3d",
+    "mujoco",
+    "rosbags",
+    "genz-icp",
+    "plyfile",
+    "pypcd4",
+    "shapely",
+)
 
 
 def input_record(paths: list[Path]) -> list[dict[str, Any]]:

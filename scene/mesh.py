@@ -25,7 +25,9 @@ def build_solid(bore: Bore, pockets: bool) -> Manifold:
     """
     solid = Manifold(Mesh64(*_tube(bore.surface(), bore.position)))
     if solid.is_empty():
-        raise FitError(f"the sections do not make a solid ({solid.status().name}); is the curve too tight for the width?")
+        raise FitError(
+            f"the sections do not make a solid ({solid.status().name}); is the curve too tight for the width?"
+        )
     solid = solid.simplify(_SIMPLIFY)
     if pockets and len(bore.pocket):
         recesses = Manifold.batch_boolean([Manifold.hull_points(box) for box in recess_boxes(bore)], OpType.Add)

@@ -1,8 +1,8 @@
 """The scene as MJCF that MuJoCo and MJX both load.
 
-Meshes are for looks and rays; bodies collide with panels, since MuJoCo collides a mesh as its convex hull. Collision bits
-let a body choose what it touches: 1 walls, 2 a smooth deck at the top of the sleepers (for wheels), 4 the ballast bed,
-sleepers and rails (for legs).
+Meshes are for looks and rays; bodies collide with panels, since MuJoCo collides a mesh as its convex hull. Collision
+bits let a body choose what it touches: 1 walls, 2 a smooth deck at the top of the sleepers (for wheels), 4 the ballast
+bed, sleepers and rails (for legs).
 """
 
 from dataclasses import dataclass
@@ -125,7 +125,7 @@ def _box(world: ET.Element, name: str, size, position, rotation: Rotation, **att
 
 
 def _along(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Rotation:
-    """x from start to end, y horizontal to the left."""
+    """X from start to end, y horizontal to the left."""
     x = (end - start) / np.linalg.norm(end - start)
     y = np.cross([0.0, 0.0, 1.0], x)
     y /= np.linalg.norm(y)
@@ -232,12 +232,19 @@ def _add_scout(world: ET.Element, bore: Bore, track: Track, config: SceneConfig)
     touch = {"contype": "0", "conaffinity": str(WALLS | DECK), "group": "2", "material": "scout"}
     radius = config.robot_radius
     _child(
-        body, "geom", name="scout_hull", type="capsule", size=_numbers([radius, 0.08]), pos="0 0 0.52", mass="40", **touch
+        body,
+        "geom",
+        name="scout_hull",
+        type="capsule",
+        size=_numbers([radius, 0.08]),
+        pos="0 0 0.52",
+        mass="40",
+        **touch,
     )
     for k, (x, y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         _child(
-            body, "geom", name=f"scout_caster_{k}", type="sphere", size="0.08", pos=_numbers([0.22 * x, 0.22 * y, 0.08]),
-            mass="1", friction="0.05 0.005 0.0001", **touch,
+            body, "geom", name=f"scout_caster_{k}", type="sphere", size="0.08",
+            pos=_numbers([0.22 * x, 0.22 * y, 0.08]), mass="1", friction="0.05 0.005 0.0001", **touch,
         )  # fmt: skip
     _child(body, "site", name="lidar", pos=_numbers([0, 0, config.lidar_height]), size="0.03")
     _child(body, "camera", name="scout", pos="0 0 1.0", xyaxes="0 -1 0 0.1 0 1", fovy="70")

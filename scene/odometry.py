@@ -17,10 +17,11 @@ from scene.trajectory import Trajectory
 
 LIBRARY = "genz-icp"
 _MIN_POINTS = 100
+_LEVEL_DURATION = 0.2  # s; short, since a carrier sways
 
 
 def estimate_trajectory(recording: Recording, advance: Callable[[], None] = lambda: None) -> Trajectory:
-    """One pose per scan, the first scan's sensor frame being the fixed frame.
+    """One pose per scan, in the first scan's sensor frame turned so that z is up (by the IMU, where there is one).
 
     Args:
         recording: The recording; each scan is read once.
@@ -42,7 +43,17 @@ def estimate_trajectory(recording: Recording, advance: Callable[[], None] = lamb
     if len(poses) < 2:
         raise FitError(f"{recording.path}: only {len(poses)} scans hold {_MIN_POINTS} points; too few for odometry")
     stack = np.asarray(poses)
-    return Trajectory(np.asarray(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), LIBRARY)
+    level = _levelling(recording.up_at_start(_LEVEL_DURATION))
+    return Trajectory(
+        np.asarray(times), level.apply(stack[:, :3, 3]), level * Rotation.from_matrix(stack[:, :3, :3]), LIBRARY
+    )
+
+
+def _levelling(up: np.ndarray | None) -> Rotation:
+    """The smallest turn that makes `up` vertical."""
+    if up is None:
+        return Rotation.identity()
+    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
 
 
 def _config() -> GenZConfig:

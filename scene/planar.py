@@ -35,8 +35,8 @@ class Walls:
 def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], height: float) -> Walls:
     """The walls where a surface `height` above the track meets the solid.
 
-    The solid is levelled first (each vertex lowered by the track's elevation at its station), so that the cut follows the
-    grade.
+    The solid is levelled first (each vertex lowered by the track's elevation at its station), so that the cut follows
+    the grade.
 
     Args:
         solid: The bore, closed at its mouths.

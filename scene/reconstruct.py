@@ -48,6 +48,7 @@ class Reconstruction:
         inputs: Files read.
         facts: For the manifest.
         provenance: Of lining features, for the manifest.
+        odometry: The estimated poses, where there was no trajectory to be given.
         cloud: The registered cloud, where there was one.
     """
 
@@ -56,7 +57,8 @@ class Reconstruction:
     inputs: list[Path]
     facts: dict[str, Any]
     provenance: dict[str, str]
-    cloud: Cloud | None
+    odometry: Trajectory | None = None
+    cloud: Cloud | None = None
 
 
 def reconstruct(source: Path, trajectory: Path | None, config: ReconstructConfig, progress: Progress) -> Reconstruction:
@@ -90,7 +92,9 @@ def reconstruct(source: Path, trajectory: Path | None, config: ReconstructConfig
     )
 
 
-def _from_bag(path: Path, trajectory_path: Path | None, config: ReconstructConfig, progress: Progress) -> Reconstruction:
+def _from_bag(
+    path: Path, trajectory_path: Path | None, config: ReconstructConfig, progress: Progress
+) -> Reconstruction:
     given = load_tum(trajectory_path) if trajectory_path else None
     with Recording(path, config.topic) as recording:
         trajectory = given or _odometry(recording, progress)
@@ -102,7 +106,9 @@ def _from_bag(path: Path, trajectory_path: Path | None, config: ReconstructConfi
             "scans": recording.scan_count,
             "scans_without_pose": uncovered,
             "poses": "given trajectory" if given else LIBRARY,
-            "length_fixed_by": "given trajectory" if given else f"odometry ({LIBRARY}); nothing measured the axial scale",
+            "length_fixed_by": "given trajectory"
+            if given
+            else f"odometry ({LIBRARY}); nothing measured the axial scale",
         }
     return _from_cloud(cloud, [path, *([trajectory_path] if trajectory_path else [])], facts, config, trajectory)
 
@@ -130,7 +136,8 @@ def _from_cloud(
         "residual_rms": float(np.sqrt(np.mean(bore.residual_rms**2))),
         "coverage": float(bore.coverage.mean()),
     }
-    return Reconstruction(bore, cloud.origin, inputs, facts, provenance, cloud)
+    odometry = trajectory if trajectory is not None and trajectory.source == LIBRARY else None
+    return Reconstruction(bore, cloud.origin, inputs, facts, provenance, odometry, cloud)
 
 
 def _from_rings(path: Path) -> Reconstruction:
@@ -149,11 +156,9 @@ def _from_rings(path: Path) -> Reconstruction:
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
         "flat_floor": False,
     }
-    return Reconstruction(bore, origin, [path], facts, {"rings": "measured", "pockets": "none"}, None)
+    return Reconstruction(bore, origin, [path], facts, {"rings": "measured", "pockets": "none"})
 
 
 def _runs_against(axis: Axis, positions: np.ndarray) -> bool:
     """Whether the sensor moved mostly towards smaller stations."""
     return bool(axis.local(positions[[0, -1]])[0] @ [-1.0, 1.0] < 0)
-
-

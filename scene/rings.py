@@ -176,8 +176,11 @@ def _fit_circle(points: np.ndarray, centre: np.ndarray, tangent: np.ndarray) -> 
     around = profile.angles()
     gap = np.abs(np.angle(np.exp(1j * (around[:, None] - angle[None])))).min(axis=1)
     moved = centre + a * lateral + b * up + ((points - centre) @ tangent).mean() * tangent
-    return moved, float(radius), float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2))), float(
-        (gap < np.pi / 8).mean()
+    return (
+        moved,
+        float(radius),
+        float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2))),
+        float((gap < np.pi / 8).mean()),
     )
 
 

@@ -1,8 +1,8 @@
 """Cloud and axis in, the section at every station out: wherever the wall goes, at the half-metre scale.
 
-A coarse grid of medians gives a first wall that pockets, rails and people cannot move. The mean residual of small cells
-against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. A flat floor is fitted as a
-line under the track, and the walls are run on straight into its corners.
+A coarse grid of medians gives a first wall that pockets, rails and people cannot move. The mean residual of small
+cells against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. A flat floor is
+fitted as a line under the track, and the walls are run on straight into its corners.
 """
 
 from dataclasses import dataclass
@@ -22,6 +22,8 @@ _FINE = (0.05, profile.N_ANGLES)
 _MEDIAN_WINDOW = (5, 5)  # 1.25 m × 15°: a pocket fills less than a tenth of it
 _SIGMA = (0.15, 1.5)  # m along, columns around
 _NEAR_WALL = 0.05  # cells further than this from the first wall are pockets or clutter
+_ON_WALL = 0.035
+_DEEPEST = 0.40  # further out is no recess of a lining, m
 _FLOOR_STEP = 0.5
 _FLOOR_SIGMA = 1.0
 _CORNER = (0.15, 0.90)  # heights above the floor between which a wall is fitted to be run on down, m
@@ -29,6 +31,7 @@ _SEEN_WEIGHT = 0.02  # returns a cell: with fewer around, the first wall stands
 _MIN_COVERAGE = 0.5
 _END_COVERAGE = 0.4
 _OVERRUN = 3.0
+_HOLLOW, _MIN_HOLLOW = 0.5, 0.7  # m from the wall, share of the points
 
 
 @dataclass(frozen=True)
@@ -40,18 +43,24 @@ class Sections:
         radius: Smooth wall, m, `(rows, cols)`.
         residual: Mean outward distance of each cell's returns from it, m, `(rows, cols)`.
         weight: Returns in each cell, `(rows, cols)`.
+        support: Points of the thinned cloud on the wall, `(rows, cols)`.
+        deepest: Furthest return behind the wall, m, `(rows, cols)`; 0 where there is none.
         spread: Inlier distance rms of each row, m, `(rows,)`.
         inlier: Cells that the wall was fitted to, `(rows, cols)`.
         flat_floor: Whether the section stands on a flat floor.
+        voxel: Thinning of the cloud it was fitted to, m.
     """
 
     grid: Grid
     radius: Float[np.ndarray, "rows cols"]
     residual: Float[np.ndarray, "rows cols"]
     weight: Float[np.ndarray, "rows cols"]
+    support: Float[np.ndarray, "rows cols"]
+    deepest: Float[np.ndarray, "rows cols"]
     spread: Float[np.ndarray, " rows"]
     inlier: Bool[np.ndarray, "rows cols"]
     flat_floor: bool
+    voxel: float
 
 
 def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
@@ -82,6 +91,9 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
         first = _clip_to_floor(first, fine, floors)
     cell = fine.cell(station, angle)
     outward = radius - first.ravel()[np.maximum(cell, 0)]
+    hollow = np.mean(np.abs(outward[cell >= 0]) < _HOLLOW)
+    if hollow < _MIN_HOLLOW:
+        raise FitError(f"no tunnel in the cloud: only {hollow:.0%} of its points lie on a wall around an open middle")
     residual, weight = unroll.means(fine, cell, outward, cloud.weights)
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     sigma = (_SIGMA[0] / fine.step, _SIGMA[1])
@@ -89,25 +101,37 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     correction *= np.clip(support / _SEEN_WEIGHT, 0.0, 1.0)
     if floors is not None:
         correction[_is_floor(first, fine, floors)] = 0.0
-    near = (np.abs(outward) < _NEAR_WALL) & (cell >= 0)
-    rows = np.maximum(cell, 0) // fine.columns
-    left = (outward - correction.ravel()[np.maximum(cell, 0)]) ** 2
-    spread = np.sqrt(
-        np.bincount(rows[near], (left * cloud.weights)[near], fine.rows)
-        / np.maximum(np.bincount(rows[near], cloud.weights[near], fine.rows), 1e-9)
-    )
-    return Sections(fine, first + correction, residual - correction, weight, spread, inlier, floors is not None)
+    outward -= correction.ravel()[np.maximum(cell, 0)]
+    on_wall = (np.abs(outward) < _ON_WALL) & (cell >= 0)
+    behind = (outward > _ON_WALL) & (outward < _DEEPEST) & (cell >= 0)
+    size = fine.rows * fine.columns
+    support_on = np.bincount(cell[on_wall], minlength=size).reshape(fine.rows, fine.columns).astype(float)
+    deepest = np.zeros(size)
+    np.maximum.at(deepest, cell[behind], outward[behind])
+    squares = np.bincount(cell[on_wall] // fine.columns, (outward**2)[on_wall], fine.rows)
+    spread = np.sqrt(squares / np.maximum(support_on.sum(axis=1), 1e-9))
+    return Sections(
+        fine, first + correction, residual - correction, weight, support_on, deepest.reshape(support_on.shape), spread,
+        inlier, floors is not None, cloud.voxel,
+    )  # fmt: skip
 
 
 def _seen_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[float, float]:
     """First and last station where a fair share of the circumference was seen."""
     grid = Grid.over(-_OVERRUN, axis.length + _OVERRUN, 0.05, 24)
     cell = grid.cell(station, angle)
-    seen = np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns).reshape(grid.rows, grid.columns) > 0
-    full = np.flatnonzero(seen.mean(axis=1) > _END_COVERAGE)
-    if not len(full):
+    count = np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns).reshape(grid.rows, grid.columns)
+    rows = np.flatnonzero((count > 0).mean(axis=1) > _END_COVERAGE)
+    if not len(rows):
         raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
-    return grid.start + full[0] * grid.step, grid.start + (full[-1] + 1) * grid.step
+    total = count.sum(axis=1)
+
+    def trimmed(inwards: np.ndarray) -> int:
+        """The first row as full as the ones behind it: noise spills a few returns over a mouth."""
+        full = [k for k in range(len(inwards) - 1) if 2 * total[inwards[k]] > np.median(total[inwards[k + 1 : k + 21]])]
+        return int(inwards[full[0]]) if full else int(inwards[0])
+
+    return grid.start + trimmed(rows) * grid.step, grid.start + (trimmed(rows[::-1]) + 1) * grid.step
 
 
 @dataclass(frozen=True)
@@ -141,7 +165,9 @@ def _floor_lines(
         return None
     at, height, slope = np.asarray(lines).T
     sigma = _FLOOR_SIGMA / (end - start) * count
-    height, slope = (gaussian_filter1d(median_filter(v, 3, mode="nearest"), sigma, mode="nearest") for v in (height, slope))
+    height, slope = (
+        gaussian_filter1d(median_filter(v, 3, mode="nearest"), sigma, mode="nearest") for v in (height, slope)
+    )
     return _Floors(at, height, slope)
 
 

@@ -48,7 +48,7 @@ def rails(track: Track, axis: Axis, start: float, end: float, step: float = 0.6)
             ]
             ring = np.stack([_place(at, base, y, z) for y, z in edges], axis=1)
             parts.append(_prism(ring))
-    return trimesh.util.concatenate(parts)
+    return _merged(parts)
 
 
 def fastenings(track: Track, axis: Axis, start: float, end: float) -> trimesh.Trimesh | None:
@@ -69,7 +69,13 @@ def fastenings(track: Track, axis: Axis, start: float, end: float) -> trimesh.Tr
                 clip = trimesh.creation.box(_CLIP)
                 across = side * config.rail_offset + edge * (config.rail.foot_width + _CLIP[1]) / 2
                 parts.append(clip.apply_translation((0, across, _CLIP[2] / 2)).apply_transform(frame))
-    return trimesh.util.concatenate(parts) if parts else None
+    return _merged(parts) if parts else None
+
+
+def _merged(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
+    return trimesh.Trimesh(np.concatenate([p.vertices for p in parts]), np.concatenate(faces), process=False)
 
 
 def _elevation(track: Track, axis: Axis, station: np.ndarray) -> np.ndarray:

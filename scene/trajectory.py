@@ -1,5 +1,6 @@
 """Poses over time: TUM files, and where a sensor was at any moment in between."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,6 +41,12 @@ class Trajectory:
         return positions, Slerp(self.times, self.rotations)(clipped)
 
 
+def save_tum(trajectory: Trajectory, path: Path) -> None:
+    """Writes `t x y z qx qy qz qw` rows."""
+    rows = np.column_stack([trajectory.times, trajectory.positions, trajectory.rotations.as_quat()])
+    np.savetxt(path, rows, fmt="%.9f")
+
+
 def load_tum(path: Path) -> Trajectory:
     """Reads `t x y z qx qy qz qw` rows; rows out of order are sorted, repeated times dropped.
 
@@ -48,7 +55,9 @@ def load_tum(path: Path) -> Trajectory:
     """
     require_input(path)
     try:
-        rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty file is reported below
+            rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
     except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
         raise RecordingError(f"{path}: not a TUM trajectory ({error})") from error
     if rows.shape[1:] != (8,) or len(rows) < 2:
@@ -57,7 +66,9 @@ def load_tum(path: Path) -> Trajectory:
         raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
     norms = np.linalg.norm(rows[:, 4:], axis=1)
     if (norms == 0).all():
-        raise RecordingError(f"{path}: holds positions only (every quaternion is zero); poses with orientation are needed")
+        raise RecordingError(
+            f"{path}: holds positions only (every quaternion is zero); poses with orientation are needed"
+        )
     if (np.abs(norms - 1) > _QUATERNION_TOLERANCE).any():
         row = int(np.argmax(np.abs(norms - 1) > _QUATERNION_TOLERANCE)) + 1
         raise RecordingError(f"{path}: row {row} has a quaternion of length {norms[row - 1]:.3g}, not 1")

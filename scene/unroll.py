@@ -41,9 +41,7 @@ class Grid:
         """Middle of each column, rad in [-π, π)."""
         return -np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns
 
-    def cell(
-        self, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"]
-    ) -> Int[np.ndarray, " p"]:
+    def cell(self, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
         """Flat index of each point's cell; -1 outside the rows."""
         row = np.floor((station - self.start) / self.step).astype(np.int64)
         column = np.floor((angle + np.pi) / (2 * np.pi) * self.columns).astype(np.int64) % self.columns

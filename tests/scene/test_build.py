@@ -1,0 +1,183 @@
+"""The command, from input to files, and what it says of bad input."""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from scene.build import build
+from tests.scene.bags import write_bag, write_bag_without_lidar, write_tum
+from tests.scene.clouds import curved_d_bore
+
+ROOT = Path(__file__).parents[2]
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "-m", "scene.build", *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+@pytest.fixture(scope="module")
+def cloud_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cloud") / "bore.ply"
+    known = curved_d_bore(length=24, per_metre=6000, offset=(12.0, -3.0, 2.0))
+    trimesh.PointCloud(known.points).export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(cloud_file, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "bore"
+    build(cloud_file, out)
+    return out
+
+
+def test_the_scene_folder_holds_everything_the_format_asks_for(scene):
+    for name in ("scene.xml", "bore.npz", "tunnel.npz", "manifest.json", "meshes/lining.ply", "meshes/solid.ply"):
+        assert (scene / name).stat().st_size > 0
+    manifest = json.loads((scene / "manifest.json").read_text())
+    assert manifest["schema"] == "subterra.manifest/1"
+    assert manifest["provenance"]["track"] == "by standard"
+    assert manifest["count"]["sleepers"] == 41
+    assert len(manifest["inputs"][0]["sha256"]) == 64
+
+
+def test_whole_meshes_are_in_the_tunnel_frame(scene):
+    with np.load(scene / "bore.npz") as bore:
+        position = bore["position"]
+    for name in ("lining", "solid"):
+        mesh = trimesh.load(scene / "meshes" / f"{name}.ply")
+        assert (mesh.bounds[0] < position.min(axis=0) + 0.1).all()
+        assert (mesh.bounds[1] > position.max(axis=0) - 0.1).all()
+    assert trimesh.load(scene / "meshes" / "solid.ply").is_volume
+
+
+def test_the_scout_comes_to_rest_on_the_deck_inside_the_bore(scene):
+    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    data = mujoco.MjData(model)
+    start = data.qpos[:3].copy()
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+    assert np.linalg.norm(data.qpos[:3] - start) < 0.05
+    assert np.abs(data.qvel).max() < 0.05
+
+
+def test_the_middle_of_the_bore_is_free_and_its_walls_stop_a_body(scene):
+    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    data = mujoco.MjData(model)
+    data.qvel[:2] = 3 * np.array([-np.sin(0.7), np.cos(0.7)])
+    for _ in range(1000):
+        mujoco.mj_step(model, data)
+    names = {
+        mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+        for contact in data.contact
+        for geom in (contact.geom1, contact.geom2)
+    }
+    with np.load(scene / "bore.npz") as bore:
+        distance = np.linalg.norm(bore["position"][:, :2] - data.qpos[:2], axis=1).min()
+    assert distance < 2.83, f"the scout went through the wall; it touches {names}"
+
+
+@pytest.mark.slow
+def test_the_scene_loads_into_mjx_and_steps(scene):
+    import jax
+    from mujoco import mjx
+
+    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    data = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
+    assert np.isfinite(np.asarray(data.qpos)).all()
+
+
+def test_the_same_input_gives_the_same_bytes(cloud_file, scene, tmp_path):
+    build(cloud_file, tmp_path / "bore")
+    for path in sorted(scene.rglob("*")):
+        if path.is_file():
+            assert path.read_bytes() == (tmp_path / "bore" / path.relative_to(scene)).read_bytes(), path.name
+
+
+def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(b"ply\n")
+    done = command(bad, "--out", scene)
+    assert done.returncode == 2
+    assert before == {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
+
+
+def bad_inputs(folder: Path) -> dict[str, tuple[list[object], str]]:
+    short = folder / "short.ply"
+    trimesh.PointCloud(curved_d_bore(length=5).points).export(short)
+    plane = folder / "plane.ply"
+    rng = np.random.default_rng(0)
+    trimesh.PointCloud(np.column_stack([rng.uniform(0, 60, 9999), rng.uniform(0, 8, 9999), np.zeros(9999)])).export(
+        plane
+    )
+    nan = folder / "nan.ply"
+    trimesh.PointCloud(np.full((99, 3), np.nan)).export(nan)
+    scans = [(100.0 + 0.1 * k, rng.uniform(-3, 3, (200, 3))) for k in range(5)]
+    bag = write_bag(folder / "a.bag", scans)
+    cut = folder / "cut.bag"
+    cut.write_bytes(bag.read_bytes()[:500])
+    note = write_bag_without_lidar(folder / "note.bag")
+    early = write_tum(folder / "early.tum", np.column_stack([np.arange(9.0), np.zeros((9, 6)), np.ones(9)]))
+    unknown = folder / "x.docx"
+    unknown.write_text("x")
+    empty = folder / "empty"
+    empty.mkdir()
+    return {
+        "missing file": ([folder / "none.bag"], r"none\.bag: no such file"),
+        "unknown kind": ([unknown], r"x\.docx: of no known kind"),
+        "truncated bag": ([cut], r"cut\.bag: not a whole ROS1 bag"),
+        "no LiDAR": ([note], r"note\.bag: has no LiDAR topic"),
+        "poses elsewhere": ([bag, "--trajectory", early], r"early\.tum: covers 0\.00 to 8\.00 s"),
+        "no trajectory file": ([bag, "--trajectory", folder / "no.tum"], r"no\.tum: no such file"),
+        "cloud and poses": ([short, "--trajectory", early], r"early\.tum: a trajectory goes with a bag"),
+        "NaN cloud": ([nan], r"nan\.ply: none of its 99 points is finite"),
+        "too short": ([short], r"short\.ply: the tunnel is .* m long; at least 10 m"),
+        "no tunnel": ([plane], r"plane\.ply: "),
+        "empty folder": ([empty], r"empty: one CSV with the columns"),
+    }
+
+
+CASES = [
+    "missing file", "unknown kind", "truncated bag", "no LiDAR", "poses elsewhere", "no trajectory file",
+    "cloud and poses", "NaN cloud", "too short", "no tunnel", "empty folder",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    return bad_inputs(tmp_path_factory.mktemp("bad"))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path):
+    arguments, sentence = inputs[case]
+    out = tmp_path / "scene"
+    done = command(*arguments, "--out", out)
+    assert done.returncode == 2, done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, done.stderr
+    assert re.search(rf"^error: .*{sentence}", lines[0]), lines[0]
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_that_is_a_file_is_refused_before_any_work(cloud_file, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("mine")
+    for out in (blocked, blocked / "below"):
+        done = command(cloud_file, "--out", out)
+        assert done.returncode == 2
+        assert f"{blocked}: is a file" in done.stderr
+    assert blocked.read_text() == "mine"

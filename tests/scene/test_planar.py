@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+
+from scene import mesh, planar, track
+
+
+@pytest.fixture(scope="module")
+def walls(bore):
+    laid = track.lay(bore, track.TrackConfig())
+    return {
+        name: planar.cut_walls(mesh.build_solid(bore, pockets=name == "pockets"), bore, laid.elevation, 0.7)
+        for name in ("smooth", "pockets")
+    }
+
+
+def test_smooth_walls_run_at_half_the_width_over_the_whole_length(bore, walls):
+    np.testing.assert_allclose(planar.half_widths(walls["smooth"], bore), 2.8, atol=0.005)
+    for station in (walls["smooth"].left_station, walls["smooth"].right_station):
+        assert station[0] == pytest.approx(0, abs=0.05)
+        assert station[-1] == pytest.approx(bore.length, abs=0.05)
+        assert (np.diff(station) >= 0).all()
+
+
+def test_left_is_left_of_the_centreline(bore, walls):
+    plan = planar.flat(bore.axis)
+    for wall, side in ((walls["smooth"].left, 1), (walls["smooth"].right, -1)):
+        assert (side * plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1] > 2.7).all()
+
+
+def test_pockets_are_recesses_of_13_cm_with_upright_sides(bore, walls):
+    plan = planar.flat(bore.axis)
+    wall = walls["pockets"].left
+    across = plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1]
+    assert across.max() == pytest.approx(2.93, abs=0.01)
+    assert (across > 2.9).sum() >= 2 * (len(bore.pocket) // 2)
+
+
+def test_the_tunnel_file_holds_every_field_of_the_format(bore, walls, tmp_path):
+    laid = track.lay(bore, track.TrackConfig())
+    planar.save(
+        tmp_path / "t.npz", "x", "simulated", bore, laid.elevation, 0.7, {**walls, "furnished": walls["pockets"]}
+    )
+    with np.load(tmp_path / "t.npz") as data:
+        assert str(data["schema"]) == "subterra.tunnel/1"
+        assert list(data["lining"]) == ["smooth", "pockets", "furnished"]
+        n = len(data["station"])
+        assert data["centre"].shape == data["tangent"].shape == (n, 2)
+        assert data["elevation"].shape == data["half_width"].shape == (n,)
+        for variant in data["lining"]:
+            for side in ("left", "right"):
+                assert data[f"{side}_{variant}"].shape == (*data[f"{side}_station_{variant}"].shape, 2)
+            assert data[f"furniture_{variant}"].shape[1] == 4

@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from scene.errors import RecordingError
+from scene.recording import Recording
+from scene.registration import register
+from scene.trajectory import load_tum
+from tests.scene.bags import write_bag, write_bag_without_lidar, write_tum
+
+SCANS = [(100.0 + 0.1 * k, np.arange(30.0).reshape(10, 3) + k) for k in range(5)]
+
+
+def still(start: float, end: float) -> np.ndarray:
+    times = np.arange(start, end, 0.05)
+    return np.column_stack([times, np.zeros((len(times), 3)), np.tile([0.0, 0, 0, 1], (len(times), 1))])
+
+
+def test_scans_come_back_as_they_were_written(tmp_path):
+    with Recording(write_bag(tmp_path / "a.bag", SCANS)) as recording:
+        scans = list(recording.scans())
+    assert recording.topic == "/livox/lidar"
+    assert recording.scan_count == 5
+    for scan, (stamp, points) in zip(scans, SCANS, strict=True):
+        assert scan.stamp == pytest.approx(stamp, abs=1e-6)
+        np.testing.assert_array_equal(scan.points, points.astype(np.float32))
+        np.testing.assert_allclose(scan.times, 0.01 * np.arange(10), atol=1e-9)
+
+
+def test_returns_at_the_origin_and_not_finite_ones_are_dropped(tmp_path):
+    points = np.array([[0, 0, 0], [np.nan, 1, 1], [np.inf, 0, 0], [1, 2, 3]], float)
+    with Recording(write_bag(tmp_path / "a.bag", [(1.0, points)])) as recording:
+        (scan,) = recording.scans()
+    np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
+
+
+def test_a_bag_without_lidar_says_what_it_holds(tmp_path):
+    with pytest.raises(RecordingError, match=r"b\.bag: has no LiDAR topic .*/note"):
+        Recording(write_bag_without_lidar(tmp_path / "b.bag"))
+
+
+def test_an_absent_topic_is_named(tmp_path):
+    with pytest.raises(RecordingError, match="no LiDAR topic /other"):
+        Recording(write_bag(tmp_path / "a.bag", SCANS), topic="/other")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7, 0.99])
+def test_a_bag_truncated_anywhere_is_refused(tmp_path, share):
+    whole = write_bag(tmp_path / "a.bag", SCANS).read_bytes()
+    cut = tmp_path / "cut.bag"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(RecordingError, match=r"cut\.bag"), Recording(cut) as recording:
+        list(recording.scans())
+
+
+def test_a_file_that_is_no_bag_is_refused(tmp_path):
+    (tmp_path / "x.bag").write_text("hello")
+    with pytest.raises(RecordingError, match=r"x\.bag: not a whole ROS1 bag"):
+        Recording(tmp_path / "x.bag")
+
+
+def test_a_trajectory_that_misses_the_recording_is_refused_with_both_spans(tmp_path):
+    trajectory = load_tum(write_tum(tmp_path / "t.tum", still(0.0, 50.0)))
+    with (
+        Recording(write_bag(tmp_path / "a.bag", SCANS)) as recording,
+        pytest.raises(RecordingError, match=r"t\.tum: covers 0\.00 to 49\.95 s, but .*a\.bag runs from 100\.00"),
+    ):
+        register(recording, trajectory, 0.05)
+
+
+def test_returns_move_with_the_sensor_during_a_sweep(tmp_path):
+    """A wall 10 m ahead of a sensor that moves 1 m during the sweep stays one plane."""
+    depth = 10.0 - np.linspace(0, 1, 200, endpoint=False)
+    points = np.stack([depth, np.linspace(-3, 3, 200), np.zeros(200)], axis=1)
+    rows = still(99.9, 101.0)
+    rows[:, 1] = 10.0 * (rows[:, 0] - 100.0)
+    trajectory = load_tum(write_tum(tmp_path / "t.tum", rows))
+    with Recording(write_bag(tmp_path / "a.bag", [(100.0, points)])) as recording:
+        cloud, uncovered = register(recording, trajectory, 0.01)
+    assert uncovered == 0
+    np.testing.assert_allclose(cloud.points[:, 0] + cloud.origin[0], 10.0, atol=1e-4)
