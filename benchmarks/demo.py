@@ -1,0 +1,162 @@
+"""`make demo`: a simulated survey to a scene, an environment, a trained agent and a report, by the users' own commands."""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from benchmarks import truth as truths
+from benchmarks.report import write_report
+
+TASK = "Subterra/TraverseShort-v0"
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Survey → bag → scene → MuJoCo and MJX → training on the reconstructed bore → report.
+
+    Attributes:
+        out: Folder to write.
+        length: Of the simulated tunnel, m.
+        seed: Of survey and training.
+        point_rate: Of the simulated LiDAR, 1/s.
+    """
+
+    out: Path = Path("out/demo")
+    length: float = 60.0
+    seed: int = 0
+    point_rate: int = 240_000
+
+
+class Stages:
+    """Runs stages one after the other; says what each does and how long it took.
+
+    Attributes:
+        seconds: Wall-clock time of each finished stage.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str, text: str) -> Iterator[None]:
+        """One stage; its time is kept under `name`."""
+        print(f"\n=== {text}", flush=True)
+        started = time.monotonic()
+        yield
+        self.seconds[name] = time.monotonic() - started
+        print(f"--- {self.seconds[name]:.1f} s", flush=True)
+
+
+def run_module(*arguments: object, may_fail: bool = False) -> str | None:
+    """Runs `python -m ...` as a user would; returns its error sentence where it may fail and did.
+
+    Raises:
+        SystemExit: It failed and may not.
+    """
+    words = [str(argument) for argument in arguments]
+    print(f"$ python -m {' '.join(words)}", flush=True)
+    done = subprocess.run([sys.executable, "-m", *words], stderr=subprocess.PIPE if may_fail else None, text=True)
+    if done.returncode == 0:
+        return None
+    if not may_fail:
+        sys.exit(done.returncode)
+    return (done.stderr or "").strip().splitlines()[-1]
+
+
+def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
+    """Loads a scene in both and steps each once; versions, sizes and MJX's compile time."""
+    import jax
+    import mujoco
+    import numpy as np
+    from mujoco import mjx
+
+    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    started = time.monotonic()
+    stepped = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
+    finite = bool(np.isfinite(np.asarray(stepped.qpos)).all())
+    return {
+        "mujoco_version": mujoco.__version__,
+        "geoms": int(model.ngeom),
+        "mesh_faces": int(model.nmeshface),
+        "mjx_compile_seconds": time.monotonic() - started,
+        "mjx_state_finite": finite,
+    }
+
+
+def main(config: DemoConfig) -> None:
+    """Runs every stage and prints where the page is."""
+    started = time.monotonic()
+    out, stages = config.out, Stages()
+    survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))
+    with stages.stage("survey", f"1/6 Simulating a survey of {config.length:g} m (a ROS1 bag in GEODE's layout)"):
+        run_module(
+            "scene.survey",
+            "--length",
+            config.length,
+            "--seed",
+            config.seed,
+            "--point-rate",
+            config.point_rate,
+            "--out",
+            survey,
+        )
+    with stages.stage("build", "2/6 Reconstructing the bore from the bag, poses given"):
+        given = ("--trajectory", survey / "groundtruth.tum")
+        run_module("scene.build", survey / "survey.bag", *given, "--provenance", "simulated", "--out", scene)
+    with stages.stage("build_odometry", "3/6 The same without poses: LiDAR odometry alone"):
+        failure = run_module(
+            "scene.build", survey / "survey.bag", "--provenance", "simulated", "--out", blind, may_fail=True
+        )
+        print(failure or "")
+    with stages.stage("load", "4/6 Loading the scene into MuJoCo and MJX"):
+        loaded = step_in_mujoco_and_mjx(scene)
+        print(", ".join(f"{name} {value}" for name, value in loaded.items()))
+    with stages.stage("train", f"5/6 Training on the reconstructed bore ({TASK})"):
+        run_module(
+            "train.navigate",
+            "--task",
+            TASK,
+            "--tunnel",
+            scene / "tunnel.npz",
+            "--seed",
+            config.seed,
+            "--overwrite",
+            "--out",
+            run,
+        )
+    with stages.stage("report", "6/6 Writing the report"):
+        truth = truths.load_truth(survey / "truth.json")
+        summary: dict[str, Any] = {
+            "provenance": "simulated",
+            "length": float(truth.station[-1] - truth.station[0]),
+            **truths.compare(scene, truth).figures(),
+            "odometry": _odometry_figures(survey, blind, truth, failure),
+            **json.loads((run / "summary.json").read_text()),
+            **loaded,
+        }
+        summary["stage_seconds"] = stages.seconds
+        summary["seconds"] = time.monotonic() - started
+        page = write_report(out, summary, truth)
+        (out / "summary.json").write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n")
+    print(f"\n{len(stages.seconds)} stages in {time.monotonic() - started:.0f} s: {page}")
+
+
+def _odometry_figures(survey: Path, scene: Path, truth: truths.Truth, failure: str | None) -> dict[str, Any]:
+    if failure:
+        return {"failure": failure}
+    placement = truths.start_placement(scene / "odometry.tum", survey / "groundtruth.tum")
+    return dict(truths.compare(scene, truth, placement).figures())
+
+
+if __name__ == "__main__":
+    main(tyro.cli(DemoConfig))

@@ -1,0 +1,134 @@
+"""A reconstructed bore against the exact truth of a simulated survey. Nothing is fitted or scaled first."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation, Slerp
+
+SCHEMA = "subterra.truth/1"
+_FINE = 0.01
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True centreline and section sizes in the survey frame.
+
+    Attributes:
+        station: m, `(n,)`.
+        position: m, `(n, 3)`.
+        width: Largest inner width, m, `(n,)`.
+        height: Floor to crown on the axis, m, `(n,)`.
+    """
+
+    station: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    width: Float[np.ndarray, " n"]
+    height: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How far a bore is from the truth, station by station.
+
+    Attributes:
+        station: True station of each compared section, m, `(k,)`.
+        lateral: Offset of the axis to the left, m, `(k,)`.
+        vertical: Offset upwards, m, `(k,)`.
+        width: Width error, m, `(k,)`.
+        height: Height error, m, `(k,)`.
+        length_error: Reconstructed less true length, m.
+    """
+
+    station: Float[np.ndarray, " k"]
+    lateral: Float[np.ndarray, " k"]
+    vertical: Float[np.ndarray, " k"]
+    width: Float[np.ndarray, " k"]
+    height: Float[np.ndarray, " k"]
+    length_error: float
+
+    def figures(self) -> dict[str, float]:
+        """The errors as single numbers, m."""
+        rms = {name: float(np.sqrt(np.mean(getattr(self, name) ** 2))) for name in ("width", "height")}
+        return {
+            "centreline_rmse": float(np.sqrt(np.mean(self.lateral**2 + self.vertical**2))),
+            "width_rmse": rms["width"],
+            "height_rmse": rms["height"],
+            "length_error": self.length_error,
+        }
+
+
+def load_truth(path: Path) -> Truth:
+    """Reads `truth.json`.
+
+    Raises:
+        ValueError: Of another schema.
+    """
+    data = json.loads(path.read_text())
+    if data.get("schema") != SCHEMA:
+        raise ValueError(f"{path}: schema is {data.get('schema')}, not {SCHEMA}")
+    return Truth(*(np.asarray(data[name], float) for name in ("station", "position", "width", "height")))
+
+
+@dataclass(frozen=True)
+class Placement:
+    """A rigid motion from the frame of a scene's input into that of the truth: `rotation @ x + shift`."""
+
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+
+SAME_FRAME = Placement(np.eye(3), np.zeros(3))
+
+
+def start_placement(estimated: Path, true: Path) -> Placement:
+    """Puts an estimated trajectory's first pose on the true pose of that moment; nothing else is fitted.
+
+    Args:
+        estimated: TUM file of the estimate.
+        true: TUM file of the truth, covering the estimate's first row.
+    """
+    first, truth = np.loadtxt(estimated)[0], np.loadtxt(true)
+    then = np.array([np.interp(first[0], truth[:, 0], column) for column in truth[:, 1:4].T])
+    turn = Slerp(truth[:, 0], Rotation.from_quat(truth[:, 4:]))(first[0]) * Rotation.from_quat(first[4:]).inv()
+    return Placement(turn.as_matrix(), then - turn.apply(first[1:4]))
+
+
+def centreline(scene: Path, placement: Placement = SAME_FRAME) -> tuple[np.ndarray, np.ndarray]:
+    """Stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of the truth."""
+    with np.load(scene / "bore.npz") as bore:
+        origin = np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"])
+        return bore["station"], (bore["position"] + origin) @ placement.rotation.T + placement.shift
+
+
+def compare(scene: Path, truth: Truth, placement: Placement = SAME_FRAME) -> Comparison:
+    """The bore of a scene folder against the truth, each true section against the reconstruction nearest to it.
+
+    Args:
+        scene: Folder with `bore.npz` and `manifest.json`.
+        truth: The truth.
+        placement: From the frame of the scene's input into that of the truth.
+    """
+    station, position = centreline(scene, placement)
+    with np.load(scene / "bore.npz") as bore:
+        size = {name: CubicSpline(station, bore[name]) for name in ("width", "height")}
+    curve = CubicSpline(station, position)
+    fine = np.arange(0.0, station[-1], _FINE)
+    at = fine[cKDTree(curve(fine)).query(truth.position)[1]]
+    inside = (at > 0) & (at < fine[-1])
+    at, offset = at[inside], (curve(at) - truth.position)[inside]
+    tangent = CubicSpline(truth.station, truth.position)(truth.station[inside], 1)
+    left = np.cross([0.0, 0.0, 1.0], tangent)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return Comparison(
+        truth.station[inside],
+        np.einsum("ij,ij->i", offset, left),
+        offset[:, 2],
+        size["width"](at) - truth.width[inside],
+        size["height"](at) - truth.height[inside],
+        float(station[-1] - (truth.station[-1] - truth.station[0])),
+    )
