@@ -1,4 +1,4 @@
-"""`make demo`: a simulated survey to a scene, an environment, a trained agent and a report, by the users' own commands."""
+"""`make demo`: a simulated survey to a scene, a trained agent and a report, by the users' own commands."""
 
 import json
 import subprocess
@@ -141,7 +141,7 @@ def main(config: DemoConfig) -> None:
             "length": float(truth.station[-1] - truth.station[0]),
             **truths.compare(scene, truth).figures(),
             "odometry": _odometry_figures(survey, blind, truth, failure),
-            **json.loads((run / "summary.json").read_text()),
+            **_training_figures(run),
             **loaded,
         }
         summary["stage_seconds"] = stages.seconds
@@ -149,6 +149,19 @@ def main(config: DemoConfig) -> None:
         page = write_report(out, summary, truth)
         (out / "summary.json").write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n")
     print(f"\n{len(stages.seconds)} stages in {time.monotonic() - started:.0f} s: {page}")
+
+
+def _training_figures(run: Path) -> dict[str, Any]:
+    """The last line of the training's log, and its evaluation."""
+    last = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    return {
+        "coverage_mean_100": last["coverage_mean_100"],
+        "success_mean_100": last["success_mean_100"],
+        "train_steps": last["step"],
+        "train_episodes": last["episodes"],
+        **{f"evaluation_{name}": evaluation[name] for name in ("episodes", "coverage", "success", "offset", "time")},
+    }
 
 
 def _odometry_figures(survey: Path, scene: Path, truth: truths.Truth, failure: str | None) -> dict[str, Any]:

@@ -105,7 +105,7 @@ def _figure_rows(summary: dict[str, Any]) -> list[tuple[tuple[str, ...], bool]]:
     for key, text, unit, factor, decimals, goal, less in _ROWS:
         value = summary.get(key)
         if value is None or not np.isfinite(value):
-            rows.append(((text, "–", unit, ""), goal is not None))
+            rows.append(((text, "-", unit, ""), goal is not None))
             continue
         shown = factor * value
         missed = goal is not None and (shown > goal if less else shown < goal)

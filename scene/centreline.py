@@ -18,7 +18,8 @@ from scene.axis import Axis, through
 from scene.errors import FitError
 
 _SKELETON_VOXEL = 0.5
-_NEIGHBOUR = 1.2
+_NEIGHBOURS = (1.2, 1.8, 2.6, 3.8)  # m; profiles may be apart, surveys have gaps
+_MIN_JOINED = 0.95
 _SLICE = 1.5
 _TILTED = 3
 _OVERRUN = 6.0
@@ -71,12 +72,7 @@ def _skeleton(points: np.ndarray, config: CentrelineConfig) -> Float[np.ndarray,
     """Centres of slices across the surface distance from end to end."""
     cells = np.unique(np.floor(points / _SKELETON_VOXEL).astype(np.int64), axis=0)
     nodes = (cells + 0.5) * _SKELETON_VOXEL
-    pairs = cKDTree(nodes).query_pairs(_NEIGHBOUR, output_type="ndarray")
-    lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
-    graph = csr_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes)))
-    labels = connected_components(graph, directed=False)[1]
-    largest = np.flatnonzero(labels == np.bincount(labels).argmax())
-    graph, nodes = graph[largest][:, largest], nodes[largest]
+    graph, nodes = _surface_graph(nodes)
 
     def distances(start: int) -> np.ndarray:
         return dijkstra(graph, directed=False, indices=start)
@@ -95,6 +91,19 @@ def _skeleton(points: np.ndarray, config: CentrelineConfig) -> Float[np.ndarray,
     # The last slices are tilted: at a mouth the surface distances still fan out from one point.
     trimmed = centres[full]
     return trimmed[_TILTED:-_TILTED] if len(trimmed) >= 4 * _TILTED else trimmed[1:-1]
+
+
+def _surface_graph(nodes: Float[np.ndarray, "k 3"]) -> tuple[csr_matrix, Float[np.ndarray, "j 3"]]:
+    """Nodes within reach of each other, joined; the reach grows until nearly all hang together."""
+    for reach in _NEIGHBOURS:
+        pairs = cKDTree(nodes).query_pairs(reach, output_type="ndarray")
+        lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
+        graph = csr_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes)))
+        labels = connected_components(graph, directed=False)[1]
+        largest = np.flatnonzero(labels == np.bincount(labels).argmax())
+        if len(largest) >= _MIN_JOINED * len(nodes):
+            break
+    return graph[largest][:, largest], nodes[largest]
 
 
 def _middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:

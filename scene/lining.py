@@ -29,6 +29,7 @@ _PROFILE = 0.30  # half window for the common size, m
 _PITCHES = (0.9, 2.1)  # widths of rings in use, m
 _MIN_COHERENCE = 0.4
 _MIN_POCKETS = 6
+_NOTHING = {"rings": "none found", "pockets": "none found"}
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
@@ -42,14 +43,14 @@ class _Holes:
 def add_features(bore: Bore, sections: Sections) -> tuple[Bore, dict[str, str]]:
     """The bore with the rings and pockets that its survey shows, and their provenance.
 
-    Position is each pocket's own; length, width and depth are common to all. Where fewer than a handful stand in rows,
-    there are none.
+    Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and
+    at a pitch of rings are none.
     """
     grid = sections.grid
     deficit = _deficit(sections)
     holes = _in_rows(_find_holes(deficit, sections), sections)
     if len(holes.row) < _MIN_POCKETS:
-        return bore, {"rings": "none found", "pockets": "none found"}
+        return bore, dict(_NOTHING)
     row, column = _refine(deficit, holes)
     station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
     slope = _slopes(sections, holes)
@@ -61,8 +62,9 @@ def add_features(bore: Bore, sections: Sections) -> tuple[Bore, dict[str, str]]:
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / _STRONG, 0, 1), True
     joints = _ring_joints(pockets["station"], bore.length)
-    found = "measured" if len(joints) else "none found"
-    return replace(bore, pocket=pockets, ring_station=joints), {"rings": found, "pockets": "measured"}
+    if not len(joints):
+        return bore, dict(_NOTHING)
+    return replace(bore, pocket=pockets, ring_station=joints), {"rings": "measured", "pockets": "measured"}
 
 
 def _deficit(sections: Sections) -> Float[np.ndarray, "rows cols"]:

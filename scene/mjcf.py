@@ -88,7 +88,7 @@ def _header(name: str) -> ET.Element:
     _child(root, "statistic", extent="12")
     visual = _child(root, "visual")
     _child(visual, "global", offwidth="1280", offheight="960")
-    _child(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.65 0.65 0.6", specular="0 0 0")
+    _child(visual, "headlight", ambient="0.45 0.45 0.45", diffuse="0.7 0.7 0.66", specular="0 0 0")
     _child(visual, "map", znear="0.005", zfar="40", fogstart="10", fogend="90")
     return root
 

@@ -17,10 +17,13 @@ from scene.cloud import Cloud
 from scene.errors import FitError
 from scene.unroll import Grid
 
-_COARSE = (0.25, 120)  # station step m, angles
+_COARSE_STEPS = (0.25, 0.5, 1.0, 1.5, 2.0)  # m; the first that leaves hardly a row of the coarse grid unseen
+_COARSE_ANGLES = 120
+_MIN_ROWS_SEEN = 0.9
 _FINE = (0.05, profile.N_ANGLES)
-_MEDIAN_WINDOW = (5, 5)  # 1.25 m × 15°: a pocket fills less than a tenth of it
+_MEDIAN_WINDOW = (1.25, 5)  # m along, 3° columns around: a pocket fills less than a tenth of it
 _SIGMA = (0.15, 1.5)  # m along, columns around
+_SIGMA_BETWEEN = 0.4  # of the spacing, where the survey is profiles apart
 _NEAR_WALL = 0.05  # cells further than this from the first wall are pockets or clutter
 _ON_WALL = 0.035
 _DEEPEST = 0.40  # further out is no recess of a lining, m
@@ -30,6 +33,7 @@ _CORNER = (0.15, 0.90)  # heights above the floor between which a wall is fitted
 _SEEN_WEIGHT = 0.02  # returns a cell: with fewer around, the first wall stands
 _MIN_COVERAGE = 0.5
 _END_COVERAGE = 0.4
+_DENSE = 0.7
 _OVERRUN = 3.0
 _HOLLOW, _MIN_HOLLOW = 0.5, 0.7  # m from the wall, share of the points
 
@@ -73,16 +77,18 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     Raises:
         FitError: Less than half of the bore's surface was seen.
     """
-    station, lateral, upward = axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, _COARSE[0])).local(
+    station, lateral, upward = axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, _COARSE_STEPS[0])).local(
         cloud.points.astype(np.float64)
     )
     angle, radius = np.arctan2(upward, lateral), np.hypot(lateral, upward)
     start, end = _seen_span(station, angle, axis)
-    coarse, fine = (Grid.over(start, end, *size) for size in (_COARSE, _FINE))
+    step = _coarse_step(station, start, end)
+    coarse, fine = Grid.over(start, end, step, _COARSE_ANGLES), Grid.over(start, end, *_FINE)
     wall = unroll.medians(coarse, coarse.cell(station, angle), radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
-    wall = unroll.median_smooth(unroll.fill_nearest(wall), _MEDIAN_WINDOW)
+    window = (round(_MEDIAN_WINDOW[0] / step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
+    wall = unroll.median_smooth(unroll.fill_nearest(wall), window)
     floors = _floor_lines(station, lateral, upward, start, end)
     if floors is not None:
         wall = _stand_on_floor(wall, coarse, floors)
@@ -96,7 +102,8 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
         raise FitError(f"no tunnel in the cloud: only {hollow:.0%} of its points lie on a wall around an open middle")
     residual, weight = unroll.means(fine, cell, outward, cloud.weights)
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
-    sigma = (_SIGMA[0] / fine.step, _SIGMA[1])
+    spacing = step if step > _COARSE_STEPS[0] else 0.0
+    sigma = (max(_SIGMA[0], _SIGMA_BETWEEN * spacing) / fine.step, _SIGMA[1])
     correction, support = unroll.smooth(residual, np.where(inlier, np.minimum(weight, 50.0), 0.0), sigma)
     correction *= np.clip(support / _SEEN_WEIGHT, 0.0, 1.0)
     if floors is not None:
@@ -117,21 +124,43 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
 
 
 def _seen_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[float, float]:
-    """First and last station where a fair share of the circumference was seen."""
-    grid = Grid.over(-_OVERRUN, axis.length + _OVERRUN, 0.05, 24)
+    """First and last station where a fair share of the circumference was seen, m."""
+    grid = Grid.over(-_OVERRUN, axis.length + _OVERRUN, _COARSE_STEPS[0], 24)
     cell = grid.cell(station, angle)
     count = np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns).reshape(grid.rows, grid.columns)
     rows = np.flatnonzero((count > 0).mean(axis=1) > _END_COVERAGE)
     if not len(rows):
         raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
-    total = count.sum(axis=1)
+    first, last = grid.start + rows[0] * grid.step, grid.start + (rows[-1] + 1) * grid.step
+    inside = station[(station >= first) & (station <= last)]
+    if len(rows) < _DENSE * (rows[-1] - rows[0] + 1):  # profiles apart: the first and the last one are the ends
+        return float(inside.min()), float(inside.max())
+    return _trimmed(inside, first, 1), -_trimmed(-inside, -last, 1)
 
-    def trimmed(inwards: np.ndarray) -> int:
-        """The first row as full as the ones behind it: noise spills a few returns over a mouth."""
-        full = [k for k in range(len(inwards) - 1) if 2 * total[inwards[k]] > np.median(total[inwards[k + 1 : k + 21]])]
-        return int(inwards[full[0]]) if full else int(inwards[0])
 
-    return grid.start + trimmed(rows) * grid.step, grid.start + (trimmed(rows[::-1]) + 1) * grid.step
+def _trimmed(station: np.ndarray, end: float, behind: float) -> float:
+    """Where the returns become as many as further inside: noise spills a few of them over a mouth.
+
+    Args:
+        station: Growing inwards, m.
+        end: Where the first returns are, m.
+        behind: How far inside to look, m.
+    """
+    step = _FINE[0]
+    total = np.histogram(station, np.arange(end - 0.5, end + 2 * behind, step))[0]
+    reach = round(behind / step)
+    full = [k for k in range(len(total) - reach) if 2 * total[k] > np.median(total[k + 1 : k + 1 + reach]) > 0]
+    return end - 0.5 + (full[0] if full else 0) * step
+
+
+def _coarse_step(station: np.ndarray, start: float, end: float) -> float:
+    """Row length of the coarse grid, m: longer where the survey is profiles some way apart."""
+    inside = station[(station >= start) & (station <= end)]
+    for step in _COARSE_STEPS:
+        edges = np.arange(start, end, step)
+        if np.mean(np.histogram(inside, np.append(edges, end))[0] > 0) >= _MIN_ROWS_SEEN:
+            return step
+    raise FitError(f"profiles more than {_COARSE_STEPS[-1]:g} m apart leave the wall between them unknown")
 
 
 @dataclass(frozen=True)

@@ -75,9 +75,7 @@ def bag(folder: Path) -> Bag:
         store.register(get_types_from_msg(custom.msgdef.data, custom.msgtype))
         assert store.generate_msgdef(custom.msgtype)[1] == custom.digest
         raw = [(t, data) for _, t, data in reader.messages([custom])]
-        imu = [
-            store.deserialize_ros1(data, c.msgtype) for c, _, data in reader.messages([connections["/imu/data"]])
-        ]
+        imu = [store.deserialize_ros1(data, c.msgtype) for c, _, data in reader.messages([connections["/imu/data"]])]
         # Object by object only once: the packed array must say the same.
         whole = store.deserialize_ros1(raw[80][1], custom.msgtype)
     points = np.array([np.frombuffer(data[-19 * POINTS :], POINT) for _, data in raw])

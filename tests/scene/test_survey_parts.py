@@ -141,8 +141,9 @@ def test_every_surface_faces_the_air() -> None:
     assert shell.volume < 0  # normals point inwards
     # Two mouths, and nothing else, are open.
     edges = shell.edges_sorted[trimesh.grouping.group_rows(shell.edges_sorted, require_count=1)]
-    from_mouth = np.abs((shell.vertices[edges] + mesh.vertices.mean(axis=0))[:, :, None] - bore.alignment.frames(
-        np.array([0.0, 20.0])
-    ).position).min(axis=2)
+    from_mouth = np.abs(
+        (shell.vertices[edges] + mesh.vertices.mean(axis=0))[:, :, None]
+        - bore.alignment.frames(np.array([0.0, 20.0])).position
+    ).min(axis=2)
     assert len(edges) > 0
     assert np.linalg.norm(from_mouth, axis=-1).max() < 4.5

@@ -1,0 +1,24 @@
+import re
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from benchmarks import page
+
+
+def test_a_page_refers_to_nothing_outside_itself():
+    figure, axes = plt.subplots()
+    axes.plot([0, 1])
+    parts = [
+        page.heading("A & B"),
+        page.figure(figure, "a line"),
+        page.figure(np.zeros((4, 4, 3), np.uint8), "a picture"),
+        page.table(("What", "Value"), [(("x < y", "1"), True)]),
+    ]
+    plt.close(figure)
+    text = page.page("T", parts)
+    assert all(source.startswith("data:image/png;base64,") for source in re.findall(r'src="([^"]*)"', text))
+    assert "http" not in text
+    assert "A &amp; B" in text
+    assert "x &lt; y" in text
+    assert '<tr class="missed">' in text

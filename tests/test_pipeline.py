@@ -1,0 +1,84 @@
+"""Across the rooms: a scene built from a cloud, and the environment that runs in it."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+import subterra_jax as st
+from scene.build import build
+from subterra_jax import reference
+from tests.scene.clouds import curved_d_bore
+from tests.shared import METRO, needs_metro
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pipeline")
+    trimesh.PointCloud(curved_d_bore(length=40, radius=200, grade=0.0, per_metre=6000).points).export(folder / "c.ply")
+    build(folder / "c.ply", folder / "scene")
+    return folder / "scene"
+
+
+def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np.ndarray:
+    """What the environment observes, without noise, from each pose."""
+    env, params = st.make("Subterra/Traverse-v0", tunnel=plan, lining=lining)
+    _, state = env.reset(jax.random.key(0), params)
+
+    def scan(position, heading, station):
+        here = state.replace(position=position, heading=heading, station=station)
+        return env.observe(here, jnp.zeros(16), params)[:16]
+
+    return np.asarray(jax.jit(jax.vmap(scan))(poses.position, poses.heading, poses.station))
+
+
+def test_the_environments_lidar_sees_what_mujoco_sees_in_the_scene(scene):
+    """Sixteen beams from 300 random poses in the planar tunnel, and `mj_multiRay` against the scene's triangles."""
+    plan = st.load_tunnel(scene / "tunnel.npz")
+    poses = reference.random_poses(plan, 300, np.random.default_rng(0))
+    ours = device_scans(plan, poses, "pockets")
+    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with np.load(scene / "tunnel.npz") as tunnel:
+        height = np.interp(poses.station, tunnel["station"], tunnel["elevation"]) + tunnel["lidar_height"]
+    lining_only = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+    theirs = np.empty_like(ours)
+    for k, (position, heading) in enumerate(zip(poses.position, poses.heading, strict=True)):
+        angle = heading + np.arange(16) * np.pi / 8
+        beams = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(16)]).astype(np.float64)
+        distance, hit = np.empty(16), np.empty(16, np.int32)
+        origin = np.array([*position, height[k]], np.float64)
+        mujoco.mj_multiRay(model, data, origin, beams.ravel(), lining_only, 1, -1, hit, distance, None, 16, 30.0)
+        theirs[k] = np.where(hit < 0, 30.0, distance)
+    error = np.abs(ours - np.minimum(theirs, 30.0))
+    assert np.median(error) < 0.01
+    assert np.mean(error < 0.05) > 0.97
+
+
+def test_an_episode_runs_on_a_scene_just_built(scene):
+    env, params = st.make("Subterra/Traverse-v0", tunnel=scene / "tunnel.npz")
+    obs, state = env.reset(jax.random.key(0), params)
+    step = jax.jit(env.step)
+    for k in range(20):
+        obs, state, _, terminated, truncated, info = step(jax.random.key(k), state, jnp.array([2.0, 0.0]), params)
+        assert not terminated
+        assert not truncated
+    assert obs.shape == (18,)
+    assert float(info["coverage"]) == pytest.approx(20 * 0.2 / 40, abs=0.03)
+
+
+@needs_metro
+def test_the_environment_runs_in_a_window_of_the_real_metro(tmp_path):
+    build(METRO, tmp_path / "metro")
+    window = st.load_tunnel(tmp_path / "metro" / "tunnel.npz").slice(400.0, 351.0)
+    assert window.length == pytest.approx(351.0, abs=0.3)
+    env, params = st.make("Subterra/Traverse-v0", tunnel=window, lining="smooth")
+    keys = jax.random.split(jax.random.key(0), 8)
+    obs, _ = jax.vmap(env.reset, (0, None))(keys, params)
+    assert np.isfinite(np.asarray(obs)).all()
+    poses = reference.random_poses(window, 200, np.random.default_rng(0))
+    truth = reference.scan(window.lining("smooth").segments, poses.position, poses.heading)
+    assert np.abs(device_scans(window, poses, "smooth") - truth).max() < 1e-3
