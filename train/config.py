@@ -21,8 +21,10 @@ class PPOConfig:
         frames: Observations stacked into the input of the networks.
         init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
         min_std: Floor of that standard deviation.
-        learning_rate: Of Adam, at the start.
-        target_kl: The learning rate follows this divergence between updates; 0 keeps it constant.
+        learning_rate: Of Adam, at the start and at most. Early on, all environments are at the same stage of their
+            episode; a rate that rises freely then overfits the network to that stage.
+        target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
+            it constant.
         max_grad_norm: Gradients are scaled down to this norm.
         discount: Per control period.
         gae_lambda: Mix of one-step and n-step advantages.
@@ -36,9 +38,9 @@ class PPOConfig:
     """
 
     seed: int = 0
-    steps: int = 3_000_000
-    n_envs: int = 256
-    unroll: int = 64
+    steps: int = 1_500_000
+    n_envs: int = 128
+    unroll: int = 128
     epochs: int = 4
     minibatches: int = 8
     hidden: tuple[int, ...] = (64, 64)
@@ -48,13 +50,13 @@ class PPOConfig:
     learning_rate: float = 1e-3
     target_kl: float = 0.01
     max_grad_norm: float = 0.5
-    discount: float = 0.99
+    discount: float = 0.98
     gae_lambda: float = 0.95
     clip: float = 0.2
     entropy_weight: float = 1e-3
     value_weight: float = 0.5
     stop_coverage: float = 0.9
-    stop_patience: int = 3
+    stop_patience: int = 40
     checkpoint_every: int = 50
 
     @property
@@ -78,11 +80,19 @@ _PRESETS: dict[str, PPOConfig] = {
     "cpu": PPOConfig(),
     # At least a million transitions per iteration, or the launches of SGD cap the rate.
     "gpu": PPOConfig(
-        steps=100_000_000, n_envs=16_384, unroll=64, minibatches=16, hidden=(256, 256), checkpoint_every=20
+        steps=60_000_000,
+        # More environments would not learn sooner: each has to drive the whole tunnel once before anyone succeeds.
+        n_envs=4096,
+        unroll=256,
+        epochs=2,
+        minibatches=32,
+        hidden=(256, 256),
+        stop_patience=20,
+        checkpoint_every=20,
     ),
 }
 _TASKS: dict[str, dict[str, dict[str, float | int]]] = {
-    "Subterra/Traverse-v0": {"cpu": {"steps": 12_000_000}, "gpu": {}},
+    "Subterra/Traverse-v0": {"cpu": {"steps": 4_000_000, "stop_patience": 60}, "gpu": {}},
     "Subterra/TraverseShort-v0": {"cpu": {}, "gpu": {"steps": 30_000_000}},
 }
 

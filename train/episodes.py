@@ -43,13 +43,14 @@ class EpisodeWindow:
             step: Environment steps before the unroll, all environments together.
 
         Returns:
-            The new rows of `COLUMNS`: `episode` counts from 1; `step` is the number of environment steps, all environments
-            together, at the end of the control period in which the episode finished.
+            The new rows of `COLUMNS`: `episode` counts from 1; `step` is the number of environment steps, all
+            environments together, at the end of the control period in which the episode finished.
         """
-        time, env = np.nonzero(finished.done)
+        done = np.asarray(finished.done)
+        time, env = np.nonzero(done)
         rows = np.zeros(len(time), COLUMNS)
         rows["episode"] = self.count + 1 + np.arange(len(time))
-        rows["step"] = step + (time + 1) * finished.done.shape[1]
+        rows["step"] = step + (time + 1) * done.shape[1]
         for name in ("coverage", "success", "length", "episode_return"):
             rows[name] = np.asarray(getattr(finished, name))[time, env]
         self.count += len(rows)

@@ -13,3 +13,7 @@ class CheckpointError(SubterraError):
 
 class RunFolderError(SubterraError):
     """The output folder cannot be written, or already holds something else."""
+
+
+class TrainingError(SubterraError):
+    """Training came to a point from which it cannot go on."""

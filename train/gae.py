@@ -17,9 +17,9 @@ def advantages(
 ) -> Float[Array, "time *env"]:
     """Advantages of the actions of a rollout; add `value` to get the targets of the value function.
 
-    After a termination nothing more can be earned, so the next value is 0. After a truncation the episode would have gone
-    on, so the next value is that of its final observation, not of the first observation of the episode that follows. A step
-    that is both counts as terminated. No advantage reaches across the end of an episode.
+    After a termination nothing more can be earned, so the next value is 0. After a truncation the episode would have
+    gone on, so the next value is that of its final observation, not of the first observation of the episode that
+    follows. A step that is both counts as terminated. No advantage reaches across the end of an episode.
 
     Args:
         reward: Reward of every step.

@@ -66,7 +66,9 @@ class Networks:
         )
         self._value = MLP(layer_sizes=(*layout.hidden, 1), activation=jax.nn.swish)
         self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
-        spread = math.log(math.expm1(layout.init_std - layout.min_std))  # inverse of the softplus inside the distribution
+        spread = math.log(
+            math.expm1(layout.init_std - layout.min_std)
+        )  # inverse of the softplus inside the distribution
         self._offset = jnp.concatenate([jnp.zeros(self.n_action), jnp.full(self.n_action, spread)])
 
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:

@@ -1,13 +1,15 @@
 """Running statistics: observations to zero mean and unit variance, rewards divided by the spread of the return."""
 
+from typing import TypeAlias
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from train.brax_parts import running_statistics
 
-Statistics = running_statistics.RunningStatisticsState
-# A reading that has not moved yet (odometry at a start) would otherwise be divided by nothing, then saturate the network.
+Statistics: TypeAlias = running_statistics.RunningStatisticsState
+# A reading that has not moved yet, like odometry at a start, would otherwise be divided by nothing.
 _STD_MIN = 1e-3
 _LARGEST = 10.0
 
@@ -15,7 +17,9 @@ _LARGEST = 10.0
 def init(shape: tuple[int, ...]) -> Statistics:
     """Statistics of nothing yet: mean 0, standard deviation 1."""
     statistics = running_statistics.init_state(jnp.zeros(shape, jnp.float32))
-    return jax.tree.map(jnp.asarray, statistics)  # Brax starts with Python numbers, which would compile everything twice
+    return jax.tree.map(
+        jnp.asarray, statistics
+    )  # Brax starts with Python numbers, which would compile everything twice
 
 
 def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:

@@ -33,7 +33,6 @@ class Rollout:
     """One unroll as it is stored: observations without their stack, `(time, env, …)`.
 
     Attributes:
-        first_stack: Frame stack at the first step, from which the others are rebuilt.
         observation: Observation acted upon.
         age: Steps since the episode began.
         raw_action: The draw before the tanh.
@@ -44,7 +43,6 @@ class Rollout:
         final_value: Value of the final observation of an episode that was truncated; 0 elsewhere.
     """
 
-    first_stack: Float[Array, "env frames obs"]
     observation: Float[Array, "time env obs"]
     age: Int[Array, "time env"]
     raw_action: Float[Array, "time env action"]
@@ -129,7 +127,6 @@ def collect(
         final_value = jax.lax.cond(jnp.any(truncated), value_of_final, lambda: jnp.zeros_like(reward))
         total, length = now.episode_return + reward, now.age + 1
         stored = Rollout(
-            first_stack=jnp.zeros(0),
             observation=now.stack[:, -1],
             age=now.age,
             raw_action=raw,
@@ -150,4 +147,4 @@ def collect(
         return after, (stored, finished, terms)
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
-    return after, stored.replace(first_stack=drive.stack), finished, jax.tree.map(jnp.mean, terms)
+    return after, stored, finished, jax.tree.map(jnp.mean, terms)

@@ -13,7 +13,7 @@ from train.config import PPOConfig
 from train.networks import Networks, Weights
 from train.rollout import Rollout
 
-_LEARNING_RATE_RANGE = (1e-5, 1e-2)
+_LOWEST_LEARNING_RATE = 1e-5
 _LEARNING_RATE_STEP = 1.2
 
 
@@ -37,20 +37,21 @@ class Lesson:
     """A rollout with what is to be learnt from it.
 
     Attributes:
+        first_stack: Frame stack at the first step, from which the others are rebuilt.
         rollout: As stored.
         advantage: Of every action, in units of the reward scale.
         target: For the value function, in the same units.
     """
 
+    first_stack: Float[Array, "env frames obs"]
     rollout: Rollout
     advantage: Float[Array, "time env"]
     target: Float[Array, "time env"]
 
     def of(self, chosen: Array) -> "Lesson":
         """The same for some of the environments."""
-        first_stack = self.rollout.first_stack[chosen]
-        part = jax.tree.map(lambda x: x[:, chosen], self.replace(rollout=self.rollout.replace(first_stack=None)))
-        return part.replace(rollout=part.rollout.replace(first_stack=first_stack))
+        parts = jax.tree.map(lambda x: x[:, chosen], (self.rollout, self.advantage, self.target))
+        return Lesson(self.first_stack[chosen], *parts)
 
 
 def optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -71,7 +72,7 @@ def loss(
     Source: Schulman et al., Proximal Policy Optimization Algorithms, 2017, Eq. 7 and 9.
     """
     rollout = lesson.rollout
-    stack = frames.rebuild(rollout.first_stack, rollout.observation, rollout.age)
+    stack = frames.rebuild(lesson.first_stack, rollout.observation, rollout.age)
     parameters = networks.parameters(weights["policy"], statistics, stack)
     value = networks.value(weights["value"], statistics, stack)
 
@@ -115,7 +116,7 @@ def learn(
         )
         direction, moments = adam.update(gradients, now.moments)
         weights = optax.apply_updates(now.weights, jax.tree.map(lambda d: -now.learning_rate * d, direction))
-        return Student(weights, moments, _follow(now.learning_rate, parts["kl"], config.target_kl)), parts
+        return Student(weights, moments, _follow(now.learning_rate, parts["kl"], config)), parts
 
     def epoch(now: Student, key_now: PRNGKeyArray) -> tuple[Student, dict[str, Array]]:
         key_order, key_loss = jax.random.split(key_now)
@@ -126,10 +127,10 @@ def learn(
     return student, jax.tree.map(jnp.mean, parts)
 
 
-def _follow(learning_rate: Array, kl: Array, target: float) -> Array:
-    """The learning rate a little higher where the policy barely moved, a little lower where it moved too far."""
-    if target == 0.0:
+def _follow(learning_rate: Array, kl: Array, config: PPOConfig) -> Array:
+    """The learning rate a little lower where the policy moved too far, higher again where it barely moved."""
+    if config.target_kl == 0.0:
         return learning_rate
-    factor = jnp.where(kl > 2.0 * target, 1.0 / _LEARNING_RATE_STEP, 1.0)
-    factor = jnp.where(kl < 0.5 * target, _LEARNING_RATE_STEP, factor)
-    return jnp.clip(learning_rate * factor, *_LEARNING_RATE_RANGE)
+    factor = jnp.where(kl > 2.0 * config.target_kl, 1.0 / _LEARNING_RATE_STEP, 1.0)
+    factor = jnp.where(kl < 0.5 * config.target_kl, _LEARNING_RATE_STEP, factor)
+    return jnp.clip(learning_rate * factor, _LOWEST_LEARNING_RATE, config.learning_rate)

@@ -1,0 +1,70 @@
+import json
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+from tests.train import corridor
+
+# Shapes in annotations are checked at run time, so that they cannot go stale. Not those of pytrees: jax also rebuilds
+# them around NumPy arrays, shapes and booleans.
+CHECKED = ("train.frames", "train.gae", "train.networks", "train.normalize")
+with install_import_hook(CHECKED, "beartype.beartype"):
+    from train import navigate
+
+TASK = "Subterra/TraverseShort-v0"
+SMALL = ("--n-envs=64", "--unroll=64", "--minibatches=4", "--hidden", "32", "32")
+
+
+def call(main, *arguments: str) -> int:
+    """Exit status of a command, run in this process."""
+    before = sys.argv
+    sys.argv = ["command", *arguments]
+    try:
+        with pytest.raises(SystemExit) as caught:
+            main()
+    finally:
+        sys.argv = before
+    return caught.value.code
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compile_once(tmp_path_factory):
+    """The same program is compiled once for all tests of this folder."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.fixture(scope="session")
+def tunnel(tmp_path_factory) -> Path:
+    """A straight tunnel of 20 m."""
+    return corridor.write(tmp_path_factory.mktemp("tunnel") / "corridor.npz", length=20.0, half_width=2.0)
+
+
+@pytest.fixture(scope="session")
+def train_small(tunnel, tmp_path_factory):
+    """Trains a small network in the corridor from the command line; returns exit status and run folder."""
+
+    def train(*arguments: str, out: Path | None = None) -> tuple[int, Path]:
+        out = out or tmp_path_factory.mktemp("runs") / "run"
+        common = ("--task", TASK, "--tunnel", str(tunnel), "--preset", "cpu", "--evaluation-episodes", "100")
+        return call(navigate.main, *common, *SMALL, "--out", str(out), *arguments), out
+
+    return train
+
+
+@pytest.fixture(scope="session")
+def trained(train_small) -> Path:
+    """A run folder in which the corridor has been learnt."""
+    status, out = train_small("--steps=250000", "--stop-patience=5")
+    assert status == 0
+    return out
+
+
+def log_without_timing(run: Path) -> list[dict]:
+    lines = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in line.items() if name != "timing"} for line in lines]

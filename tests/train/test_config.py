@@ -1,0 +1,48 @@
+import dataclasses
+
+import pytest
+
+import subterra_jax as st
+from train.config import PPOConfig, check, make_config
+from train.errors import ConfigError
+
+WRONG = {
+    "steps": 0,
+    "n_envs": 0,
+    "unroll": -1,
+    "minibatches": 7,
+    "hidden": (),
+    "frames": 0,
+    "seed": -1,
+    "learning_rate": 0.0,
+    "init_std": 0.001,
+    "discount": 1.5,
+    "gae_lambda": -0.1,
+    "clip": float("nan"),
+    "entropy_weight": -1.0,
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_setting_that_makes_no_sense_is_refused_by_name(name):
+    with pytest.raises(ConfigError, match="min_std" if name == "init_std" else name):
+        check(dataclasses.replace(PPOConfig(), **{name: WRONG[name]}))
+
+
+@pytest.mark.parametrize("preset", ["cpu", "gpu"])
+@pytest.mark.parametrize("task", st.TASKS)
+def test_every_task_has_presets_that_make_sense(task, preset):
+    config = check(make_config(task, preset))
+    assert preset == "cpu" or config.steps_per_iteration >= 1_000_000
+
+
+def test_an_unknown_task_or_preset_is_refused_with_those_there_are():
+    with pytest.raises(ConfigError, match="TraverseShort"):
+        make_config("Subterra/Nowhere-v0")
+    with pytest.raises(ConfigError, match="cpu, gpu"):
+        make_config("Subterra/Traverse-v0", "abacus")
+
+
+def test_steps_are_rounded_up_to_whole_iterations():
+    config = dataclasses.replace(PPOConfig(), steps=1001, n_envs=10, unroll=10, minibatches=5)
+    assert (config.steps_per_iteration, config.iterations, config.minibatch_envs) == (100, 11, 2)

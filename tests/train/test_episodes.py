@@ -1,0 +1,90 @@
+import json
+
+import jax.numpy as jnp
+import numpy as np
+
+from train import curve, normalize
+from train.episodes import Best, EpisodeWindow
+from train.networks import Policy
+from train.rollout import Finished
+
+
+def finished(done, coverage, success, episode_return, length):
+    return Finished(*(jnp.asarray(x) for x in (done, coverage, success, episode_return, length)))
+
+
+def random_unroll(rng, n_steps=20, n_envs=9, p_done=0.1):
+    shape = (n_steps, n_envs)
+    return finished(
+        done=rng.random(shape) < p_done,
+        coverage=rng.random(shape, np.float32),
+        success=rng.random(shape) < 0.5,
+        episode_return=rng.random(shape, np.float32),
+        length=rng.integers(1, 500, shape, np.int32),
+    )
+
+
+def test_episodes_are_ordered_by_step_and_then_by_environment():
+    done = np.array([[False, True, True], [True, False, True]])
+    coverage = np.array([[9, 0.1, 0.2], [0.3, 9, 0.4]], np.float32)
+    rows = EpisodeWindow().add(finished(done, coverage, done, coverage, np.full((2, 3), 7, np.int32)), step=60)
+    np.testing.assert_array_equal(rows["coverage"], np.array([0.1, 0.2, 0.3, 0.4], np.float32))
+    np.testing.assert_array_equal(rows["episode"], [1, 2, 3, 4])
+    np.testing.assert_array_equal(rows["step"], [63, 63, 66, 66])
+
+
+def test_the_window_holds_exactly_the_last_hundred_episodes():
+    rng, window, every = np.random.default_rng(0), EpisodeWindow(), []
+    for unroll in range(20):
+        every.extend(window.add(random_unroll(rng), step=180 * unroll).tolist())
+        coverage = [row[2] for row in every][-100:]
+        assert window.mean("coverage") == np.float32(coverage).mean(dtype=np.float64)
+    assert window.full
+    assert window.count == len(every) > 200
+
+
+def test_a_window_without_episodes_has_no_mean():
+    assert EpisodeWindow().mean("coverage") is None
+
+
+def test_a_window_survives_json_exactly():
+    window = EpisodeWindow()
+    window.add(random_unroll(np.random.default_rng(1)), step=0)
+    again = EpisodeWindow.from_json(json.loads(json.dumps(window.to_json())))
+    assert again.count == window.count
+    np.testing.assert_array_equal(again.last, window.last)
+
+
+def full_window(success, episode_return):
+    ones = np.ones((1, 100), np.float32)
+    succeeded = np.arange(100)[None] < 100 * success
+    window = EpisodeWindow()
+    window.add(finished(ones > 0, ones, succeeded, ones * episode_return, ones.astype(np.int32)), step=0)
+    return window
+
+
+def named(name):
+    return Policy(weights=name, statistics=normalize.init(()))
+
+
+def test_the_best_policy_is_chosen_by_success_then_by_return_then_by_being_later():
+    best = Best.of(None, full_window(0.9, 10.0), 1, named("first"))
+    best = Best.of(best, full_window(0.8, 99.0), 2, named("more return, less success"))
+    assert best.policy.weights == "first"
+    best = Best.of(best, full_window(0.9, 11.0), 3, named("more return"))
+    assert best.policy.weights == "more return"
+    best = Best.of(best, full_window(0.9, 11.0), 4, named("later"))
+    assert (best.policy.weights, best.iteration) == ("later", 4)
+
+
+def test_no_policy_is_the_best_before_a_hundred_episodes_have_finished():
+    best = Best.of(None, EpisodeWindow(), 0, named("untrained"))
+    best = Best.of(best, EpisodeWindow(), 1, named("a little trained"))
+    assert best.policy.weights == "a little trained"
+    assert Best.of(best, full_window(0.0, -5.0), 2, named("measured")).policy.weights == "measured"
+
+
+def test_the_rolling_mean_of_a_curve_is_that_of_the_last_hundred():
+    values = np.random.default_rng(2).random(350)
+    slow = [values[max(0, i - 99) : i + 1].mean() for i in range(350)]
+    np.testing.assert_allclose(curve.rolling(values), slow, rtol=1e-12)

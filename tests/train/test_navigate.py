@@ -1,0 +1,119 @@
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.train.conftest import SMALL, TASK, call
+from train import checkpoint, curve, navigate
+
+
+def test_a_run_folder_holds_everything(trained):
+    names = {path.name for path in trained.iterdir()}
+    assert names == {
+        "checkpoint",
+        "config.json",
+        "curve.csv",
+        "curve.png",
+        "episodes.csv",
+        "evaluation.json",
+        "log.jsonl",
+    }
+    config = json.loads((trained / "config.json").read_text())
+    assert len(config["tunnel_sha256"]) == 64
+    assert config["tunnel_provenance"] == "simulated"
+    assert config["config"]["n_envs"] == 64
+    assert "jax" in config["versions"]
+    assert (trained / "curve.png").read_bytes().startswith(b"\x89PNG")
+    for path in trained.rglob("*.json*"):
+        assert str(trained.parent) not in path.read_text(), f"{path.name} names a path of this machine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--task", "Subterra/Nowhere-v0"), "no training preset for task 'Subterra/Nowhere-v0'"),
+        (("--preset", "abacus"), "unknown preset 'abacus'"),
+        (("--minibatches", "7"), "n_envs = 128 cannot be divided into minibatches = 7"),
+        (("--steps", "0"), "steps must be at least 1, got 0"),
+        (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
+        (("--lining", "velvet"), "no lining 'velvet'"),
+        (("--resume",), "holds no checkpoint"),
+        (("--evaluation-episodes", "0"), "evaluation_episodes must be at least 1, got 0"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_status_2_before_anything_is_written(tmp_path, capsys, arguments, message):
+    (tmp_path / "run").mkdir()
+    assert call(navigate.main, "--out", str(tmp_path / "run"), *arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    for out in (tmp_path / "file", tmp_path / "file" / "run"):
+        assert call(navigate.main, "--out", str(out)) == 2
+        assert "is a file" in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten_unasked(trained, capsys):
+    before = (trained / "log.jsonl").read_bytes()
+    assert call(navigate.main, "--out", str(trained)) == 2
+    assert "holds a run already" in capsys.readouterr().err
+    assert (trained / "log.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--hidden", "32", "16"), "was trained with hidden = [32, 32], not [32, 16]"),
+        (("--seed", "5"), "was trained with seed = 0, not 5"),
+        (("--lining", "smooth"), "was trained with lining = pockets, not smooth"),
+    ],
+)
+def test_a_run_resumes_only_as_what_it_was(trained, train_small, capsys, arguments, message):
+    status, _ = train_small("--resume", *arguments, out=trained)
+    assert status == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_truncated_checkpoint_is_a_clear_error_when_resumed(trained, train_small, tmp_path, capsys):
+    shutil.copytree(trained, tmp_path / "run")
+    facts = checkpoint.load(tmp_path / "run").path / checkpoint.FACTS
+    facts.write_bytes(facts.read_bytes()[:100])
+    status, _ = train_small("--resume", out=tmp_path / "run")
+    assert status == 2
+    assert "damaged checkpoint" in capsys.readouterr().err
+
+
+def test_ctrl_c_saves_the_checkpoint_and_exits_with_130(tunnel, tmp_path):
+    out = tmp_path / "run"
+    line = [sys.executable, "-m", "train.navigate", "--task", TASK, "--tunnel", str(tunnel), "--out", str(out), *SMALL]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    process = subprocess.Popen([*line, "--stop-coverage=2"], stderr=subprocess.PIPE, text=True, env=environment)
+    log = out / "log.jsonl"
+    while process.poll() is None and not (log.exists() and log.read_text().count("\n") >= 2):
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "--resume" in error
+    facts = checkpoint.load(out).facts
+    assert facts["iteration"] == log.read_text().count("\n")
+    assert (out / "curve.png").exists()
+    assert not (out / "evaluation.json").exists()
+
+
+def test_curves_of_several_runs_are_drawn_into_one_figure(trained, tmp_path, capsys):
+    assert call(curve.main, str(trained), str(trained), "--out", str(tmp_path / "both.png")) == 0
+    assert (tmp_path / "both.png").stat().st_size > 10_000
+    assert call(curve.main, str(tmp_path), "--out", str(tmp_path / "none.png")) == 2
+    assert "no readable episodes.csv" in capsys.readouterr().err

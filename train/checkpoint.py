@@ -1,0 +1,152 @@
+"""Training runs and policies on disk: arrays by Orbax, everything else in one JSON file beside them.
+
+A run folder holds `checkpoint/<iteration>/`. Each is written under a temporary name and renamed, so that a kill at any
+moment leaves the one before it whole. A digest of all arrays is kept in the JSON file: a damaged array is an error,
+never a policy.
+"""
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from train.errors import CheckpointError
+
+SCHEMA = "subterra.checkpoint/1"
+FOLDER, FACTS, ARRAYS = "checkpoint", "checkpoint.json", "arrays"
+_KEPT = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Stored:
+    """A checkpoint as read: checked against its digest, not yet against any network.
+
+    Attributes:
+        path: Where it was read.
+        facts: The JSON file.
+        arrays: Every array, by the name of its place.
+    """
+
+    path: Path
+    facts: dict[str, Any]
+    arrays: dict[str, np.ndarray]
+
+    def restore(self, name: str, like: Any) -> Any:
+        """One of the trees that were saved.
+
+        Args:
+            name: What it was saved as.
+            like: A tree of the same structure, its leaves of the shapes and types wanted, as from `jax.eval_shape`.
+
+        Raises:
+            CheckpointError: An array is missing, or of another shape or type.
+        """
+        paths, structure = jax.tree_util.tree_flatten_with_path(like)
+        leaves = []
+        for path, wanted in paths:
+            place = _place(name, path)
+            if place not in self.arrays:
+                raise CheckpointError(f"{self.path}: has no {place}; it was made for another network")
+            leaf = self.arrays[place]
+            if leaf.shape != wanted.shape or leaf.dtype != wanted.dtype:
+                raise CheckpointError(
+                    f"{self.path}: made for another network: {place} is {leaf.dtype}{list(leaf.shape)}, "
+                    f"this one needs {wanted.dtype}{list(wanted.shape)}"
+                )
+            leaves.append(leaf)
+        return jax.tree.unflatten(structure, leaves)
+
+
+def save(run: Path, iteration: int, trees: dict[str, Any], facts: dict[str, Any]) -> Path:
+    """Writes `run/checkpoint/<iteration>` and forgets all but the last two.
+
+    Args:
+        run: The run folder.
+        iteration: Names the checkpoint.
+        trees: Pytrees of arrays, by name.
+        facts: What JSON can hold; `schema` and `digest` are added.
+
+    Returns:
+        Where it is.
+    """
+    arrays = {
+        _place(name, path): np.asarray(leaf)
+        for name, tree in trees.items()
+        for path, leaf in jax.tree_util.tree_flatten_with_path(jax.device_get(tree))[0]
+    }
+    place = run / FOLDER / f"{iteration:08d}"
+    fresh = place.with_name(f".{place.name}.partial")
+    for leftover in (fresh, place):  # `place` exists only where a resumed run passes it again
+        shutil.rmtree(leftover, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    # At least one axis each: Orbax gives scalars back as Python numbers.
+    ocp.PyTreeCheckpointer().save((fresh / ARRAYS).resolve(), {k: np.atleast_1d(v) for k, v in arrays.items()})
+    shapes = {name: list(array.shape) for name, array in arrays.items()}
+    whole = {"schema": SCHEMA, **facts, "shapes": shapes, "digest": _digest(arrays)}
+    (fresh / FACTS).write_text(json.dumps(whole, indent=1) + "\n")
+    fresh.rename(place)
+    for old in _numbered(run / FOLDER)[:-_KEPT]:
+        shutil.rmtree(old)
+    return place
+
+
+def load(folder: Path) -> Stored:
+    """Reads the newest checkpoint of a run folder, or the checkpoint that `folder` itself is.
+
+    Raises:
+        CheckpointError: There is none, or it is damaged.
+    """
+    place = _find(folder)
+    try:
+        facts = json.loads((place / FACTS).read_text())
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{place}: damaged checkpoint: {FACTS} cannot be read") from error
+    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
+        raise CheckpointError(f"{place}: field 'schema' of {FACTS} must be {SCHEMA!r}")
+    try:
+        restored = ocp.PyTreeCheckpointer().restore((place / ARRAYS).resolve())
+        arrays = {name: np.asarray(restored[name]).reshape(shape) for name, shape in facts["shapes"].items()}
+    except Exception as error:  # a truncated file surfaces as whatever the storage library makes of it
+        raise CheckpointError(f"{place}: damaged checkpoint: its arrays cannot be read") from error
+    if _digest(arrays) != facts.get("digest"):
+        raise CheckpointError(f"{place}: damaged checkpoint: its arrays are not those that were written")
+    return Stored(place, facts, arrays)
+
+
+def exists(run: Path) -> bool:
+    """Whether a run folder holds a checkpoint."""
+    return bool(_numbered(run / FOLDER))
+
+
+def _find(folder: Path) -> Path:
+    if not folder.exists():
+        raise CheckpointError(f"{folder}: no such folder")
+    if (folder / FACTS).exists():
+        return folder
+    numbered = _numbered(folder / FOLDER) or _numbered(folder)
+    if not numbered:
+        raise CheckpointError(f"{folder}: holds no checkpoint")
+    return numbered[-1]
+
+
+def _numbered(folder: Path) -> list[Path]:
+    return sorted((p for p in folder.glob("*") if p.name.isdigit()), key=lambda p: int(p.name))
+
+
+def _place(name: str, path: Any) -> str:
+    return f"{name}.{jax.tree_util.keystr(path, simple=True, separator='.')}"
+
+
+def _digest(arrays: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype} {arrays[name].shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

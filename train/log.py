@@ -1,0 +1,109 @@
+"""What a run says while it trains: a bar for people, one JSON line per iteration for programs."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+LOG, EPISODES = "log.jsonl", "episodes.csv"
+_HEADER = "episode,step,coverage,success,length"
+_PLAIN_EVERY = 10.0
+
+
+class RunLog:
+    """`log.jsonl` and `episodes.csv` of a run folder, flushed after every iteration.
+
+    Args:
+        run: The run folder.
+        iteration: Iterations to keep of an earlier log; 0 begins anew.
+        episodes: Episodes to keep.
+    """
+
+    def __init__(self, run: Path, iteration: int = 0, episodes: int = 0) -> None:
+        # A killed run may have logged more than its last checkpoint knows; those iterations come again.
+        _keep_lines(run / LOG, iteration)
+        _keep_lines(run / EPISODES, episodes + 1 if iteration else 0)
+        self._log: TextIO = (run / LOG).open("a")
+        self._episodes: TextIO = (run / EPISODES).open("a")
+        if not self._episodes.tell():
+            self._episodes.write(_HEADER + "\n")
+
+    def write(self, record: dict[str, Any], rows: np.ndarray) -> None:
+        """Adds one iteration and the episodes that finished in it."""
+        self._log.write(json.dumps(record, allow_nan=False) + "\n")
+        for row in rows:
+            self._episodes.write(
+                f"{row['episode']},{row['step']},{row['coverage']:.9g},{row['success']:d},{row['length']}\n"
+            )
+        self._log.flush()
+        self._episodes.flush()
+
+    def close(self) -> None:
+        """Closes both files."""
+        self._log.close()
+        self._episodes.close()
+
+
+class Bar:
+    """Progress on stderr: steps, steps/s, coverage, success, time left. A line now and then where it is no terminal.
+
+    Args:
+        steps: Steps to train for.
+        done: Steps done before.
+    """
+
+    def __init__(self, steps: int, done: int = 0) -> None:
+        self._console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.percentage:>3.0f} %"),
+            TimeElapsedColumn(),
+            TextColumn("left at most"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._progress.add_task("compiling", total=steps, completed=done)
+        self._told = time.monotonic()
+        self._progress.start()
+        if self._progress.disable:
+            self._console.print("compiling")
+
+    def show(self, record: dict[str, Any]) -> None:
+        """Shows one iteration."""
+        text = (
+            f"{record['step']:,} steps  {record['timing']['steps_per_second']:,}/s  "
+            f"coverage {_percent(record['coverage_mean_100'])}  success {_percent(record['success_mean_100'])}"
+        )
+        self._progress.update(self._task, completed=record["step"], description=text)
+        if self._progress.disable and time.monotonic() - self._told > _PLAIN_EVERY:
+            self._console.print(text)
+            self._told = time.monotonic()
+
+    def close(self) -> None:
+        """Leaves the bar as it is."""
+        self._progress.stop()
+
+
+def read_log(run: Path) -> list[dict[str, Any]]:
+    """Every line of a run's log."""
+    return [json.loads(line) for line in (run / LOG).read_text().splitlines()]
+
+
+def _percent(share: float | None) -> str:
+    return "none yet" if share is None else f"{100.0 * share:.1f} %"
+
+
+def _keep_lines(path: Path, count: int) -> None:
+    """Cuts a file after its first `count` lines."""
+    if not path.exists():
+        return
+    lines = path.read_text().splitlines(keepends=True)[:count]
+    fresh = path.with_name(f".{path.name}.partial")
+    fresh.write_text("".join(lines))
+    fresh.replace(path)

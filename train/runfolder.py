@@ -1,0 +1,135 @@
+"""A run folder: refused before anything is compiled if it cannot be used, and filled by one run."""
+
+import dataclasses
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from train import checkpoint, policies, ppo
+from train.config import PPOConfig
+from train.episodes import Best, EpisodeWindow
+from train.errors import ConfigError, RunFolderError
+from train.learner import Learner
+from train.log import EPISODES, LOG
+
+CONFIG = "config.json"
+_FILES = (CONFIG, LOG, EPISODES, "curve.png", "curve.csv", "evaluation.json")
+# The limits on training may change when a run goes on; nothing else may.
+_LIMITS = ("steps", "stop_coverage", "stop_patience", "checkpoint_every")
+
+
+class RunFolder:
+    """The outputs of one training run.
+
+    Args:
+        path: The folder.
+        world: What is trained on.
+        learner: What is trained.
+
+    Raises:
+        RunFolderError: No folder can be written there.
+    """
+
+    def __init__(self, path: Path, world: policies.World, learner: Learner) -> None:
+        for place in (path, *path.parents):
+            if place.exists():
+                if not place.is_dir():
+                    raise RunFolderError(f"{place}: is a file, so no folder {path} can be written")
+                if not os.access(place, os.W_OK):
+                    raise RunFolderError(f"{place}: cannot be written to")
+                break
+        self.path, self._world, self._learner = path, world, learner
+
+    def start(self, *, overwrite: bool) -> None:
+        """Makes the folder ready for a new run.
+
+        Raises:
+            RunFolderError: It holds a run already, and that may not be overwritten.
+        """
+        if any((self.path / name).exists() for name in _FILES) or checkpoint.exists(self.path):
+            if not overwrite:
+                raise RunFolderError(
+                    f"{self.path}: holds a run already; --resume goes on with it, --overwrite replaces it"
+                )
+            for name in _FILES:
+                (self.path / name).unlink(missing_ok=True)
+            shutil.rmtree(self.path / checkpoint.FOLDER, ignore_errors=True)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self._write_config()
+
+    def resume(self) -> ppo.Snapshot:
+        """The newest checkpoint of the folder.
+
+        Raises:
+            CheckpointError: There is none, it is damaged, or it is of another network.
+            ConfigError: It was trained on something else or with other settings.
+        """
+        stored = checkpoint.load(self.path)
+        config, facts = self._learner.config, stored.facts
+        for name, value in self._world.facts.items():
+            if facts["world"].get(name) != value:
+                raise ConfigError(f"{self.path}: was trained with {name} = {facts['world'].get(name)}, not {value}")
+        for name, value in _plain(config).items():
+            if name not in _LIMITS and facts["config"].get(name) != value:
+                raise ConfigError(f"{self.path}: was trained with {name} = {facts['config'].get(name)}, not {value}")
+        shapes = jax.eval_shape(self._learner.init, jax.random.PRNGKey(0), self._world.params)
+        best = facts["best"]
+        snapshot = ppo.Snapshot(
+            iteration=facts["iteration"],
+            state=jax.tree.map(jax.numpy.asarray, stored.restore("state", shapes)),
+            window=EpisodeWindow.from_json(facts["window"]),
+            best=Best(
+                score=(best["success"], best["episode_return"]),
+                iteration=best["iteration"],
+                policy=stored.restore("policy", policies.policy_shapes(self._learner.networks)),
+            ),
+            solved_for=facts["solved_for"],
+        )
+        self._write_config()
+        return snapshot
+
+    def save(self, snapshot: ppo.Snapshot) -> None:
+        """Writes a checkpoint, from which the policy can be used and the run can go on."""
+        score = snapshot.best.score
+        checkpoint.save(
+            self.path,
+            snapshot.iteration,
+            {"policy": snapshot.policy, "state": snapshot.state},
+            {
+                "world": self._world.facts,
+                "task": self._world.task,
+                "layout": dataclasses.asdict(self._learner.networks.layout),
+                "config": _plain(self._learner.config),
+                "iteration": snapshot.iteration,
+                "best": {"success": score[0], "episode_return": score[1], "iteration": snapshot.best.iteration},
+                "solved_for": snapshot.solved_for,
+                "window": snapshot.window.to_json(),
+            },
+        )
+
+    def write_json(self, name: str, values: dict[str, Any]) -> None:
+        """Writes one JSON file, whole or not at all."""
+        fresh = self.path / f".{name}.partial"
+        fresh.write_text(json.dumps(values, indent=1) + "\n")
+        fresh.replace(self.path / name)
+
+    def _write_config(self) -> None:
+        device = jax.devices()[0]
+        self.write_json(
+            CONFIG,
+            {
+                "schema": "subterra.run/1",
+                **self._world.facts,
+                "config": _plain(self._learner.config),
+                "device": f"{device.platform}: {device.device_kind}",
+                "versions": policies.versions(),
+            },
+        )
+
+
+def _plain(config: PPOConfig) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(config)))
