@@ -1,51 +1,61 @@
-"""Any recording as a stream of timed scans. Today: ROS1 bags with Livox `CustomMsg`."""
+"""Any recording as a stream of timed scans: ROS1 and ROS2 bags, MCAP files, folders of scans."""
 
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from rosbags.rosbag1 import Reader
-from rosbags.rosbag1.reader import ReaderError
-from rosbags.typesys import Stores, get_typestore
 
 from scene.errors import RecordingError
-from scene.livox import MESSAGE_TYPES, parse_custom_msg
+from scene.reading.cause import cause
+from scene.reading.detect import RECORDINGS, detect
+from scene.reading.rosbag import RosBag
+from scene.reading.scanfolder import ScanFolder
 from scene.scan import Scan
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
+_MOST_OUT_OF_ORDER = 0.05
+_LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and would make all later ones look late
 
 
 class Recording:
-    """An open ROS1 bag. A context manager; iterate `scans()` as often as needed.
+    """An open recording. A context manager; iterate `scans()` as often as needed.
 
     Attributes:
-        path: The bag.
-        topic: The LiDAR topic read.
-        scan_count: Scans in the bag.
+        path: The recording.
+        topic: The LiDAR topic read; the folder's name for a folder of scans.
+        scan_count: Scans in the recording.
+        facts: What was detected, for the manifest; complete once a scan has been read.
 
     Raises:
-        RecordingError: Not a bag, truncated, or without a LiDAR topic.
+        RecordingError: Not a recording, truncated, or without a LiDAR topic.
     """
 
-    def __init__(self, path: Path, topic: str | None = None) -> None:
+    def __init__(self, path: Path, topic: str | None = None, format: str | None = None) -> None:
         self.path = path
-        try:
-            self._reader = Reader(path)
-            self._reader.open()
-        except (ReaderError, OSError, ValueError, KeyError, struct.error, AssertionError) as error:
-            raise RecordingError(
-                f"{path}: not a whole ROS1 bag ({error}); was it truncated or never closed?"
-            ) from error
-        try:
-            self._connection = self._find_lidar(topic)
-        except RecordingError:
-            self._reader.close()
-            raise
-        self.topic = self._connection.topic
-        self.scan_count = self._connection.msgcount
+        found = detect(path, format)
+        if found.format not in RECORDINGS:
+            raise RecordingError(f"{path}: is no recording of scans, but {found.format}")
+        self._source: RosBag | ScanFolder = (
+            ScanFolder(path) if found.format == "scans" else RosBag(found.path, found.format, topic)
+        )
+        self._source.facts["format_by"] = found.by
+        self.topic, self.scan_count, self.facts = self._source.topic, self._source.scan_count, self._source.facts
+
+    @property
+    def reader(self) -> Any:
+        """The open bag, for what lies beside the LiDAR: `connections` and `messages(connections=…)`."""
+        return self._source.reader
+
+    def deserialize(self, raw: bytes, message_type: str) -> Any:
+        """A message of a standard type from `reader`, as an object, whatever the bag's serialisation.
+
+        Raises:
+            Exception: Whatever the library raises on damage.
+        """
+        return self._source.deserialize(raw, message_type)
 
     def __enter__(self) -> "Recording":
         return self
@@ -53,31 +63,43 @@ class Recording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._reader.close()
-
-    def _find_lidar(self, topic: str | None):
-        lidars = [c for c in self._reader.connections if c.msgtype in MESSAGE_TYPES]
-        chosen = [c for c in lidars if topic in (None, c.topic)]
-        if not chosen:
-            held = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in self._reader.connections)) or "nothing"
-            wanted = f"LiDAR topic {topic}" if topic else "LiDAR topic (livox_ros_driver/CustomMsg)"
-            raise RecordingError(f"{self.path}: has no {wanted}; it holds {held}")
-        return max(chosen, key=lambda connection: connection.msgcount)
+        self._source.close()
 
     def scans(self) -> Iterator[Scan]:
-        """The scans in the order of the bag.
+        """The scans in the order of the recording; one whose time does not grow is left out, and counted in `facts`.
 
         Raises:
-            RecordingError: A message is damaged; says which.
+            RecordingError: A message is damaged, or more than 5 % of the times do not grow; says which.
         """
-        try:
-            for index, (_, _, raw) in enumerate(self._reader.messages(connections=[self._connection])):
-                try:
-                    yield parse_custom_msg(bytes(raw))
-                except ValueError as error:
-                    raise RecordingError(f"{self.path}: scan {index} of {self.topic} is {error}") from error
-        except (ReaderError, struct.error, EOFError, KeyError, AssertionError) as error:
-            raise RecordingError(f"{self.path}: damaged while reading {self.topic} ({error})") from error
+        last, late = None, 0
+        for index, scan in enumerate(self._source.scans()):
+            if last is not None and scan.stamp <= last:
+                late += 1
+                self.facts["scans_out_of_order"] = late
+                if late > max(_MOST_OUT_OF_ORDER * self.scan_count, 1):
+                    raise RecordingError(
+                        f"{self.path}: the times of {self.topic} do not grow: scan {index} is of {scan.stamp:.3f} s, "
+                        f"one before it of {last:.3f} s"
+                    )
+                continue
+            if last is not None and scan.stamp > last + _LONGEST_PAUSE:
+                raise RecordingError(
+                    f"{self.path}: scan {index} of {self.topic} is of {scan.stamp:.3f} s, "
+                    f"{scan.stamp - last:.0f} s after the one before it"
+                )
+            last = scan.stamp
+            yield scan
+
+    def peek(self) -> dict[str, Any]:
+        """`facts` with what only a scan can tell; reads the first one.
+
+        Raises:
+            RecordingError: There is none, or it is damaged.
+        """
+        for scan in self._source.scans():
+            if len(scan.points):  # a sensor that is starting up sends empty sweeps
+                return self.facts
+        raise RecordingError(f"{self.path}: {self.topic} holds no scan with a return in it")
 
     def up_at_start(self, duration: float) -> Float[np.ndarray, "3"] | None:
         """Direction against gravity in the LiDAR's frame at the start, `(3,)` unit, or `None` without an IMU.
@@ -87,17 +109,23 @@ class Recording:
 
         Args:
             duration: How long to average, s.
+
+        Raises:
+            RecordingError: A message is damaged.
         """
         beside = self.topic.rsplit("/", 1)[0]
-        imus = [c for c in self._reader.connections if c.msgtype == _IMU_TYPE and c.topic.rsplit("/", 1)[0] == beside]
+        imus = [c for c in self.reader.connections if c.msgtype == _IMU_TYPE and c.topic.rsplit("/", 1)[0] == beside]
         if not imus:
             return None
-        store, total, start = get_typestore(Stores.ROS1_NOETIC), np.zeros(3), None
-        for _, stamp, raw in self._reader.messages(connections=imus[:1]):
-            start = stamp if start is None else start
-            if stamp - start > duration * 1e9:
-                break
-            force = store.deserialize_ros1(raw, _IMU_TYPE).linear_acceleration  # type: ignore[attr-defined]
-            total += (force.x, force.y, force.z)
+        total, start = np.zeros(3), None
+        try:
+            for _, stamp, raw in self.reader.messages(connections=imus[:1]):
+                start = stamp if start is None else start
+                if stamp - start > duration * 1e9:
+                    break
+                force = self.deserialize(raw, _IMU_TYPE).linear_acceleration
+                total += (force.x, force.y, force.z)
+        except Exception as error:  # the library raises anything on damage
+            raise RecordingError(f"{self.path}: a message of {imus[0].topic} is damaged ({cause(error)})") from error
         length = float(np.linalg.norm(total))
         return total / length if np.isfinite(length) and length > 0 else None

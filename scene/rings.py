@@ -1,8 +1,6 @@
 """An as-built survey of rings: a few total-station points on each, one circle a ring, a round bore through them."""
 
-import csv
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -10,30 +8,17 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from scene import profile
-from scene.axis import Axis, through
+from scene.axis import Axis, through, with_frames
 from scene.bore import POCKET, STATION_STEP, Bore
-from scene.errors import FitError, RecordingError
+from scene.errors import FitError
+from scene.reading.ringsurvey import RingSurvey
 
-COLUMNS = ("POINT", "EASTING", "NORTHING", "ELEVATION")
 _MIN_POINTS = 5
-_MIN_RINGS = 4
 _LARGEST_RESIDUAL = 0.25
 _PASSES = 3
-
-
-@dataclass(frozen=True)
-class RingSurvey:
-    """Points of each ring, in the order of the file.
-
-    Attributes:
-        path: The file.
-        names: Ring numbers as written.
-        points: Easting, northing, elevation of each ring's points, m, `(k, 3)` each.
-    """
-
-    path: Path
-    names: list[str]
-    points: list[Float[np.ndarray, "k 3"]]
+_RADII = (0.5, 15.0)  # m
+_LEAST_SPACING = 0.05  # m
+_LONGEST_GAP = 50.0  # m; across more, nobody knows how the tunnel runs
 
 
 @dataclass(frozen=True)
@@ -55,46 +40,6 @@ class RingFit:
     seen: Float[np.ndarray, " r"]
 
 
-def find_survey(folder: Path) -> Path:
-    """The one CSV in a folder whose header is that of a ring survey.
-
-    Raises:
-        RecordingError: None is, or several are.
-    """
-    matching = [path for path in sorted(folder.glob("*.csv")) if _header(path) == COLUMNS]
-    if len(matching) != 1:
-        found = ", ".join(path.name for path in matching) or "none"
-        raise RecordingError(f"{folder}: one CSV with the columns {','.join(COLUMNS)} is needed, found {found}")
-    return matching[0]
-
-
-def read_survey(path: Path) -> RingSurvey:
-    """Reads `POINT,EASTING,NORTHING,ELEVATION`, where POINT is `ring.point` as text (`0.10` is not `0.1`).
-
-    Raises:
-        RecordingError: Names the file and the line.
-    """
-    rings: dict[str, list[tuple[float, ...]]] = {}
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != COLUMNS:
-                raise RecordingError(f"{path}: columns are {reader.fieldnames}, not {','.join(COLUMNS)}")
-            for row in reader:
-                ring, dot, _ = (row["POINT"] or "").partition(".")
-                point = tuple(float(row[column]) for column in COLUMNS[1:])
-                if not dot or not np.isfinite(point).all():
-                    raise ValueError(f"point {row['POINT']!r} at {point}")
-                rings.setdefault(ring, []).append(point)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path}: cannot be read ({error})") from error
-    except (ValueError, TypeError) as error:
-        raise RecordingError(f"{path}: line {reader.line_num} is not a ring point ({error})") from error
-    if len(rings) < _MIN_RINGS:
-        raise RecordingError(f"{path}: holds {len(rings)} rings; at least {_MIN_RINGS} are needed")
-    return RingSurvey(path, list(rings), [np.asarray(points) for points in rings.values()])
-
-
 def fit_rings(survey: RingSurvey) -> RingFit:
     """A circle through each ring's points, in the plane square to the axis through the rings' centres.
 
@@ -105,14 +50,23 @@ def fit_rings(survey: RingSurvey) -> RingFit:
         if len(points) < _MIN_POINTS:
             raise FitError(f"{survey.path}: ring {name} has {len(points)} points; at least {_MIN_POINTS} are needed")
     centre = np.array([points.mean(axis=0) for points in survey.points])
+    _require_order(survey, centre)
     for _ in range(_PASSES):
         tangent = _tangents(centre)
-        fits = [_fit_circle(p, c, t) for p, c, t in zip(survey.points, centre, tangent, strict=True)]
+        rows = zip(survey.points, survey.offsets, centre, tangent, strict=True)
+        fits = [_fit_circle(*row) for row in rows]
         centre = np.array([fit[0] for fit in fits])
     radius, rms, seen = (np.array([fit[k] for fit in fits]) for k in (1, 2, 3))
     if (rms > _LARGEST_RESIDUAL).any():
         worst = int(np.argmax(rms))
         raise FitError(f"{survey.path}: ring {survey.names[worst]} is no circle (rms {rms[worst]:.2f} m)")
+    odd = (radius < _RADII[0]) | (radius > _RADII[1])
+    if odd.any():
+        worst = int(np.argmax(odd))
+        raise FitError(
+            f"{survey.path}: ring {survey.names[worst]} has a radius of {radius[worst]:.4g} m; is the unit right?"
+        )
+    _require_no_gap(survey, centre)
     return RingFit(survey.names, centre, radius, rms, seen)
 
 
@@ -147,12 +101,23 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
     )
 
 
-def _header(path: Path) -> tuple[str, ...]:
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            return tuple(file.readline().strip().split(","))
-    except (OSError, UnicodeDecodeError):
-        return ()
+def against_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:
+    """Where the rings lie on the design axis, for the manifest: chainages of the ends, offsets right and up.
+
+    Args:
+        fit: The rings.
+        design: Chainage, easting, northing, elevation, m, in order, `(d, 4)`.
+    """
+    axis = with_frames(design[:, 0], design[:, 1:], _tangents(design[:, 1:]))
+    chainage, left, up = axis.local(fit.centre)
+    return {
+        "chainage_first": float(chainage[0]),
+        "chainage_last": float(chainage[-1]),
+        "right_of_design_mean": float(-left.mean()),
+        "right_of_design_sd": float(left.std()),
+        "above_design_mean": float(up.mean()),
+        "above_design_sd": float(up.std()),
+    }
 
 
 def _tangents(centre: np.ndarray) -> np.ndarray:
@@ -161,14 +126,39 @@ def _tangents(centre: np.ndarray) -> np.ndarray:
     return tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
-def _fit_circle(points: np.ndarray, centre: np.ndarray, tangent: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+def _require_order(survey: RingSurvey, centre: np.ndarray) -> None:
+    """Rings must follow each other along the tunnel: a step is neither nothing nor backwards."""
+    step = np.diff(centre, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    if (length < _LEAST_SPACING).any():
+        at = int(np.argmin(length))
+        raise FitError(f"{survey.path}: rings {survey.names[at]} and {survey.names[at + 1]} lie at the same place")
+    turn = np.einsum("ij,ij->i", step[:-1], step[1:])
+    if (turn < 0).any():
+        at = int(np.argmax(turn < 0)) + 1
+        raise FitError(f"{survey.path}: the rings are out of order: the tunnel turns back at ring {survey.names[at]}")
+
+
+def _require_no_gap(survey: RingSurvey, centre: np.ndarray) -> None:
+    length = np.linalg.norm(np.diff(centre, axis=0), axis=1)
+    if (length > _LONGEST_GAP).any():
+        at = int(np.argmax(length))
+        raise FitError(
+            f"{survey.path}: between rings {survey.names[at]} and {survey.names[at + 1]} lie {length[at]:.1f} m "
+            f"without a ring; at most {_LONGEST_GAP:g} m can be bridged"
+        )
+
+
+def _fit_circle(
+    points: np.ndarray, offset: np.ndarray, centre: np.ndarray, tangent: np.ndarray
+) -> tuple[np.ndarray, float, float, float]:
     lateral = np.cross([0.0, 0.0, 1.0], tangent)
     lateral /= np.linalg.norm(lateral)
     up = np.cross(tangent, lateral)
     x, y = (points - centre) @ lateral, (points - centre) @ up
 
     def misfit(circle: np.ndarray) -> np.ndarray:
-        return np.hypot(x - circle[0], y - circle[1]) - circle[2]
+        return np.hypot(x - circle[0], y - circle[1]) + offset - circle[2]  # targets stand inside the wall
 
     start = [0.0, 0.0, float(np.hypot(x, y).mean())]
     a, b, radius = least_squares(misfit, start, loss="soft_l1", f_scale=0.02).x

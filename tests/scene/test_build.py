@@ -48,7 +48,7 @@ def test_the_scene_folder_holds_everything_the_format_asks_for(scene):
         assert (scene / name).stat().st_size > 0
     manifest = json.loads((scene / "manifest.json").read_text())
     assert manifest["schema"] == "subterra.manifest/1"
-    assert manifest["provenance"]["track"] == "by standard"
+    assert manifest["provenance"]["sleepers"] == "by standard"
     assert manifest["count"]["sleepers"] == 41
     assert len(manifest["inputs"][0]["sha256"]) == 64
 
@@ -146,7 +146,7 @@ def bad_inputs(folder: Path) -> dict[str, tuple[list[object], str]]:
         "NaN cloud": ([nan], r"nan\.ply: none of its 99 points is finite"),
         "too short": ([short], r"short\.ply: the tunnel is .* m long; at least 10 m"),
         "no tunnel": ([plane], r"plane\.ply: "),
-        "empty folder": ([empty], r"empty: one CSV with the columns"),
+        "empty folder": ([empty], r"empty: of no known kind"),
     }
 
 

@@ -4,8 +4,8 @@ import trimesh
 from pypcd4 import PointCloud
 
 from scene.cloud import VoxelMean
-from scene.cloudfile import read_cloud
 from scene.errors import RecordingError
+from scene.reading.cloudfile import read_cloud
 
 POINTS = np.random.default_rng(0).uniform(-3, 3, (500, 3)).astype(np.float32)
 
@@ -41,7 +41,7 @@ def write_pcd(path, points):
 
 @pytest.mark.parametrize(("suffix", "write"), [(".ply", write_ply), (".pcd", write_pcd)])
 def test_a_cloud_file_comes_back_as_it_was_written(tmp_path, suffix, write):
-    cloud = read_cloud(write(tmp_path / f"c{suffix}", POINTS), 1e-4)
+    cloud, _ = read_cloud(write(tmp_path / f"c{suffix}", POINTS), 1e-4)
     back = cloud.points + cloud.origin
     np.testing.assert_allclose(back[np.lexsort(back.T)], POINTS[np.lexsort(POINTS.T)], atol=1e-5)
 

@@ -1,0 +1,180 @@
+import numpy as np
+import pytest
+
+from scene.errors import RecordingError
+from scene.reading.cloudfile import read_cloud
+from scene.reading.columns import find_xyz, plain
+from scene.reading.config import ReadingConfig
+from scene.reading.frame import choose
+from tests.scene.files import CLOUDS, write_e57, write_parquet, write_text, write_xlsx
+
+# No two coordinates nearer than the formats round, so that points can be put in order.
+RNG = np.random.default_rng(0)
+POINTS = np.column_stack([RNG.permutation(np.linspace(-a, a, 500, dtype=np.float32)) for a in (30, 3, 3)])
+NONE = np.empty((0, 3))
+
+
+def points_of(path, **config):
+    cloud, facts = read_cloud(path, 1e-4, ReadingConfig(**config))
+    back = cloud.points + cloud.origin
+    return back[np.lexsort(back.T)], facts
+
+
+def ordered(points):
+    return points[np.lexsort(points.T)]
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_every_format_comes_back_as_it_was_written(tmp_path, name):
+    back, facts = points_of(CLOUDS[name](tmp_path / name, POINTS))
+    np.testing.assert_allclose(back, ordered(POINTS), atol=2e-5)
+    assert facts["points_read"] == 500
+    assert facts["points_dropped"] == 0
+
+
+@pytest.mark.parametrize("name", [name for name in CLOUDS if "xyz" not in name and "csv" not in name])
+def test_a_format_is_known_by_its_content_where_the_name_lies(tmp_path, name):
+    path = CLOUDS[name](tmp_path / name, POINTS).rename(tmp_path / "cloud.dat")
+    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-5)
+
+
+def test_each_scan_of_an_e57_is_placed_by_its_own_pose(tmp_path):
+    quarter = (np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)]), np.array([100.0, 0, 5]))
+    still = (np.array([1.0, 0, 0, 0]), np.array([0.0, 0, 0]))
+    back, facts = points_of(write_e57(tmp_path / "a.e57", POINTS, still, quarter))
+    turned = np.column_stack([100 - POINTS[:, 1], POINTS[:, 0], POINTS[:, 2] + 5])
+    np.testing.assert_allclose(back, ordered(np.concatenate([POINTS, turned])), atol=2e-5)
+    assert facts["format"] == "E57, 2 scans"
+
+
+@pytest.mark.parametrize(
+    ("delimiter", "header", "comma"),
+    [(" ", "", False), ("\t", "//X Y Z".replace(" ", "\t"), False), (";", "Easting;Northing;Height", True),
+     (",", "# exported", False), (",", "", False)],
+)  # fmt: skip
+def test_delimiter_header_and_decimal_comma_are_detected(tmp_path, delimiter, header, comma):
+    path = write_text(tmp_path / "a.txt", POINTS, delimiter, header)
+    if comma:
+        path.write_text(path.read_text().replace(".", ","))
+    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
+
+
+def test_columns_are_found_by_name_in_any_order(tmp_path):
+    path = write_text(tmp_path / "a.csv", POINTS[:, [2, 0, 1]], ",", "z,x,y")
+    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
+    path = write_parquet(tmp_path / "a.parquet", POINTS[:, [1, 0, 2]], ("Northing", "Easting", "Elevation"))
+    np.testing.assert_allclose(points_of(path)[0], ordered(POINTS), atol=2e-6)
+
+
+def test_names_give_their_unit():
+    assert plain("EASTING (M.)") == ("easting", "m")
+    assert plain("//X [mm]") == ("x", "mm")
+    assert plain("z_mm") == ("z", "mm")
+    assert plain("m") == ("m", None)
+    assert find_xyz(["t", "x (mm)", "y (mm)", "z (mm)"]) == ([1, 2, 3], "mm")
+    with pytest.raises(ValueError, match="differ in unit"):
+        find_xyz(["x (mm)", "y (m)", "z (mm)"])
+
+
+@pytest.mark.parametrize("name", [name for name in CLOUDS if "e57" not in name and "la" not in name])
+def test_millimetres_are_detected_and_become_metres(tmp_path, name):
+    back, facts = points_of(CLOUDS[name](tmp_path / name, POINTS * 1000))
+    np.testing.assert_allclose(back, ordered(POINTS), atol=2e-4)
+    assert facts["unit"].startswith("mm (detected")
+
+
+def test_a_flag_comes_before_a_declaration_and_a_declaration_before_detection(tmp_path):
+    path = write_text(tmp_path / "a.csv", POINTS, ",", "x (mm),y (mm),z (mm)")
+    assert points_of(path)[1]["unit"] == "mm (declared)"
+    assert points_of(path, unit="m")[1]["unit"] == "m (by flag)"
+
+
+def test_axes_are_taken_in_the_order_that_the_flag_gives():
+    frame = choose(NONE, None, "m", "-yxz")
+    np.testing.assert_array_equal(frame.apply(np.array([[1.0, 2, 3]])), [[-2, 1, 3]])
+    assert "mirrored" not in frame.facts["axes"]
+    assert "mirrored" in choose(NONE, None, "m", "xzy").facts["axes"]
+
+
+def test_a_cloud_that_lies_along_z_is_turned_and_says_so():
+    along_z = POINTS[:, [1, 2, 0]]
+    frame = choose(along_z, None, None, None)
+    assert "y is taken as up" in frame.facts["axes"]
+    np.testing.assert_allclose(frame.apply(along_z), np.column_stack([POINTS[:, 1], -POINTS[:, 0], POINTS[:, 2]]))
+    assert choose(along_z, None, None, "xyz").facts["axes"] == "xyz (by flag)"
+
+
+def test_a_long_climbing_tunnel_in_metres_is_not_taken_for_millimetres():
+    climb = np.random.default_rng(0).uniform(0, 1, (500, 1)) * [5000, 3000, 150] + POINTS
+    assert choose(climb, None, None, None).unit == "m"
+
+
+@pytest.mark.parametrize(
+    ("config", "sentence"),
+    [({"unit": "ft"}, "unit 'ft' is neither m nor mm"), ({"axes": "xxz"}, "axes 'xxz' are not"),
+     ({"format": "docx"}, "format 'docx' is none of"), ({"format": "las"}, "not a readable LAS cloud")],
+)  # fmt: skip
+def test_a_wrong_flag_is_named(tmp_path, config, sentence):
+    with pytest.raises(RecordingError, match=rf"a\.xyz: {sentence}"):
+        points_of(write_text(tmp_path / "a.xyz", POINTS), **config)
+
+
+def test_metres_taken_for_something_else_by_a_flag_end_in_a_sentence(tmp_path):
+    far = POINTS * 1e6
+    with pytest.raises(RecordingError, match=r"a\.xyz: most of its points lie further apart .* is the unit mm"):
+        points_of(write_text(tmp_path / "a.xyz", far), unit="m")
+
+
+def test_a_bad_line_is_named_by_its_number(tmp_path):
+    path = write_text(tmp_path / "a.csv", POINTS, ",", "x,y,z")
+    lines = path.read_text().splitlines()
+    lines[300] = "1,two,3"
+    path.write_text("\n".join(lines))
+    with pytest.raises(RecordingError, match=r"a\.csv: not a readable table cloud \(line 301 has no numbers"):
+        points_of(path)
+
+
+HUGE = {
+    "a.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 99999999999\nproperty float x\nproperty float y\n"
+    b"property float z\nend_header\n",
+    "ascii.ply": b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nproperty float y\n"
+    b"property float z\nend_header\n1 2 3\n",
+    "a.pcd": b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 99999999999\nHEIGHT 1\n"
+    b"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 99999999999\nDATA binary\n" + bytes(99),
+}
+HUGE["packed.pcd"] = HUGE["a.pcd"].replace(b"DATA binary", b"DATA binary_compressed")
+
+
+@pytest.mark.parametrize("name", HUGE)
+def test_a_header_that_claims_a_gigantic_count_is_refused_before_anything_is_allocated(tmp_path, name):
+    (tmp_path / name).write_bytes(HUGE[name])
+    with pytest.raises(RecordingError, match="its header promises"):
+        points_of(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", [name for name in CLOUDS if "e57" not in name and "la" not in name])
+def test_points_that_are_not_finite_are_dropped_and_counted_and_a_cloud_of_them_is_refused(tmp_path, name):
+    some = POINTS.copy()
+    some[::5] = np.nan
+    back, facts = points_of(CLOUDS[name](tmp_path / name, some))
+    np.testing.assert_allclose(back, ordered(some[np.isfinite(some).all(axis=1)]), atol=2e-5)
+    assert (facts["points_read"], facts["points_dropped"]) == (500, 100)
+    with pytest.raises(RecordingError, match="none of its 500 points is finite"):
+        points_of(CLOUDS[name](tmp_path / name, np.full_like(POINTS, np.nan)))
+
+
+@pytest.mark.parametrize("name", ["ascii.ply", "a.parquet", "a.csv", "empty.pcd"])
+def test_a_cloud_without_points_is_refused(tmp_path, name):
+    path = tmp_path / name
+    if name == "empty.pcd":
+        whole = CLOUDS["a.pcd"](path, POINTS).read_bytes()
+        path.write_bytes(whole.replace(b"WIDTH 500", b"WIDTH 0").replace(b"POINTS 500", b"POINTS 0"))
+    else:
+        CLOUDS[name](path, NONE)
+    with pytest.raises(RecordingError, match=rf"{name}: (holds no points|not a readable table cloud)"):
+        points_of(path)
+
+
+def test_a_ring_survey_is_no_cloud(tmp_path):
+    with pytest.raises(RecordingError, match=r"a\.xlsx: is no registered cloud"):
+        points_of(write_xlsx(tmp_path / "a.xlsx", [(0, 1, 1.0, 2.0, 3.0, 0.0)]))

@@ -1,0 +1,147 @@
+"""The drivers' conventions of per-point times, each as a bag that the driver could have written."""
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from scene.errors import RecordingError
+from scene.recording import Recording
+from tests.scene.messages import (
+    HESAI,
+    LIVOX2,
+    OUSTER,
+    PLAIN,
+    POINTCLOUD2,
+    VELODYNE,
+    livox_cdr,
+    pointcloud2,
+    write_bag1,
+    write_bag2,
+)
+
+XYZ = np.random.default_rng(0).uniform(1, 9, (40, 3)).astype(np.float32)
+SWEEP = np.linspace(0, 0.0975, 40)
+
+
+def columns(points=XYZ, **extra):
+    return {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2], **extra}
+
+
+def read(path, **options):
+    with Recording(path, **options) as recording:
+        return list(recording.scans()), recording.facts
+
+
+CONVENTIONS = {
+    "velodyne, stamp at the end": (VELODYNE, 24, {"time": SWEEP - 0.0975}, 99.9025, "`time`, s before the stamp"),
+    "velodyne, stamp at the start": (VELODYNE, 22, {"time": SWEEP}, 100.0, "`time`, s after the stamp"),
+    "ouster": (OUSTER, 48, {"t": (SWEEP * 1e9).astype("u4")}, 100.0, "`t`, ns after the stamp"),
+    "hesai": (HESAI, 26, {"timestamp": 1.7e9 + SWEEP}, 1.7e9, "`timestamp`, absolute, s"),
+    "livox driver 2": (HESAI, 26, {"timestamp": 1.7e18 + SWEEP * 1e9}, 1.7e9, "`timestamp`, absolute, ns"),
+    "another clock": (HESAI, 26, {"timestamp": 1.6e9 + SWEEP}, 1.7e9, "absolute by another clock, s"),
+    "milliseconds": (VELODYNE, 24, {"time": SWEEP * 1e3}, 100.0, "`time`, ms after the stamp"),
+}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+@pytest.mark.parametrize("big", [False, True])
+def test_every_driver_s_point_times_become_seconds_after_the_start_of_the_sweep(tmp_path, name, big):
+    fields, step, times, start, said = CONVENTIONS[name]
+    stamp = 1.7e9 if start > 1e9 else 100.0
+    raw = pointcloud2(stamp, fields, step, columns(**times), big=big)
+    (scan,), facts = read(write_bag1(tmp_path / "a.bag", {"/points": [(stamp, raw)]}))
+    assert said in facts["point_times"]
+    assert scan.stamp == pytest.approx(start, abs=1e-6)
+    np.testing.assert_allclose(scan.times, SWEEP, atol=1e-6)
+    np.testing.assert_array_equal(scan.points, XYZ)
+
+
+@pytest.mark.parametrize("extra", [{}, {"time": np.zeros(40)}])
+def test_a_cloud_without_point_times_is_a_static_sweep_and_says_so(tmp_path, extra):
+    fields, step = (VELODYNE, 22) if extra else (PLAIN, 12)
+    raw = pointcloud2(5.0, fields, step, columns(**extra))
+    (scan,), facts = read(write_bag1(tmp_path / "a.bag", {"/points": [(5.0, raw)]}))
+    assert "static" in facts["point_times"]
+    assert scan.stamp == 5.0
+    assert not scan.times.any()
+
+
+def test_returns_come_in_the_order_of_time_whatever_the_order_of_rings(tmp_path):
+    order = np.random.default_rng(1).permutation(40)
+    raw = pointcloud2(5.0, OUSTER, 32, columns(XYZ[order], t=(SWEEP[order] * 1e9).astype("u4")), height=4)
+    (scan,), _ = read(write_bag1(tmp_path / "a.bag", {"/ouster/points": [(5.0, raw)]}))
+    np.testing.assert_array_equal(scan.points, XYZ)
+
+
+def test_padding_behind_rows_and_zero_and_nan_returns_are_dropped(tmp_path):
+    points = XYZ.copy()
+    points[3], points[7, 1], points[9] = 0, np.nan, np.inf
+    raw = pointcloud2(5.0, OUSTER, 32, columns(points, t=(SWEEP * 1e9).astype("u4")), height=4, row_padding=13)
+    (scan,), _ = read(write_bag1(tmp_path / "a.bag", {"/ouster/points": [(5.0, raw)]}))
+    np.testing.assert_array_equal(scan.points, np.delete(XYZ, [3, 7, 9], axis=0))
+
+
+def test_the_sensor_s_topic_is_preferred_and_the_others_are_named(tmp_path):
+    messages = [(5.0 + k, pointcloud2(5.0 + k, PLAIN, 12, columns())) for k in range(3)]
+    bag = write_bag1(tmp_path / "a.bag", {"/cloud_registered": messages, "/velodyne_points": messages[:1]})
+    _, facts = read(bag)
+    assert facts["topic"] == "/velodyne_points"
+    assert facts["other_lidar_topics"] == ["/cloud_registered"]
+    _, facts = read(bag, topic="/cloud_registered", format="bag")
+    assert facts["topic"] == "/cloud_registered"
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+@pytest.mark.parametrize("whole", [True, False])
+def test_ros2_bags_read_as_folders_and_as_single_files(tmp_path, plugin, whole):
+    messages = [
+        (100.0 + k, pointcloud2(100.0 + k, OUSTER, 32, columns(t=(SWEEP * 1e9).astype("u4")), cdr=True))
+        for k in range(3)
+    ]
+    folder = write_bag2(tmp_path / "b", plugin, "/ouster/points", POINTCLOUD2, messages)
+    path = folder if whole else next(file for file in folder.iterdir() if file.suffix in (".db3", ".mcap"))
+    scans, facts = read(path)
+    assert len(scans) == 3
+    assert facts["message_type"] == POINTCLOUD2
+    np.testing.assert_array_equal(scans[2].points, XYZ)
+    np.testing.assert_allclose(scans[2].times, SWEEP, atol=1e-6)
+
+
+def test_livox_messages_of_ros2_read_with_their_alignment(tmp_path):
+    folder = write_bag2(tmp_path / "b", StoragePlugin.SQLITE3, "/livox/lidar", LIVOX2, [(9.0, livox_cdr(9.0, XYZ))])
+    (scan,), _ = read(folder)
+    np.testing.assert_array_equal(scan.points, XYZ)
+    np.testing.assert_allclose(scan.times, 1e-6 * np.arange(40), atol=1e-12)
+
+
+BAD = {
+    "times of no sweep": (pointcloud2(5.0, VELODYNE, 22, columns(time=np.geomspace(1, 1e20, 40))), "spans"),
+    "no coordinates": (pointcloud2(5.0, [("x", "f4", 0)], 4, {"x": XYZ[:, 0]}), "without the field y, z"),
+    "a field outside": (
+        pointcloud2(5.0, PLAIN, 12, columns()).replace(b"z\x08\0\0\0", b"z\x0a\0\0\0"),
+        "outside its 12-byte points",
+    ),
+    "too many points": (pointcloud2(5.0, PLAIN, 12, columns(), point_count=10**9), "in 480 bytes"),
+    "truncated": (pointcloud2(5.0, PLAIN, 12, columns())[:150], "not a whole PointCloud2"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_damaged_cloud_message_is_named_with_its_place_and_cause(tmp_path, name):
+    raw, cause = BAD[name]
+    good = pointcloud2(4.0, PLAIN, 12, columns())
+    bag = write_bag1(tmp_path / "a.bag", {"/points": [(4.0, good), (5.0, raw)]})
+    with pytest.raises(RecordingError, match=rf"a\.bag: scan 1 of /points is .*{cause}"):
+        read(bag)
+
+
+def test_one_repeated_time_is_left_out_and_counted_and_many_are_refused(tmp_path):
+    def bag(name, stamps):
+        messages = [(1.0 + k, pointcloud2(s, PLAIN, 12, columns())) for k, s in enumerate(stamps)]
+        return write_bag1(tmp_path / name, {"/points": messages})
+
+    scans, facts = read(bag("one.bag", [5.0, 5.1, 5.1, 5.2]))
+    assert [scan.stamp for scan in scans] == pytest.approx([5.0, 5.1, 5.2])
+    assert facts["scans_out_of_order"] == 1
+    with pytest.raises(RecordingError, match=r"many\.bag: the times of /points do not grow: scan 2 is of 4\.800 s"):
+        read(bag("many.bag", [5.0, 4.9, 4.8, 4.7]))

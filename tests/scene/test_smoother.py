@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scene import chain as chains
+from scene import rotation as so3
+from scene.chain import Chain, Motion
+from scene.errors import FitError
+from scene.leastsquares import NormalEquations
+from scene.problem import Noise, solve_with_heading
+from scene.smoother import inertial_problem, odometry_problem
+from scene.terms import Sightings, Steps
+from tests.scene import walks
+
+DURATION = 24.0
+
+
+def errors(chain: Chain, mounted: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Attitude, degrees, and position, m, against the walk."""
+    twist = walks.attitude(chain.times, mounted).inv() * Rotation.from_matrix(chain.attitude)
+    return np.rad2deg(twist.as_rotvec()), chain.position - walks.position(chain.times)
+
+
+@pytest.mark.parametrize("mounted", [0.0, -2.5])
+def test_prism_and_imu_give_place_and_attitude_however_the_imu_is_mounted(mounted):
+    problem, guess = inertial_problem(
+        walks.inertial(DURATION, mounted), walks.control(DURATION, mounted), walks.LEVER, Noise()
+    )
+    chain = solve_with_heading(problem, guess)
+    twist, off = errors(chain, mounted)
+    assert np.sqrt(np.mean(twist**2, axis=0)).max() < 0.3
+    assert np.sqrt(np.mean(off**2)) < 0.003
+    np.testing.assert_allclose(chain.gyro_bias[-1], 0.003, atol=1e-3)
+
+
+def test_a_control_row_that_is_wrong_by_a_metre_moves_the_trajectory_by_millimetres():
+    control = walks.control(DURATION)
+    control.positions[40] += (0.0, 1.0, 0.0)
+    problem, guess = inertial_problem(walks.inertial(DURATION), control, walks.LEVER, Noise())
+    _, off = errors(solve_with_heading(problem, guess))
+    assert np.abs(off).max() < 0.015
+
+
+def test_control_restores_the_length_that_odometry_lost_without_an_imu():
+    odometry, control = walks.slipping_odometry(DURATION), walks.control(DURATION)
+    problem, guess = odometry_problem(odometry, control, walks.LEVER, Noise())
+    chain = solve_with_heading(problem, guess)
+    twist, off = errors(chain)
+    lost = odometry.trajectory.positions
+    assert np.linalg.norm(lost[-1] - lost[0]) < 0.6 * DURATION
+    assert np.sqrt(np.mean(off**2)) < 0.01
+    assert np.sqrt(np.mean(twist**2, axis=0)).max() < 0.5
+
+
+def test_odometry_outside_the_time_of_the_control_is_an_error():
+    odometry, control = walks.slipping_odometry(DURATION), walks.control(DURATION)
+    with pytest.raises(FitError, match=r"prism\.tum: only 0 sweeps"):
+        odometry_problem(odometry, type(control)(control.times + 1e4, control.positions, control.path, 0),
+                         walks.LEVER, Noise())  # fmt: skip
+
+
+class Recorder:
+    """Keeps what a term adds."""
+
+    def add(self, residual, first, jacobian_first, second, jacobian_second):
+        self.residual, self.first, self.second = residual, first, second
+        self.jacobians = jacobian_first, jacobian_second
+
+
+def small_chain() -> Chain:
+    rng = np.random.default_rng(1)
+    times = 0.1 * np.arange(4.0)
+    near = [1e-3 * rng.standard_normal((4, 3)) for _ in range(4)]
+    return Chain(times, walks.attitude(times).as_matrix(), walks.position(times) + near[0], 1 + near[1], *near[2:])
+
+
+def terms():
+    rng = np.random.default_rng(2)
+    ends = np.arange(3), np.arange(1, 4)
+    chain = small_chain()
+    turn = so3.inverse(chain.attitude[:-1]) @ chain.attitude[1:]
+    unit = np.broadcast_to(np.eye(3), (3, 3, 3))
+    motion = Motion(
+        rng.standard_normal((3, 3)) * 0.1, rng.standard_normal((3, 3)) + np.array([0, 0, 9.8]), 1.0, 1.0, True
+    )
+    seen = Sightings(np.array([0, 1, 2]), np.array([0.0, 0.5, 0.9]), chain.position[:3], walks.LEVER, 1.0)
+    steps = Steps(*ends, turn, rng.standard_normal((3, 3)), unit, unit)
+    return {
+        "motion": lambda sink, at: chains.add_motion(sink, at, motion, 1.0),
+        "sightings": lambda sink, at: seen.add_to(sink, at, 1e9),
+        "steps": lambda sink, at: steps.add_to(sink, at, 1e9),
+    }
+
+
+@pytest.mark.parametrize("name", ["motion", "sightings", "steps"])
+def test_written_out_derivatives_agree_with_finite_differences(name):
+    add, chain, h = terms()[name], small_chain(), 1e-6
+    here, moved = Recorder(), Recorder()
+    add(here, chain)
+    for unknown in range(chains.SIZE):
+        for which, jacobian in zip((here.first, here.second), here.jacobians, strict=True):
+            for term, knot in enumerate(which):
+                step = np.zeros((4, chains.SIZE))
+                step[knot, unknown] = h
+                add(moved, chain.moved(step))
+                slope = (moved.residual[term] - here.residual[term]) / h
+                # The turn half way, and the half turn of the force, are linearised to first order in a small angle.
+                np.testing.assert_allclose(slope, jacobian[term][:, unknown], atol=0.02)
+
+
+def test_the_banded_solution_is_the_dense_one():
+    rng = np.random.default_rng(0)
+    equations = NormalEquations(5, 2, 2)
+    rows, right = [], []
+    for first, second in [(0, 1), (1, 2), (0, 2), (2, 4), (3, 4), (1, 3)]:
+        left, other, residual = rng.standard_normal((3, 2)), rng.standard_normal((3, 2)), rng.standard_normal(3)
+        equations.add(residual[None], np.array([first]), left[None], np.array([second]), other[None])
+        row = np.zeros((3, 10))
+        row[:, 2 * first : 2 * first + 2], row[:, 2 * second : 2 * second + 2] = left, other
+        rows.append(row)
+        right.append(-residual)
+    expected = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+    np.testing.assert_allclose(equations.solve().ravel(), expected, rtol=1e-8)
+
+
+def test_what_nothing_determines_is_an_error():
+    equations = NormalEquations(2, 2, 1)
+    equations.add(np.ones((1, 1)), np.array([0]), np.ones((1, 1, 2)))
+    with pytest.raises(FitError, match="not determined"):
+        equations.solve()
