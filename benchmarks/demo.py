@@ -1,11 +1,12 @@
 """`make demo`: a simulated survey to a scene, a trained agent and a report, by the users' own commands."""
 
+import io
 import json
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,9 @@ def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
     import jax
     import mujoco
     import numpy as np
-    from mujoco import mjx
+
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # it mourns the optional Warp backend
+        from mujoco import mjx
 
     model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
     data = mujoco.MjData(model)

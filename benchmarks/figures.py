@@ -65,7 +65,7 @@ def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: i
     with np.load(bore_path) as data:
         bore = {name: data[name] for name in data.files}
     rows = np.linspace(0, len(bore["station"]) - 1, count + 2).astype(int)[1:-1]
-    figure, axes = plt.subplots(1, count, figsize=(3 * count, 3.6), sharey=True, layout="constrained")
+    figure, axes = plt.subplots(1, count, figsize=(3 * count, 4.4), sharey=True, layout="constrained")
     for panel, row in zip(axes, rows, strict=True):
         offset = points - bore["position"][row]
         near = offset[np.abs(offset @ bore["tangent"][row]) < _SLICE]
@@ -119,16 +119,21 @@ def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
     return np.asarray(trimesh.load(scene / "cloud.ply").vertices)
 
 
-def render_bore(scene: Path, width: int = 960, height: int = 540) -> np.ndarray | None:
-    """A view down the bore from the scout's camera, `(height, width, 3)`; `None` where no GL context can be had."""
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    try:
-        with mujoco.Renderer(model, height, width) as renderer:
-            renderer.update_scene(data, camera="scout")
-            return renderer.render()
-    except (RuntimeError, ImportError, AttributeError, OSError):
-        return None
+def drawn_bore(bore_path: Path, eye: float = 2.0, reach: float = 40.0) -> Figure:
+    """The bore in perspective from `eye` metres inside, as its sections every metre: where nothing can be rendered."""
+    with np.load(bore_path) as data:
+        bore = {name: data[name] for name in data.files}
+    start = int(np.searchsorted(bore["station"], eye))
+    frame = np.stack([bore["lateral"][start], bore["up"][start], bore["tangent"][start]])
+    figure, axes = plt.subplots(figsize=(8, 6), layout="constrained")
+    for row in range(start + 4, len(bore["station"]), 4):
+        if bore["station"][row] > eye + reach:
+            break
+        across, along = bore["radius"][row] * np.cos(bore["angle"]), bore["radius"][row] * np.sin(bore["angle"])
+        ring = bore["position"][row] + across[:, None] * bore["lateral"][row] + along[:, None] * bore["up"][row]
+        left, up, ahead = frame @ (ring - bore["position"][start]).T
+        seen = ahead > 0.5
+        axes.plot(-left[seen] / ahead[seen], up[seen] / ahead[seen], color=_INK, lw=0.6, alpha=0.8)
+    axes.set(xlim=(-1.4, 1.4), ylim=(-1.05, 1.05), aspect="equal")
+    axes.set_axis_off()
+    return figure

@@ -20,7 +20,8 @@ figure { margin: 1rem 0; }
 figure img { width: 100%; background: #fff; border: 1px solid var(--line); border-radius: 6px; }
 figcaption, .note { color: color-mix(in srgb, var(--ink) 70%, transparent); font-size: .92rem; }
 table { border-collapse: collapse; width: 100%; } th, td { text-align: left; padding: .35rem .6rem; }
-th, td { border-bottom: 1px solid var(--line); } td.number { text-align: right; font-variant-numeric: tabular-nums; }
+th, td { border-bottom: 1px solid var(--line); }
+th.number, td.number { text-align: right; font-variant-numeric: tabular-nums; }
 tr.missed td { background: color-mix(in srgb, #c1121f 14%, transparent); }
 .simulated { display: inline-block; background: var(--soft); border: 1px solid var(--line);
   border-radius: 4px; padding: 0 .5rem; }
@@ -58,12 +59,11 @@ def figure(content: Figure | np.ndarray | bytes, caption: str) -> str:
 
 def table(columns: tuple[str, ...], rows: Iterable[tuple[tuple[str, ...], bool]]) -> str:
     """A table of strings; a row's flag marks it as missing its goal. The second column is set as numbers."""
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in columns)
+    kinds = ["number" if k == 1 else "text" for k in range(len(columns))]
+    head = "".join(f'<th class="{kind}">{html.escape(name)}</th>' for kind, name in zip(kinds, columns, strict=True))
     lines = []
     for cells, missed in rows:
-        data = "".join(
-            f'<td class="{"number" if k == 1 else "text"}">{html.escape(cell)}</td>' for k, cell in enumerate(cells)
-        )
+        data = "".join(f'<td class="{kind}">{html.escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
         lines.append(f'<tr class="{"missed" if missed else "met"}">{data}</tr>')
     return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
 

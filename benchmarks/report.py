@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks import figures, page
+from benchmarks import figures, page, render
 from benchmarks.truth import Truth, centreline, compare, start_placement
 
 # Figure in summary.json, what it is, unit, factor, decimals, goal and whether less is better.
@@ -64,9 +64,12 @@ def _bore_parts(out: Path, summary: dict[str, Any], truth: Truth) -> list[str]:
         placement = start_placement(blind / "odometry.tum", out / "survey" / "groundtruth.tum")
         odometry = figures.Axis("reconstructed, odometry alone", *centreline(blind, placement))
     parts = []
-    view = figures.render_bore(scene)
+    view = render.picture(scene)
     if view is not None:
         parts.append(page.figure(view, "The scene in MuJoCo, from the camera of its scout robot."))
+    else:
+        drawn = _closed(figures.drawn_bore(scene / "bore.npz"))
+        parts.append(page.figure(drawn, "The bore, drawn section by section; no OpenGL was to be had for a rendering."))
     plan = figures.plan_and_profile(truth, given, odometry)
     sections = figures.section_overlays(scene / "bore.npz", figures.scene_points(scene))
     errors = figures.section_errors(compare(scene, truth))

@@ -3,7 +3,7 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -11,13 +11,14 @@ import trimesh
 import tyro
 
 from scene import manifest, mesh, mjcf, planar
+from scene.calibration import find_calibration
 from scene.cli import progress_bar, run
 from scene.cloud import thinned
 from scene.errors import FitError
 from scene.files import replace_folder, require_output_folder
 from scene.mjcf import SceneConfig
 from scene.reconstruct import ReconstructConfig, Reconstruction, reconstruct
-from scene.track import TrackConfig, lay
+from scene.track import Track, TrackConfig, lay
 from scene.trajectory import save_tum
 
 _PREVIEW_VOXEL = 0.06
@@ -42,7 +43,14 @@ class BuildConfig:
     scene: SceneConfig = field(default_factory=SceneConfig)
 
 
-def build(source: Path, out: Path, trajectory: Path | None = None, config: BuildConfig | None = None) -> Reconstruction:
+def build(
+    source: Path,
+    out: Path,
+    trajectory: Path | None = None,
+    config: BuildConfig | None = None,
+    control: Path | None = None,
+    calibration: str | None = None,
+) -> Reconstruction:
     """Reconstructs the tunnel in `source` and writes its scene folder whole, or not at all.
 
     Args:
@@ -50,15 +58,18 @@ def build(source: Path, out: Path, trajectory: Path | None = None, config: Build
         out: Folder to write; a previous one is replaced once the new one is complete.
         trajectory: Poses for a bag, TUM.
         config: Defaults where not given.
+        control: Positions for a bag, TUM.
+        calibration: See `scene.calibration.find_calibration`.
 
     Raises:
         SubterraError: The input is at fault, or the output cannot be written.
     """
     config = config or BuildConfig()
     require_output_folder(out)
+    mounts = find_calibration(calibration)
     started = time.monotonic()
     with progress_bar() as progress:
-        result = reconstruct(source, trajectory, config.reconstruct, progress)
+        result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts)
     _say(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
     with replace_folder(out) as folder:
         write_scene_folder(folder, config.name or out.name, result, config)
@@ -70,7 +81,7 @@ def build(source: Path, out: Path, trajectory: Path | None = None, config: Build
 def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> None:
     """Writes the six parts of a scene folder and compiles the scene once."""
     bore = result.bore
-    laid = lay(bore, config.track)
+    laid = lay(bore, config.track, result.seen.sleepers)
     smooth, pocketed = mesh.build_solid(bore, pockets=False), mesh.build_solid(bore, pockets=True)
     height = config.scene.lidar_height
     walls = {
@@ -105,11 +116,13 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
             "pockets": len(bore.pocket),
             "lining_faces": len(lining.faces),
         },
-        "track": {"least_clearance": float(laid.clearance.min()) if len(laid.clearance) else None, "slab": laid.raised},
+        "track": _track_facts(laid, result),
         "provenance": {
             "bore": config.provenance,
-            "track": "by standard" if len(laid.sleeper_station) else "none: the bore is too low for it",
-            **result.provenance,
+            **{
+                asset: kind.replace("measured", config.provenance)
+                for asset, kind in {**_track_provenance(laid, result), **result.provenance}.items()
+            },
         },
     }
     manifest.write(folder / "manifest.json", content, config)
@@ -118,6 +131,29 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
     if result.odometry is not None:
         save_tum(result.odometry, folder / "odometry.tum")
     _compile(folder / "scene.xml")
+
+
+def _track_facts(laid: Track, result: Reconstruction) -> dict[str, Any]:
+    rails = result.seen.rails
+    return {
+        "least_clearance": float(laid.clearance.min()) if len(laid.clearance) else None,
+        "slab": laid.raised,
+        "sleepers_seen": int(laid.measured.sum()),
+        "protrusion": laid.config.protrusion,
+        "gauge": laid.config.gauge,
+        "gauge_seen": rails.separation - laid.config.rail.head_width if rails else None,
+        "rail_top_seen": rails.top if rails else None,
+    }
+
+
+def _track_provenance(laid: Track, result: Reconstruction) -> dict[str, str]:
+    if not len(laid.sleeper_station):
+        return {"track": "none: the bore is too low for it"}
+    return {
+        "sleepers": "measured" if laid.measured.any() else "by standard",
+        "rails": "by standard" + (", seen in the survey" if result.seen.rails else ""),
+        "fasteners": "by standard",
+    }
 
 
 def _compile(path: Path) -> None:
@@ -136,6 +172,8 @@ def main(
     /,
     out: Path,
     trajectory: Path | None = None,
+    control: Path | None = None,
+    calibration: str | None = None,
     config: Annotated[BuildConfig, tyro.conf.arg(name="")] = BuildConfig(),
 ) -> None:
     """Builds a scene from a recording.
@@ -143,13 +181,17 @@ def main(
     Example: python -m scene.build survey.bag --trajectory groundtruth.tum --out build/tunnel
 
     Args:
-        source: A ROS1 bag, a registered cloud (.ply, .pcd), or a folder with an as-built ring survey.
+        source: A recording (ROS1 or ROS2 bag, MCAP, folder of timed scans), a registered cloud (PLY, PCD, LAS, LAZ,
+            E57, XYZ, CSV, Parquet), or an as-built ring survey (CSV, XLSX).
         out: Folder to write; replaced only once the new scene is complete.
         trajectory: Poses of the LiDAR in TUM form (t x y z qx qy qz qw), for a bag; without it, LiDAR odometry.
+        control: Positions of a prism in TUM form (quaternion zero, any order) that fix odometry's length.
+        calibration: Where prism and IMU sit: geode-gamma, geode-beta, …, a YAML file, or the prism's lever arm x,y,z
+            in the LiDAR's axes, m.
         config: Settings.
     """
     np.seterr(all="ignore")
-    build(source, out, trajectory, config)
+    build(source, out, trajectory, config, control, calibration)
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ _COARSE_ANGLES = 72
 _POINTS_PER_METRE = 5_000
 _MIN_SEEN = 0.6
 _ELONGATION = 1.6
+_DOWN, _TRACK = -0.8, 0.5  # directions in which sleepers and rails may hide the bed, and how deep, m
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,9 @@ def _middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:
         around = np.interp(centres, centres[seen], medians[seen], period=2 * np.pi)
         line = floor.fit_line(lateral[rows], upward[rows])
         if line is not None:
-            around = np.minimum(around, floor.radius(line, centres))
+            bed = floor.radius(line, centres)
+            under_track = (np.sin(centres) < _DOWN) & (bed < around + _TRACK)
+            around = np.where(under_track, bed, np.minimum(around, bed))
         across, along = profile.measure(centres, around).middle
         middles.append(extended.position[k] + across * extended.lateral[k] + along * extended.up[k])
     if len(middles) < 4:

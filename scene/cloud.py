@@ -43,11 +43,13 @@ class VoxelMean:
 
     Attributes:
         voxel: Edge length, m.
+        finite: Finite points given.
+        returns: Those of them that were kept: all within 2²⁰ voxels of the first.
     """
 
     def __init__(self, voxel: float) -> None:
         self.voxel = voxel
-        self.returns = 0
+        self.finite = self.returns = 0
         self._origin: np.ndarray | None = None
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
         self._pending = 0
@@ -55,16 +57,18 @@ class VoxelMean:
     def add(self, points: Float[np.ndarray, "n 3"]) -> None:
         """Adds points in the fixed frame, m; those not finite are dropped."""
         points = points[np.isfinite(points).all(axis=1)]
+        self.finite += len(points)
         if not len(points):
             return
         if self._origin is None:
             self._origin = np.floor(np.median(points, axis=0))
         local = points - self._origin
+        inside = (np.abs(local) < (_HALF - 1) * self.voxel).all(axis=1)
+        local = local[inside]
         cell = np.floor(local / self.voxel).astype(np.int64)
-        inside = (np.abs(cell) < _HALF).all(axis=1)
         key = ((cell[:, 0] + _HALF) << 2 * _BITS) | ((cell[:, 1] + _HALF) << _BITS) | (cell[:, 2] + _HALF)
         sums = np.concatenate([local, np.ones((len(local), 1))], axis=1)
-        self._push(*_merge(key[inside], sums[inside]))
+        self._push(*_merge(key, sums))
         self.returns += int(inside.sum())
 
     def cloud(self) -> Cloud:

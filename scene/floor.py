@@ -10,6 +10,7 @@ _CLUTTER = 0.45
 _MIN_POINTS = 30
 _FLAT_SHARE = 0.85
 _INNER = 0.75
+_BESIDE = 0.5
 
 
 def fit_line(lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
@@ -35,12 +36,19 @@ def fit_line(lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, " n"]) 
         keep = (residual > below) & (residual < above)
         if keep.sum() < _MIN_POINTS or np.ptp(y[keep]) < half_width:
             return None
-        slope, height = np.polyfit(y[keep], z[keep], 1)
-        line = (float(height), float(slope))
+        line = _through(y[keep], z[keep])
+    beside = keep & (np.abs(y) > _BESIDE * half_width)
+    if min((beside & (y > 0)).sum(), (beside & (y < 0)).sum()) >= _MIN_POINTS:
+        line = _through(y[beside], z[beside])  # beside the track, where no sleeper lifts it
     residual = z - line[0] - line[1] * y
     explained = (np.abs(residual) < 0.06) | ((residual > 0) & (residual < _CLUTTER))
     support = (np.abs(residual) < 0.06).mean()
     return line if explained.mean() > _FLAT_SHARE and support > 0.3 else None
+
+
+def _through(y: np.ndarray, z: np.ndarray) -> tuple[float, float]:
+    slope, height = np.polyfit(y, z, 1)
+    return float(height), float(slope)
 
 
 def radius(line: tuple[float, float], angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:

@@ -1,8 +1,8 @@
 """Rings and bolt pockets of the lining, found on the wall rolled out flat.
 
 A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
-hidden by its own edge, so that one pocket says little about its depth or size; but the pockets of a lining come from one
-mould, and all of them together say it well.
+hidden by its own edge, so that one pocket says little about its depth or size; but the pockets of a lining come from
+one mould, and all of them together say it well.
 """
 
 from dataclasses import dataclass, replace

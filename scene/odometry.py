@@ -1,63 +1,185 @@
-"""Poses from the scans themselves, by LiDAR odometry (GenZ-ICP).
+"""LiDAR odometry: each sweep against a map of those before it, by small-gicp, blended with what was expected of it.
 
-In a bore the scans barely constrain the motion along the axis: attitude and cross-axis position come out well, the
-length does not. The manifest says so.
+In a bore a sweep barely constrains its place along the axis, and plain registration then jumps about. Each result is
+therefore blended with the expected pose by the information of both: where the walls say little, the expectation
+stands. It comes from a guide (a gyro, or an earlier trajectory), else from going on as before.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
-from genz_icp.config import GenZConfig
-from genz_icp.genz_icp import GenZICP
+import small_gicp
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError
 from scene.recording import Recording
+from scene.registration import deskew
+from scene.scan import Scan
 from scene.trajectory import Trajectory
 
-LIBRARY = "genz-icp"
+LIBRARY = "small-gicp"
 _MIN_POINTS = 100
-_LEVEL_DURATION = 0.2  # s; short, since a carrier sways
+_RANGE = 60.0  # m
+_THINNING, _VOXEL, _REACH = 0.25, 0.5, 1.0  # m: of a sweep, of the map, of a correspondence
+_HORIZON = 100  # sweeps that an unseen voxel of the map is kept for
+_WARM_UP = 5  # sweeps before the expectation is worth anything without a guide
+_KNOTS = 11  # poses that a sweep is unwound with
 
 
-def estimate_trajectory(recording: Recording, advance: Callable[[], None] = lambda: None) -> Trajectory:
-    """One pose per scan, in the first scan's sensor frame turned so that z is up (by the IMU, where there is one).
+@dataclass(frozen=True)
+class Guide:
+    """What is known of the motion before the LiDAR is asked.
+
+    Attributes:
+        trajectory: Attitudes of the LiDAR, and its positions where `moves`, in any fixed frame.
+        moves: Whether the positions mean anything.
+        turn_sigma: Standard deviation of the turn from one sweep to the next, rad.
+        shift_sigma: Of the shift from one sweep to the next, m.
+    """
+
+    trajectory: Trajectory
+    moves: bool
+    turn_sigma: float
+    shift_sigma: float
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Poses of the LiDAR in the middle of each sweep, in the frame of the first of them.
+
+    Attributes:
+        trajectory: The poses.
+        weakest: Unit direction in each sweep that its walls say least about: the bore's axis, `(n, 3)`.
+    """
+
+    trajectory: Trajectory
+    weakest: Float[np.ndarray, "n 3"]
+
+
+def estimate_odometry(
+    recording: Recording, guide: Guide | None = None, advance: Callable[[], None] = lambda: None
+) -> Odometry:
+    """One pose for each sweep of at least 100 returns.
 
     Args:
         recording: The recording; each scan is read once.
+        guide: See `Guide`; without one, each sweep is expected to go on as the last did.
         advance: Called after each scan, for a progress bar.
 
     Raises:
         FitError: Fewer than two usable scans.
     """
-    odometry = GenZICP(_config())
-    times, poses = [], []
+    tracker = _Tracker()
+    times: list[float] = []
+    weakest: list[np.ndarray] = []
     for scan in recording.scans():
         advance()
-        if len(scan.points) < _MIN_POINTS:
+        span = float(scan.times.max(initial=0.0))
+        if len(scan.points) < _MIN_POINTS or (guide and not guide.trajectory.covers(scan.stamp, scan.stamp + span)):
             continue
-        span = max(scan.times[-1], 1e-9)
-        odometry.register_frame(scan.points.astype(np.float64), scan.times / span)
-        times.append(scan.stamp + 0.5 * span)  # GenZ-ICP deskews to the middle of the sweep
-        poses.append(odometry.last_pose.copy())
-    if len(poses) < 2:
-        raise FitError(f"{recording.path}: only {len(poses)} scans hold {_MIN_POINTS} points; too few for odometry")
-    stack = np.asarray(poses)
-    level = _levelling(recording.up_at_start(_LEVEL_DURATION))
-    return Trajectory(
-        np.asarray(times), level.apply(stack[:, :3, 3]), level * Rotation.from_matrix(stack[:, :3, :3]), LIBRARY
-    )
+        middle = scan.stamp + 0.5 * span
+        if times and middle <= times[-1]:
+            continue  # a message that was recorded twice
+        weakest.append(tracker.register(scan, middle, guide))
+        times.append(middle)
+    if len(times) < 2:
+        raise FitError(f"{recording.path}: only {len(times)} scans hold {_MIN_POINTS} points; too few for odometry")
+    stack = np.asarray(tracker.poses)
+    poses = Trajectory(np.asarray(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), LIBRARY)
+    return Odometry(poses, np.asarray(weakest))
 
 
-def _levelling(up: np.ndarray | None) -> Rotation:
-    """The smallest turn that makes `up` vertical."""
-    if up is None:
-        return Rotation.identity()
-    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0]
+class _Tracker:
+    """The map so far, and the pose of every sweep in it."""
+
+    def __init__(self) -> None:
+        self.poses: list[np.ndarray] = []
+        self._map = small_gicp.GaussianVoxelMap(_VOXEL)
+        self._map.set_lru(horizon=_HORIZON, clear_cycle=10)
+        self._time = 0.0
+        self._step = np.eye(4)
+        self._pace = 0.1  # s that `_step` took
+
+    def register(self, scan: Scan, middle: float, guide: Guide | None) -> np.ndarray:
+        """Adds a sweep; returns the direction in it that its walls say least about."""
+        last = self.poses[-1] if self.poses else np.eye(4)
+        gap = middle - self._time if self.poses else self._pace
+        step = self._expected(middle, gap, guide)
+        points = self._unwound(scan, middle, guide, step, gap)
+        near = points[np.linalg.norm(points, axis=1) < _RANGE]
+        # One thread: sums in one order, so that the same recording gives the same bytes.
+        source, _ = small_gicp.preprocess_points(near, _THINNING, num_threads=1)
+        pose, weakest = last @ step, np.array([1.0, 0.0, 0.0])
+        if self.poses and source.size() >= _MIN_POINTS:
+            result = small_gicp.align(self._map, source, pose, max_correspondence_distance=_REACH, num_threads=1)
+            if result.num_inliers >= _MIN_POINTS and np.isfinite(result.T_target_source).all():
+                weakest = _weakest(result.H)
+                pose = _blend(result, pose, *self._sigmas(guide))
+        if source.size() >= _MIN_POINTS or not self.poses:
+            self._map.insert(source, pose)
+        if self.poses:
+            self._step, self._pace = np.linalg.inv(last) @ pose, gap
+        self._time = middle
+        self.poses.append(pose)
+        return weakest
+
+    def _sigmas(self, guide: Guide | None) -> tuple[float, float]:
+        if guide is None:
+            return (np.deg2rad(0.5), 0.02) if len(self.poses) > _WARM_UP else (np.inf, np.inf)
+        moving = guide.moves or len(self.poses) > _WARM_UP
+        return guide.turn_sigma, guide.shift_sigma if moving else np.inf
+
+    def _expected(self, middle: float, gap: float, guide: Guide | None) -> np.ndarray:
+        """The step from the last sweep's pose to this one's, by the guide or as the last step was."""
+        share = gap / self._pace
+        step = _pose(Rotation.from_matrix(self._step[:3, :3]) ** share, share * self._step[:3, 3])
+        if guide is not None and self.poses:
+            places, turns = guide.trajectory.at(np.array([self._time, middle]))
+            step[:3, :3] = (turns[0].inv() * turns[1]).as_matrix()
+            if guide.moves:
+                step[:3, 3] = turns[0].inv().apply(places[1] - places[0])
+        return step
+
+    def _unwound(self, scan: Scan, middle: float, guide: Guide | None, step: np.ndarray, gap: float) -> np.ndarray:
+        """The sweep's points as seen from where the sensor was in the middle of it, m."""
+        times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + 1e-6), _KNOTS)
+        share = (times - middle) / gap
+        shifts = share[:, None] * step[:3, 3]
+        if guide is None:
+            turns = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(step[:3, :3]).as_rotvec())
+        else:
+            places, turns = guide.trajectory.at(times)
+            back = turns[_KNOTS // 2].inv()
+            if guide.moves:
+                shifts = back.apply(places - places[_KNOTS // 2])
+            turns = back * turns
+        return deskew(scan, Trajectory(times, shifts, turns, LIBRARY))
 
 
-def _config() -> GenZConfig:
-    config = GenZConfig()
-    config.data.deskew = True
-    config.data.max_range = 60.0
-    return config
+def _pose(turn: Rotation, shift: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), shift
+    return pose
+
+
+def _weakest(information: np.ndarray) -> np.ndarray:
+    """The direction of least information on the shift, once the turn is free."""
+    turn, cross, shift = information[:3, :3], information[:3, 3:], information[3:, 3:]
+    return np.linalg.eigh(shift - cross.T @ np.linalg.solve(turn, cross))[1][:, 0]
+
+
+def _blend(
+    result: small_gicp.RegistrationResult, expected: np.ndarray, turn_sigma: float, shift_sigma: float
+) -> np.ndarray:
+    """The registered pose, moved towards the expected one where that is the surer of the two.
+
+    Source: the posterior of two Gaussians, in the tangent space of the registered pose.
+    """
+    pose = result.T_target_source
+    gap = np.linalg.inv(pose) @ expected
+    way = np.concatenate([Rotation.from_matrix(gap[:3, :3]).as_rotvec(), gap[:3, 3]])
+    trust = np.diag(np.repeat([turn_sigma**-2.0, shift_sigma**-2.0], 3))
+    part = np.linalg.solve(result.H + trust, trust @ way)
+    return pose @ _pose(Rotation.from_rotvec(part[:3]), part[3:])

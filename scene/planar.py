@@ -12,7 +12,7 @@ from scene.bore import Bore
 from scene.errors import FitError
 
 SCHEMA = "subterra.tunnel/1"
-_COLLINEAR = 0.0002
+_COLLINEAR = 0.0005  # m; a tenth of it would double the vertices
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from scene.trajectory import Trajectory
 
 _KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
 _BATCH = 20  # sweeps thinned together
-_MAX_UNCOVERED = 0.05
 
 
 def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
@@ -34,7 +33,11 @@ def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
 
 
 def register(
-    recording: Recording, trajectory: Trajectory, voxel: float, advance: Callable[[], None] = lambda: None
+    recording: Recording,
+    trajectory: Trajectory,
+    voxel: float,
+    advance: Callable[[], None] = lambda: None,
+    most_uncovered: float = 0.05,
 ) -> tuple[Cloud, int]:
     """The registered cloud, and how many scans the trajectory did not cover.
 
@@ -43,9 +46,10 @@ def register(
         trajectory: Where the sensor was.
         voxel: Thinning, m.
         advance: Called after each scan.
+        most_uncovered: Share of the scans that may lack a pose; those are left out.
 
     Raises:
-        RecordingError: The trajectory misses more than 5 % of the scans.
+        RecordingError: The trajectory misses a larger share of the scans.
         FitError: No point is left.
     """
     thinned, batch, uncovered, span = VoxelMean(voxel), [], 0, [np.inf, -np.inf]
@@ -62,7 +66,7 @@ def register(
             batch = []
     if batch:
         thinned.add(np.concatenate(batch))
-    if uncovered > _MAX_UNCOVERED * max(recording.scan_count, 1):
+    if uncovered > most_uncovered * max(recording.scan_count, 1):
         raise RecordingError(
             f"{trajectory.source}: covers {trajectory.times[0]:.2f} to {trajectory.times[-1]:.2f} s, but "
             f"{recording.path} runs from {span[0]:.2f} to {span[1]:.2f} s; {uncovered} of {recording.scan_count} scans "

@@ -1,13 +1,14 @@
 """Sleepers, rails, pads and fasteners, placed by standard and checked against the bore."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from scene.bore import Bore
 from scene.errors import FitError
+from scene.trackseen import SeenSleepers
 
 _FLAT = 0.10  # a bed this little above the lowest point of the bore is its floor
 _SMOOTHING = 1.0  # m
@@ -76,6 +77,7 @@ class Track:
         bed: z of the ballast or slab at each station of the bore, m, `(n,)`.
         elevation: z of the top of the sleepers, of the floor where there is no track, m, `(n,)`.
         sleeper_station: m, `(k,)`; empty where the bore is too narrow for a track.
+        measured: Sleepers that the survey shows, `(k,)`; the others lie where the spacing asks for one.
         clearance: From each sleeper's ends to the wall at its top, the smaller side, m, `(k,)`.
         raised: Whether the bed is a slab above the floor of the bore (a round bore).
     """
@@ -84,12 +86,18 @@ class Track:
     bed: Float[np.ndarray, " n"]
     elevation: Float[np.ndarray, " n"]
     sleeper_station: Float[np.ndarray, " k"]
+    measured: Bool[np.ndarray, " k"]
     clearance: Float[np.ndarray, " k"]
     raised: bool
 
 
-def lay(bore: Bore, config: TrackConfig) -> Track:
+def lay(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None) -> Track:
     """Lays the track on the flat floor, or on a bed just wide enough where the bore is round.
+
+    Args:
+        bore: The bore.
+        config: By which standard.
+        seen: Sleepers that the survey shows; they are taken as they lie and stand out as far as they do.
 
     Raises:
         FitError: A sleeper would come closer to the wall than the margin.
@@ -103,8 +111,12 @@ def lay(bore: Bore, config: TrackConfig) -> Track:
     smooth = gaussian_filter1d(bed, sigma, mode="nearest")
     if np.median(floor + bore.height - bed) < config.min_headroom:
         level = gaussian_filter1d(floor, sigma, mode="nearest")
-        return Track(config, level, level, np.empty(0), np.empty(0), False)
-    station = np.arange(int(bore.length / config.sleeper_spacing + 1e-6) + 1) * config.sleeper_spacing
+        return Track(config, level, level, np.empty(0), np.empty(0, bool), np.empty(0), False)
+    if seen is None:
+        station = np.arange(int(bore.length / config.sleeper_spacing + 1e-6) + 1) * config.sleeper_spacing
+        measured = np.zeros(len(station), bool)
+    else:
+        station, measured, config = seen.station, seen.measured, replace(config, protrusion=seen.protrusion)
     elevation = smooth + config.protrusion
     clearance = _clearance(bore, elevation, station) - config.sleeper_length / 2
     if (clearance < config.margin).any():
@@ -113,7 +125,7 @@ def lay(bore: Bore, config: TrackConfig) -> Track:
             f"the sleeper at {station[worst]:.1f} m comes within {clearance[worst]:.2f} m of the wall; "
             f"{config.margin:g} m are needed"
         )
-    return Track(config, smooth, elevation, station, clearance, raised)
+    return Track(config, smooth, elevation, station, measured, clearance, raised)
 
 
 def _radius_down(bore: Bore) -> np.ndarray:
@@ -141,6 +153,12 @@ def _lowest_chord(bore: Bore, half_width: float) -> np.ndarray:
 
 
 def _clearance(bore: Bore, elevation: np.ndarray, station: np.ndarray) -> np.ndarray:
+    """From the axis to the nearer wall at the height of the track, at each station, m."""
     rows = np.clip(np.rint(station / (bore.station[1] - bore.station[0])).astype(int), 0, len(bore.station) - 1)
-    level = elevation - bore.position[:, 2]
-    return np.array([min(float(_wall_at(bore, row, level[row], side)) for side in (1, -1)) for row in rows])
+    across, upward = bore.radius[rows] * np.cos(bore.angle), bore.radius[rows] * np.sin(bore.angle)
+    level = (elevation - bore.position[:, 2])[rows, None]
+    next_across, next_upward = np.roll(across, -1, axis=1), np.roll(upward, -1, axis=1)
+    crosses = (upward < level) != (next_upward < level)
+    share = np.where(crosses, (level - upward) / np.where(crosses, next_upward - upward, 1.0), 0.0)
+    at = np.where(crosses, across + share * (next_across - across), 0.0)
+    return np.minimum(at.max(axis=1), -at.min(axis=1))

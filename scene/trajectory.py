@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,15 @@ class Trajectory:
     rotations: Rotation
     source: str
 
+    @property
+    def path(self) -> Path:
+        """The file that the poses were read from."""
+        return Path(self.source)
+
+    @cached_property
+    def _slerp(self) -> Slerp:
+        return Slerp(self.times, self.rotations)
+
     def covers(self, start: float, end: float) -> bool:
         """Whether poses exist over the whole interval, s."""
         return bool(self.times[0] <= start and end <= self.times[-1])
@@ -38,7 +48,7 @@ class Trajectory:
         """Positions (linear) and rotations (slerp) at the given times, s; outside the span the nearest pose holds."""
         clipped = np.clip(times, self.times[0], self.times[-1])
         positions = np.stack([np.interp(clipped, self.times, column) for column in self.positions.T], axis=1)
-        return positions, Slerp(self.times, self.rotations)(clipped)
+        return positions, self._slerp(clipped)
 
 
 def save_tum(trajectory: Trajectory, path: Path) -> None:

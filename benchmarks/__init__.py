@@ -1,0 +1,1 @@
+"""Everything that scores: speed, fidelity and the demo."""

@@ -1,0 +1,67 @@
+"""A picture of a scene, off screen: `python -m benchmarks.render SCENE --out PNG`."""
+
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from PIL import Image
+
+# MuJoCo chooses its GL backend when it is imported, so each is tried in a process of its own.
+_BACKENDS = ("egl", "osmesa", "glfw")
+_TIMEOUT = 120.0
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """Renders a scene as its scout sees it.
+
+    Attributes:
+        scene: Scene folder, or an MJCF file.
+        out: PNG to write.
+        camera: Camera of the scene.
+        width: Pixels.
+        height: Pixels.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    out: Path = Path("view.png")
+    camera: str = "scout"
+    width: int = 960
+    height: int = 540
+
+
+def picture(scene: Path) -> np.ndarray | None:
+    """A view down the bore, `(height, width, 3)` uint8; `None` where no GL backend works."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "view.png"
+        for backend in _BACKENDS:
+            command = [sys.executable, "-m", "benchmarks.render", str(scene), "--out", str(out)]
+            environment = {**os.environ, "MUJOCO_GL": backend}
+            done = subprocess.run(command, env=environment, capture_output=True, timeout=_TIMEOUT, check=False)
+            if done.returncode == 0 and out.exists():
+                with Image.open(out) as image:
+                    return np.asarray(image.convert("RGB"))
+    return None
+
+
+def main(config: RenderConfig) -> None:
+    """Renders once, with the backend that `MUJOCO_GL` names."""
+    import mujoco
+
+    path = config.scene / "scene.xml" if config.scene.is_dir() else config.scene
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer = mujoco.Renderer(model, config.height, config.width)
+    renderer.update_scene(data, camera=config.camera)
+    Image.fromarray(renderer.render()).save(config.out)
+    renderer.close()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(RenderConfig))

@@ -1,0 +1,162 @@
+"""How the instruments of a carrier sit against its LiDAR: published presets, a YAML file, or a lever arm."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from scene.errors import RecordingError
+from scene.files import require_input
+
+_ORTHONORMAL = 1e-3  # published matrices are rounded to 6 digits
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A rigid transform that maps LiDAR coordinates to the instrument's: `p_instrument = rotation @ p_lidar + shift`.
+
+    Attributes:
+        rotation: `(3, 3)`.
+        shift: m, `(3,)`.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+    @property
+    def origin(self) -> Float[np.ndarray, "3"]:
+        """The instrument's origin in LiDAR coordinates, m."""
+        return -self.rotation.T @ self.shift
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Where prism and IMU are, seen from the LiDAR.
+
+    Attributes:
+        name: Preset, file or lever arm, for the manifest.
+        prism: In LiDAR coordinates, m, `(3,)`.
+        imu: Maps LiDAR coordinates to the IMU's, by topic of the IMU.
+    """
+
+    name: str
+    prism: Float[np.ndarray, "3"]
+    imu: dict[str, Mount]
+
+
+def _mount(rotation: list[list[float]], shift: list[float]) -> Mount:
+    u, _, vt = np.linalg.svd(np.array(rotation))
+    return Mount(u @ vt, np.array(shift))
+
+
+def _target(shift: list[float], wxyz: list[float]) -> Mount:
+    return Mount(Rotation.from_quat([*wxyz[1:], wxyz[0]]).as_matrix(), np.array(shift))
+
+
+# Source: GEODE (PengYu-Team/GEODE_dataset, arXiv 2409.04961). Its scripts give (t, q wxyz), "γ to Leica", and
+# take a LiDAR pose P to P · inv(T): T maps LiDAR coordinates to the target's, whose origin is inv(T) · 0.
+_LEICA_GAMMA = _target([0.00947221, -0.308202, -0.365733], [0.999901, -0.00492765, 0.00575961, 0.0117651])
+_LEICA_BETA = _target([-0.0108864, 0.293397, -0.452674], [0.999991, 0.000903519, 0.0035434, -0.00220342])
+_GNSS_GAMMA = _target([0.0305, -0.5959, 0.0902], [0.9998828, -0.0057758, 0.0022253, 0.0140019])
+_GNSS_ALPHA = _target([0.0090, -0.2925, 0.4533], [0.9999909, -0.0009, -0.00355, 0.0022])
+# Source: GEODE, `T_IMU_LiDAR`, p_imu = T p_lidar, of the external Xsens MTi-30.
+_MTI_GAMMA = _mount(
+    [[0.99962, 0.027463, 0.002445], [-0.027517, 0.999299, 0.025398], [-0.001746, -0.025456, 0.999674]],
+    [0.049258, -0.0125, 0.026946],
+)
+_MTI_BETA = _mount(
+    [[0.998638, 0.052001, -0.004278], [-0.051937, 0.998554, 0.0139], [0.004994, -0.013659, 0.999894]],
+    [-0.027172, -0.034873, 0.062643],
+)
+_MTI_ALPHA = _mount(
+    [[0.9999, 0.0049, 0.0153], [-0.0050, 1.0, 0.0021], [-0.0153, -0.0022, 0.9999]], [0.0961, -0.1338, 0.3032]
+)
+# Source: FAST-LIO's avia.yaml, p_imu = p_lidar + t: axes parallel, the chip at minus this in LiDAR coordinates.
+_AVIA = Mount(np.eye(3), np.array([0.04165, 0.02326, -0.0284]))
+
+_GAMMA = {"/livox/imu": _AVIA, "/imu/data": _MTI_GAMMA}
+PRESETS = {
+    "geode-gamma": Calibration("geode-gamma", _LEICA_GAMMA.origin, _GAMMA),
+    "geode-beta": Calibration("geode-beta", _LEICA_BETA.origin, {"/imu/data": _MTI_BETA}),
+    "geode-gamma-gnss": Calibration("geode-gamma-gnss", _GNSS_GAMMA.origin, _GAMMA),
+    "geode-alpha-gnss": Calibration("geode-alpha-gnss", _GNSS_ALPHA.origin, {"/imu/data": _MTI_ALPHA}),
+    # The ground truth of the Tunneling sequences is given in α's own LiDAR frame.
+    "geode-alpha": Calibration("geode-alpha", np.zeros(3), {"/imu/data": _MTI_ALPHA}),
+}
+# What is known of an IMU without being told: Livox's sits in the housing.
+UNCALIBRATED = Calibration("none: the control is taken for the LiDAR's own origin", np.zeros(3), {"/livox/imu": _AVIA})
+
+
+def find_calibration(text: str | None) -> Calibration:
+    """A calibration from what a user wrote.
+
+    Args:
+        text: Name of a preset, path of a YAML file, or a lever arm `x,y,z` (the prism in LiDAR coordinates, m).
+
+    Raises:
+        RecordingError: None of the three, or a file that is malformed.
+    """
+    if text is None:
+        return UNCALIBRATED
+    if text in PRESETS:
+        return PRESETS[text]
+    numbers = text.replace(",", " ").split()
+    try:
+        lever = np.array([float(number) for number in numbers])
+    except ValueError:
+        lever = np.empty(0)
+    if lever.shape == (3,) and np.isfinite(lever).all():
+        return replace(UNCALIBRATED, name=text, prism=lever)
+    if text.lower().endswith((".yaml", ".yml")):
+        return load_calibration(Path(text))
+    raise RecordingError(
+        f"{text}: no calibration of that name; it is a preset ({', '.join(sorted(PRESETS))}), a .yaml file, "
+        "or a lever arm x,y,z in metres"
+    )
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Reads `prism: [x, y, z]` (m, LiDAR coordinates) and `imu: {topic: {rotation: 3x3, shift: [x, y, z]}}`.
+
+    An IMU's transform maps LiDAR coordinates to the IMU's. Both keys may be left out; any other is refused.
+
+    Raises:
+        RecordingError: Unreadable, or a key or a shape is wrong; names it.
+    """
+    require_input(path)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise RecordingError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict) or set(content) - {"prism", "imu"}:
+        raise RecordingError(f"{path}: a calibration has the keys prism and imu, found {content!r:.80}")
+    imus = content.get("imu") or {}
+    if not isinstance(imus, dict):
+        raise RecordingError(f"{path}: imu must map topics to rotation and shift, found {imus!r:.80}")
+    mounts = {}
+    for topic, entry in imus.items():
+        if not isinstance(entry, dict):
+            raise RecordingError(f"{path}: imu {topic} must have rotation and shift, found {entry!r:.80}")
+        rotation = _numbers(path, f"imu {topic} rotation", entry.get("rotation", np.eye(3)), (3, 3))
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0:
+            raise RecordingError(f"{path}: imu {topic} rotation is no rotation matrix")
+        mounts[str(topic)] = _mount(
+            rotation.tolist(), _numbers(path, f"imu {topic} shift", entry.get("shift"), (3,)).tolist()
+        )
+    prism = _numbers(path, "prism", content.get("prism", np.zeros(3)), (3,))
+    return Calibration(path.name, prism, {**UNCALIBRATED.imu, **mounts})
+
+
+def _numbers(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if array.shape != shape or not np.isfinite(array).all():
+        wanted = " by ".join(str(size) for size in shape)
+        raise RecordingError(f"{path}: {name} must be {wanted} numbers, found {value!r:.80}")
+    return array
