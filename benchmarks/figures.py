@@ -116,7 +116,9 @@ def drawn_view(tunnel_path: Path, lining: str = "pockets", stretch: float = 20.0
 
 def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
     """The registered cloud of a scene folder, thinned, in the tunnel frame, m."""
-    return np.asarray(trimesh.load(scene / "cloud.ply").vertices)
+    cloud = trimesh.load(scene / "cloud.ply")
+    assert isinstance(cloud, trimesh.PointCloud)  # for the type checker; the builder writes no faces
+    return np.asarray(cloud.vertices)
 
 
 def drawn_bore(bore_path: Path, eye: float = 2.0, reach: float = 40.0) -> Figure:

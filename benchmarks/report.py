@@ -104,7 +104,7 @@ def _odometry_sentence(odometry: dict[str, Any]) -> str:
 
 
 def _figure_rows(summary: dict[str, Any]) -> list[tuple[tuple[str, ...], bool]]:
-    rows = []
+    rows: list[tuple[tuple[str, ...], bool]] = []
     for key, text, unit, factor, decimals, goal, less in _ROWS:
         value = summary.get(key)
         if value is None or not np.isfinite(value):

@@ -6,14 +6,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from scene import profile
 from scene.axis import Axis, with_frames
 from scene.errors import RecordingError
-from scene.section import Sections
 
 SCHEMA = "subterra.bore/1"
 STATION_STEP = 0.25
-_MIN_COVERAGE = 0.4
 
 POCKET = np.dtype(
     [
@@ -102,36 +99,3 @@ def load(path: Path) -> Bore:
 def uniform_stations(length: float) -> Float[np.ndarray, " n"]:
     """From 0 to `length`, at most `STATION_STEP` apart, m."""
     return np.linspace(0.0, length, int(np.ceil(length / STATION_STEP - 1e-9)) + 1)
-
-
-def measured_extents(angle: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height of each section, m, `(n,)` each."""
-    extents = [profile.measure(angle, section) for section in radius]
-    return np.array([e.width for e in extents]), np.array([e.height for e in extents])
-
-
-def from_sections(axis: Axis, sections: Sections) -> Bore:
-    """The bore over the seen span, without lining features; stations start at its first end."""
-    grid = sections.grid
-    start, end = grid.start, grid.start + grid.rows * grid.step
-    station = uniform_stations(end - start)
-    at = axis.at(station + start)
-    rows = np.clip((station + start - grid.start) / grid.step - 0.5, 0, grid.rows - 1)
-    low = np.minimum(rows.astype(np.intp), max(grid.rows - 2, 0))
-    share = (rows - low)[:, None]
-    high = np.minimum(low + 1, grid.rows - 1)
-    radius = (1 - share) * sections.radius[low] + share * sections.radius[high]
-    width, height = measured_extents(grid.angle, radius)
-    seen = sections.weight > 0
-    coverage = np.array([seen[max(row - 2, 0) : row + 3].any(axis=0).mean() for row in low])
-    return Bore(
-        station, at.position, at.tangent, at.lateral, at.up, width, height, grid.angle, radius,
-        _window_mean(sections.spread, low), coverage, coverage < _MIN_COVERAGE,
-        np.empty(0), np.empty(0, POCKET),
-    )  # fmt: skip
-
-
-def _window_mean(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Mean over the five rows, one station step, around each place."""
-    padded = np.pad(rows, 2, mode="edge")
-    return np.mean([padded[at + k] for k in range(5)], axis=0)

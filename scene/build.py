@@ -10,16 +10,16 @@ import numpy as np
 import trimesh
 import tyro
 
-from scene import manifest, mesh, mjcf, planar
-from scene.calibration import find_calibration
 from scene.cli import progress_bar, run
 from scene.cloud import thinned
 from scene.errors import FitError
 from scene.files import replace_folder, require_output_folder
-from scene.mjcf import SceneConfig
+from scene.poses.calibration import find_calibration
+from scene.poses.trajectory import save_tum
 from scene.reconstruct import ReconstructConfig, Reconstruction, reconstruct
-from scene.track import Track, TrackConfig, lay
-from scene.trajectory import save_tum
+from scene.writing import manifest, mesh, mjcf, planar
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import Track, TrackConfig, lay
 
 _PREVIEW_VOXEL = 0.06
 

@@ -7,26 +7,26 @@ from typing import Any
 import numpy as np
 from rich.progress import Progress
 
-from scene import bore as bores
-from scene import lining, locate, rings
 from scene.axis import Axis
 from scene.bore import Bore
-from scene.calibration import UNCALIBRATED, Calibration
-from scene.centreline import CentrelineConfig, fit_centreline
 from scene.cloud import Cloud
-from scene.control import Control, load_control
 from scene.errors import FitError, RecordingError
 from scene.files import require_input
-from scene.locate import Located
+from scene.fitting import assemble, lining, rings
+from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.section import fit_sections
+from scene.fitting.trackseen import SeenTrack, find_track
+from scene.poses import locate
+from scene.poses.calibration import UNCALIBRATED, Calibration
+from scene.poses.control import Control, load_control
+from scene.poses.locate import Located
+from scene.poses.registration import register
+from scene.poses.trajectory import Trajectory, load_tum
 from scene.reading.cloudfile import read_cloud
 from scene.reading.config import ReadingConfig
 from scene.reading.detect import CLOUDS, RECORDINGS, detect, sentence
+from scene.reading.recording import Recording
 from scene.reading.ringsurvey import read_survey
-from scene.recording import Recording
-from scene.registration import register
-from scene.section import fit_sections
-from scene.trackseen import SeenTrack, find_track
-from scene.trajectory import Trajectory, load_tum
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def _from_cloud(
     if located is not None and _runs_against(axis, located.trajectory.positions - cloud.origin):
         axis = axis.reversed()
     sections = fit_sections(cloud, axis)
-    smooth = bores.from_sections(axis, sections)
+    smooth = assemble.from_sections(axis, sections)
     bore, provenance = lining.add_features(smooth, sections)
     seen = find_track(cloud, bore) if sections.flat_floor else SeenTrack(None, None)
     facts = {

@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 from scene.reading.pointtimes import make_scan
-from scene.scan import Scan
+from scene.reading.scan import Scan
 
 MESSAGE_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from scene.reading.pointtimes import FIELDS, make_scan
-from scene.scan import Scan
+from scene.reading.scan import Scan
 
 MESSAGE_TYPE = "sensor_msgs/msg/PointCloud2"
 # Source: sensor_msgs/PointField, INT8 = 1 … FLOAT64 = 8.

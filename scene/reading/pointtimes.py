@@ -8,7 +8,7 @@ with the stamp.
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from scene.scan import Scan
+from scene.reading.scan import Scan
 
 FIELDS = ("t", "time", "offset_time", "timestamp", "time_stamp", "timestamps", "ts")
 STATIC = "none: every sweep is taken as static"

@@ -12,7 +12,7 @@ from scene.errors import RecordingError
 from scene.reading import livox
 from scene.reading.cause import cause, one_line, refusing
 from scene.reading.pointcloud2 import MESSAGE_TYPE, parse_pointcloud2
-from scene.scan import Scan
+from scene.reading.scan import Scan
 
 _NAMES = {"bag": "ROS1 bag", "rosbag2": "ROS2 bag", "db3": "ROS2 bag", "mcap": "ROS2 MCAP file"}
 # Where several topics carry clouds, the sensor's own comes before what other programs made of it.

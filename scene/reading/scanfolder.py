@@ -12,8 +12,8 @@ from scene.errors import RecordingError
 from scene.reading import pcd, ply
 from scene.reading.cause import cause
 from scene.reading.pointtimes import FIELDS, make_scan
+from scene.reading.scan import Scan
 from scene.reading.source import stacked
-from scene.scan import Scan
 
 _SUFFIXES = (".pcd", ".ply", ".bin")
 _LISTS = ("times.txt", "timestamps.txt")

@@ -82,8 +82,12 @@ def draw_alignment(rng: np.random.Generator, length: float) -> Alignment:
     side = rng.choice([-1.0, 1.0])
     while knots[-1] < length + MARGIN:
         bend = side / rng.uniform(150.0, 400.0)
-        for run, value in ((rng.uniform(12.0, 25.0), bend), (rng.uniform(15.0, 45.0), bend),
-                           (rng.uniform(12.0, 25.0), 0.0), (rng.uniform(0.0, 20.0) + 1.0, 0.0)):
+        for run, value in (
+            (rng.uniform(12.0, 25.0), bend),
+            (rng.uniform(15.0, 45.0), bend),
+            (rng.uniform(12.0, 25.0), 0.0),
+            (rng.uniform(0.0, 20.0) + 1.0, 0.0),
+        ):
             knots.append(knots[-1] + run * scale)
             curvature.append(value)
         side = -side

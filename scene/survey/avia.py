@@ -52,7 +52,9 @@ def directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> F
 
 
 def returned(
-    rng: np.random.Generator, distance: Float32[np.ndarray, "n"], cosine: Float32[np.ndarray, "n"],
+    rng: np.random.Generator,
+    distance: Float32[np.ndarray, "n"],
+    cosine: Float32[np.ndarray, "n"],
     part: UInt8[np.ndarray, "n"],
 ) -> Bool[np.ndarray, "n"]:
     """Which pulses come back.

@@ -112,7 +112,9 @@ def draw_walk(rng: np.random.Generator, bore: Bore, speed: float, period: float)
     duration = period * np.ceil((bore.alignment.length + STOP - START) / speed / period)
     degree = np.pi / 180.0
     return Walk(
-        bore, speed, float(duration),
+        bore,
+        speed,
+        float(duration),
         # Progress sways with the speed, so that nobody walks backwards.
         ahead=_draw_sway(rng, 0.1 * speed, 0.008 * speed),
         across=_draw_sway(rng, 0.12, 0.015),

@@ -85,7 +85,10 @@ def custom_message(seq: int, begin: int, points: np.ndarray) -> bytes:
 
 
 def imu_messages(
-    frame: str, nanoseconds: np.ndarray, quaternion: Float[np.ndarray, "n 4"] | None, gyro: Float[np.ndarray, "n 3"],
+    frame: str,
+    nanoseconds: np.ndarray,
+    quaternion: Float[np.ndarray, "n 4"] | None,
+    gyro: Float[np.ndarray, "n 3"],
     accel: Float[np.ndarray, "n 3"],
 ) -> list[bytes]:
     """`sensor_msgs/Imu` messages.

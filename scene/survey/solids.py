@@ -21,8 +21,12 @@ _RAIL_STEP = 0.25  # m; the chord of a 150 m bend is then off by 0.05 mm
 
 
 def _copies(
-    shape: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], centre: Float[np.ndarray, "k 3"],
-    axes: Float[np.ndarray, "k 3 3"], part: Part, station: Float[np.ndarray, "k"],
+    shape: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    centre: Float[np.ndarray, "k 3"],
+    axes: Float[np.ndarray, "k 3 3"],
+    part: Part,
+    station: Float[np.ndarray, "k"],
 ) -> Mesh:
     """One copy of a shape for each centre and frame."""
     vertices = centre[:, None] + np.einsum("kij,vj->kvi", axes, shape)

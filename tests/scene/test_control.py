@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from scene.calibration import PRESETS, find_calibration
-from scene.control import load_control
 from scene.errors import RecordingError
+from scene.poses.calibration import PRESETS, find_calibration
+from scene.poses.control import load_control
 from tests.scene.test_trajectory import write
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from scene import rings
 from scene.errors import FitError, RecordingError
+from scene.fitting import rings
 from scene.reading.cloudfile import read_cloud
+from scene.reading.recording import Recording
 from scene.reading.ringsurvey import read_survey
-from scene.recording import Recording
 from tests.scene.bags import write_bag
 from tests.scene.files import CLOUDS, RING_HEADER, ring_rows, write_xlsx
 from tests.scene.messages import LIVOX2, OUSTER, POINTCLOUD2, livox_cdr, pointcloud2, write_bag1, write_bag2

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from scene import mesh
+from scene.writing import mesh
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from scene import mesh, planar, track
+from scene.writing import mesh, planar, track
 
 
 @pytest.fixture(scope="module")

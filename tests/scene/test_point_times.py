@@ -5,7 +5,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from scene.errors import RecordingError
-from scene.recording import Recording
+from scene.reading.recording import Recording
 from tests.scene.messages import (
     HESAI,
     LIVOX2,

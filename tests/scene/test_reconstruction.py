@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scene import bore as bores
-from scene.centreline import CentrelineConfig, fit_centreline
+from scene.bore import Bore
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError
-from scene.section import fit_sections
+from scene.fitting import assemble
+from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.section import fit_sections
 from tests.scene.clouds import KnownBore, curved_d_bore
 
 
@@ -18,13 +19,13 @@ def thin(points: np.ndarray) -> Cloud:
     return voxels.cloud()
 
 
-def rebuilt(points: np.ndarray) -> tuple[bores.Bore, Cloud]:
+def rebuilt(points: np.ndarray) -> tuple[Bore, Cloud]:
     cloud = thin(points)
     axis = fit_centreline(cloud.points, CentrelineConfig())
-    return bores.from_sections(axis, fit_sections(cloud, axis)), cloud
+    return assemble.from_sections(axis, fit_sections(cloud, axis)), cloud
 
 
-def offsets(bore: bores.Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.ndarray]:
+def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.ndarray]:
     centre = known.centre - cloud.origin
     offset = bore.position - centre[cKDTree(centre).query(bore.position)[1]]
     return np.einsum("ij,ij->i", offset, bore.lateral), np.einsum("ij,ij->i", offset, bore.up)

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from scene.errors import RecordingError
-from scene.recording import Recording
-from scene.registration import register
-from scene.trajectory import load_tum
+from scene.poses.registration import register
+from scene.poses.trajectory import load_tum
+from scene.reading.recording import Recording
 from tests.scene.bags import write_bag, write_bag_without_lidar, write_tum
 
 SCANS = [(100.0 + 0.1 * k, np.arange(30.0).reshape(10, 3) + k) for k in range(5)]

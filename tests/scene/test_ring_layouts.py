@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from scene import rings
 from scene.errors import FitError, RecordingError
+from scene.fitting import rings
 from scene.reading.detect import detect
 from scene.reading.ringsurvey import read_survey
 from tests.scene.files import RING_HEADER, ring_rows, write_xlsx

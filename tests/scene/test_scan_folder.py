@@ -4,7 +4,7 @@ import trimesh
 from pypcd4 import PointCloud
 
 from scene.errors import RecordingError
-from scene.recording import Recording
+from scene.reading.recording import Recording
 
 XYZ = np.random.default_rng(0).uniform(1, 9, (30, 3)).astype(np.float32)
 

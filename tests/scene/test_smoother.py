@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scene import chain as chains
-from scene import rotation as so3
-from scene.chain import Chain, Motion
 from scene.errors import FitError
-from scene.leastsquares import NormalEquations
-from scene.problem import Noise, solve_with_heading
-from scene.smoother import inertial_problem, odometry_problem
-from scene.terms import Sightings, Steps
+from scene.poses import chain as chains
+from scene.poses import rotation as so3
+from scene.poses.chain import Chain, Motion
+from scene.poses.leastsquares import NormalEquations
+from scene.poses.problem import Noise, solve_with_heading
+from scene.poses.smoother import inertial_problem, odometry_problem
+from scene.poses.terms import Sightings, Steps
 from tests.scene import walks
 
 DURATION = 24.0

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scene import mesh, mjcf, planar, track, trackmesh
 from scene.errors import FitError
+from scene.writing import mesh, mjcf, planar, track, trackmesh
 from tests.scene.conftest import arc_bore
 
 

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.errors import RecordingError
-from scene.trajectory import load_tum
+from scene.poses.trajectory import load_tum
 
 
 def write(path, text):

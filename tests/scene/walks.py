@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scene.control import Control
-from scene.imu import GRAVITY, Inertial
-from scene.odometry import Odometry
-from scene.trajectory import Trajectory
+from scene.poses.control import Control
+from scene.poses.imu import GRAVITY, Inertial
+from scene.poses.odometry import Odometry
+from scene.poses.trajectory import Trajectory
 
 LEVER = np.array([0.1, -0.3, 0.35])
 

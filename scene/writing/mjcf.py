@@ -15,12 +15,12 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from shapely import LineString, Point
 
-from scene import trackmesh
 from scene.axis import Axis
 from scene.bore import Bore
-from scene.mesh import chunks
-from scene.planar import Walls
-from scene.track import Track
+from scene.writing import trackmesh
+from scene.writing.mesh import chunks
+from scene.writing.planar import Walls
+from scene.writing.track import Track
 
 WALLS, DECK, GROUND = 1, 2, 4
 _PANEL_TOLERANCE = 0.02

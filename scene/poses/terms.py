@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from scene import rotation as so3
-from scene.chain import PLACE, SIZE, TURN, Chain
-from scene.leastsquares import NormalEquations
+from scene.poses import rotation as so3
+from scene.poses.chain import PLACE, SIZE, TURN, Chain
+from scene.poses.leastsquares import NormalEquations
 
 _EYE = np.eye(3)
 

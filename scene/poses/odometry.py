@@ -14,10 +14,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError
-from scene.recording import Recording
-from scene.registration import deskew
-from scene.scan import Scan
-from scene.trajectory import Trajectory
+from scene.poses.registration import deskew
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import Recording
+from scene.reading.scan import Scan
 
 LIBRARY = "small-gicp"
 _MIN_POINTS = 100

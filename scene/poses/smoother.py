@@ -4,16 +4,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_smoothing_spline
 
-from scene import headings
-from scene import rotation as so3
-from scene.calibration import Mount
-from scene.chain import Chain, Motion
-from scene.control import Control
 from scene.errors import FitError
-from scene.imu import Inertial
-from scene.odometry import Odometry
-from scene.problem import SMOOTH_BETWEEN_SWEEPS, Noise, Problem
-from scene.terms import Sightings, Steps
+from scene.poses import headings
+from scene.poses import rotation as so3
+from scene.poses.calibration import Mount
+from scene.poses.chain import Chain, Motion
+from scene.poses.control import Control
+from scene.poses.imu import Inertial
+from scene.poses.odometry import Odometry
+from scene.poses.problem import SMOOTH_BETWEEN_SWEEPS, Noise, Problem
+from scene.poses.terms import Sightings, Steps
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°
 # What one step of the odometry is trusted to: rad, and m across and along the bore. Measured on simulated surveys.

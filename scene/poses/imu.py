@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.errors import RecordingError
-from scene.recording import Recording
+from scene.reading.recording import Recording
 
 IMU_TYPE = "sensor_msgs/msg/Imu"
 GRAVITY = 9.80665  # m/s²

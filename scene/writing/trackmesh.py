@@ -5,7 +5,7 @@ import trimesh
 from jaxtyping import Float
 
 from scene.axis import Axis
-from scene.track import RailProfile, Track, TrackConfig
+from scene.writing.track import RailProfile, Track, TrackConfig
 
 # Engineering defaults, not sourced: plan size of a pad, envelope of an elastic clip.
 _PAD = (0.18, 0.15)

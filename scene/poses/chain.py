@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from scene import rotation as so3
-from scene.imu import GRAVITY
-from scene.leastsquares import NormalEquations
+from scene.poses import rotation as so3
+from scene.poses.imu import GRAVITY
+from scene.poses.leastsquares import NormalEquations
 
 SIZE = 15
 TURN, PLACE, _SPEED, _GYRO, _ACCEL = (slice(3 * k, 3 * k + 3) for k in range(5))

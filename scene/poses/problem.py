@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scene import chain as chains
-from scene import headings
-from scene.chain import Chain, Motion
-from scene.leastsquares import NormalEquations
-from scene.terms import Sightings, Steps
+from scene.poses import chain as chains
+from scene.poses import headings
+from scene.poses.chain import Chain, Motion
+from scene.poses.leastsquares import NormalEquations
+from scene.poses.terms import Sightings, Steps
 
 _YAWS = np.deg2rad(np.arange(0, 360, 45))
 _TRIAL = 60.0  # s of the recording on which the mounting's heading is tried out

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from scene import profile
 from scene.axis import Axis, through, with_frames
 from scene.bore import POCKET, STATION_STEP, Bore
 from scene.errors import FitError
+from scene.fitting import profile
 from scene.reading.ringsurvey import RingSurvey
 
 _MIN_POINTS = 5

@@ -13,9 +13,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from scene import floor, profile
 from scene.axis import Axis, through
 from scene.errors import FitError
+from scene.fitting import floor, profile
 
 _SKELETON_VOXEL = 0.5
 _NEIGHBOURS = (1.2, 1.8, 2.6, 3.8)  # m; profiles may be apart, surveys have gaps

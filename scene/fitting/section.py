@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d, median_filter
 
-from scene import floor, profile, unroll
 from scene.axis import Axis
 from scene.cloud import Cloud
 from scene.errors import FitError
-from scene.unroll import Grid
+from scene.fitting import floor, profile, unroll
+from scene.fitting.unroll import Grid
 
 _COARSE_STEPS = (0.25, 0.5, 1.0, 1.5, 2.0)  # m; the first that leaves hardly a row of the coarse grid unseen
 _COARSE_ANGLES = 120

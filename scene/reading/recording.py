@@ -12,8 +12,8 @@ from scene.errors import RecordingError
 from scene.reading.cause import cause
 from scene.reading.detect import RECORDINGS, detect
 from scene.reading.rosbag import RosBag
+from scene.reading.scan import Scan
 from scene.reading.scanfolder import ScanFolder
-from scene.scan import Scan
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
 _MOST_OUT_OF_ORDER = 0.05

@@ -7,22 +7,23 @@ import numpy as np
 from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
-from scene.attitude import find_inertial, gyro_guide, levelling
-from scene.calibration import Calibration, Mount
-from scene.chain import Chain
-from scene.control import MIN_SHARE, Control
 from scene.errors import RecordingError
-from scene.imu import Inertial
-from scene.odometry import LIBRARY, Guide, Odometry, estimate_odometry
-from scene.problem import Noise, Problem, solve_with_heading
-from scene.recording import Recording
-from scene.smoother import inertial_problem, odometry_problem, steps_of_imu
-from scene.trajectory import Trajectory
+from scene.poses.attitude import find_inertial, gyro_guide, levelling
+from scene.poses.calibration import Calibration, Mount
+from scene.poses.chain import Chain
+from scene.poses.control import MIN_SHARE, Control
+from scene.poses.imu import Inertial
+from scene.poses.odometry import LIBRARY, Guide, Odometry, estimate_odometry
+from scene.poses.problem import Noise, Problem, solve_with_heading
+from scene.poses.smoother import inertial_problem, odometry_problem, steps_of_imu
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import Recording
 
 # Guides: what is trusted of the turn (rad) and the shift (m) from one sweep to the next.
 _BY_CONTROL = (np.deg2rad(0.1), 0.02)
 _BY_CONTROL_WITHOUT_IMU = (np.deg2rad(0.5), 0.02)
 _OUTLIER = 4.0  # standard deviations
+_END = 0.05  # m; an end of the bore is found to this, on simulated surveys
 
 
 @dataclass(frozen=True)
@@ -136,15 +137,15 @@ def _without_imu(
 
 
 def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str, Any]:
-    """Residuals of the control, and what they say of the length: an end's 95 % along one axis, for both ends."""
+    """Residuals of the control, and what they say of the length and the length they allow, 95 %."""
     residual = problem.sightings.residual(chain)
     kept = np.linalg.norm(residual, axis=1) < _OUTLIER * np.sqrt(3) * problem.sightings.sigma
     rms = float(np.sqrt(np.mean(residual[kept] ** 2))) if kept.any() else float("inf")
     trusted = max(rms, problem.noise.control)
     return {
         "length_fixed_by": "control",
-        "length_uncertainty": float(2 * np.sqrt(2) * trusted),
-        "length_uncertainty_from": "95 %, from the control's residuals; the scale of the control itself is not in it",
+        "length_uncertainty": float(np.sqrt(2) * np.hypot(2 * trusted, _END)),
+        "length_uncertainty_from": "95 %: control residuals, and how well ends are found; not the control's own scale",
         "control_rows": len(residual),
         "control_rows_repeated": control.dropped,
         "control_outliers": int((~kept).sum()),

@@ -7,9 +7,9 @@ from jaxtyping import Float
 
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError, RecordingError
-from scene.recording import Recording
-from scene.scan import Scan
-from scene.trajectory import Trajectory
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import Recording
+from scene.reading.scan import Scan
 
 _KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
 _BATCH = 20  # sweeps thinned together

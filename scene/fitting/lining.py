@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from scene.bore import POCKET, Bore
-from scene.section import Sections
+from scene.fitting.section import Sections
 
 _MODES = ("nearest", "wrap")
 _HOLE = (4, 3)  # cells of 5 cm × 1°

@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from scene.bore import Bore
 from scene.errors import FitError
-from scene.trackseen import SeenSleepers
+from scene.fitting.trackseen import SeenSleepers
 
 _FLAT = 0.10  # a bed this little above the lowest point of the bore is its floor
 _SMOOTHING = 1.0  # m

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from scene import rotation as so3
+from scene.poses import rotation as so3
 
 _LEVEL_TIME = 1.0  # s; over this a walker's accelerations cancel
 _TRACK_TIME = 10.0  # s; over this the carrier faces, on average, the way it goes

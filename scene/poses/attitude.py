@@ -3,12 +3,12 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scene import rotation as so3
-from scene.calibration import Calibration, Mount
-from scene.imu import Inertial, imu_topics, read_inertial
-from scene.odometry import Guide
-from scene.recording import Recording
-from scene.trajectory import Trajectory
+from scene.poses import rotation as so3
+from scene.poses.calibration import Calibration, Mount
+from scene.poses.imu import Inertial, imu_topics, read_inertial
+from scene.poses.odometry import Guide
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import Recording
 
 _LEVEL_TIME = 0.2  # s; short, since a carrier sways
 _LONGEST_GAP = 2.0  # s without IMU samples

@@ -1,0 +1,1 @@
+"""Bore in, files out: meshes, planar tunnel, track, MJCF and manifest."""
