@@ -124,6 +124,14 @@ def measure_exactness(plan: st.TunnelPlan, config: ThroughputConfig, params: st.
     return reference.agreement(plan.lining(config.lining).segments, poses, np.concatenate(ranges))
 
 
+def _version(package: str) -> str | None:
+    """Version of a package; None where it runs from a checkout that was not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def environment_facts() -> dict[str, Any]:
     """Hardware and versions."""
     device = jax.devices()[0]
@@ -133,7 +141,7 @@ def environment_facts() -> dict[str, Any]:
         "n_devices": len(jax.devices()),
         "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "python": platform.python_version(),
-        **{name: metadata.version(name) for name in ("jax", "jaxlib", "flax", "numpy", "subterra-jax")},
+        **{name: _version(name) for name in ("jax", "jaxlib", "flax", "numpy", "subterra-jax")},
     }
 
 

@@ -16,6 +16,3 @@ def test_the_wheel_holds_the_simulator_and_its_tunnels_alone(tmp_path):
     tops = {name.split("/")[0] for name in names if ".dist-info" not in name}
     assert tops == {"subterra_jax"}
     assert any(name.startswith("subterra_jax/data/") and name.endswith(".npz") for name in names)
-    assert any(
-        "gymnasium.envs" in zipfile.ZipFile(wheel).read(n).decode() for n in names if n.endswith("entry_points.txt")
-    )

@@ -19,8 +19,8 @@ _MIN_TOP = 10
 _MIN_SEEN = 0.6  # of the sleepers that the median spacing asks for
 _SPACINGS = (0.45, 0.80)  # in use, m
 _RAIL_BAND = (0.60, 0.95)  # from the axis, m
-_RAIL_LOW = 0.12
-_RAIL_TOP = 0.015  # thickness of the top layer that the head's middle is taken from, m
+_RAIL_LOW, _RAIL_HIGH = 0.12, 0.40  # above the bed, m
+_HEAD_LAYER = 0.02  # above and below the most frequent height, m
 _MIN_RAIL = 0.5  # share of the metres along which a rail must be seen
 
 
@@ -44,12 +44,12 @@ class SeenRails:
     """Both rails.
 
     Attributes:
-        separation: Between the middles of the heads, m.
+        outer: Between the outer faces of the heads, m.
         centre: Of the track to the left of the axis, m.
         top: Above the bed, m.
     """
 
-    separation: float
+    outer: float
     centre: float
     top: float
 
@@ -155,12 +155,36 @@ def _find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) ->
     sides = []
     for side in (1, -1):
         across = side * lateral
-        band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < 0.4)
-        metres = np.unique(station[band].astype(int))
-        if len(metres) < _MIN_RAIL * max(np.ptp(station), 1.0):
+        band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < _RAIL_HIGH)
+        if len(np.unique(station[band].astype(int))) < _MIN_RAIL * max(np.ptp(station), 1.0):
             return None
-        top = float(np.percentile(height[band], 90))
-        head = band & (np.abs(height - top) < _RAIL_TOP)
-        sides.append((float(np.median(across[head])), float(np.median(height[head]))))
+        top = _mode(height[band])
+        head = band & (np.abs(height - top) < _HEAD_LAYER)
+        edge = _outer_edge(across[head])
+        if edge is None:
+            return None
+        sides.append((edge, float(np.median(height[head]))))
     (left, left_top), (right, right_top) = sides
     return SeenRails(left + right, (left - right) / 2, (left_top + right_top) / 2)
+
+
+def _mode(height: np.ndarray) -> float:
+    count, edges = np.histogram(height, np.arange(_RAIL_LOW, _RAIL_HIGH, 0.004))
+    return float(edges[np.convolve(count, np.ones(3), mode="same").argmax()] + 0.002)
+
+
+def _outer_edge(across: np.ndarray) -> float | None:
+    """Where the head's top falls to half its density, m.
+
+    The outer edge: on the inner one the side of the head is seen as well, and a middle would be drawn towards it.
+    """
+    step = 0.002
+    count, edges = np.histogram(across, np.arange(*_RAIL_BAND, step))
+    smooth, at = np.convolve(count, np.full(5, 0.2), mode="same"), edges[:-1] + step / 2
+    middle = float(np.median(across))
+    plateau = np.median(smooth[(at > middle) & (at < middle + 0.02)])
+    below = np.flatnonzero((at > middle + 0.02) & (smooth < plateau / 2))
+    if not len(below) or plateau <= 0:
+        return None
+    k = int(below[0])
+    return float(at[k - 1] + (smooth[k - 1] - plateau / 2) / (smooth[k - 1] - smooth[k]) * step)
