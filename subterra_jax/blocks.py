@@ -12,8 +12,10 @@ import numpy as np
 
 from subterra_jax.plan import Lining, TunnelPlan, Wall
 
-# Boxes are a little larger than their walls, so that float32 arithmetic on the device cannot shut a wall out of its box.
-BOX_MARGIN = 2e-4
+# Boxes are a little larger than their walls, so that rounding on the device cannot shut a wall out of its box: m.
+BOX_MARGIN = 1e-5
+# A robot never brings its LiDAR nearer to a wall than this: footprint radius less the motion of one step, m.
+LIDAR_GAP = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,14 +25,14 @@ class Blocks:
     Attributes:
         centre: Middle of each box, m, `(n_blocks, 2)`; exactly representable in float32.
         half: Half the long axis of each box as a vector, m, `(n_blocks, 2)`.
-        slimness: Half thickness of each box over its half length, `(n_blocks,)`.
-        offset: Vertices of each block from the middle of its box, m, `(n_blocks, m, 2)`; the last one repeated as padding.
+        thickness: Half the thickness of each box, m, `(n_blocks,)`.
+        offset: Vertices of each block from the middle of its box, m, `(n_blocks, m, 2)`; padded with the last one.
         station: Station of the middle of each block, m, `(n_blocks,)`.
     """
 
     centre: np.ndarray
     half: np.ndarray
-    slimness: np.ndarray
+    thickness: np.ndarray
     offset: np.ndarray
     station: np.ndarray
 
@@ -55,16 +57,48 @@ def _cuts(wall: Wall, clearance: np.ndarray, length: float, max_segments: int) -
     return cuts
 
 
-def _box(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Centre, half long axis and slimness of a thin box around a few vertices.
+def _lidded(vertex: np.ndarray, inward: float) -> np.ndarray:
+    """The inner hull of a piece of wall: its pockets and hollows closed with lids.
 
-    The thinnest box of a polygon lies along one of its hull's edges, so it is enough to try the directions between pairs
-    of vertices.
+    A beam from inside the tunnel can meet the piece only through this line, and what it meets behind a lid belongs to
+    the same piece; so it is enough that the box encloses the line. That keeps boxes thin where pockets are deep.
+
+    Args:
+        vertex: Vertices in the direction of growing station, `(k, 2)`, m.
+        inward: -1 for a left wall, whose inside is on its right; +1 for a right wall.
+
+    Returns:
+        Some of the vertices; all of them where a recess is deep.
+    """
+    hull: list[np.ndarray] = []
+    for point in vertex:
+        while len(hull) >= 2 and inward * _cross(hull[-1] - hull[-2], point - hull[-1]) >= 0.0:
+            hull.pop()
+        hull.append(point)
+    kept = np.stack(hull)
+    middle, half = 0.5 * (kept[1:] + kept[:-1]), 0.5 * (kept[1:] - kept[:-1])
+    depth = _distance_to_segment(vertex[:, None, :], middle, half).min(axis=1).max()
+    # Inside a wide and deep recess the LiDAR itself would look out through the lid.
+    roomy = depth > LIDAR_GAP and 2.0 * np.linalg.norm(half, axis=1).max() > 2.0 * LIDAR_GAP
+    return vertex if roomy else kept
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
+def _box(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Centre, half long axis and half thickness of a thin box around a few vertices.
+
+    The thinnest box of a polygon lies along one of its hull's edges, so it is enough to try the directions between
+    pairs of vertices.
     """
     first, second = np.triu_indices(len(vertex), k=1)
     edge = vertex[second] - vertex[first]
     size = np.linalg.norm(edge, axis=1)
-    direction = edge[size > 1e-9] / size[size > 1e-9, None]
+    # A file may repeat a vertex; a block of nothing else is a point, for which any direction will do.
+    edge, size = (edge[size > 1e-9], size[size > 1e-9]) if np.any(size > 1e-9) else (np.eye(2), np.ones(2))
+    direction = edge / size[:, None]
     normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
     across = vertex @ normal.T
     along = vertex @ direction.T
@@ -75,7 +109,7 @@ def _box(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     centre = middle.astype(np.float32).astype(np.float64)
     half_length = np.abs((vertex - centre) @ direction[best]).max() + BOX_MARGIN
     half_thickness = np.abs((vertex - centre) @ normal[best]).max() + BOX_MARGIN
-    return centre, half_length * direction[best], float(half_thickness / half_length)
+    return centre, half_length * direction[best], float(half_thickness)
 
 
 def _furniture_runs(furniture: np.ndarray, max_segments: int) -> list[np.ndarray]:
@@ -100,25 +134,28 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
         max_segments: Most segments in one block.
     """
     pieces: list[np.ndarray] = []
+    enclosed: list[np.ndarray] = []
     stations: list[float] = []
-    for wall in (lining.left, lining.right):
+    for wall, inward in ((lining.left, -1.0), (lining.right, 1.0)):
         centre = np.stack([np.interp(wall.station, plan.station, plan.centre[:, i]) for i in range(2)], axis=-1)
         for first, last in _cuts(wall, np.linalg.norm(wall.vertex - centre, axis=1), length, max_segments):
             pieces.append(wall.vertex[first : last + 1])
+            enclosed.append(_lidded(pieces[-1], inward))
             stations.append(0.5 * (wall.station[first] + wall.station[last]))
     for run in _furniture_runs(lining.furniture, max_segments):
         pieces.append(run)
+        enclosed.append(run)
         nearest = np.argmin(np.sum((plan.centre - run.mean(axis=0)) ** 2, axis=1))
         stations.append(float(plan.station[nearest]))
     order = np.argsort(stations, kind="stable")
     n_vertices = max(len(piece) for piece in pieces)
-    boxes = [_box(pieces[i]) for i in order]
+    boxes = [_box(enclosed[i]) for i in order]
     centre = np.stack([box[0] for box in boxes])
     padded = np.stack([np.pad(pieces[i], ((0, n_vertices - len(pieces[i])), (0, 0)), mode="edge") for i in order])
     return Blocks(
         centre=centre,
         half=np.stack([box[1] for box in boxes]),
-        slimness=np.array([box[2] for box in boxes]),
+        thickness=np.array([box[2] for box in boxes]),
         offset=padded - centre[:, None, :],
         station=np.asarray(stations)[order],
     )
@@ -164,8 +201,8 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
         ],
         axis=0,
     )
-    thickness = blocks.slimness[block] * np.linalg.norm(box_half, axis=1)
-    within = distance - thickness <= reach + slack[node]
+    # What hides behind a lid is at most a pocket further away than the box, never nearer.
+    within = distance - blocks.thickness[block] <= reach + slack[node]
     node, block = node[within], block[within]
     first = np.full(len(plan.station), len(blocks.centre) - 1)
     last = np.zeros(len(plan.station), int)

@@ -1,6 +1,6 @@
 """Dead reckoning that drifts: noise at every step and a bias that lasts an episode, on distance and on heading."""
 
-from __future__ import annotations
+import dataclasses
 
 import jax.numpy as jnp
 from flax import struct
@@ -77,4 +77,4 @@ def advance_odometry(
     """
     travelled = motion[0] * period * (1.0 + state.distance_bias) + params.distance_sigma * noise[0]
     turned = (motion[1] + state.heading_bias) * period + params.heading_sigma * noise[1]
-    return state.replace(distance=state.distance + travelled, heading=wrap(state.heading + turned))
+    return dataclasses.replace(state, distance=state.distance + travelled, heading=wrap(state.heading + turned))

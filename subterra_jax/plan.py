@@ -185,9 +185,9 @@ class _Fields:
     def wall(self, side: str, lining: str) -> Wall:
         field = f"{side}_{lining}"
         vertex = self.numbers(field, None, 2)
-        station = self.numbers(f"{side}_station_{lining}", len(vertex))
         if len(vertex) < 2:
             raise self.fail(field, f"needs at least 2 vertices, has {len(vertex)}")
+        station = self.numbers(f"{side}_station_{lining}", len(vertex))
         if np.any(np.diff(station) < 0.0):
             raise self.fail(f"{side}_station_{lining}", f"decreases at index {np.argmax(np.diff(station) < 0.0)}")
         return Wall(vertex, station)

@@ -1,7 +1,5 @@
 """Reward of the paper, Eq. 1, term by term."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float

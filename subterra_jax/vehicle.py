@@ -1,7 +1,5 @@
 """The robot: a unicycle that does exactly what it is told, and the walls it must not touch."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
@@ -56,7 +54,7 @@ def drive(
         period: How long it is held, s.
 
     Returns:
-        Position and heading afterwards. Speed 0 turns on the spot; yaw rate 0 is a straight line, without a division by 0.
+        Position and heading afterwards. Speed 0 turns on the spot; yaw rate 0 is a straight line, not a division by 0.
     """
     half_turn = 0.5 * command[1] * period
     small = jnp.abs(half_turn) < 1e-2
@@ -79,8 +77,8 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
         Distance, m; exact up to 0.8 m, and never below 0.8 m where the truth is beyond.
     """
     window = tunnel.contact_first[node_at(tunnel, station)] + jnp.arange(tunnel.n_contact)
-    from_robot = (tunnel.box_centre[window] - position)[:, None, :] + tunnel.vertices[window]
-    x0, y0, x1, y1 = from_robot[:, :-1, 0], from_robot[:, :-1, 1], from_robot[:, 1:, 0], from_robot[:, 1:, 1]
+    vertex = (tunnel.box[:2, window].T - position)[:, :, None] + tunnel.wall[window]
+    x0, y0, x1, y1 = vertex[:, 0, :-1], vertex[:, 1, :-1], vertex[:, 0, 1:], vertex[:, 1, 1:]
     edge_x, edge_y = x1 - x0, y1 - y0
     size = edge_x * edge_x + edge_y * edge_y
     # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.

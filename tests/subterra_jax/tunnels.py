@@ -93,9 +93,7 @@ def _with_pockets(station: np.ndarray, offset: np.ndarray, length: float) -> tup
         inside |= (station >= a - 1e-6) & (station <= b + 1e-6)
     a_offset, b_offset = np.interp(starts, station, offset), np.interp(ends, station, offset)
     corner_station = np.stack([starts, starts, ends, ends], axis=1).ravel()
-    corner_offset = np.stack(
-        [a_offset, a_offset + POCKET_DEPTH, b_offset + POCKET_DEPTH, b_offset], axis=1
-    ).ravel()
+    corner_offset = np.stack([a_offset, a_offset + POCKET_DEPTH, b_offset + POCKET_DEPTH, b_offset], axis=1).ravel()
     all_station = np.concatenate([station[~inside], corner_station])
     all_offset = np.concatenate([offset[~inside], corner_offset])
     order = np.argsort(all_station, kind="stable")

@@ -1,0 +1,150 @@
+"""Many environments at once: reset by themselves with a fresh draw, and step in one compiled program."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from subterra_jax.env import EnvParams, Info, State, TraverseEnv
+
+Obs = Float[Array, "n_envs n_obs"]
+Policy = Callable[[PRNGKeyArray, Obs], Float[Array, "n_envs 2"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class AutoReset:
+    """A batch of environments in which a finished one begins anew within the same step.
+
+    One key serves the whole batch, and what environment i draws from it does not depend on how many there are.
+
+    Attributes:
+        env: The environment.
+        params_axes: `in_axes` of the params for `vmap`: None (the default) shares one set of params, 0 gives each
+            environment its own, a pytree of the two mixes them.
+    """
+
+    env: TraverseEnv
+    params_axes: Any = None
+
+    def reset(self, key: PRNGKeyArray, params: EnvParams, n_envs: int) -> tuple[Obs, State]:
+        """Begin an episode in each of `n_envs` environments.
+
+        Returns:
+            Observations `(n_envs, n_obs)` and the batched state.
+        """
+        start_key, scan_key = jax.random.split(key)
+        state = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
+        noise = self.env.draw_step(scan_key, (n_envs,), params)
+        return self._vmap(self.env.observe, 2)(state, noise.ranges, params), state
+
+    def step(
+        self, key: PRNGKeyArray, state: State, action: Float[Array, "n_envs 2"], params: EnvParams
+    ) -> tuple[Obs, State, Float[Array, "n_envs"], Bool[Array, "n_envs"], Bool[Array, "n_envs"], Info]:
+        """Step every environment; begin a new episode, with a fresh draw, in those that finished.
+
+        Args:
+            key: One key for the whole batch.
+            state: Batched state.
+            action: Speeds (m/s) and yaw rates (rad/s).
+            params: The task; batched as `params_axes` says.
+
+        Returns:
+            As `TraverseEnv.step`, batched. Observation and state are those of the new episode where one began. Reward,
+            flags and info are those of the step taken; `info["final_observation"]` is what that step's own state looks
+            like, and equals the observation wherever no episode ended.
+        """
+        step_key, start_key = jax.random.split(key)
+        n_envs = action.shape[0]
+        noise = self.env.draw_step(step_key, (n_envs,), params)
+        stepped, reward, terminated, truncated, info = self._vmap(self.env.advance, 3)(
+            state, action, noise.odometry, params
+        )
+        begun = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
+        done = terminated | truncated
+        merged = jax.tree.map(
+            lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), begun, stepped
+        )
+        obs = self._vmap(self.env.observe, 2)(merged, noise.ranges, params)
+        info["final_observation"] = self._final(done, stepped, noise.ranges, params, obs)
+        return obs, merged, reward, terminated, truncated, info
+
+    def _final(
+        self, done: Bool[Array, "n_envs"], stepped: State, noise: Float[Array, "n_envs b"], params: EnvParams, obs: Obs
+    ) -> Obs:
+        """Observations of the states before any reset.
+
+        Only finished environments are cast again: a few at a time in the usual step, and everybody in the rare step in
+        which more have finished.
+        """
+        n_envs = done.shape[0]
+        n_few = max(1, n_envs // 32)
+
+        def few() -> Obs:
+            (index,) = jnp.nonzero(done, size=n_few, fill_value=n_envs)
+            rows = lambda tree: jax.tree.map(lambda leaf: jnp.take(leaf, index, axis=0, mode="clip"), tree)  # noqa: E731
+            some = jax.tree.map(
+                lambda axis, part: part if axis is None else rows(part),
+                self.params_axes,
+                params,
+                is_leaf=lambda axis: axis is None,
+            )
+            return obs.at[index].set(self._vmap(self.env.observe, 2)(rows(stepped), rows(noise), some), mode="drop")
+
+        def everybody() -> Obs:
+            again = self._vmap(self.env.observe, 2)(stepped, noise, params)
+            return jnp.where(done[:, None], again, obs)
+
+        n_done = jnp.sum(done)
+        branch = jnp.where(n_done == 0, 0, jnp.where(n_done <= n_few, 1, 2))
+        return jax.lax.switch(branch, [lambda: obs, few, everybody])
+
+    def _vmap(self, function: Callable[..., Any], n_batched: int) -> Callable[..., Any]:
+        """`function` over a batch: its first `n_batched` arguments are batched, the params as `params_axes` says."""
+        return jax.vmap(function, in_axes=(*[0] * n_batched, self.params_axes))
+
+
+def rollout(
+    env: AutoReset,
+    policy: Policy,
+    key: PRNGKeyArray,
+    obs: Obs,
+    state: State,
+    params: EnvParams,
+    n_steps: int,
+) -> tuple[Obs, State, dict[str, Any]]:
+    """Let a policy drive for a number of steps, in one `lax.scan`.
+
+    Args:
+        env: The batch.
+        policy: Key and observations to actions `(n_envs, 2)`; pure.
+        key: Source of the policy's and the environments' randomness.
+        obs: Observations to begin with.
+        state: State to begin with.
+        params: The task.
+        n_steps: Steps to take.
+
+    Returns:
+        Last observations, last state, and every step's `obs` (before the step), `action`, `reward`, `terminated`,
+        `truncated` and `info`, each with the steps as first axis.
+    """
+
+    def one_step(carry: tuple[Obs, State], step_key: PRNGKeyArray) -> tuple[tuple[Obs, State], dict[str, Any]]:
+        obs, state = carry
+        policy_key, env_key = jax.random.split(step_key)
+        action = policy(policy_key, obs)
+        next_obs, state, reward, terminated, truncated, info = env.step(env_key, state, action, params)
+        record = {
+            "obs": obs,
+            "action": action,
+            "reward": reward,
+            "terminated": terminated,
+            "truncated": truncated,
+            "info": info,
+        }
+        return (next_obs, state), record
+
+    (obs, state), records = jax.lax.scan(one_step, (obs, state), jax.random.split(key, n_steps))
+    return obs, state, records

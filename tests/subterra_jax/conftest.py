@@ -1,0 +1,36 @@
+"""Shapes and dtypes in the simulator's annotations are checked while its tests run."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+from tests.subterra_jax import checking, tunnels
+
+# A no-op where another room's tests have imported the simulator before.
+with install_import_hook("subterra_jax", f"{checking.__name__}.check_functions"):
+    from subterra_jax.plan import TunnelPlan, load_tunnel
+
+
+@pytest.fixture(scope="session")
+def plan_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[dict[str, Any]], TunnelPlan]:
+    """Arrays of a tunnel, through a file, to what the simulator reads."""
+    folder = tmp_path_factory.mktemp("tunnels")
+
+    def write_and_load(arrays: dict[str, Any]) -> TunnelPlan:
+        path: Path = tunnels.write_tunnel(folder / f"{len(list(folder.iterdir()))}.npz", arrays)
+        return load_tunnel(path)
+
+    return write_and_load
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compile_once(tmp_path_factory: pytest.TempPathFactory):
+    """The same program is compiled once for all tests of this folder."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)

@@ -1,0 +1,86 @@
+"""Tunnel files: what is wrong with a broken one is said with its file and its field."""
+
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import reference
+from tests.subterra_jax import tunnels
+
+
+@pytest.fixture
+def arrays():
+    return tunnels.tunnel_arrays(tunnels.s_bend(100.0, 100.0, lead=10.0), roughness=0.01)
+
+
+def test_the_packaged_tunnel_has_its_length_and_linings():
+    plan = st.load_tunnel()
+    assert plan.length == pytest.approx(351.0, abs=1.0)
+    assert {"smooth", "pockets"} <= set(plan.linings)
+    assert plan.provenance in ("measured", "simulated")
+
+
+@pytest.mark.parametrize(
+    ("field", "spoil"),
+    [
+        ("schema", lambda a: "subterra.tunnel/99"),
+        ("name", lambda a: None),
+        ("provenance", lambda a: 3.0),
+        ("station", lambda a: a + 1.0),
+        ("station", lambda a: a**1.01),
+        ("centre", lambda a: a[:-1]),
+        ("centre", lambda a: np.where(np.arange(len(a))[:, None] == 7, np.nan, a)),
+        ("tangent", lambda a: 2.0 * a),
+        ("elevation", lambda a: None),
+        ("half_width", lambda a: -a),
+        ("lidar_height", lambda a: np.zeros(2)),
+        ("lining", lambda a: np.zeros(2)),
+        ("left_smooth", lambda a: None),
+        ("left_smooth", lambda a: a[:1]),
+        ("right_pockets", lambda a: a[:, :1]),
+        ("right_station_smooth", lambda a: a[::-1]),
+        ("left_station_pockets", lambda a: a[1:]),
+        ("furniture_pockets", lambda a: np.zeros((3, 3))),
+        ("left_pockets", lambda a: a.astype(str)),
+    ],
+)
+def test_a_broken_field_is_named_together_with_its_file(tmp_path, arrays, field, spoil):
+    spoilt = spoil(arrays[field])
+    arrays.pop(field)
+    if spoilt is not None:
+        arrays[field] = spoilt
+    path = tunnels.write_tunnel(tmp_path / "broken.npz", arrays)
+    with pytest.raises(st.TunnelError, match=rf"broken\.npz.*'{field}'"):
+        st.load_tunnel(path)
+
+
+def test_a_file_that_is_no_archive_or_not_there_is_named(tmp_path):
+    (tmp_path / "text.npz").write_text("not an archive")
+    for name in ("text.npz", "absent.npz"):
+        with pytest.raises(st.TunnelError, match=name):
+            st.load_tunnel(tmp_path / name)
+
+
+def test_an_unknown_lining_is_refused_with_the_ones_there_are(plan_of, arrays):
+    with pytest.raises(st.TunnelError, match="smooth, pockets"):
+        plan_of(arrays).lining("velvet")
+
+
+@pytest.mark.parametrize("lining", ["smooth", "pockets"])
+def test_a_slice_keeps_the_walls_and_opens_its_ends(plan_of, arrays, lining):
+    whole = plan_of(arrays)
+    piece = whole.slice(20.1, 45.3)
+    assert piece.length == pytest.approx(45.3)
+    assert piece.station[0] == 0.0
+    poses = reference.random_poses(piece, 300, np.random.default_rng(0))
+    inside = reference.scan(piece.lining(lining).segments, poses.position, poses.heading)
+    before = reference.scan(whole.lining(lining).segments, poses.position, poses.heading)
+    # Where the piece has a wall it is the old one; through its mouths a beam sees nothing.
+    np.testing.assert_allclose(inside[inside < 30.0], before[inside < 30.0], atol=1e-9)
+    assert ((inside == 30.0) & (before < 30.0)).any()
+
+
+@pytest.mark.parametrize(("start", "length"), [(-1.0, 10.0), (95.0, 10.0), (10.0, 0.0)])
+def test_a_slice_beyond_the_tunnel_is_refused(plan_of, arrays, start, length):
+    with pytest.raises(ValueError, match="does not lie within"):
+        plan_of(arrays).slice(start, length)
