@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 export XLA_PYTHON_CLIENT_PREALLOCATE ?= false
 
-.PHONY: demo test test-slow lint setup clean help
+.PHONY: demo test test-slow lint setup tunnels clean help
 
 help:            ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## */\t/' | expand -t 16
@@ -33,6 +33,16 @@ $(STAMP): pyproject.toml
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/pip install --quiet --disable-pip-version-check --constraint .ci/constraints.txt --editable '.[dev]'
 	@touch $@
+
+SHARED ?= ../shared
+tunnels: $(STAMP)  ## make the packaged tunnels again, byte for byte; SHARED names the folder that holds data/metro_asbuilt
+	$(BIN)/python -m scene.survey --length 351 --seed 0 --out build/survey-351
+	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
+		--provenance simulated --name subterra-351 --out build/subterra-351
+	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --out build/metro-asbuilt
+	for name in subterra-351 metro-asbuilt; do \
+		cp build/$$name/tunnel.npz subterra_jax/data/$$name.npz && cp build/$$name/manifest.json subterra_jax/data/$$name.json; \
+	done
 
 clean:           ## remove what was built
 	rm -rf $(VENV) build dist out *.egg-info

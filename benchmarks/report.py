@@ -98,7 +98,7 @@ def _odometry_sentence(odometry: dict[str, Any]) -> str:
         return f"Without poses, by LiDAR odometry alone, no bore came out: {odometry['failure']}"
     return (
         "Without poses, by LiDAR odometry alone, started at the true pose and not aligned: centreline RMSE "
-        f"{odometry['centreline_rmse']:.2f} m, length error {odometry['length_error']:+.2f} m, "
+        f"{odometry['centreline_rmse']:.3f} m, length error {odometry['length_error']:+.2f} m, "
         f"width RMSE {100 * odometry['width_rmse']:.1f} cm. A smooth bore hardly constrains motion along its axis."
     )
 

@@ -12,7 +12,7 @@ import numpy as np
 from subterra_jax.errors import TunnelError
 
 SCHEMA = "subterra.tunnel/1"
-PACKAGED = "subterra-351.npz"
+PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,7 +197,7 @@ def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
     """Read and check a `tunnel.npz`.
 
     Args:
-        path: The file; None reads the tunnel packaged with Subterra.
+        path: The file, or the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); None is the first of those.
 
     Returns:
         The tunnel with every lining variant; `Tunnel.from_plan` makes it ready for the device.
@@ -205,10 +205,12 @@ def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
     Raises:
         TunnelError: The file cannot be read, or a field is missing or wrong; the message names both.
     """
-    if path is None:
-        with resources.as_file(resources.files("subterra_jax") / "data" / PACKAGED) as packaged:
+    name = PACKAGED[0] if path is None else str(path)
+    if name in PACKAGED:
+        with resources.as_file(resources.files("subterra_jax") / "data" / f"{name}.npz") as packaged:
             return load_tunnel(packaged)
-    fields = _Fields(Path(path))
+    path = Path(name)
+    fields = _Fields(path)
     if fields.text("schema") != SCHEMA:
         raise fields.fail("schema", f"must be {SCHEMA!r}, is {fields.text('schema')!r}")
     station = fields.numbers("station", None)

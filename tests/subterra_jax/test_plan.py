@@ -84,3 +84,10 @@ def test_a_slice_keeps_the_walls_and_opens_its_ends(plan_of, arrays, lining):
 def test_a_slice_beyond_the_tunnel_is_refused(plan_of, arrays, start, length):
     with pytest.raises(ValueError, match="does not lie within"):
         plan_of(arrays).slice(start, length)
+
+
+def test_both_packaged_tunnels_load_by_name():
+    assert st.load_tunnel().name == st.load_tunnel("subterra-351").name == "subterra-351"
+    metro = st.load_tunnel("metro-asbuilt")
+    assert metro.provenance == "measured"
+    assert metro.length == pytest.approx(1283.7, abs=0.2)
