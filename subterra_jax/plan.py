@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
@@ -193,6 +194,12 @@ class _Fields:
         return Wall(vertex, station)
 
 
+def tunnel_file(path: str | Path | None) -> Traversable:
+    """The file that a path, the name of a packaged tunnel, or None (the default one) stands for."""
+    name = PACKAGED[0] if path is None else str(path)
+    return resources.files("subterra_jax") / "data" / f"{name}.npz" if name in PACKAGED else Path(name)
+
+
 def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
     """Read and check a `tunnel.npz`.
 
@@ -205,11 +212,11 @@ def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
     Raises:
         TunnelError: The file cannot be read, or a field is missing or wrong; the message names both.
     """
-    name = PACKAGED[0] if path is None else str(path)
-    if name in PACKAGED:
-        with resources.as_file(resources.files("subterra_jax") / "data" / f"{name}.npz") as packaged:
-            return load_tunnel(packaged)
-    path = Path(name)
+    with resources.as_file(tunnel_file(path)) as file:
+        return _read(file)
+
+
+def _read(path: Path) -> TunnelPlan:
     fields = _Fields(path)
     if fields.text("schema") != SCHEMA:
         raise fields.fail("schema", f"must be {SCHEMA!r}, is {fields.text('schema')!r}")

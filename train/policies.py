@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from importlib import metadata, resources
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 import subterra_jax as st
-from subterra_jax.plan import PACKAGED
+from subterra_jax.plan import tunnel_file
 from train import checkpoint, normalize
 from train.errors import CheckpointError, ConfigError
 from train.networks import Layout, Networks, Policy
@@ -46,7 +46,7 @@ def open_world(task: str, tunnel: Path | None, lining: str) -> World:
         raise ConfigError(f"unknown task {task!r}; there are {', '.join(st.TASKS)}")
     plan = st.load_tunnel(tunnel)
     env, params = st.make(task, tunnel=plan, lining=lining)
-    content = (resources.files("subterra_jax") / "data" / PACKAGED if tunnel is None else tunnel).read_bytes()
+    content = tunnel_file(tunnel).read_bytes()
     return World(
         task,
         env,
