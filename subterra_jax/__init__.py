@@ -4,9 +4,10 @@ import importlib.util
 
 from subterra_jax import batch
 from subterra_jax.batch import AutoReset, rollout
-from subterra_jax.env import EnvParams, State, TraverseEnv
+from subterra_jax.env import TraverseEnv
 from subterra_jax.errors import SubterraError, TunnelError
 from subterra_jax.plan import TunnelPlan, load_tunnel
+from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import TASKS, make
 from subterra_jax.tunnel import Tunnel
 

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.env import EnvParams, Info, State, TraverseEnv
+from subterra_jax.env import Info, TraverseEnv
+from subterra_jax.state import EnvParams, State
 
 Obs = Float[Array, "n_envs n_obs"]
 Policy = Callable[[PRNGKeyArray, Obs], Float[Array, "n_envs 2"]]

@@ -77,10 +77,17 @@ def _lidded(vertex: np.ndarray, inward: float) -> np.ndarray:
         hull.append(point)
     kept = np.stack(hull)
     middle, half = 0.5 * (kept[1:] + kept[:-1]), 0.5 * (kept[1:] - kept[:-1])
-    depth = _distance_to_segment(vertex[:, None, :], middle, half).min(axis=1).max()
+    depth = distance_to_segment(vertex[:, None, :], middle, half).min(axis=1).max()
     # Inside a wide and deep recess the LiDAR itself would look out through the lid.
     roomy = depth > LIDAR_GAP and 2.0 * np.linalg.norm(half, axis=1).max() > 2.0 * LIDAR_GAP
     return vertex if roomy else kept
+
+
+def distance_to_segment(point: np.ndarray, middle: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Distance from points to segments `middle ± half`, all `(..., 2)`."""
+    from_middle = point - middle
+    along = np.sum(from_middle * half, axis=-1) / np.maximum(np.sum(half * half, axis=-1), 1e-12)
+    return np.linalg.norm(from_middle - np.clip(along, -1.0, 1.0)[..., None] * half, axis=-1)
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> float:
@@ -161,52 +168,13 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
     )
 
 
-def _distance_to_segment(point: np.ndarray, middle: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Distance from points to segments `middle ± half`, all `(..., 2)`."""
-    from_middle = point - middle
-    along = np.sum(from_middle * half, axis=-1) / np.maximum(np.sum(half * half, axis=-1), 1e-12)
-    return np.linalg.norm(from_middle - np.clip(along, -1.0, 1.0)[..., None] * half, axis=-1)
-
-
-def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray, int]:
-    """For each node of the chainage grid, the blocks within reach of a robot near that node.
-
-    Args:
-        plan: The tunnel, for its chainage grid.
-        blocks: Its blocks.
-        reach: Distance that the window must cover, m, wherever across the tunnel the robot is and up to half a grid
-            step along it; beyond a mouth, up to 0.5 m outside.
-
-    Returns:
-        First block of each node's window `(n,)`, and the number of blocks in a window, the same for all.
-    """
-    spacing = plan.station[1] - plan.station[0]
-    slack = np.full(len(plan.station), 0.6 * spacing + 0.01)
-    slack[[0, -1]] += 0.5
-    normal = np.stack([-plan.tangent[:, 1], plan.tangent[:, 0]], axis=-1)
-    across = plan.half_width[:, None] * normal
-    node, block = np.nonzero(
-        np.linalg.norm(plan.centre[:, None, :] - blocks.centre[None, :, :], axis=-1)
-        < reach + slack.max() + plan.half_width.max() + np.linalg.norm(blocks.half, axis=1)[None, :] * 1.5
+def padded(blocks: Blocks, count: int) -> Blocks:
+    """At least `count` blocks: the missing ones are points too far away to be seen."""
+    missing = max(0, count - len(blocks.centre))
+    return Blocks(
+        centre=np.pad(blocks.centre, ((0, missing), (0, 0)), constant_values=1e6),
+        half=np.pad(blocks.half, ((0, missing), (0, 0))),
+        thickness=np.pad(blocks.thickness, (0, missing)),
+        offset=np.pad(blocks.offset, ((0, missing), (0, 0), (0, 0))),
+        station=np.pad(blocks.station, (0, missing), constant_values=np.inf),
     )
-    centre, half = plan.centre[node], across[node]
-    box_centre, box_half = blocks.centre[block], blocks.half[block]
-    # Two segments that do not cross are nearest at an end of one of them.
-    distance = np.min(
-        [
-            _distance_to_segment(centre + half, box_centre, box_half),
-            _distance_to_segment(centre - half, box_centre, box_half),
-            _distance_to_segment(box_centre + box_half, centre, half),
-            _distance_to_segment(box_centre - box_half, centre, half),
-        ],
-        axis=0,
-    )
-    # What hides behind a lid is at most a pocket further away than the box, never nearer.
-    within = distance - blocks.thickness[block] <= reach + slack[node]
-    node, block = node[within], block[within]
-    first = np.full(len(plan.station), len(blocks.centre) - 1)
-    last = np.zeros(len(plan.station), int)
-    np.minimum.at(first, node, block)
-    np.maximum.at(last, node, block)
-    size = int(np.clip(np.max(last - first) + 1, 1, len(blocks.centre)))
-    return np.clip(first, 0, len(blocks.centre) - size), size

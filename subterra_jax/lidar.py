@@ -13,6 +13,8 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.tunnel import Tunnel, node_at
 
+NOTHING = np.int32(2**31 - 1)
+
 
 @struct.dataclass
 class LidarParams:
@@ -72,6 +74,9 @@ def candidates(
     With m the middle of a box and e its half axis, both from the LiDAR, a line along d crosses the box if
     |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams share.
 
+    Blocks half a window apart are never both within reach along one beam, so that the two halves of the window are
+    folded into one before the nearest are sought.
+
     Args:
         tunnel: The tunnel.
         first: First block of the window.
@@ -82,40 +87,64 @@ def candidates(
         Block numbers, nearest box first. A beam that enters fewer boxes gets arbitrary blocks for the rest, which does
         no harm: a hit on any wall is a hit.
     """
-    n_beams, none = direction.shape[0], jnp.int32(2**31 - 1)
-    number = jnp.arange(tunnel.n_scan, dtype=jnp.int32)[:, None]
-    box = lax.dynamic_slice_in_dim(tunnel.box, first, tunnel.n_scan, axis=1)[:, :, None]
-    m_x, m_y, thickness = box[0] - position[0], box[1] - position[1], box[4]
-    turn = m_x * box[3] - m_y * box[2]
-    # With e turned so that m × e ≥ 0, the sign of d × e tells whether the crossing lies ahead or behind.
-    e_x, e_y = box[2] * jnp.sign(turn), box[3] * jnp.sign(turn)
-    to_face = jnp.maximum(jnp.abs(turn) - thickness * jnp.sqrt(e_x * e_x + e_y * e_y), 0.0)
-    # Looking along a wall, from between the two faces of its box, one may meet it ahead or behind.
-    least = jnp.where(to_face > 0.0, 0.0, -jnp.inf)
-
+    n_beams, n_half = direction.shape[0], tunnel.n_scan // 2
+    n_bits = (tunnel.n_scan - 1).bit_length()
     # Opposite beams share a line, and so everything but its sense.
     lines = direction if n_beams % 2 else direction[: n_beams // 2]
-    d_x, d_y = lines[None, :, 0], lines[None, :, 1]
-    beside = jnp.abs(d_x * m_y - d_y * m_x)
-    facing = d_x * e_y - d_y * e_x
-    crosses = beside <= jnp.abs(facing) + thickness
-    distance = to_face / (jnp.abs(facing) + 1e-20)
-
-    # Distances are not negative, so their bits sort like integers, and the last bits can carry the block's number: one
-    # minimum finds the nearest box and which it is.
-    n_bits = max(1, (tunnel.n_scan - 1).bit_length())
-    key = lax.bitcast_convert_type(distance, jnp.int32) & jnp.int32(-(1 << n_bits)) | number
-    senses = [facing] if n_beams % 2 else [facing, -facing]
+    box = lax.dynamic_slice_in_dim(tunnel.box, first, tunnel.n_scan, axis=1)
+    number = jnp.arange(tunnel.n_scan, dtype=jnp.int32)
+    near = _entries(box[:, :n_half], number[:n_half], n_bits, position, lines)
+    far = _entries(box[:, n_half:], number[n_half:], n_bits, position, lines)
     nearest = []
-    for sense in senses:
-        rest = jnp.where(crosses & (sense > least), key, none)
+    for sense in range(1 if n_beams % 2 else 2):
+        rest = jnp.minimum(near[sense], far[sense])
         found = []
         for _ in range(tunnel.n_candidates):
             found.append(jnp.min(rest, axis=0))
-            rest = jnp.where(rest > found[-1], rest, none)
+            rest = jnp.where(rest > found[-1], rest, NOTHING)
         nearest.append(jnp.stack(found, axis=-1))
     block = first + (jnp.concatenate(nearest) & jnp.int32((1 << n_bits) - 1))
     return jnp.minimum(block, tunnel.box.shape[1] - 1)
+
+
+def _entries(
+    box: Float[Array, "6 k"],
+    number: Int[Array, "k"],
+    n_bits: int,
+    position: Float[Array, "2"],
+    lines: Float[Array, "m 2"],
+) -> tuple[Int[Array, "k m"], Int[Array, "k m"]]:
+    """For each box and line, the distance of the crossing and the box's number in one sortable integer.
+
+    Args:
+        box: Boxes, as in `Tunnel`.
+        number: Their numbers.
+        n_bits: Bits that a number takes.
+        position: Origin of the lines, m.
+        lines: Their unit vectors.
+
+    Returns:
+        Crossings ahead, and crossings behind; `NOTHING` where there is none. Distances lose their last bits to the
+        number, which makes them less by up to a few millimetres, never more.
+    """
+    box, number = box[:, :, None], number[:, None]
+    m_x, m_y, thickness = box[0] - position[0], box[1] - position[1], box[4]
+    turn = m_x * box[3] - m_y * box[2]
+    # With e turned so that m × e ≥ 0, the sign of d × e tells whether the crossing lies ahead or behind.
+    e_x, e_y = jnp.where(turn < 0.0, -box[2], box[2]), jnp.where(turn < 0.0, -box[3], box[3])
+    to_face = jnp.abs(turn) - thickness * box[5]
+    # Looking along a wall, from between the two faces of its box, one may meet it ahead or behind.
+    outside = to_face > 0.0
+    to_face, least = jnp.where(outside, to_face, 0.0), jnp.where(outside, 0.0, -jnp.inf)
+    d_x, d_y = lines[None, :, 0], lines[None, :, 1]
+    beside = jnp.abs(d_x * m_y - d_y * m_x)
+    facing = d_x * e_y - d_y * e_x
+    distance = to_face / (jnp.abs(facing) + 1e-20)
+    # Distances are not negative, so their bits sort like integers, and the last bits can carry the block's number: one
+    # minimum finds the nearest box and which it is.
+    key = lax.bitcast_convert_type(distance, jnp.int32) & jnp.int32(-(1 << n_bits)) | number
+    key = jnp.where(beside <= jnp.abs(facing) + thickness, key, NOTHING)
+    return jnp.where(facing > least, key, NOTHING), jnp.where(-facing > least, key, NOTHING)
 
 
 def hits(

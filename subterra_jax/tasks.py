@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.env import EnvParams, StartParams, TraverseEnv
+from subterra_jax.blocks import LIDAR_GAP
+from subterra_jax.env import TraverseEnv
 from subterra_jax.lidar import LidarParams
 from subterra_jax.odometry import OdometryParams
 from subterra_jax.plan import TunnelPlan
 from subterra_jax.reward import RewardParams
+from subterra_jax.state import EnvParams, StartParams
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, resolve
 from subterra_jax.vehicle import VehicleParams
 
@@ -91,8 +93,13 @@ def _as_array(leaf: Any) -> jax.Array:
 
 def _check(fields: dict[str, Any]) -> None:
     """Refuse, with the value, what the simulator would otherwise get silently wrong."""
-    n_beams, radius = fields["lidar"].n_beams, float(np.max(fields["vehicle"].radius))
+    n_beams, robot = fields["lidar"].n_beams, fields["vehicle"]
     if n_beams < 1:
         raise ValueError(f"n_beams must be at least 1, got {n_beams}")
-    if not 0.0 < radius <= CONTACT_REACH:
-        raise ValueError(f"radius must be in (0, {CONTACT_REACH}] m, got {radius}")
+    if not np.all((np.asarray(robot.radius) > 0.0) & (np.asarray(robot.radius) <= CONTACT_REACH)):
+        raise ValueError(f"radius must be in (0, {CONTACT_REACH}] m, got {robot.radius}")
+    if np.any(robot.radius - np.asarray(robot.speed_max) * robot.period < LIDAR_GAP - 1e-6):
+        raise ValueError(
+            f"radius {robot.radius} m less one step of {robot.speed_max} m/s for {robot.period} s must leave "
+            f"{LIDAR_GAP} m between LiDAR and walls"
+        )

@@ -7,8 +7,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.blocks import build_blocks, windows
+from subterra_jax.blocks import build_blocks, padded
 from subterra_jax.plan import TunnelPlan, load_tunnel
+from subterra_jax.windows import separation, windows
 
 CONTACT_REACH = 0.8
 
@@ -25,12 +26,12 @@ class Tunnel:
         grid: Centreline x, y (m), unit tangent x, y and half-width (m) at each node of the chainage grid.
         scan_first: First block of the window that a LiDAR near each node can see.
         contact_first: First block of the window that a robot near each node can touch.
-        box: Rows of the middle x, y of the box around each block, half its long axis as a vector x, y, and half its
-            thickness, m.
+        box: Rows of the middle x, y of the box around each block, half its long axis as a vector x, y, half its
+            thickness and half its length, m.
         wall: Row of x and row of y of the vertices of each block, from the middle of its box, m; the last one repeated
             as padding.
         reach: Largest range for which the scan window was made, m.
-        n_scan: Blocks in a scan window.
+        n_scan: Blocks in a scan window; even, and blocks half a window apart are further apart than `reach`.
         n_contact: Blocks in a contact window.
         n_candidates: Blocks in which a beam looks for its hit, nearest first.
     """
@@ -40,7 +41,7 @@ class Tunnel:
     grid: Float[Array, "n_nodes 5"]
     scan_first: Int[Array, "n_nodes"]
     contact_first: Int[Array, "n_nodes"]
-    box: Float[Array, "5 n_blocks"]
+    box: Float[Array, "6 n_blocks"]
     wall: Float[Array, "n_blocks 2 n_vertices"]
     reach: float = struct.field(pytree_node=False)
     n_scan: int = struct.field(pytree_node=False)
@@ -74,7 +75,11 @@ class Tunnel:
         """
         blocks = build_blocks(plan, plan.lining(lining), block_length, max_segments)
         scan_first, n_scan = windows(plan, blocks, reach)
+        n_scan = 2 * max(-(-n_scan // 2), separation(blocks, reach))
+        # A slice beyond the end would start earlier than asked for.
+        blocks = padded(blocks, int(scan_first.max()) + n_scan)
         contact_first, n_contact = windows(plan, blocks, CONTACT_REACH)
+        half_length = np.linalg.norm(blocks.half, axis=1)
         grid = np.concatenate([plan.centre, plan.tangent, plan.half_width[:, None]], axis=1)
         return cls(
             length=jnp.float32(plan.length),
@@ -82,7 +87,9 @@ class Tunnel:
             grid=jnp.asarray(grid, jnp.float32),
             scan_first=jnp.asarray(scan_first, jnp.int32),
             contact_first=jnp.asarray(contact_first, jnp.int32),
-            box=jnp.asarray(np.column_stack([blocks.centre, blocks.half, blocks.thickness]).T, jnp.float32),
+            box=jnp.asarray(
+                np.column_stack([blocks.centre, blocks.half, blocks.thickness, half_length]).T, jnp.float32
+            ),
             wall=jnp.asarray(blocks.offset.swapaxes(1, 2), jnp.float32),
             reach=reach,
             n_scan=n_scan,

@@ -14,7 +14,8 @@ class VehicleParams:
     Attributes:
         speed_max: Largest forward speed, m/s; the robot cannot reverse.
         yaw_rate_max: Largest yaw rate to either side, rad/s.
-        radius: Radius of the footprint, m; at most 0.8, the distance at which walls are looked for.
+        radius: Radius of the footprint, m; at most 0.8, the distance at which walls are looked for, and at least 0.2 m
+            more than the motion of one step, so that contact is noticed before the LiDAR is in a wall.
         period: Control period, s.
     """
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.env import StartParams
 from subterra_jax.lidar import LidarParams
 from subterra_jax.odometry import OdometryParams
+from subterra_jax.state import StartParams
 from subterra_jax.vehicle import VehicleParams
 
 INFO = {
@@ -204,6 +204,7 @@ def test_actions_that_are_not_numbers_leave_everything_finite(task, bad):
         ({"speed": 3.0}, "no field"),
         ({"lidar": LidarParams(n_beams=0)}, "n_beams must be at least 1, got 0"),
         ({"vehicle": VehicleParams(radius=1.5)}, "radius must be in"),
+        ({"vehicle": VehicleParams(speed_max=5.0)}, "must leave 0.2 m"),
         ({"lining": "velvet"}, "no lining 'velvet'"),
     ],
 )

@@ -101,9 +101,12 @@ def test_noise_has_its_size_stays_in_range_and_spares_beams_without_a_hit():
     assert noisy.max() <= 30.0
 
 
-@pytest.mark.parametrize("lining", ["pockets", "smooth"])
-def test_the_packaged_tunnel_is_exact_at_random_poses(lining):
-    check_exact(load_tunnel(), lining, 100_000 if lining == "pockets" else 20_000)
+@pytest.mark.parametrize(
+    ("name", "lining", "n_poses"),
+    [("subterra-351", "pockets", 100_000), ("subterra-351", "smooth", 20_000), ("metro-asbuilt", "smooth", 20_000)],
+)
+def test_the_packaged_tunnels_are_exact_at_random_poses(name, lining, n_poses):
+    check_exact(load_tunnel(name), lining, n_poses)
 
 
 @pytest.mark.parametrize("lining", ["pockets", "smooth"])
