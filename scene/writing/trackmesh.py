@@ -1,8 +1,7 @@
-"""Triangles of the track: one sleeper for all, rails and fastenings merged by stretch."""
+"""Shapes of the track: one sleeper for all, the boxes of a rail, fastenings merged by stretch."""
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 
 from scene.axis import Axis
 from scene.writing.track import RailProfile, Track, TrackConfig
@@ -29,26 +28,6 @@ def rail_boxes(profile: RailProfile) -> list[tuple[float, float, float]]:
         (profile.web_width, profile.foot_height, neck),
         (profile.head_width, neck, profile.height),
     ]
-
-
-def rails(track: Track, axis: Axis, start: float, end: float, step: float = 0.6) -> trimesh.Trimesh:
-    """Both rails between two stations, m, as three extruded boxes each."""
-    station = np.linspace(start, end, max(int(np.ceil((end - start) / step)), 1) + 1)
-    config = track.config
-    base = _elevation(track, axis, station) + config.pad_thickness
-    at = axis.at(station)
-    parts = []
-    for side in (1, -1):
-        for width, low, high in rail_boxes(config.rail):
-            edges = [
-                (side * config.rail_offset - width / 2, low),
-                (side * config.rail_offset + width / 2, low),
-                (side * config.rail_offset + width / 2, high),
-                (side * config.rail_offset - width / 2, high),
-            ]
-            ring = np.stack([_place(at, base, y, z) for y, z in edges], axis=1)
-            parts.append(_prism(ring))
-    return _merged(parts)
 
 
 def fastenings(track: Track, axis: Axis, start: float, end: float) -> trimesh.Trimesh | None:
@@ -80,19 +59,3 @@ def _merged(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
 
 def _elevation(track: Track, axis: Axis, station: np.ndarray) -> np.ndarray:
     return np.interp(station, axis.station, track.elevation)
-
-
-def _place(at: Axis, base: np.ndarray, across: float, above: float) -> Float[np.ndarray, "k 3"]:
-    points = at.position + across * at.lateral
-    points[:, 2] = base + above
-    return points
-
-
-def _prism(ring: Float[np.ndarray, "k 4 3"]) -> trimesh.Trimesh:
-    k = len(ring)
-    corner = np.arange(4 * k).reshape(k, 4)
-    a, b = corner[:-1], np.roll(corner[:-1], -1, axis=1)
-    c, d = corner[1:], np.roll(corner[1:], -1, axis=1)
-    sides = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
-    caps = [[0, 2, 1], [0, 3, 2], *(corner[-1][[[0, 1, 2], [0, 2, 3]]]).tolist()]
-    return trimesh.Trimesh(ring.reshape(-1, 3), np.concatenate([sides, caps]), process=False)

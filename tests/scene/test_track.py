@@ -1,10 +1,11 @@
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 
 from scene.errors import FitError
-from scene.writing import mesh, mjcf, planar, track, trackmesh
+from scene.writing import mesh, mjcf, planar, track
 from tests.scene.conftest import arc_bore
 
 
@@ -12,21 +13,29 @@ def test_sleepers_stand_every_60_cm_from_end_to_end():
     assert len(track.lay(arc_bore(length=60.0), track.TrackConfig()).sleeper_station) == 101
 
 
-def test_the_gauge_is_between_the_inner_faces_of_the_heads(bore):
-    """Measured on the triangles, 16 mm below the rail top; rail centres 1.435 m apart would give 1.362 m."""
+@pytest.fixture(scope="module")
+def written(bore, tmp_path_factory):
+    """The scene of the bore: its track, its counts and its file."""
+    folder = tmp_path_factory.mktemp("track")
     laid = track.lay(bore, track.TrackConfig())
-    rails = trackmesh.rails(laid, bore.axis, 0.0, bore.length)
-    assert rails.is_watertight
-    station = 10.2
-    at = bore.axis.at(np.array([station]))
-    base = np.interp(station, bore.station, laid.elevation)
-    top = base + 0.010 + 0.176
+    solid = mesh.build_solid(bore, pockets=False)
+    walls = planar.cut_walls(solid, bore, laid.elevation, 0.7)
+    lining = mesh.open_lining(mesh.as_trimesh(solid), bore)
+    return laid, mjcf.write_scene(folder, "x", bore, lining, walls, laid, mjcf.SceneConfig()), folder / "scene.xml"
+
+
+def test_the_gauge_is_between_the_inner_faces_of_the_heads(bore, written):
+    """Seen by rays in the compiled scene, 16 mm below the rail top; rail centres 1.435 m apart would give 1.362 m."""
+    laid, _, path = written
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    at = bore.axis.at(np.array([10.2]))
+    top = np.interp(10.2, bore.station, laid.elevation) + 0.010 + 0.176
     origin = np.array([*at.position[0, :2], top - 0.016])
-    hits = [
-        np.linalg.norm(rails.ray.intersects_location([origin], [side * at.lateral[0]], multiple_hits=False)[0] - origin)
-        for side in (1, -1)
-    ]
-    assert sum(hits) == pytest.approx(1.435, abs=0.001)
+    track_only, hit = np.array([0, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+    distances = [mujoco.mj_ray(model, data, origin, side * at.lateral[0], track_only, 1, -1, hit) for side in (1, -1)]
+    assert sum(distances) == pytest.approx(1.435, abs=0.002)
 
 
 def test_the_bed_is_the_flat_floor_and_sleepers_stand_out_of_it(bore):
@@ -57,12 +66,8 @@ def test_a_sleeper_too_near_the_wall_is_an_error_with_its_place():
         track.lay(arc_bore(half_width=1.3), track.TrackConfig(shoulder=0.0))
 
 
-def test_the_scene_file_names_every_sleeper_and_both_rails(bore, tmp_path):
-    laid = track.lay(bore, track.TrackConfig())
-    solid = mesh.build_solid(bore, pockets=False)
-    walls = planar.cut_walls(solid, bore, laid.elevation, 0.7)
-    lining = mesh.open_lining(mesh.as_trimesh(solid), bore)
-    count = mjcf.write_scene(tmp_path, "x", bore, lining, walls, laid, mjcf.SceneConfig())
-    text = (tmp_path / "scene.xml").read_text()
+def test_the_scene_file_names_every_sleeper_and_both_rails(written):
+    _, count, path = written
+    text = path.read_text()
     assert text.count('name="sleeper_') == count["sleepers"] == 41
     assert text.count('name="rail_left_') == text.count('name="rail_right_') > 0
