@@ -1,6 +1,5 @@
 """Position-only control: where a total station saw a prism, at about 3 Hz, without attitude."""
 
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.errors import RecordingError
-from scene.files import require_input
+from scene.poses.trajectory import read_rows
 
 _MIN_ROWS = 10
 _MIN_EXTENT = 3.0  # m; less than a bore is wide, and no heading comes of it
@@ -57,13 +56,7 @@ def load_control(path: Path) -> Control:
     Raises:
         RecordingError: Unreadable, malformed, too few rows, or all at one place.
     """
-    require_input(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an empty file is reported below
-            rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise RecordingError(f"{path}: not position control in TUM form ({error})") from error
+    rows = read_rows(path, "position control in TUM form")
     if rows.size and rows.shape[1] not in (4, 8):
         raise RecordingError(f"{path}: control has rows of 4 or 8 numbers (t x y z, TUM), found {rows.shape[1]}")
     if rows.size and not np.isfinite(rows).all():

@@ -57,19 +57,28 @@ def save_tum(trajectory: Trajectory, path: Path) -> None:
     np.savetxt(path, rows, fmt="%.9f")
 
 
+def read_rows(path: Path, kind: str) -> Float[np.ndarray, "n k"]:
+    """Rows of numbers, all of one length; an empty file has none.
+
+    Raises:
+        RecordingError: Missing, or not `kind`.
+    """
+    require_input(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # an empty file is reported by the caller
+            return np.loadtxt(path, dtype=np.float64, ndmin=2)
+    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
+        raise RecordingError(f"{path}: not {kind} ({error})") from error
+
+
 def load_tum(path: Path) -> Trajectory:
     """Reads `t x y z qx qy qz qw` rows; rows out of order are sorted, repeated times dropped.
 
     Raises:
         RecordingError: Unreadable, malformed, or positions without orientation.
     """
-    require_input(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an empty file is reported below
-            rows = np.loadtxt(path, dtype=np.float64, ndmin=2)
-    except (ValueError, UnicodeDecodeError, IsADirectoryError) as error:
-        raise RecordingError(f"{path}: not a TUM trajectory ({error})") from error
+    rows = read_rows(path, "a TUM trajectory")
     if rows.shape[1:] != (8,) or len(rows) < 2:
         raise RecordingError(f"{path}: a TUM trajectory has at least 2 rows of 8 numbers, found {rows.shape}")
     if not np.isfinite(rows).all():
