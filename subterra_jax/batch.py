@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from subterra_jax import lidar
 from subterra_jax.env import Info, TraverseEnv
 from subterra_jax.state import EnvParams, State
 
@@ -68,9 +69,30 @@ class AutoReset:
         merged = jax.tree.map(
             lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), begun, stepped
         )
-        obs = self._vmap(self.env.observe, 2)(merged, noise.ranges, params)
-        info["final_observation"] = self._final(done, stepped, noise.ranges, params, obs)
+        obs, info["final_observation"] = self._observe(done, merged, stepped, noise.ranges, params)
         return obs, merged, reward, terminated, truncated, info
+
+    def _observe(
+        self,
+        done: Bool[Array, "n_envs"],
+        merged: State,
+        stepped: State,
+        noise: Float[Array, "n_envs b"],
+        params: EnvParams,
+    ) -> tuple[Obs, Obs]:
+        """Observations after and before any reset.
+
+        The fused kernels take all scans in one go and skip those that nobody wants, of environments that have not
+        finished.
+        """
+        if self.params_axes is None and lidar.skips_unwanted(params.lidar):
+            both = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), (merged, noise), (stepped, noise))
+            wanted = jnp.concatenate([jnp.ones_like(done), done])
+            observe = jax.vmap(self.env.observe, in_axes=(0, 0, None, 0))
+            obs, final = jnp.split(observe(both[0], both[1], params, wanted), 2)
+            return obs, jnp.where(done[:, None], final, obs)
+        obs = self._vmap(self.env.observe, 2)(merged, noise, params)
+        return obs, self._final(done, stepped, noise, params, obs)
 
     def _final(
         self, done: Bool[Array, "n_envs"], stepped: State, noise: Float[Array, "n_envs b"], params: EnvParams, obs: Obs

@@ -177,17 +177,24 @@ class TraverseEnv:
         )
         return state, sum(terms.values(), jnp.zeros(())), terminated, truncated, info
 
-    def observe(self, state: State, noise: Float[Array, "n_beams"], params: EnvParams) -> Float[Array, "n_obs"]:
+    def observe(
+        self,
+        state: State,
+        noise: Float[Array, "n_beams"],
+        params: EnvParams,
+        wanted: Bool[Array, ""] | bool = True,
+    ) -> Float[Array, "n_obs"]:
         """The observation of a state.
 
         Args:
             state: The state.
             noise: Standard normal numbers for the ranges.
             params: The task.
+            wanted: Whether anybody will look at it; where not, the ranges may be anything.
 
         Returns:
             Noisy ranges (m), dead-reckoned distance (m) and heading (rad).
         """
-        ranges = lidar.scan(params.tunnel, state.position, state.heading, state.station, params.lidar)
+        ranges = lidar.scan(params.tunnel, state.position, state.heading, state.station, params.lidar, wanted)
         dead_reckoned = jnp.stack([state.odometry.distance, state.odometry.heading])
         return jnp.concatenate([lidar.add_noise(ranges, noise, params.lidar), dead_reckoned])

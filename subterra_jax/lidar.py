@@ -1,19 +1,18 @@
-"""Planar LiDAR: exact ranges to the wall polylines.
+"""Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch on a GPU, by kernels (`fused`)."""
 
-Walls come in short blocks, each in a thin box. Every beam is tested against all boxes of a window with a few products,
-and then meets the true segments of the few blocks that it enters first. Nothing about the walls is approximated; the
-cost depends neither on the tunnel's length nor, much, on its pockets.
-"""
+from collections.abc import Callable
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Bool, Float, Int
 
+from subterra_jax import cast, fused
 from subterra_jax.tunnel import Tunnel, node_at
-
-NOTHING = np.int32(2**31 - 1)
 
 
 @struct.dataclass
@@ -24,11 +23,13 @@ class LidarParams:
         range_max: Largest range, m. A beam that hits nothing reports exactly this.
         range_sigma: Standard deviation of the range noise, m.
         n_beams: Beams in one scan; fixes array shapes, so it is static.
+        fused: Use the fused kernels where there is an NVIDIA GPU for them; off, XLA does it there too.
     """
 
     range_max: float = 30.0
     range_sigma: float = 0.05
     n_beams: int = struct.field(pytree_node=False, default=16)
+    fused: bool = struct.field(pytree_node=False, default=True)
 
 
 def scan(
@@ -37,6 +38,7 @@ def scan(
     heading: Float[Array, ""],
     station: Float[Array, ""],
     params: LidarParams,
+    wanted: Bool[Array, ""] | bool = True,
 ) -> Float[Array, "n_beams"]:
     """True ranges of one scan: beam 0 straight ahead, the others counter-clockwise, evenly spaced over the whole turn.
 
@@ -46,141 +48,106 @@ def scan(
         heading: Its heading, rad.
         station: Its station, m; chooses the window of walls.
         params: The LiDAR.
+        wanted: Whether anybody will look at it; where not, the ranges may be anything.
 
     Returns:
         Ranges without noise, m, in [0, range_max]; exactly `range_max` where a beam meets no wall within it, as when it
         leaves through a mouth.
     """
     first = tunnel.scan_first[node_at(tunnel, station)]
+    take: Callable[..., Array] = _cast_fused if skips_unwanted(params) else _cast
+    return take(tunnel, position, heading, first, jnp.asarray(wanted), params)
+
+
+def skips_unwanted(params: LidarParams) -> bool:
+    """Whether a batch of scans is cast by the fused kernels, which cost little for scans that nobody wants."""
+    return params.fused and fused.supported(params.n_beams)
+
+
+def _cast(
+    tunnel: Tunnel,
+    position: Float[Array, "2"],
+    heading: Float[Array, ""],
+    first: Int[Array, ""],
+    wanted: Bool[Array, ""],
+    params: LidarParams,
+) -> Float[Array, "n_beams"]:
+    """`scan` of a known window, by XLA, wanted or not."""
+    del wanted
     direction = beam_directions(heading, params.n_beams)
-    block = candidates(tunnel, first, position, direction)
-    return jnp.minimum(jnp.min(hits(tunnel, block, position, direction), axis=-1), params.range_max)
+    return jnp.minimum(cast.nearest(tunnel, first, position, direction), params.range_max)
+
+
+# One scan is cast by XLA; a batch of them in one tunnel by the fused kernels, however many `vmap`s made it.
+_cast_fused = custom_vmap(_cast)
+
+
+@_cast_fused.def_vmap
+def _cast_batch(axis_size: int, batched: Any, tunnel: Tunnel, *rest: Any) -> tuple[Array, bool]:
+    rows, params = rest[:-1], rest[-1]
+    if any(jax.tree.leaves((batched[0], batched[-1]))):
+        by_xla: Callable[..., Array] = jax.vmap(_cast, in_axes=_axes(batched))
+        return by_xla(tunnel, *rows, params), True
+    return _cast_rows(tunnel, *_spread(rows, batched[1:-1], axis_size), params), True
+
+
+@custom_vmap
+def _cast_rows(
+    tunnel: Tunnel, position: Array, heading: Array, first: Array, wanted: Array, params: LidarParams
+) -> Float[Array, "n n_beams"]:
+    """Many scans in one tunnel."""
+
+    def by_kernel(
+        tunnel: Tunnel, position: Array, heading: Array, first: Array, wanted: Array, params: LidarParams
+    ) -> Array:
+        return fused.scan(
+            tunnel, position, heading, first, wanted, jnp.asarray(params.range_max), bearings(params.n_beams)
+        )
+
+    return lax.platform_dependent(
+        tunnel, position, heading, first, wanted, params, cuda=by_kernel, default=_cast_by_xla
+    )
+
+
+@_cast_rows.def_vmap
+def _cast_more_rows(axis_size: int, batched: Any, tunnel: Tunnel, *rest: Any) -> tuple[Array, bool]:
+    """A further batch axis becomes part of the rows; where tunnels differ, XLA does it."""
+    rows, params = rest[:-1], rest[-1]
+    if any(jax.tree.leaves((batched[0], batched[-1]))):
+        by_xla: Callable[..., Array] = jax.vmap(_cast_by_xla, in_axes=_axes(batched))
+        return by_xla(tunnel, *rows, params), True
+    flat = [row.reshape(-1, *row.shape[2:]) for row in _spread(rows, batched[1:-1], axis_size)]
+    return _cast_rows(tunnel, *flat, params).reshape(axis_size, -1, params.n_beams), True
+
+
+_cast_by_xla = jax.vmap(_cast, in_axes=(None, 0, 0, 0, 0, None))
+
+
+def _axes(batched: Any) -> tuple[Any, ...]:
+    """`in_axes` that say which arguments are batched."""
+    return tuple(jax.tree.map(lambda is_batched: 0 if is_batched else None, batched))
+
+
+def _spread(rows: tuple[Array, ...], batched: Any, axis_size: int) -> list[Array]:
+    """All rows with a batch axis."""
+    return [
+        row if is_batched else jnp.broadcast_to(row, (axis_size, *row.shape))
+        for row, is_batched in zip(rows, batched, strict=True)
+    ]
+
+
+def bearings(n_beams: int) -> Float[np.ndarray, "n_beams"]:
+    """Of the beams from the heading, rad."""
+    return np.arange(n_beams) * (2.0 * np.pi / n_beams)
 
 
 def beam_directions(heading: Float[Array, ""], n_beams: int) -> Float[Array, "n_beams 2"]:
     """Unit vectors of the beams in the tunnel frame."""
-    bearing = np.arange(n_beams) * (2.0 * np.pi / n_beams)
+    bearing = bearings(n_beams)
     # Rotating constants keeps more digits than adding a bearing to a heading in float32.
     cos, sin = jnp.cos(heading), jnp.sin(heading)
     along, across = np.float32(np.cos(bearing)), np.float32(np.sin(bearing))
     return jnp.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
-
-
-def candidates(
-    tunnel: Tunnel, first: Int[Array, ""], position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
-) -> Int[Array, "n_beams n_candidates"]:
-    """The blocks whose boxes each beam enters first.
-
-    With m the middle of a box and e its half axis, both from the LiDAR, a line along d crosses the box if
-    |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams share.
-
-    Blocks half a window apart are never both within reach along one beam, so that the two halves of the window are
-    folded into one before the nearest are sought.
-
-    Args:
-        tunnel: The tunnel.
-        first: First block of the window.
-        position: Position of the LiDAR, tunnel frame, m.
-        direction: Unit vectors of the beams; if their number is even, the second half must oppose the first.
-
-    Returns:
-        Block numbers, nearest box first. A beam that enters fewer boxes gets arbitrary blocks for the rest, which does
-        no harm: a hit on any wall is a hit.
-    """
-    n_beams, n_half = direction.shape[0], tunnel.n_scan // 2
-    n_bits = (tunnel.n_scan - 1).bit_length()
-    # Opposite beams share a line, and so everything but its sense.
-    lines = direction if n_beams % 2 else direction[: n_beams // 2]
-    box = lax.dynamic_slice_in_dim(tunnel.box, first, tunnel.n_scan, axis=1)
-    number = jnp.arange(tunnel.n_scan, dtype=jnp.int32)
-    near = _entries(box[:, :n_half], number[:n_half], n_bits, position, lines)
-    far = _entries(box[:, n_half:], number[n_half:], n_bits, position, lines)
-    nearest = []
-    for sense in range(1 if n_beams % 2 else 2):
-        rest = jnp.minimum(near[sense], far[sense])
-        found = []
-        for _ in range(tunnel.n_candidates):
-            found.append(jnp.min(rest, axis=0))
-            rest = jnp.where(rest > found[-1], rest, NOTHING)
-        nearest.append(jnp.stack(found, axis=-1))
-    block = first + (jnp.concatenate(nearest) & jnp.int32((1 << n_bits) - 1))
-    return jnp.minimum(block, tunnel.box.shape[1] - 1)
-
-
-def _entries(
-    box: Float[Array, "6 k"],
-    number: Int[Array, "k"],
-    n_bits: int,
-    position: Float[Array, "2"],
-    lines: Float[Array, "m 2"],
-) -> tuple[Int[Array, "k m"], Int[Array, "k m"]]:
-    """For each box and line, the distance of the crossing and the box's number in one sortable integer.
-
-    Args:
-        box: Boxes, as in `Tunnel`.
-        number: Their numbers.
-        n_bits: Bits that a number takes.
-        position: Origin of the lines, m.
-        lines: Their unit vectors.
-
-    Returns:
-        Crossings ahead, and crossings behind; `NOTHING` where there is none. Distances lose their last bits to the
-        number, which makes them less by up to a few millimetres, never more.
-    """
-    box, number = box[:, :, None], number[:, None]
-    m_x, m_y, thickness = box[0] - position[0], box[1] - position[1], box[4]
-    turn = m_x * box[3] - m_y * box[2]
-    # With e turned so that m × e ≥ 0, the sign of d × e tells whether the crossing lies ahead or behind.
-    e_x, e_y = jnp.where(turn < 0.0, -box[2], box[2]), jnp.where(turn < 0.0, -box[3], box[3])
-    to_face = jnp.abs(turn) - thickness * box[5]
-    # Looking along a wall, from between the two faces of its box, one may meet it ahead or behind.
-    outside = to_face > 0.0
-    to_face, least = jnp.where(outside, to_face, 0.0), jnp.where(outside, 0.0, -jnp.inf)
-    d_x, d_y = lines[None, :, 0], lines[None, :, 1]
-    beside = jnp.abs(d_x * m_y - d_y * m_x)
-    facing = d_x * e_y - d_y * e_x
-    distance = to_face / (jnp.abs(facing) + 1e-20)
-    # Distances are not negative, so their bits sort like integers, and the last bits can carry the block's number: one
-    # minimum finds the nearest box and which it is.
-    key = lax.bitcast_convert_type(distance, jnp.int32) & jnp.int32(-(1 << n_bits)) | number
-    key = jnp.where(beside <= jnp.abs(facing) + thickness, key, NOTHING)
-    return jnp.where(facing > least, key, NOTHING), jnp.where(-facing > least, key, NOTHING)
-
-
-def hits(
-    tunnel: Tunnel,
-    block: Int[Array, "n_beams n_blocks"],
-    position: Float[Array, "2"],
-    direction: Float[Array, "n_beams 2"],
-) -> Float[Array, "n_beams n_blocks"]:
-    """Distance at which each beam meets the walls of a few blocks.
-
-    Args:
-        tunnel: The tunnel.
-        block: The blocks to look at.
-        position: Position of the LiDAR, tunnel frame, m.
-        direction: Unit vectors of the beams.
-
-    Returns:
-        Distance to the nearest segment of each block, m; `inf` where the beam meets none.
-    """
-    m_x, m_y = tunnel.box[0, block] - position[0], tunnel.box[1, block] - position[1]
-    d_x, d_y = direction[:, 0, None], direction[:, 1, None]
-    # Middle first, then vertices from it: large coordinates cancel before anything is rounded.
-    middle_left, middle_ahead = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
-    x, y = tunnel.wall[block, 0], tunnel.wall[block, 1]
-    d_x, d_y = d_x[..., None], d_y[..., None]
-    left = middle_left[..., None] + (d_x * y - d_y * x)
-    ahead = middle_ahead[..., None] + (d_x * x + d_y * y)
-    a, b = left[..., :-1], left[..., 1:]
-    # A beam through the joint of two blocks must meet one of them although their ends are rounded apart.
-    joint = (2e-7 * (1.0 + jnp.abs(middle_ahead)))[..., None]
-    meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
-    share = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
-    distance = ahead[..., :-1] + share * (ahead[..., 1:] - ahead[..., :-1])
-    bits = lax.bitcast_convert_type(jnp.where(meets & (distance >= 0.0), distance, jnp.inf), jnp.int32)
-    # As integers, because a minimum of floats must look out for NaN, which costs a quarter of this function on a CPU.
-    return lax.bitcast_convert_type(jnp.min(bits, axis=-1), jnp.float32)
 
 
 def add_noise(

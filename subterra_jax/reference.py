@@ -134,7 +134,7 @@ def agreement(segments: np.ndarray, poses: Poses, ranges: np.ndarray, tolerance:
     rows = np.flatnonzero(off.any(axis=1))
     turned = [
         np.abs(ranges[rows] - scan(segments, poses.position[rows], poses.heading[rows], n_beams, turn=turn))
-        for turn in (-3e-6, -1e-6, 1e-6, 3e-6)
+        for turn in (-3e-6, -1e-6, -3e-7, 3e-7, 1e-6, 3e-6)
     ]
     excused = np.zeros_like(off)
     excused[rows] = off[rows] & (np.min(turned, axis=0) < tolerance)
