@@ -1,4 +1,4 @@
-"""The true centreline: straights, clothoids and arcs in plan, grades with vertical curves in profile."""
+"""The true centreline by arc length, and the frames on it."""
 
 from dataclasses import dataclass
 
@@ -65,42 +65,39 @@ class Alignment:
         )
 
 
-def draw_alignment(rng: np.random.Generator, length: float) -> Alignment:
-    """Draw a centreline.
+@dataclass(frozen=True)
+class Elements:
+    """What a centreline is made of: piecewise linear curvature in plan and grade in profile, constant beyond the ends.
 
-    Curvature in plan is continuous and piecewise linear: straight, clothoid, arc of 150 to 400 m radius, clothoid, and
-    so on, each bend the other way. The grade stays within ±1 % and changes linearly with station (vertical curves).
+    Attributes:
+        plan: Stations of the knots of the curvature, m.
+        curvature: There, 1/m; positive turns left.
+        profile: Stations of the knots of the grade, m.
+        grade: There, rise over run.
+    """
+
+    plan: Float[np.ndarray, "p"]
+    curvature: Float[np.ndarray, "p"]
+    profile: Float[np.ndarray, "q"]
+    grade: Float[np.ndarray, "q"]
+
+
+def lay_out(rng: np.random.Generator, length: float, elements: Elements) -> Alignment:
+    """The centreline of `elements`.
+
     The survey frame has z up; heading and origin in it are drawn, so that no axis of the frame follows the bore.
 
     Args:
         rng: Source of randomness.
         length: Length between the mouths, m.
+        elements: Curvature and grade by station.
     """
-    # Short bores get short elements, so that 15 m bend too.
-    scale = float(np.clip(length / 90.0, 0.2, 1.5))
-    knots, curvature = [-MARGIN, rng.uniform(8.0, 16.0) * scale], [0.0, 0.0]
-    side = rng.choice([-1.0, 1.0])
-    while knots[-1] < length + MARGIN:
-        bend = side / rng.uniform(150.0, 400.0)
-        for run, value in (
-            (rng.uniform(12.0, 25.0), bend),
-            (rng.uniform(15.0, 45.0), bend),
-            (rng.uniform(12.0, 25.0), 0.0),
-            (rng.uniform(0.0, 20.0) + 1.0, 0.0),
-        ):
-            knots.append(knots[-1] + run * scale)
-            curvature.append(value)
-        side = -side
-
-    grade_knots = np.arange(-MARGIN, length + MARGIN + 2 * 25.0, 25.0)
-    grade = np.repeat(rng.uniform(-0.01, 0.01, (len(grade_knots) + 1) // 2), 2)[: len(grade_knots)]
     heading = rng.uniform(-np.pi, np.pi)
     origin = np.concatenate([rng.uniform(-2000.0, 2000.0, 2), rng.uniform(-40.0, 40.0, 1)])
-
     n = round((length + 2 * MARGIN) / STEP) + 1
     s = np.linspace(-MARGIN, length + MARGIN, n)
-    kappa = np.interp(s, knots, curvature)
-    slope = np.arctan(np.interp(s, grade_knots, grade))
+    kappa = np.interp(s, elements.plan, elements.curvature)
+    slope = np.arctan(np.interp(s, elements.profile, elements.grade))
     psi = np.concatenate([[0.0], np.cumsum(0.5 * (kappa[1:] + kappa[:-1]) * np.diff(s))])
     psi += heading - np.interp(0.0, s, psi)
     psi_of, slope_of = CubicHermiteSpline(s, psi, kappa), CubicHermiteSpline(s, slope, np.gradient(slope, s))

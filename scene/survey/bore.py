@@ -1,34 +1,114 @@
 """The true bore: everything that is drawn once and then surveyed."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scene.survey.alignment import Alignment, draw_alignment
+from scene.survey import plan, shape
+from scene.survey.alignment import Alignment, Elements, lay_out
+from scene.survey.config import TruthName
+from scene.survey.field import draw_field
 from scene.survey.furniture import Furniture, draw_furniture
 from scene.survey.mesh import Mesh, join
-from scene.survey.section import Section, draw_section
+from scene.survey.section import Section, Trend
+from scene.survey.shape import Shape
 from scene.survey.solids import nail_mesh, track_mesh
 from scene.survey.surface import surface_mesh
+
+_IRREGULAR_SIGMA = 0.13  # m, standard deviation of the walls
+_CROSSFALL = 0.02  # of the irregular bore's floor
 
 
 @dataclass(frozen=True)
 class Bore:
-    """Centreline, section and furniture of one bore."""
+    """Centreline, section and furniture of one bore, and the name of its class of section."""
 
+    section_type: str
     alignment: Alignment
     section: Section
     furniture: Furniture
 
     def mesh(self) -> Mesh:
         """Every surface that a ray can meet."""
-        shape = (self.alignment, self.section, self.furniture)
-        mesh = join([surface_mesh(*shape), track_mesh(*shape), nail_mesh(*shape)])
+        parts = (self.alignment, self.section, self.furniture)
+        mesh = join([surface_mesh(*parts), track_mesh(*parts), nail_mesh(*parts)])
         # To the micrometre, so that the last bits of a matrix product do not decide about the bytes of a survey.
         return replace(mesh, vertices=np.round(mesh.vertices, 6))
 
 
-def draw_bore(seed: np.random.SeedSequence, length: float) -> Bore:
-    """Draw a bore of `length` m."""
+def _steady(length: float) -> Trend:
+    return Trend()
+
+
+def _widened(length: float) -> Trend:
+    """1 m wider over the middle third, by ramps of an eighth of the length, at most 8 m."""
+    ramp, third = min(8.0, length / 8.0), length / 3.0
+    return Trend((third - 0.5 * ramp, third + 0.5 * ramp, 2 * third - 0.5 * ramp, 2 * third + 0.5 * ramp), (0, 1, 1, 0))
+
+
+def _flared(length: float) -> Trend:
+    """A portal 3 m wider at the last mouth, opening with the square of the distance over 6 m."""
+    share = np.linspace(0.0, 1.0, 7)
+    return Trend(tuple(length - 6.0 + 6.0 * share), tuple(3.0 * share**2))
+
+
+@dataclass(frozen=True)
+class _Class:
+    section_type: str
+    shape: Callable[[], Shape] = shape.d_shape
+    elements: Callable[[np.random.Generator, float], Elements] = plan.draw_railway
+    widening: Callable[[float], Trend] = _steady
+    rough: bool = False
+
+
+_CLASSES: dict[TruthName, _Class] = {
+    "paper": _Class("D"),
+    "metro": _Class("D", elements=plan.metro),
+    "ellipse": _Class("ellipse", shape.ellipse),
+    "widening": _Class("D, widening", widening=_widened),
+    "horseshoe": _Class("horseshoe", shape.horseshoe),
+    "s-bend": _Class("D", elements=plan.draw_s_bend),
+    "grade": _Class("D", elements=plan.draw_grade),
+    "irregular": _Class("irregular", shape.arch, widening=_flared, rough=True),
+    "circle": _Class("circle", shape.circle),
+}
+
+
+def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correlation: float) -> Section:
+    """Width and height vary by 5 cm (1 σ) over 8 to 15 m, the surface by 1 cm over 1 to 2 m, or as `irregular`."""
+    return Section(
+        kind.shape(),
+        width_field=draw_field(rng, 0.05, rng.uniform(8.0, 15.0)),
+        height_field=draw_field(rng, 0.05, rng.uniform(8.0, 15.0)),
+        roughness=draw_field(
+            rng,
+            _IRREGULAR_SIGMA if kind.rough else 0.01,
+            correlation if kind.rough else rng.uniform(1.0, 2.0),
+            dims=2,
+            terms=256,
+        ),
+        widening=kind.widening(length),
+        crossfall=_CROSSFALL if kind.rough else 0.0,
+    )
+
+
+def draw_bore(
+    seed: np.random.SeedSequence, length: float, truth: TruthName = "paper", correlation: float = 2.0
+) -> Bore:
+    """Draw a bore.
+
+    Args:
+        seed: Source of randomness.
+        length: Between the mouths, m.
+        truth: Its class.
+        correlation: Correlation length of the walls of `irregular`, m; the others do not use it.
+    """
     first, second, third = (np.random.default_rng(s) for s in seed.spawn(3))
-    return Bore(draw_alignment(first, length), draw_section(second), draw_furniture(third, length))
+    kind = _CLASSES[truth]
+    return Bore(
+        kind.section_type,
+        lay_out(first, length, kind.elements(first, length)),
+        _draw_section(second, kind, length, correlation),
+        draw_furniture(third, length, rings=not kind.rough),
+    )

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.survey.bore import Bore
+from scene.survey.mount import Mount
 
 START, STOP = -10.0, -2.0  # m: from the first mouth; from the second
 CARRY_HEIGHT = 1.6  # m above the floor
@@ -89,11 +90,30 @@ class Walk:
         above = CARRY_HEIGHT - 0.5 * self.bore.section.height(station) + self.above(time)
         turns = np.stack([self.yaw(time), -self.pitch(time), self.roll(time)], axis=-1)
         attitude = Rotation.from_matrix(frames.matrix) * Rotation.from_euler("ZYX", turns)
-        quaternion = attitude.as_quat()
+        return Poses(frames.point(self.across(time), above), attitude.as_quat())
+
+
+@dataclass(frozen=True)
+class Carried:
+    """An instrument on the walk.
+
+    Attributes:
+        walk: Motion of the rack, which is that of the Avia's frame.
+        mount: Of the instrument against the Avia.
+    """
+
+    walk: Walk
+    mount: Mount
+
+    def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
+        """Exact poses at `time`, s."""
+        rack = self.walk.poses(time)
+        attitude = Rotation.from_quat(rack.quaternion)
+        quaternion = (attitude * Rotation.from_matrix(self.mount.rotation.T)).as_quat()
         # One sign throughout, so that neighbours can be interpolated.
         flips = np.cumprod(np.where((quaternion[1:] * quaternion[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
         quaternion[1:] *= flips[:, None]
-        return Poses(frames.point(self.across(time), above), quaternion)
+        return Poses(rack.position + attitude.apply(self.mount.origin), quaternion)
 
     def poses_between(self, begin: float, time: Float[np.ndarray, "n"]) -> Poses:
         """Poses at many sorted `time`, s, not before `begin`, by a table of exact poses; quick."""

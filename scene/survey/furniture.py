@@ -1,21 +1,22 @@
 """What is built into the bore: rings, bolt pockets, nails, sleepers, rails. Sizes and where they stand."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 RING_WIDTH = 1.5  # m [track.md A5: Guangzhou line 21]
 POCKET_LENGTH = 0.20  # m, along the axis
 POCKET_WIDTH = 0.18  # m, along the girth
-POCKET_DEPTH = 0.13  # m, along the normal of the section at the pocket's middle
+POCKET_DEPTH = 0.13  # m, mean, along the normal of the section at the pocket's middle
 POCKET_OFFSET = 0.22  # m from the ring joint to the middle of a pocket
 NAIL_DIAMETER = 0.028  # m
 NAIL_DEPTH = 0.06  # m, axis of the nail behind the lining surface
-FILLED_SHARE = 0.04  # pockets mortared flush
+POCKET_DEPTH_SIGMA = 0.01  # m, from pocket to pocket
+FILLED_SHARE = 0.05  # pockets missing: mortared flush
 NAIL_MISSING_SHARE = 0.03
 
 SLEEPER_SPACING = 0.6  # m
+SLEEPER_JITTER = 0.01  # m, standard deviation of each sleeper's station
 SLEEPER_LENGTH = 2.50  # m, across the track
 SLEEPER_TOP = 0.20  # m, along the track
 SLEEPER_BOTTOM = 0.30  # m, along the track
@@ -49,25 +50,7 @@ RAIL_AXIS = 0.5 * (GAUGE + 0.073)  # m from the track's axis to the rail's: half
 RAIL_TOP = SLEEPER_RISE + PAD[2] + RAIL_HEIGHT  # m above the floor
 
 
-@dataclass(frozen=True)
-class Row:
-    """A longitudinal row of pockets.
-
-    Attributes:
-        side: +1 left, -1 right.
-        on: The part of the section that it runs along.
-        at: Middle of the row: height above the floor, m, on the wall; angle above the springing, rad, on the crown.
-    """
-
-    side: int
-    on: Literal["wall", "crown"]
-    at: float
-
-
-WALL_ROWS = (SLEEPER_RISE + 0.70, 2.20)  # m above the floor; the first is 0.70 m above the sleepers
-CROWN_ROWS = (float(np.deg2rad(35.0)), float(np.deg2rad(70.0)))  # rad above the springing, about the crown's centre
-_PLACES: tuple[tuple[Literal["wall", "crown"], tuple[float, ...]], ...] = (("wall", WALL_ROWS), ("crown", CROWN_ROWS))
-ROWS = tuple(Row(side, on, at) for side in (1, -1) for on, places in _PLACES for at in places)
+N_ROWS = 8  # longitudinal rows of pockets: four on the left side from the floor up, four on the right
 
 
 @dataclass(frozen=True)
@@ -75,9 +58,10 @@ class Furniture:
     """Where the furniture of one bore stands.
 
     Attributes:
-        joints: Stations of the ring joints, m `(r,)`.
+        joints: Stations of the ring joints, m `(r,)`; empty where the bore has no rings.
         pocketed: Which joints have pockets: those far enough from the mouths `(r,)`.
-        filled: Pockets mortared flush, by joint, row of `ROWS` and side of the joint (before, after) `(r, k, 2)`.
+        filled: Pockets mortared flush, by joint, row and side of the joint (before, after) `(r, k, 2)`.
+        depth: Depth of each pocket, m `(r, k, 2)`.
         nails: Whether a nail bridges the pair; false wherever a pocket is filled `(r, k)`.
         sleepers: Stations of the sleepers' middles, m `(t,)`.
     """
@@ -85,19 +69,23 @@ class Furniture:
     joints: np.ndarray
     pocketed: np.ndarray
     filled: np.ndarray
+    depth: np.ndarray
     nails: np.ndarray
     sleepers: np.ndarray
 
 
-def draw_furniture(rng: np.random.Generator, length: float) -> Furniture:
-    """Draw the furniture of a bore of `length` m.
+def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True) -> Furniture:
+    """Draw the furniture of a bore of `length` m, without rings, pockets and nails if not `rings`.
 
     The first joint and the first sleeper stand at drawn stations: whoever assumes that they start at a mouth is wrong.
     """
-    joints = np.arange(rng.uniform(0.1, 1.4), length - 1e-3, RING_WIDTH)
-    sleepers = np.arange(rng.uniform(0.16, 0.44), length - 0.16, SLEEPER_SPACING)
+    joints = np.arange(rng.uniform(0.1, 1.4), length - 1e-3, RING_WIDTH)[: None if rings else 0]
+    # Far enough from the mouths for the jitter, which ends at three standard deviations.
+    sleepers = np.arange(rng.uniform(0.19, 0.44), length - 0.19, SLEEPER_SPACING)
+    sleepers = sleepers + SLEEPER_JITTER * np.clip(rng.standard_normal(len(sleepers)), -3.0, 3.0)
     reach = POCKET_OFFSET + 0.5 * POCKET_LENGTH + 0.05
     pocketed = (joints > reach) & (joints < length - reach)
-    filled = rng.random((len(joints), len(ROWS), 2)) < FILLED_SHARE
-    nails = (rng.random((len(joints), len(ROWS))) >= NAIL_MISSING_SHARE) & ~filled.any(axis=2)
-    return Furniture(joints, pocketed, filled, nails & pocketed[:, None], sleepers)
+    filled = rng.random((len(joints), N_ROWS, 2)) < FILLED_SHARE
+    depth = POCKET_DEPTH + POCKET_DEPTH_SIGMA * np.clip(rng.standard_normal(filled.shape), -3.0, 3.0)
+    nails = (rng.random((len(joints), N_ROWS)) >= NAIL_MISSING_SHARE) & ~filled.any(axis=2)
+    return Furniture(joints, pocketed, filled, depth, nails & pocketed[:, None], sleepers)

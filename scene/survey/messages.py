@@ -1,16 +1,18 @@
-"""ROS1 messages of GEODE's device γ, serialised by the message or by the thousand, never point by point."""
+"""ROS1 messages of a Livox LiDAR and of IMUs, serialised by the message or by the thousand, never point by point."""
 
 import struct
 
 import numpy as np
 from jaxtyping import Float
 
+from scene.survey.lidar import Lidar, Sweep
+
 EPOCH = 1_700_000_000  # s: stamp of the first point, the same for every survey
 
 CUSTOM_TYPE, CUSTOM_MD5 = "livox_ros_driver/msg/CustomMsg", "e4d6829bdfe657cb6c21a746c86b21a6"
 IMU_TYPE, IMU_MD5 = "sensor_msgs/msg/Imu", "6a62c6daae103f4ff57a132d6f95cec2"
-_RULE = "=" * 80
-_HEADER = f"""{_RULE}
+RULE = "=" * 80
+HEADER = f"""{RULE}
 MSG: std_msgs/Header
 uint32 seq
 time stamp
@@ -23,8 +25,8 @@ uint8 lidar_id
 uint8[3] rsvd
 CustomPoint[] points
 
-{_HEADER}
-{_RULE}
+{HEADER}
+{RULE}
 MSG: livox_ros_driver/CustomPoint
 uint32 offset_time
 float32 x
@@ -42,15 +44,15 @@ float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance
 
-{_HEADER}
-{_RULE}
+{HEADER}
+{RULE}
 MSG: geometry_msgs/Quaternion
 float64 x
 float64 y
 float64 z
 float64 w
 
-{_RULE}
+{RULE}
 MSG: geometry_msgs/Vector3
 float64 x
 float64 y
@@ -69,18 +71,24 @@ def stamp(nanoseconds: int) -> int:
     return EPOCH * 1_000_000_000 + nanoseconds
 
 
-def custom_message(seq: int, begin: int, points: np.ndarray) -> bytes:
-    """A `livox_ros_driver/CustomMsg`.
+def header(seq: int, nanoseconds: int, frame: bytes) -> bytes:
+    """A `std_msgs/Header` stamped `nanoseconds` after the start of the survey."""
+    seconds, rest = divmod(stamp(nanoseconds), 1_000_000_000)
+    return struct.pack("<IIII", seq, seconds, rest, len(frame)) + frame
 
-    Args:
-        seq: Number of the scan.
-        begin: Time of its first point since the start of the survey, ns; becomes stamp and timebase.
-        points: Array of `POINT`.
+
+def custom_message(sweep: Sweep, lidar: Lidar) -> bytes:
+    """A `livox_ros_driver/CustomMsg`; stamp and timebase are the time of the first point.
+
+    A pulse without return keeps its time and line and lies at (0, 0, 0).
     """
-    seconds, rest = divmod(stamp(begin), 1_000_000_000)
-    frame = b"livox_frame"
-    head = struct.pack("<IIII", seq, seconds, rest, len(frame)) + frame
-    head += struct.pack("<QIB3xI", stamp(begin), len(points), 1, len(points))
+    points = np.zeros(len(sweep.points), POINT)
+    points["offset_time"], points["line"] = sweep.offset, lidar.line
+    points["x"], points["y"], points["z"] = sweep.points.T
+    points["reflectivity"] = sweep.reflectivity
+    points["tag"] = np.where(sweep.second, 0x10, 0)
+    head = header(sweep.number, sweep.begin, b"livox_frame")
+    head += struct.pack("<QIB3xI", stamp(sweep.begin), len(points), 1, len(points))
     return head + points.tobytes()
 
 

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 
 from scene.survey import furniture as fur
 from scene.survey.alignment import Alignment
-from scene.survey.furniture import ROWS, Furniture
+from scene.survey.furniture import Furniture
 from scene.survey.mesh import Mesh, Part, join
 from scene.survey.section import Section
 
@@ -45,7 +45,7 @@ def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> 
         return _copies(shape, _BOX, frames.point(np.full_like(s, across), floor + above), frames.matrix, part, s)
 
     # Down to just under the floor only: from outside the mouth, one would see the buried part beneath it.
-    tall = fur.SLEEPER_RISE + _BURIED
+    tall = fur.SLEEPER_RISE + _BURIED + 0.5 * fur.SLEEPER_LENGTH * abs(section.crossfall)
     low = fur.SLEEPER_TOP + (fur.SLEEPER_BOTTOM - fur.SLEEPER_TOP) * tall / fur.SLEEPER_HEIGHT
     sleeper = 0.5 * _CORNERS * (1.0, fur.SLEEPER_LENGTH, tall)
     sleeper[:, 0] *= np.where(sleeper[:, 2] > 0, fur.SLEEPER_TOP, low)
@@ -88,12 +88,12 @@ def nail_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> M
     """Nails: cylinders between the middles of two pockets, behind the lining except where they cross the pockets."""
     joint, row = np.nonzero(furniture.nails)
     station = furniture.joints[joint]
-    node = np.array([section.row_nodes(r)[1] for r in ROWS])[row]
+    node = section.shape.rows[row, 1]
     ends = []
     for offset in (-fur.POCKET_OFFSET, fur.POCKET_OFFSET):
         frames = alignment.frames(station + offset)
         at = np.arange(len(node))
-        yz = section.rough(station + offset)[at, node] + fur.NAIL_DEPTH * section.normal[node]
+        yz = section.rough(station + offset)[at, node] + fur.NAIL_DEPTH * section.shape.normal[node]
         ends.append(frames.point(yz[:, 0], yz[:, 1]))
     along = ends[1] - ends[0]
     half = 0.5 * np.linalg.norm(along, axis=1)

@@ -4,9 +4,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from scene.survey.alignment import Alignment
-from scene.survey.furniture import POCKET_DEPTH, POCKET_LENGTH, POCKET_OFFSET, ROWS, Furniture
+from scene.survey.furniture import POCKET_LENGTH, POCKET_OFFSET, Furniture
 from scene.survey.mesh import Mesh, Part, join
-from scene.survey.section import CELL, Section, refine
+from scene.survey.section import Section
+from scene.survey.shape import CELL, refine
 
 _JOINT_HALF = 0.01  # m: the strip that is darker than the lining around a ring joint
 _FLOOR_CELL = 0.3  # m across the floor
@@ -36,7 +37,7 @@ def _split(quads: Int[np.ndarray, "*q 4"]) -> Int[np.ndarray, "t 3"]:
 def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> Mesh:
     """Lining, pockets and floor, with normals towards the air; both mouths open."""
     rows = station_rows(furniture, alignment.length)
-    frames = alignment.frames(rows)
+    frames, shape = alignment.frames(rows), section.shape
     nodes = section.rough(rows)
     vertices = frames.point(nodes[..., 0], nodes[..., 1])
     n, m = nodes.shape[:2]
@@ -51,10 +52,10 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
     for j, r, side in np.argwhere(furniture.pocketed[:, None, None] & ~furniture.filled):
         centre = furniture.joints[j] + (2 * side - 1) * POCKET_OFFSET
         i0, ic, i1 = np.searchsorted(rows, centre + 0.5 * POCKET_LENGTH * np.array([-1, 0, 1]) - 1e-6)
-        j0, jc, j1 = section.row_nodes(ROWS[r])
+        j0, jc, j1 = shape.rows[r]
         keep[i0:i1, j0:j1] = False
-        out = section.normal[jc, 0] * frames.lateral[ic] + section.normal[jc, 1] * frames.up[ic]
-        pockets.append(_pocket(vertices[i0 : i1 + 1, j0 : j1 + 1], POCKET_DEPTH * out, rows[ic]))
+        out = shape.normal[jc, 0] * frames.lateral[ic] + shape.normal[jc, 1] * frames.up[ic]
+        pockets.append(_pocket(vertices[i0 : i1 + 1, j0 : j1 + 1], furniture.depth[j, r, side] * out, rows[ic]))
 
     station = np.broadcast_to(middle[:, None], keep.shape)
     lining = Mesh(vertices.reshape(-1, 3), _split(quads[keep]), part[keep].repeat(2), station[keep].repeat(2))

@@ -8,7 +8,7 @@ import numpy as np
 from scene.survey import furniture as fur
 from scene.survey.bore import Bore
 from scene.survey.config import SurveyConfig
-from scene.survey.furniture import ROWS
+from scene.survey.furniture import N_ROWS
 
 STEP = 0.25  # m between the stations of the truth
 _DEFINITIONS = {
@@ -16,7 +16,9 @@ _DEFINITIONS = {
     "position": "middle of the smooth section: half its width, half its height; station is arc length along it",
     "width": "largest horizontal distance between the walls in the section, roughness included, pockets excluded",
     "height": "floor to crown on the axis, roughness included; width_smooth and height_smooth leave roughness out",
-    "floor": "flat ballast surface, half of height_smooth below position",
+    "middle": "of the actual section, along lateral and up from position: half way between the walls where the width "
+    "is largest, half way from floor to crown",
+    "floor": "ballast surface, straight across, half of height_smooth below position; crossfall: its rise to the left",
     "angle": "rad about position, from lateral towards up",
     "pockets.depth": "along the normal of the smooth section at the pocket's middle",
     "rails.gauge": "between the inner faces of the heads 14 to 16 mm below rail top; rails upright, not inclined",
@@ -32,10 +34,11 @@ def describe(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
     alignment, section, furniture = bore.alignment, bore.section, bore.furniture
     station = np.arange(0.0, alignment.length + 1e-9, STEP)
     frames = alignment.frames(station)
-    width, height = section.measure(station)
+    actual = section.measure(station)
     return {
         "schema": "subterra.truth/1",
         "provenance": "simulated",
+        "section_type": bore.section_type,
         "seed": config.seed,
         "config": {k: v for k, v in asdict(config).items() if k != "out"},
         "definitions": _DEFINITIONS,
@@ -43,10 +46,12 @@ def describe(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
         "station": _list(station),
         "position": _list(frames.position),
         "tangent": _list(frames.tangent, 9),
-        "width": _list(width),
-        "height": _list(height),
+        "width": _list(actual.width),
+        "height": _list(actual.height),
         "width_smooth": _list(section.width(station)),
         "height_smooth": _list(section.height(station)),
+        "middle": _list(actual.middle),
+        "crossfall": section.crossfall,
         "rings": {"width": fur.RING_WIDTH, "station": _list(furniture.joints)},
         "pockets": _pockets(bore),
         "nails": {"diameter": fur.NAIL_DIAMETER, "depth": fur.NAIL_DEPTH, "count": int(furniture.nails.sum())},
@@ -59,20 +64,20 @@ def _pockets(bore: Bore) -> list[dict[str, Any]]:
     """Every place of a pocket by growing ring, row and station; `open` is false where it is mortared flush."""
     section, furniture = bore.section, bore.furniture
     out = []
-    nodes = np.array([section.row_nodes(row) for row in ROWS])
     for side, offset in enumerate((-fur.POCKET_OFFSET, fur.POCKET_OFFSET)):
         station = furniture.joints + offset
         frames, smooth = bore.alignment.frames(station), section.smooth(station)
+        half = 0.5 * section.height(station)
         for j in np.flatnonzero(furniture.pocketed):
-            for r, (first, middle, last) in enumerate(nodes):
-                (y, z), normal = smooth[j, middle], section.normal[middle]
+            for r, (first, middle, last) in enumerate(section.shape.rows):
+                (y, z), normal = smooth[j, middle], section.shape.normal[middle]
                 centre = frames.position[j] + y * frames.lateral[j] + z * frames.up[j]
                 out.append({
-                    "ring": int(j), "row": r, "side": "left" if ROWS[r].side > 0 else "right",
+                    "ring": int(j), "row": r, "side": "left" if 2 * r < N_ROWS else "right",
                     "station": round(float(station[j]), 6), "angle": round(float(np.arctan2(z, y)), 6),
-                    "above_floor": round(float(z - smooth[j, 0, 1]), 6), "position": _list(centre),
+                    "above_floor": round(float(z + half[j]), 6), "position": _list(centre),
                     "outward": _list(normal[0] * frames.lateral[j] + normal[1] * frames.up[j], 9),
-                    "length": fur.POCKET_LENGTH, "depth": fur.POCKET_DEPTH,
+                    "length": fur.POCKET_LENGTH, "depth": round(float(furniture.depth[j, r, side]), 6),
                     "width": round(float(np.linalg.norm(smooth[j, last] - smooth[j, first])), 6),
                     "open": not bool(furniture.filled[j, r, side]), "nail": bool(furniture.nails[j, r]),
                 })  # fmt: skip

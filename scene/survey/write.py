@@ -8,7 +8,8 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+import yaml
+from jaxtyping import Float, Shaped
 
 from scene.survey.mesh import Mesh
 from scene.survey.messages import EPOCH
@@ -32,6 +33,12 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write JSON on one line."""
     with replacing(path) as part:
         part.write_text(json.dumps(content, allow_nan=False) + "\n")
+
+
+def write_yaml(path: Path, content: dict[str, Any]) -> None:
+    """Write YAML, lists of numbers on one line."""
+    with replacing(path) as part:
+        part.write_text(yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120))
 
 
 def write_tum(
@@ -73,10 +80,12 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
 
 
 class CloudWriter:
-    """Writes returns in the survey frame, float64, to a binary PLY and a binary PCD as they come."""
+    """Writes returns in the survey frame, float64, to a binary PLY, and a binary PCD if asked, as they come."""
 
-    def __init__(self, ply: Path, pcd: Path) -> None:
-        self._files = [(ply.open("wb"), _ply_header), (pcd.open("wb"), _pcd_header)]
+    def __init__(self, ply: Path, pcd: Path | None = None) -> None:
+        self._files = [(ply.open("wb"), _ply_header)]
+        if pcd is not None:
+            self._files.append((pcd.open("wb"), _pcd_header))
         self._count = 0
         self._write_headers()
 
@@ -85,8 +94,11 @@ class CloudWriter:
             file.seek(0)
             file.write(header(self._count))
 
-    def add(self, points: np.ndarray) -> None:
-        """Append an array of `CLOUD_POINT`."""
+    def add(self, placed: Float[np.ndarray, "n 3"], intensity: Shaped[np.ndarray, "n"]) -> None:
+        """Append points, m, in the survey frame."""
+        points = np.empty(len(placed), CLOUD_POINT)
+        points["x"], points["y"], points["z"] = placed.T
+        points["intensity"] = intensity
         self._count += len(points)
         for file, _ in self._files:
             file.write(points.tobytes())

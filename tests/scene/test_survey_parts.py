@@ -7,12 +7,15 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene.survey import avia
+from scene.survey import avia, echo
 from scene.survey.__main__ import main
-from scene.survey.alignment import draw_alignment
+from scene.survey.alignment import lay_out
 from scene.survey.bore import draw_bore
+from scene.survey.cast import Hits
+from scene.survey.config import SensorErrors
 from scene.survey.field import draw_field
 from scene.survey.mesh import Part
+from scene.survey.plan import draw_railway
 
 SURVEY = Path(__file__).parents[2] / "scene" / "survey"
 
@@ -92,7 +95,8 @@ def test_far_and_grazing_pulses_are_lost() -> None:
 
     def share(distance: float, cosine: float) -> float:
         full = [np.full(4000, v, np.float32) for v in (distance, cosine)]
-        return avia.returned(rng, *full, np.full(4000, Part.LINING, np.uint8)).mean()
+        hits = Hits(*full, np.full(4000, Part.LINING, np.uint8), np.zeros((4000, 3), np.float32))
+        return echo.returned(rng, avia.avia(), SensorErrors(), hits).mean()
 
     assert share(5.0, 0.5) > 0.99
     assert share(40.0, 2.8 / 40.0) > 0.9
@@ -104,7 +108,8 @@ def test_far_and_grazing_pulses_are_lost() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_the_centreline_bends_as_a_railway_does(seed: int) -> None:
-    alignment = draw_alignment(np.random.default_rng(seed), 200.0)
+    rng = np.random.default_rng(seed)
+    alignment = lay_out(rng, 200.0, draw_railway(rng, 200.0))
     s = np.arange(0.0, 200.0, 0.1)
     frames = alignment.frames(s)
     np.testing.assert_allclose(np.gradient(frames.position, 0.1, axis=0)[1:-1], frames.tangent[1:-1], atol=3e-5)

@@ -1,0 +1,141 @@
+"""Sensor errors at the rates and sizes configured, on surfaces whose answer is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scene.survey import echo
+from scene.survey.__main__ import main
+from scene.survey.cast import Caster, Hits
+from scene.survey.config import SensorErrors
+from scene.survey.lidar import Lidar
+from scene.survey.mesh import Mesh, Part
+from scene.survey.os1 import os1
+from scene.survey.rack import IMUS
+from scene.survey.vlp16 import vlp16
+
+NEAR, FAR = 5.0, 5.3  # m: two walls across the x axis, with an edge at y = 0
+
+
+def two_walls() -> Caster:
+    """For y > 0 at `NEAR`, else at `FAR`; seen from the origin."""
+    corners = [(x, y, z) for x, y0, y1 in ((NEAR, 0, 50), (FAR, -50, 50)) for y in (y0, y1) for z in (-50, 50)]
+    faces = np.array([(0, 2, 1), (1, 2, 3), (4, 6, 5), (5, 6, 7)])[:, ::-1]
+    return Caster(Mesh(np.array(corners, float), faces, np.full(4, Part.LINING, np.uint8), np.zeros(4)))
+
+
+def looked(caster: Caster, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, Hits]:
+    """Rays from the origin to `y` on the near wall's plane."""
+    ray = np.stack([np.full_like(y, NEAR), y, np.full_like(y, 0.01)], axis=-1)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    origin = np.zeros_like(ray)
+    caster.load(0.0, origin[0])
+    return origin, ray, caster.cast_loaded(origin, ray)
+
+
+def hits(distance: float, cosine: float, n: int) -> Hits:
+    full = [np.full(n, v, np.float32) for v in (distance, cosine)]
+    return Hits(*full, np.full(n, Part.LINING, np.uint8), np.zeros((n, 3), np.float32))
+
+
+def mix(share: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Reported and true distances along x of beams at `y`, m."""
+    caster, lidar = two_walls(), os1()
+    origin, ray, seen = looked(caster, y)
+    distance = echo.mixed(np.random.default_rng(3), lidar, share, caster, origin, ray, seen)
+    return distance * ray[:, 0], seen.distance * ray[:, 0]
+
+
+def test_mixed_pixels_lie_between_the_two_surfaces_of_an_edge_and_nowhere_else() -> None:
+    rim = NEAR * np.tan(os1().divergence)
+    reported, true = mix(1.0, np.linspace(-3.0 * rim, 3.0 * rim, 60_001))
+    moved = abs(reported - true) > 1e-6
+    assert ((reported[moved] > NEAR) & (reported[moved] < FAR)).all()
+    at = np.linspace(-3.0, 3.0, 60_001)[moved]
+    # The far wall is met behind the edge: a beam that misses the near wall still grazes it up to one rim away.
+    assert abs(at).max() < 1.07
+    # Evenly between the walls.
+    assert reported[moved].mean() == pytest.approx(0.5 * (NEAR + FAR), abs=3 * 0.3 / np.sqrt(12 * moved.sum()))
+
+
+def test_the_share_of_mixed_pixels_is_the_one_configured() -> None:
+    # At the edge itself half of all rims lie across it.
+    n = 40_000
+    reported, true = mix(0.2, np.full(n, 1e-6))
+    share = (abs(reported - true) > 1e-6).mean()
+    assert share == pytest.approx(0.2 * 0.5, abs=3 * np.sqrt(0.1 * 0.9 / n))
+
+
+def test_surfaces_further_apart_than_a_pulse_do_not_mix() -> None:
+    caster = two_walls()
+    # From 20 m to the side, the far wall's grazing continuation is beyond the pulse.
+    origin, ray, _ = looked(caster, np.full(2000, 1e-6))
+    back = origin + np.array([0.0, -20.0, 0.0])
+    ray = np.array([NEAR, 20.0 + 1e-6, 0.0]) / np.hypot(NEAR, 20.0) + 0 * ray
+    seen = caster.cast_loaded(back, ray)
+    reported = echo.mixed(np.random.default_rng(0), os1(), 1.0, caster, back, ray, seen)
+    np.testing.assert_array_equal(reported, seen.distance)
+    assert (FAR - NEAR) / NEAR * np.hypot(NEAR, 20.0) > echo.PULSE
+
+
+def test_range_noise_grows_with_range_and_incidence() -> None:
+    def sigma(distance: float, cosine: float) -> float:
+        one = [np.array([v], np.float32) for v in (distance, cosine)]
+        return float(echo.noise_sigma(SensorErrors(), *one)[0])
+
+    assert sigma(0.0, 1.0) == pytest.approx(0.019)
+    assert sigma(50.0, 1.0) == pytest.approx(np.hypot(0.019, 0.005))
+    assert sigma(0.0, np.sqrt(0.5)) == pytest.approx(np.hypot(0.019, 0.002))
+    # The tangent stops at 10.
+    assert sigma(0.0, 0.01) == sigma(0.0, 0.05) == pytest.approx(np.hypot(0.019, 0.02))
+    assert echo.noise_sigma(SensorErrors(), np.full(1, np.inf, np.float32), np.zeros(1, np.float32))[0] < 0.03
+
+
+@pytest.mark.parametrize("lidar", [vlp16(), os1()], ids=lambda lidar: lidar.name)
+def test_echoes_too_weak_are_lost_and_can_be_kept(lidar: Lidar) -> None:
+    rng, n = np.random.default_rng(0), 4000
+
+    def share(errors: SensorErrors, distance: float, cosine: float) -> float:
+        return echo.returned(rng, lidar, errors, hits(distance, cosine, n)).mean()
+
+    given = SensorErrors()
+    assert share(given, 5.0, 0.8) > 0.99
+    assert share(given, 80.0, 2.8 / 80.0) < 0.01
+    middle = (0.3 * 2.8 / lidar.weakest_echo) ** (1 / 3)
+    assert share(given, middle, 2.8 / middle) == pytest.approx(0.498, abs=3 * 0.5 / np.sqrt(n))
+    all_kept = replace(given, weak_echoes=False, lost=0.0)
+    assert share(all_kept, 80.0, 2.8 / 80.0) == 1.0
+    some = replace(given, weak_echoes=False, lost=0.1)
+    assert share(some, 80.0, 2.8 / 80.0) == pytest.approx(0.9, abs=3 * np.sqrt(0.09 / n))
+    assert share(all_kept, 5.0, -0.5) == share(all_kept, lidar.range_max + 1, 1.0) == share(all_kept, 0.2, 1.0) == 0.0
+
+
+def test_every_imu_is_mounted_by_a_rotation() -> None:
+    for imus in IMUS.values():
+        for imu in imus:
+            np.testing.assert_allclose(imu.mount.rotation @ imu.mount.rotation.T, np.eye(3), atol=1e-12)
+            assert np.linalg.det(imu.mount.rotation) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("args", "reason"),
+    [
+        (["--truth", "metro", "--length", "352"], "length must be at most 351 m for truth metro"),
+        (["--truth", "irregular", "--correlation", "0.5"], "correlation must lie between 1 and 4 m"),
+        (["--scan-every", "0"], "scan_every must be at least 1"),
+        (["--sensors", "avia", "avia"], "sensors must differ"),
+        (["--profiles", "50"], "profiles must lie between 0.1 m and half the length"),
+        (["--cloud", "--sensors"], "cloud needs a sensor"),
+        (["--cloud", "--profiles", "1"], "cloud needs a sensor"),
+        (["--errors.lost", "1.5"], "errors.lost must lie between 0 and 1"),
+        (["--errors.range-noise", "nan"], "errors.range_noise must not be negative"),
+    ],
+)
+def test_a_wrong_value_is_refused_in_one_sentence(
+    args: list[str], reason: str, tmp_path: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["--out", f"{tmp_path}/out", *args]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"error: {reason}")
+    assert told.count("\n") == 1
