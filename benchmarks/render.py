@@ -6,6 +6,7 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -14,16 +15,18 @@ from PIL import Image
 # MuJoCo chooses its GL backend when it is imported, so each is tried in a process of its own.
 _BACKENDS = ("egl", "osmesa", "glfw")
 _TIMEOUT = 120.0
+_LIT = 7  # OpenGL lights a scene with eight lights, the headlight among them
+_LOOK_AHEAD = 8.0  # m
 
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """Renders a scene as its scout sees it.
+    """Renders a scene as one of its cameras sees it.
 
     Attributes:
         scene: Scene folder, or an MJCF file.
         out: PNG to write.
-        camera: Camera of the scene.
+        camera: Camera of the scene: scout, chase, portal_start, middle, wall or portal_end.
         width: Pixels.
         height: Pixels.
     """
@@ -49,6 +52,21 @@ def picture(scene: Path) -> np.ndarray | None:
     return None
 
 
+def light_up(model: Any, data: Any, camera: str) -> None:
+    """Switches on the lamps nearest to what a camera looks at, and the others off, since few can be on at a time.
+
+    Args:
+        model: An `MjModel`.
+        data: Its `MjData`, after `mj_forward`.
+        camera: Name of the camera.
+    """
+    eye = model.camera(camera).id
+    ahead = data.cam_xpos[eye] - _LOOK_AHEAD * data.cam_xmat[eye].reshape(3, 3)[:, 2]
+    nearest = np.argsort(np.linalg.norm(data.light_xpos - ahead, axis=1))[:_LIT]
+    model.light_active[:] = False
+    model.light_active[nearest] = True
+
+
 def main(config: RenderConfig) -> None:
     """Renders once, with the backend that `MUJOCO_GL` names."""
     import mujoco
@@ -57,6 +75,7 @@ def main(config: RenderConfig) -> None:
     model = mujoco.MjModel.from_xml_path(str(path))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    light_up(model, data, config.camera)
     renderer = mujoco.Renderer(model, config.height, config.width)
     renderer.update_scene(data, camera=config.camera)
     Image.fromarray(renderer.render()).save(config.out)

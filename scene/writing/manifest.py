@@ -1,15 +1,12 @@
 """`manifest.json`: what went in, how it was treated, what came out, and what of it was measured."""
 
 import dataclasses
-import hashlib
 import json
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from scene.files import sha256
 
 SCHEMA = "subterra.manifest/1"
 _LIBRARIES = (
@@ -29,25 +26,6 @@ _LIBRARIES = (
     "openpyxl",
     "shapely",
 )
-
-
-def input_record(paths: list[Path]) -> list[dict[str, Any]]:
-    """Name, size and hash of each input; no folder names, so that the manifest does not depend on the place.
-
-    A folder of scans counts as one input, whose hash is that of its files' names and hashes.
-    """
-    return [_folder_record(path) if path.is_dir() else _file_record(path) for path in paths]
-
-
-def _file_record(path: Path) -> dict[str, Any]:
-    return {"file": path.name, "bytes": path.stat().st_size, "sha256": sha256(path)}
-
-
-def _folder_record(path: Path) -> dict[str, Any]:
-    records = [_file_record(file) for file in sorted(path.iterdir()) if file.is_file()]
-    digest = hashlib.sha256("".join(f"{r['file']} {r['sha256']}\n" for r in records).encode())
-    size = sum(record["bytes"] for record in records)
-    return {"folder": path.name, "files": len(records), "bytes": size, "sha256": digest.hexdigest()}
 
 
 def write(path: Path, content: dict[str, Any], config: Any) -> None:

@@ -2,19 +2,19 @@
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from manifold3d import Manifold, Mesh64, OpType
 
 from scene.bore import Bore
 from scene.errors import FitError
+from scene.writing.recess import on_wall, recess_boxes, wall_normals
+from scene.writing.unrolled import AROUND, Sheet, Unrolled, corners, triangulate, unroll
 
-_SIMPLIFY = 0.002
-_LID_OVERLAP = 0.05  # how far a recess reaches into the air, so that the union leaves no film
 _MOUTH_TOLERANCE = 1e-4
 
 
 def build_solid(bore: Bore, pockets: bool) -> Manifold:
-    """The air of the bore as one solid, closed at both mouths, simplified to 2 mm.
+    """The air of the bore as one solid, closed at both mouths, its triangles about 0.2 m in size.
 
     Args:
         bore: The bore.
@@ -23,15 +23,17 @@ def build_solid(bore: Bore, pockets: bool) -> Manifold:
     Raises:
         FitError: The sections fold into each other, so that no solid comes out.
     """
-    solid = Manifold(Mesh64(*_tube(bore.surface(), bore.position)))
+    _require_unfolded(bore)
+    plane = unroll(bore)
+    boxes, apart = _boxes(bore, plane) if pockets else (np.empty((0, 4)), np.zeros(len(bore.pocket), bool))
+    sheet = triangulate(plane, bore.length, np.sort(plane.to_around(corners(bore))), boxes[apart] if pockets else boxes)
+    solid = Manifold(Mesh64(*_closed(bore, plane, sheet, np.flatnonzero(apart))))
     if solid.is_empty():
-        raise FitError(
-            f"the sections do not make a solid ({solid.status().name}); is the curve too tight for the width?"
-        )
-    solid = solid.simplify(_SIMPLIFY)
-    if pockets and len(bore.pocket):
-        recesses = Manifold.batch_boolean([Manifold.hull_points(box) for box in recess_boxes(bore)], OpType.Add)
-        solid = solid + recesses
+        raise FitError(f"the sections do not make a solid ({solid.status().name})")
+    crowded = np.flatnonzero(~apart) if pockets else np.empty(0, np.intp)
+    if len(crowded):
+        recesses = [Manifold.hull_points(box) for box in recess_boxes(bore, crowded)]
+        solid = solid + Manifold.batch_boolean(recesses, OpType.Add)
     return max(solid.decompose(), key=lambda part: part.volume())
 
 
@@ -66,56 +68,67 @@ def chunks(lining: trimesh.Trimesh, bore: Bore, length: float) -> list[trimesh.T
     return [part for part in parts if len(part.faces)]
 
 
-def recess_boxes(bore: Bore) -> list[Float[np.ndarray, "8 3"]]:
-    """Corners of each pocket as a box square to the wall it is sunk into, m."""
-    axis, boxes = bore.axis, []
-    surface = bore.surface()
-    for pocket in bore.pocket:
-        row = int(np.argmin(np.abs(bore.station - pocket["station"])))
-        at = axis.at(np.array([pocket["station"]]))
-        radius = np.interp(pocket["angle"], bore.angle, bore.radius[row], period=2 * np.pi)
-        lateral, up, tangent = at.lateral[0], at.up[0], at.tangent[0]
-        centre = at.position[0] + radius * (np.cos(pocket["angle"]) * lateral + np.sin(pocket["angle"]) * up)
-        outward = wall_normal(surface[row], bore, row, pocket["angle"])
-        around = np.cross(outward, tangent)
-        along = np.cross(around, outward)
-        steps = [
-            (0.5 * pocket["length"] * along, (-1, 1)),
-            (0.5 * pocket["width"] * around, (-1, 1)),
-        ]
-        corners = [
-            centre + i * steps[0][0] + j * steps[1][0] + d * outward
-            for i in steps[0][1]
-            for j in steps[1][1]
-            for d in (-_LID_OVERLAP, float(pocket["depth"]))
-        ]
-        boxes.append(np.asarray(corners))
-    return boxes
+def _require_unfolded(bore: Bore) -> None:
+    step = np.einsum("nmi,ni->nm", np.diff(bore.surface(), axis=0), bore.tangent[:-1] + bore.tangent[1:])
+    folded = np.flatnonzero((step <= 0).any(axis=1))
+    if len(folded):
+        raise FitError(
+            f"the sections fold into each other at {bore.station[folded[0]]:.1f} m; "
+            "is the curve too tight for the width?"
+        )
 
 
-def wall_normal(section: Float[np.ndarray, "m 3"], bore: Bore, row: int, angle: float) -> Float[np.ndarray, "3"]:
-    """Outward unit normal of a section's polygon at an angle, over an arc of about 5°."""
-    m = len(bore.angle)
-    column = int(np.argmin(np.abs(np.angle(np.exp(1j * (bore.angle - angle))))))
-    reach = max(1, m // 144)
-    chord = section[(column + reach) % m] - section[(column - reach) % m]
-    normal = np.cross(chord, bore.tangent[row])
-    return normal / np.linalg.norm(normal)
+def _boxes(bore: Bore, plane: Unrolled) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:
+    """Each pocket's rectangle in the plane, and whether it stands clear of the others, the seam and the mouths."""
+    pocket, clear = bore.pocket, 0.6 * AROUND
+    u, half = plane.to_around(pocket["angle"]), pocket["width"] / 2
+    box = np.column_stack([u - half, u + half, pocket["station"] - pocket["length"] / 2, pocket["station"]])
+    box[:, 3] += pocket["length"] / 2
+    apart = (box[:, 0] > clear) & (box[:, 1] < plane.girth - clear)
+    apart &= (box[:, 2] > clear) & (box[:, 3] < bore.length - clear)
+    order = np.argsort(box[:, 2], kind="stable")
+    longest = np.max(box[:, 3] - box[:, 2], initial=0.0)
+    for place, k in enumerate(order):
+        last = np.searchsorted(box[order, 2], box[k, 3] + clear) if longest else place
+        others = order[place + 1 : last]
+        near = (box[others, 0] < box[k, 1] + clear) & (box[others, 1] > box[k, 0] - clear)
+        apart[others[near]] = False
+    return box, apart
 
 
-def _tube(
-    surface: Float[np.ndarray, "n m 3"], centre: Float[np.ndarray, "n 3"]
+def _closed(
+    bore: Bore, plane: Unrolled, sheet: Sheet, pocket: Int[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    n, m, _ = surface.shape
-    corner = np.arange(n * m).reshape(n, m)
-    a, b = corner[:-1], np.roll(corner[:-1], -1, axis=1)
-    c, d = corner[1:], np.roll(corner[1:], -1, axis=1)
-    wall = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
-    first, last = n * m, n * m + 1
-    mouths = [
-        np.stack([np.full(m, first), np.roll(corner[0], -1), corner[0]], -1),
-        np.stack([np.full(m, last), corner[-1], np.roll(corner[-1], -1)], -1),
-    ]
-    vertices = np.concatenate([surface.reshape(-1, 3), centre[[0]], centre[[-1]]])
-    faces = np.concatenate([wall, *mouths]).astype(np.uint64)
-    return np.ascontiguousarray(vertices), np.ascontiguousarray(faces)
+    """The sheet rolled up, its recesses pushed outwards, both mouths closed."""
+    vertex = on_wall(bore, sheet.station, plane.to_angle(sheet.around))
+    count, faces = len(vertex), sheet.faces
+    rim = np.flatnonzero(sheet.rim)
+    sunk = np.arange(count)
+    sunk[rim] = count + np.arange(len(rim))
+    push = np.zeros((count, 3))
+    if len(pocket):
+        outward = wall_normals(bore, pocket) * bore.pocket["depth"][pocket, None]
+        push = np.where(sheet.recess[:, None] >= 0, outward[sheet.recess], 0.0)
+    vertex = np.concatenate([np.where(sheet.rim[:, None], vertex, vertex + push), vertex[rim] + push[rim]])
+    owner = sheet.recess[faces]
+    inside = (owner[:, 0] >= 0) & (owner == owner[:, :1]).all(axis=1)
+    faces = np.where(inside[:, None], sunk[faces], faces)
+    first = np.flatnonzero(np.diff(sheet.recess[rim], prepend=-1))
+    following = rim + 1
+    following[np.append(first, len(rim))[1:] - 1] = rim[first]
+    sides = [np.column_stack([rim, following, sunk[following]]), np.column_stack([rim, sunk[following], sunk[rim]])]
+    return _capped(bore, sheet, vertex, np.concatenate([faces, *sides]))
+
+
+def _capped(
+    bore: Bore, sheet: Sheet, vertex: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+    """The mouths closed with fans about the axis."""
+    caps, n = [], len(vertex)
+    for k, station in enumerate((0.0, sheet.station.max())):
+        ring = np.flatnonzero((sheet.station == station) & ~sheet.rim)
+        ring = ring[np.argsort(sheet.around[ring])]
+        after = np.roll(ring, -1)
+        caps.append(np.column_stack([np.full(len(ring), n + k), *((after, ring) if k == 0 else (ring, after))]))
+    vertex = np.concatenate([vertex, bore.position[[0, -1]]])
+    return np.ascontiguousarray(vertex), np.ascontiguousarray(np.concatenate([faces, *caps]).astype(np.uint64))

@@ -12,7 +12,7 @@ from scene.bore import Bore
 from scene.errors import FitError
 
 SCHEMA = "subterra.tunnel/1"
-_COLLINEAR = 0.0005  # m; a tenth of it would double the vertices
+_COLLINEAR = 0.001  # m; half of it would add half as many vertices to a smooth wall
 
 
 @dataclass(frozen=True)
@@ -102,8 +102,12 @@ def save(
     elevation: Float[np.ndarray, " n"],
     lidar_height: float,
     variants: dict[str, Walls],
+    furniture: dict[str, Float[np.ndarray, "f 4"]] | None = None,
 ) -> None:
-    """Writes `tunnel.npz`; docs/formats.md says what each field means. `variants` holds `smooth` first."""
+    """Writes `tunnel.npz`; docs/formats.md says what each field means. `variants` holds `smooth` first.
+
+    `furniture` holds, by variant, segments beside the walls; none where a variant is not named.
+    """
     plan = flat(bore.axis)
     fields: dict[str, np.ndarray] = {
         "schema": np.array(SCHEMA),
@@ -120,7 +124,7 @@ def save(
     for variant, walls in variants.items():
         fields[f"left_{variant}"], fields[f"left_station_{variant}"] = walls.left, walls.left_station
         fields[f"right_{variant}"], fields[f"right_station_{variant}"] = walls.right, walls.right_station
-        fields[f"furniture_{variant}"] = np.empty((0, 4))
+        fields[f"furniture_{variant}"] = (furniture or {}).get(variant, np.empty((0, 4)))
     np.savez_compressed(path, **fields)  # type: ignore[arg-type]
 
 

@@ -152,13 +152,21 @@ def _lowest_chord(bore: Bore, half_width: float) -> np.ndarray:
     return levels
 
 
-def _clearance(bore: Bore, elevation: np.ndarray, station: np.ndarray) -> np.ndarray:
-    """From the axis to the nearer wall at the height of the track, at each station, m."""
-    rows = np.clip(np.rint(station / (bore.station[1] - bore.station[0])).astype(int), 0, len(bore.station) - 1)
-    across, upward = bore.radius[rows] * np.cos(bore.angle), bore.radius[rows] * np.sin(bore.angle)
-    level = (elevation - bore.position[:, 2])[rows, None]
+def wall_offset(bore: Bore, level: Float[np.ndarray, " n"], side: int) -> Float[np.ndarray, " n"]:
+    """From the axis to the wall, m, `level` m above the axis at each station, to the left for `side` 1, else the right.
+
+    0 where the bore is not that high.
+    """
+    across, upward = side * bore.radius * np.cos(bore.angle), bore.radius * np.sin(bore.angle)
+    level = level[:, None]
     next_across, next_upward = np.roll(across, -1, axis=1), np.roll(upward, -1, axis=1)
     crosses = (upward < level) != (next_upward < level)
     share = np.where(crosses, (level - upward) / np.where(crosses, next_upward - upward, 1.0), 0.0)
-    at = np.where(crosses, across + share * (next_across - across), 0.0)
-    return np.minimum(at.max(axis=1), -at.min(axis=1))
+    return np.where(crosses, across + share * (next_across - across), 0.0).max(axis=1)
+
+
+def _clearance(bore: Bore, elevation: np.ndarray, station: np.ndarray) -> np.ndarray:
+    """From the axis to the nearer wall at the height of the track, at each station, m."""
+    level = elevation - bore.position[:, 2]
+    nearer = np.minimum(wall_offset(bore, level, 1), wall_offset(bore, level, -1))
+    return nearer[np.clip(np.rint(station / bore.station[1]).astype(int), 0, len(bore.station) - 1)]

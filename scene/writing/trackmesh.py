@@ -1,14 +1,32 @@
-"""Shapes of the track: one sleeper for all, the boxes of a rail, fastenings merged by stretch."""
+"""Shapes of the track: a sleeper, what fastens rails to it, the boxes of a rail; and nails merged by stretch."""
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
-from scene.axis import Axis
-from scene.writing.track import RailProfile, Track, TrackConfig
+from scene.bore import Bore
+from scene.writing.recess import on_wall
+from scene.writing.track import RailProfile, TrackConfig
 
-# Engineering defaults, not sourced: plan size of a pad, envelope of an elastic clip.
+# Engineering defaults, not sourced: plan size of a pad; cast shoulder; a clip of 20 mm bar, e-shaped from above, from
+# its leg in the shoulder to its toe on the rail's foot, as x along the rail, y away from the foot's edge, z above it.
 _PAD = (0.18, 0.15)
-_CLIP = (0.09, 0.11, 0.06)
+_SHOULDER, _SHOULDER_AT = (0.07, 0.055, 0.045), 0.045
+_CLIP_BAR = 0.020
+_CLIP = 0.001 * np.array(
+    [
+        (-50, 45, 12),
+        (35, 45, 12),
+        (58, 36, 16),
+        (62, 15, 24),
+        (45, -4, 30),
+        (10, -14, 26),
+        (-12, -16, 14),
+        (-38, -14, 10),
+    ]
+)
+_BAR_SIDES = 6
+_BOLT_SIDES = 6
 
 
 def sleeper(config: TrackConfig) -> trimesh.Trimesh:
@@ -30,32 +48,61 @@ def rail_boxes(profile: RailProfile) -> list[tuple[float, float, float]]:
     ]
 
 
-def fastenings(track: Track, axis: Axis, start: float, end: float) -> trimesh.Trimesh | None:
-    """Pads and clips of the sleepers between two stations, m; for looks. `None` where there is no sleeper."""
-    chosen = track.sleeper_station[(track.sleeper_station >= start) & (track.sleeper_station < end)]
-    config, parts = track.config, []
-    at, base = axis.at(chosen), _elevation(track, axis, chosen)
-    for k in range(len(chosen)):
+def fastening(config: TrackConfig) -> trimesh.Trimesh:
+    """What holds the rails to one sleeper, about the middle of its top, m: two pads, four shoulders, four clips."""
+    parts = []
+    for side in (1, -1):
+        pad = trimesh.creation.box((*_PAD, config.pad_thickness))
+        parts.append(pad.apply_translation((0, side * config.rail_offset, config.pad_thickness / 2)))
+        for edge in (1, -1):
+            foot = side * config.rail_offset + edge * config.rail.foot_width / 2
+            shoulder = trimesh.creation.box(_SHOULDER)
+            parts.append(shoulder.apply_translation((0, foot + edge * _SHOULDER_AT, _SHOULDER[2] / 2)))
+            path = _CLIP * [edge, edge, 1.0] + [0.0, foot, config.pad_thickness + config.rail.foot_height]
+            parts.append(_bar(path, _CLIP_BAR / 2))
+    return _merged(parts)
+
+
+def _bar(path: Float[np.ndarray, "k 3"], radius: float) -> trimesh.Trimesh:
+    """A round bar bent along a path, closed at both ends, m."""
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    aside = np.cross(along, [0.0, 0.0, 1.0])
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    turn = np.arange(_BAR_SIDES) * 2 * np.pi / _BAR_SIDES
+    ring = np.cos(turn)[:, None] * aside[:, None] + np.sin(turn)[:, None] * np.cross(aside, along)[:, None]
+    vertex = np.concatenate([(path[:, None] + radius * ring).reshape(-1, 3), path[[0, -1]]])
+    corner = np.arange(len(path) * _BAR_SIDES).reshape(len(path), _BAR_SIDES)
+    after = np.roll(corner, -1, axis=1)
+    a, b, c, d = (part.ravel() for part in (corner[:-1], after[:-1], corner[1:], after[1:]))
+    first, last = np.full(_BAR_SIDES, len(vertex) - 2), np.full(_BAR_SIDES, len(vertex) - 1)
+    ends = [(first, after[0], corner[0]), (last, corner[-1], after[-1])]
+    faces = np.concatenate([np.column_stack(part) for part in [(a, b, c), (b, d, c), *ends]])
+    bar = trimesh.Trimesh(vertex, faces, process=False)
+    if bar.volume < 0:
+        bar.invert()
+    return bar
+
+
+def nails(bore: Bore, start: float, end: float) -> trimesh.Trimesh | None:
+    """The bolts between two stations, m, as prisms behind the wall, for looks. `None` where there is none."""
+    chosen = bore.nail[(bore.nail["station"] >= start) & (bore.nail["station"] < end)]
+    if not len(chosen):
+        return None
+    at = bore.axis.at(chosen["station"])
+    wall, parts = on_wall(bore, chosen["station"], chosen["angle"]), []
+    for k, nail in enumerate(chosen):
+        outward = np.cos(nail["angle"]) * at.lateral[k] + np.sin(nail["angle"]) * at.up[k]
         frame = np.eye(4)
-        frame[:3, 0], frame[:3, 1] = at.tangent[k], at.lateral[k]
-        frame[:3, 2] = np.cross(at.tangent[k], at.lateral[k])
-        frame[:2, 3], frame[2, 3] = at.position[k, :2], base[k]
-        for side in (1, -1):
-            pad = trimesh.creation.box((*_PAD, config.pad_thickness))
-            pad.apply_translation((0, side * config.rail_offset, config.pad_thickness / 2))
-            parts.append(pad.apply_transform(frame))
-            for edge in (1, -1):
-                clip = trimesh.creation.box(_CLIP)
-                across = side * config.rail_offset + edge * (config.rail.foot_width + _CLIP[1]) / 2
-                parts.append(clip.apply_translation((0, across, _CLIP[2] / 2)).apply_transform(frame))
-    return _merged(parts) if parts else None
+        frame[:3, 2], frame[:3, 0] = at.tangent[k], outward
+        frame[:3, 1] = np.cross(frame[:3, 2], frame[:3, 0])
+        frame[:3, 3] = wall[k] + nail["depth"] * outward
+        bolt = trimesh.creation.cylinder(nail["diameter"] / 2, nail["length"], sections=_BOLT_SIDES)
+        parts.append(bolt.apply_transform(frame))
+    return _merged(parts)
 
 
 def _merged(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
     return trimesh.Trimesh(np.concatenate([p.vertices for p in parts]), np.concatenate(faces), process=False)
-
-
-def _elevation(track: Track, axis: Axis, station: np.ndarray) -> np.ndarray:
-    return np.interp(station, axis.station, track.elevation)

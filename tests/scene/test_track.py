@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from scene.bore import NAIL
 from scene.errors import FitError
-from scene.writing import mesh, mjcf, planar, track
+from scene.writing import mesh, mjcf, planar, track, trackmesh
 from tests.scene.conftest import arc_bore
 
 
@@ -71,3 +72,30 @@ def test_the_scene_file_names_every_sleeper_and_both_rails(written):
     text = path.read_text()
     assert text.count('name="sleeper_') == count["sleepers"] == 41
     assert text.count('name="rail_left_') == text.count('name="rail_right_') > 0
+
+
+def test_each_sleeper_has_two_pads_and_four_clips_on_the_rails_feet():
+    config = track.TrackConfig()
+    parts = trackmesh.fastening(config).split(only_watertight=True)
+    pads = [part for part in parts if np.ptp(part.bounds[:, 2]) == pytest.approx(config.pad_thickness)]
+    clips = [part for part in parts if len(part.vertices) > 8]
+    assert (len(pads), len(clips), len(parts)) == (2, 4, 10)
+    for clip in clips:
+        inner = np.abs(np.abs(clip.vertices[:, 1]) - config.rail_offset)
+        foot = config.pad_thickness + config.rail.foot_height
+        assert inner.min() < config.rail.foot_width / 2
+        assert clip.vertices[inner < config.rail.foot_width / 2, 2].min() == pytest.approx(foot, abs=0.005)
+
+
+def test_nails_bridge_the_joint_behind_the_wall(bore, tmp_path):
+    assert trackmesh.nails(bore, 0.0, bore.length) is None
+    rows = [(4.5, 0.4, 0.30, 0.028, 0.06, 1.0, False), (7.5, 2.0, 0.30, 0.028, 0.06, 1.0, True)]
+    nailed = replace(bore, nail=np.array(rows, NAIL))
+    mesh_of_nails = trackmesh.nails(nailed, 0.0, bore.length)
+    assert mesh_of_nails.is_volume
+    station, lateral, up = nailed.axis.local(mesh_of_nails.vertices)
+    first = np.abs(station - 4.5) < 1
+    assert np.ptp(station[first]) == pytest.approx(0.30, abs=0.02)  # on its arc
+    depth = np.hypot(lateral, up)[first].mean() - np.interp(0.4, bore.angle, bore.radius[0])
+    assert depth == pytest.approx(0.06, abs=0.01)
+    assert trackmesh.nails(nailed, 5.0, 7.0) is None

@@ -90,6 +90,19 @@ def test_furniture_is_seen(plan_of):
     check_exact(plan_of(arrays), "smooth", 2000)
 
 
+def test_furniture_along_a_wall_is_exact(plan_of):
+    """Brackets a metre apart, whose boxes a beam along the wall grazes by the dozen."""
+    arrays = tunnels.tunnel_arrays(tunnels.s_bend(150.0, 150.0), roughness=0.015)
+    centre, tangent = arrays["centre"][8:-8:4], arrays["tangent"][8:-8:4]
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    corners = [
+        centre + x * tangent - (2.75 - y) * normal for x, y in ((-0.03, 0), (0.03, 0), (0.03, 0.05), (-0.03, 0.05))
+    ]
+    outline = np.stack(corners, axis=1)
+    arrays["furniture_pockets"] = np.concatenate([outline, np.roll(outline, -1, axis=1)], axis=2).reshape(-1, 4)
+    check_exact(plan_of(arrays), "pockets", 20_000)
+
+
 def test_noise_has_its_size_stays_in_range_and_spares_beams_without_a_hit():
     true = jnp.array([10.0, 30.0, 0.01, 29.99])
     noise = jax.random.normal(jax.random.key(0), (20_000, 4))
@@ -103,7 +116,12 @@ def test_noise_has_its_size_stays_in_range_and_spares_beams_without_a_hit():
 
 @pytest.mark.parametrize(
     ("name", "lining", "n_poses"),
-    [("subterra-351", "pockets", 100_000), ("subterra-351", "smooth", 20_000), ("metro-asbuilt", "smooth", 20_000)],
+    [
+        ("subterra-351", "pockets", 100_000),
+        ("subterra-351", "smooth", 20_000),
+        ("subterra-351", "furnished", 20_000),
+        ("metro-asbuilt", "smooth", 20_000),
+    ],
 )
 def test_the_packaged_tunnels_are_exact_at_random_poses(name, lining, n_poses):
     check_exact(load_tunnel(name), lining, n_poses)

@@ -1,0 +1,108 @@
+"""MJCF elements: numbers, boxes and meshes as attributes."""
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+# What a body touches is chosen by these bits of its geoms' `conaffinity`.
+SOLID = 1  # everything that is really there: lining, bed, sleepers, rails, furniture
+DECK = 2  # a smooth deck at the top of the sleepers, for wheels; not really there
+GROUND = 4  # bed, sleepers and rails alone, for legs
+LOW_WALL = 8  # lining and furniture at robots' height alone, a few panels, so that MJX has few pairs to test
+
+_DIGITS = 5
+
+
+def child(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
+    """A new element below `parent`."""
+    return ET.SubElement(parent, tag, attributes)
+
+
+def numbers(values: ArrayLike) -> str:
+    """Numbers as MJCF writes them, six digits."""
+    return " ".join(f"{value:.6g}" for value in np.ravel(values))
+
+
+def quaternion(rotation: Rotation) -> str:
+    """A rotation as MJCF writes it, real part first."""
+    return numbers(rotation.as_quat()[[3, 0, 1, 2]])
+
+
+def along(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Rotation:
+    """X from start to end, y horizontal to the left."""
+    x = (end - start) / np.linalg.norm(end - start)
+    y = np.array([-x[1], x[0], 0.0])
+    y /= np.linalg.norm(y)
+    return Rotation.from_matrix(np.stack([x, y, cross(x, y)], axis=1))
+
+
+def cross(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The vector product; NumPy's takes ten times as long for a single pair, and there are ten thousands of boxes."""
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def box(
+    world: ET.Element,
+    name: str,
+    half: ArrayLike,
+    centre: ArrayLike,
+    rotation: Rotation,
+    bits: int,
+    **attributes: str,
+) -> None:
+    """A fixed box that bodies touch whose affinity has one of `bits`; half sizes and centre in m."""
+    child(
+        world, "geom", name=name, type="box", size=numbers(half), pos=numbers(centre), quat=quaternion(rotation),
+        contype=str(bits), conaffinity="0", **attributes,
+    )  # fmt: skip
+
+
+def mesh_geom(
+    asset: ET.Element,
+    world: ET.Element,
+    folder: Path,
+    name: str,
+    mesh: trimesh.Trimesh,
+    material: str,
+    group: str,
+    coordinates: tuple[Float[np.ndarray, "t 2"], np.ndarray] | None = None,
+    reuse: bool = False,
+) -> None:
+    """A mesh for looks and rays, stored about its own whole-metre origin so that few digits suffice.
+
+    Args:
+        asset: Where the mesh is declared.
+        world: Where it is placed.
+        folder: For its file.
+        name: Of mesh, geom and file.
+        mesh: In the tunnel frame, m.
+        material: Of the geom.
+        group: Of the geom.
+        coordinates: Texture coordinates, and which of them each corner of each face has, `(f, 3)`.
+        reuse: Whether a file of that name that is there already is this mesh's.
+    """
+    origin = np.floor(mesh.vertices.mean(axis=0))
+    path = folder / f"{name}.obj"
+    if not (reuse and path.exists()):
+        path.write_text(_obj(mesh.vertices - origin, mesh.faces, coordinates))
+    child(asset, "mesh", name=name, file=path.name, inertia="shell")
+    child(
+        world, "geom", name=name, type="mesh", mesh=name, pos=numbers(origin), material=material, group=group,
+        contype="0", conaffinity="0",
+    )  # fmt: skip
+
+
+def _obj(vertices: np.ndarray, faces: np.ndarray, coordinates: tuple[np.ndarray, np.ndarray] | None) -> str:
+    lines = [f"v {x:.{_DIGITS}f} {y:.{_DIGITS}f} {z:.{_DIGITS}f}" for x, y, z in vertices.tolist()]
+    if coordinates is None:
+        return "\n".join(lines + [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]) + "\n"
+    texture, corner = coordinates
+    lines += [f"vt {u:.4f} {v:.4f}" for u, v in texture.tolist()]
+    both = np.stack([faces + 1, corner + 1], axis=-1).reshape(-1, 6)
+    lines += [f"f {a}/{d} {b}/{e} {c}/{f}" for a, d, b, e, c, f in both.tolist()]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,146 @@
+"""Furniture by standard: in its place, clear of the robot's gauge, and the same to MuJoCo's rays as in the plane."""
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from scene.writing import geometry, track
+from scene.writing.furnished import furnish_bore, planar_segments
+from scene.writing.furniture import counts
+from scene.writing.mjcf import SceneConfig
+from scene.writing.place import FurnitureConfig
+from tests.scene.conftest import arc_bore
+
+WITH_DOOR = FurnitureConfig(passage_spacing=20.0, plate_spacing=6.0)
+
+
+@pytest.fixture(scope="module")
+def level():
+    """A bore without grade, so that rays and plane agree beyond a few metres."""
+    return arc_bore(length=24.0, radius=150.0, grade=0.0)
+
+
+@pytest.fixture(scope="module")
+def laid(level):
+    return track.lay(level, track.TrackConfig())
+
+
+@pytest.fixture(scope="module")
+def written(level, laid, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("furnished")
+    config = SceneConfig(furniture=WITH_DOOR)
+    return folder, *geometry.write_geometry(folder, "x", "simulated", level, laid, config)
+
+
+@pytest.fixture(scope="module")
+def tunnel(written):
+    with np.load(written[0] / "tunnel.npz") as data:
+        return {name: data[name] for name in data.files}
+
+
+def segments(tunnel, variant: str) -> np.ndarray:
+    walls = [tunnel[f"{side}_{variant}"] for side in ("left", "right")]
+    return np.concatenate([*(np.hstack([wall[:-1], wall[1:]]) for wall in walls), tunnel[f"furniture_{variant}"]])
+
+
+def cast(lines: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
+    a, edge = lines[:, :2] - origin, lines[:, 2:] - lines[:, :2]
+    across = direction[0] * edge[:, 1] - direction[1] * edge[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distance = (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) / across
+        share = (a[:, 0] * direction[1] - a[:, 1] * direction[0]) / across
+    hit = (distance > 0) & (share >= 0) & (share <= 1)
+    return float(np.min(distance[hit], initial=30.0))
+
+
+def test_brackets_stand_every_metre_with_an_arm_a_tier_and_one_door_at_half_the_spacing(written):
+    _, count, _ = written
+    assert count["furniture_bracket"] == 24
+    assert count["furniture_bracket_arm"] == 4 * 24
+    assert count["furniture_handrail_post"] == pytest.approx(12 - 2, abs=1)
+    assert count["furniture_hectometre_plate"] == 3
+    assert count["furniture_niche"] == 1
+
+
+def test_every_kind_can_be_left_out(level, laid):
+    kinds = {"walkway", "handrail", "cables", "third_rail", "plates", "passage", "lamps"}
+    none = FurnitureConfig(**dict.fromkeys(kinds, False))
+    nothing = furnish_bore(level, laid, none)
+    assert not nothing.pieces
+    assert not nothing.niches
+    assert not len(planar_segments(nothing.pieces, level, laid.elevation, 0.7))
+    only_cables = furnish_bore(level, laid, replace(none, cables=True))
+    assert set(counts(only_cables.pieces)) == {"bracket", "bracket_arm", "cable"}
+
+
+def test_nothing_enters_the_robots_gauge(level, laid):
+    for piece in furnish_bore(level, laid, WITH_DOOR).pieces:
+        station, lateral, _ = level.axis.local(piece.corners())
+        low = piece.corners()[:, 2] - np.interp(station, level.station, laid.elevation)
+        if low.min() < 2.0:
+            assert np.abs(lateral).min() > 0.9, piece.kind
+            assert (np.sign(lateral) == np.sign(lateral[0])).all(), piece.kind
+
+
+def test_walkway_and_third_rail_are_left_out_where_the_bore_is_too_narrow():
+    narrow = arc_bore(half_width=1.7, radius=300.0)
+    laid = track.lay(narrow, track.TrackConfig(shoulder=0.2))
+    kinds = counts(furnish_bore(narrow, laid, FurnitureConfig()).pieces)
+    assert "walkway" not in kinds
+    assert "handrail_post" not in kinds
+    assert "bracket" in kinds
+
+
+def test_the_niche_is_half_a_metre_deep_two_metres_long_and_on_the_left_alone(level, tunnel):
+    def across(side: str) -> np.ndarray:
+        wall = tunnel[f"{side}_furnished"]
+        return np.abs(level.axis.local(np.column_stack([wall, np.full(len(wall), 3.2)]))[1])
+
+    assert across("left").max() == pytest.approx(2.8 + 0.5, abs=0.02)
+    assert across("right").max() == pytest.approx(2.8 + 0.13, abs=0.02)
+    deep = tunnel["left_station_furnished"][across("left") > 3.2]
+    assert np.ptp(deep) == pytest.approx(2.0, abs=0.26)
+    assert deep.mean() == pytest.approx(10.0, abs=0.3)
+
+
+def test_posts_and_brackets_are_cut_as_closed_outlines(tunnel):
+    outline = tunnel["furniture_furnished"].reshape(-1, 4, 4)[:-1]  # the last is the door
+    np.testing.assert_allclose(outline[:, :, 2:], np.roll(outline[:, :, :2], -1, axis=1))
+    size = np.linalg.norm(outline[:, :, 2:] - outline[:, :, :2], axis=2)
+    np.testing.assert_allclose(size, 0.05, atol=0.002)
+    assert not len(tunnel["furniture_smooth"])
+    assert not len(tunnel["furniture_pockets"])
+
+
+@pytest.mark.parametrize(("variant", "scene"), [("pockets", "scene.xml"), ("furnished", "scene_furnished.xml")])
+def test_mujocos_rays_see_what_the_plane_holds(level, laid, tunnel, written, variant, scene):
+    model = mujoco.MjModel.from_xml_path(str(written[0] / scene))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    rng, lines, error = np.random.default_rng(0), segments(tunnel, variant), []
+    visible, hit = np.array([1, 1, 0, 0, 0, 0], np.uint8), np.zeros(1, np.int32)
+    for row in rng.integers(8, len(level.station) - 8, 400):
+        turn = rng.uniform(-np.pi, np.pi)
+        origin = level.position[row] + rng.uniform(-1.5, 1.5) * level.lateral[row]
+        origin[2] = laid.elevation[row] + 0.7
+        direction = np.array([np.cos(turn), np.sin(turn), 0.0])
+        distance = mujoco.mj_ray(model, data, origin, direction, visible, 1, -1, hit)
+        error.append(abs(min(distance if distance >= 0 else 30.0, 30.0) - cast(lines, origin[:2], direction[:2])))
+    assert np.mean(np.array(error) < 0.005) > 0.98
+
+
+def test_the_niche_is_open_to_bodies_and_closed_at_its_back(level, laid, written):
+    from tests.scene.test_walls import Probe
+
+    probe = Probe(written[0] / "scene_furnished.xml")
+    at = level.axis.at(np.array([10.0]))
+    inside = np.array([*(at.position[0] + 2.85 * at.lateral[0])[:2], laid.elevation[40] + 1.3])
+    assert not probe.touches(inside)
+    assert probe.touches(inside + 0.25 * at.lateral[0])
+    assert Probe(written[0] / "scene.xml").touches(inside)
+
+
+def test_furniture_is_marked_as_by_standard(written):
+    assert written[2]["furniture"].startswith("by standard")

@@ -1,0 +1,110 @@
+"""The solid and the lining as manifold3d and trimesh judge them, over bores that are hard to mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from manifold3d import Error, Manifold, Mesh64
+from scipy.ndimage import gaussian_filter
+
+from scene.bore import POCKET, Bore
+from scene.errors import FitError
+from scene.writing import mesh
+from tests.scene.conftest import arc_bore
+
+
+def irregular(bore: Bore) -> Bore:
+    """Walls that vary by 13 cm at a correlation length of about a metre."""
+    noise = gaussian_filter(np.random.default_rng(0).standard_normal(bore.radius.shape), (4, 14), mode="wrap")
+    return replace(bore, radius=bore.radius + 0.13 * noise / noise.std())
+
+
+def crowded(bore: Bore) -> Bore:
+    """Pockets that overlap one another, pockets across a mouth, and one at the seam's side, the floor."""
+    rows = [(8.0, 0.3), (8.1, 0.32), (0.05, 0.5), (bore.length, 2.5), (12.0, -np.pi / 2), (12.15, -np.pi / 2)]
+    more = np.array([(s, a, 0.2, 0.16, 0.13, 1.0, True) for s, a in rows], POCKET)
+    return replace(bore, pocket=np.concatenate([bore.pocket, more]))
+
+
+BORES = {
+    "a bend of 60 m": lambda: arc_bore(radius=60.0),
+    "nearly straight": lambda: arc_bore(radius=2000.0),
+    "irregular walls": lambda: irregular(arc_bore(radius=150.0)),
+    "crowded pockets": lambda: crowded(arc_bore(radius=150.0)),
+    "no pockets": lambda: replace(arc_bore(), pocket=np.empty(0, POCKET)),
+}
+
+
+@pytest.fixture(scope="module", params=BORES)
+def case(request):
+    bore = BORES[request.param]()
+    solid = mesh.as_trimesh(mesh.build_solid(bore, pockets=True))
+    return bore, solid, mesh.open_lining(solid, bore)
+
+
+def section_volume(bore: Bore) -> float:
+    x, y = bore.radius * np.cos(bore.angle), bore.radius * np.sin(bore.angle)
+    area = 0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1), axis=1))
+    return float(np.trapezoid(area, bore.station))
+
+
+def boundary(surface: trimesh.Trimesh) -> np.ndarray:
+    edges, count = np.unique(surface.edges_sorted, axis=0, return_counts=True)
+    assert count.max() <= 2
+    return edges[count == 1]
+
+
+def test_both_libraries_accept_the_solid_as_one_ball(case):
+    _, solid, _ = case
+    assert solid.is_watertight
+    assert solid.is_winding_consistent
+    assert solid.is_volume
+    assert (solid.euler_number, solid.body_count) == (2, 1)
+    vertices, faces = np.array(solid.vertices), np.array(solid.faces, np.uint64)
+    again = Manifold(Mesh64(vertices, faces))
+    assert again.status() == Error.NoError
+    assert again.genus() == 0
+    assert again.volume() == pytest.approx(solid.volume)
+
+
+def test_the_lining_has_two_boundary_loops_one_at_either_mouth(case):
+    bore, _, lining = case
+    loops = trimesh.graph.connected_components(boundary(lining), min_len=3)
+    assert len(loops) == 2
+    for loop, end in zip(
+        sorted(loops, key=lambda part: bore.axis.local(lining.vertices[part])[0].mean()), (0, -1), strict=True
+    ):
+        assert np.abs((lining.vertices[loop] - bore.position[end]) @ bore.tangent[end]).max() < 1e-3
+
+
+def test_its_volume_is_that_of_the_sections_and_pockets(case):
+    bore, solid, _ = case
+    pockets = float(np.sum(bore.pocket["length"] * bore.pocket["width"] * bore.pocket["depth"]))
+    assert solid.volume == pytest.approx(section_volume(bore) + pockets, rel=3e-3)
+
+
+def test_triangles_are_well_shaped_and_small_enough_to_show_the_pockets(case):
+    _, _, lining = case
+    edge = np.linalg.norm(lining.triangles - np.roll(lining.triangles, 1, axis=1), axis=2)
+    height = 2 * lining.area_faces / edge.max(axis=1)
+    angle = np.degrees(trimesh.triangles.angles(lining.triangles)).min(axis=1)
+    assert np.percentile(angle, 5) > 30
+    assert np.percentile(edge.max(axis=1) / height, 95) < 4
+    assert np.percentile(edge, 95) < 0.25
+    assert np.mean(angle < 1) < 1e-3
+
+
+def test_the_lining_faces_the_axis(case):
+    bore, _, lining = case
+    station, lateral, up = bore.axis.local(lining.triangles_center)
+    at = bore.axis.at(station)
+    outward = lateral[:, None] * at.lateral + up[:, None] * at.up
+    seen = np.einsum("ij,ij->i", lining.face_normals, outward) < 1e-3
+    assert lining.area_faces[seen].sum() / lining.area > 0.98
+
+
+def test_sections_that_fold_into_each_other_are_an_error_with_their_place():
+    bore = arc_bore(length=24.0, radius=60.0)
+    with pytest.raises(FitError, match=r"fold into each other at \d"):
+        mesh.build_solid(replace(bore, radius=bore.radius * 25), pockets=False)
