@@ -1,15 +1,19 @@
-"""What every command of this room shares: one sentence for a user's mistake, and a bar for long work."""
+"""What every command of this room shares: one sentence for a user's mistake, and bars for long work."""
 
 import sys
+import time
 from collections.abc import Callable
+from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from scene.errors import SubterraError
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
+_LINE_EVERY, _LINE_SHARE = 10.0, 0.1  # s, and share of a stage, between two lines where there is no terminal
 
 
 def run(command: Callable[[], None]) -> None:
@@ -20,18 +24,100 @@ def run(command: Callable[[], None]) -> None:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
     except KeyboardInterrupt:
-        print("interrupted; nothing was written", file=sys.stderr)
+        print("interrupted; the output is as it was, and the same command goes on from here", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
 
 
-def progress_bar() -> Progress:
-    """A bar on stderr, silent where stderr is no terminal."""
-    console = Console(stderr=True)
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-        disable=not console.is_terminal,
-    )
+class _Rate(ProgressColumn):
+    """Steps a second."""
+
+    def render(self, task: Task) -> Text:
+        """Empty until there is a speed."""
+        return Text("" if not task.speed else f"{task.speed:.3g}/s")
+
+
+class Stage:
+    """One stage of long work, whose steps are counted.
+
+    Attributes:
+        name: What is done.
+        done: Steps so far.
+    """
+
+    def __init__(self, bars: Progress, console: Console, name: str, total: int | None) -> None:
+        self.name, self._total, self.done = name, total, 0
+        self._bars, self._console = bars, console
+        self._task = bars.add_task(name, total=total)
+        self._started = self._line_at = time.monotonic()
+        self._first = self._line_done = 0
+
+    @property
+    def total(self) -> int | None:
+        """Steps in all; `None` where nobody knows."""
+        return self._total
+
+    @total.setter
+    def total(self, total: int | None) -> None:
+        self._total = total
+        self._bars.update(self._task, total=total)
+
+    def advance(self, steps: int = 1) -> None:
+        """Counts steps."""
+        self.done += steps
+        self._bars.advance(self._task, steps)
+        if not self._console.is_terminal and self.total:
+            self._line()
+
+    def resume(self, done: int) -> None:
+        """Goes on from a partial result, and says so."""
+        self.done = self._first = self._line_done = done
+        self._bars.update(self._task, completed=done)
+        share = f"at {100 * done / self.total:.0f} %" if self.total else f"after {done:,}"
+        print(f"Resumed {share} of {self.name}", flush=True)
+
+    def _line(self) -> None:
+        """One line for each tenth of a stage that lasts."""
+        now = time.monotonic()
+        steps = self.done - self._line_done
+        if now - self._line_at < _LINE_EVERY or steps < _LINE_SHARE * (self.total or 0) or self.done == self.total:
+            return
+        self._line_at, self._line_done = now, self.done
+        rate = (self.done - self._first) / (now - self._started)
+        left = max((self.total or 0) - self.done, 0) / rate
+        print(
+            f"{self.name}: {self.done / (self.total or 1):.0%}, {rate:.3g}/s, {left:.0f} s left",
+            file=self._console.file,
+            flush=True,
+        )
+
+
+class Stages:
+    """Shows on stderr how far long stages are: bars in a terminal, else a line for each tenth of those that last."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn())
+        self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
+
+    def __enter__(self) -> "Stages":
+        self._bars.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bars.stop()
+
+    def start(self, name: str, total: int | None) -> Stage:
+        """A new stage below the others.
+
+        Args:
+            name: What is done.
+            total: Steps in all; `None` where nobody knows.
+        """
+        return Stage(self._bars, self._console, name, total)
+
+
+def progress_bar() -> Stages:
+    """Stages on stderr."""
+    return Stages()

@@ -1,6 +1,7 @@
 """Files and folders that appear whole or not at all."""
 
-import hashlib
+import ctypes
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,16 +9,7 @@ from pathlib import Path
 
 from scene.errors import OutputError, RecordingError
 
-_CHUNK = 1 << 22
-
-
-def sha256(path: Path) -> str:
-    """Hex digest of a file's bytes."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_CHUNK):
-            digest.update(block)
-    return digest.hexdigest()
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux, renameat2(2)
 
 
 def require_input(path: Path) -> Path:
@@ -55,6 +47,7 @@ def replace_folder(path: Path) -> Iterator[Path]:
     """A folder to write into that takes the place of `path` once the block ends without an error.
 
     A previous folder at `path` stays whole until then; after an error or an interrupt, nothing of the new one is left.
+    What a killed process left behind is put right by the next one.
 
     Raises:
         OutputError: `path`, or a parent of it, is a file, or the disk refuses.
@@ -62,17 +55,32 @@ def replace_folder(path: Path) -> Iterator[Path]:
     require_output_folder(path)
     fresh, stale = path.with_name(f".{path.name}.partial"), path.with_name(f".{path.name}.stale")
     try:
-        for leftover in (fresh, stale):
-            shutil.rmtree(leftover, ignore_errors=True)
+        _put_back(path, stale)
+        shutil.rmtree(fresh, ignore_errors=True)
         fresh.mkdir(parents=True)
         yield fresh
-        if path.exists():
+        if path.exists() and not _exchange(fresh, path):
             path.rename(stale)
-        fresh.rename(path)
+        if not path.exists():
+            fresh.rename(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
-        if not path.exists() and stale.exists():
-            stale.rename(path)
-        shutil.rmtree(stale, ignore_errors=True)
+        _put_back(path, stale)
+
+
+def _put_back(path: Path, stale: Path) -> None:
+    """Ends a replacement that stopped between its two renames."""
+    if stale.exists() and not path.exists():
+        stale.rename(path)
+    shutil.rmtree(stale, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swaps two folders in one step, so that neither place is ever empty; `False` where the system cannot."""
+    try:
+        swap = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):  # no Linux, or one before 2014
+        return False
+    return swap(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0

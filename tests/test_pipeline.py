@@ -34,24 +34,25 @@ def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np
     return np.asarray(jax.jit(jax.vmap(scan))(poses.position, poses.heading, poses.station))
 
 
-def test_the_environments_lidar_sees_what_mujoco_sees_in_the_scene(scene):
+@pytest.mark.parametrize(("lining", "file"), [("pockets", "scene.xml"), ("furnished", "scene_furnished.xml")])
+def test_the_environments_lidar_sees_what_mujoco_sees_in_the_scene(scene, lining, file):
     """Sixteen beams from 300 random poses in the planar tunnel, and `mj_multiRay` against the scene's triangles."""
     plan = st.load_tunnel(scene / "tunnel.npz")
     poses = reference.random_poses(plan, 300, np.random.default_rng(0))
-    ours = device_scans(plan, poses, "pockets")
-    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    ours = device_scans(plan, poses, lining)
+    model = mujoco.MjModel.from_xml_path(str(scene / file))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     with np.load(scene / "tunnel.npz") as tunnel:
         height = np.interp(poses.station, tunnel["station"], tunnel["elevation"]) + tunnel["lidar_height"]
-    lining_only = np.array([1, 0, 0, 0, 0, 0], np.uint8)
+    visible = np.array([1, 1, 0, 0, 0, 0], np.uint8)
     theirs = np.empty_like(ours)
     for k, (position, heading) in enumerate(zip(poses.position, poses.heading, strict=True)):
         angle = heading + np.arange(16) * np.pi / 8
         beams = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(16)]).astype(np.float64)
         distance, hit = np.empty(16), np.empty(16, np.int32)
         origin = np.array([*position, height[k]], np.float64)
-        mujoco.mj_multiRay(model, data, origin, beams.ravel(), lining_only, 1, -1, hit, distance, None, 16, 30.0)
+        mujoco.mj_multiRay(model, data, origin, beams.ravel(), visible, 1, -1, hit, distance, None, 16, 30.0)
         theirs[k] = np.where(hit < 0, 30.0, distance)
     error = np.abs(ours - np.minimum(theirs, 30.0))
     assert np.median(error) < 0.01
@@ -68,6 +69,17 @@ def test_an_episode_runs_on_a_scene_just_built(scene):
         assert not truncated
     assert obs.shape == (18,)
     assert float(info["coverage"]) == pytest.approx(20 * 0.2 / 40, abs=0.03)
+
+
+def test_an_episode_runs_between_furniture(scene):
+    plan = st.load_tunnel(scene / "tunnel.npz")
+    assert len(plan.lining("furnished").furniture) > 0
+    env, params = st.make("Subterra/Traverse-v0", tunnel=plan, lining="furnished")
+    _, state = env.reset(jax.random.key(0), params)
+    step = jax.jit(env.step)
+    for k in range(20):
+        _, state, _, terminated, _, _ = step(jax.random.key(k), state, jnp.array([2.0, 0.0]), params)
+        assert not terminated
 
 
 @needs_metro

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from scene.poses import rotation as so3
 from scene.poses.calibration import Calibration, Mount
 from scene.poses.imu import Inertial, imu_topics, read_inertial
-from scene.poses.odometry import Guide
+from scene.poses.tracker import Guide
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
 

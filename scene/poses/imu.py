@@ -1,4 +1,9 @@
-"""Inertial samples beside a LiDAR: rates, specific forces, and orientation where the instrument gives one."""
+"""Inertial samples beside a LiDAR: rates and specific forces.
+
+The `orientation` field is not read. Where an instrument fills it (`/imu/data` of an Xsens MTi), a filter of its own
+made it from these same rates and forces, with errors that are neither stated nor white, and from a magnetometer that
+steel lining, rails and cables turn.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.errors import RecordingError
+from scene.reading.cause import cause
 from scene.reading.recording import Recording
 
 IMU_TYPE = "sensor_msgs/msg/Imu"
@@ -47,13 +53,18 @@ def imu(recording: Recording, topic: str) -> Iterator[tuple[float, np.ndarray, n
         RecordingError: A message is damaged; says which.
     """
     connections = [c for c in recording.reader.connections if c.topic == topic and c.msgtype == IMU_TYPE]
-    for index, (_, _, raw) in enumerate(recording.reader.messages(connections=connections)):
+    messages, index = recording.reader.messages(connections=connections), 0
+    while True:
         try:
+            _, _, raw = next(messages)
             message = recording.deserialize(raw, IMU_TYPE)
+        except StopIteration:
+            return
         except Exception as error:  # the library raises anything from struct.error to AssertionError on damage
-            raise RecordingError(f"{recording.path}: message {index} of {topic} is damaged ({error})") from error
+            raise RecordingError(f"{recording.path}: message {index} of {topic} is damaged ({cause(error)})") from error
         stamp, turn, push = message.header.stamp, message.angular_velocity, message.linear_acceleration
         yield stamp.sec + stamp.nanosec * 1e-9, np.array([turn.x, turn.y, turn.z]), np.array([push.x, push.y, push.z])
+        index += 1
 
 
 def read_inertial(recording: Recording, topic: str) -> Inertial | None:

@@ -5,44 +5,18 @@ therefore blended with the expected pose by the information of both: where the w
 stands. It comes from a guide (a gyro, or an earlier trajectory), else from going on as before.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import small_gicp
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from scene.cli import Stage
 from scene.errors import FitError
-from scene.poses.registration import deskew
+from scene.poses.odometrylog import OdometryLog, Tracked
+from scene.poses.tracker import LIBRARY, MIN_POINTS, Guide, Tracker
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
-from scene.reading.scan import Scan
-
-LIBRARY = "small-gicp"
-_MIN_POINTS = 100
-_RANGE = 60.0  # m
-_THINNING, _VOXEL, _REACH = 0.25, 0.5, 1.0  # m: of a sweep, of the map, of a correspondence
-_HORIZON = 100  # sweeps that an unseen voxel of the map is kept for
-_WARM_UP = 5  # sweeps before the expectation is worth anything without a guide
-_KNOTS = 11  # poses that a sweep is unwound with
-
-
-@dataclass(frozen=True)
-class Guide:
-    """What is known of the motion before the LiDAR is asked.
-
-    Attributes:
-        trajectory: Attitudes of the LiDAR, and its positions where `moves`, in any fixed frame.
-        moves: Whether the positions mean anything.
-        turn_sigma: Standard deviation of the turn from one sweep to the next, rad.
-        shift_sigma: Of the shift from one sweep to the next, m.
-    """
-
-    trajectory: Trajectory
-    moves: bool
-    turn_sigma: float
-    shift_sigma: float
 
 
 @dataclass(frozen=True)
@@ -58,128 +32,50 @@ class Odometry:
     weakest: Float[np.ndarray, "n 3"]
 
 
-def estimate_odometry(
-    recording: Recording, guide: Guide | None = None, advance: Callable[[], None] = lambda: None
-) -> Odometry:
+def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog) -> Odometry:
     """One pose for each sweep of at least 100 returns.
 
     Args:
         recording: The recording; each scan is read once.
         guide: See `Guide`; without one, each sweep is expected to go on as the last did.
-        advance: Called after each scan, for a progress bar.
+        stage: Counts the scans.
+        log: What an earlier build tracked, and where this one keeps what it does.
 
     Raises:
         FitError: Fewer than two usable scans.
     """
-    tracker = _Tracker()
-    times: list[float] = []
-    weakest: list[np.ndarray] = []
-    for scan in recording.scans():
-        advance()
+    tracked = log.read()
+    tracker = Tracker()
+    if tracked.times:
+        stage.resume(tracked.place.messages)
+    if not tracked.done:
+        for thinned, pose, middle in zip(tracked.thinned, tracked.poses, tracked.times, strict=True):
+            tracker.follow(thinned, pose, middle)
+        _track(recording, guide, stage, log, tracker, tracked)
+    if len(tracked.times) < 2:
+        count = len(tracked.times)
+        raise FitError(f"{recording.path}: only {count} scans hold {MIN_POINTS} points; too few for odometry")
+    stack = np.asarray(tracked.poses)
+    poses = Trajectory(np.asarray(tracked.times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), LIBRARY)
+    return Odometry(poses, np.asarray(tracked.weakest))
+
+
+def _track(
+    recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog, tracker: Tracker, tracked: Tracked
+) -> None:
+    times = tracked.times
+    for scan in recording.scans(tracked.place):
+        stage.advance()
         span = float(scan.times.max(initial=0.0))
-        if len(scan.points) < _MIN_POINTS or (guide and not guide.trajectory.covers(scan.stamp, scan.stamp + span)):
-            continue
         middle = scan.stamp + 0.5 * span
-        if times and middle <= times[-1]:
-            continue  # a message that was recorded twice
-        weakest.append(tracker.register(scan, middle, guide))
-        times.append(middle)
-    if len(times) < 2:
-        raise FitError(f"{recording.path}: only {len(times)} scans hold {_MIN_POINTS} points; too few for odometry")
-    stack = np.asarray(tracker.poses)
-    poses = Trajectory(np.asarray(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), LIBRARY)
-    return Odometry(poses, np.asarray(weakest))
-
-
-class _Tracker:
-    """The map so far, and the pose of every sweep in it."""
-
-    def __init__(self) -> None:
-        self.poses: list[np.ndarray] = []
-        self._map = small_gicp.GaussianVoxelMap(_VOXEL)
-        self._map.set_lru(horizon=_HORIZON, clear_cycle=10)
-        self._time = 0.0
-        self._step = np.eye(4)
-        self._pace = 0.1  # s that `_step` took
-
-    def register(self, scan: Scan, middle: float, guide: Guide | None) -> np.ndarray:
-        """Adds a sweep; returns the direction in it that its walls say least about."""
-        last = self.poses[-1] if self.poses else np.eye(4)
-        gap = middle - self._time if self.poses else self._pace
-        step = self._expected(middle, gap, guide)
-        points = self._unwound(scan, middle, guide, step, gap)
-        near = points[np.linalg.norm(points, axis=1) < _RANGE]
-        # One thread: sums in one order, so that the same recording gives the same bytes.
-        source, _ = small_gicp.preprocess_points(near, _THINNING, num_threads=1)
-        pose, weakest = last @ step, np.array([1.0, 0.0, 0.0])
-        if self.poses and source.size() >= _MIN_POINTS:
-            result = small_gicp.align(self._map, source, pose, max_correspondence_distance=_REACH, num_threads=1)
-            if result.num_inliers >= _MIN_POINTS and np.isfinite(result.T_target_source).all():
-                weakest = _weakest(result.H)
-                pose = _blend(result, pose, *self._sigmas(guide))
-        if source.size() >= _MIN_POINTS or not self.poses:
-            self._map.insert(source, pose)
-        if self.poses:
-            self._step, self._pace = np.linalg.inv(last) @ pose, gap
-        self._time = middle
-        self.poses.append(pose)
-        return weakest
-
-    def _sigmas(self, guide: Guide | None) -> tuple[float, float]:
-        if guide is None:
-            return (np.deg2rad(0.5), 0.02) if len(self.poses) > _WARM_UP else (np.inf, np.inf)
-        moving = guide.moves or len(self.poses) > _WARM_UP
-        return guide.turn_sigma, guide.shift_sigma if moving else np.inf
-
-    def _expected(self, middle: float, gap: float, guide: Guide | None) -> np.ndarray:
-        """The step from the last sweep's pose to this one's, by the guide or as the last step was."""
-        share = gap / self._pace
-        step = _pose(Rotation.from_matrix(self._step[:3, :3]) ** share, share * self._step[:3, 3])
-        if guide is not None and self.poses:
-            places, turns = guide.trajectory.at(np.array([self._time, middle]))
-            step[:3, :3] = (turns[0].inv() * turns[1]).as_matrix()
-            if guide.moves:
-                step[:3, 3] = turns[0].inv().apply(places[1] - places[0])
-        return step
-
-    def _unwound(self, scan: Scan, middle: float, guide: Guide | None, step: np.ndarray, gap: float) -> np.ndarray:
-        """The sweep's points as seen from where the sensor was in the middle of it, m."""
-        times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + 1e-6), _KNOTS)
-        share = (times - middle) / gap
-        shifts = share[:, None] * step[:3, 3]
-        if guide is None:
-            turns = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(step[:3, :3]).as_rotvec())
-        else:
-            places, turns = guide.trajectory.at(times)
-            back = turns[_KNOTS // 2].inv()
-            if guide.moves:
-                shifts = back.apply(places - places[_KNOTS // 2])
-            turns = back * turns
-        return deskew(scan, Trajectory(times, shifts, turns, LIBRARY))
-
-
-def _pose(turn: Rotation, shift: np.ndarray) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), shift
-    return pose
-
-
-def _weakest(information: np.ndarray) -> np.ndarray:
-    """The direction of least information on the shift, once the turn is free."""
-    turn, cross, shift = information[:3, :3], information[:3, 3:], information[3:, 3:]
-    return np.linalg.eigh(shift - cross.T @ np.linalg.solve(turn, cross))[1][:, 0]
-
-
-def _blend(
-    result: small_gicp.RegistrationResult, expected: np.ndarray, turn_sigma: float, shift_sigma: float
-) -> np.ndarray:
-    """The registered pose, moved towards the expected one where that is the surer of the two.
-
-    Source: the posterior of two Gaussians, in the tangent space of the registered pose.
-    """
-    pose = result.T_target_source
-    gap = np.linalg.inv(pose) @ expected
-    way = np.concatenate([Rotation.from_matrix(gap[:3, :3]).as_rotvec(), gap[:3, 3]])
-    trust = np.diag(np.repeat([turn_sigma**-2.0, shift_sigma**-2.0], 3))
-    part = np.linalg.solve(result.H + trust, trust @ way)
-    return pose @ _pose(Rotation.from_rotvec(part[:3]), part[3:])
+        if (
+            len(scan.points) < MIN_POINTS
+            or (guide and not guide.trajectory.covers(scan.stamp, scan.stamp + span))
+            or (times and middle <= times[-1])  # a message that was recorded twice
+        ):
+            continue
+        weakest = tracker.register(scan, middle, guide)
+        log.add(tracked, middle, tracker.poses[-1], weakest, tracker.thinned)
+        if log.due():
+            log.write(tracked, recording.place)
+    log.write(tracked, recording.place, done=True)

@@ -1,15 +1,17 @@
 """Scans and poses to one cloud: every return moved from the pose at its own time."""
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from scene.cli import Stage
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError, RecordingError
 from scene.poses.trajectory import Trajectory
-from scene.reading.recording import Recording
+from scene.reading.recording import START, Place, Recording
 from scene.reading.scan import Scan
+from scene.resume import Partial
 
 _KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
 _BATCH = 20  # sweeps thinned together
@@ -36,8 +38,9 @@ def register(
     recording: Recording,
     trajectory: Trajectory,
     voxel: float,
-    advance: Callable[[], None] = lambda: None,
+    stage: Stage,
     most_uncovered: float = 0.05,
+    partial: Partial | None = None,
 ) -> tuple[Cloud, int]:
     """The registered cloud, and how many scans the trajectory did not cover.
 
@@ -45,34 +48,75 @@ def register(
         recording: The scans.
         trajectory: Where the sensor was.
         voxel: Thinning, m.
-        advance: Called after each scan.
+        stage: Counts the scans.
         most_uncovered: Share of the scans that may lack a pose; those are left out.
+        partial: What an earlier build got done, and where this one keeps what it does.
 
     Raises:
         RecordingError: The trajectory misses a larger share of the scans.
         FitError: No point is left.
     """
-    thinned, batch, uncovered, span = VoxelMean(voxel), [], 0, [np.inf, -np.inf]
-    for scan in recording.scans():
-        advance()
+    partial = partial or Partial(None)
+    state = _State(VoxelMean(voxel))
+    if (known := partial.load("cloud")) is not None:
+        state = _State.restored(known, voxel)
+        stage.resume(state.place.messages)
+    batch = []
+    for scan in recording.scans(state.place):
+        stage.advance()
         end = scan.stamp + float(scan.times.max(initial=0.0))
-        span = [min(span[0], scan.stamp), max(span[1], end)]
-        if not trajectory.covers(scan.stamp, end):
-            uncovered += 1
-            continue
-        batch.append(deskew(scan, trajectory))
+        state.span = (min(state.span[0], scan.stamp), max(state.span[1], end))
+        if trajectory.covers(scan.stamp, end):
+            batch.append(deskew(scan, trajectory))
+        else:
+            state.uncovered += 1
         if len(batch) == _BATCH:
-            thinned.add(np.concatenate(batch))
-            batch = []
+            state.thinned.add(np.concatenate(batch))
+            batch, state.place = [], recording.place
+            if partial.due():
+                partial.save("cloud", **state.arrays())
     if batch:
-        thinned.add(np.concatenate(batch))
-    if uncovered > most_uncovered * max(recording.scan_count, 1):
-        raise RecordingError(
-            f"{trajectory.source}: covers {trajectory.times[0]:.2f} to {trajectory.times[-1]:.2f} s, but "
-            f"{recording.path} runs from {span[0]:.2f} to {span[1]:.2f} s; {uncovered} of {recording.scan_count} scans "
-            "have no pose"
-        )
-    cloud = thinned.cloud()
+        state.thinned.add(np.concatenate(batch))
+    state.place = recording.place
+    _require_covered(state, recording, trajectory, most_uncovered)
+    if partial.due():
+        partial.save("cloud", **state.arrays())
+    cloud = state.thinned.cloud()
     if not len(cloud.points):
         raise FitError(f"{recording.path}: no return is left after registration")
-    return cloud, uncovered
+    return cloud, state.uncovered
+
+
+@dataclass
+class _State:
+    """How far a registration is, between two batches."""
+
+    thinned: VoxelMean
+    place: Place = START
+    uncovered: int = 0
+    span: tuple[float, float] = (np.inf, -np.inf)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """For a partial result."""
+        counts = {"place": self.place.as_array(), "uncovered": np.array(self.uncovered), "span": np.array(self.span)}
+        return {**counts, **self.thinned.arrays()}
+
+    @classmethod
+    def restored(cls, arrays: dict[str, np.ndarray], voxel: float) -> "_State":
+        """The opposite of `arrays`."""
+        start, end = arrays["span"]
+        return cls(
+            VoxelMean.restored(voxel, arrays),
+            Place.from_array(arrays["place"]),
+            int(arrays["uncovered"]),
+            (float(start), float(end)),
+        )
+
+
+def _require_covered(state: _State, recording: Recording, trajectory: Trajectory, most_uncovered: float) -> None:
+    if state.uncovered > most_uncovered * max(recording.scan_count, 1):
+        raise RecordingError(
+            f"{trajectory.source}: covers {trajectory.times[0]:.2f} to {trajectory.times[-1]:.2f} s, but "
+            f"{recording.path} runs from {state.span[0]:.2f} to {state.span[1]:.2f} s; {state.uncovered} of "
+            f"{recording.scan_count} scans have no pose"
+        )

@@ -8,11 +8,14 @@ _NAMES = (
     ("y", "northing", "north", "n"),
     ("z", "elevation", "elev", "height", "altitude", "h"),
 )
-_UNIT = re.compile(r"[\s_]*[(\[]?\s*\b(mm|millimet(?:er|re)s?|m|met(?:er|re)s?)\b\.?\s*[)\]]?$", re.IGNORECASE)
+_UNIT = re.compile(
+    r"[\s_]*[(\[]?\s*\b(mm|millimet(?:er|re)s?|m|met(?:er|re)s?|us[ -]?ft|ft|feet|foot)\b\.?\s*[)\]]?$", re.IGNORECASE
+)
+_STARTS = (("mm", "mm"), ("milli", "mm"), ("m", "m"), ("us", "us-ft"), ("f", "ft"))
 
 
 def plain(name: str) -> tuple[str, str | None]:
-    """A column's name in lower case without its unit, and the unit, `m` or `mm`, where it gives one.
+    """A column's name in lower case without its unit, and the unit, a key of `frame.UNITS`, where it gives one.
 
     `EASTING (M.)` is `easting` in m; a name that is a unit alone is left as it is.
     """
@@ -22,7 +25,7 @@ def plain(name: str) -> tuple[str, str | None]:
     base = re.sub(r"[(\[][^)\]]*[)\]]", "", text).strip() if bracketed else text
     unit = None
     if found and (bracketed or " " in text.replace("_", " ")):
-        unit = "mm" if found.group(1).lower().startswith(("mm", "milli")) else "m"
+        unit = next(unit for start, unit in _STARTS if found.group(1).lower().startswith(start))
         base = base if bracketed else _UNIT.sub("", " " + base.replace("_", " "))
     return base.strip(" _.").lower(), unit
 

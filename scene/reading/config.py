@@ -16,7 +16,7 @@ class ReadingConfig:
     Attributes:
         topic: LiDAR topic of a bag; found by its type where not given.
         format: Of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.
-        unit: Of a registered cloud's or a ring survey's coordinates: m or mm.
+        unit: Of a registered cloud's or a ring survey's coordinates: m, mm, ft or us-ft.
         axes: Of a registered cloud: which of its axes point east, north and up, such as xyz, xzy or -yxz.
     """
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-UNITS = {"m": 1.0, "mm": 1e-3}
+# Metres of each. Source: NIST SP 811, B.6: the international foot, and the US survey foot of 1200/3937 m.
+UNITS = {"m": 1.0, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200 / 3937}
+UNIT_NAMES = "m, mm, ft or us-ft"
 _AXES = re.compile(r"(-?[xyz])(-?[xyz])(-?[xyz])")
 # The least extent of a tunnel's box is a height: at most some 100 m in m, at least some 1000 in mm.
 _MM_FROM = 500.0
@@ -20,7 +22,7 @@ class Frame:
     """How stored coordinates become metres with z up.
 
     Attributes:
-        unit: `m` or `mm`.
+        unit: A key of `UNITS`.
         axes: Which stored axes point along x, y and z.
         facts: Both, and how each was found, for people and the manifest.
     """
@@ -40,15 +42,17 @@ def choose(sample: np.ndarray, declared: str | None, unit: str | None, axes: str
 
     Args:
         sample: Points from all over the cloud, as stored; few or none where the unit is declared, `(k, 3)`.
-        declared: Unit the file itself gives.
+        declared: Unit the file itself gives; words other than a key of `UNITS` are refused.
         unit: Unit by flag.
         axes: Axes by flag.
 
     Raises:
-        ValueError: A flag is no unit, or no order of axes.
+        ValueError: A flag is no unit, or no order of axes; the file declares another unit.
     """
     if unit is not None and unit not in UNITS:
-        raise ValueError(f"unit {unit!r} is neither m nor mm")
+        raise ValueError(f"unit {unit!r} is none of {UNIT_NAMES}")
+    if unit is None and declared not in (None, *UNITS):
+        raise ValueError(f"its coordinates are in {declared}, not in {UNIT_NAMES}; --unit overrides what it says")
     if axes is not None:
         _parsed(axes)
     finite = sample[np.isfinite(sample).all(axis=1)]

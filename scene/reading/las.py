@@ -9,6 +9,7 @@ import lazrs
 import numpy as np
 from laspy.vlrs.known import LasZipVlr
 
+from scene.reading.lasunit import declared_unit
 from scene.reading.source import BATCH, CloudSource
 
 _LARGEST_CHUNK = 10_000_000  # points; LASzip writes 50,000
@@ -37,6 +38,7 @@ def open_cloud(path: Path) -> CloudSource:
             _require_sane_chunks(path, header)
         name = f"{kind} {header.version}, point format {header.point_format.id}"
         count = header.point_count
+        unit = declared_unit([*header.vlrs, *(header.evlrs or [])])
 
     def chunks() -> Iterator[np.ndarray]:
         read = 0
@@ -48,7 +50,7 @@ def open_cloud(path: Path) -> CloudSource:
         if read != count:
             raise ValueError(f"it ends after {read} of {count} points")
 
-    return CloudSource(name, chunks, box)
+    return CloudSource(name, chunks, box, unit, count)
 
 
 def _require_sane_header(path: Path) -> None:

@@ -18,7 +18,7 @@ def open_cloud(path: Path) -> CloudSource:
         ValueError: Damaged, without such columns, or with columns that hold no numbers.
     """
     with pq.ParquetFile(path) as file:
-        names = file.schema_arrow.names
+        names, rows = file.schema_arrow.names, file.metadata.num_rows
         found = find_xyz(names)
         if found is None:
             raise ValueError(f"no columns x, y, z among {', '.join(names)}")
@@ -35,7 +35,7 @@ def open_cloud(path: Path) -> CloudSource:
         with pq.ParquetFile(path) as file:
             yield from _batches(file, columns, list(range(file.num_row_groups)))
 
-    return CloudSource("Parquet", chunks, np.concatenate([np.empty((0, 3)), *sample]), declared)
+    return CloudSource("Parquet", chunks, np.concatenate([np.empty((0, 3)), *sample]), declared, rows)
 
 
 def _batches(file: pq.ParquetFile, columns: list[str], groups: list[int]) -> Iterator[np.ndarray]:

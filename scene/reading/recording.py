@@ -1,6 +1,7 @@
 """Any recording as a stream of timed scans: ROS1 and ROS2 bags, MCAP files, folders of scans."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,6 +21,34 @@ _MOST_OUT_OF_ORDER = 0.05
 _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and would make all later ones look late
 
 
+@dataclass(frozen=True)
+class Place:
+    """How far a recording has been read.
+
+    Attributes:
+        messages: Of the LiDAR, taken.
+        last: Time of the last scan handed out, s.
+        late: Messages left out because their time did not grow.
+    """
+
+    messages: int = 0
+    last: float | None = None
+    late: int = 0
+
+    def as_array(self) -> Float[np.ndarray, "3"]:
+        """All three as numbers."""
+        return np.array([self.messages, np.nan if self.last is None else self.last, self.late])
+
+    @classmethod
+    def from_array(cls, values: Float[np.ndarray, "3"]) -> "Place":
+        """The opposite of `as_array`."""
+        last = float(values[1])
+        return cls(int(values[0]), None if np.isnan(last) else last, int(values[2]))
+
+
+START = Place()
+
+
 class Recording:
     """An open recording. A context manager; iterate `scans()` as often as needed.
 
@@ -28,6 +57,7 @@ class Recording:
         topic: The LiDAR topic read; the folder's name for a folder of scans.
         scan_count: Scans in the recording.
         facts: What was detected, for the manifest; complete once a scan has been read.
+        place: How far the latest `scans()` has come.
 
     Raises:
         RecordingError: Not a recording, truncated, or without a LiDAR topic.
@@ -42,6 +72,7 @@ class Recording:
             ScanFolder(path) if found.format == "scans" else RosBag(found.path, found.format, topic)
         )
         self._source.facts["format_by"] = found.by
+        self.place = START
         self.topic, self.scan_count, self.facts = self._source.topic, self._source.scan_count, self._source.facts
 
     @property
@@ -65,14 +96,19 @@ class Recording:
     ) -> None:
         self._source.close()
 
-    def scans(self) -> Iterator[Scan]:
+    def scans(self, after: Place = START) -> Iterator[Scan]:
         """The scans in the order of the recording; one whose time does not grow is left out, and counted in `facts`.
+
+        Args:
+            after: Where to go on; the messages before it are skipped unread.
 
         Raises:
             RecordingError: A message is damaged, or more than 5 % of the times do not grow; says which.
         """
-        last, late = None, 0
-        for index, scan in enumerate(self._source.scans()):
+        self.place, last, late = after, after.last, after.late
+        if late:
+            self.facts["scans_out_of_order"] = late
+        for index, scan in enumerate(self._source.scans(after.messages), after.messages):
             if last is not None and scan.stamp <= last:
                 late += 1
                 self.facts["scans_out_of_order"] = late
@@ -88,6 +124,7 @@ class Recording:
                     f"{scan.stamp - last:.0f} s after the one before it"
                 )
             last = scan.stamp
+            self.place = Place(index + 1, last, late)
             yield scan
 
     def peek(self) -> dict[str, Any]:

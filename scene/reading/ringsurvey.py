@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scene.errors import RecordingError
 from scene.reading.cause import cause, refusing
 from scene.reading.columns import find_xyz, plain
-from scene.reading.frame import UNITS
+from scene.reading.frame import UNIT_NAMES, UNITS
 from scene.reading.sheets import SUFFIXES, Sheet, sheets
 
 NEEDED = "EASTING, NORTHING, ELEVATION with POINT (ring.point), or with RING NO. and POINT NO."
@@ -71,13 +71,13 @@ def read_survey(path: Path, unit: str | None = None) -> RingSurvey:
 
     Args:
         path: CSV or XLSX. In the layout with `POINT` this must be text, since `0.10` is not `0.1`.
-        unit: `m` or `mm`, overriding the header.
+        unit: A key of `frame.UNITS`, overriding the header.
 
     Raises:
         RecordingError: Names the file, and the line or the sheet and row.
     """
     if unit not in (None, *UNITS):
-        raise RecordingError(f"{path}: unit {unit!r} is neither m nor mm")
+        raise RecordingError(f"{path}: unit {unit!r} is none of {UNIT_NAMES}")
     rings: dict[str, list[tuple[float, ...]]] = {}
     columns, headers, design = None, [], None
     with refusing(path, "a readable survey", RecordingError), sheets(path) as tables:

@@ -11,10 +11,11 @@ from rosbags.typesys import Stores, get_typestore
 from scene.errors import RecordingError
 from scene.reading import livox
 from scene.reading.cause import cause, one_line, refusing
+from scene.reading.mcap import is_ros1, open_mcap
 from scene.reading.pointcloud2 import MESSAGE_TYPE, parse_pointcloud2
 from scene.reading.scan import Scan
 
-_NAMES = {"bag": "ROS1 bag", "rosbag2": "ROS2 bag", "db3": "ROS2 bag", "mcap": "ROS2 MCAP file"}
+_NAMES = {"bag": "ROS1 bag", "rosbag2": "ROS2 bag", "db3": "ROS2 bag", "mcap": "MCAP file"}
 # Where several topics carry clouds, the sensor's own comes before what other programs made of it.
 _SENSOR_WORDS = ("velodyne", "ouster", "os_cloud", "os1", "livox", "hesai", "pandar", "rslidar", "lidar", "points")
 _DERIVED_WORDS = ("map", "registered", "filtered", "ground", "cluster", "obstacle", "corrected", "global")
@@ -37,14 +38,14 @@ class RosBag:
         self.path, self._ros1 = path, format == "bag"
         name = _NAMES[format]
         with refusing(path, f"a whole {name}; was it truncated or never closed?", RecordingError):
-            self.reader: Any = Reader1(path) if self._ros1 else _reader2(path, format)
-            self.reader.open()
-        self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
+            self.reader: Any = _opened(path, format)
         try:
             self._connections, others = self._choose(topic)
         except RecordingError:
             self.close()
             raise
+        self._ros1 = self._ros1 or is_ros1(self._connections[0])
+        self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
         self.topic, self._type = self._connections[0].topic, self._connections[0].msgtype
         self.scan_count = sum(connection.msgcount for connection in self._connections)
         self.facts: dict[str, Any] = {"kind": name, "topic": self.topic, "message_type": self._type}
@@ -61,8 +62,11 @@ class RosBag:
             return self._store.deserialize_ros1(raw, message_type)
         return self._store.deserialize_cdr(raw, message_type)
 
-    def scans(self) -> Iterator[Scan]:
+    def scans(self, skip: int = 0) -> Iterator[Scan]:
         """The scans in the order of the bag; a header without a stamp takes the time of its message.
+
+        Args:
+            skip: Messages at the start that are not parsed.
 
         Raises:
             RecordingError: A message is damaged; says which.
@@ -78,6 +82,9 @@ class RosBag:
                 raise RecordingError(
                     f"{self.path}: damaged after scan {index} of {self.topic} ({cause(error)})"
                 ) from error
+            if index < skip:
+                index += 1
+                continue
             try:
                 yield self._parse(bytes(raw), received * 1e-9)
             except Exception as error:
@@ -122,6 +129,14 @@ def _likelihood(connection: Any) -> tuple[bool, bool, bool, int]:
     )
 
 
-def _reader2(path: Path, format: str) -> Any:
+def _opened(path: Path, format: str) -> Any:
     """The library's reader of a folder, or of one storage file whatever its name ends in."""
-    return Reader2(path) if path.is_dir() else Reader2.STORAGE_PLUGINS[f".{format}"](path)
+    if format == "mcap":
+        return open_mcap(path)
+    reader: Any
+    if format == "bag":
+        reader = Reader1(path)
+    else:
+        reader = Reader2(path) if path.is_dir() else Reader2.STORAGE_PLUGINS[f".{format}"](path)
+    reader.open()
+    return reader

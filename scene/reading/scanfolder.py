@@ -66,13 +66,16 @@ class ScanFolder:
         """A folder holds no messages."""
         raise RecordingError(f"{self.path}: holds no {message_type}")
 
-    def scans(self) -> Iterator[Scan]:
+    def scans(self, skip: int = 0) -> Iterator[Scan]:
         """The scans in the order of their names.
+
+        Args:
+            skip: Scans at the start that are not read.
 
         Raises:
             RecordingError: A file is damaged; says which.
         """
-        for file, stamp in zip(self._files, self._times, strict=True):
+        for file, stamp in zip(self._files[skip:], self._times[skip:], strict=True):
             try:
                 records = _read(file)
                 name = next((name for name in FIELDS if name in (records.dtype.names or ())), None)

@@ -17,13 +17,15 @@ class CloudSource:
         format: With its version, for the manifest.
         chunks: Starts reading: x, y, z as stored, `(n, 3)` float64 each, of bounded size.
         sample: Points from all over the file, or corners of its box, by which a unit can be told, `(k, 3)`.
-        unit: `m` or `mm` where the format or a header says so.
+        unit: `m`, `mm` or a kind of foot, where the format or a header says so.
+        count: Points in all, where the file knows.
     """
 
     format: str
     chunks: Callable[[], Iterator[Float[np.ndarray, "n 3"]]]
     sample: Float[np.ndarray, "k 3"]
     unit: str | None = None
+    count: int | None = None
 
 
 def stacked(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
@@ -46,4 +48,4 @@ def from_records(format: str, records: np.ndarray) -> CloudSource:
         for start in range(0, len(records), BATCH):
             yield stacked(records[start : start + BATCH])
 
-    return CloudSource(format, chunks, stacked(records[:: max(len(records) // 2000, 1)]))
+    return CloudSource(format, chunks, stacked(records[:: max(len(records) // 2000, 1)]), count=len(records))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
 
 MD5 = "e4d6829bdfe657cb6c21a746c86b21a6"
 DEFINITION = """std_msgs/Header header
@@ -42,6 +43,20 @@ def write_bag(path: Path, scans: list[tuple[float, np.ndarray]], topic: str = "/
         connection = writer.add_connection(topic, "livox_ros_driver/msg/CustomMsg", msgdef=DEFINITION, md5sum=MD5)
         for stamp, points in scans:
             writer.write(connection, int(stamp * 1e9), custom_msg(stamp, points))
+    return path
+
+
+def write_imu_bag(path: Path, points: np.ndarray, count: int) -> Path:
+    """A bag with one sweep and `count` samples of `/livox/imu` at 200 Hz, at rest and in g."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Writer(path) as writer:
+        lidar = writer.add_connection("/livox/lidar", "livox_ros_driver/msg/CustomMsg", msgdef=DEFINITION, md5sum=MD5)
+        writer.write(lidar, int(5e9), custom_msg(5.0, points))
+        imu = writer.add_connection("/livox/imu", "sensor_msgs/msg/Imu", typestore=store)
+        for k in range(count):
+            head = np.array([k, 5, 5_000_000 * k, 5], "<u4").tobytes() + b"livox"
+            numbers = np.concatenate([[0.0, 0, 0, 1], np.zeros(9), [0.01, 0, 0.1], np.zeros(9), [0, 0, 1], np.zeros(9)])
+            writer.write(imu, int(5e9) + 5_000_000 * k, head + numbers.astype("<f8").tobytes())
     return path
 
 

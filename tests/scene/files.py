@@ -32,8 +32,9 @@ def write_pcd(path: Path, points: np.ndarray, encoding: Encoding = Encoding.BINA
     return path
 
 
-def write_las(path: Path, points: np.ndarray) -> Path:
+def write_las(path: Path, points: np.ndarray, *records: laspy.VLR) -> Path:
     header = laspy.LasHeader(point_format=3, version="1.2")
+    header.vlrs.extend(records)
     header.scales, header.offsets = [1e-5] * 3, np.floor(np.nanmean(points, axis=0))
     las = laspy.LasData(header)
     las.x, las.y, las.z = points.T

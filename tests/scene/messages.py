@@ -113,3 +113,24 @@ def write_bag2(folder: Path, plugin: StoragePlugin, topic: str, kind: str, messa
         for stamp, raw in messages:
             writer.write(connection, int(stamp * 1e9), raw)
     return folder
+
+
+def write_mcap(path: Path, profile: str, encodings: tuple[str, str], name: str, messages: list) -> Path:
+    """An MCAP file without chunks and summary; `encodings` are of its schema and its messages."""
+
+    def text(value: str | bytes) -> bytes:
+        raw = value.encode() if isinstance(value, str) else value
+        return struct.pack("<I", len(raw)) + raw
+
+    def record(code: int, body: bytes) -> bytes:
+        return struct.pack("<BQ", code, len(body)) + body
+
+    schema, message = encodings
+    body = record(1, text(profile) + text(""))
+    body += record(3, struct.pack("<H", 1) + text(name) + text(schema) + text("whatever"))
+    body += record(4, struct.pack("<HH", 1, 1) + text("/points") + text(message) + text(b""))
+    for k, (stamp, raw) in enumerate(messages):
+        body += record(5, struct.pack("<HIQQ", 1, k, int(stamp * 1e9), int(stamp * 1e9)) + raw)
+    magic = b"\x89MCAP0\r\n"
+    path.write_bytes(magic + body + record(15, bytes(4)) + record(2, bytes(20)) + magic)
+    return path

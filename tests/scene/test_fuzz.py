@@ -8,18 +8,23 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import laspy
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from scene.errors import FitError, RecordingError
 from scene.fitting import rings
+from scene.poses.calibration import load_calibration
+from scene.poses.control import load_control
+from scene.poses.imu import read_inertial
+from scene.poses.trajectory import load_tum
 from scene.reading.cloudfile import read_cloud
 from scene.reading.recording import Recording
 from scene.reading.ringsurvey import read_survey
-from tests.scene.bags import write_bag
-from tests.scene.files import CLOUDS, RING_HEADER, ring_rows, write_xlsx
-from tests.scene.messages import LIVOX2, OUSTER, POINTCLOUD2, livox_cdr, pointcloud2, write_bag1, write_bag2
+from tests.scene.bags import write_bag, write_imu_bag
+from tests.scene.files import CLOUDS, RING_HEADER, ring_rows, write_las, write_xlsx
+from tests.scene.messages import LIVOX2, OUSTER, POINTCLOUD2, livox_cdr, pointcloud2, write_bag1, write_bag2, write_mcap
 
 CASES = 60
 POINTS = np.random.default_rng(0).uniform(-3, 3, (200, 3)).astype(np.float32) * [10, 1, 1]
@@ -106,10 +111,74 @@ def read_rings(path: Path) -> None:
     assert np.isfinite(fit.centre).all()
 
 
+def imu_bag(folder: Path) -> Path:
+    return write_imu_bag(folder / "imu.bag", POINTS, 60)
+
+
+def read_imu(path: Path) -> None:
+    with Recording(path) as recording:
+        inertial = read_inertial(recording, "/livox/imu")
+    if inertial is not None:
+        assert (np.diff(inertial.times) > 0).all()
+        assert np.isfinite(inertial.rate).all()
+        assert np.isfinite(inertial.force).all()
+
+
+def ros1_mcap(folder: Path) -> Path:
+    messages = [(5.0 + k, cloud_message(5.0 + k, False)) for k in range(3)]
+    return write_mcap(folder / "a.mcap", "ros1", ("ros1msg", "ros1"), "sensor_msgs/PointCloud2", messages)
+
+
+def feet(folder: Path) -> Path:
+    wkt = b'PROJCS["a",GEOGCS["b",UNIT["degree",0.0174]],UNIT["US survey foot",0.304800609601219]]\0'
+    return write_las(folder / "feet.las", POINTS, laspy.VLR("LASF_Projection", 2112, "", wkt))
+
+
+def tum(folder: Path) -> Path:
+    rows = np.column_stack([np.arange(20.0), np.arange(20.0), np.zeros((20, 5)), np.ones(20)])
+    np.savetxt(folder / "poses.tum", rows, fmt="%.6f")
+    return folder / "poses.tum"
+
+
+def calibration(folder: Path) -> Path:
+    (folder / "c.yaml").write_text(
+        "prism: [0.1, -0.3, 0.3]\nimu:\n  /imu/data:\n    rotation: [[0.0, 1.0, 0], [-1, 0, 0], [0, 0, 1]]\n"
+        "    shift: [0.05, 0, 0.02]\n"
+    )
+    return folder / "c.yaml"
+
+
+def read_poses(path: Path) -> None:
+    trajectory = load_tum(path)
+    assert (np.diff(trajectory.times) > 0).all()
+    assert np.isfinite(trajectory.at(trajectory.times)[0]).all()
+
+
+def read_control(path: Path) -> None:
+    control = load_control(path)
+    assert (np.diff(control.times) > 0).all()
+    assert np.isfinite(control.positions).all()
+
+
+def read_calibration(path: Path) -> None:
+    for mount in load_calibration(path).imu.values():
+        np.testing.assert_allclose(mount.rotation @ mount.rotation.T, np.eye(3), atol=1e-9)
+        assert np.isfinite(mount.shift).all()
+
+
+def control(folder: Path) -> Path:
+    return tum(folder)
+
+
 # Name: what writes a whole input and returns the file to damage, and what reads it, given that file.
 READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], None]]] = {
     **{name: ((lambda n: lambda folder: CLOUDS[n](folder / n, POINTS))(name), read_file) for name in CLOUDS},
-    **{write.__name__: (write, read_recording) for write in (ros1, livox1, db3, mcap, livox2)},
+    **{write.__name__: (write, read_recording) for write in (ros1, livox1, db3, mcap, livox2, ros1_mcap)},
+    "feet": (feet, read_file),
+    "imu": (imu_bag, read_imu),
+    "tum": (tum, read_poses),
+    "control": (control, read_control),
+    "calibration": (calibration, read_calibration),
     **{write.__name__: (write, lambda path: read_recording(path.parent)) for write in (metadata, kitti, times)},
     **{write.__name__: (write, read_rings) for write in (xlsx, csv)},
 }

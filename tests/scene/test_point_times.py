@@ -17,6 +17,7 @@ from tests.scene.messages import (
     pointcloud2,
     write_bag1,
     write_bag2,
+    write_mcap,
 )
 
 XYZ = np.random.default_rng(0).uniform(1, 9, (40, 3)).astype(np.float32)
@@ -112,6 +113,30 @@ def test_livox_messages_of_ros2_read_with_their_alignment(tmp_path):
     (scan,), _ = read(folder)
     np.testing.assert_array_equal(scan.points, XYZ)
     np.testing.assert_allclose(scan.times, 1e-6 * np.arange(40), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("profile", "schema", "message", "name"),
+    [
+        ("", "ros2msg", "cdr", POINTCLOUD2),
+        ("ros1", "ros1msg", "ros1", "sensor_msgs/PointCloud2"),
+        ("", "ros1msg", "ros1", "sensor_msgs/PointCloud2"),
+        ("a profile of one's own", "omgidl", "cdr", POINTCLOUD2),
+    ],
+)
+def test_mcap_files_of_any_profile_read_by_the_encoding_of_their_messages(tmp_path, profile, schema, message, name):
+    times = (SWEEP * 1e9).astype("u4")
+    raws = [(100.0 + k, pointcloud2(100.0 + k, OUSTER, 32, columns(t=times), cdr=message == "cdr")) for k in range(3)]
+    scans, facts = read(write_mcap(tmp_path / "a.mcap", profile, (schema, message), name, raws))
+    assert [scan.stamp for scan in scans] == [100.0, 101.0, 102.0]
+    assert facts["message_type"] == POINTCLOUD2
+    np.testing.assert_array_equal(scans[2].points, XYZ)
+
+
+def test_an_mcap_of_other_messages_says_what_it_holds(tmp_path):
+    bag = write_mcap(tmp_path / "a.mcap", "", ("protobuf", "protobuf"), "foxglove.PointCloud", [(1.0, b"x")])
+    with pytest.raises(RecordingError, match=r"a\.mcap: has no LiDAR topic .*/points \(foxglove\.PointCloud\)"):
+        read(bag)
 
 
 BAD = {

@@ -1,0 +1,148 @@
+"""The map that LiDAR odometry builds as it goes, and one sweep after another placed in it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import small_gicp
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from scene.poses.registration import deskew
+from scene.poses.trajectory import Trajectory
+from scene.reading.scan import Scan
+
+LIBRARY = "small-gicp"
+MIN_POINTS = 100
+_RANGE = 60.0  # m
+_THINNING, _VOXEL, _REACH = 0.25, 0.5, 1.0  # m: of a sweep, of the map, of a correspondence
+_NEIGHBOURS = 10  # whose spread is a point's covariance
+_HORIZON = 100  # sweeps that an unseen voxel of the map is kept for
+_WARM_UP = 5  # sweeps before the expectation is worth anything without a guide
+_KNOTS = 11  # poses that a sweep is unwound with
+
+
+@dataclass(frozen=True)
+class Guide:
+    """What is known of the motion before the LiDAR is asked.
+
+    Attributes:
+        trajectory: Attitudes of the LiDAR, and its positions where `moves`, in any fixed frame.
+        moves: Whether the positions mean anything.
+        turn_sigma: Standard deviation of the turn from one sweep to the next, rad.
+        shift_sigma: Of the shift from one sweep to the next, m.
+    """
+
+    trajectory: Trajectory
+    moves: bool
+    turn_sigma: float
+    shift_sigma: float
+
+
+class Tracker:
+    """The map so far, and the pose of every sweep in it.
+
+    Attributes:
+        poses: Sweep to map, `(4, 4)` each.
+        thinned: The last sweep's points as they went into the map, m, `(k, 3)`: what `follow` needs of it.
+    """
+
+    def __init__(self) -> None:
+        self.thinned: Float[np.ndarray, "k 3"] = np.empty((0, 3))
+        self.poses: list[np.ndarray] = []
+        self._map = small_gicp.GaussianVoxelMap(_VOXEL)
+        self._map.set_lru(horizon=_HORIZON, clear_cycle=10)
+        self._time = 0.0
+        self._step = np.eye(4)
+        self._pace = 0.1  # s that `_step` took
+
+    def register(self, scan: Scan, middle: float, guide: Guide | None) -> np.ndarray:
+        """Adds a sweep; returns the direction in it that its walls say least about."""
+        last = self.poses[-1] if self.poses else np.eye(4)
+        gap = middle - self._time if self.poses else self._pace
+        step = self._expected(middle, gap, guide)
+        points = self._unwound(scan, middle, guide, step, gap)
+        near = points[np.linalg.norm(points, axis=1) < _RANGE]
+        # One thread: sums in one order, so that the same recording gives the same bytes.
+        source, _ = small_gicp.preprocess_points(near, _THINNING, _NEIGHBOURS, num_threads=1)
+        pose, weakest = last @ step, np.array([1.0, 0.0, 0.0])
+        if self.poses and source.size() >= MIN_POINTS:
+            result = small_gicp.align(self._map, source, pose, max_correspondence_distance=_REACH, num_threads=1)
+            if result.num_inliers >= MIN_POINTS and np.isfinite(result.T_target_source).all():
+                weakest = _weakest(result.H)
+                pose = _blend(result, pose, *self._sigmas(guide))
+        self.thinned = np.asarray(source.points())[:, :3]
+        self._accept(source, pose, middle)
+        return weakest
+
+    def follow(self, thinned: Float[np.ndarray, "k 3"], pose: Float[np.ndarray, "4 4"], middle: float) -> None:
+        """Adds a sweep whose pose is known from an earlier run: leaves exactly the state that `register` left then."""
+        source = small_gicp.PointCloud(thinned)
+        small_gicp.estimate_covariances(source, num_neighbors=_NEIGHBOURS, num_threads=1)
+        self._accept(source, pose, middle)
+
+    def _accept(self, source: small_gicp.PointCloud, pose: np.ndarray, middle: float) -> None:
+        if source.size() >= MIN_POINTS or not self.poses:
+            self._map.insert(source, pose)
+        if self.poses:
+            self._step, self._pace = np.linalg.inv(self.poses[-1]) @ pose, middle - self._time
+        self._time = middle
+        self.poses.append(pose)
+
+    def _sigmas(self, guide: Guide | None) -> tuple[float, float]:
+        if guide is None:
+            return (np.deg2rad(0.5), 0.02) if len(self.poses) > _WARM_UP else (np.inf, np.inf)
+        moving = guide.moves or len(self.poses) > _WARM_UP
+        return guide.turn_sigma, guide.shift_sigma if moving else np.inf
+
+    def _expected(self, middle: float, gap: float, guide: Guide | None) -> np.ndarray:
+        """The step from the last sweep's pose to this one's, by the guide or as the last step was."""
+        share = gap / self._pace
+        step = _pose(Rotation.from_matrix(self._step[:3, :3]) ** share, share * self._step[:3, 3])
+        if guide is not None and self.poses:
+            places, turns = guide.trajectory.at(np.array([self._time, middle]))
+            step[:3, :3] = (turns[0].inv() * turns[1]).as_matrix()
+            if guide.moves:
+                step[:3, 3] = turns[0].inv().apply(places[1] - places[0])
+        return step
+
+    def _unwound(self, scan: Scan, middle: float, guide: Guide | None, step: np.ndarray, gap: float) -> np.ndarray:
+        """The sweep's points as seen from where the sensor was in the middle of it, m."""
+        times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + 1e-6), _KNOTS)
+        share = (times - middle) / gap
+        shifts = share[:, None] * step[:3, 3]
+        if guide is None:
+            turns = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(step[:3, :3]).as_rotvec())
+        else:
+            places, turns = guide.trajectory.at(times)
+            back = turns[_KNOTS // 2].inv()
+            if guide.moves:
+                shifts = back.apply(places - places[_KNOTS // 2])
+            turns = back * turns
+        return deskew(scan, Trajectory(times, shifts, turns, LIBRARY))
+
+
+def _pose(turn: Rotation, shift: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), shift
+    return pose
+
+
+def _weakest(information: np.ndarray) -> np.ndarray:
+    """The direction of least information on the shift, once the turn is free."""
+    turn, cross, shift = information[:3, :3], information[:3, 3:], information[3:, 3:]
+    return np.linalg.eigh(shift - cross.T @ np.linalg.solve(turn, cross))[1][:, 0]
+
+
+def _blend(
+    result: small_gicp.RegistrationResult, expected: np.ndarray, turn_sigma: float, shift_sigma: float
+) -> np.ndarray:
+    """The registered pose, moved towards the expected one where that is the surer of the two.
+
+    Source: the posterior of two Gaussians, in the tangent space of the registered pose.
+    """
+    pose = result.T_target_source
+    gap = np.linalg.inv(pose) @ expected
+    way = np.concatenate([Rotation.from_matrix(gap[:3, :3]).as_rotvec(), gap[:3, 3]])
+    trust = np.diag(np.repeat([turn_sigma**-2.0, shift_sigma**-2.0], 3))
+    part = np.linalg.solve(result.H + trust, trust @ way)
+    return pose @ _pose(Rotation.from_rotvec(part[:3]), part[3:])

@@ -1,0 +1,133 @@
+"""Partial results beside the output, so that a build that was killed goes on where it was and gives the same bytes."""
+
+import fcntl
+import os
+import shutil
+import time
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from scene.errors import OutputError
+
+_KEY = "key"
+_SHARE = 0.02  # of the time, at most, goes into writing partial results
+
+
+class Partial:
+    """The partial results of one build: named sets of arrays in a folder, each written whole or not at all.
+
+    They count only for the key they were written under; others are discarded. A disk that refuses them stops the
+    writing of partial results and not the build.
+
+    Attributes:
+        folder: Where they lie; `None` keeps nothing.
+        fresh: Whether to start over whatever lies there.
+        every: Least time between two writings of a growing result, s; more where writing takes long. 0 writes at every
+            occasion, whatever it costs.
+    """
+
+    def __init__(self, folder: Path | None, fresh: bool = False, every: float = 5.0) -> None:
+        self.folder, self.fresh, self.every = folder, fresh, every
+        self._lock: IO[str] | None = None
+        self._open = False
+        self._next = time.monotonic() + every
+
+    def open(self, key: str) -> None:
+        """Starts keeping results under a key; what lies there under another one is discarded, which is said.
+
+        Raises:
+            OutputError: Another build is at work on the same output.
+        """
+        if self.folder is None:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._take()
+            place = self.folder / _KEY
+            known = place.read_text() if place.is_file() else None
+            if known != key or self.fresh:
+                if known is not None and not self.fresh:
+                    print("a partial result of another input, configuration or version was discarded", flush=True)
+                self._clear()
+                _write_text(place, key)
+            self._open = True
+        except OSError as error:
+            self._give_up(error)
+
+    @property
+    def keeps(self) -> bool:
+        """Whether what is saved is written at all."""
+        return self._open
+
+    def due(self) -> bool:
+        """Whether it is time to write a growing result again; rarer where writing takes long."""
+        return self._open and time.monotonic() >= self._next
+
+    def save(self, name: str, **arrays: np.ndarray) -> None:
+        """Writes a result under a name, in place of an older one; nothing where results are not kept."""
+        if not self._open or self.folder is None:
+            return
+        started = time.monotonic()
+        fresh = self.folder / f"{name}.tmp"
+        try:
+            with fresh.open("wb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]
+            fresh.replace(self.folder / f"{name}.npz")
+        except OSError as error:
+            self._give_up(error)
+        now = time.monotonic()
+        self._next = now + max(self.every, (now - started) / _SHARE if self.every else 0.0)
+
+    def load(self, name: str) -> dict[str, np.ndarray] | None:
+        """A result as it was saved; `None` where there is none that is whole."""
+        if not self._open or self.folder is None:
+            return None
+        try:
+            with np.load(self.folder / f"{name}.npz", allow_pickle=False) as kept:
+                return dict(kept)  # the archive's checksums are tested on the way
+        except Exception:  # absent, or damaged in whatever way: it is computed again
+            return None
+
+    def close(self) -> None:
+        """Lets go of the folder; what lies there stays for the next build."""
+        if self._lock is not None:
+            self._lock.close()
+        self._lock, self._open = None, False
+
+    def discard(self) -> None:
+        """Removes everything: the build is done, or its input is at fault."""
+        if self.folder is not None and self._lock is not None:
+            shutil.rmtree(self.folder, ignore_errors=True)
+        self.close()
+
+    def _take(self) -> None:
+        assert self.folder is not None
+        self._lock = (self.folder / "lock").open("w")
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.close()
+            raise OutputError(f"{self.folder}: another build is at work on this output") from error
+
+    def _clear(self) -> None:
+        assert self.folder is not None
+        for entry in self.folder.iterdir():
+            if entry.name != "lock":
+                entry.unlink()
+
+    def _give_up(self, error: OSError) -> None:
+        print(f"no partial results are kept ({error.strerror or error}); a killed build starts over", flush=True)
+        self.discard()
+
+
+def beside(out: Path) -> Path:
+    """The folder for the partial results of a build that writes `out`."""
+    return out.with_name(f".{out.name}.resume")
+
+
+def _write_text(path: Path, text: str) -> None:
+    fresh = path.with_name(f"{path.name}.tmp")
+    fresh.write_text(text)
+    os.replace(fresh, path)
