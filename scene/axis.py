@@ -8,6 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 _VERTICAL = np.array([0.0, 0.0, 1.0])
+_BEND_OVER = 10.0  # m
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,24 @@ class Axis:
     def length(self) -> float:
         """From the first to the last station, m."""
         return float(self.station[-1] - self.station[0])
+
+    @property
+    def curvature(self) -> Float[np.ndarray, " n"]:
+        """Turn of the heading for each metre in plan, 1/m, positive to the left; the reciprocal of the plan radius.
+
+        Taken over 10 m, or what of them the axis has, so that it is the track's bend and not the fit's noise.
+        """
+        heading = np.unwrap(np.arctan2(self.tangent[:, 1], self.tangent[:, 0]))
+        run = np.hypot(self.tangent[:, 0], self.tangent[:, 1])
+        plan = np.concatenate([[0.0], np.cumsum((run[1:] + run[:-1]) / 2 * np.diff(self.station))])
+        ends = [np.clip(plan + side * _BEND_OVER / 2, plan[0], plan[-1]) for side in (-1, 1)]
+        before, after = (np.interp(end, plan, heading) for end in ends)
+        return (after - before) / np.maximum(ends[1] - ends[0], 1e-9)
+
+    @property
+    def grade(self) -> Float[np.ndarray, " n"]:
+        """Rise for each metre in plan."""
+        return self.tangent[:, 2] / np.hypot(self.tangent[:, 0], self.tangent[:, 1])
 
     def at(self, station: Float[np.ndarray, " k"]) -> "Axis":
         """The axis at other stations; beyond its ends it runs on straight."""

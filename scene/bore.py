@@ -1,7 +1,8 @@
 """The bore: the reconstructed solid as a centreline with a section at every station."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
@@ -21,6 +22,33 @@ POCKET = np.dtype(
         ("depth", "f8"),
         ("confidence", "f8"),
         ("measured", "?"),
+    ]
+)
+
+NAIL = np.dtype(
+    [
+        ("station", "f8"),
+        ("angle", "f8"),
+        ("length", "f8"),
+        ("diameter", "f8"),
+        ("depth", "f8"),
+        ("confidence", "f8"),
+        ("measured", "?"),
+    ]
+)
+
+STRETCH = np.dtype(
+    [
+        ("start", "f8"),
+        ("end", "f8"),
+        ("type", "U9"),
+        ("width", "f8"),
+        ("height", "f8"),
+        ("crown_radius", "f8"),
+        ("wall_radius", "f8"),
+        ("rms", "f8"),
+        ("rms_free", "f8"),
+        ("confidence", "f8"),
     ]
 )
 
@@ -44,6 +72,9 @@ class Bore:
         filled: Section interpolated, `(n,)`.
         ring_station: Ring joints, m, `(r,)`.
         pocket: Recesses of the lining, `(p,)` of `POCKET`.
+        confidence: Probability that the wall is within 5 cm of the true one, mean over the angles, `(n,)`.
+        stretch: Stretches of one type of section, `(t,)` of `STRETCH`.
+        nail: Bolts that bridge two pockets across a joint, `(b,)` of `NAIL`.
     """
 
     station: Float[np.ndarray, " n"]
@@ -60,6 +91,9 @@ class Bore:
     filled: Bool[np.ndarray, " n"]
     ring_station: Float[np.ndarray, " r"]
     pocket: Shaped[np.ndarray, " p"]
+    confidence: Float[np.ndarray, " n"]
+    stretch: Shaped[np.ndarray, " t"] = field(default_factory=lambda: np.empty(0, STRETCH))
+    nail: Shaped[np.ndarray, " b"] = field(default_factory=lambda: np.empty(0, NAIL))
 
     @property
     def length(self) -> float:
@@ -76,9 +110,20 @@ class Bore:
         across, along = self.radius * np.cos(self.angle), self.radius * np.sin(self.angle)
         return self.position[:, None] + across[..., None] * self.lateral[:, None] + along[..., None] * self.up[:, None]
 
+    @property
+    def section_type(self) -> Shaped[np.ndarray, " n"]:
+        """Type of section at each station: `d`, `horseshoe`, `circle` or `free`, `(n,)`."""
+        types = np.full(len(self.station), "free", STRETCH["type"])
+        for stretch in self.stretch:
+            types[(self.station >= stretch["start"]) & (self.station <= stretch["end"])] = stretch["type"]
+        return types
+
     def save(self, path: Path) -> None:
-        """Writes `bore.npz`; the same bore gives the same bytes."""
-        np.savez_compressed(path, schema=SCHEMA, **{field.name: getattr(self, field.name) for field in fields(self)})
+        """Writes `bore.npz`, with what follows from the axis and the stretches; the same bore gives the same bytes."""
+        axis = self.axis
+        derived: dict[str, Any] = {"curvature": axis.curvature, "grade": axis.grade, "section_type": self.section_type}
+        own: dict[str, Any] = {part.name: getattr(self, part.name) for part in fields(self)}
+        np.savez_compressed(path, schema=SCHEMA, **own, **derived)
 
 
 def load(path: Path) -> Bore:
@@ -91,8 +136,10 @@ def load(path: Path) -> Bore:
         with np.load(path) as data:
             if str(data["schema"]) != SCHEMA:
                 raise RecordingError(f"{path}: schema is {data['schema']}, not {SCHEMA}")
-            return Bore(**{field.name: data[field.name] for field in fields(Bore)})
-    except (OSError, ValueError, KeyError, EOFError) as error:
+            values = {part.name: data[part.name] for part in fields(Bore) if part.name in data}
+            values.setdefault("confidence", np.full(len(values["station"]), np.nan))  # not in the first files
+            return Bore(**values)
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise RecordingError(f"{path}: not a bore file ({error})") from error
 
 

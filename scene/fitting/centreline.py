@@ -9,19 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_lsq_spline
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.spatial import cKDTree
 
 from scene.axis import Axis, through
 from scene.errors import FitError
 from scene.fitting import floor, profile
+from scene.fitting.branches import require_no_fold
+from scene.fitting.skeleton import skeleton
 
-_SKELETON_VOXEL = 0.5
-_NEIGHBOURS = (1.2, 1.8, 2.6, 3.8)  # m; profiles may be apart, surveys have gaps
-_MIN_JOINED = 0.95
-_SLICE = 1.5
-_TILTED = 3
+_HERE = np.zeros(3)
 _OVERRUN = 6.0
 _FULL_SHARE = 0.5
 _SPACING = 1.0
@@ -29,6 +24,7 @@ _PASSES = 4
 _COARSE_ANGLES = 72
 _POINTS_PER_METRE = 5_000
 _MIN_SEEN = 0.6
+_FURTHEST = 2.0  # times the median radius of a section: further is a passage, which has no part in its middle
 _ELONGATION = 1.6
 _DOWN, _TRACK = -0.8, 0.5  # directions in which sleepers and rails may hide the bed, and how deep, m
 
@@ -46,17 +42,20 @@ class CentrelineConfig:
     cutoff: float = 12.0
 
 
-def fit_centreline(points: Float[np.ndarray, "n 3"], config: CentrelineConfig) -> Axis:
+def fit_centreline(
+    points: Float[np.ndarray, "n 3"], config: CentrelineConfig, origin: Float[np.ndarray, "3"] = _HERE
+) -> Axis:
     """The axis of the bore, from end to end of the cloud.
 
     Args:
         points: Registered cloud, z up, m.
         config: See `CentrelineConfig`.
+        origin: Of the points' frame in the input's, m, so that an error can say where in the input.
 
     Raises:
-        FitError: Too short, or nothing like a tunnel.
+        FitError: Too short, nothing like a tunnel, or with a branch or a room.
     """
-    axis = _smooth(_skeleton(points, config), config.cutoff)
+    axis = _smooth(skeleton(points, config.min_length, origin), config.cutoff)
     stride = max(1, int(len(points) / (axis.length * _POINTS_PER_METRE)))
     sample = points[::stride].astype(np.float64)
     for _ in range(_PASSES):
@@ -66,45 +65,8 @@ def fit_centreline(points: Float[np.ndarray, "n 3"], config: CentrelineConfig) -
     across = 2 * float(np.median(np.hypot(*axis.local(sample[:: max(1, len(sample) // 20_000)])[1:])))
     if axis.length < _ELONGATION * across:
         raise FitError(f"{axis.length:.0f} m long and {across:.0f} m across: a room, not a tunnel")
+    require_no_fold(axis, across, origin)
     return axis
-
-
-def _skeleton(points: np.ndarray, config: CentrelineConfig) -> Float[np.ndarray, "k 3"]:
-    """Centres of slices across the surface distance from end to end."""
-    cells = np.unique(np.floor(points / _SKELETON_VOXEL).astype(np.int64), axis=0)
-    nodes = (cells + 0.5) * _SKELETON_VOXEL
-    graph, nodes = _surface_graph(nodes)
-
-    def distances(start: int) -> np.ndarray:
-        return dijkstra(graph, directed=False, indices=start)
-
-    from_start = distances(int(np.argmax(distances(0))))
-    from_end = distances(int(np.argmax(from_start)))
-    along = (from_start - from_end) / 2  # the half difference is square to the axis where one distance alone is tilted
-    if np.ptp(along) < config.min_length:
-        raise FitError(f"the tunnel is {np.ptp(along):.1f} m long; at least {config.min_length:g} m are needed")
-    index = np.floor((along - along.min()) / _SLICE).astype(np.intp)
-    count = np.bincount(index)
-    centres = np.stack([np.bincount(index, nodes[:, axis]) / np.maximum(count, 1) for axis in range(3)], axis=1)
-    full = count > 0.4 * np.median(count)
-    if full.sum() < 6:
-        raise FitError("no tunnel in the cloud: its surface has no two ends")
-    # The last slices are tilted: at a mouth the surface distances still fan out from one point.
-    trimmed = centres[full]
-    return trimmed[_TILTED:-_TILTED] if len(trimmed) >= 4 * _TILTED else trimmed[1:-1]
-
-
-def _surface_graph(nodes: Float[np.ndarray, "k 3"]) -> tuple[csr_matrix, Float[np.ndarray, "j 3"]]:
-    """Nodes within reach of each other, joined; the reach grows until nearly all hang together."""
-    for reach in _NEIGHBOURS:
-        pairs = cKDTree(nodes).query_pairs(reach, output_type="ndarray")
-        lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
-        graph = csr_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes)))
-        labels = connected_components(graph, directed=False)[1]
-        largest = np.flatnonzero(labels == np.bincount(labels).argmax())
-        if len(largest) >= _MIN_JOINED * len(nodes):
-            break
-    return graph[largest][:, largest], nodes[largest]
 
 
 def _middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:
@@ -131,6 +93,7 @@ def _middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:
             bed = floor.radius(line, centres)
             under_track = (np.sin(centres) < _DOWN) & (bed < around + _TRACK)
             around = np.where(under_track, bed, np.minimum(around, bed))
+        around = np.minimum(around, _FURTHEST * np.median(around))
         across, along = profile.measure(centres, around).middle
         middles.append(extended.position[k] + across * extended.lateral[k] + along * extended.up[k])
     if len(middles) < 4:

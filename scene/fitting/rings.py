@@ -8,9 +8,10 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
 from scene.axis import Axis, through, with_frames
-from scene.bore import POCKET, STATION_STEP, Bore
+from scene.bore import POCKET, STATION_STEP, STRETCH, Bore
 from scene.errors import FitError
 from scene.fitting import profile
+from scene.fitting.sureness import UNSEEN, known
 from scene.reading.ringsurvey import RingSurvey
 
 _MIN_POINTS = 5
@@ -98,7 +99,16 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
         filled=distance > STATION_STEP,
         ring_station=at,
         pocket=np.empty(0, POCKET),
+        confidence=np.interp(axis.station, at, fit.seen)
+        * known(np.hypot(np.interp(axis.station, at, fit.rms), UNSEEN * distance)),
+        stretch=np.array([_round_stretch(axis, fit)], STRETCH),
     )
+
+
+def _round_stretch(axis: Axis, fit: RingFit) -> tuple[float | str, ...]:
+    """The whole bore as one circular stretch; no free profile was measured."""
+    radius, rms = float(fit.radius.mean()), float(np.sqrt(np.mean(fit.rms**2)))
+    return 0.0, axis.length, "circle", 2 * radius, 2 * radius, radius, radius, rms, np.nan, 1.0
 
 
 def against_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:

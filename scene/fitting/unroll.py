@@ -108,3 +108,24 @@ def smooth(
     total = gaussian_filter(weight, sigma, mode=modes)
     summed = gaussian_filter(np.where(weight > 0, value, 0.0) * weight, sigma, mode=modes)
     return np.divide(summed, total, out=np.zeros_like(summed), where=total > 1e-12), total
+
+
+def fill_along(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
+    """NaN cells by linear interpolation around each row; the angle wraps. A row of NaN alone stays so."""
+    result, columns = field.copy(), np.arange(field.shape[1], dtype=float)
+    for row in np.flatnonzero(np.isnan(field).any(axis=1) & np.isfinite(field).any(axis=1)):
+        seen = np.isfinite(field[row])
+        result[row] = np.interp(columns, columns[seen], field[row][seen], period=field.shape[1])
+    return result
+
+
+def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
+    """Linear interpolation of the coarse wall on the fine grid; the angle wraps, the ends hold."""
+    row = np.clip((fine.station - coarse.start) / coarse.step - 0.5, 0, coarse.rows - 1)
+    low = np.minimum(row.astype(np.intp), max(coarse.rows - 2, 0))
+    share = (row - low)[:, None]
+    along = (1 - share) * wall[low] + share * wall[np.minimum(low + 1, coarse.rows - 1)]
+    column = (np.arange(fine.columns) + 0.5) * coarse.columns / fine.columns - 0.5
+    left = np.floor(column).astype(np.intp)
+    part = column - left
+    return (1 - part) * along[:, left % coarse.columns] + part * along[:, (left + 1) % coarse.columns]

@@ -1,0 +1,200 @@
+"""Bolt pockets and ring joints, found on the wall rolled out flat.
+
+A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
+hidden by its own edge, so that one pocket says little about its depth or size; but the pockets of a lining come from
+one mould, and all of them together say it well.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from scene.bore import POCKET
+from scene.fitting.section import Sections
+
+_MODES = ("nearest", "wrap")
+_HOLE = (4, 3)  # cells of 5 cm × 1°
+_AROUND = (16, 13)
+_EXPECTED = (31, 21)
+_APART = (7, 7)
+_STRONG, _WEAK = 0.32, 0.22
+_MIN_EXPECTED = 0.2  # points a cell; with fewer on the wall a hole says nothing
+_MIN_DEPTH = 0.06
+_ROW_WIDTH = 0.15  # m
+_ROW_SHARE = 0.3  # of the fullest row
+FLOOR_MARGIN = 0.45  # m above the floor
+_PROFILE = 0.30  # half window for the common size, m
+_PITCHES = (0.9, 2.1)  # widths of rings in use, m
+_MIN_COHERENCE = 0.4
+_MIN_POCKETS = 6
+_MIN_SEEN = 0.6  # of the wall
+_NOISE_SHARE = 0.25  # of the depth
+_SIDE = 0.5
+_DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
+
+
+@dataclass(frozen=True)
+class _Holes:
+    row: Int[np.ndarray, " p"]
+    column: Int[np.ndarray, " p"]
+    score: Float[np.ndarray, " p"]
+
+
+def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
+    """The pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints that they straddle, m.
+
+    Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and
+    at a pitch of rings are none: both are empty then.
+    """
+    grid = sections.grid
+    nothing = np.empty(0, POCKET), np.empty(0)
+    deficit = _deficit(sections)
+    holes = _in_rows(_find_holes(deficit, sections), sections)
+    if len(holes.row) < _MIN_POCKETS:
+        return nothing
+    row, column = _refine(deficit, sections, holes)
+    station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
+    slope = _slopes(sections, holes)
+    length, width = _common_size(deficit, sections, holes, slope)
+    depth = _common_depth(sections, holes, slope)
+    inside = (station > grid.start + length) & (station < grid.start + grid.rows * grid.step - length)
+    if inside.sum() < _MIN_POCKETS:
+        return nothing
+    pockets = np.zeros(int(inside.sum()), POCKET)
+    pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
+    pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
+    pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / _STRONG, 0, 1), True
+    joints = _ring_joints(pockets["station"], grid.rows * grid.step)
+    return (pockets, joints) if len(joints) else nothing
+
+
+def could_show(sections: Sections, depth: float) -> bool:
+    """Whether the cloud is dense and fine enough that pockets of a depth, m, would be found in it, were there any."""
+    near = uniform_filter(sections.support, _EXPECTED, mode=_MODES)[~_near_floor(sections)]
+    seen = float(np.mean(near > _MIN_EXPECTED)) if near.size else 0.0
+    noise = float(np.median(sections.spread))
+    return sections.spacing == 0.0 and seen > _MIN_SEEN and noise < _NOISE_SHARE * depth
+
+
+def _deficit(sections: Sections) -> Float[np.ndarray, "rows cols"]:
+    """How much less of the wall was seen in each cell than around it: 0 as usual, 1 nothing."""
+    expected = uniform_filter(sections.support, _EXPECTED, mode=_MODES)
+    share = sections.support / np.maximum(expected, 1e-9)
+    deficit = np.where(expected > _MIN_EXPECTED, np.clip(1 - share, -1, 1), 0.0)
+    return np.where(_near_floor(sections), 0.0, deficit)
+
+
+def _near_floor(sections: Sections) -> np.ndarray:
+    """Cells of a flat floor and its corners, where track and clutter make holes of their own."""
+    if not sections.flat_floor:
+        return np.zeros(sections.radius.shape, bool)
+    grid = sections.grid
+    lowest = (sections.radius * np.sin(grid.angle)).min(axis=1, keepdims=True)
+    return sections.radius * np.sin(grid.angle) - lowest < FLOOR_MARGIN
+
+
+def _find_holes(deficit: np.ndarray, sections: Sections) -> _Holes:
+    score = uniform_filter(deficit, _HOLE, mode=_MODES) - uniform_filter(deficit, _AROUND, mode=_MODES)
+    behind = maximum_filter(sections.deepest, (9, 5), mode=_MODES)
+    peak = (score == maximum_filter(score, _APART, mode=_MODES)) & (score > _WEAK) & (behind > _MIN_DEPTH)
+    row, column = np.nonzero(peak)
+    return _Holes(row, column, score[row, column])
+
+
+def _in_rows(holes: _Holes, sections: Sections) -> _Holes:
+    """The holes that stand in the rows which the clearest of them form."""
+    columns = sections.grid.columns
+    reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / columns)
+    strong = np.bincount(holes.column[holes.score > _STRONG], minlength=columns).astype(float)
+    window = max(int(2 * reach) | 1, 3)
+    filled = uniform_filter(strong, window, mode="wrap") * window
+    peaks = np.flatnonzero(
+        (filled == maximum_filter(filled, 2 * window + 1, mode="wrap")) & (filled > max(_ROW_SHARE * filled.max(), 2))
+    )
+    if not len(peaks):
+        return _Holes(*(part[:0] for part in (holes.row, holes.column, holes.score)))
+    apart = np.abs((holes.column[:, None] - peaks[None] + columns / 2) % columns - columns / 2).min(axis=1)
+    keep = apart <= max(reach, 1.5)
+    return _Holes(holes.row[keep], holes.column[keep], holes.score[keep])
+
+
+def _patches(field: np.ndarray, holes: _Holes, rows: int, columns: int) -> Float[np.ndarray, "p r c"]:
+    """The field around each hole; beyond the ends the last row holds, around it wraps."""
+    at_row = np.clip(holes.row[:, None] + np.arange(-rows, rows + 1), 0, field.shape[0] - 1)
+    at_column = (holes.column[:, None] + np.arange(-columns, columns + 1)) % field.shape[1]
+    return field[at_row[:, :, None], at_column[:, None, :]]
+
+
+def _refine(
+    deficit: np.ndarray, sections: Sections, holes: _Holes
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Row and column of each hole's centre of gravity, in cells.
+
+    The side that faces the scanner is seen through the mouth and blurs that rim, so that the hole alone would lie
+    4 cm off; being the rim, it counts half.
+    """
+    missing = np.maximum(_patches(deficit, holes, 4, 3), 0.0) ** 2
+    side = _patches((sections.deepest > _MIN_DEPTH).astype(float), holes, 4, 3)
+    patch = missing + _SIDE * side
+    mass = np.maximum(patch.sum(axis=(1, 2)), 1e-9)
+    row = holes.row + (patch.sum(axis=2) @ np.arange(-4, 5)) / mass
+    column = holes.column + (patch.sum(axis=1) @ np.arange(-3, 4)) / mass
+    return row, column
+
+
+def _slopes(sections: Sections, holes: _Holes) -> Float[np.ndarray, " p"]:
+    """Cosine between the wall's normal and the radius at each hole: along a wall seen aslant cells are longer."""
+    around = 2 * np.pi / sections.grid.columns
+    wall = sections.radius
+    before, after = (wall[holes.row, (holes.column + step) % wall.shape[1]] for step in (-3, 3))
+    lean = (after - before) / (6 * around) / wall[holes.row, holes.column]
+    return 1 / np.sqrt(1 + lean**2)
+
+
+def _common_size(deficit: np.ndarray, sections: Sections, holes: _Holes, slope: np.ndarray) -> tuple[float, float]:
+    """Length and width of the mould, m, from the mean hole, along and around.
+
+    A voxel that the rim crosses still holds a wall point, so the hole in the thinned cloud is one voxel short each way.
+    """
+    grid = sections.grid
+    across = sections.radius[holes.row, holes.column] * 2 * np.pi / grid.columns / slope  # m a column
+    rows, columns = int(_PROFILE / grid.step), int(_PROFILE / np.median(across))
+    mean = _patches(deficit, holes, rows, columns).mean(axis=0)
+    mean = mean - np.median(mean)
+    core = mean[rows - 3 : rows + 4, columns - 3 : columns + 4]
+    along, around = core.sum(axis=1), core.sum(axis=0)
+    length = _spread(along) * grid.step
+    width = _spread(around) * float(np.median(across))
+    return float(np.clip(length + sections.voxel, 0.05, 0.5)), float(np.clip(width + sections.voxel, 0.05, 0.5))
+
+
+def _spread(profile: Float[np.ndarray, " k"]) -> float:
+    """Width, in cells, of the box with the profile's second moment, less that of one cell."""
+    weight = np.maximum(profile, 0.0)
+    at = np.arange(len(profile)) - len(profile) // 2
+    mass = weight.sum()
+    if mass <= 0:
+        return 1.0
+    centre = (weight @ at) / mass
+    variance = (weight @ (at - centre) ** 2) / mass
+    return float(np.sqrt(max(12 * variance - 1.0, 1.0)))
+
+
+def _common_depth(sections: Sections, holes: _Holes, slope: np.ndarray) -> float:
+    """Depth of the mould, m: what the pockets show whose backs are seen."""
+    deepest = _patches(sections.deepest, holes, 4, 2).max(axis=(1, 2)) * slope
+    return float(np.quantile(deepest, _DEEP_SHARE))
+
+
+def _ring_joints(station: Float[np.ndarray, " p"], length: float) -> Float[np.ndarray, " r"]:
+    """Stations of the ring joints that the pockets straddle, m; empty where no pitch fits."""
+    step = _PITCHES[0] ** 2 / (8 * max(length, 1.0))
+    pitch = np.arange(*_PITCHES, step)
+    wave = np.exp(2j * np.pi * station[None] / pitch[:, None]).mean(axis=1)
+    best = int(np.argmax(np.abs(wave)))
+    if np.abs(wave[best]) < _MIN_COHERENCE:
+        return np.empty(0)
+    phase = np.angle(wave[best]) / (2 * np.pi) * pitch[best] % pitch[best]
+    return np.arange(phase, length, pitch[best])

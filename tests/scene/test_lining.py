@@ -1,0 +1,129 @@
+"""Pockets and nails are measured where they can be seen, by standard where not, and never invented."""
+
+import numpy as np
+import pytest
+
+from scene.bore import Bore, load
+from scene.cloud import Cloud
+from scene.fitting import assemble, lining
+from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.lining import LiningConfig
+from scene.fitting.section import fit_sections
+from tests.scene.shapes import swept
+from tests.scene.test_irregular_walls import Irregular
+from tests.scene.test_reconstruction import thin
+
+RADIUS, LENGTH, RING = 2.75, 18.0, 1.5
+JOINTS = np.arange(0.75, LENGTH, RING)
+ROWS = np.deg2rad([-30.0, 10.0, 50.0, 90.0, 130.0, 170.0, 210.0])
+OFFSET, HALF, DEPTH, NAIL = 0.22, (0.10, 0.09), 0.13, 0.06
+
+
+def lined(nails: bool) -> np.ndarray:
+    """A round bore with recesses of known size, each pair bridged by a bolt of 28 mm, seen from everywhere."""
+    rng = np.random.default_rng(1)
+    station, angle = rng.random(700_000) * LENGTH, rng.uniform(-np.pi, np.pi, 700_000)
+    radius = np.full(len(station), RADIUS)
+    hole, bolt = np.zeros(len(station), bool), np.zeros(len(station), bool)
+    for joint in JOINTS:
+        for row in ROWS:
+            around = RADIUS * np.angle(np.exp(1j * (angle - row)))
+            for side in (-1, 1):
+                along = station - joint - side * OFFSET
+                inside = (np.abs(along) < HALF[0]) & (np.abs(around) < HALF[1])
+                hole |= inside
+                bolt |= inside & (np.abs(around) < 0.014) & (side * along < 0)
+    radius[hole] += DEPTH
+    if nails:
+        radius[bolt] = RADIUS + NAIL - 0.011
+    points = np.stack([station, radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return points + rng.normal(0, 0.004, points.shape) + 40.0
+
+
+def built(points: np.ndarray, config: LiningConfig | None = None) -> tuple[Bore, dict[str, str], Cloud]:
+    cloud = thin(points)
+    axis = fit_centreline(cloud.points, CentrelineConfig(), cloud.origin)
+    sections = fit_sections(cloud, axis)
+    return *lining.add_features(assemble.from_sections(axis, sections), sections, cloud, config), cloud
+
+
+@pytest.fixture(scope="module")
+def with_nails():
+    return built(lined(nails=True))
+
+
+def test_pockets_are_measured_with_place_size_and_depth(with_nails):
+    bore, provenance, _ = with_nails
+    assert provenance["pockets"] == provenance["rings"] == "measured"
+    assert len(bore.pocket) == pytest.approx(2 * len(JOINTS) * len(ROWS), rel=0.06)
+    assert bore.pocket["measured"].all()
+    apart = np.abs(np.angle(np.exp(1j * (bore.pocket["angle"][:, None] - np.concatenate([ROWS, np.pi - ROWS])))))
+    assert np.quantile(apart.min(axis=1), 0.95) * RADIUS < 0.03
+    assert bore.pocket["depth"].mean() == pytest.approx(DEPTH, abs=0.015)
+    assert np.median(np.diff(bore.ring_station)) == pytest.approx(RING, abs=0.01)
+
+
+def test_nails_are_seen_in_their_pockets(with_nails):
+    bore, provenance, _ = with_nails
+    assert provenance["nails"].startswith("measured")
+    seen = bore.nail[bore.nail["measured"]]
+    assert len(seen) > 0.9 * len(JOINTS) * len(ROWS)
+    assert seen["depth"].mean() == pytest.approx(NAIL, abs=0.01)
+    assert seen["length"].mean() == pytest.approx(2 * OFFSET, abs=0.03)
+    off_joint = np.abs(seen["station"][:, None] - bore.ring_station).min(axis=1)
+    assert np.quantile(off_joint, 0.95) < 0.05
+    assert seen["confidence"].min() > 0.8
+
+
+def test_empty_pockets_have_no_nails():
+    bore, provenance, _ = built(lined(nails=False))
+    assert provenance["pockets"] == "measured"
+    assert provenance["nails"] == "none found"
+    assert not len(bore.nail)
+
+
+def test_a_smooth_wall_seen_well_gets_nothing():
+    bore, provenance, _ = built(swept("circle", 18, yaw=0.4, per_metre=9000))
+    assert set(provenance.values()) == {"none found"}
+    assert not len(bore.pocket)
+    assert not len(bore.ring_station)
+
+
+def test_a_wall_seen_too_thinly_gets_the_standard_lining_marked_so(tmp_path):
+    points = swept("circle", 30, yaw=0.4)
+    along = (points - points.mean(axis=0))[:, :2] @ [np.cos(0.4), np.sin(0.4)]
+    bore, provenance, _ = built(points[np.abs(along - np.rint(along)) < 0.05])
+    assert provenance == {"rings": "by standard", "pockets": "by standard", "nails": "by standard"}
+    assert len(bore.pocket) == 2 * 8 * len(bore.ring_station)
+    assert len(bore.nail) == 8 * len(bore.ring_station)
+    assert not bore.pocket["measured"].any()
+    assert not bore.nail["measured"].any()
+    assert (bore.pocket["depth"] == 0.13).all()
+    np.testing.assert_allclose(np.diff(bore.ring_station), 1.5)
+    bore.save(tmp_path / "bore.npz")
+    np.testing.assert_array_equal(load(tmp_path / "bore.npz").nail, bore.nail)
+
+
+def test_the_standard_lining_can_be_left_out_and_chosen():
+    points = swept("circle", 30, yaw=0.4)
+    along = (points - points.mean(axis=0))[:, :2] @ [np.cos(0.4), np.sin(0.4)]
+    sparse = points[np.abs(along - np.rint(along)) < 0.05]
+    bore, provenance, _ = built(sparse, LiningConfig(by_standard=False))
+    assert not len(bore.pocket)
+    assert provenance["pockets"] == "none: the survey cannot show them"
+    chosen = LiningConfig(ring_width=2.0, pockets_per_ring=5, stagger=0.5, pocket_size=(0.25, 0.2))
+    bore, _, _ = built(sparse, chosen)
+    assert np.diff(bore.ring_station) == pytest.approx(2.0)
+    assert len(bore.pocket) == 10 * len(bore.ring_station)
+    assert (bore.pocket["length"] == 0.25).all()
+    even, odd = (set(np.round(bore.nail["angle"][k * 5 : k * 5 + 5], 3)) for k in (0, 1))
+    assert not even & odd
+
+
+def test_walls_too_irregular_for_segments_get_none_by_standard():
+    tunnel, rng = Irregular.drawn(2.0, seed=3), np.random.default_rng(0)
+    points = np.concatenate([tunnel.profile(station, 2500, rng) for station in np.arange(0.3, 20.0, 1.0)])
+    bore, provenance, _ = built(points + 50.0)
+    assert not len(bore.pocket)
+    assert provenance["rings"] == "none"
+    assert set(bore.section_type) == {"free"}
