@@ -5,13 +5,12 @@ hidden by its own edge, so that one pocket says little about its depth or size; 
 one mould, and all of them together say it well.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from scene.bore import POCKET
+from scene.fitting.pattern import CLEAR, Holes, in_pattern, in_rows, ring_joints
 from scene.fitting.section import Sections
 
 _MODES = ("nearest", "wrap")
@@ -19,27 +18,17 @@ _HOLE = (4, 3)  # cells of 5 cm × 1°
 _AROUND = (16, 13)
 _EXPECTED = (31, 21)
 _APART = (7, 7)
-_STRONG, _WEAK = 0.32, 0.22
+_WEAK, _FAINT = 0.22, 0.12
 _MIN_EXPECTED = 0.2  # points a cell; with fewer on the wall a hole says nothing
 _MIN_DEPTH = 0.06
-_ROW_WIDTH = 0.15  # m
-_ROW_SHARE = 0.3  # of the fullest row
 FLOOR_MARGIN = 0.45  # m above the floor
+_ROW_WIDTH = 0.15  # m
 _PROFILE = 0.30  # half window for the common size, m
-_PITCHES = (0.9, 2.1)  # widths of rings in use, m
-_MIN_COHERENCE = 0.4
 _MIN_POCKETS = 6
 _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _SIDE = 0.5
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
-
-
-@dataclass(frozen=True)
-class _Holes:
-    row: Int[np.ndarray, " p"]
-    column: Int[np.ndarray, " p"]
-    score: Float[np.ndarray, " p"]
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
@@ -51,9 +40,12 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     grid = sections.grid
     nothing = np.empty(0, POCKET), np.empty(0)
     deficit = _deficit(sections)
-    holes = _in_rows(_find_holes(deficit, sections), sections)
+    faint = _find_holes(deficit, sections)
+    reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / grid.columns)
+    holes = in_rows(faint.where(faint.score > _WEAK), grid.columns, reach)
     if len(holes.row) < _MIN_POCKETS:
         return nothing
+    holes = in_pattern(faint, holes, grid, reach)
     row, column = _refine(deficit, sections, holes)
     station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
     slope = _slopes(sections, holes)
@@ -65,8 +57,8 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     pockets = np.zeros(int(inside.sum()), POCKET)
     pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
-    pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / _STRONG, 0, 1), True
-    joints = _ring_joints(pockets["station"], grid.rows * grid.step)
+    pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
+    joints = ring_joints(pockets["station"], grid.rows * grid.step)
     return (pockets, joints) if len(joints) else nothing
 
 
@@ -95,32 +87,15 @@ def _near_floor(sections: Sections) -> np.ndarray:
     return sections.radius * np.sin(grid.angle) - lowest < FLOOR_MARGIN
 
 
-def _find_holes(deficit: np.ndarray, sections: Sections) -> _Holes:
+def _find_holes(deficit: np.ndarray, sections: Sections) -> Holes:
     score = uniform_filter(deficit, _HOLE, mode=_MODES) - uniform_filter(deficit, _AROUND, mode=_MODES)
     behind = maximum_filter(sections.deepest, (9, 5), mode=_MODES)
-    peak = (score == maximum_filter(score, _APART, mode=_MODES)) & (score > _WEAK) & (behind > _MIN_DEPTH)
+    peak = (score == maximum_filter(score, _APART, mode=_MODES)) & (score > _FAINT) & (behind > _MIN_DEPTH)
     row, column = np.nonzero(peak)
-    return _Holes(row, column, score[row, column])
+    return Holes(row, column, score[row, column])
 
 
-def _in_rows(holes: _Holes, sections: Sections) -> _Holes:
-    """The holes that stand in the rows which the clearest of them form."""
-    columns = sections.grid.columns
-    reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / columns)
-    strong = np.bincount(holes.column[holes.score > _STRONG], minlength=columns).astype(float)
-    window = max(int(2 * reach) | 1, 3)
-    filled = uniform_filter(strong, window, mode="wrap") * window
-    peaks = np.flatnonzero(
-        (filled == maximum_filter(filled, 2 * window + 1, mode="wrap")) & (filled > max(_ROW_SHARE * filled.max(), 2))
-    )
-    if not len(peaks):
-        return _Holes(*(part[:0] for part in (holes.row, holes.column, holes.score)))
-    apart = np.abs((holes.column[:, None] - peaks[None] + columns / 2) % columns - columns / 2).min(axis=1)
-    keep = apart <= max(reach, 1.5)
-    return _Holes(holes.row[keep], holes.column[keep], holes.score[keep])
-
-
-def _patches(field: np.ndarray, holes: _Holes, rows: int, columns: int) -> Float[np.ndarray, "p r c"]:
+def _patches(field: np.ndarray, holes: Holes, rows: int, columns: int) -> Float[np.ndarray, "p r c"]:
     """The field around each hole; beyond the ends the last row holds, around it wraps."""
     at_row = np.clip(holes.row[:, None] + np.arange(-rows, rows + 1), 0, field.shape[0] - 1)
     at_column = (holes.column[:, None] + np.arange(-columns, columns + 1)) % field.shape[1]
@@ -128,7 +103,7 @@ def _patches(field: np.ndarray, holes: _Holes, rows: int, columns: int) -> Float
 
 
 def _refine(
-    deficit: np.ndarray, sections: Sections, holes: _Holes
+    deficit: np.ndarray, sections: Sections, holes: Holes
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Row and column of each hole's centre of gravity, in cells.
 
@@ -144,7 +119,7 @@ def _refine(
     return row, column
 
 
-def _slopes(sections: Sections, holes: _Holes) -> Float[np.ndarray, " p"]:
+def _slopes(sections: Sections, holes: Holes) -> Float[np.ndarray, " p"]:
     """Cosine between the wall's normal and the radius at each hole: along a wall seen aslant cells are longer."""
     around = 2 * np.pi / sections.grid.columns
     wall = sections.radius
@@ -153,7 +128,7 @@ def _slopes(sections: Sections, holes: _Holes) -> Float[np.ndarray, " p"]:
     return 1 / np.sqrt(1 + lean**2)
 
 
-def _common_size(deficit: np.ndarray, sections: Sections, holes: _Holes, slope: np.ndarray) -> tuple[float, float]:
+def _common_size(deficit: np.ndarray, sections: Sections, holes: Holes, slope: np.ndarray) -> tuple[float, float]:
     """Length and width of the mould, m, from the mean hole, along and around.
 
     A voxel that the rim crosses still holds a wall point, so the hole in the thinned cloud is one voxel short each way.
@@ -182,19 +157,7 @@ def _spread(profile: Float[np.ndarray, " k"]) -> float:
     return float(np.sqrt(max(12 * variance - 1.0, 1.0)))
 
 
-def _common_depth(sections: Sections, holes: _Holes, slope: np.ndarray) -> float:
+def _common_depth(sections: Sections, holes: Holes, slope: np.ndarray) -> float:
     """Depth of the mould, m: what the pockets show whose backs are seen."""
     deepest = _patches(sections.deepest, holes, 4, 2).max(axis=(1, 2)) * slope
     return float(np.quantile(deepest, _DEEP_SHARE))
-
-
-def _ring_joints(station: Float[np.ndarray, " p"], length: float) -> Float[np.ndarray, " r"]:
-    """Stations of the ring joints that the pockets straddle, m; empty where no pitch fits."""
-    step = _PITCHES[0] ** 2 / (8 * max(length, 1.0))
-    pitch = np.arange(*_PITCHES, step)
-    wave = np.exp(2j * np.pi * station[None] / pitch[:, None]).mean(axis=1)
-    best = int(np.argmax(np.abs(wave)))
-    if np.abs(wave[best]) < _MIN_COHERENCE:
-        return np.empty(0)
-    phase = np.angle(wave[best]) / (2 * np.pi) * pitch[best] % pitch[best]
-    return np.arange(phase, length, pitch[best])

@@ -34,6 +34,9 @@ def skeleton(
     """
     cells = np.unique(np.floor(points / VOXEL).astype(np.int64), axis=0)
     nodes = (cells + 0.5) * VOXEL
+    extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    if extent < min_length:
+        raise FitError(f"the tunnel is at most {extent:.1f} m long; at least {min_length:g} m are needed")
     graph, nodes = _surface_graph(nodes)
 
     def distances(start: int) -> np.ndarray:

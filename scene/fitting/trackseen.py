@@ -21,6 +21,7 @@ _SPACINGS = (0.45, 0.80)  # in use, m
 _RAIL_BAND = (0.60, 0.95)  # from the axis, m
 _RAIL_LOW, _RAIL_HIGH = 0.12, 0.40  # above the bed, m
 _HEAD_LAYER = 0.02  # above and below the most frequent height, m
+_SWAY_BLOCK = 1.0  # m
 _MIN_RAIL = 0.5  # share of the metres along which a rail must be seen
 
 
@@ -152,20 +153,47 @@ def _complete(centre: np.ndarray, spacing: float, length: float) -> tuple[np.nda
 
 
 def _find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:
-    sides = []
-    for side in (1, -1):
-        across = side * lateral
-        band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < _RAIL_HIGH)
-        if len(np.unique(station[band].astype(int))) < _MIN_RAIL * max(np.ptp(station), 1.0):
-            return None
-        top = _mode(height[band])
-        head = band & (np.abs(height - top) < _HEAD_LAYER)
-        edge = _outer_edge(across[head])
-        if edge is None:
-            return None
-        sides.append((edge, float(np.median(height[head]))))
-    (left, left_top), (right, right_top) = sides
-    return SeenRails(left + right, (left - right) / 2, (left_top + right_top) / 2)
+    heads = [_head(station, side * lateral, height) for side in (1, -1)]
+    left, right = heads
+    if left is None or right is None:
+        return None
+    sway = _sway(station, lateral, left, right)
+    edges = [_outer_edge(side * (lateral - sway)[head]) for side, head in ((1, left), (-1, right))]
+    if edges[0] is None or edges[1] is None:
+        return None
+    top = np.mean([np.median(height[head]) for head in heads])
+    return SeenRails(edges[0] + edges[1], (edges[0] - edges[1]) / 2, float(top))
+
+
+def _head(station: np.ndarray, across: np.ndarray, height: np.ndarray) -> Bool[np.ndarray, " n"] | None:
+    """Returns on the top of one rail; `None` where it is seen along too little of the bore."""
+    band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < _RAIL_HIGH)
+    if len(np.unique(station[band].astype(int))) < _MIN_RAIL * max(np.ptp(station), 1.0):
+        return None
+    return band & (np.abs(height - _mode(height[band])) < _HEAD_LAYER)
+
+
+def _sway(station: np.ndarray, lateral: np.ndarray, left: np.ndarray, right: np.ndarray) -> Float[np.ndarray, " n"]:
+    """How far the track lies to the left of its mean place under the axis, metre by metre, m.
+
+    Both rails sway together: the axis follows the walls, and poses are a centimetre off here and there. Unless it is
+    taken out it blurs the edges of the heads.
+    """
+    block = (station / _SWAY_BLOCK).astype(np.intp)
+    blocks = int(block.max()) + 1
+    middles = np.full((2, blocks), np.nan)
+    for k, head in enumerate((left, right)):
+        order = np.argsort(block[head], kind="stable")
+        at, bounds = lateral[head][order], np.searchsorted(block[head][order], np.arange(blocks + 1))
+        for i in range(blocks):
+            if bounds[i + 1] - bounds[i] >= _MIN_TOP:
+                middles[k, i] = np.median(at[bounds[i] : bounds[i + 1]])
+    middle = middles.mean(axis=0)
+    known = np.isfinite(middle)
+    if known.sum() < 2:
+        return np.zeros(len(station))
+    at = (np.flatnonzero(known) + 0.5) * _SWAY_BLOCK
+    return np.interp(station, at, middle[known] - np.median(middle[known]))
 
 
 def _mode(height: np.ndarray) -> float:
