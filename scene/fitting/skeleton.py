@@ -34,7 +34,7 @@ def skeleton(
     """
     cells = np.unique(np.floor(points / VOXEL).astype(np.int64), axis=0)
     nodes = (cells + 0.5) * VOXEL
-    extent = float(np.linalg.norm(np.ptp(nodes, axis=0)))
+    extent = 2 * float(np.linalg.norm(nodes[:, :2] - nodes[:, :2].mean(axis=0), axis=1).max())
     if extent < min_length:
         raise FitError(f"the tunnel is at most {extent:.1f} m long; at least {min_length:g} m are needed")
     graph, nodes = _surface_graph(nodes)
