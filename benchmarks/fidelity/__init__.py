@@ -1,0 +1,6 @@
+"""How true a reconstruction is: 18 categories, 199 metrics, a verdict that can fail.
+
+scene folder ─► candidate ┐
+held-out recording ┐      ├─► case ─► categories/ ─► values ─► scoring ─► report/
+truth or control   ┴─► references ┘
+"""

@@ -1,0 +1,163 @@
+"""Controls of sleepers, rails and pockets."""
+
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+
+from benchmarks.fidelity.candidate import Candidate, Track
+from benchmarks.fidelity.controls.parts import cut_components, moved_components
+from benchmarks.fidelity.controls.warp import curve, warped_mesh
+
+_NEAR = 0.3  # m along the track within which a fastening belongs to a sleeper
+_MARGIN = 0.03  # m around a pocket's footprint
+_RAMP = 3.0  # m at the mouths over which a shifted pattern comes to rest
+_LEFT_DEPTH = 5e-4  # m that a removed pocket keeps, so that its sides do not vanish
+
+
+def sleepers_removed(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
+    """Sleepers missing with what fastens rails to them."""
+    track, line = candidate.track, curve(candidate)
+    count = len(track.sleeper)
+    gone = rng.permutation(count)[: round(share * count)]
+    away = np.sort(line.local(track.sleeper[gone])[:, 0])
+
+    def stays(middles: np.ndarray) -> np.ndarray:
+        return _gap(line.local(middles)[:, 0], away) > _NEAR
+
+    kept = np.setdiff1d(np.arange(count), gone)
+    return replace(candidate, track=replace(
+        track, sleeper=track.sleeper[kept], sleeper_mesh=cut_components(track.sleeper_mesh, stays),
+        fastening_mesh=cut_components(track.fastening_mesh, stays),
+    ))  # fmt: skip
+
+
+def sleepers_respaced(candidate: Candidate, spacing: float) -> Candidate:
+    """Sleepers at another spacing from the first one on; those beyond the end are gone."""
+    track, line = candidate.track, curve(candidate)
+    old = line.local(track.sleeper)[:, 0]
+    factor = spacing / float(np.median(np.diff(old)))
+
+    def target(station: np.ndarray) -> np.ndarray:
+        nearest = old[np.argmin(np.abs(station[:, None] - old[None]), axis=1)]
+        return station - nearest + old[0] + factor * (nearest - old[0])
+
+    def shift(middles: np.ndarray) -> np.ndarray:
+        local = line.local(middles)
+        return line.point(np.column_stack([target(local[:, 0]), local[:, 1:]])) - middles
+
+    def inside(middles: np.ndarray) -> np.ndarray:
+        return line.local(middles)[:, 0] < candidate.length - 0.1
+
+    sleeper = track.sleeper + shift(track.sleeper)
+    return replace(candidate, track=replace(
+        track, sleeper=sleeper[inside(sleeper)],
+        sleeper_mesh=cut_components(moved_components(track.sleeper_mesh, shift), inside),
+        fastening_mesh=cut_components(moved_components(track.fastening_mesh, shift), inside),
+    ))  # fmt: skip
+
+
+def gauge_changed(candidate: Candidate, gauge: float) -> Candidate:
+    """Rails and fastenings moved apart or together, half on each side, m."""
+    track, line = candidate.track, curve(candidate)
+    middle = np.mean([line.local(points)[:, 1].mean() for points in track.rail.values() if len(points)])
+    aside = 0.5 * (gauge - (track.gauge or gauge))
+
+    def move(points: np.ndarray) -> np.ndarray:
+        local = line.local(points)
+        local[:, 1] += aside * np.sign(local[:, 1] - middle)
+        return line.point(local)
+
+    return replace(candidate, track=Track(
+        track.sleeper, track.sleeper_mesh, {side: move(points) for side, points in track.rail.items()},
+        warped_mesh(track.rail_mesh, move), warped_mesh(track.fastening_mesh, move), gauge,
+    ))  # fmt: skip
+
+
+def pockets_scaled(candidate: Candidate, factor: float, share: float, rng: np.random.Generator) -> Candidate:
+    """Depth of a share of the pockets times a factor; 0 closes them."""
+    bore = candidate.bore
+    if not len(bore.pocket):
+        return candidate
+    pick = rng.permutation(len(bore.pocket))[: round(share * len(bore.pocket))]
+    chosen = bore.pocket[pick]
+    line = curve(candidate)
+
+    def deeper(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+        local = line.local(mesh.vertices)
+        radius, angle = np.hypot(local[:, 1], local[:, 2]), np.arctan2(local[:, 2], local[:, 1])
+        smooth = _smooth_radius(candidate, local[:, 0], angle)
+        excess = radius - smooth
+        inside = (excess > 0.02) & _in_pockets(chosen, local[:, 0], angle, smooth)
+        wanted = smooth + np.maximum(factor * excess, _LEFT_DEPTH)
+        grown = np.where(inside, wanted / np.maximum(radius, 1e-9), 1.0)
+        vertices = mesh.vertices.copy()
+        vertices[inside] = line.point(local * np.column_stack([np.ones(len(local)), grown, grown]))[inside]
+        return trimesh.Trimesh(vertices, mesh.faces, process=False)
+
+    pocket = bore.pocket.copy()
+    pocket["depth"][pick] *= factor
+    if not factor:
+        pocket = np.delete(pocket, pick)
+    return replace(
+        candidate, lining=deeper(candidate.lining), solid=deeper(candidate.solid), bore=replace(bore, pocket=pocket)
+    )
+
+
+def pattern_shifted(candidate: Candidate, shift: float) -> Candidate:
+    """Pockets and joints along the tunnel by some metres; mouths and track stay."""
+    bore, line = candidate.bore, curve(candidate)
+
+    def target(station: np.ndarray) -> np.ndarray:
+        fade = np.interp(station, [0.0, _RAMP, candidate.length - _RAMP, candidate.length], [0.0, 1.0, 1.0, 0.0])
+        return station + shift * fade
+
+    def move(points: np.ndarray) -> np.ndarray:
+        local = line.local(points)
+        local[:, 0] = target(local[:, 0])
+        return line.point(local)
+
+    pocket = bore.pocket.copy()
+    pocket["station"] = target(pocket["station"])
+    return replace(
+        candidate, lining=warped_mesh(candidate.lining, move), solid=warped_mesh(candidate.solid, move),
+        bore=replace(bore, pocket=pocket, ring_station=target(bore.ring_station)),
+    )  # fmt: skip
+
+
+def ring_pitch(candidate: Candidate) -> float:
+    """Median distance of the ring joints, m; 1.5 where none is known."""
+    joints = candidate.bore.ring_station
+    return float(np.median(np.diff(joints))) if len(joints) > 2 else 1.5
+
+
+def _smooth_radius(candidate: Candidate, station: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    bore = candidate.bore
+    row = np.clip(np.searchsorted(bore.station, station), 1, len(bore.station) - 1)
+    step = (angle - bore.angle[0]) / (bore.angle[1] - bore.angle[0])
+    low = np.floor(step).astype(int) % len(bore.angle)
+    share, along = (
+        step - np.floor(step),
+        (station - bore.station[row - 1]) / (bore.station[row] - bore.station[row - 1]),
+    )
+    along = np.clip(along, 0.0, 1.0)
+    high = (low + 1) % len(bore.angle)
+    before, after = (bore.radius[r, low] * (1 - share) + bore.radius[r, high] * share for r in (row - 1, row))
+    return (1 - along) * before + along * after
+
+
+def _in_pockets(pocket: np.ndarray, station: np.ndarray, angle: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    inside = np.zeros(len(station), bool)
+    order = np.argsort(station)
+    for one in pocket:
+        reach = 0.5 * one["length"] + _MARGIN
+        part = order[slice(*np.searchsorted(station[order], [one["station"] - reach, one["station"] + reach]))]
+        turn = (angle[part] - one["angle"] + np.pi) % (2.0 * np.pi) - np.pi
+        inside[part] |= np.abs(turn) * radius[part] < 0.5 * one["width"] + 3 * _MARGIN
+    return inside
+
+
+def _gap(station: np.ndarray, away: np.ndarray) -> np.ndarray:
+    if not len(away):
+        return np.full(len(station), np.inf)
+    return np.min(np.abs(station[:, None] - away[None]), axis=1)

@@ -1,0 +1,139 @@
+"""The visible surface of a candidate, rays in it and distances to it."""
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from benchmarks.fidelity.candidate import Candidate, concatenated
+from benchmarks.fidelity.case import Case, derived
+
+CELL = 0.08  # m between the samples that lead to the nearest triangle
+CANDIDATES = 8
+_CHUNK = 200_000
+_PARALLEL = 1e-12
+
+
+class Caster:
+    """First hits of rays in a mesh: embree says which triangle, float64 says where.
+
+    Attributes:
+        mesh: What is hit, from both sides.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self.mesh = mesh
+        self._offset = np.round(mesh.bounds.mean(axis=0)) if len(mesh.faces) else np.zeros(3)
+        moved = trimesh.Trimesh(mesh.vertices - self._offset, mesh.faces, process=False)
+        self._rays = RayMeshIntersector(moved, scale_to_box=False) if len(mesh.faces) else None
+        self._corner = mesh.triangles[:, 0]
+        edge = mesh.triangles[:, 1:] - self._corner[:, None]
+        self._normal = np.cross(edge[:, 0], edge[:, 1])
+
+    def first(
+        self, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+        """Distance to the first hit, m, and the face hit; `inf` and -1 where a ray meets nothing.
+
+        Args:
+            origin: m, `(n, 3)`.
+            direction: Unit vectors, `(n, 3)`.
+        """
+        face = np.full(len(origin), -1, np.int64)
+        if self._rays is not None:
+            for start in range(0, len(origin), _CHUNK):
+                part = slice(start, start + _CHUNK)
+                face[part] = self._rays.intersects_first(origin[part] - self._offset, direction[part])
+        hit = face >= 0
+        reach = np.full(len(origin), np.inf)
+        normal = self._normal[face[hit]]
+        along = np.einsum("ij,ij->i", normal, direction[hit])
+        along = np.where(np.abs(along) < _PARALLEL, np.inf, along)
+        gap = self._corner[face[hit]] - origin[hit]
+        reach[hit] = np.maximum(np.einsum("ij,ij->i", normal, gap) / along, 0.0)
+        return reach, face
+
+
+class Nearest:
+    """Closest points of a mesh.
+
+    A k-d tree over samples of every triangle proposes triangles, `trimesh` gives the exact closest point of each. Where
+    many small triangles crowd around a large one the distance may come out up to `CELL` too long, nowhere too short.
+
+    Attributes:
+        mesh: What distances are measured to.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        self.mesh = mesh
+        samples, self._face = lattice(mesh, CELL)
+        self._tree = cKDTree(samples, balanced_tree=False)
+
+    def query(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
+        """Distance, m, closest point, and its face.
+
+        Raises:
+            ValueError: The mesh has no triangle.
+        """
+        if not len(self._face):
+            raise ValueError("no surface to measure distances to")
+        proposed = self._face[self._tree.query(points, min(CANDIDATES, len(self._face)))[1].reshape(len(points), -1)]
+        best = np.full(len(points), np.inf)
+        closest, face = np.zeros((len(points), 3)), np.full(len(points), -1)
+        for column in range(proposed.shape[1]):
+            repeated = (proposed[:, :column] == proposed[:, column, None]).any(axis=1)
+            rows = np.flatnonzero(~repeated)
+            near = trimesh.triangles.closest_point(self.mesh.triangles[proposed[rows, column]], points[rows])
+            distance = np.linalg.norm(near - points[rows], axis=1)
+            better = distance < best[rows]
+            rows = rows[better]
+            best[rows], closest[rows], face[rows] = distance[better], near[better], proposed[rows, column]
+        return best, closest, face
+
+
+def lattice(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " k"]]:
+    """Points on every triangle, at most about `cell` apart, and the face of each; at least one a triangle."""
+    triangles = mesh.triangles
+    if not len(triangles):
+        return np.zeros((0, 3)), np.zeros(0, np.int64)
+    sides = np.linalg.norm(triangles[:, [2, 0, 1]] - triangles[:, [1, 2, 0]], axis=2)  # opposite corner 0, 1, 2
+    turn = (np.argmax(sides, axis=1)[:, None] + np.arange(3)) % 3
+    apex, left, right = np.take_along_axis(triangles, turn[:, :, None], axis=1).transpose(1, 0, 2)
+    base = np.maximum(sides.max(axis=1), 1e-12)
+    height = np.linalg.norm(np.cross(left - apex, right - apex), axis=1) / base
+    columns = np.maximum(np.ceil(base / cell), 1).astype(int)
+    rows = np.maximum(np.ceil(height / cell), 1).astype(int)
+    face = np.repeat(np.arange(len(triangles)), columns * rows)
+    place = np.arange(len(face)) - np.repeat(np.cumsum(columns * rows) - columns * rows, columns * rows)
+    down = (place // columns[face] + 0.5) / rows[face]
+    across = (place % columns[face] + 0.5) / columns[face]
+    foot = left[face] + across[:, None] * (right - left)[face]
+    return apex[face] + down[:, None] * (foot - apex[face]), face
+
+
+def visible(candidate: Candidate) -> trimesh.Trimesh:
+    """Everything that a sensor can see of a candidate: lining, track and what else stands in it."""
+    track = candidate.track
+    parts = [candidate.lining, track.sleeper_mesh, track.rail_mesh, track.fastening_mesh, candidate.extra]
+    return concatenated([part for part in parts if len(part.faces)])
+
+
+@derived
+def surface(case: Case) -> trimesh.Trimesh:
+    """Everything visible of the candidate, tunnel frame."""
+    return visible(case.candidate)
+
+
+@derived
+def intersector(case: Case) -> Caster:
+    """Rays in `surface`."""
+    return Caster(surface(case))
+
+
+@derived
+def nearest(case: Case) -> Nearest:
+    """Distances to `surface`."""
+    return Nearest(surface(case))

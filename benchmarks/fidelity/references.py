@@ -1,0 +1,195 @@
+"""What a reconstruction is judged against: a held-out recording, the generator's truth, unseen control."""
+
+import json
+from dataclasses import dataclass, field
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+
+from benchmarks.fidelity import noreturn
+from benchmarks.fidelity.errors import FidelityError
+from scene.poses.trajectory import load_tum
+from scene.reading.recording import Recording
+
+TRUTH_SCHEMA = "subterra.truth/1"
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Beams of a recording that the builder never opened, tunnel frame.
+
+    Attributes:
+        time: Of each beam, s, `(n,)`.
+        scan: Number of its scan, `(n,)`; beams are in the order of scans.
+        origin: Where the sensor was, m, `(n, 3)`.
+        direction: Unit vectors, `(n, 3)`.
+        range: To the return, m; `inf` where none came back, `(n,)`.
+        sensor: What recorded it.
+        sigma: Standard deviation of its range noise by the sensor's data sheet, m.
+        range_max: Its reach, m.
+        hash: SHA-256 of the recording.
+        knows_missing: Whether beams without a return are among the beams.
+        cache: Computed once from this reference alone.
+    """
+
+    time: Float[np.ndarray, " n"]
+    scan: Int[np.ndarray, " n"]
+    origin: Float[np.ndarray, "n 3"]
+    direction: Float[np.ndarray, "n 3"]
+    range: Float[np.ndarray, " n"]
+    sensor: str
+    sigma: float
+    range_max: float
+    hash: str
+    knows_missing: bool = False
+    cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    @property
+    def returned(self) -> Bool[np.ndarray, " n"]:
+        """Whether each beam came back."""
+        return np.isfinite(self.range)
+
+    @property
+    def points(self) -> Float[np.ndarray, "k 3"]:
+        """The returns, m."""
+        kept = self.returned
+        return self.origin[kept] + self.range[kept, None] * self.direction[kept]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The exact truth of a simulated survey, tunnel frame.
+
+    Attributes:
+        station: m, `(n,)`.
+        position: Middle of width and height, m, `(n, 3)`.
+        tangent: Unit vectors, `(n, 3)`.
+        width: Largest inner width, m, `(n,)`.
+        height: Floor to crown, m, `(n,)`.
+        surface: The true surface: lining with pockets, floor, sleepers, rails, fastenings.
+        part: Which of `parts` each face of `surface` belongs to, `(f,)`.
+        parts: Names.
+        furniture: `rings`, `pockets`, `nails`, `sleepers`, `rails` of `truth.json`, in the survey frame.
+        origin: Subtracted from the survey frame, m, `(3,)`.
+        cache: Computed once from this reference alone.
+    """
+
+    station: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    tangent: Float[np.ndarray, "n 3"]
+    width: Float[np.ndarray, " n"]
+    height: Float[np.ndarray, " n"]
+    surface: trimesh.Trimesh
+    part: Int[np.ndarray, " f"]
+    parts: tuple[str, ...]
+    furniture: dict[str, Any]
+    origin: Float[np.ndarray, "3"]
+    cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
+
+
+@dataclass(frozen=True)
+class HoldConfig:
+    """How much of a held-out recording is scored.
+
+    Attributes:
+        scan_spacing: Distance that the sensor moves between two scans kept, m.
+        beams_per_scan: Beams kept of a scan at most, evenly spaced in time.
+        sigma: Range noise by the data sheet, m.
+        range_max: Reach, m.
+    """
+
+    scan_spacing: float = 1.0
+    beams_per_scan: int = 6000
+    sigma: float = 0.02
+    range_max: float = 100.0
+
+
+def load_hold(recording: Path, trajectory: Path, origin: Float[np.ndarray, "3"], config: HoldConfig) -> Hold:
+    """Reads a held-out recording with its poses.
+
+    Args:
+        recording: Any recording that `scene` reads.
+        trajectory: Poses of its LiDAR in the frame of the scene's input, TUM.
+        origin: Of the tunnel frame in that frame, m.
+        config: How much of it is kept.
+
+    Raises:
+        FidelityError: Nothing of it has a pose.
+        RecordingError: It cannot be read.
+    """
+    poses = load_tum(trajectory)
+    kept: list[tuple[np.ndarray, ...]] = []
+    last = None
+    with Recording(recording) as opened:
+        knows_missing = noreturn.organised(opened)
+        for number, scan in enumerate(noreturn.scans(opened) if knows_missing else opened.scans()):
+            times = scan.stamp + scan.times
+            if not len(times) or not poses.covers(times.min(), times.max()):
+                continue
+            here = poses.at(np.array([scan.stamp]))[0][0]
+            if last is not None and np.linalg.norm(here - last) < config.scan_spacing:
+                continue
+            last = here
+            pick = np.linspace(0, len(times) - 1, min(len(times), config.beams_per_scan)).astype(int)
+            position, rotation = poses.at(times[pick])
+            reach = np.linalg.norm(scan.points[pick], axis=1)
+            direction = rotation.apply(scan.points[pick] / np.maximum(reach, 1e-9)[:, None])
+            kept.append((times[pick], np.full(len(pick), number), position - origin, direction, reach))
+        topic = opened.topic
+    if not kept:
+        raise FidelityError(f"{recording}: no scan lies within the times of {trajectory}")
+    time, scan_number, at, direction, reach = (np.concatenate(column) for column in zip(*kept, strict=True))
+    good = reach > 1e-3
+    reach = np.where(reach > 0.5 * noreturn.SILENT, np.inf, reach)
+    return Hold(
+        time[good], scan_number[good], at[good], direction[good], reach[good],
+        sensor=topic, sigma=config.sigma, range_max=config.range_max, hash=file_hash(recording),
+        knows_missing=knows_missing,
+    )  # fmt: skip
+
+
+def load_truth(folder: Path, origin: Float[np.ndarray, "3"]) -> Truth:
+    """Reads `truth.json` and `truth.ply` of a simulated survey.
+
+    Raises:
+        FidelityError: Missing, or of another schema.
+    """
+    path = folder / "truth.json"
+    if not path.exists() or not (folder / "truth.ply").exists():
+        raise FidelityError(f"{folder}: holds no truth.json with its truth.ply")
+    data = json.loads(path.read_text())
+    if data.get("schema") != TRUTH_SCHEMA:
+        raise FidelityError(f"{path}: schema is {data.get('schema')}, not {TRUTH_SCHEMA}")
+    surface, part = _parts(folder / "truth.ply", origin)
+    names = tuple(data.get("definitions", {}).get("parts", ())) or PARTS
+    columns = (np.asarray(data[name], float) for name in ("station", "position", "tangent", "width", "height"))
+    station, position, tangent, width, height = columns
+    furniture = {name: data[name] for name in ("rings", "pockets", "nails", "sleepers", "rails") if name in data}
+    return Truth(station, position - origin, tangent, width, height, surface, part, names, furniture, origin)
+
+
+PARTS = ("lining", "joint", "pocket", "nail", "floor", "sleeper", "rail", "fastening")
+
+
+def _parts(path: Path, origin: Float[np.ndarray, "3"]) -> tuple[trimesh.Trimesh, Int[np.ndarray, " f"]]:
+    from plyfile import PlyData
+
+    ply = PlyData.read(path)
+    vertex, face = ply["vertex"], ply["face"]
+    points = np.column_stack([vertex[axis] for axis in "xyz"]).astype(float) - origin
+    faces = np.vstack(face["vertex_indices"]).astype(np.int64)
+    return trimesh.Trimesh(points, faces, process=False), np.asarray(face["part"]).astype(int)
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, or of the files of a folder in the order of their names."""
+    digest = sha256()
+    for file in [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file()):
+        with file.open("rb") as opened:
+            while block := opened.read(1 << 22):
+                digest.update(block)
+    return digest.hexdigest()

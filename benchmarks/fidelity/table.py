@@ -1,0 +1,135 @@
+"""The table of the 199 metrics: `metrics.csv` with the thresholds that calibration has put in place of its guesses."""
+
+import csv
+import json
+import math
+import re
+from dataclasses import dataclass, replace
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+HERE = Path(__file__).parent
+METRICS = HERE / "metrics.csv"
+THRESHOLDS = HERE / "thresholds.json"
+CATEGORIES = 18
+COUNT = 199
+_MAP = re.compile(
+    r"^(?:(?P<kind>[DU])\((?P<a>[\d.]+),(?P<b>[\d.]+)\)|B\((?P<t>[\d.]+);(?P<ba>[\d.]+),(?P<bb>[\d.]+)\)|(?P<p>P)|-)$"
+)
+
+
+@dataclass(frozen=True)
+class Map:
+    """From a raw value to a score of 0 to 100.
+
+    Attributes:
+        kind: `D` less is better, `U` more is better, `B` near `target` is better, `P` pass or fail, `-` not scored.
+        good: Where the score reaches 100.
+        bad: Where it reaches 0.
+        target: Of `B`.
+    """
+
+    kind: str
+    good: float = 0.0
+    bad: float = 0.0
+    target: float = 0.0
+
+    def score(self, value: float) -> float:
+        """0 to 100; a value that is not a number scores 0."""
+        if math.isnan(value):
+            return 0.0
+        if self.kind == "P":
+            return 100.0 if value >= 0.5 else 0.0
+        distance = abs(value - self.target) if self.kind == "B" else value
+        if self.good == self.bad:
+            return 100.0 if distance <= self.good else 0.0
+        return 100.0 * min(max((self.bad - distance) / (self.bad - self.good), 0.0), 1.0)
+
+    def scaled(self, factor: float) -> "Map":
+        """Both thresholds moved by a factor; a share moves by its shortfall from 1, pass or fail does not move."""
+        if self.kind == "U" and max(self.good, self.bad) <= 1.0:
+            return replace(self, good=1.0 - factor * (1.0 - self.good), bad=1.0 - factor * (1.0 - self.bad))
+        if self.kind in "DUB":
+            return replace(self, good=factor * self.good, bad=factor * self.bad)
+        return self
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A row of the table.
+
+    Attributes:
+        number: 1 to 199.
+        category: Three letters.
+        category_name: In words.
+        id: Unique.
+        definition: In a sentence.
+        unit: SI, `1` for a share, `bool`, `count`.
+        direction: `down`, `up`, `band` or `info`.
+        role: `S` scored, `G` scored and a gate, `L` logged.
+        map: To a score.
+        evidence: Letters of H held-out, T truth, K standard, S self-consistency, C true by construction.
+        library: What computes it.
+    """
+
+    number: int
+    category: str
+    category_name: str
+    id: str
+    definition: str
+    unit: str
+    direction: str
+    role: str
+    map: Map
+    evidence: str
+    library: str
+
+    @property
+    def scored(self) -> bool:
+        """Whether it counts."""
+        return self.role in "SG"
+
+
+def parse_map(text: str) -> Map:
+    """`D(a,b)`, `U(a,b)`, `B(t;a,b)`, `P` or `-`.
+
+    Raises:
+        ValueError: Anything else.
+    """
+    found = _MAP.match(text.strip())
+    if found is None:
+        raise ValueError(f"{text!r} is no score map")
+    if found["kind"] == "D":
+        return Map("D", float(found["a"]), float(found["b"]))
+    if found["kind"] == "U":
+        return Map("U", float(found["b"]), float(found["a"]))
+    if found["t"]:
+        return Map("B", float(found["ba"]), float(found["bb"]), float(found["t"]))
+    return Map("P" if found["p"] else "-")
+
+
+@cache
+def load() -> dict[str, Metric]:
+    """The table by id, in its order, with the calibrated thresholds where there are some."""
+    calibrated = json.loads(THRESHOLDS.read_text())["maps"] if THRESHOLDS.exists() else {}
+    table: dict[str, Metric] = {}
+    with METRICS.open(newline="") as file:
+        for row in csv.DictReader(file):
+            text = calibrated.get(row["id"], {}).get("map", row["map"])
+            table[row["id"]] = Metric(
+                int(row["n"]), row["cat"], row["cat_name"], row["id"], row["definition"], row["unit"],
+                row["direction"], row["role"], parse_map(text), row["evidence"], row["lib"],
+            )  # fmt: skip
+    return table
+
+
+def categories() -> dict[str, str]:
+    """Names by their three letters, in the order of the table."""
+    return {metric.category: metric.category_name for metric in load().values()}
+
+
+def thresholds_hash() -> str:
+    """SHA-256 of table and calibrated thresholds together."""
+    frozen = THRESHOLDS.read_bytes() if THRESHOLDS.exists() else b""
+    return sha256(METRICS.read_bytes() + frozen).hexdigest()

@@ -1,0 +1,54 @@
+"""Tubes judged against the right one, each once for all test modules of the surface categories."""
+
+from dataclasses import replace
+from functools import cache
+
+import trimesh
+
+from benchmarks.fidelity import registry, table
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.scoring import score_one
+from benchmarks.fidelity.value import Value
+from tests.benchmarks.fidelity import tube
+
+BEAMS = 2000
+
+
+@cache
+def judged(**changes) -> Case:
+    """The default tube's recording against a tube with other dimensions; without any, against itself."""
+    return tube.case(tube.Tube(), replace(tube.Tube(), **changes), beams=BEAMS)
+
+
+@cache
+def obstructed(size: float = 0.5) -> Case:
+    """A cube on the floor in the middle of an otherwise right tube, beside the track."""
+    right = judged()
+    box = trimesh.creation.box((size, size, 2.0))
+    box.apply_translation(tube.Tube().point(9.0, 1.9, -1.2)[0])
+    return Case(replace(right.candidate, extra=box), right.hold, None, right.truth)
+
+
+def value(id: str, case: Case) -> Value:
+    """One metric by its id, as the suite computes it."""
+    return registry.compute(case, id, registry.registered()[id])
+
+
+def raw(id: str, case: Case) -> float:
+    """Its raw value; fails where there is none."""
+    found = value(id, case)
+    assert found.value is not None, f"{id}: {found.reason}"
+    return found.value
+
+
+def scores(category: str, case: Case) -> dict[str, float | None]:
+    """Scores of a category's scored metrics."""
+    rows = table.load()
+    ids = [id for id, metric in rows.items() if metric.category == category and metric.scored]
+    return {id: score_one(rows[id], value(id, case)).score for id in ids}
+
+
+def category(name: str, case: Case) -> float:
+    """Mean score of the metrics of a category that have one."""
+    known = [score for score in scores(name, case).values() if score is not None]
+    return sum(known) / len(known)

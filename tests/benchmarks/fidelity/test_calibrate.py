@@ -1,0 +1,63 @@
+"""Thresholds move only where evidence says so, and to where it says."""
+
+import pytest
+
+from benchmarks.fidelity import calibrate, evidence, table
+from benchmarks.fidelity.evidence import Survey
+from benchmarks.fidelity.report.content import map_text
+from benchmarks.fidelity.value import Value
+
+ROWS = evidence.draft()
+
+
+def at(share: float, **single: float) -> dict[str, Value]:
+    """Every metric at a share of its good end's distance from the ideal; some at a value."""
+    made = {}
+    for id, row in ROWS.items():
+        good, _ = evidence.ends(row.map)
+        placed = evidence.moved(row.map, share * good, 1.0)
+        made[id] = Value(placed.good + row.map.target if row.map.kind == "B" else placed.good)
+        if row.map.kind == "P":
+            made[id] = Value(1.0)
+    return made | {id: Value(value) for id, value in single.items()}
+
+
+def survey(ceiling: dict[str, Value], **spoilt: dict[str, Value]) -> Survey:
+    return Survey("one", at(0.1), ceiling, {(name, 0.1): values for name, values in spoilt.items()})
+
+
+def test_nothing_moves_where_the_truth_reaches_every_good_end() -> None:
+    assert calibrate.calibrated(ROWS, [survey(at(0.9))]) == {}
+
+
+def test_a_good_end_that_the_truth_misses_moves_to_one_and_a_half_times_what_it_reaches() -> None:
+    good = ROWS["c2m_mean"].map.good
+    found = calibrate.calibrated(ROWS, [survey(at(0.1, c2m_mean=1.2 * good))])
+    assert list(found) == ["c2m_mean"]
+    assert found["c2m_mean"][0].good == pytest.approx(1.8 * good)
+    assert "truth itself" in found["c2m_mean"][1]
+
+
+def test_a_share_that_the_truth_misses_moves_by_its_shortfall() -> None:
+    row = ROWS["occ2d_free_iou"]
+    found = calibrate.calibrated(ROWS, [survey(at(0.1, occ2d_free_iou=row.map.good - 0.02))])
+    assert found["occ2d_free_iou"][0].good == pytest.approx(1.0 - 1.5 * (1.0 - row.map.good + 0.02), abs=1e-3)
+
+
+def test_a_bad_end_moves_to_what_a_control_reaches_that_falls_too_little() -> None:
+    row = ROWS["cl_lateral_rmse"]
+    reached = 0.5 * (row.map.good + row.map.bad)
+    found = calibrate.calibrated(ROWS, [survey(at(0.1), N07=at(0.1, cl_lateral_rmse=reached))])
+    assert found["cl_lateral_rmse"][0].bad == pytest.approx(reached, rel=0.06)
+    assert found["cl_lateral_rmse"][0].good == row.map.good
+    assert "N07" in found["cl_lateral_rmse"][1]
+
+
+def test_a_metric_that_does_not_see_the_control_stays() -> None:
+    found = calibrate.calibrated(ROWS, [survey(at(0.1), N07=at(0.1))])
+    assert found == {}
+
+
+def test_what_was_moved_reads_back_from_the_text_of_its_map() -> None:
+    for row in table.load().values():
+        assert table.parse_map(map_text(row)) == row.map, row.id

@@ -1,0 +1,50 @@
+import numpy as np
+import pytest
+
+from benchmarks.fidelity.derive.beams import returns
+from benchmarks.fidelity.derive.observed import phantom
+from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
+
+
+def test_the_right_tube_is_complete_and_has_nothing_too_much():
+    assert raw("comp_10cm", judged()) > 0.99
+    assert raw("fscore_10cm", judged()) > 0.99
+    assert raw("extra_surface_frac", judged()) < 0.001
+    assert raw("missing_surface_frac", judged()) == 0.0
+    assert category("CMP", judged()) > 99.0
+
+
+def test_missing_surface_is_the_share_of_returns_beyond_the_end():
+    short = judged(length=14.0)
+    beyond = tube.Tube().frames([14.0])
+    points = returns(short).points
+    behind = (points - beyond[0]) @ beyond[1][0] > 0.2
+    assert raw("missing_surface_frac", short) == pytest.approx(behind.mean(), abs=0.01)
+    assert category("CMP", short) < 70.0
+
+
+def test_an_obstacle_that_beams_pass_through_is_extra_surface():
+    found = raw("extra_surface_frac", obstructed())
+    assert found > 0.003
+    assert found == np.mean(phantom(obstructed()))
+    assert raw("comp_10cm", obstructed()) < raw("comp_10cm", judged())
+    assert raw("hausdorff_p99", obstructed()) >= raw("hausdorff_p99", judged())
+
+
+def test_chamfer_grows_with_a_shift_and_the_f_score_falls():
+    shifted = judged(shift=(0.12, 0.0))
+    assert raw("chamfer_l1", shifted) > 1.5 * raw("chamfer_l1", judged())
+    assert raw("fscore_10cm", shifted) < raw("fscore_10cm", judged()) - 0.1
+    assert raw("dcd", shifted) > raw("dcd", judged()) + 0.1
+
+
+def test_a_finer_tolerance_never_gives_a_higher_share():
+    shifted = judged(shift=(0.08, 0.0))
+    assert raw("comp_10cm", shifted) <= raw("comp_20cm", shifted)
+    assert raw("fscore_5cm", shifted) <= raw("fscore_10cm", shifted) <= raw("fscore_20cm", shifted)
+
+
+def test_the_least_complete_stretch_is_no_better_than_the_whole():
+    assert raw("comp_chainage_min", judged()) <= raw("comp_10cm", judged())
+    assert raw("comp_chainage_min", judged(height=6.6)) < 0.9

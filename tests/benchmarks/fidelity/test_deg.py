@@ -1,0 +1,76 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.aliasing import real_alias
+from benchmarks.fidelity.derive.hessian import real_frames
+from benchmarks.fidelity.derive.planarscan import localised
+from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import category, judged, raw
+
+SMOOTH = replace(tube.Tube(), bend=np.inf, grade=0.0, variation=0.0, depth=0.0, track=False)
+
+
+def test_the_right_tube_is_as_degenerate_as_the_real_one():
+    assert raw("deg_axial_info_logratio", judged()) < 0.06
+    assert raw("deg_cond_logratio", judged()) < 0.06
+    assert raw("deg_weak_angle_diff", judged()) < 2.0
+    assert raw("deg_rot_info_logratio", judged()) < 0.06
+    assert raw("deg_landmark_diff", judged()) < 1.0
+    assert raw("deg_icp_axial_logratio", judged()) >= 0.0
+
+
+def test_a_straight_smooth_tube_tells_nothing_along_its_axis():
+    frames = real_frames(tube.case(SMOOTH, sigma=1e-4, beams=2000))
+    assert np.median(frames.axial) < 1e-3
+    axis = SMOOTH.frames([9.0])[1][0]
+    assert np.median(np.abs(frames.weakest @ axis)) > 0.999
+    assert np.median(frames.translation.sum(axis=1)) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_sleepers_tell_the_axis():
+    bare, laid = (tube.case(replace(SMOOTH, track=laid), sigma=1e-3, beams=2000) for laid in (False, True))
+    assert np.median(real_frames(laid).axial) > 5 * np.median(real_frames(bare).axial)
+
+
+def test_a_scan_fits_as_well_elsewhere_in_a_smooth_tube_and_nowhere_else_in_a_wavy_one():
+    smooth, wavy = (tube.case(replace(SMOOTH, variation=v), sigma=1e-3, beams=2000) for v in (0.0, 0.05))
+    assert np.median(real_alias(smooth)) < 1.2
+    assert np.median(real_alias(wavy)) > 3.0
+
+
+@pytest.mark.parametrize("id", ["deg_axial_info_logratio", "deg_cond_logratio", "deg_eig_w1", "deg_weak_angle_diff"])
+def test_a_tube_without_track_is_more_degenerate(id):
+    assert raw(id, judged(track=False)) > 1.5 * raw(id, judged())
+
+
+def test_the_profile_along_the_tunnel_follows_its_landmarks():
+    assert raw("deg_profile_corr", judged(track=False)) < raw("deg_profile_corr", judged())
+    assert raw("deg_class_kappa", judged(track=False)) < raw("deg_class_kappa", judged())
+    assert category("DEG", judged(track=False)) < category("DEG", judged()) - 10.0
+
+
+def test_the_alias_ratio_changes_without_track():
+    assert raw("deg_alias_diff", judged(track=False)) > 0.0
+    assert raw("deg_alias_diff", judged()) < 0.2
+
+
+def _planar(path, walls, lining="smooth"):
+    station = np.linspace(0.0, 20.0, 81)
+    centre = np.column_stack([station, np.zeros(81)])
+    polylines = {f"{side}_{lining}": wall for side, wall in zip(("left", "right"), walls, strict=True)}
+    np.savez(path, station=station, centre=centre, tangent=np.tile([1.0, 0.0], (81, 1)), **polylines)
+    return Case(replace(judged().candidate, tunnel=path))
+
+
+def test_a_planar_scan_is_lost_between_smooth_walls_and_found_between_pilasters(tmp_path):
+    straight = [np.array([[0.0, side], [20.0, side]]) for side in (2.5, -2.5)]
+    assert not localised(_planar(tmp_path / "smooth.npz", straight)).any()
+    x = np.repeat(np.arange(0.0, 20.5, 1.0), 2)
+    step = np.tile([0.0, 0.5, 0.5, 0.0], len(x) // 4 + 1)[: len(x)]
+    stepped = [np.column_stack([x, side * (2.0 + step)]) for side in (1, -1)]
+    pilasters = _planar(tmp_path / "pockets.npz", stepped, "pockets")
+    assert localised(pilasters).mean() > 0.5
+    assert raw("deg_planar_axial_info", pilasters) == localised(pilasters).mean()

@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity.derive.mapstats import voxelised, wasserstein
+from benchmarks.fidelity.derive.noise import mean_entropy, planes
+from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw, value
+
+
+def test_the_right_tube_gives_the_same_distributions():
+    assert raw("range_ks", judged()) < 0.005
+    assert raw("range_w1", judged()) < 0.01
+    assert raw("incidence_w1", judged()) < 0.5
+    assert raw("c2st_auc", judged()) < 0.65
+    assert category("DIS", judged()) > 98.0
+
+
+def test_a_moved_cloud_is_as_far_in_wasserstein_as_it_was_moved():
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform(0.15, 0.35, (400, 3)) + np.repeat(0.5 * np.arange(4), 100)[:, None] * [1.0, 0.0, 0.0]
+    key, distance = wasserstein(voxelised(cloud, 0.5), voxelised(cloud + np.array([0.03, -0.04, 0.0]), 0.5))
+    assert len(key) == 4
+    np.testing.assert_allclose(distance, 0.05, atol=1e-6)
+
+
+def test_a_cloud_twice_as_rough_is_as_far_as_its_roughness():
+    rng = np.random.default_rng(1)
+    flat = rng.uniform(0.05, 0.45, (200_000, 3)) * [1.0, 1.0, 0.0]
+    noise = rng.normal(size=len(flat))[:, None] * [0.0, 0.0, 1.0]
+    smooth, rough = (voxelised(flat + 0.25 * np.array([0, 0, 1.0]) + sigma * noise, 0.5) for sigma in (0.01, 0.03))
+    _, distance = wasserstein(smooth, rough)
+    np.testing.assert_allclose(distance, 0.02, atol=1e-4)
+
+
+def test_the_entropy_of_a_normal_cloud_is_its_formula():
+    rng = np.random.default_rng(2)
+    cloud = rng.normal(size=(4000, 3)) * [0.02, 0.03, 0.01]
+    expected = 0.5 * np.log((2 * np.pi * np.e) ** 3 * (0.02 * 0.03 * 0.01) ** 2)
+    assert mean_entropy(cKDTree(cloud), cloud[:200]) == pytest.approx(expected, abs=0.05)
+
+
+def test_a_local_plane_knows_its_normal_and_its_noise():
+    rng = np.random.default_rng(3)
+    cloud = np.column_stack([rng.uniform(-1, 1, (5000, 2)), 0.01 * rng.normal(size=5000)])
+    found = planes(cloud, cKDTree(cloud), cloud[:2000])
+    assert np.median(np.abs(found.normal[:, 2])) > 0.99
+    assert np.median(found.sigma) == pytest.approx(0.01, rel=0.1)
+    assert np.median(found.residual) == pytest.approx(0.00674, rel=0.1)
+
+
+@pytest.mark.parametrize("id", ["range_ks", "range_w1", "elevation_w1", "azimuth_profile_rmse", "awd", "c2st_auc"])
+def test_a_wider_tube_shifts_the_distribution(id):
+    assert raw(id, judged(width=5.9)) > 1.5 * raw(id, judged())
+
+
+def test_what_is_not_recorded_is_missing():
+    assert value("dropout_diff", judged()).value is None
+    assert not value("dropout_diff", judged()).failed
+
+
+@pytest.mark.parametrize("id", ["mme_diff", "noise_sigma_diff", "scs_diff"])
+def test_map_statistics_are_finite_and_not_negative(id):
+    assert raw(id, obstructed()) >= 0.0
+
+
+def test_a_tube_without_track_scores_lower():
+    assert category("DIS", judged(track=False)) < category("DIS", judged()) - 3.0

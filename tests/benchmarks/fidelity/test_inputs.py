@@ -1,0 +1,59 @@
+"""What a user can get wrong with the commands: one sentence, status 2, nothing half-written."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.fidelity import calibrate, inputs
+from benchmarks.fidelity.calibrate import CalibrateConfig
+from benchmarks.fidelity.candidate import load
+from benchmarks.fidelity.errors import FidelityError
+from benchmarks.fidelity.inputs import Inputs
+from benchmarks.fidelity.references import HoldConfig
+
+
+def test_a_recording_without_poses_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FidelityError, match="--recording and --trajectory go together"):
+        inputs.completed(Inputs(scene=tmp_path, recording=tmp_path))
+
+
+def test_references_without_a_scene_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FidelityError, match="need --scene"):
+        inputs.completed(Inputs(truth=tmp_path))
+
+
+def test_a_folder_without_a_manifest_is_no_scene(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text("<mujoco/>")
+    with pytest.raises(FidelityError, match=r"bore\.npz is missing"):
+        load(tmp_path)
+
+
+def test_the_noise_of_a_sensor_comes_from_its_data_sheet() -> None:
+    assert inputs.with_sigma(HoldConfig(), Path("survey_os1.bag")).sigma == 0.03
+    assert inputs.with_sigma(HoldConfig(), Path("unknown.bag")).sigma == HoldConfig().sigma
+    assert inputs.with_sigma(HoldConfig(sigma=0.011), Path("survey_os1.bag")).sigma == 0.011
+
+
+def test_a_mistake_at_the_command_line_ends_in_one_sentence_and_status_2(tmp_path: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.fidelity",
+        "run",
+        "--scene",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "o"),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3])
+    assert done.returncode == 2
+    assert done.stderr.strip() == f"error: {tmp_path}: is no scene folder, scene.xml is missing"
+    assert not (tmp_path / "o").exists()
+
+
+def test_calibration_asks_for_three_surveys(tmp_path: Path) -> None:
+    with pytest.raises(FidelityError, match="needs 3 simulated surveys, 1 were given"):
+        calibrate.run(CalibrateConfig((tmp_path,), tmp_path / "thresholds.json"))
+    assert not (tmp_path / "thresholds.json").exists()

@@ -1,0 +1,49 @@
+"""What must not move the scores keeps what it should keep."""
+
+import numpy as np
+import pytest
+
+from benchmarks.fidelity import registry, table
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.controls.invariance import INVARIANCES
+from tests.benchmarks.fidelity import tube
+
+WATCHED = ("c2m_mean", "beam_range_mae", "cl_lateral_rmse", "sec_width_rmse", "mesh_orientation_frac", "trk_sleeper_f1")
+
+
+@pytest.fixture(scope="module")
+def base() -> Case:
+    return tube.case(tube.Tube(bend=80.0))
+
+
+def scores(case: Case) -> dict[str, float | None]:
+    entries, rows = registry.registered(), table.load()
+    return {id: rows[id].map.score(registry.compute(case, id, entries[id]).value or 0.0) for id in WATCHED}
+
+
+@pytest.mark.parametrize("control", INVARIANCES)
+def test_an_invariance_is_quiet(base: Case, control: str) -> None:
+    changed = INVARIANCES[control].change(base, np.random.default_rng(0))
+    assert scores(changed) == pytest.approx(scores(base), abs=INVARIANCES[control].category_limit)
+
+
+def test_a_distance_moves_nothing_but_places(base: Case) -> None:
+    moved = INVARIANCES["I3"].change(base, np.random.default_rng(0))
+    shift = np.linalg.norm(moved.candidate.lining.vertices - base.candidate.lining.vertices, axis=1)
+    assert shift.min() > 1000.0
+    assert moved.candidate.solid.volume == pytest.approx(base.candidate.solid.volume, rel=1e-6)
+
+
+def test_a_reversed_axis_starts_at_the_other_end(base: Case) -> None:
+    turned = INVARIANCES["I4"].change(base, np.random.default_rng(0)).candidate.bore
+    np.testing.assert_allclose(turned.position[0], base.candidate.bore.position[-1])
+    np.testing.assert_allclose(np.cross(turned.tangent, turned.lateral), turned.up, atol=1e-9)
+    row, column = 7, 33
+    point = turned.position[row] + turned.radius[row, column] * (
+        np.cos(turned.angle[column]) * turned.lateral[row] + np.sin(turned.angle[column]) * turned.up[row]
+    )
+    old = base.candidate.bore
+    away = point - old.position[-1 - row]
+    angle = np.arctan2(away @ old.up[-1 - row], away @ old.lateral[-1 - row])
+    expected = np.interp(angle, old.angle, old.radius[-1 - row], period=2 * np.pi)
+    assert np.linalg.norm(away) == pytest.approx(expected, abs=1e-3)

@@ -1,0 +1,71 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.path import sensor_path
+from benchmarks.fidelity.derive.voxels import EDGE, Occupied, dilated, occupied, tolerant
+from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
+
+
+def test_the_right_tube_reaches_the_ceiling_that_noise_leaves():
+    assert raw("vox_iou_norm", judged()) == pytest.approx(1.0, abs=0.02)
+    assert raw("vox_iou_20cm", judged()) < 1.0
+    assert raw("vox_f1_tol1", judged()) > 0.999
+    assert raw("vox_interior_mismatch", judged()) < 0.01
+    assert category("OCC", judged()) > 95.0
+
+
+def test_two_draws_differ_in_noise_alone():
+    grids = occupied(judged())
+    assert (grids.first != grids.second).any()
+    assert (dilated(grids.first) & grids.second).sum() > 0.999 * grids.second.sum()
+
+
+def test_f1_by_hand():
+    real, first = np.zeros((6, 5, 5), bool), np.zeros((6, 5, 5), bool)
+    real[:3, 2, 2] = True
+    first[:2, 2, 3] = True  # beside the first two, one voxel off
+    first[5, 2, 2] = True  # alone
+    grids = Occupied(real, first, first, real | first, np.arange(6) * EDGE)
+    assert tolerant(grids, np.zeros(6, int))[0] == pytest.approx(2 * 1.0 * (2 / 3) / (1.0 + 2 / 3))
+    np.testing.assert_allclose(tolerant(grids, np.array([0, 0, 0, 1, 1, 1])), [1.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("id", ["vox_iou_norm", "vox_precision", "vox_recall", "vox_kappa", "vox_proj_iou_yz"])
+def test_a_shift_of_a_voxel_lowers(id):
+    assert raw(id, judged(shift=(EDGE, 0.0))) < raw(id, judged()) - 0.1
+
+
+def test_an_obstacle_is_a_mismatch_in_the_interior():
+    assert raw("vox_interior_mismatch", obstructed()) > raw("vox_interior_mismatch", judged()) + 0.01
+    assert raw("vox_f1_tol1", obstructed()) < raw("vox_f1_tol1", judged())
+
+
+def test_what_ends_early_lacks_its_last_stretch_and_its_mismatch_lies_at_the_mouth():
+    short = judged(length=14.0)
+    assert raw("vox_chainage_min_f1", short) < 0.9
+    assert raw("vox_recall", short) < 0.85 * raw("vox_recall", judged())
+    assert raw("vox_mouth_mismatch", short) > raw("vox_mouth_mismatch", judged())
+
+
+def test_a_constant_tube_scores_lower():
+    assert category("OCC", judged(variation=0.0, depth=0.0)) < category("OCC", judged())
+    assert category("OCC", judged(width=5.9)) < category("OCC", judged()) - 15.0
+
+
+@pytest.mark.parametrize("id", ["vox_proj_iou_xy", "vox_proj_iou_xz"])
+def test_projections_see_a_tube_that_is_too_big(id):
+    assert raw(id, judged(width=6.6, height=7.2)) < raw(id, judged()) - 0.05
+
+
+def test_poses_in_a_wrong_order_leave_the_path_and_spoil_the_agreement():
+    hold = judged().hold
+    number = np.unique(hold.scan)
+    swapped = dict(zip(number, np.roll(number, len(number) // 2), strict=True))
+    at = {k: hold.origin[np.argmax(hold.scan == k)] for k in number}
+    wrong = replace(hold, origin=np.array([at[swapped[k]] for k in hold.scan]), cache={})
+    lost = Case(judged().candidate, wrong)
+    assert sensor_path(lost).length == pytest.approx(sensor_path(judged()).length, rel=0.02)
+    assert category("OCC", lost) < category("OCC", judged()) - 30.0

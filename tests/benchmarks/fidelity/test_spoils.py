@@ -1,0 +1,180 @@
+"""Every control does to the geometry what its row says."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.controls import catalogue
+from benchmarks.fidelity.controls.catalogue import Setting
+from tests.benchmarks.fidelity import tube
+
+NO_SCENE = sorted(set(catalogue.SPOIL) - {"N01", "N12", "N29", "N30", "N31", "N33"})
+
+
+@pytest.fixture(scope="module")
+def base() -> Case:
+    return tube.case()
+
+
+def spoil(case: Case, control: str, dose: float, scratch: Path = Path("unused")) -> Case:
+    return catalogue.spoiled(case, control, dose, Setting(np.random.default_rng(0), scratch, lambda: case.candidate))
+
+
+def candidate(case: Case, control: str, dose: float) -> Candidate:
+    return spoil(case, control, dose).candidate
+
+
+def test_the_table_has_36_controls_and_each_has_a_function() -> None:
+    assert list(catalogue.load()) == [f"N{k:02d}" for k in range(1, 37)]
+    assert set(catalogue.SPOIL) == set(catalogue.load())
+    for control in catalogue.load().values():
+        assert set(control.bold) <= set(control.doses)
+        assert control.falls or "leak" in control.reason
+
+
+@pytest.mark.parametrize("control", NO_SCENE)
+def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, control: str) -> None:
+    before = base.candidate.lining.vertices.copy(), base.candidate.solid.faces.copy(), base.hold.origin.copy()
+    spoilt = spoil(base, control, catalogue.load()[control].bold[0])
+    np.testing.assert_array_equal(before[0], base.candidate.lining.vertices)
+    np.testing.assert_array_equal(before[1], base.candidate.solid.faces)
+    np.testing.assert_array_equal(before[2], base.hold.origin)
+    assert spoilt.candidate is not base.candidate or spoilt.hold is not base.hold
+    assert not spoilt.cache
+
+
+@pytest.mark.parametrize("control", NO_SCENE)
+def test_the_same_dose_gives_the_same_bytes(base: Case, control: str) -> None:
+    dose = catalogue.load()[control].bold[0]
+    one, other = spoil(base, control, dose), spoil(base, control, dose)
+    np.testing.assert_array_equal(one.candidate.lining.vertices, other.candidate.lining.vertices)
+    np.testing.assert_array_equal(one.hold.range, other.hold.range)
+
+
+def test_a_section_scaled_by_5_percent_is_5_percent_larger_all_round(base: Case) -> None:
+    spoilt = candidate(base, "N02", 5)
+    assert spoilt.bore.width == pytest.approx(1.05 * base.candidate.bore.width, rel=1e-3)
+    assert spoilt.solid.volume == pytest.approx(1.05**2 * base.candidate.solid.volume, rel=2e-3)
+    assert spoilt.length == pytest.approx(base.candidate.length, rel=1e-4)
+
+
+def test_width_alone_leaves_the_height(base: Case) -> None:
+    spoilt = candidate(base, "N03", 5)
+    assert spoilt.bore.width == pytest.approx(1.05 * base.candidate.bore.width, rel=1e-3)
+    assert spoilt.bore.height == pytest.approx(base.candidate.bore.height, rel=1e-3)
+
+
+def test_an_axial_stretch_moves_mesh_and_recording_together(base: Case) -> None:
+    spoilt = spoil(base, "N04", 5)
+    assert spoilt.candidate.length == pytest.approx(1.05 * base.candidate.length, rel=1e-3)
+    near = trimesh.proximity.closest_point(spoilt.candidate.lining, spoilt.hold.points[::400])[1]
+    before = trimesh.proximity.closest_point(base.candidate.lining, base.hold.points[::400])[1]
+    assert np.median(near) < 1.5 * np.median(before)
+
+
+def test_a_shift_of_10_cm_moves_the_axis_by_10_cm(base: Case) -> None:
+    moved = candidate(base, "N07", 0.10).bore.position - base.candidate.bore.position
+    assert np.linalg.norm(moved, axis=1) == pytest.approx(0.10, abs=2e-3)
+    assert moved[:, 2] == pytest.approx(0.0, abs=5e-3)
+
+
+def test_a_raised_floor_leaves_the_crown(base: Case) -> None:
+    before, after = base.candidate.lining.vertices, candidate(base, "N08", 0.15).lining.vertices
+    rise = np.linalg.norm(after - before, axis=1)
+    assert rise.max() == pytest.approx(0.15, abs=0.01)
+    assert rise[before[:, 2] > before[:, 2].mean() + 1.5].max() < 2e-3
+
+
+def test_what_is_shortened_by_10_percent_stays_watertight(base: Case) -> None:
+    spoilt = candidate(base, "N09", 10)
+    assert spoilt.length == pytest.approx(0.9 * base.candidate.length, abs=0.3)
+    assert spoilt.solid.is_watertight
+    assert len(spoilt.track.sleeper) < len(base.candidate.track.sleeper)
+
+
+def test_a_straightened_axis_has_no_curvature_and_its_length(base: Case) -> None:
+    curved = tube.case(tube.Tube(bend=60.0))
+    spoilt = candidate(curved, "N10", 100)
+    position = spoilt.bore.position
+    chord = np.linalg.norm(position[-1] - position[0])
+    assert chord == pytest.approx(spoilt.length, rel=1e-4)
+    assert spoilt.length == pytest.approx(curved.candidate.length, rel=1e-3)
+
+
+def test_flipped_normals_turn_the_volume_negative(base: Case) -> None:
+    assert candidate(base, "N14", 1).solid.volume == pytest.approx(-base.candidate.solid.volume)
+
+
+@pytest.mark.parametrize(("control", "dose"), [("N13", 1.0), ("N16", 2.0), ("N17", 10.0)])
+def test_mesh_damage_is_damage(base: Case, control: str, dose: float) -> None:
+    assert base.candidate.solid.is_watertight
+    assert not candidate(base, control, dose).solid.is_watertight
+
+
+def test_a_hole_has_its_area(base: Case) -> None:
+    lost = base.candidate.lining.area - candidate(base, "N13", 1.0).lining.area
+    assert lost == pytest.approx(1.0, abs=0.15)
+
+
+def test_sleepers_go_with_their_fastenings(base: Case) -> None:
+    before, after = base.candidate.track, candidate(base, "N22", 30).track
+    share = len(after.sleeper) / len(before.sleeper)
+    assert share == pytest.approx(0.7, abs=0.04)
+    assert len(after.fastening_mesh.faces) / len(before.fastening_mesh.faces) == pytest.approx(share, abs=1e-9)
+    assert len(after.sleeper_mesh.faces) / len(before.sleeper_mesh.faces) == pytest.approx(share, abs=1e-9)
+
+
+def test_sleepers_take_their_new_spacing(base: Case) -> None:
+    gaps = np.linalg.norm(np.diff(candidate(base, "N23", 0.66).track.sleeper, axis=0), axis=1)
+    assert gaps == pytest.approx(0.66, abs=2e-3)
+
+
+def test_rails_take_their_new_gauge(base: Case) -> None:
+    rail = candidate(base, "N24", 1.445).track.rail
+    assert np.linalg.norm(rail["left"] - rail["right"], axis=1) == pytest.approx(1.445, abs=1e-3)
+
+
+def test_removed_pockets_leave_a_smooth_wall_of_less_volume(base: Case) -> None:
+    spoilt, pocket = candidate(base, "N25", 100), base.candidate.bore.pocket
+    taken = base.candidate.solid.volume - spoilt.solid.volume
+    assert taken == pytest.approx(float((pocket["length"] * pocket["width"] * pocket["depth"]).sum()), rel=0.35)
+    assert len(spoilt.bore.pocket) == 0
+
+
+def test_a_wall_cuts_the_air_in_two(base: Case) -> None:
+    assert len(candidate(base, "N20", 2).solid.split(only_watertight=True)) == 2
+
+
+def test_debris_is_where_it_was_dropped(base: Case) -> None:
+    spoilt = candidate(base, "N21", 5)
+    assert len(spoilt.extra.split()) == 5
+    assert spoilt.solid.volume < base.candidate.solid.volume
+
+
+def test_a_closed_mouth_has_one_rim_less(base: Case) -> None:
+    def rims(mesh: trimesh.Trimesh) -> int:
+        edges, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+        return len(trimesh.graph.connected_components(edges[count == 1], min_len=3))
+
+    open_mesh = base.candidate.lining.copy()
+    open_mesh.merge_vertices(digits_vertex=6)
+    assert rims(candidate(base, "N28", 1).lining) == rims(open_mesh) - 1
+
+
+def test_permuted_poses_keep_every_beam(base: Case) -> None:
+    spoilt = spoil(base, "N32", 2).hold
+    np.testing.assert_array_equal(spoilt.range, base.hold.range)
+    assert np.median(np.linalg.norm(spoilt.origin - base.hold.origin, axis=1)) > 1.0
+
+
+def test_a_foreign_tunnel_is_brought_to_our_mouth(base: Case) -> None:
+    other = tube.candidate(tube.Tube(heading=1.0, bend=70.0))
+    setting = Setting(np.random.default_rng(0), Path("unused"), lambda: other)
+    spoilt = catalogue.spoiled(base, "N33", 1, setting)
+    assert spoilt.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
+    flat = spoilt.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
+    assert flat == pytest.approx(1.0, abs=2e-3)

@@ -1,0 +1,56 @@
+"""The table itself: how many, and what may be scored."""
+
+import math
+
+import pytest
+
+from benchmarks.fidelity import registry, table
+from benchmarks.fidelity.table import Map, parse_map
+
+
+def test_there_are_18_categories_and_199_metrics_with_unique_ids() -> None:
+    rows = list(table.load().values())
+    assert len(table.categories()) == table.CATEGORIES == 18
+    assert len(rows) == table.COUNT == 199
+    assert [row.number for row in rows] == list(range(1, 200))
+    assert len({row.id for row in rows}) == 199
+
+
+def test_nothing_that_is_true_by_construction_is_scored() -> None:
+    by_construction = [row for row in table.load().values() if "C" in row.evidence]
+    assert [row.id for row in by_construction] == ["selfcast_p2s_mean", "selfcast_within_10cm", "selfcast_noise_ratio"]
+    assert not any(row.scored for row in by_construction)
+
+
+def test_every_metric_of_the_table_is_computed_by_something() -> None:
+    assert list(registry.registered()) == list(table.load())
+
+
+def test_every_scored_metric_has_a_map_and_every_logged_one_has_none() -> None:
+    for row in table.load().values():
+        assert (row.map.kind == "-") == (not row.scored), row.id
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "score"),
+    [
+        ("D(1,3)", 1.0, 100.0),
+        ("D(1,3)", 2.0, 50.0),
+        ("D(1,3)", 9.0, 0.0),
+        ("U(0.5,0.9)", 0.7, 50.0),
+        ("B(1;0.2,1.0)", 0.4, 50.0),
+        ("B(1;0.2,1.0)", 1.6, 50.0),
+        ("P", 1.0, 100.0),
+        ("P", 0.0, 0.0),
+        ("D(1,3)", math.nan, 0.0),
+    ],
+)
+def test_a_map_scores_as_the_specification_says(text: str, value: float, score: float) -> None:
+    assert parse_map(text).score(value) == pytest.approx(score)
+
+
+def test_a_share_moves_by_its_shortfall_and_never_past_one() -> None:
+    moved = parse_map("U(0.85,0.97)").scaled(1.1)
+    assert (moved.good, moved.bad) == (pytest.approx(0.967), pytest.approx(0.835))
+    assert parse_map("D(1,3)").scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
+    assert parse_map("P").scaled(1.1) == parse_map("P")
