@@ -89,7 +89,7 @@ def _track_facts(laid: Track, result: Reconstruction) -> dict[str, Any]:
         "sleepers_seen": int(laid.measured.sum()),
         "protrusion": laid.config.protrusion,
         "gauge": laid.config.gauge,
-        "gauge_seen": rails.outer - 2 * laid.config.rail.head_width if rails else None,
+        "gauge_seen": rails.gauge if rails else None,
         "rail_top_seen": rails.top if rails else None,
     }
 

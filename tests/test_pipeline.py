@@ -9,6 +9,9 @@ import trimesh
 
 import subterra_jax as st
 from scene.build import build
+from scene.fitting.lining import LiningConfig
+from scene.output import BuildConfig
+from scene.reconstruct import ReconstructConfig
 from subterra_jax import reference
 from tests.scene.clouds import curved_d_bore
 from tests.shared import METRO, needs_metro
@@ -84,7 +87,9 @@ def test_an_episode_runs_between_furniture(scene):
 
 @needs_metro
 def test_the_environment_runs_in_a_window_of_the_real_metro(tmp_path):
-    build(METRO, tmp_path / "metro")
+    # Without what stands there by standard: 13,696 pockets take a while and change no wall.
+    bare = BuildConfig(reconstruct=ReconstructConfig(lining=LiningConfig(by_standard=False)))
+    build(METRO, tmp_path / "metro", config=bare)
     window = st.load_tunnel(tmp_path / "metro" / "tunnel.npz").slice(400.0, 351.0)
     assert window.length == pytest.approx(351.0, abs=0.3)
     env, params = st.make("Subterra/Traverse-v0", tunnel=window, lining="smooth")

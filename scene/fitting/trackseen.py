@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from scene.bore import Bore
 from scene.cloud import Cloud
+from scene.fitting.railsseen import SeenRails, find_rails
 
 _BIN = 0.01  # m along
 _SMOOTH = 0.09  # m, box; well below a sleeper's width
@@ -18,11 +19,6 @@ _TOP_LAYER = 0.012
 _MIN_TOP = 10
 _MIN_SEEN = 0.6  # of the sleepers that the median spacing asks for
 _SPACINGS = (0.45, 0.80)  # in use, m
-_RAIL_BAND = (0.60, 0.95)  # from the axis, m
-_RAIL_LOW, _RAIL_HIGH = 0.12, 0.40  # above the bed, m
-_HEAD_LAYER = 0.02  # above and below the most frequent height, m
-_SWAY_BLOCK = 1.0  # m
-_MIN_RAIL = 0.5  # share of the metres along which a rail must be seen
 
 
 @dataclass(frozen=True)
@@ -41,21 +37,6 @@ class SeenSleepers:
 
 
 @dataclass(frozen=True)
-class SeenRails:
-    """Both rails.
-
-    Attributes:
-        outer: Between the outer faces of the heads, m.
-        centre: Of the track to the left of the axis, m.
-        top: Above the bed, m.
-    """
-
-    outer: float
-    centre: float
-    top: float
-
-
-@dataclass(frozen=True)
 class SeenTrack:
     """What of a track the cloud shows; `None` for what it does not."""
 
@@ -71,7 +52,7 @@ def find_track(cloud: Cloud, bore: Bore) -> SeenTrack:
         bore: With a flat floor; a track on a round invert is not looked for.
     """
     station, lateral, height = _above_floor(cloud, bore)
-    return SeenTrack(_find_sleepers(station, lateral, height, bore.length), _find_rails(station, lateral, height))
+    return SeenTrack(_find_sleepers(station, lateral, height, bore.length), find_rails(station, lateral, height))
 
 
 def _above_floor(cloud: Cloud, bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -150,69 +131,3 @@ def _complete(centre: np.ndarray, spacing: float, length: float) -> tuple[np.nda
         places.append(places[-1] + spacing)
         measured.append(False)
     return np.array(places), np.array(measured)
-
-
-def _find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:
-    heads = [_head(station, side * lateral, height) for side in (1, -1)]
-    left, right = heads
-    if left is None or right is None:
-        return None
-    sway = _sway(station, lateral, left, right)
-    edges = [_outer_edge(side * (lateral - sway)[head]) for side, head in ((1, left), (-1, right))]
-    if edges[0] is None or edges[1] is None:
-        return None
-    top = np.mean([np.median(height[head]) for head in heads])
-    return SeenRails(edges[0] + edges[1], (edges[0] - edges[1]) / 2, float(top))
-
-
-def _head(station: np.ndarray, across: np.ndarray, height: np.ndarray) -> Bool[np.ndarray, " n"] | None:
-    """Returns on the top of one rail; `None` where it is seen along too little of the bore."""
-    band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < _RAIL_HIGH)
-    if len(np.unique(station[band].astype(int))) < _MIN_RAIL * max(np.ptp(station), 1.0):
-        return None
-    return band & (np.abs(height - _mode(height[band])) < _HEAD_LAYER)
-
-
-def _sway(station: np.ndarray, lateral: np.ndarray, left: np.ndarray, right: np.ndarray) -> Float[np.ndarray, " n"]:
-    """How far the track lies to the left of its mean place under the axis, metre by metre, m.
-
-    Both rails sway together: the axis follows the walls, and poses are a centimetre off here and there. Unless it is
-    taken out it blurs the edges of the heads.
-    """
-    block = (station / _SWAY_BLOCK).astype(np.intp)
-    blocks = int(block.max()) + 1
-    middles = np.full((2, blocks), np.nan)
-    for k, head in enumerate((left, right)):
-        order = np.argsort(block[head], kind="stable")
-        at, bounds = lateral[head][order], np.searchsorted(block[head][order], np.arange(blocks + 1))
-        for i in range(blocks):
-            if bounds[i + 1] - bounds[i] >= _MIN_TOP:
-                middles[k, i] = np.median(at[bounds[i] : bounds[i + 1]])
-    middle = middles.mean(axis=0)
-    known = np.isfinite(middle)
-    if known.sum() < 2:
-        return np.zeros(len(station))
-    at = (np.flatnonzero(known) + 0.5) * _SWAY_BLOCK
-    return np.interp(station, at, middle[known] - np.median(middle[known]))
-
-
-def _mode(height: np.ndarray) -> float:
-    count, edges = np.histogram(height, np.arange(_RAIL_LOW, _RAIL_HIGH, 0.004))
-    return float(edges[np.convolve(count, np.ones(3), mode="same").argmax()] + 0.002)
-
-
-def _outer_edge(across: np.ndarray) -> float | None:
-    """Where the head's top falls to half its density, m.
-
-    The outer edge: on the inner one the side of the head is seen as well, and a middle would be drawn towards it.
-    """
-    step = 0.002
-    count, edges = np.histogram(across, np.arange(*_RAIL_BAND, step))
-    smooth, at = np.convolve(count, np.full(5, 0.2), mode="same"), edges[:-1] + step / 2
-    middle = float(np.median(across))
-    plateau = np.median(smooth[(at > middle) & (at < middle + 0.02)])
-    below = np.flatnonzero((at > middle + 0.02) & (smooth < plateau / 2))
-    if not len(below) or plateau <= 0:
-        return None
-    k = int(below[0])
-    return float(at[k - 1] + (smooth[k - 1] - plateau / 2) / (smooth[k - 1] - smooth[k]) * step)

@@ -5,6 +5,7 @@ import pytest
 from benchmarks.fidelity import calibrate, evidence, table
 from benchmarks.fidelity.evidence import Survey
 from benchmarks.fidelity.report.content import map_text
+from benchmarks.fidelity.table import Metric
 from benchmarks.fidelity.value import Value
 
 ROWS = evidence.draft()
@@ -22,39 +23,73 @@ def at(share: float, **single: float) -> dict[str, Value]:
     return made | {id: Value(value) for id, value in single.items()}
 
 
-def survey(ceiling: dict[str, Value], **spoilt: dict[str, Value]) -> Survey:
-    return Survey("one", at(0.1), ceiling, {(name, 0.1): values for name, values in spoilt.items()})
+def survey(ceiling: dict[str, Value], null: dict[str, Value] | None = None, **spoilt: dict[str, Value]) -> Survey:
+    """One survey whose null tube scores 0 everywhere unless another is given."""
+    worst = {id: Value(distant(row)) for id, row in ROWS.items()}
+    return Survey("one", at(0.1), ceiling, null or worst, {(name, 0.1): values for name, values in spoilt.items()})
+
+
+def distant(row: Metric) -> float:
+    """What scores 0."""
+    return row.map.bad + (row.map.target if row.map.kind == "B" else 0.0)
+
+
+def moves(*surveys: Survey) -> dict[str, tuple[Metric, str]]:
+    return calibrate.calibrated(ROWS, {}, list(surveys))
 
 
 def test_nothing_moves_where_the_truth_reaches_every_good_end() -> None:
-    assert calibrate.calibrated(ROWS, [survey(at(0.9))]) == {}
+    assert moves(survey(at(0.9))) == {}
 
 
 def test_a_good_end_that_the_truth_misses_moves_to_one_and_a_half_times_what_it_reaches() -> None:
     good = ROWS["c2m_mean"].map.good
-    found = calibrate.calibrated(ROWS, [survey(at(0.1, c2m_mean=1.2 * good))])
+    found = moves(survey(at(0.1, c2m_mean=1.2 * good)))
     assert list(found) == ["c2m_mean"]
-    assert found["c2m_mean"][0].good == pytest.approx(1.8 * good)
+    assert found["c2m_mean"][0].map.good == pytest.approx(1.8 * good)
     assert "truth itself" in found["c2m_mean"][1]
 
 
 def test_a_share_that_the_truth_misses_moves_by_its_shortfall() -> None:
     row = ROWS["occ2d_free_iou"]
-    found = calibrate.calibrated(ROWS, [survey(at(0.1, occ2d_free_iou=row.map.good - 0.02))])
-    assert found["occ2d_free_iou"][0].good == pytest.approx(1.0 - 1.5 * (1.0 - row.map.good + 0.02), abs=1e-3)
+    found = moves(survey(at(0.1, occ2d_free_iou=row.map.good - 0.02)))
+    assert found["occ2d_free_iou"][0].map.good == pytest.approx(1.0 - 1.5 * (1.0 - row.map.good + 0.02), abs=1e-3)
 
 
 def test_a_bad_end_moves_to_what_a_control_reaches_that_falls_too_little() -> None:
     row = ROWS["cl_lateral_rmse"]
     reached = 0.5 * (row.map.good + row.map.bad)
-    found = calibrate.calibrated(ROWS, [survey(at(0.1), N07=at(0.1, cl_lateral_rmse=reached))])
-    assert found["cl_lateral_rmse"][0].bad == pytest.approx(reached, rel=0.06)
-    assert found["cl_lateral_rmse"][0].good == row.map.good
+    found = moves(survey(at(0.1), N07=at(0.1, cl_lateral_rmse=reached)))
+    assert found["cl_lateral_rmse"][0].map.bad == pytest.approx(reached, rel=0.06)
+    assert found["cl_lateral_rmse"][0].map.good == row.map.good
     assert "N07" in found["cl_lateral_rmse"][1]
 
 
+def test_a_null_tube_that_would_meet_the_draft_moves_the_good_end_to_half_of_its_error() -> None:
+    good = ROWS["c2m_mean"].map.good
+    null = {id: Value(distant(row)) for id, row in ROWS.items()} | {"c2m_mean": Value(0.9 * good)}
+    found = moves(survey(at(0.1), null))
+    assert list(found) == ["c2m_mean"]
+    assert found["c2m_mean"][0].map.good == pytest.approx(0.45 * good, rel=0.06)
+    assert found["c2m_mean"][0].map.bad == pytest.approx(3.0 * found["c2m_mean"][0].map.good)
+
+
+def test_a_null_tube_as_good_as_the_truth_moves_nothing() -> None:
+    good = ROWS["c2m_mean"].map.good
+    null = {id: Value(distant(row)) for id, row in ROWS.items()} | {"c2m_mean": Value(0.9 * good)}
+    assert moves(survey(at(0.1, c2m_mean=0.6 * good), null)) == {}
+
+
+def test_what_was_decided_by_hand_is_kept_with_its_reason_and_no_rule_touches_it() -> None:
+    decided = evidence.decided(ROWS)
+    found = calibrate.calibrated(ROWS, decided, [survey(at(5.0))])
+    for id, (row, reason) in decided.items():
+        assert reason
+        assert found[id] == (row, reason)
+
+
 def test_a_metric_that_does_not_see_the_control_stays() -> None:
-    found = calibrate.calibrated(ROWS, [survey(at(0.1), N07=at(0.1))])
+    found = moves(survey(at(0.1), N07=at(0.1)))
     assert found == {}
 
 
