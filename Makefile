@@ -36,7 +36,7 @@ $(STAMP): pyproject.toml
 
 SHARED ?= ../shared
 tunnels: $(STAMP)  ## make the packaged tunnels again, byte for byte; SHARED names the folder that holds data/metro_asbuilt
-	$(BIN)/python -m scene.survey --length 351 --seed 0 --out build/survey-351
+	$(BIN)/python -m scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out build/survey-351
 	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
 		--provenance simulated --name subterra-351 --out build/subterra-351
 	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --out build/metro-asbuilt
