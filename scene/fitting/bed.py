@@ -1,4 +1,4 @@
-"""The flat floor along the whole bore, and the walls run on straight into its corners."""
+"""The flat floor along the whole bore, and the walls run on into its corners."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,11 @@ from scene.fitting.unroll import Grid
 
 _STEP = 0.5  # m
 _SIGMA = 1.0  # m
-_CORNER = (0.15, 0.90)  # heights above the floor between which a wall is fitted to be run on down, m
+_FITTED = (0.20, 1.10)  # heights above the floor between which a wall is fitted to be run on down, m
+_FOOT = 0.45  # below it the fit takes the place of the wall, m
+_BETWEEN = 0.3  # |cos| of the directions that meet the floor between the walls
+_RAILS = 0.7  # of the distance out to the wall
+_NEWTON, _CONVERGED = 6, 0.01
 
 
 @dataclass(frozen=True)
@@ -61,27 +65,78 @@ def find_floors(
     return Floors(at, height, slope)
 
 
-def stand_on(wall: np.ndarray, grid: Grid, floors: Floors) -> np.ndarray:
-    """Replaces what lies below `_CORNER` by each wall run on straight."""
-    lateral, upward = wall * np.cos(grid.angle), wall * np.sin(grid.angle)
+def stand_on(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarray) -> np.ndarray:
+    """Replaces the foot of each wall by the parabola that the wall above it follows, run on to the floor.
+
+    Args:
+        wall: Its distance from the axis, m, `(rows, cols)`.
+        grid: Its cells.
+        floors: Where the foot is.
+        seen: The same without smoothing around, which would round the corner off, m, `(rows, cols)`.
+    """
+    lateral, upward = seen * np.cos(grid.angle), seen * np.sin(grid.angle)
     height = np.interp(grid.station, floors.station, floors.height)[:, None]
     slope = np.interp(grid.station, floors.station, floors.slope)[:, None]
     above = upward - (height + slope * lateral)
-    result = wall.copy()
-    for side in (np.cos(grid.angle) > 0.2, np.cos(grid.angle) < -0.2):
-        band = side & (above > _CORNER[0]) & (above < _CORNER[1])
-        enough = band.sum(axis=1) >= 3
-        weight = band.astype(float)
-        mass = np.maximum(weight.sum(axis=1), 1e-9)
-        mean_u, mean_l = (weight * upward).sum(1) / mass, (weight * lateral).sum(1) / mass
-        du, dl = upward - mean_u[:, None], lateral - mean_l[:, None]
-        lean = (weight * du * dl).sum(1) / np.maximum((weight * du * du).sum(1), 1e-6)
-        foot = (mean_l - lean * mean_u)[:, None]
-        straight = foot / (np.cos(grid.angle) - lean[:, None] * np.sin(grid.angle))
-        low = (np.sign(np.cos(grid.angle)) == np.sign(foot)) & (np.sin(grid.angle) < 0) & (straight > 0)
-        low &= straight * np.sin(grid.angle) - (height + slope * straight * np.cos(grid.angle)) < _CORNER[0]
-        result = np.where(low & enough[:, None], straight, result)
+    on_floor = floors.radius(grid)
+    # Between the feet the floor itself will do, whatever sleepers and rails stand on it.
+    under = (np.abs(np.cos(grid.angle)) < _BETWEEN) & (np.sin(grid.angle) < 0) & (above < _FOOT)
+    result = np.where(under, 2 * wall, wall)
+    for side in (1, -1):
+        facing = side * np.cos(grid.angle) > _BETWEEN
+        out = side * lateral
+        # Rails are as high as the lower end of the band, but nowhere near the wall.
+        band = facing & (above > _FITTED[0]) & (above < _FITTED[1])
+        band &= out > _RAILS * np.where(band, out, 0.0).max(axis=1, keepdims=True)
+        curve, known = _parabolas(above, out, band)
+        foot = _meet(curve, grid.angle, side, height, slope)
+        # A ray that meets the floor inside the foot of the wall meets no wall.
+        inside = on_floor * side * np.cos(grid.angle) < curve[0][:, None]
+        foot = np.where(np.isnan(foot) & inside, 2 * wall, foot)
+        climb = foot * np.sin(grid.angle) - (height + slope * foot * np.cos(grid.angle))
+        low = facing & (np.sin(grid.angle) < 0) & (foot > 0) & (climb < _FOOT)
+        result = np.where(low & known[:, None], foot, result)
     return result
+
+
+def _parabolas(above: np.ndarray, out: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lateral distance of a wall as `a + b h + c h²` of the height above the floor, a row each; `c` is common to all.
+
+    Returns:
+        Coefficients `(3, rows)`, and the rows in which enough of the wall was seen.
+    """
+    known = band.sum(axis=1) >= 3
+    weight = band / np.maximum(band.sum(axis=1, keepdims=True), 1)
+    h, y = above - _mean(above, weight), out - _mean(out, weight)
+    square = h**2 - _mean(h**2, weight)
+    # Least squares for b and c of each row; a row alone says little of c, all rows together say it well.
+    hh, hs, ss = (_mean(x, weight)[:, 0] for x in (h * h, h * square, square * square))
+    hy, sy = (_mean(x, weight)[:, 0] for x in (h * y, square * y))
+    bend = (sy * hh - hy * hs) / np.maximum(ss * hh - hs * hs, 1e-12)
+    c = float(np.median(bend[known])) if known.any() else 0.0
+    b = (hy - c * hs) / np.maximum(hh, 1e-9)
+    middle = _mean(above, weight)[:, 0]
+    b = b - 2 * c * middle
+    a = _mean(out - b[:, None] * above - c * above**2, weight)[:, 0]
+    return np.stack([a, b, np.full_like(a, c)]), known
+
+
+def _mean(field: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    return (weight * field).sum(axis=1, keepdims=True)
+
+
+def _meet(curve: np.ndarray, angle: np.ndarray, side: int, height: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Distance from the axis to the parabola in each direction, m, by Newton's method; NaN where it finds none."""
+    a, b, c = (coefficient[:, None] for coefficient in curve)
+    across, descent = side * np.cos(angle), np.sin(angle) - slope * np.cos(angle)
+    r = a / np.maximum(across, _BETWEEN)
+    for _ in range(_NEWTON):
+        h = np.clip(r * descent - height, -1.0, _FITTED[1])
+        steepness = across - (b + 2 * c * h) * descent
+        r = r - (r * across - (a + b * h + c * h * h)) / np.where(np.abs(steepness) < 0.05, 0.05, steepness)
+        r = np.clip(r, 0.0, 4 * np.maximum(a, 0.1))
+    h = r * descent - height
+    return np.where(np.abs(r * across - (a + b * h + c * h * h)) < _CONVERGED, r, np.nan)
 
 
 def is_floor(wall: Float[np.ndarray, "rows cols"], grid: Grid, floors: Floors) -> Bool[np.ndarray, "rows cols"]:

@@ -28,6 +28,7 @@ _MIN_POCKETS = 6
 _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _SIDE = 0.5
+_OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
@@ -158,6 +159,6 @@ def _spread(profile: Float[np.ndarray, " k"]) -> float:
 
 
 def _common_depth(sections: Sections, holes: Holes, slope: np.ndarray) -> float:
-    """Depth of the mould, m: what the pockets show whose backs are seen."""
+    """Depth of the mould, m: what the pockets show whose backs are seen, less what noise adds to the deepest return."""
     deepest = _patches(sections.deepest, holes, 4, 2).max(axis=(1, 2)) * slope
-    return float(np.quantile(deepest, _DEEP_SHARE))
+    return float(np.quantile(deepest, _DEEP_SHARE) - _OVERSHOOT * np.median(sections.spread))

@@ -107,15 +107,16 @@ def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: bed.Floors | 
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
+    along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
     wall = unroll.median_smooth(unroll.fill_nearest(wall), window)
     if floors is None:
         return unroll.resample(wall, coarse, fine)
-    # Clipped on the fine grid: exactly, not by interpolation across the corner.
-    return bed.clip(unroll.resample(_standing(wall, coarse, floors), coarse, fine), fine, floors)
+    # Clipped on the fine grid alone: interpolation between a wall and a floor would cut their corner off.
+    return bed.clip(unroll.resample(bed.stand_on(wall, coarse, floors, along), coarse, fine), fine, floors)
 
 
 def _standing(wall: np.ndarray, grid: Grid, floors: bed.Floors) -> np.ndarray:
-    return bed.clip(bed.stand_on(wall, grid, floors), grid, floors)
+    return bed.clip(bed.stand_on(wall, grid, floors, wall), grid, floors)
 
 
 def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:

@@ -90,8 +90,8 @@ def fill_nearest(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "ro
 def median_smooth(field: Float[np.ndarray, "rows cols"], window: tuple[int, int]) -> Float[np.ndarray, "rows cols"]:
     """Median over a window of cells; the angle wraps, the ends hold."""
     pad = window[1] // 2
-    wrapped = np.concatenate([field[:, -pad:], field, field[:, :pad]], axis=1)
-    return median_filter(wrapped, window, mode="nearest")[:, pad:-pad]
+    wrapped = np.concatenate([field[:, field.shape[1] - pad :], field, field[:, :pad]], axis=1)
+    return median_filter(wrapped, window, mode="nearest")[:, pad : pad + field.shape[1]]
 
 
 def smooth(
