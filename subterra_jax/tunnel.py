@@ -12,7 +12,7 @@ from subterra_jax.plan import TunnelPlan, load_tunnel
 from subterra_jax.windows import separation, windows
 
 CONTACT_REACH = 0.8
-_CANDIDATES, _CANDIDATES_FURNISHED = 3, 5
+_CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
 
 
 @struct.dataclass
@@ -70,7 +70,7 @@ class Tunnel:
             max_segments: Most wall segments in one block; speed alone depends on it.
             n_candidates: Blocks in which a beam looks for its hit. A beam may graze the boxes of one or two blocks
                 without touching their walls: with 2, about one random beam in 10⁶ misses its wall; with 3, none in 10⁷.
-                None is 3, and 5 where there is furniture, beside which a beam grazes more of them.
+                None is 3, and 8 where there is furniture, beside which a beam grazes more of them.
 
         Raises:
             TunnelError: The plan has no such lining.

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate, Track, concatenated
+from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.compiled import Track, concatenated
 from benchmarks.fidelity.references import PARTS, Hold, Truth
 from tests.benchmarks.fidelity.tubemesh import rolled
 from tests.benchmarks.fidelity.tubeshape import Tube
