@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.fidelity import evidence, store, table
+from benchmarks.fidelity import evidence, rules, store, table
 from benchmarks.fidelity.errors import FidelityError
 from benchmarks.fidelity.evidence import Survey
 from benchmarks.fidelity.report.content import map_text
-from benchmarks.fidelity.table import Map, Metric
+from benchmarks.fidelity.table import Metric
 
 SCHEMA = "subterra.fidelity-thresholds/1"
 FEWEST = 3
@@ -39,28 +39,45 @@ def run(config: CalibrateConfig) -> None:
     surveys = [evidence.load(folder) for folder in config.runs]
     drafted = evidence.draft()
     maps = {
-        id: {"map": map_text(replace(drafted[id], map=map)), "was": map_text(drafted[id]), "reason": reason}
-        for id, (map, reason) in calibrated(drafted, surveys).items()
+        id: {
+            "map": map_text(row),
+            "role": row.role,
+            "was": f"{drafted[id].role} {map_text(drafted[id])}",
+            "reason": why,
+        }
+        for id, (row, why) in calibrated(drafted, evidence.decided(drafted), surveys).items()
     }
     store.write_json(config.out, {"schema": SCHEMA, "surveys": [survey.name for survey in surveys], "maps": maps})
     print(f"{config.out}: {len(maps)} of {table.COUNT} thresholds moved")
 
 
-def calibrated(rows: dict[str, Metric], surveys: list[Survey]) -> dict[str, tuple[Map, str]]:
-    """Moved maps with their reasons, by metric; what evidence says nothing against is not among them."""
-    lower = evidence.bad_ends(rows, surveys)
-    found = {}
+def calibrated(
+    rows: dict[str, Metric], decided: dict[str, tuple[Metric, str]], surveys: list[Survey]
+) -> dict[str, tuple[Metric, str]]:
+    """Rows with moved maps or roles and the reasons, by metric; what evidence says nothing against is not among them.
+
+    Args:
+        rows: The draft.
+        decided: Rows changed by hand; rules do not touch them again.
+        surveys: The evidence.
+    """
+    moved = {id: row for id, (row, _) in decided.items()}
+    reasons = {id: [reason] for id, (_, reason) in decided.items()}
+
+    def move(id: str, good: float, bad: float, reason: str) -> None:
+        row = current[id]
+        moved[id] = current[id] = replace(row, map=evidence.moved(row.map, good, bad))
+        reasons.setdefault(id, []).append(reason)
+
+    current = rows | moved
     for id, row in rows.items():
-        if not row.scored or row.map.kind not in "DUB":
+        if id in decided:
             continue
-        good, bad = evidence.ends(row.map)
-        reasons = []
-        if (upper := evidence.good_end(row, surveys)) is not None:
-            good, bad = upper[0], max(bad, 2.0 * upper[0])
-            reasons.append(f"good end: {upper[1]}")
-        if id in lower and lower[id][0] > evidence.WIDEN * good:
-            bad = lower[id][0]
-            reasons.append(f"bad end: {lower[id][1]}")
-        if reasons:
-            found[id] = (evidence.moved(row.map, good, bad), "; ".join(reasons))
-    return found
+        if (tight := rules.null_ends(row, surveys)) is not None:
+            move(id, *tight)
+        elif (upper := rules.good_end(row, surveys)) is not None:
+            move(id, upper[0], max(evidence.ends(row.map)[1], 2.0 * upper[0]), f"good end: {upper[1]}")
+    for id, (bad, reason) in rules.bad_ends(current, surveys).items():
+        if id not in decided:
+            move(id, evidence.ends(current[id].map)[0], bad, f"bad end: {reason}")
+    return {id: (row, "; ".join(reasons[id])) for id, row in moved.items()}

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import trimesh
 from jaxtyping import Float, Shaped
-from scipy.spatial.transform import Rotation
 
+from benchmarks.fidelity.compiled import Track, nails_of, track_of
 from benchmarks.fidelity.errors import FidelityError
 
 MANIFEST_SCHEMA = "subterra.manifest/1"
@@ -34,27 +34,6 @@ class Bore:
 
 
 @dataclass(frozen=True)
-class Track:
-    """The track as the compiled scene holds it, tunnel frame.
-
-    Attributes:
-        sleeper: Middle of the top of each sleeper, in the order of the file, m, `(s, 3)`.
-        sleeper_mesh: All sleepers.
-        rail: By side (`left`, `right`), the rail head's inner face at its top, along the rail, m, `(k, 3)`.
-        rail_mesh: All rails.
-        fastening_mesh: Pads, clips and shoulders.
-        gauge: Of the track's configuration, m; `None` without a track.
-    """
-
-    sleeper: Float[np.ndarray, "s 3"]
-    sleeper_mesh: trimesh.Trimesh
-    rail: dict[str, Float[np.ndarray, "k 3"]]
-    rail_mesh: trimesh.Trimesh
-    fastening_mesh: trimesh.Trimesh
-    gauge: float | None
-
-
-@dataclass(frozen=True)
 class Candidate:
     """A reconstruction to be judged.
 
@@ -69,6 +48,7 @@ class Candidate:
         scene: The MJCF file, by default the folder's own.
         tunnel: The planar tunnel of the environment, by default the folder's own.
         extra: Further visible surfaces (debris, pillars): empty in what the builder made.
+        nails: Bolts that bridge pockets, as the compiled scene holds them.
     """
 
     name: str
@@ -81,6 +61,7 @@ class Candidate:
     scene: Path
     tunnel: Path
     extra: trimesh.Trimesh = field(default_factory=trimesh.Trimesh)
+    nails: trimesh.Trimesh = field(default_factory=trimesh.Trimesh)
 
     @property
     def origin(self) -> Float[np.ndarray, "3"]:
@@ -112,76 +93,9 @@ def load(folder: Path) -> Candidate:
         lining, solid = (
             trimesh.load_mesh(folder / "meshes" / f"{name}.ply", process=False) for name in ("lining", "solid")
         )
-        track = track_of(mujoco.MjModel.from_xml_path(str(scene)), manifest)
+        model = mujoco.MjModel.from_xml_path(str(scene))
+        track, nails = track_of(model, manifest), nails_of(model)
     except (OSError, ValueError, KeyError) as error:
         raise FidelityError(f"{folder}: cannot be read as a scene ({error})") from error
-    return Candidate(manifest["name"], folder, lining, solid, bore, track, manifest, scene, folder / "tunnel.npz")
-
-
-def track_of(model: mujoco.MjModel, manifest: dict[str, Any]) -> Track:
-    """The track from the compiled scene: its geoms by name."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    parts: dict[str, list[trimesh.Trimesh]] = {"sleeper": [], "rail": [], "fastening": []}
-    rail: dict[str, list[np.ndarray]] = {"left": [], "right": []}
-    top = []
-    for geom in range(model.ngeom):
-        name = model.geom(geom).name
-        kind = name.split("_")[0].removesuffix("s")
-        if kind not in parts:
-            continue
-        mesh = geom_mesh(model, data, geom)
-        parts[kind].append(mesh)
-        if kind == "sleeper":
-            top.append([*mesh.bounds.mean(axis=0)[:2], mesh.bounds[1, 2]])
-        elif name.endswith("_head"):
-            side = name.split("_")[1]
-            frame, half = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
-            inward = -1.0 if side == "left" else 1.0
-            for end in (-half[0], half[0]):
-                rail[side].append(data.geom_xpos[geom] + frame @ [end, inward * half[1], half[2]])
-    joined = {kind: concatenated(meshes) for kind, meshes in parts.items()}
-    gauge = manifest.get("track", {}).get("gauge") if top else None
-    return Track(
-        np.asarray(top).reshape(-1, 3),
-        joined["sleeper"],
-        {side: np.asarray(points).reshape(-1, 3) for side, points in rail.items()},
-        joined["rail"],
-        joined["fastening"],
-        gauge,
-    )
-
-
-def concatenated(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Several meshes as one; none gives an empty one."""
-    if not meshes:
-        return trimesh.Trimesh()
-    before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return trimesh.Trimesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, before, strict=False)]),
-        process=False,
-    )
-
-
-def geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> trimesh.Trimesh:
-    """A box or mesh geom as triangles in the world frame, m.
-
-    Raises:
-        ValueError: Another kind of geom.
-    """
-    kind = model.geom_type[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        mesh = trimesh.creation.box(2.0 * model.geom_size[geom])
-    elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-        k = model.geom_dataid[geom]
-        vertices = model.mesh_vert[model.mesh_vertadr[k] : model.mesh_vertadr[k] + model.mesh_vertnum[k]]
-        faces = model.mesh_face[model.mesh_faceadr[k] : model.mesh_faceadr[k] + model.mesh_facenum[k]]
-        mesh = trimesh.Trimesh(vertices.astype(float), faces, process=False)
-    else:
-        raise ValueError(f"geom {model.geom(geom).name} is neither a box nor a mesh")
-    placement = np.eye(4)
-    placement[:3, :3] = Rotation.from_matrix(data.geom_xmat[geom].reshape(3, 3)).as_matrix()
-    placement[:3, 3] = data.geom_xpos[geom]
-    mesh.apply_transform(placement)
-    return mesh
+    plan = folder / "tunnel.npz"
+    return Candidate(manifest["name"], folder, lining, solid, bore, track, manifest, scene, plan, nails=nails)

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import Bore, Candidate, Track
+from benchmarks.fidelity.candidate import Bore, Candidate
+from benchmarks.fidelity.compiled import Track
 from benchmarks.fidelity.controls.parts import without_faces
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.derive.surface import Caster
@@ -29,7 +30,7 @@ def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
     wall.merge_vertices(digits_vertex=6)
     return replace(
         base, name="truth", lining=wall, solid=capped(wall), bore=_bore(truth), track=_track(truth, base.track),
-        extra=part(truth, ("nail",)),
+        nails=part(truth, ("nail",)),
     )  # fmt: skip
 
 

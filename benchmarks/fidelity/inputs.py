@@ -104,8 +104,8 @@ def packaged(inputs: Inputs) -> Inputs:
     survey, scene = Path("build/survey-351"), Path("build") / PACKAGED
     fitted, held = survey / "survey.bag", survey / f"survey_{HELD_OUT}.bag"
     if not fitted.exists() or not held.exists():
-        make("scene.survey", "--length", PACKAGED_LENGTH, "--seed", 0, "--sensors", "avia", HELD_OUT,
-             "--scan-every", 10, "--out", survey)  # fmt: skip
+        make("scene.survey", "--truth", "metro", "--length", PACKAGED_LENGTH, "--seed", 0,
+             "--sensors", "avia", HELD_OUT, "--scan-every", 10, "--out", survey)  # fmt: skip
     if not built_from(scene, fitted):
         given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated", "--name", PACKAGED)
         make("scene.build", fitted, *given, "--out", scene)

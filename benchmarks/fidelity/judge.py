@@ -1,5 +1,6 @@
 """Runs the whole judgement of a case: reconstruction, null tubes, ceiling, leaks, and the verdict over all of it."""
 
+import gc
 import json
 from dataclasses import dataclass, replace
 from functools import partial
@@ -75,6 +76,8 @@ def values_of(case: Case, folder: Path) -> dict[str, dict[str, Value]]:
             one = replace(case, candidate=candidate, cache={})
             chosen = None if name == "base" else geometry()
             values[name] = evaluate(one, chosen, values.get("base"), partial(_advance, stage))
+            one.cache.clear()
+            gc.collect()  # meshes and their rays refer to each other
     dumped = {name: store.dump_values(entry) for name, entry in values.items()}
     store.write_json(path, {"schema": SCHEMA, "key": key, "values": dumped}, digits=17)
     return values

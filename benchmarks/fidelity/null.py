@@ -6,7 +6,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from benchmarks.fidelity.candidate import Candidate, Track
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.compiled import Track
 
 CORNERS = 72  # of the swept polygon
 STEP = 0.5  # m between rings
@@ -39,8 +40,9 @@ def null_tube(candidate: Candidate, sleepers: bool = True) -> Candidate:
     track = candidate.track if sleepers else without_track()
     name = f"{candidate.name} as null tube" + ("" if sleepers else " without track")
     return replace(
-        candidate, name=name, lining=lining, solid=solid, bore=constant, track=track, extra=trimesh.Trimesh()
-    )
+        candidate, name=name, lining=lining, solid=solid, bore=constant, track=track, extra=trimesh.Trimesh(),
+        nails=trimesh.Trimesh(),
+    )  # fmt: skip
 
 
 def swept(

@@ -75,15 +75,21 @@ def score_one(metric: Metric, value: Value, map: Map | None = None) -> Score:
     return Score(metric, value, (map or metric.map).score(value.value))
 
 
-def score_all(values: dict[str, Value], maps: dict[str, Map] | None = None, strict: bool = False) -> Scored:
+def score_all(
+    values: dict[str, Value],
+    maps: dict[str, Map] | None = None,
+    strict: bool = False,
+    rows: dict[str, Metric] | None = None,
+) -> Scored:
     """Scores every metric and every category.
 
     Args:
         values: By id; all 199.
         maps: In place of the table's, for the sweep.
         strict: Count what is missing as 0.
+        rows: In place of the table, for calibration.
     """
-    rows = table.load()
+    rows = rows or table.load()
     scores = {id: score_one(rows[id], values[id], (maps or {}).get(id)) for id in rows}
     categories = {
         name: _category([s for s in scores.values() if s.metric.category == name], strict)

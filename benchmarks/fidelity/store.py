@@ -1,6 +1,7 @@
 """Values and results as JSON files that appear whole or not at all."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
 from functools import cache
 from hashlib import sha256
@@ -24,8 +25,11 @@ NOT_VALUES = (
     "sweep.py",
     "calibrate.py",
     "evidence.py",
+    "rules.py",
     "split.py",
-)  # what no raw value depends on
+    "table.py",
+    "controls",
+)  # what no raw value of a case depends on; what a control does has its own key
 
 
 def write_text(path: Path, text: str) -> Path:
@@ -92,13 +96,25 @@ def load_values(content: dict[str, Any]) -> dict[str, Value]:
 
 @cache
 def code_hash() -> str:
-    """SHA-256 of the code and tables that raw values depend on: a result of other code is not taken up again."""
+    """SHA-256 of the code that raw values depend on: a result of other code is not taken up again.
+
+    Thresholds, roles and required falls are not part of it: they are applied to kept values at no cost.
+    """
     here = Path(__file__).parent
+    return _hash_of(file for file in here.rglob("*.py") if file.relative_to(here).parts[0] not in NOT_VALUES)
+
+
+@cache
+def controls_hash() -> str:
+    """SHA-256 of the code of the controls; what they must do is no part of it."""
+    here = Path(__file__).parent / "controls"
+    return _hash_of(file for file in here.glob("*.py") if file.name != "verdicts.py")
+
+
+def _hash_of(files: Iterable[Path]) -> str:
     digest = sha256()
-    for file in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".csv")):
-        place = file.relative_to(here)
-        if place.parts[0] not in NOT_VALUES:
-            digest.update(place.as_posix().encode() + file.read_bytes())
+    for file in sorted(files):
+        digest.update(file.relative_to(Path(__file__).parent).as_posix().encode() + file.read_bytes())
     return digest.hexdigest()
 
 
@@ -120,6 +136,7 @@ def candidate_hash(candidate: Candidate) -> str:
         candidate.lining,
         candidate.solid,
         candidate.extra,
+        candidate.nails,
         candidate.track.sleeper_mesh,
         candidate.track.rail_mesh,
     ):

@@ -111,15 +111,16 @@ def parse_map(text: str) -> Map:
 
 @cache
 def load() -> dict[str, Metric]:
-    """The table by id, in its order, with the calibrated thresholds where there are some."""
+    """The table by id, in its order, with the calibrated thresholds and roles where there are some."""
     calibrated = json.loads(THRESHOLDS.read_text())["maps"] if THRESHOLDS.exists() else {}
     table: dict[str, Metric] = {}
     with METRICS.open(newline="") as file:
         for row in csv.DictReader(file):
-            text = calibrated.get(row["id"], {}).get("map", row["map"])
+            moved = calibrated.get(row["id"], {})
+            text, role = moved.get("map", row["map"]), moved.get("role", row["role"])
             table[row["id"]] = Metric(
                 int(row["n"]), row["cat"], row["cat_name"], row["id"], row["definition"], row["unit"],
-                row["direction"], row["role"], parse_map(text), row["evidence"], row["lib"],
+                row["direction"], role, parse_map(text), row["evidence"], row["lib"],
             )  # fmt: skip
     return table
 

@@ -8,8 +8,8 @@ import numpy as np
 from packaging.requirements import Requirement
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import geom_mesh
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.compiled import geom_mesh
 from benchmarks.fidelity.derive import inventory, probe, released, scenerays
 from benchmarks.fidelity.derive.released import of_released
 from benchmarks.fidelity.registry import metric

@@ -1,17 +1,21 @@
 """Controls of sleepers, rails and pockets."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import Candidate, Track
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.compiled import Track
 from benchmarks.fidelity.controls.parts import cut_components, moved_components
 from benchmarks.fidelity.controls.warp import curve, warped_mesh
+from benchmarks.fidelity.derive.curve import Curve
 
 _NEAR = 0.3  # m along the track within which a fastening belongs to a sleeper
 _MARGIN = 0.03  # m around a pocket's footprint
 _RAMP = 3.0  # m at the mouths over which a shifted pattern comes to rest
+_NAIL_ALONG, _NAIL_AROUND = 0.4, 0.1  # m and rad between a nail and a pocket that it reaches into
 _LEFT_DEPTH = 5e-4  # m that a removed pocket keeps, so that its sides do not vanish
 
 
@@ -75,7 +79,7 @@ def gauge_changed(candidate: Candidate, gauge: float) -> Candidate:
 
 
 def pockets_scaled(candidate: Candidate, factor: float, share: float, rng: np.random.Generator) -> Candidate:
-    """Depth of a share of the pockets times a factor; 0 closes them."""
+    """Depth of a share of the pockets times a factor; 0 closes them, and the nails in them are gone."""
     bore = candidate.bore
     if not len(bore.pocket):
         return candidate
@@ -99,9 +103,11 @@ def pockets_scaled(candidate: Candidate, factor: float, share: float, rng: np.ra
     pocket["depth"][pick] *= factor
     if not factor:
         pocket = np.delete(pocket, pick)
+    nails = candidate.nails if factor else cut_components(candidate.nails, _out_of(chosen, line))
     return replace(
-        candidate, lining=deeper(candidate.lining), solid=deeper(candidate.solid), bore=replace(bore, pocket=pocket)
-    )
+        candidate, lining=deeper(candidate.lining), solid=deeper(candidate.solid),
+        bore=replace(bore, pocket=pocket), nails=nails,
+    )  # fmt: skip
 
 
 def pattern_shifted(candidate: Candidate, shift: float) -> Candidate:
@@ -122,6 +128,7 @@ def pattern_shifted(candidate: Candidate, shift: float) -> Candidate:
     return replace(
         candidate, lining=warped_mesh(candidate.lining, move), solid=warped_mesh(candidate.solid, move),
         bore=replace(bore, pocket=pocket, ring_station=target(bore.ring_station)),
+        nails=warped_mesh(candidate.nails, move),
     )  # fmt: skip
 
 
@@ -155,6 +162,19 @@ def _in_pockets(pocket: np.ndarray, station: np.ndarray, angle: np.ndarray, radi
         turn = (angle[part] - one["angle"] + np.pi) % (2.0 * np.pi) - np.pi
         inside[part] |= np.abs(turn) * radius[part] < 0.5 * one["width"] + 3 * _MARGIN
     return inside
+
+
+def _out_of(pocket: np.ndarray, line: Curve) -> Callable[[np.ndarray], np.ndarray]:
+    """Whether bodies lie farther from every pocket than a nail reaches."""
+
+    def away(middles: np.ndarray) -> np.ndarray:
+        local = line.local(middles)
+        along = np.abs(local[:, :1] - pocket["station"][None])
+        turn = np.arctan2(local[:, 2:], local[:, 1:2]) - pocket["angle"][None]
+        turn = np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi)
+        return ~((along < _NAIL_ALONG) & (turn < _NAIL_AROUND)).any(axis=1)
+
+    return away
 
 
 def _gap(station: np.ndarray, away: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ import pymeshlab
 import trimesh
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import Candidate, concatenated
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.compiled import concatenated
 from benchmarks.fidelity.controls.parts import without_faces
 
 _SAME = 1e-6  # m between a vertex of the lining and its twin in the solid

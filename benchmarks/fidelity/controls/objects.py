@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import Candidate, concatenated
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.compiled import concatenated
 from benchmarks.fidelity.controls.warp import curve
 
 _WALL = 0.3  # m thick

@@ -1,5 +1,6 @@
 """Runs controls side by side, keeps what is done, and judges what each did to the scores."""
 
+import gc
 import multiprocessing
 import re
 import tempfile
@@ -48,7 +49,7 @@ class Bench:
     def key(self) -> str:
         """Of the base: a kept result of another base is not taken up."""
         other = "" if self.foreign is None else str(self.foreign.resolve())
-        return sha256(f"{store.case_hash(self.case)} {other}".encode()).hexdigest()
+        return sha256(f"{store.case_hash(self.case)} {store.controls_hash()} {other}".encode()).hexdigest()
 
 
 def jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
@@ -130,7 +131,9 @@ def _start(bench: Bench) -> None:
 
 
 def _in_worker(job: Job) -> Outcome:
-    return one(_worker["bench"], job)
+    outcome = one(_worker["bench"], job)
+    gc.collect()  # meshes and their rays refer to each other: without it a worker grows by 100 MB a control
+    return outcome
 
 
 def _computed(bench: Bench, todo: list[Job], processes: int) -> Iterator[Outcome]:

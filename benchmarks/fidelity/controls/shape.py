@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import Candidate, Track
+from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.compiled import Track
 from benchmarks.fidelity.controls.parts import cut_components
 from benchmarks.fidelity.controls.warp import Map, bent, curve, warped
 from benchmarks.fidelity.derive.curve import Curve
@@ -101,6 +102,7 @@ def shortened(candidate: Candidate, share: float) -> Candidate:
     return replace(
         candidate, lining=cut(candidate.lining, False), solid=_capped_cut(candidate, cut), bore=short,
         track=_short_track(candidate.track, line, end),
+        nails=cut_components(candidate.nails, lambda middles: line.local(middles)[:, 0] <= end),
     )  # fmt: skip
 
 

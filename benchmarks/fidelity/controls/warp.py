@@ -8,8 +8,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from benchmarks.fidelity.candidate import Bore, Candidate, Track
+from benchmarks.fidelity.candidate import Bore, Candidate
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.compiled import Track
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.references import Hold, Truth
 
@@ -32,6 +33,7 @@ def warped(candidate: Candidate, move: Map) -> Candidate:
         bore=warped_bore(candidate.bore, move),
         track=warped_track(candidate.track, move),
         extra=warped_mesh(candidate.extra, move),
+        nails=warped_mesh(candidate.nails, move),
     )
 
 

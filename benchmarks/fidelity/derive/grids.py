@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
-from benchmarks.fidelity.candidate import concatenated
 from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.compiled import concatenated
 from benchmarks.fidelity.derive import carving
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.derive.radii import lining_radii, truth_radii

@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from benchmarks.fidelity.candidate import Track, track_of
 from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.compiled import Track, track_of
 
 Result = TypeVar("Result")
 _KEPT: dict[tuple[Any, ...], Any] = {}
@@ -63,7 +63,8 @@ def mesh_hash(case: Case) -> str:
     """SHA-256 of the visible surface and the centreline in memory."""
     digest, judged = sha256(case.candidate.bore.position.tobytes()), case.candidate
     track = judged.track
-    for mesh in (judged.lining, track.sleeper_mesh, track.rail_mesh, track.fastening_mesh, judged.extra):
+    laid = (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh)
+    for mesh in (judged.lining, *laid, judged.extra, judged.nails):
         digest.update(np.ascontiguousarray(mesh.vertices).tobytes() + np.ascontiguousarray(mesh.faces).tobytes())
     return digest.hexdigest()
 

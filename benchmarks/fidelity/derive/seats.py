@@ -4,8 +4,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from benchmarks.fidelity.candidate import concatenated, geom_mesh
 from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.compiled import concatenated, geom_mesh
 from benchmarks.fidelity.derive import released
 from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.derive.released import of_released

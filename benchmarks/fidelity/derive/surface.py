@@ -6,8 +6,9 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from benchmarks.fidelity.candidate import Candidate, concatenated
+from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.compiled import concatenated
 
 CELL = 0.08  # m between the samples that lead to the nearest triangle
 CANDIDATES = 8
@@ -115,9 +116,10 @@ def lattice(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray, "k 3"
 
 
 def visible(candidate: Candidate) -> trimesh.Trimesh:
-    """Everything that a sensor can see of a candidate: lining, track and what else stands in it."""
+    """Everything that a sensor can see of a candidate: lining with its nails, track and what else stands in it."""
     track = candidate.track
-    parts = [candidate.lining, track.sleeper_mesh, track.rail_mesh, track.fastening_mesh, candidate.extra]
+    laid = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
+    parts = [candidate.lining, *laid, candidate.extra, candidate.nails]
     return concatenated([part for part in parts if len(part.faces)])
 
 

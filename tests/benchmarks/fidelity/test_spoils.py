@@ -10,6 +10,7 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.controls import catalogue
 from benchmarks.fidelity.controls.catalogue import Setting
+from benchmarks.fidelity.derive.surface import visible
 from tests.benchmarks.fidelity import tube
 
 NO_SCENE = sorted(set(catalogue.SPOIL) - {"N01", "N12", "N29", "N30", "N31", "N33"})
@@ -178,3 +179,18 @@ def test_a_foreign_tunnel_is_brought_to_our_mouth(base: Case) -> None:
     assert spoilt.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
     flat = spoilt.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
     assert flat == pytest.approx(1.0, abs=2e-3)
+
+
+def test_nails_are_seen_move_with_the_pattern_and_go_with_their_pockets(base: Case) -> None:
+    bore = base.candidate.bore
+    one = bore.pocket[len(bore.pocket) // 2]
+    row = int(np.argmin(np.abs(bore.station - one["station"])))
+    away = np.cos(one["angle"]) * bore.lateral[row] + np.sin(one["angle"]) * bore.up[row]
+    nail = trimesh.creation.icosphere(subdivisions=0, radius=0.02)
+    nail.apply_translation(bore.position[row] + 2.7 * away)
+    nailed = tube.spoiled(base, nails=nail)
+    assert len(visible(nailed.candidate).faces) == len(visible(base.candidate).faces) + len(nail.faces)
+    assert not len(candidate(nailed, "N25", 100).nails.faces)
+    assert len(candidate(nailed, "N26", 2).nails.faces) == len(nail.faces)
+    along = (candidate(nailed, "N26", 3).nails.centroid - nail.centroid) @ bore.tangent[row]
+    assert abs(along) > 0.2
