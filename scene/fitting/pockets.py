@@ -6,8 +6,9 @@ one mould, and all of them together say it well.
 """
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
 from scene.fitting.pattern import CLEAR, Holes, in_pattern, in_rows, ring_joints
@@ -28,6 +29,7 @@ _MIN_POCKETS = 6
 _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
 _SIDE = 0.5
+_RIB = 0.02  # least wall left between two pockets, m
 _OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
@@ -59,8 +61,25 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
+    pockets = pockets[_apart(pockets, float(np.median(sections.radius)))]
     joints = ring_joints(pockets["station"], grid.rows * grid.step)
     return (pockets, joints) if len(joints) else nothing
+
+
+def _apart(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:
+    """Those to keep, so that none overlap: of two that do, one pocket was seen as two holes, and the fainter goes.
+
+    Args:
+        pockets: All, with the size of the mould.
+        radius: Of the bore, m.
+    """
+    length, width = float(pockets["length"][0]) + _RIB, float(pockets["width"][0]) + _RIB
+    place = np.column_stack([pockets["station"] / length, pockets["angle"] * radius / width])
+    keep = np.ones(len(pockets), bool)
+    for i, j in sorted(cKDTree(place).query_pairs(1.0, p=np.inf)):
+        if keep[i] and keep[j]:
+            keep[i if pockets["confidence"][i] < pockets["confidence"][j] else j] = False
+    return keep
 
 
 def could_show(sections: Sections, depth: float) -> bool:
