@@ -1,5 +1,7 @@
 """LIN: pockets and ring grid on the unrolled lining."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from benchmarks.fidelity.case import Case
@@ -65,35 +67,34 @@ def _of_matched(case: Case, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarr
     return reference.station[pairs[:, 1]], getattr(judged, name)[pairs[:, 0]], getattr(reference, name)[pairs[:, 1]]
 
 
-@metric("lin_pocket_depth_bias", needs="reference")
-def lin_pocket_depth_bias(case: Case) -> Value:
-    """Mean error of the depth of matched pockets, m, absolute."""
-    found = _of_matched(case, "depth")
+def _over_matched(
+    case: Case, id: str, name: str, error: Callable[..., np.ndarray], statistic: Callable[[np.ndarray], float]
+) -> Value:
+    """A statistic of the error of one property of the matched pockets."""
+    found = _of_matched(case, name)
     if isinstance(found, Value):
         return found
     station, judged, reference = found
-    return estimate(lambda e: abs(mean(e)), judged - reference, station, case.rng("lin_pocket_depth_bias"))
+    return estimate(statistic, error(judged, reference), station, case.rng(id))
+
+
+@metric("lin_pocket_depth_bias", needs="reference")
+def lin_pocket_depth_bias(case: Case) -> Value:
+    """Mean error of the depth of matched pockets, m, absolute."""
+    return _over_matched(case, "lin_pocket_depth_bias", "depth", np.subtract, lambda e: abs(mean(e)))
 
 
 @metric("lin_pocket_depth_mae", needs="reference")
 def lin_pocket_depth_mae(case: Case) -> Value:
     """Mean absolute error of the same, m."""
-    found = _of_matched(case, "depth")
-    if isinstance(found, Value):
-        return found
-    station, judged, reference = found
-    return estimate(mean, np.abs(judged - reference), station, case.rng("lin_pocket_depth_mae"))
+    return _over_matched(case, "lin_pocket_depth_mae", "depth", lambda judged, true: np.abs(judged - true), mean)
 
 
 @metric("lin_pocket_area_rel_err", needs="reference")
 def lin_pocket_area_rel_err(case: Case) -> Value:
     """Median relative error of the area of matched pockets, %."""
-    found = _of_matched(case, "area")
-    if isinstance(found, Value):
-        return found
-    station, judged, reference = found
-    error = 100.0 * np.abs(judged / reference - 1.0)
-    return estimate(lambda e: float(np.median(e)), error, station, case.rng("lin_pocket_area_rel_err"))
+    share = lambda judged, true: 100.0 * np.abs(judged / true - 1.0)  # noqa: E731
+    return _over_matched(case, "lin_pocket_area_rel_err", "area", share, lambda e: float(np.median(e)))
 
 
 def _reference_pitch(case: Case) -> float | None:
