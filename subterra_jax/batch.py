@@ -9,11 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax import lidar
-from subterra_jax.env import Info, TraverseEnv
-from subterra_jax.state import EnvParams, State
+from subterra_jax.env import Info, TunnelEnv
+from subterra_jax.state import EnvParams, State, StepNoise
 
 Obs = Float[Array, "n_envs n_obs"]
-Policy = Callable[[PRNGKeyArray, Obs], Float[Array, "n_envs 2"]]
+Policy = Callable[[PRNGKeyArray, Obs], Float[Array, "n_envs n_action"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ class AutoReset:
             environment its own, a pytree of the two mixes them.
     """
 
-    env: TraverseEnv
+    env: TunnelEnv
     params_axes: Any = None
 
     def reset(self, key: PRNGKeyArray, params: EnvParams, n_envs: int) -> tuple[Obs, State]:
@@ -40,36 +40,34 @@ class AutoReset:
         start_key, scan_key = jax.random.split(key)
         state = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
         noise = self.env.draw_step(scan_key, (n_envs,), params)
-        return self._vmap(self.env.observe, 2)(state, noise.ranges, params), state
+        return self._vmap(self.env.observe, 2)(state, noise, params), state
 
     def step(
-        self, key: PRNGKeyArray, state: State, action: Float[Array, "n_envs 2"], params: EnvParams
+        self, key: PRNGKeyArray, state: State, action: Float[Array, "n_envs n_action"], params: EnvParams
     ) -> tuple[Obs, State, Float[Array, "n_envs"], Bool[Array, "n_envs"], Bool[Array, "n_envs"], Info]:
         """Step every environment; begin a new episode, with a fresh draw, in those that finished.
 
         Args:
             key: One key for the whole batch.
             state: Batched state.
-            action: Speeds (m/s) and yaw rates (rad/s).
+            action: Speeds (m/s) and yaw rates (rad/s), and what `TunnelEnv.action_size` adds.
             params: The task; batched as `params_axes` says.
 
         Returns:
-            As `TraverseEnv.step`, batched. Observation and state are those of the new episode where one began. Reward,
+            As `TunnelEnv.step`, batched. Observation and state are those of the new episode where one began. Reward,
             flags and info are those of the step taken; `info["final_observation"]` is what that step's own state looks
             like, and equals the observation wherever no episode ended.
         """
         step_key, start_key = jax.random.split(key)
         n_envs = action.shape[0]
         noise = self.env.draw_step(step_key, (n_envs,), params)
-        stepped, reward, terminated, truncated, info = self._vmap(self.env.advance, 3)(
-            state, action, noise.odometry, params
-        )
+        stepped, reward, terminated, truncated, info = self._vmap(self.env.advance, 3)(state, action, noise, params)
         begun = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
         done = terminated | truncated
         merged = jax.tree.map(
             lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old), begun, stepped
         )
-        obs, info["final_observation"] = self._observe(done, merged, stepped, noise.ranges, params)
+        obs, info["final_observation"] = self._observe(done, merged, stepped, noise, params)
         return obs, merged, reward, terminated, truncated, info
 
     def _observe(
@@ -77,7 +75,7 @@ class AutoReset:
         done: Bool[Array, "n_envs"],
         merged: State,
         stepped: State,
-        noise: Float[Array, "n_envs b"],
+        noise: StepNoise,
         params: EnvParams,
     ) -> tuple[Obs, Obs]:
         """Observations after and before any reset.
@@ -94,9 +92,7 @@ class AutoReset:
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
         return obs, self._final(done, stepped, noise, params, obs)
 
-    def _final(
-        self, done: Bool[Array, "n_envs"], stepped: State, noise: Float[Array, "n_envs b"], params: EnvParams, obs: Obs
-    ) -> Obs:
+    def _final(self, done: Bool[Array, "n_envs"], stepped: State, noise: StepNoise, params: EnvParams, obs: Obs) -> Obs:
         """Observations of the states before any reset.
 
         Only finished environments are cast again: a few at a time in the usual step, and everybody in the rare step in
@@ -142,7 +138,7 @@ def rollout(
 
     Args:
         env: The batch.
-        policy: Key and observations to actions `(n_envs, 2)`; pure.
+        policy: Key and observations to actions `(n_envs, n_action)`; pure.
         key: Source of the policy's and the environments' randomness.
         obs: Observations to begin with.
         state: State to begin with.

@@ -1,5 +1,6 @@
 """Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch on a GPU, by kernels (`fused`)."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -56,7 +57,10 @@ def scan(
     """
     first = tunnel.scan_first[node_at(tunnel, station)]
     take: Callable[..., Array] = _cast_fused if skips_unwanted(params) else _cast
-    return take(tunnel, position, heading, first, jnp.asarray(wanted), params)
+    # Nothing that may differ within a batch but the rows themselves, or the kernels could not serve it.
+    beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
+    ranges = take(tunnel.walls, position, heading, first, jnp.asarray(wanted), beams)
+    return jnp.minimum(ranges, params.range_max)
 
 
 def skips_unwanted(params: LidarParams) -> bool:

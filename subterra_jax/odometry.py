@@ -1,4 +1,4 @@
-"""Dead reckoning that drifts: noise at every step and a bias that lasts an episode, on distance and on heading."""
+"""Dead reckoning that drifts: noise at every step, a bias that lasts an episode, and an error that wanders."""
 
 import dataclasses
 
@@ -7,6 +7,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.vehicle import wrap
+from subterra_jax.wander import WanderParams, advance_wander, start_wander
 
 
 @struct.dataclass
@@ -18,12 +19,24 @@ class OdometryParams:
         distance_bias_sigma: Standard deviation over episodes of the relative error of distance, 1.
         heading_sigma: Standard deviation of the heading noise of one step, rad.
         heading_bias_sigma: Standard deviation over episodes of the yaw-rate error, rad/s.
+        wander: Relative error of distance that changes along the way, 1; None, as in the paper's task, is none at all.
     """
 
     distance_sigma: float = 0.01
     distance_bias_sigma: float = 0.02
     heading_sigma: float = 0.001
     heading_bias_sigma: float = 0.002
+    wander: WanderParams | None = None
+
+    @property
+    def n_reset_noise(self) -> int:
+        """Standard normal numbers that the start of an episode needs."""
+        return 2 if self.wander is None else 3
+
+    @property
+    def n_step_noise(self) -> int:
+        """Standard normal numbers that a step needs."""
+        return 2 if self.wander is None else 3
 
 
 @struct.dataclass
@@ -35,19 +48,21 @@ class OdometryState:
         heading: Dead-reckoned heading since the start, rad, in [-π, π].
         distance_bias: Relative error of distance, 1.
         heading_bias: Error of the yaw rate, rad/s.
+        wander: Relative error of distance at present, on top of the bias, 1; None without one.
     """
 
     distance: Float[Array, ""]
     heading: Float[Array, ""]
     distance_bias: Float[Array, ""]
     heading_bias: Float[Array, ""]
+    wander: Float[Array, ""] | None = None
 
 
-def start_odometry(noise: Float[Array, "2"], params: OdometryParams) -> OdometryState:
+def start_odometry(noise: Float[Array, "n"], params: OdometryParams) -> OdometryState:
     """An odometer at 0 with a fresh bias.
 
     Args:
-        noise: Two standard normal numbers, for the bias of distance and of heading.
+        noise: Standard normal numbers, for the bias of distance and of heading, and for the wandering error if any.
         params: Sizes of the errors.
     """
     zero = jnp.zeros_like(noise[0])
@@ -56,6 +71,7 @@ def start_odometry(noise: Float[Array, "2"], params: OdometryParams) -> Odometry
         heading=zero,
         distance_bias=params.distance_bias_sigma * noise[0],
         heading_bias=params.heading_bias_sigma * noise[1],
+        wander=None if params.wander is None else start_wander(noise[2], params.wander),
     )
 
 
@@ -63,7 +79,7 @@ def advance_odometry(
     state: OdometryState,
     motion: Float[Array, "2"],
     period: Float[Array, ""],
-    noise: Float[Array, "2"],
+    noise: Float[Array, "n"],
     params: OdometryParams,
 ) -> OdometryState:
     """Add one step's measured motion.
@@ -72,9 +88,15 @@ def advance_odometry(
         state: The odometer before.
         motion: True speed (m/s) and yaw rate (rad/s) during the step.
         period: Duration of the step, s.
-        noise: Two standard normal numbers, for distance and heading.
+        noise: Standard normal numbers, for distance, heading, and the wandering error if there is one.
         params: Sizes of the errors. All zero gives the truth.
     """
-    travelled = motion[0] * period * (1.0 + state.distance_bias) + params.distance_sigma * noise[0]
+    moved, scale, wander = motion[0] * period, 1.0 + state.distance_bias, state.wander
+    if params.wander is not None and wander is not None:
+        scale = scale + wander
+        wander = advance_wander(wander, moved, noise[2], params.wander)
+    travelled = moved * scale + params.distance_sigma * noise[0]
     turned = (motion[1] + state.heading_bias) * period + params.heading_sigma * noise[1]
-    return dataclasses.replace(state, distance=state.distance + travelled, heading=wrap(state.heading + turned))
+    return dataclasses.replace(
+        state, distance=state.distance + travelled, heading=wrap(state.heading + turned), wander=wander
+    )

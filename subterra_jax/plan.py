@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import re
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -14,6 +16,7 @@ from subterra_jax.errors import TunnelError
 
 SCHEMA = "subterra.tunnel/1"
 PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
+GENERATED = re.compile(r"control|procedural:.*")  # names of tunnels that are made, not read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +67,8 @@ class TunnelPlan:
         half_width: Half the distance between the smooth walls, m, `(n,)`.
         lidar_height: Height of the LiDAR plane above `elevation`, m.
         linings: Variant name to its walls.
+        ring_pitch: Distance from ring joint to ring joint, at which the pockets repeat, m; 0 where there are no rings
+            or nobody said.
     """
 
     name: str
@@ -75,11 +80,17 @@ class TunnelPlan:
     half_width: np.ndarray
     lidar_height: float
     linings: dict[str, Lining]
+    ring_pitch: float = 0.0
 
     @property
     def length(self) -> float:
         """Length of the centreline, m."""
         return float(self.station[-1])
+
+    @property
+    def default_lining(self) -> str:
+        """The variant to use where nobody said: `pockets`, or the first where there are none."""
+        return "pockets" if "pockets" in self.linings else next(iter(self.linings))
 
     def lining(self, name: str) -> Lining:
         """The walls of one variant; raises `TunnelError` naming the variants there are."""
@@ -201,19 +212,39 @@ def tunnel_file(path: str | Path | None) -> Traversable:
 
 
 def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
-    """Read and check a `tunnel.npz`.
+    """Read and check a `tunnel.npz`, or make a tunnel that goes by a name.
 
     Args:
-        path: The file, or the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); None is the first of those.
+        path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); `control`, the bore without
+            landmarks; or `procedural:SPLIT:INDEX`, one of the family. None is the first packaged one.
 
     Returns:
         The tunnel with every lining variant; `Tunnel.from_plan` makes it ready for the device.
 
     Raises:
-        TunnelError: The file cannot be read, or a field is missing or wrong; the message names both.
+        TunnelError: The file cannot be read, or a field is missing or wrong; the message names both. Or there is no
+            such generated tunnel.
     """
+    if GENERATED.fullmatch(str(path)):
+        from subterra_jax.procedural import named  # it makes what this module defines
+
+        return named(str(path))
     with resources.as_file(tunnel_file(path)) as file:
         return _read(file)
+
+
+def tunnel_digest(path: str | Path | None = None) -> str:
+    """SHA-256 of what `load_tunnel` would load: of the file, or of a generated tunnel's arrays."""
+    if not GENERATED.fullmatch(str(path)):
+        return hashlib.sha256(tunnel_file(path).read_bytes()).hexdigest()
+    plan = load_tunnel(path)
+    arrays = [plan.station, plan.centre, plan.tangent, plan.elevation, plan.half_width]
+    for name, lining in plan.linings.items():
+        arrays.append(np.frombuffer(name.encode(), np.uint8))
+        for wall in (lining.left, lining.right):
+            arrays += [wall.vertex, wall.station]
+        arrays.append(lining.furniture)
+    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
 
 def _read(path: Path) -> TunnelPlan:
@@ -233,6 +264,10 @@ def _read(path: Path) -> TunnelPlan:
     half_width = fields.numbers("half_width", n)
     if np.any(half_width <= 0.0):
         raise fields.fail("half_width", "must be positive")
+    # Files written before the field was thought of do not have it.
+    ring_pitch = float(fields.numbers("ring_pitch")) if "ring_pitch" in fields.data else 0.0
+    if ring_pitch < 0.0:
+        raise fields.fail("ring_pitch", f"must not be negative, is {ring_pitch}")
     names: Any = fields.data.get("lining")
     if names is None:
         raise fields.fail("lining", "is missing")
@@ -253,4 +288,5 @@ def _read(path: Path) -> TunnelPlan:
             )
             for name in names
         },
+        ring_pitch=ring_pitch,
     )

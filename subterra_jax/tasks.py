@@ -11,16 +11,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from subterra_jax.blocks import LIDAR_GAP
-from subterra_jax.env import TraverseEnv
+from subterra_jax.env import TunnelEnv
+from subterra_jax.faults import FaultParams
 from subterra_jax.lidar import LidarParams
+from subterra_jax.obstacles import ObstacleParams
 from subterra_jax.odometry import OdometryParams
 from subterra_jax.plan import TunnelPlan
-from subterra_jax.reward import RewardParams
-from subterra_jax.state import EnvParams, StartParams
+from subterra_jax.reward import GoalRewardParams, RewardParams
+from subterra_jax.rules import Relocalise, Rule, StopAt, Traverse, TurnBack
+from subterra_jax.slip import SlipParams
+from subterra_jax.state import EnvParams, GoalParams, StartParams
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, resolve
 from subterra_jax.vehicle import VehicleParams
+from subterra_jax.wander import WanderParams
 
 SHORT_LENGTH = 60.0
+_SHORT_GOALS = {"low": 10.0, "high": 60.0, "margin": 5.0, "tolerance": 0.25}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,17 +34,51 @@ class Task:
     """One row of the task table.
 
     Attributes:
+        rule: What it asks.
         horizon: Steps after which an episode is truncated.
         piece: Start and length of the piece of tunnel it happens in, m; None is the whole tunnel.
+        parts: Fields of `EnvParams` beside those that every task has.
     """
 
+    rule: Rule
     horizon: int
-    piece: tuple[float, float] | None
+    piece: tuple[float, float] | None = None
+    parts: dict[str, Any] = dataclasses.field(default_factory=dict)
 
+
+def _parts(start: StartParams | None = None, goal: dict[str, Any] | None = None, **further: Any) -> dict[str, Any]:
+    """What every task from T1 on has: slip, odometry that wanders, a goal and its reward."""
+    return {
+        "odometry": OdometryParams(wander=WanderParams(sigma=0.01)),
+        "reward": GoalRewardParams(),
+        "slip": SlipParams(),
+        "goal": GoalParams(**(goal or {})),
+        **({} if start is None else {"start": start}),
+        **further,
+    }
+
+
+# A goal of 60 m needs some tunnel behind it, and one who returns some behind the start.
+_SHORT = (0.0, SHORT_LENGTH + 5.0)
+_RETURN, _OFFSET = StartParams(station=5.0), StartParams(station=9.0, station_sigma=3.0)
 
 TASKS: dict[str, Task] = {
-    "Subterra/Traverse-v0": Task(horizon=3000, piece=None),
-    "Subterra/TraverseShort-v0": Task(horizon=600, piece=(0.0, SHORT_LENGTH)),
+    "Subterra/Traverse-v0": Task(Traverse(), 3000),
+    "Subterra/TraverseShort-v0": Task(Traverse(), 600, (0.0, SHORT_LENGTH)),
+    "Subterra/StopAt-v0": Task(StopAt(), 4000, parts=_parts()),
+    "Subterra/StopAtShort-v0": Task(StopAt(), 1000, _SHORT, _parts(goal=_SHORT_GOALS)),
+    "Subterra/StopAtOffset-v0": Task(StopAt(), 4000, parts=_parts(_OFFSET)),
+    "Subterra/StopAtOffsetShort-v0": Task(StopAt(), 1000, _SHORT, _parts(_OFFSET, {**_SHORT_GOALS, "low": 20.0})),
+    "Subterra/Return-v0": Task(TurnBack(), 8000, parts=_parts(_RETURN)),
+    "Subterra/ReturnShort-v0": Task(TurnBack(), 2000, _SHORT, _parts(_RETURN, _SHORT_GOALS)),
+    "Subterra/Obstructed-v0": Task(StopAt(), 4000, parts=_parts(obstacles=ObstacleParams())),
+    "Subterra/ObstructedShort-v0": Task(StopAt(), 1000, _SHORT, _parts(goal=_SHORT_GOALS, obstacles=ObstacleParams())),
+    "Subterra/Faulted-v0": Task(StopAt(), 4000, parts=_parts(faults=FaultParams())),
+    "Subterra/FaultedShort-v0": Task(StopAt(), 1000, _SHORT, _parts(goal=_SHORT_GOALS, faults=FaultParams())),
+    "Subterra/Relocalise-v0": Task(Relocalise(), 2000, parts=_parts()),
+    "Subterra/RelocaliseShort-v0": Task(
+        Relocalise(), 1000, _SHORT, _parts(goal={"tolerance": 0.25, "travel_max": 40.0})
+    ),
 }
 
 
@@ -46,15 +86,19 @@ def make(
     id: str,
     tunnel: Tunnel | TunnelPlan | str | Path | None = None,
     lining: str = "pockets",
+    estimates: bool = False,
     **overrides: Any,
-) -> tuple[TraverseEnv, EnvParams]:
+) -> tuple[TunnelEnv, EnvParams]:
     """Make an environment and its params.
 
     Args:
         id: A key of `TASKS`.
-        tunnel: A tunnel file, a plan from `load_tunnel`, or a ready `Tunnel`, which is taken as it is, neither cut to
-            the task's piece nor given another lining. None is the packaged tunnel.
+        tunnel: A tunnel file, the name of a packaged tunnel, a plan from `load_tunnel`, or a ready `Tunnel`, one or
+            several, which is taken as it is, neither cut to the task's piece nor given another lining. None is the
+            packaged tunnel.
         lining: Variant of the walls: `pockets` (the default, as in the recorded bore), `smooth` or `furnished`.
+        estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
+            estimation track. It does not move the robot; `info` tells its error.
         **overrides: Fields of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`.
 
     Returns:
@@ -74,15 +118,17 @@ def make(
         "reward": RewardParams(),
         "start": StartParams(),
         "horizon": task.horizon,
+        **task.parts,
     }
     known = {field.name for field in dataclasses.fields(EnvParams)} - {"tunnel"}
     if unknown := set(overrides) - known:
         raise ValueError(f"no field {sorted(unknown)} in EnvParams; there are {sorted(known)}")
     fields.update(overrides)
-    _check(fields)
+    _check(task.rule, fields)
     reach = float(np.max(fields["lidar"].range_max))
     params = EnvParams(tunnel=resolve(tunnel, lining, task.piece, reach), **fields)
-    return TraverseEnv(id=id), jax.tree.map(_as_array, params)
+    _check_length(id, params)
+    return TunnelEnv(id=id, rule=task.rule, estimates=estimates), jax.tree.map(_as_array, params)
 
 
 def _as_array(leaf: Any) -> jax.Array:
@@ -91,7 +137,7 @@ def _as_array(leaf: Any) -> jax.Array:
     return leaf.astype(jnp.int32 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.float32)
 
 
-def _check(fields: dict[str, Any]) -> None:
+def _check(rule: Rule, fields: dict[str, Any]) -> None:
     """Refuse, with the value, what the simulator would otherwise get silently wrong."""
     n_beams, robot = fields["lidar"].n_beams, fields["vehicle"]
     if n_beams < 1:
@@ -103,3 +149,16 @@ def _check(fields: dict[str, Any]) -> None:
             f"radius {robot.radius} m less one step of {robot.speed_max} m/s for {robot.period} s must leave "
             f"{LIDAR_GAP} m between LiDAR and walls"
         )
+    if rule.has_goal != (fields.get("goal") is not None):
+        raise ValueError(f"goal must {'be' if rule.has_goal else 'not be'} GoalParams for this task")
+    wanted = GoalRewardParams if rule.has_goal else RewardParams
+    if not isinstance(fields["reward"], wanted):
+        raise ValueError(f"reward must be {wanted.__name__} for this task, got {type(fields['reward']).__name__}")
+
+
+def _check_length(id: str, params: EnvParams) -> None:
+    """Refuse a tunnel in which the task has no room."""
+    shortest = float(np.min(np.asarray(params.tunnel.length)))
+    needed = 0.0 if params.goal is None else float(np.max(params.goal.low) + np.max(params.goal.margin))
+    if shortest < needed:
+        raise ValueError(f"{id} needs a tunnel of {needed:g} m, this one has {shortest:.1f} m")

@@ -1,7 +1,12 @@
-"""The tunnel on the device: what the simulator reads at every step, as one pytree."""
+"""The tunnel on the device, or many of them: what the simulator reads at every step, as one pytree."""
 
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -17,18 +22,23 @@ _CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
 
 @struct.dataclass
 class Tunnel:
-    """A planar tunnel with one lining, cut into blocks of wall in order of station.
+    """A planar tunnel with one lining, cut into blocks of wall in order of station; or a stack of several such tunnels.
 
-    Two tunnels whose arrays have the same shapes share one compiled program.
+    A stack holds the nodes and the blocks of its tunnels one after another, each tunnel near its own origin, and
+    has `k` numbers where one tunnel has one. `pick` gives the view of one tunnel that every function here, `lidar.scan`
+    and `vehicle.clearance` work on. Two tunnels or stacks whose arrays have the same shapes share one compiled program.
 
     Attributes:
-        length: Length of the centreline, m.
+        length: Length of the centreline, m; `()`, or `(k,)` in a stack of k, as the next four.
         spacing: Step of the chainage grid, m.
+        ring_pitch: Distance from ring joint to ring joint, m; 0 where there are no rings.
+        first_node: Row of `grid` that belongs to station 0.
+        n_nodes: Nodes of the chainage grid.
         grid: Centreline x, y (m), unit tangent x, y and half-width (m) at each node of the chainage grid.
         scan_first: First block of the window that a LiDAR near each node can see.
         contact_first: First block of the window that a robot near each node can touch.
         box: Rows of the middle x, y of the box around each block, half its long axis as a vector x, y, half its
-            thickness and half its length, m.
+            thickness and half its length, m. Padding has a negative thickness: no beam enters it.
         wall: Row of x and row of y of the vertices of each block, from the middle of its box, m; the last one repeated
             as padding.
         reach: Largest range for which the scan window was made, m.
@@ -37,11 +47,14 @@ class Tunnel:
         n_candidates: Blocks in which a beam looks for its hit, nearest first.
     """
 
-    length: Float[Array, ""]
-    spacing: Float[Array, ""]
-    grid: Float[Array, "n_nodes 5"]
-    scan_first: Int[Array, "n_nodes"]
-    contact_first: Int[Array, "n_nodes"]
+    length: Float[Array, "*k"]
+    spacing: Float[Array, "*k"]
+    ring_pitch: Float[Array, "*k"]
+    first_node: Int[Array, "*k"]
+    n_nodes: Int[Array, "*k"]
+    grid: Float[Array, "all_nodes 5"]
+    scan_first: Int[Array, "all_nodes"]
+    contact_first: Int[Array, "all_nodes"]
     box: Float[Array, "6 n_blocks"]
     wall: Float[Array, "n_blocks 2 n_vertices"]
     reach: float = struct.field(pytree_node=False)
@@ -49,11 +62,57 @@ class Tunnel:
     n_contact: int = struct.field(pytree_node=False)
     n_candidates: int = struct.field(pytree_node=False)
 
+    @property
+    def count(self) -> int:
+        """Tunnels in it: 1, or k for a stack."""
+        return 1 if jnp.ndim(self.length) == 0 else self.length.shape[0]
+
+    def pick(self, index: Int[Array, ""] | int) -> "Tunnel":
+        """One tunnel of a stack; itself where there is only one.
+
+        The large arrays stay shared, so that a batch may pick a different tunnel for each environment at no cost.
+
+        Args:
+            index: Number of the tunnel, from 0 to `count - 1`; not checked.
+        """
+        if self.count == 1:
+            return self
+        return self._with_numbers(
+            self.length[index], self.spacing[index], self.ring_pitch[index], self.first_node[index], self.n_nodes[index]
+        )
+
+    @property
+    def walls(self) -> "Tunnel":
+        """The blocks alone, with nothing left that differs among the tunnels of a stack; for functions of blocks.
+
+        In a batch that picks different tunnels it is one for all.
+        """
+        return self._with_numbers(*(np.float32(0.0),) * 3, *(np.int32(0),) * 2)
+
+    def _with_numbers(self, length: Any, spacing: Any, ring_pitch: Any, first_node: Any, n_nodes: Any) -> "Tunnel":
+        return dataclasses.replace(
+            self, length=length, spacing=spacing, ring_pitch=ring_pitch, first_node=first_node, n_nodes=n_nodes
+        )
+
+    @staticmethod
+    def stack(tunnels: Sequence["Tunnel"]) -> "Tunnel":
+        """Several tunnels in one, at no cost per step; see `subterra_jax.stack`.
+
+        Args:
+            tunnels: One or more single tunnels, of any length and lining.
+
+        Raises:
+            ValueError: There are none, or one is a stack itself.
+        """
+        from subterra_jax.stack import stack  # it needs this class
+
+        return stack(tunnels)
+
     @classmethod
     def from_plan(
         cls,
         plan: TunnelPlan,
-        lining: str = "pockets",
+        lining: str | None = None,
         *,
         reach: float = 30.0,
         block_length: float = 2.0,
@@ -64,7 +123,7 @@ class Tunnel:
 
         Args:
             plan: The tunnel as read from its file.
-            lining: The variant of its walls to use.
+            lining: The variant of its walls to use; None is `pockets`, or the first where there are none.
             reach: Largest range that a LiDAR will ask for, m.
             block_length: Wanted length of the blocks of wall, m; speed alone depends on it.
             max_segments: Most wall segments in one block; speed alone depends on it.
@@ -75,9 +134,10 @@ class Tunnel:
         Raises:
             TunnelError: The plan has no such lining.
         """
-        blocks = build_blocks(plan, plan.lining(lining), block_length, max_segments)
+        walls = plan.lining(lining or plan.default_lining)
+        blocks = build_blocks(plan, walls, block_length, max_segments)
         if n_candidates is None:
-            n_candidates = _CANDIDATES if len(plan.lining(lining).furniture) == 0 else _CANDIDATES_FURNISHED
+            n_candidates = _CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED
         scan_first, n_scan = windows(plan, blocks, reach)
         n_scan = 2 * max(-(-n_scan // 2), separation(blocks, reach))
         # A slice beyond the end would start earlier than asked for.
@@ -85,21 +145,29 @@ class Tunnel:
         contact_first, n_contact = windows(plan, blocks, CONTACT_REACH)
         half_length = np.linalg.norm(blocks.half, axis=1)
         grid = np.concatenate([plan.centre, plan.tangent, plan.half_width[:, None]], axis=1)
+        box = np.column_stack([blocks.centre, blocks.half, blocks.thickness, half_length]).T
+        real, whole = partial(_on_device, dtype=np.float32), partial(_on_device, dtype=np.int32)
         return cls(
-            length=jnp.float32(plan.length),
-            spacing=jnp.float32(plan.station[1] - plan.station[0]),
-            grid=jnp.asarray(grid, jnp.float32),
-            scan_first=jnp.asarray(scan_first, jnp.int32),
-            contact_first=jnp.asarray(contact_first, jnp.int32),
-            box=jnp.asarray(
-                np.column_stack([blocks.centre, blocks.half, blocks.thickness, half_length]).T, jnp.float32
-            ),
-            wall=jnp.asarray(blocks.offset.swapaxes(1, 2), jnp.float32),
+            length=real(plan.length),
+            spacing=real(plan.station[1] - plan.station[0]),
+            ring_pitch=real(plan.ring_pitch),
+            first_node=whole(0),
+            n_nodes=whole(len(plan.station)),
+            grid=real(grid),
+            scan_first=whole(scan_first),
+            contact_first=whole(contact_first),
+            box=real(box),
+            wall=real(blocks.offset.swapaxes(1, 2)),
             reach=reach,
             n_scan=n_scan,
             n_contact=n_contact,
             n_candidates=n_candidates,
         )
+
+
+def _on_device(values: Any, dtype: Any) -> Array:
+    """An array on the device; `jnp.asarray` would compile a program for each new shape."""
+    return jax.device_put(np.ascontiguousarray(values, dtype).reshape(np.shape(values)))
 
 
 @struct.dataclass
@@ -120,17 +188,18 @@ class Foot:
 
 
 def node_at(tunnel: Tunnel, station: Float[Array, ""]) -> Int[Array, ""]:
-    """Index of the node of the chainage grid nearest to a station; a station beyond a mouth gives the last node."""
-    n_nodes = tunnel.grid.shape[0]
-    return jnp.clip(jnp.round(station / tunnel.spacing), 0, n_nodes - 1).astype(jnp.int32)
+    """Row of `grid` of the node nearest to a station; a station beyond a mouth gives the last node."""
+    node = jnp.clip(jnp.round(station / tunnel.spacing), 0, tunnel.n_nodes - 1)
+    return tunnel.first_node + node.astype(jnp.int32)
 
 
 def at_station(tunnel: Tunnel, station: Float[Array, ""]) -> Float[Array, "5"]:
     """Centre x, y (m), unit tangent x, y and half-width (m) at a station; straight on beyond the mouths."""
     place = station / tunnel.spacing
-    index = jnp.clip(jnp.floor(place), 0, tunnel.grid.shape[0] - 2).astype(jnp.int32)
+    index = jnp.clip(jnp.floor(place), 0, tunnel.n_nodes - 2).astype(jnp.int32)
     share = place - index
-    lower, upper = tunnel.grid[index], tunnel.grid[index + 1]
+    row = tunnel.first_node + index
+    lower, upper = tunnel.grid[row], tunnel.grid[row + 1]
     return lower + share * (upper - lower)
 
 
@@ -155,21 +224,31 @@ def foot(tunnel: Tunnel, position: Float[Array, "2"], near: Float[Array, ""]) ->
     return Foot(station=station, lateral=lateral, half_width=half_width, tangent=jnp.stack([tangent_x, tangent_y]))
 
 
+Source = Tunnel | TunnelPlan | str | Path | None
+
+
 def resolve(
-    tunnel: Tunnel | TunnelPlan | str | Path | None,
-    lining: str,
+    tunnel: Source | Sequence[Source],
+    lining: str | None,
     piece: tuple[float, float] | None,
     reach: float,
 ) -> Tunnel:
     """A device tunnel from whatever a user names one by.
 
     Args:
-        tunnel: A ready `Tunnel`, taken as it is; a plan; a file; or None for the packaged tunnel.
-        lining: The variant of the walls.
+        tunnel: A ready `Tunnel`, taken as it is; a plan; a file or a name, as for `load_tunnel`; None for the packaged
+            tunnel; or a list of such things, which becomes one stack.
+        lining: The variant of the walls; None is `pockets`, or the first where a tunnel has none.
         piece: Start and length of the piece to cut out, m; None keeps the whole tunnel. A length beyond the tunnel's
             end is shortened to it.
         reach: Largest range that will be asked for, m.
+
+    Raises:
+        TunnelError: A file is unreadable or wrong, or there is no such tunnel or lining.
+        ValueError: A ready tunnel was made for shorter ranges, or the list is empty.
     """
+    if isinstance(tunnel, list | tuple):
+        return Tunnel.stack([resolve(each, lining, piece, reach) for each in tunnel])
     if isinstance(tunnel, Tunnel):
         if tunnel.reach < reach:
             raise ValueError(f"the tunnel was made for ranges up to {tunnel.reach} m, got range_max={reach}")

@@ -89,12 +89,18 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
 
 
 def in_contact(
-    tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array, ""], params: VehicleParams
+    tunnel: Tunnel, clear: Float[Array, ""], station: Float[Array, ""], params: VehicleParams
 ) -> Bool[Array, ""]:
-    """Whether the footprint touches a wall or furniture, or lies wholly outside one of the mouths.
+    """Whether the footprint touches anything, or lies wholly outside one of the mouths.
 
     It is looked at at the end of each control period; in one period the robot moves at most half its radius, so that
     it cannot pass through a wall unseen. Leaving through a mouth counts as contact, because no wall goes on there.
+
+    Args:
+        tunnel: The tunnel.
+        clear: Distance from the middle of the robot to the nearest thing, m.
+        station: Station of the robot, m.
+        params: The robot.
     """
     outside = (station < -params.radius) | (station > tunnel.length + params.radius)
-    return (clearance(tunnel, position, station) < params.radius) | outside
+    return (clear < params.radius) | outside

@@ -10,8 +10,10 @@ from manifold3d import Manifold, Mesh64
 from scene.axis import Axis, with_frames
 from scene.bore import Bore
 from scene.errors import FitError
+from scene.writing.skin import has_rings
 
 SCHEMA = "subterra.tunnel/1"
+_SAME_JOINT = 0.4  # m: less than a ring is wide
 _COLLINEAR = 0.001  # m; half of it would add half as many vertices to a smooth wall
 
 
@@ -94,6 +96,18 @@ def half_widths(walls: Walls, bore: Bore) -> Float[np.ndarray, " n"]:
     return (across(walls.left, walls.left_station) - across(walls.right, walls.right_station)) / 2
 
 
+def ring_pitch(bore: Bore) -> float:
+    """Distance from ring joint to ring joint, m; 0 where there are none.
+
+    A ring survey may have only some of its rings; the joints are then those that the laid nails bridge.
+    """
+    joints = bore.ring_station
+    if not has_rings(bore):
+        at = np.sort(bore.nail["station"])
+        joints = at[np.diff(at, prepend=-np.inf) > _SAME_JOINT]
+    return float(np.median(np.diff(joints))) if len(joints) > 1 else 0.0
+
+
 def save(
     path: Path,
     name: str,
@@ -119,6 +133,7 @@ def save(
         "elevation": elevation,
         "half_width": half_widths(variants["smooth"], bore),
         "lidar_height": np.array(lidar_height),
+        "ring_pitch": np.array(ring_pitch(bore)),
         "lining": np.array(list(variants)),
     }
     for variant, walls in variants.items():

@@ -13,6 +13,12 @@ from tests.subterra_jax import tunnels
 PARAMS = jax.tree.map(jnp.asarray, vehicle.VehicleParams())
 
 
+def touching(tunnel, position, station):
+    """Whether a robot at a place is in contact."""
+    clear = vehicle.clearance(tunnel, jnp.array(position), jnp.float32(station))
+    return bool(vehicle.in_contact(tunnel, clear, jnp.float32(station), PARAMS))
+
+
 @pytest.mark.parametrize("command", [(2.0, 0.0), (1.0, 1.5), (2.0, -0.3), (0.0, 1.0), (1.7, 1e-4)])
 def test_a_constant_command_is_followed_along_its_exact_arc(command):
     v, w = command
@@ -70,13 +76,13 @@ def test_clearance_is_the_distance_to_the_nearest_of_all_segments(lining):
 @pytest.mark.parametrize(("lateral", "touches"), [(2.424, False), (2.426, True), (-2.424, False), (-2.426, True)])
 def test_contact_begins_where_the_footprint_meets_the_wall(plan_of, lateral, touches):
     tunnel = Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.straight(20.0))), "smooth")
-    assert bool(vehicle.in_contact(tunnel, jnp.array([10.1, lateral]), jnp.float32(10.1), PARAMS)) is touches
+    assert touching(tunnel, [10.1, lateral], 10.1) is touches
 
 
 @pytest.mark.parametrize(("station", "touches"), [(-0.39, False), (-0.41, True), (20.39, False), (20.41, True)])
 def test_a_robot_wholly_outside_a_mouth_is_in_contact(plan_of, station, touches):
     tunnel = Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.straight(20.0))), "smooth")
-    assert bool(vehicle.in_contact(tunnel, jnp.array([station, 0.0]), jnp.float32(station), PARAMS)) is touches
+    assert touching(tunnel, [station, 0.0], station) is touches
 
 
 @pytest.mark.parametrize("radius", [60.0, 300.0])

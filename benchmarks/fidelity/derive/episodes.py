@@ -33,7 +33,7 @@ def _episode(case: Case, actions: np.ndarray) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=0)
-def _roll(env: st.TraverseEnv, params: EnvParams, key: jax.Array, actions: jax.Array) -> jax.Array:
+def _roll(env: st.TunnelEnv, params: EnvParams, key: jax.Array, actions: jax.Array) -> jax.Array:
     """Observations of an episode, the first one included."""
     begin, go = jax.random.split(key)
     first, state = env.reset(begin, params)

@@ -45,7 +45,7 @@ class Poses:
         return np.minimum(reach.reshape(flat.shape) * flat, most)
 
 
-def environment(case: Case) -> tuple[st.TraverseEnv, EnvParams]:
+def environment(case: Case) -> tuple[st.TunnelEnv, EnvParams]:
     """The task on the candidate's own tunnel, read afresh."""
     return st.make(TASK, tunnel=case.candidate.tunnel, lining=LINING)
 

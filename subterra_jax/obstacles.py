@@ -1,0 +1,145 @@
+"""Boxes on the way: where they stand, how far beams see them, how near the robot comes."""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int, UInt32
+
+from subterra_jax.hashing import uniform
+from subterra_jax.tunnel import Tunnel, at_station
+
+PITCH = 15.0  # m of tunnel for each box
+REACH = 33.0  # m of arc on which anything within 30 m lies
+N_SLOTS = 6  # cover twice the reach, wherever it begins
+_N_NEAR = 2  # slots next to a point on either side of it, for contact
+
+
+@struct.dataclass
+class ObstacleParams:
+    """Boxes, one in every 15 m of tunnel, and one parked trolley among them.
+
+    Attributes:
+        size_min: Least side of a box, m.
+        size_max: Largest side of a box, m.
+        gap: Free width that is always left on one side, m.
+        first: No obstacle stands before this station, m.
+        trolley_length: Length of the trolley, along the tunnel, m.
+        trolley_width: Its width, m.
+    """
+
+    size_min: float = 0.3
+    size_max: float = 0.8
+    gap: float = 1.2
+    first: float = 8.0
+    trolley_length: float = 2.4
+    trolley_width: float = 1.2
+
+
+@struct.dataclass
+class Boxes:
+    """A few boxes in the tunnel frame.
+
+    Attributes:
+        centre: Middles, m; far away where there is none.
+        axis: Unit vectors along the first side.
+        half: Half sides, m, the first along `axis`.
+    """
+
+    centre: Float[Array, "n 2"]
+    axis: Float[Array, "n 2"]
+    half: Float[Array, "n 2"]
+
+
+def boxes_near(
+    seed: UInt32[Array, ""], station: Float[Array, ""], reach: float, n: int, tunnel: Tunnel, params: ObstacleParams
+) -> Boxes:
+    """The boxes of the slots from `reach` before a station on.
+
+    Args:
+        seed: Of the episode: the same seed gives the same boxes.
+        station: Where one looks from, m.
+        reach: How far back the first slot lies, m.
+        n: How many slots.
+        tunnel: The tunnel they stand in.
+        params: Their sizes.
+    """
+    slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n)
+    return boxes_in(seed, slot, tunnel, params)
+
+
+def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, params: ObstacleParams) -> Boxes:
+    """The boxes of given slots, slot k being the stations from 15 k to 15 (k + 1) m."""
+    u = lambda index: uniform(seed, slot, index)  # noqa: E731
+    n_slots = jnp.maximum(jnp.floor(tunnel.length / PITCH), 2.0)
+    trolley = slot == 1 + jnp.floor(uniform(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
+    side = 0.5 * (params.size_min + (params.size_max - params.size_min) * jnp.stack([u(0), u(1)], axis=-1))
+    parked = 0.5 * jnp.stack([jnp.asarray(params.trolley_length), jnp.asarray(params.trolley_width)])
+    half = jnp.where(trolley[:, None], parked, side)
+    turn = jnp.where(trolley, 0.0, jnp.pi * u(2))
+    # A margin of a trolley's half at both ends keeps the boxes of two slots apart.
+    station = PITCH * slot + 1.5 + (PITCH - 3.0) * u(3)
+    x, y, tangent_x, tangent_y, half_width = jax.vmap(at_station, (None, 0), 1)(tunnel, station)
+    cos, sin = jnp.cos(turn), jnp.sin(turn)
+    across = jnp.abs(sin) * half[:, 0] + jnp.abs(cos) * half[:, 1]
+    lateral = jnp.maximum((half_width - across) * u(4), params.gap + across - half_width)
+    lateral = jnp.where(u(5) < 0.5, -lateral, lateral)
+    there = (station - half[:, 0] - half[:, 1] > params.first) & (station < tunnel.length)
+    centre = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x], axis=-1)
+    return Boxes(
+        centre=jnp.where(there[:, None], centre, 1e6),
+        axis=jnp.stack([tangent_x * cos - tangent_y * sin, tangent_x * sin + tangent_y * cos], axis=-1),
+        half=half,
+    )
+
+
+def distance_along(
+    boxes: Boxes, position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
+) -> Float[Array, "n_beams"]:
+    """Distance at which each beam first meets a box, m; `inf` where it meets none, 0 from inside of one."""
+    p_x, p_y = _in_frame(boxes, position - boxes.centre)
+    axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
+    d_x, d_y = direction[:, 0, None], direction[:, 1, None]
+    ahead_x, ahead_y = d_x * axis_x + d_y * axis_y, d_y * axis_x - d_x * axis_y
+    near_x, far_x = _slab(p_x, ahead_x, boxes.half[:, 0])
+    near_y, far_y = _slab(p_y, ahead_y, boxes.half[:, 1])
+    near, far = jnp.maximum(near_x, near_y), jnp.minimum(far_x, far_y)
+    met = (near <= far) & (far >= 0.0)
+    return jnp.min(jnp.where(met, jnp.maximum(near, 0.0), jnp.inf), axis=-1)
+
+
+def clearance(
+    seed: UInt32[Array, ""],
+    station: Float[Array, ""],
+    position: Float[Array, "2"],
+    tunnel: Tunnel,
+    params: ObstacleParams,
+) -> Float[Array, ""]:
+    """Distance from a point to the nearest box, m; 0 inside; exact up to 0.8 m."""
+    boxes = boxes_near(seed, station, 3.0, _N_NEAR, tunnel, params)
+    p_x, p_y = _in_frame(boxes, position - boxes.centre)
+    out_x, out_y = (jnp.maximum(jnp.abs(p) - boxes.half[:, i], 0.0) for i, p in enumerate((p_x, p_y)))
+    return jnp.min(jnp.sqrt(out_x * out_x + out_y * out_y))
+
+
+def segments(boxes: Boxes) -> Float[Array, "n 4 4"]:
+    """The sides of boxes as segments `x0, y0, x1, y1`, m, four to a box."""
+    long = boxes.axis * boxes.half[:, :1]
+    wide = jnp.stack([-boxes.axis[:, 1], boxes.axis[:, 0]], axis=-1) * boxes.half[:, 1:]
+    corner = jnp.stack([long + wide, wide - long, -long - wide, long - wide], axis=1) + boxes.centre[:, None]
+    return jnp.concatenate([corner, jnp.roll(corner, -1, axis=1)], axis=-1)
+
+
+def _in_frame(boxes: Boxes, vector: Float[Array, "n 2"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Components of vectors along and across the boxes."""
+    axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
+    return vector[:, 0] * axis_x + vector[:, 1] * axis_y, vector[:, 1] * axis_x - vector[:, 0] * axis_y
+
+
+def _slab(
+    origin: Float[Array, "n"], ahead: Float[Array, "n_beams n"], half: Float[Array, "n"]
+) -> tuple[Float[Array, "n_beams n"], Float[Array, "n_beams n"]]:
+    """Distances at which beams enter and leave the strip |x| ≤ half."""
+    tiny = jnp.where(ahead < 0.0, -1e-12, 1e-12)
+    inverse = 1.0 / jnp.where(jnp.abs(ahead) < 1e-12, tiny, ahead)
+    a, b = (-half - origin) * inverse, (half - origin) * inverse
+    return jnp.minimum(a, b), jnp.maximum(a, b)

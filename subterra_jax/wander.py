@@ -1,0 +1,41 @@
+"""An error that wanders over the distance travelled: Ornstein-Uhlenbeck, exact for any step."""
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+
+@struct.dataclass
+class WanderParams:
+    """A stationary Ornstein-Uhlenbeck process over distance.
+
+    Attributes:
+        sigma: Standard deviation at any place, in the unit of the error.
+        length: Distance over which its correlation falls to 1/e, m.
+    """
+
+    sigma: float
+    length: float = 30.0
+
+
+def start_wander(noise: Float[Array, ""], params: WanderParams) -> Float[Array, ""]:
+    """A value from the stationary distribution; `noise` is standard normal."""
+    return params.sigma * noise
+
+
+def advance_wander(
+    value: Float[Array, ""], travelled: Float[Array, ""], noise: Float[Array, ""], params: WanderParams
+) -> Float[Array, ""]:
+    """The value a distance further on; unchanged where nothing was travelled.
+
+    Args:
+        value: The value before.
+        travelled: Distance, m; its sign does not matter.
+        noise: A standard normal number.
+        params: The process.
+
+    Source: Gillespie 1996, Exact numerical simulation of the Ornstein-Uhlenbeck process.
+    """
+    ratio = jnp.abs(travelled) / params.length
+    # expm1, because 1 - exp(-x) has few digits left at a step of 0.2 m in 30 m.
+    return jnp.exp(-ratio) * value + params.sigma * jnp.sqrt(-jnp.expm1(-2.0 * ratio)) * noise

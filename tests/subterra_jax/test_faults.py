@@ -1,0 +1,112 @@
+"""Faults: none at severity 0, and each as often and as bad as its params say."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import faults
+
+N, BEAMS = 4000, 16
+ZERO = faults.FaultParams(
+    dropout_rate=0.0, dust_rate=0.0, freeze_rate=0.0, delay=0.0, wet_share=0.0, severity_low=4, severity_high=4
+)
+
+
+def begun(params, n=N):
+    draw, seed = jax.random.uniform(jax.random.key(0), (n,)), jax.random.bits(jax.random.key(1), (n,))
+    return jax.vmap(faults.start_faults, (0, 0, None, None))(draw, seed, jnp.zeros(6), params)
+
+
+def run(params, steps, n=N):
+    """States after each step, with the time as row of `seen`."""
+    advance = jax.jit(jax.vmap(faults.advance_faults, (0, None, 0, None, None)), static_argnums=3)
+    state, kept = begun(params, n), []
+    for k in range(steps):
+        draw = jax.random.uniform(jax.random.key(10 + k), (n, faults.n_step_noise(BEAMS)))
+        state = advance(state, jnp.full(6, k + 1.0), draw, BEAMS, params)
+        kept.append(state)
+    return kept
+
+
+def test_every_severity_is_drawn_alike():
+    severity = np.asarray(begun(faults.FaultParams()).severity)
+    counts = np.array([(severity == k).sum() for k in range(5)])
+    assert counts.sum() == N
+    assert np.abs(counts - N / 5).max() < 4 * np.sqrt(N * 0.2 * 0.8)
+
+
+def test_at_severity_0_nothing_is_spoilt():
+    params = faults.FaultParams(severity_low=0, severity_high=0)
+    state = run(params, 30)[-1]
+    draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
+    ranges = jnp.full((N, BEAMS), 3.0)
+    spoilt = jax.vmap(faults.spoil, (0, 0, 0, None, None))(ranges, state, draw, jnp.float32(30.0), params)
+    np.testing.assert_array_equal(spoilt, ranges)
+    assert not jax.vmap(faults.frozen)(state).any()
+    np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(state, params)[:, 0], 30.0)
+    np.testing.assert_array_equal(jax.vmap(faults.grip, (0, None, None))(state, jnp.float32(5.0), params), 1.0)
+
+
+def test_dust_reflects_the_stated_share_of_beams_somewhere_before_the_wall():
+    params = dataclasses.replace(ZERO, dust_rate=0.15)
+    draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
+    spoilt = jax.vmap(faults.spoil, (0, 0, 0, None, None))(
+        jnp.full((N, BEAMS), 3.0), begun(params), draw, jnp.float32(30.0), params
+    )
+    short = np.asarray(spoilt)[np.asarray(spoilt) < 3.0]
+    assert abs(short.size / spoilt.size - 0.15) < 4 * np.sqrt(0.15 * 0.85 / spoilt.size)
+    assert abs(short.mean() - 1.5) < 4 * 3.0 / np.sqrt(12 * short.size)
+
+
+def test_dropped_beams_are_one_sector_that_reports_the_largest_range():
+    params = dataclasses.replace(ZERO, dropout_rate=0.5)
+    state = run(params, 5)[-1]
+    draw = jnp.zeros(faults.n_step_noise(BEAMS))
+    spoilt = np.asarray(
+        jax.vmap(faults.spoil, (0, 0, None, None, None))(
+            jnp.full((N, BEAMS), 3.0), state, draw, jnp.float32(30.0), params
+        )
+    )
+    out = spoilt == 30.0
+    some = out.any(axis=1)
+    assert some.mean() > 0.5
+    assert (spoilt[~out] == 3.0).all()
+    # One sector: round the turn, beams change from in to out exactly once.
+    changes = (out[some] != np.roll(out[some], 1, axis=1)).sum(axis=1)
+    assert (changes == 2).all()
+    assert out[some].sum(axis=1).max() <= 12
+
+
+def test_observations_are_as_late_as_the_severity_says():
+    params = dataclasses.replace(ZERO, delay=4.0)
+    state = run(params, 8, n=3)[-1]
+    np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(state, params)[:, 0], 4.0)
+    milder = dataclasses.replace(state, severity=jnp.full(3, 2.0))
+    np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(milder, params)[:, 0], 6.0)
+
+
+def test_wet_rail_takes_the_stated_share_of_the_speed_in_whole_patches():
+    params = dataclasses.replace(ZERO, wet_share=0.3)
+    state = jax.tree.map(lambda leaf: leaf[0], begun(params))
+    grip = np.asarray(jax.vmap(faults.grip, (None, 0, None))(state, jnp.arange(0.0, 20_000.0, 2.5), params))
+    assert set(np.unique(grip)) == {np.float32(0.7), np.float32(1.0)}
+    patches = grip.reshape(-1, 4)
+    assert (patches == patches[:, :1]).all()
+    assert abs((patches[:, 0] < 1.0).mean() - 0.3) < 4 * np.sqrt(0.3 * 0.7 / len(patches))
+
+
+def test_a_frozen_odometer_loses_what_is_driven_meanwhile():
+    always = dataclasses.replace(ZERO, freeze_rate=1.0, freeze_steps=1000.0)
+    env, params = st.make("Subterra/FaultedShort-v0", faults=always)
+    _, state = jax.jit(env.reset)(jax.random.key(0), params)
+    step, readings = jax.jit(env.step), []
+    for k in range(6):
+        obs, state, *_ = step(jax.random.key(k), state, jnp.array([1.0, 0.0]), params)
+        readings.append(float(obs[16]))
+    assert readings[0] != 0.0
+    assert len(set(readings[1:])) == 1
+    assert float(state.station) == pytest.approx(0.6, abs=0.1)

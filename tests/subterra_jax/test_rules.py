@@ -1,0 +1,188 @@
+"""The rules of T1 to T5: what counts as success, what ends an episode, what is drawn anew."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.odometry import OdometryParams
+from subterra_jax.slip import SlipParams
+from subterra_jax.state import GoalParams, StartParams
+from subterra_jax.wander import WanderParams
+
+EXACT = {
+    "slip": SlipParams(0.0, 0.0, WanderParams(0.0)),
+    "odometry": OdometryParams(0.0, 0.0, 0.0, 0.0, WanderParams(0.0)),
+}
+CENTRED = StartParams(lateral=0.0, heading=0.0)
+_compiled = {}
+
+
+def drive(env, params, commands, key=0):
+    """Step through commands until the episode ends; the infos and the flags of the last step."""
+    name = (env, jax.tree.structure(params))
+    reset, step = _compiled.setdefault(name, (jax.jit(env.reset), jax.jit(env.step)))
+    obs, state = reset(jax.random.key(key), params)
+    infos = []
+    for k, command in enumerate(commands):
+        action = jnp.zeros(env.action_size).at[: len(command)].set(jnp.array(command))
+        obs, state, reward, terminated, truncated, info = step(jax.random.key(k), state, action, params)
+        infos.append({**jax.tree.map(np.asarray, info), "reward": float(reward)})
+        if terminated or truncated:
+            break
+    return obs, state, infos, bool(terminated), bool(truncated)
+
+
+def straight(id, **overrides):
+    """A task on a straight piece, with exact motion and odometry."""
+    return st.make(id, tunnel=st.Tunnel.from_plan(st.load_tunnel().slice(0.0, 65.0), "smooth"), **EXACT, **overrides)
+
+
+def to(distance):
+    """Commands that drive a distance at 1 m/s and then stand."""
+    return [(1.0, 0.0)] * round(distance * 10) + [(0.0, 0.0)] * 12
+
+
+@pytest.mark.parametrize(("offset", "expected"), [(0.0, True), (0.4, True), (0.7, False)])
+def test_a_stop_ends_the_episode_and_succeeds_within_the_tolerance(offset, expected):
+    env, params = straight("Subterra/StopAtShort-v0", goal=GoalParams(12.0, 12.0, tolerance=0.5), start=CENTRED)
+    _, _, infos, terminated, truncated = drive(env, params, to(12.0 + offset))
+    assert terminated
+    assert not truncated
+    assert bool(infos[-1]["stopped"])
+    assert bool(infos[-1]["success"]) is expected
+    assert float(infos[-1]["goal_error"]) == pytest.approx(offset, abs=0.15)
+    # Ten steps below 0.05 m/s are a stop, and not one fewer.
+    assert len(infos) == round((12.0 + offset) * 10) + 10
+    assert not any(info["stopped"] for info in infos[:-1])
+
+
+def test_standing_still_at_once_is_a_failure():
+    env, params = straight("Subterra/StopAtShort-v0", start=CENTRED)
+    _, _, infos, terminated, _ = drive(env, params, [(0.0, 0.0)] * 20)
+    assert terminated
+    assert len(infos) == 10
+    assert not infos[-1]["success"]
+
+
+def test_the_reward_is_the_sum_of_its_terms_and_pays_most_for_a_hit():
+    env, params = straight("Subterra/StopAtShort-v0", goal=GoalParams(12.0, 12.0, tolerance=0.5), start=CENTRED)
+    _, _, infos, *_ = drive(env, params, to(12.0))
+    for info in infos:
+        terms = [float(value) for name, value in info.items() if name.startswith("reward_")]
+        assert info["reward"] == pytest.approx(sum(terms), abs=1e-5)
+    assert infos[-1]["reward"] > 6.0
+    progress = sum(float(info["reward_progress"]) for info in infos)
+    assert progress == pytest.approx(0.05 * 12.0, abs=0.02)
+
+
+def test_the_goal_is_observed_and_differs_from_episode_to_episode():
+    env, params = st.make("Subterra/StopAtShort-v0")
+    obs, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 300), params)
+    goal = np.asarray(obs)[:, env.fields(params)["goal"]][:, 0]
+    np.testing.assert_array_equal(goal, state.goal.station)
+    assert 10.0 <= goal.min() < 12.0
+    assert 58.0 < goal.max() <= 60.0
+    pitch = np.asarray(obs)[:, env.fields(params)["ring_pitch"]]
+    assert (pitch == float(params.tunnel.ring_pitch)).all()
+    assert 1.0 < pitch[0, 0] < 2.0
+
+
+def test_a_hidden_offset_of_the_start_is_not_in_the_odometry():
+    env, params = st.make("Subterra/StopAtOffsetShort-v0")
+    obs, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 2000), params)
+    station = np.asarray(state.station, np.float64)
+    assert abs(station.mean() - 9.0) < 3 * 3.0 / np.sqrt(2000)
+    assert abs(station.std() - 3.0) < 0.2
+    assert station.min() >= 0.0
+    assert (np.asarray(obs)[:, env.fields(params)["odometry"]] == 0.0).all()
+
+
+def test_coming_back_counts_only_after_the_flag():
+    env, params = straight("Subterra/ReturnShort-v0", goal=GoalParams(12.0, 12.0), start=StartParams(5.0, 0.0, 0.0))
+    turn = [(0.0, 1.5)] * 20 + [(0.0, (np.pi - 3.0) * 10)]
+    out, back = [(1.0, 0.0)] * 60, [(1.0, 0.0)] * 60
+    _, _, infos, terminated, _ = drive(env, params, out + turn + back + [(0.0, 0.0)] * 12)
+    flags = [bool(info["flag"]) for info in infos]
+    assert flags.index(True) == 50 - 1 or flags.index(True) == 50
+    assert all(flags[flags.index(True) :])
+    assert terminated
+    assert infos[-1]["success"], infos[-1]
+    # Stopping at the start without having been there is none.
+    _, _, infos, *_ = drive(env, params, [(0.0, 0.0)] * 12)
+    assert abs(float(infos[-1]["goal_error"])) < 0.1
+    assert not infos[-1]["success"]
+
+
+def test_a_report_must_be_right_in_place_and_in_direction():
+    env, params = st.make("Subterra/RelocaliseShort-v0", **EXACT)
+    _, state = jax.jit(env.reset)(jax.random.key(4), params)
+    station, tangent = float(state.station), np.asarray(params.tunnel.grid)[0, 2:4]
+    facing = 1.0 if np.cos(state.heading) * tangent[0] + np.sin(state.heading) * tangent[1] > 0 else -1.0
+    for estimate, direction, expected in (
+        (station, facing, True),
+        (station + 2, facing, False),
+        (station, -facing, False),
+    ):
+        _, _, infos, terminated, _ = drive(env, params, [(0.0, 0.0, estimate, 0.0, direction)] * 12, key=4)
+        assert terminated
+        assert bool(infos[-1]["success"]) is expected
+    assert float(infos[-1]["estimate_error"]) == pytest.approx(0.0, abs=1e-4)
+
+
+def test_relocalisation_begins_anywhere_and_either_way():
+    env, params = st.make("Subterra/Relocalise-v0")
+    _, state = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 1000), params)
+    station = np.asarray(state.station)
+    length = float(params.tunnel.length)
+    assert station.min() >= 5.0
+    assert station.max() <= length - 5.0
+    assert np.abs(np.histogram(station, 5, (5.0, length - 5.0))[0] - 200).max() < 60
+    forward = np.asarray(jax.vmap(env.privileged, (0, None))(state, params)["heading_cos"]) > 0
+    assert abs(forward.mean() - 0.5) < 0.06
+
+
+def test_driving_too_far_without_a_report_is_a_failure():
+    env, params = st.make(
+        "Subterra/RelocaliseShort-v0", **EXACT, goal=GoalParams(travel_max=0.5), start=StartParams(heading=0.0)
+    )
+    _, _, infos, terminated, truncated = drive(env, params, [(1.0, 0.0, 10.0, 0.0, 1.0)] * 10)
+    assert terminated
+    assert not truncated
+    assert len(infos) in (5, 6)
+    assert not infos[-1]["success"]
+    assert float(infos[-1]["reward_crash"]) == -1.0
+
+
+def test_an_estimate_is_scored_and_moves_nothing():
+    plain, params = st.make("Subterra/StopAtShort-v0")
+    judged, _ = st.make("Subterra/StopAtShort-v0", estimates=True)
+    _, a, _, *_ = drive(plain, params, [(1.0, 0.1)] * 3)
+    _, b, infos, *_ = drive(judged, params, [(1.0, 0.1, 7.0, -1.0)] * 3)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert float(infos[-1]["estimate_error"]) == pytest.approx(7.0 - float(b.station), abs=1e-5)
+    assert float(infos[-1]["estimate_log_sigma"]) == -1.0
+
+
+def test_privileged_state_tells_what_observations_do_not():
+    env, params = st.make("Subterra/StopAtShort-v0")
+    _, state = jax.jit(env.reset)(jax.random.key(0), params)
+    known = env.privileged(state, params)
+    assert float(known["to_goal"]) == pytest.approx(float(state.goal.station - state.station))
+    assert float(known["heading_cos"]) == pytest.approx(1.0, abs=0.01)
+    assert {"slip", "yaw_slip", "distance_bias"} <= set(known)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"goal": None}, "goal must be GoalParams"),
+        ({"reward": st.reward.RewardParams()}, "reward must be GoalRewardParams"),
+        ({"tunnel": st.Tunnel.from_plan(st.load_tunnel().slice(0.0, 12.0), "smooth")}, "needs a tunnel of 15 m"),
+    ],
+)
+def test_a_task_that_cannot_be_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        st.make("Subterra/StopAtShort-v0", **arguments)

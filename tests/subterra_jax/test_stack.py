@@ -1,0 +1,161 @@
+"""Several tunnels in one: each behaves as it does alone, whichever others are beside it."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import fused, lidar, reference, vehicle
+from subterra_jax.tunnel import Tunnel, foot, node_at
+from tests.subterra_jax import tunnels
+
+PARAMS = lidar.LidarParams()
+
+
+@pytest.fixture(scope="module")
+def plans(plan_of) -> list[st.TunnelPlan]:
+    """Four tunnels that differ in length, width, bends, lining and ring pitch, the third shorter than a window."""
+    packaged = st.load_tunnel()
+    return [
+        packaged.slice(100.0, 90.0),
+        plan_of(tunnels.tunnel_arrays(tunnels.s_bend(150.0, 60.0), half_width=2.6)),
+        plan_of(tunnels.tunnel_arrays(tunnels.straight(24.0), half_width=3.0)),
+        packaged.slice(200.0, 60.0),
+    ]
+
+
+@pytest.fixture(scope="module")
+def alone(plans) -> list[Tunnel]:
+    linings = ("pockets", "pockets", "smooth", "furnished")
+    return [Tunnel.from_plan(plan, lining) for plan, lining in zip(plans, linings, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def together(alone) -> Tunnel:
+    return Tunnel.stack(alone)
+
+
+@jax.jit
+def look(tunnel: Tunnel, index, position, heading, station):
+    """Scan, clearance and foot of many poses, each in the tunnel that it names."""
+
+    def one(index, position, heading, station):
+        mine = tunnel.pick(index)
+        return (
+            lidar.scan(mine, position, heading, station, PARAMS),
+            vehicle.clearance(mine, position, station),
+            foot(mine, position, station),
+            mine.length,
+            mine.ring_pitch,
+        )
+
+    return jax.vmap(one)(index, position, heading, station)
+
+
+def poses_in(plans, n: int) -> list[reference.Poses]:
+    rng = np.random.default_rng(0)
+    return [
+        reference.Poses(
+            *(np.concatenate(pair) for pair in zip(vars(inner).values(), vars(outer).values(), strict=True))
+        )
+        for inner, outer in (
+            (reference.random_poses(p, n, rng), reference.random_poses(p, n // 4, rng, near_mouths=True)) for p in plans
+        )
+    ]
+
+
+def assert_same(one, other) -> None:
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_stack_gives_bit_for_bit_what_each_tunnel_gives_alone(plans, alone, together):
+    for i, (tunnel, poses) in enumerate(zip(alone, poses_in(plans, 400), strict=True)):
+        own = look(tunnel, jnp.zeros(len(poses.station), jnp.int32), *vars(poses).values())
+        index = jnp.full(len(poses.station), i)
+        assert_same(own, look(together, index, *vars(poses).values()))
+
+
+def test_a_batch_may_mix_the_tunnels_of_a_stack(plans, alone, together):
+    several = poses_in(plans, 400)
+    n = len(several[0].station)
+    mixed = [
+        np.stack(part, axis=1).reshape(n * len(plans), *part[0].shape[1:])
+        for part in zip(*(vars(poses).values() for poses in several), strict=True)
+    ]
+    seen = look(together, jnp.tile(jnp.arange(len(plans)), n), *mixed)
+    for i, (tunnel, poses) in enumerate(zip(alone, several, strict=True)):
+        own = look(tunnel, jnp.zeros(n, jnp.int32), *vars(poses).values())
+        assert_same(own, jax.tree.map(lambda leaf, i=i: leaf[i :: len(plans)], seen))
+
+
+def test_each_tunnel_of_a_stack_agrees_with_its_own_walls(plans, together):
+    linings = ("pockets", "pockets", "smooth", "furnished")
+    for i, (plan, lining, poses) in enumerate(zip(plans, linings, poses_in(plans, 400), strict=True)):
+        ranges = look(together, jnp.full(len(poses.station), i), *vars(poses).values())[0]
+        result = reference.agreement(plan.lining(lining).segments, poses, np.asarray(ranges))
+        assert result.n_wrong == 0
+        assert result.max_error < 1e-3
+
+
+def test_no_window_reaches_the_neighbour(alone, together):
+    ends = np.cumsum([t.grid.shape[0] for t in alone])
+    padding = np.flatnonzero(np.asarray(together.box)[4] < 0.0)
+    window = 1 << (together.n_scan - 1).bit_length()
+    for first, last in zip(np.r_[0, ends[:-1]], ends, strict=True):
+        starts = np.asarray(together.scan_first)[first:last]
+        seen = np.setdiff1d(np.arange(starts.min(), starts.max() + window), padding)
+        assert seen.max() - seen.min() == len(seen) - 1
+
+
+def test_the_fused_kernels_see_each_tunnel_of_a_stack(plans, alone):
+    poses = [reference.Poses(*(v[:24] for v in vars(p).values())) for p in poses_in(plans[:2], 30)]
+    stacked = Tunnel.stack(alone[:2])
+    position, heading, station = (np.concatenate(part) for part in zip(*(vars(p).values() for p in poses), strict=True))
+    index, rows = np.repeat([0, 1], 24), (jnp.asarray(position), jnp.asarray(heading))
+    first = jax.vmap(lambda i, s: stacked.scan_first[node_at(stacked.pick(i), s)])(index, station)
+    ranges = fused.scan(stacked.walls, *rows, first, jnp.ones(48, bool), jnp.float32(30.0), lidar.bearings(16))
+    truth = look(stacked, index, position, heading, station)[0]
+    np.testing.assert_allclose(ranges, truth, atol=1e-4)
+
+
+def test_a_batch_of_different_tunnels_and_lidars_goes_to_the_kernels_as_rows(plans, together, monkeypatch):
+    """Otherwise it would fall back to XLA on a GPU, which is several times slower there."""
+    poses, index = poses_in(plans, 8)[0], jnp.arange(8) % 2 * 3
+    params = lidar.LidarParams(range_max=jnp.linspace(5.0, 30.0, 8), range_sigma=jnp.linspace(0.0, 0.1, 8))
+
+    def scans() -> jax.Array:
+        one = lambda i, p, h, s, lidar_params: lidar.scan(together.pick(i), p, h, s, lidar_params)  # noqa: E731
+        rows = (jnp.asarray(value[:8]) for value in vars(poses).values())
+        return jax.vmap(one)(index, *rows, params)
+
+    by_xla, kernel, calls = scans(), lidar._cast_rows, []
+    monkeypatch.setattr(lidar, "_cast_rows", lambda *args: calls.append(args) or kernel(*args))
+    monkeypatch.setattr(lidar, "skips_unwanted", lambda params: True)
+    np.testing.assert_allclose(scans(), by_xla, atol=1e-5)
+    assert [call[1].shape for call in calls] == [(8, 2)]
+
+
+def test_a_stack_of_one_is_that_one_and_picks_itself(alone):
+    assert Tunnel.stack(alone[:1]) is alone[0]
+    assert alone[0].pick(0) is alone[0]
+    assert (alone[0].count, Tunnel.stack(alone[:3]).count) == (1, 3)
+
+
+def test_an_empty_stack_and_a_stack_of_stacks_are_refused(alone, together):
+    with pytest.raises(ValueError, match="at least one"):
+        Tunnel.stack([])
+    with pytest.raises(ValueError, match="tunnel 1 is a stack of 4"):
+        Tunnel.stack([alone[0], together])
+
+
+def test_padding_is_never_taken_for_a_wall(plan_of):
+    """A beam at exactly 45° from a point with x = y looks straight at where padding is."""
+    tunnel = Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.straight(6.0))), "smooth")
+    ranges = jax.jit(partial(lidar.scan, params=PARAMS))(
+        tunnel, jnp.array([2.0, 2.0]), jnp.float32(0.0), jnp.float32(2.0)
+    )
+    assert float(ranges[2]) == pytest.approx(0.825 * 2**0.5, abs=1e-5)
