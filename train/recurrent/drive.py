@@ -1,0 +1,162 @@
+"""Driving every environment for one unroll with memory, and what is kept of it."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from train.recurrent import senses
+from train.recurrent.network import RecurrentNetworks, Weights
+
+
+@struct.dataclass
+class Drive:
+    """Where the environments are between two unrolls."""
+
+    env_state: Any
+    observation: Float[Array, "env obs"]
+    reckoning: senses.Reckoning
+    hidden: Float[Array, "env hidden"]
+    first: Bool[Array, "env"]
+
+
+@struct.dataclass
+class Rollout:
+    """One unroll as it is stored, `(time, env, …)`.
+
+    Attributes:
+        features: Inputs of the network.
+        first: The episode begins with this step.
+        ahead: Goal less reckoned distance, m.
+        error: True less reckoned distance, m: what the estimation head is to learn.
+        phase: Sine and cosine of the true place between two rings.
+        truth: Inputs of the critic.
+        raw_action: The draw before the tanh.
+        log_prob: Its log density when it was drawn.
+        reward: As the environment paid it.
+        terminated: The episode ended for good.
+        truncated: The episode ended by the clock.
+    """
+
+    features: Float[Array, "time env n"]
+    first: Bool[Array, "time env"]
+    ahead: Float[Array, "time env"]
+    error: Float[Array, "time env"]
+    phase: Float[Array, "time env 2"]
+    truth: Float[Array, "time env n"]
+    raw_action: Float[Array, "time env action"]
+    log_prob: Float[Array, "time env"]
+    reward: Float[Array, "time env"]
+    terminated: Bool[Array, "time env"]
+    truncated: Bool[Array, "time env"]
+
+
+@struct.dataclass
+class View:
+    """An observation with what was made of it."""
+
+    features: Float[Array, "env n"]
+    ahead: Float[Array, "env"]
+    reckoned: Float[Array, "env"]
+    pitch: Float[Array, "env"]
+
+
+def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> View:
+    """The inputs of the network for a batch of observations."""
+    part = {name: observation[..., where] for name, where in env.fields(params).items()}
+    goal, pitch = part["goal"][..., 0] - params.start.station, part["ring_pitch"][..., 0]
+    reckoned = senses.fused(reckoning, part["odometry"][..., 0])
+    features = senses.features(part["ranges"], part["odometry"], goal, pitch, reckoning)
+    return View(features, goal - reckoned, reckoned, pitch)
+
+
+def truth(env: Any, params: Any, state: Any, view: View, error: Float[Array, "env"]) -> Float[Array, "env n"]:
+    """What the critic is shown: the true state, and how wrong the agent's estimate of it is.
+
+    Args:
+        env: The environment.
+        params: Its params.
+        state: Batched state.
+        view: What the agent sees.
+        error: The agent's own estimate of true less reckoned distance, m.
+    """
+    known = jax.vmap(env.privileged, (0, None))(state, params)
+    ahead = known["to_goal"]
+    wrong = view.reckoned + params.start.station + error - known["station"]
+    parts = [
+        known["offset"],
+        known["heading_sin"],
+        known["heading_cos"],
+        jnp.tanh(ahead),
+        jnp.tanh(ahead / 10.0),
+        ahead / 100.0,
+        jnp.tanh(wrong),
+        wrong / 5.0,
+        10.0 * known["slip"],
+        state.goal.still / 10.0,
+        *jnp.moveaxis(state.command, -1, 0),
+    ]
+    return jnp.stack(parts, axis=-1)
+
+
+def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, hidden: int) -> Drive:
+    """Every environment at the start of an episode."""
+    observation, state = env.reset(key, params, n_envs)
+    return Drive(state, observation, senses.start((n_envs,)), jnp.zeros((n_envs, hidden)), jnp.ones(n_envs, bool))
+
+
+def collect(
+    env: Any,
+    params: Any,
+    networks: RecurrentNetworks,
+    weights: dict[str, Weights],
+    drive: Drive,
+    key: PRNGKeyArray,
+    n_steps: int,
+) -> tuple[Drive, Rollout, dict[str, Float[Array, ""]]]:
+    """Drives `n_steps` control periods with the sampled policy.
+
+    Returns:
+        Where the environments are afterwards, the stored unroll, and sums over its finished episodes and steps.
+    """
+
+    def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, dict[str, Array]]]:
+        key_action, key_env = jax.random.split(key_now)
+        view = look(env.env, params, now.observation, now.reckoning)
+        hidden, _ = networks.remember(weights, view.features[None], now.hidden, now.first[None])
+        thought = networks.think(weights, hidden, view.ahead)
+        raw = networks.distribution.sample_no_postprocessing(thought.parameters, key_action)
+        action = networks.action(raw)
+        observation, state, reward, terminated, truncated, info = env.step(key_env, now.env_state, action, params)
+        done = terminated | truncated
+        station = now.env_state.station - params.start.station
+        angle = 2.0 * jnp.pi * station / jnp.maximum(view.pitch, 0.5)
+        stored = Rollout(
+            features=view.features,
+            first=now.first,
+            ahead=view.ahead,
+            error=station - view.reckoned,
+            phase=jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1),
+            truth=truth(env.env, params, now.env_state, view, thought.error),
+            raw_action=raw,
+            log_prob=networks.distribution.log_prob(thought.parameters, raw),
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+        )
+        sums = {
+            "episodes": jnp.sum(done),
+            "successes": jnp.sum(done & info["success"]),
+            "contacts": jnp.sum(done & info["contact"]),
+            "steps": jnp.float32(done.shape[0]),
+            "estimate_error": jnp.sum(jnp.abs(stored.error - thought.error)),
+            "reckoning_error": jnp.sum(jnp.abs(stored.error)),
+            **{name: jnp.sum(value) for name, value in info.items() if name.startswith("reward_")},
+        }
+        after = Drive(state, observation, senses.advance(now.reckoning, action, done), hidden, done)
+        return after, (stored, sums)
+
+    after, (stored, sums) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
+    return after, stored, jax.tree.map(jnp.sum, sums)

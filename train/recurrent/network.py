@@ -1,0 +1,168 @@
+"""A GRU with three heads (what to do, where one is, which part of a ring one is at) and a critic that sees the truth."""
+
+import dataclasses
+import math
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from train.brax_parts import MLP, NormalTanhDistribution
+
+Weights = Any
+
+
+@dataclasses.dataclass(frozen=True)
+class RecurrentLayout:
+    """What fixes every array shape and the meaning of the outputs; a checkpoint carries it.
+
+    Attributes:
+        n_features: Inputs of the network.
+        n_truth: Inputs of the critic.
+        action_low: Smallest action, m/s and rad/s.
+        action_high: Largest action, m/s and rad/s.
+        hidden: Width of the GRU and of the layers around it.
+        bins: Bins of the estimation head.
+        bin_width: Their width, m.
+        init_std: Standard deviation of the untrained policy before the tanh.
+        min_std: Its floor.
+    """
+
+    n_features: int
+    n_truth: int
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    hidden: int
+    bins: int
+    bin_width: float
+    init_std: float
+    min_std: float
+
+
+class Memory(nn.Module):
+    """A dense layer and a GRU over time; the hidden state is cleared where an episode begins."""
+
+    hidden: int
+
+    @nn.compact
+    def __call__(
+        self,
+        features: Float[Array, "time env n"],
+        state: Float[Array, "env hidden"],
+        first: Bool[Array, "time env"],
+    ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
+        """Last hidden state, and that of every step."""
+        encoded = nn.swish(nn.Dense(self.hidden)(features))
+        # All that does not wait for the state before is done for the whole sequence at once.
+        gates = nn.Dense(3 * self.hidden)(encoded)
+        weight = self.param("recurrent", nn.initializers.orthogonal(), (self.hidden, 3 * self.hidden))
+
+        def step(before: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+            gate, begins = now
+            before = jnp.where(begins[:, None], 0.0, before)
+            given, kept = jnp.split(gate, 3, axis=-1), jnp.split(before @ weight, 3, axis=-1)
+            reset, update = nn.sigmoid(given[0] + kept[0]), nn.sigmoid(given[1] + kept[1] + 1.0)
+            fresh = jnp.tanh(given[2] + reset * kept[2])
+            after = update * before + (1.0 - update) * fresh
+            return after, after
+
+        return jax.lax.scan(step, state, (gates, first))
+
+
+@dataclasses.dataclass(frozen=True)
+class Thought:
+    """What the network makes of a step.
+
+    Attributes:
+        parameters: Of the action distribution, before the tanh.
+        logits: Of the bins of true less reckoned distance.
+        phase: Sine and cosine of the place between two rings.
+        error: Expected true less reckoned distance, m.
+        log_sigma: Log of its standard deviation, m.
+    """
+
+    parameters: Float[Array, "*batch p"]
+    logits: Float[Array, "*batch bins"]
+    phase: Float[Array, "*batch 2"]
+    error: Float[Array, "*batch"]
+    log_sigma: Float[Array, "*batch"]
+
+
+class RecurrentNetworks:
+    """The network of a layout; its weights are `memory`, `estimate`, `phase`, `policy` and `critic`."""
+
+    def __init__(self, layout: RecurrentLayout) -> None:
+        self.layout = layout
+        n_action = len(layout.action_low)
+        self.n_action = n_action
+        self.distribution = NormalTanhDistribution(n_action, min_std=layout.min_std)
+        self._memory, self._estimate, self._phase = Memory(layout.hidden), nn.Dense(layout.bins), nn.Dense(2)
+        self._policy = MLP(
+            layer_sizes=(layout.hidden, self.distribution.param_size),
+            activation=jax.nn.swish,
+            output_kernel_init=jax.nn.initializers.variance_scaling(1e-4, "fan_in", "uniform"),
+        )
+        self._critic = MLP(layer_sizes=(layout.hidden, layout.hidden, 1), activation=jax.nn.swish)
+        self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
+        spread = math.log(math.expm1(layout.init_std - layout.min_std))
+        self._offset = jnp.concatenate([jnp.zeros(n_action), jnp.full(n_action, spread)])
+        self.centres = (jnp.arange(layout.bins) - 0.5 * (layout.bins - 1)) * layout.bin_width
+
+    def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
+        """Untrained weights."""
+        keys = jax.random.split(key, 5)
+        layout = self.layout
+        hidden = jnp.zeros((1, 1, layout.hidden))
+        features = jnp.zeros((1, 1, layout.n_features))
+        return {
+            "memory": self._memory.init(keys[0], features, hidden[0], jnp.zeros((1, 1), bool)),
+            "estimate": self._estimate.init(keys[1], hidden),
+            "phase": self._phase.init(keys[2], hidden),
+            "policy": self._policy.init(keys[3], jnp.zeros((1, layout.hidden + _N_AIM))),
+            "critic": self._critic.init(keys[4], jnp.zeros((1, layout.n_truth))),
+        }
+
+    def remember(
+        self, weights: dict[str, Weights], features: Array, state: Array, first: Array
+    ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
+        """Hidden states over time."""
+        return self._memory.apply(weights["memory"], features, state, first)
+
+    def think(
+        self, weights: dict[str, Weights], hidden: Float[Array, "*batch hidden"], ahead: Float[Array, "*batch"]
+    ) -> Thought:
+        """The heads.
+
+        Args:
+            weights: Weights.
+            hidden: Hidden states.
+            ahead: Goal less reckoned distance, m.
+        """
+        logits = self._estimate.apply(weights["estimate"], hidden)
+        share = jax.nn.softmax(logits)
+        error = jnp.sum(share * self.centres, axis=-1)
+        spread = jnp.sum(share * jnp.square(self.centres - error[..., None]), axis=-1)
+        log_sigma = 0.5 * jnp.log(spread + self.layout.bin_width**2 / 12.0)
+        # The policy aims with the estimate but must not bend it to its own ends.
+        aim = _aim(jax.lax.stop_gradient(ahead - error), jax.lax.stop_gradient(log_sigma))
+        parameters = self._policy.apply(weights["policy"], jnp.concatenate([hidden, aim], axis=-1)) + self._offset
+        return Thought(parameters, logits, self._phase.apply(weights["phase"], hidden), error, log_sigma)
+
+    def value(self, weights: dict[str, Weights], truth: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+        """Expected return, in units of the reward scale."""
+        return self._critic.apply(weights["critic"], truth)[..., 0]
+
+    def action(self, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
+        """The action in m/s and rad/s that belongs to a draw of the Gaussian."""
+        return self._low + 0.5 * (jnp.tanh(raw) + 1.0) * (self._high - self._low)
+
+
+_N_AIM = 5
+
+
+def _aim(ahead: Float[Array, "*batch"], log_sigma: Float[Array, "*batch"]) -> Float[Array, "*batch 5"]:
+    """The way to go at several scales, from the last decimetres on."""
+    scaled = [jnp.tanh(ahead / scale) for scale in (0.5, 2.0, 10.0)]
+    return jnp.stack([*scaled, jnp.clip(ahead / 100.0, -1.0, 4.0), log_sigma], axis=-1)
