@@ -1,0 +1,1 @@
+"""Who else steps: each file one environment, its package optional."""

@@ -1,0 +1,183 @@
+"""The stopwatch: one `lax.scan` of steps, compiled apart, warmed, and timed again and again.
+
+Ours and every JAX peer go through the same loop. What a step returns is summed, and the observation that it leaves is
+read by the next one, so that no ray can be dropped and every observation is written to memory.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+Carry = tuple[Any, Any]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A batch of environments under random actions.
+
+    Attributes:
+        reset: Key and params to observations and state.
+        step: Key, observations and state, and params, to new observations and state, a scalar that depends on
+            everything else the step returned, and the share of environments whose episode ended.
+        params: What the step reads and does not change; an argument of the compiled program, not a constant in it.
+    """
+
+    reset: Callable[[PRNGKeyArray, Any], Carry]
+    step: Callable[[PRNGKeyArray, Carry, Any], tuple[Carry, Float[Array, ""], Float[Array, ""]]]
+    params: Any = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long to look.
+
+    Attributes:
+        steps: Steps in one call.
+        repeats: Timed calls.
+        seconds: Time that all of them may take, s; where they would take longer, a call has fewer steps.
+        seed: Of resets and steps.
+    """
+
+    steps: int = 100
+    repeats: int = 20
+    seconds: float = 30.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What was measured at one batch size.
+
+    Attributes:
+        n_envs: Environments in the batch.
+        steps: Steps in one call.
+        compile_seconds: To trace and compile the call, s; part of nothing else.
+        steps_per_second: Environment steps per second of each timed call.
+        share_done: Share of steps at which an episode ended.
+        checksum: Of everything that every timed step returned; the same for the same seed, device and versions.
+    """
+
+    n_envs: int
+    steps: int
+    compile_seconds: float
+    steps_per_second: list[float]
+    share_done: float
+    checksum: float
+
+    @property
+    def quartiles(self) -> tuple[float, float, float]:
+        """Lower quartile, median and upper quartile of the steps per second."""
+        lower, median, upper = np.percentile(self.steps_per_second, [25, 50, 75])
+        return float(lower), float(median), float(upper)
+
+
+@dataclass
+class Program:
+    """A compiled call and what its timed calls have given so far.
+
+    Attributes:
+        n_envs: Environments in the batch.
+        steps: Steps in one call.
+        compile_seconds: To trace and compile it, s.
+        restart: Begin every call at the same state, in place of where the last one ended.
+        totals: Of each timed call, what its steps returned, summed.
+    """
+
+    n_envs: int
+    steps: int
+    compile_seconds: float
+    restart: bool
+    _call: Callable[..., Any]
+    _params: Any
+    _carry: Carry
+    _rates: list[float] = field(default_factory=list)
+    _done: list[float] = field(default_factory=list)
+    totals: list[float] = field(default_factory=list)
+
+    def call(self, key: PRNGKeyArray, keep: bool = True) -> float:
+        """Runs one call and returns its time, s.
+
+        Raises:
+            FloatingPointError: An observation or a reward was not finite.
+        """
+        started = perf_counter()
+        carry, total, done = jax.block_until_ready(self._call(key, self._carry, self._params))
+        elapsed = perf_counter() - started
+        if not np.isfinite(float(total)):
+            raise FloatingPointError(f"observations or rewards stopped being finite at n_envs={self.n_envs}")
+        if not self.restart:
+            self._carry = carry
+        if keep:
+            self._rates.append(self.n_envs * self.steps / elapsed)
+            self._done.append(float(done))
+            self.totals.append(float(total))
+        return elapsed
+
+    def speed(self) -> Speed:
+        """What its calls have given."""
+        share, total = float(np.mean(self._done)), float(np.sum(self.totals))
+        return Speed(self.n_envs, self.steps, self.compile_seconds, list(self._rates), share, total)
+
+
+def measure(loop: Loop, n_envs: int, timing: Timing) -> Speed:
+    """Times one loop."""
+    return measure_in_turn([loop], n_envs, timing)[0]
+
+
+def measure_in_turn(loops: Sequence[Loop], n_envs: int, timing: Timing, restart: bool = False) -> list[Speed]:
+    """Times loops call by call in turn, so that a machine that slows down slows them all.
+
+    Args:
+        loops: What to time.
+        n_envs: Environments in their batches.
+        timing: How long to look.
+        restart: Begin every call at the state after the reset.
+    """
+    programs = [prepare(loop, n_envs, timing, restart) for loop in loops]
+    for key in jax.random.split(jax.random.key(timing.seed + 1), timing.repeats):
+        for program in programs:
+            program.call(key)
+    return [program.speed() for program in programs]
+
+
+def prepare(loop: Loop, n_envs: int, timing: Timing, restart: bool = False) -> Program:
+    """Compiles a call and runs it once; with fewer steps where the calls would take longer than they may."""
+    carry = jax.block_until_ready(jax.jit(loop.reset)(jax.random.key(timing.seed), loop.params))
+    program = _compile(loop, n_envs, timing.steps, carry, restart)
+    elapsed = program.call(jax.random.key(timing.seed), keep=False)
+    steps = max(1, min(timing.steps, int(timing.steps * timing.seconds / (timing.repeats * elapsed))))
+    # A second compilation pays where it saves a third of the time.
+    if steps < 0.7 * timing.steps:
+        program = _compile(loop, n_envs, steps, carry, restart)
+        program.call(jax.random.key(timing.seed), keep=False)
+    return program
+
+
+def _compile(loop: Loop, n_envs: int, steps: int, carry: Carry, restart: bool) -> Program:
+    started = perf_counter()
+    call = jax.jit(_many_steps(loop, steps)).lower(jax.random.key(0), carry, loop.params).compile()
+    return Program(n_envs, steps, perf_counter() - started, restart, call, loop.params, carry)
+
+
+def _many_steps(loop: Loop, steps: int) -> Callable[..., Any]:
+    def many_steps(key: PRNGKeyArray, carry: Carry, params: Any) -> tuple[Carry, Array, Array]:
+        def one_step(carried: tuple[Carry, Array], key: PRNGKeyArray) -> tuple[tuple[Carry, Array], Array]:
+            (obs, state), total = carried
+            following, rest, done = loop.step(key, (obs, state), params)
+            return (following, total + digest(obs) + rest), done
+
+        (carry, total), done = jax.lax.scan(one_step, (carry, jnp.zeros(())), jax.random.split(key, steps))
+        return carry, total + digest(carry[0]), jnp.mean(done)
+
+    return many_steps
+
+
+def digest(tree: Any) -> Float[Array, ""]:
+    """Sum of the means of all leaves: one number that depends on every number."""
+    return sum((jnp.mean(leaf, dtype=jnp.float32) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -1,0 +1,91 @@
+"""The throughput command, at sizes that say nothing about speed."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import subterra_jax as st
+from benchmarks.throughput import __main__ as command
+from benchmarks.throughput import exactness
+from benchmarks.throughput.config import ThroughputConfig
+from benchmarks.throughput.facts import environment_facts
+from benchmarks.throughput.result import Result
+
+QUICK = ("--n", "2", "--steps", "1", "--repeats", "1", "--poses", "20", "--peers", "none")
+
+
+def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["throughput", *arguments])
+    return command.main()
+
+
+def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path):
+    size = ("--n", "8", "--steps", "4", "--repeats", "3", "--poses", "500", "--peers", "mujoco")
+    arguments = ("--task", "Subterra/TraverseShort-v0", *size, "--out", str(tmp_path / "speed"))
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.throughput", *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "speed" / "throughput.json").read_text())
+    assert result["schema"] == "subterra.throughput/2"
+    assert [speed["n_envs"] for speed in result["speed"]] == [8]
+    for speed in (*result["speed"], *result["floor"], *result["peers"][0]["speeds"]):
+        assert 0 < speed["q1"] <= speed["median"] <= speed["q3"]
+        assert len(speed["steps_per_second"]) == 3
+        assert speed["ns_per_step"] == pytest.approx(1e9 / speed["median"])
+    assert result["speed"][0]["rays_per_second"] == pytest.approx(16 * result["speed"][0]["median"])
+    assert result["exactness"]["n_rays"] == 8000
+    assert result["exactness"]["n_wrong"] == 0
+    assert result["exactness"]["max_error"] < 1e-3
+    assert result["environment"]["jax"]
+    assert result["environment"]["date"]
+    (route,) = result["peers"]
+    assert route["ratios"]["8"] == pytest.approx(result["speed"][0]["median"] / route["speeds"][0]["median"])
+    assert (tmp_path / "speed" / "throughput.png").read_bytes().startswith(b"\x89PNG")
+    assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == ["throughput.json", "throughput.png"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("--task", "Subterra/Nowhere-v0"), "Nowhere"),
+        (("--lining", "velvet"), "velvet"),
+        (("--linings", "smooth", "velvet"), "velvet"),
+        (("--tunnel", "nowhere.npz"), "nowhere.npz"),
+        (("--scene", "nowhere"), "nowhere"),
+        (("--steps", "0"), "--steps"),
+        (("--n", "0"), "0"),
+        (("--lengths", "-5"), "-5"),
+        (("--peers", "auto", "mujoco"), "auto mujoco"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_status_2(monkeypatch, capsys, arguments, named):
+    assert (
+        run_here(monkeypatch, *(a for a in QUICK if arguments[0] != "--peers" or a not in QUICK[-2:]), *arguments) == 2
+    )
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert named in line
+
+
+def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "gymnax", None)
+    assert run_here(monkeypatch, "--peers", "gymnax") == 2
+    assert "peer 'gymnax' cannot be imported" in capsys.readouterr().err
+
+
+def test_a_lidar_that_is_a_centimetre_off_fails_the_run(monkeypatch, capsys):
+    plan, true_scan = st.load_tunnel().slice(0.0, 50.0), exactness.lidar.scan
+    params = st.make("Subterra/Traverse-v0", plan)[1]
+    monkeypatch.setattr(exactness.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
+    gate = exactness.measure_exactness(plan, "pockets", params, 20, seed=0)
+    # Beams that leave through a mouth report the largest range, a centimetre more now.
+    assert gate.n_wrong == gate.n_rays == 320
+    facts = {"name": "t", "length": 50.0, "lining": "pockets"}
+    found = Result(ThroughputConfig(), environment_facts(), facts, 16, exactness=gate)
+    monkeypatch.setattr(command, "run", lambda config: found)
+    assert run_here(monkeypatch) == 1
+    output = capsys.readouterr()
+    assert "320 wrong" in output.out
+    assert "disagrees with the reference" in output.err

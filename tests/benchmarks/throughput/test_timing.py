@@ -1,0 +1,84 @@
+"""The stopwatch counts what was done, and drops nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from benchmarks.throughput.config import ThroughputConfig
+from benchmarks.throughput.measure import arithmetic_floor, environment_loop, floor_loop
+from benchmarks.throughput.timing import Loop, Timing, digest, measure, measure_in_turn, prepare
+
+
+def counting(first: float = 0.0) -> Loop:
+    """The observation counts steps; nothing else is returned."""
+    return Loop(
+        reset=lambda key, params: (jnp.full((3,), first), jnp.zeros(3)),
+        step=lambda key, carry, params: ((carry[0] + 1.0, carry[1]), jnp.zeros(()), jnp.float32(0.25)),
+    )
+
+
+def test_every_observation_is_in_the_checksum():
+    speed = measure(counting(), 3, Timing(steps=4, repeats=2))
+    # The call that warms up counts from 0 to 4, so the timed ones see 4..8 and 8..12.
+    assert speed.checksum == sum(range(4, 9)) + sum(range(8, 13))
+    assert speed.share_done == 0.25
+    assert len(speed.steps_per_second) == 2
+
+
+def test_a_call_that_restarts_sees_the_same_every_time():
+    speeds = measure_in_turn([counting(), counting(100.0)], 3, Timing(steps=4, repeats=3), restart=True)
+    assert [speed.checksum for speed in speeds] == [3 * sum(range(5)), 3 * sum(range(100, 105))]
+
+
+def test_calls_get_fewer_steps_where_they_would_take_too_long():
+    assert prepare(counting(), 3, Timing(steps=50, repeats=20, seconds=1e-9)).steps == 1
+    assert prepare(counting(), 3, Timing(steps=50, repeats=20, seconds=1e9)).steps == 50
+
+
+def test_what_is_not_finite_stops_the_run():
+    with pytest.raises(FloatingPointError, match="n_envs=3"):
+        measure(counting(np.inf), 3, Timing(steps=2, repeats=1))
+
+
+def test_one_number_of_any_observation_changes_the_digest():
+    obs = np.random.default_rng(0).uniform(0.0, 30.0, (4, 18)).astype(np.float32)
+    bumped = np.tile(obs, (72, 1, 1))
+    bumped[np.arange(72), np.arange(72) // 18, np.arange(72) % 18] += 0.05
+    assert not np.any(np.asarray(jax.vmap(digest)(bumped)) == np.asarray(digest(obs)))
+
+
+def test_the_same_seed_measures_the_same_steps():
+    env, params = st.make("Subterra/TraverseShort-v0")
+    program = prepare(environment_loop(env, params, 4), 4, Timing(steps=3), restart=True)
+    for seed in (0, 0, 1):
+        program.call(jax.random.key(seed))
+    first, again, other = program.totals
+    assert first == again
+    assert first != other
+
+
+def test_the_floor_reads_and_writes_every_leaf_and_simulates_nothing():
+    carry = (jnp.zeros((5, 18)), {"steps": jnp.zeros(5, jnp.int32), "heading": jnp.zeros(5)})
+    (obs, state), _, done = floor_loop(Loop(lambda *_: carry, counting().step)).step(jax.random.key(0), carry, None)
+    assert np.all(np.asarray(obs) != 0.0)
+    assert np.all(np.asarray(state["steps"]) != 0)
+    assert np.all(np.asarray(state["heading"]) != 0.0)
+    assert np.ptp(np.asarray(obs), axis=1).max() == 0.0
+    assert done == 0.0
+
+
+def test_the_arithmetic_floor_of_an_h200_is_that_of_96_thousand_operations_a_step():
+    assert 1e9 / arithmetic_floor("NVIDIA H200", 16) == pytest.approx(2.87, abs=0.01)
+    assert arithmetic_floor("abacus", 16) is None
+
+
+def test_sizes_are_measured_once_each_and_stop_at_4096_on_a_cpu(monkeypatch):
+    assert ThroughputConfig(n=(16, 1, 16)).sizes() == (1, 16)
+    assert ThroughputConfig().sizes() == (1, 16, 256, 1024, 4096)
+    assert ThroughputConfig().studied() == 1024
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert ThroughputConfig().sizes()[-1] == 262_144
+    assert ThroughputConfig().studied() == 65_536
+    assert ThroughputConfig(study_n=8).studied() == 8
