@@ -2,11 +2,13 @@
 
 import importlib.util
 
-from subterra_jax import batch
+from subterra_jax import batch, procedural
 from subterra_jax.batch import AutoReset, rollout
-from subterra_jax.env import TraverseEnv
+from subterra_jax.env import TunnelEnv
 from subterra_jax.errors import SubterraError, TunnelError
-from subterra_jax.plan import TunnelPlan, load_tunnel
+from subterra_jax.plan import TunnelPlan
+from subterra_jax.randomize import LogUniform, randomize
+from subterra_jax.sources import load_tunnel
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import TASKS, make
 from subterra_jax.tunnel import Tunnel
@@ -15,19 +17,22 @@ __all__ = [
     "TASKS",
     "AutoReset",
     "EnvParams",
+    "LogUniform",
     "State",
     "SubterraError",
-    "TraverseEnv",
     "Tunnel",
+    "TunnelEnv",
     "TunnelError",
     "TunnelPlan",
     "batch",
     "load_tunnel",
     "make",
+    "procedural",
+    "randomize",
     "rollout",
 ]
 
 if importlib.util.find_spec("gymnasium") is not None:
-    from subterra_jax.gym import register
+    from subterra_jax.adapters.registration import register
 
     register()

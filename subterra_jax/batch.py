@@ -83,11 +83,13 @@ class AutoReset:
         The fused kernels take all scans in one go and skip those that nobody wants, of environments that have not
         finished.
         """
-        if self.params_axes is None and lidar.skips_unwanted(params.lidar):
-            both = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), (merged, noise), (stepped, noise))
-            wanted = jnp.concatenate([jnp.ones_like(done), done])
-            observe = jax.vmap(self.env.observe, in_axes=(0, 0, None, 0))
-            obs, final = jnp.split(observe(both[0], both[1], params, wanted), 2)
+        if lidar.skips_unwanted(params.lidar):
+            twice = lambda one, other: jnp.concatenate([one, other])  # noqa: E731
+            both_states, both_noises = jax.tree.map(twice, (merged, noise), (stepped, noise))
+            both_params = self._of_batched(params, lambda leaf: twice(leaf, leaf))
+            wanted = twice(jnp.ones_like(done), done)
+            observe = jax.vmap(self.env.observe, in_axes=(0, 0, self.params_axes, 0))
+            obs, final = jnp.split(observe(both_states, both_noises, both_params, wanted), 2)
             return obs, jnp.where(done[:, None], final, obs)
         obs = self._vmap(self.env.observe, 2)(merged, noise, params)
         return obs, self._final(done, stepped, noise, params, obs)
@@ -104,12 +106,7 @@ class AutoReset:
         def few() -> Obs:
             (index,) = jnp.nonzero(done, size=n_few, fill_value=n_envs)
             rows = lambda tree: jax.tree.map(lambda leaf: jnp.take(leaf, index, axis=0, mode="clip"), tree)  # noqa: E731
-            some = jax.tree.map(
-                lambda axis, part: part if axis is None else rows(part),
-                self.params_axes,
-                params,
-                is_leaf=lambda axis: axis is None,
-            )
+            some = self._of_batched(params, rows)
             return obs.at[index].set(self._vmap(self.env.observe, 2)(rows(stepped), rows(noise), some), mode="drop")
 
         def everybody() -> Obs:
@@ -119,6 +116,15 @@ class AutoReset:
         n_done = jnp.sum(done)
         branch = jnp.where(n_done == 0, 0, jnp.where(n_done <= n_few, 1, 2))
         return jax.lax.switch(branch, [lambda: obs, few, everybody])
+
+    def _of_batched(self, params: EnvParams, change: Callable[[Any], Any]) -> EnvParams:
+        """Params with `change` applied to those that differ among environments; their batch axis is the first."""
+        return jax.tree.map(
+            lambda axis, part: part if axis is None else jax.tree.map(change, part),
+            self.params_axes,
+            params,
+            is_leaf=lambda axis: axis is None,
+        )
 
     def _vmap(self, function: Callable[..., Any], n_batched: int) -> Callable[..., Any]:
         """`function` over a batch: its first `n_batched` arguments are batched, the params as `params_axes` says."""

@@ -49,7 +49,6 @@ class _Pieces:
         last: Last vertex of each piece.
         station: Station of the middle of each, m.
         inward: -1 for a left wall, +1 for a right wall, 0 for furniture.
-        view: Unit vector along the tunnel for furniture, zero for walls.
     """
 
     vertex: Float[np.ndarray, "v 2"]
@@ -57,7 +56,6 @@ class _Pieces:
     last: Int[np.ndarray, " n"]
     station: Float[np.ndarray, " n"]
     inward: Float[np.ndarray, " n"]
-    view: Float[np.ndarray, "n 2"]
 
 
 def _joined(parts: list[_Pieces]) -> _Pieces:
@@ -71,7 +69,6 @@ def _joined(parts: list[_Pieces]) -> _Pieces:
         last=np.concatenate([p.last + s for p, s in zip(parts, shift, strict=False)])[order],
         station=station[order],
         inward=np.concatenate([part.inward for part in parts])[order],
-        view=np.concatenate([part.view for part in parts])[order],
     )
 
 
@@ -81,7 +78,7 @@ def _wall_pieces(plan: TunnelPlan, wall: Wall, inward: float, length: float, max
     cuts = np.array(_cuts(wall.station, np.sqrt(off_x * off_x + off_y * off_y), length, max_segments))
     first, last = cuts[:-1], cuts[1:]
     middle = 0.5 * (wall.station[first] + wall.station[last])
-    return _Pieces(wall.vertex, first, last, middle, np.full(len(first), inward), np.zeros((len(first), 2)))
+    return _Pieces(wall.vertex, first, last, middle, np.full(len(first), inward))
 
 
 def _cuts(
@@ -124,7 +121,7 @@ def _furniture_pieces(plan: TunnelPlan, furniture: Float[np.ndarray, "f 4"], max
     vertex[np.setdiff1d(np.arange(len(vertex)), last, assume_unique=True)] = furniture[:, :2]
     mean = np.add.reduceat(vertex, first) / (count + 1)[:, None]
     nearest = [int(np.argmin((plan.centre[:, 0] - x) ** 2 + (plan.centre[:, 1] - y) ** 2)) for x, y in mean]
-    return _Pieces(vertex, first, last, plan.station[nearest], np.zeros(len(first)), plan.tangent[nearest])
+    return _Pieces(vertex, first, last, plan.station[nearest], np.zeros(len(first)))
 
 
 def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: int) -> Blocks:
@@ -146,7 +143,7 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
     count = pieces.last - pieces.first + 1
     place = np.minimum(pieces.first[:, None] + np.arange(count.max()), pieces.last[:, None])
     vertex = pieces.vertex[place]
-    centre, half, thickness = thin_boxes(*lidded(vertex, count, pieces.inward), pieces.view)
+    centre, half, thickness = thin_boxes(*lidded(vertex, count, pieces.inward))
     return Blocks(centre, half, thickness, offset=vertex - centre[:, None, :], station=pieces.station)
 
 

@@ -1,18 +1,17 @@
-"""Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch on a GPU, by kernels (`fused`)."""
+"""Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch, by kernels (`fused`, `native`)."""
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import lax
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax import cast, fused
+from subterra_jax import cast, fused, native
+from subterra_jax.rows import rowwise
 from subterra_jax.tunnel import Tunnel, node_at
 
 
@@ -24,7 +23,7 @@ class LidarParams:
         range_max: Largest range, m. A beam that hits nothing reports exactly this.
         range_sigma: Standard deviation of the range noise, m.
         n_beams: Beams in one scan; fixes array shapes, so it is static.
-        fused: Use the fused kernels where there is an NVIDIA GPU for them; off, XLA does it there too.
+        fused: Use kernels where there are any, for NVIDIA GPUs and for CPUs with numba; off, XLA does it everywhere.
     """
 
     range_max: float = 30.0
@@ -56,10 +55,11 @@ def scan(
         leaves through a mouth.
     """
     first = tunnel.scan_first[node_at(tunnel, station)]
-    take: Callable[..., Array] = _cast_fused if skips_unwanted(params) else _cast
+    by_kernels = skips_unwanted(params) or (params.fused and native.supported())
+    take: Callable[..., Array] = _cast_by_kernels if by_kernels else _cast
     # Nothing that may differ within a batch but the rows themselves, or the kernels could not serve it.
     beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
-    ranges = take(tunnel.walls, position, heading, first, jnp.asarray(wanted), beams)
+    ranges = take((tunnel.walls, beams), position, heading, first, jnp.asarray(wanted))
     return jnp.minimum(ranges, params.range_max)
 
 
@@ -69,75 +69,47 @@ def skips_unwanted(params: LidarParams) -> bool:
 
 
 def _cast(
-    tunnel: Tunnel,
+    what: tuple[Tunnel, LidarParams],
     position: Float[Array, "2"],
     heading: Float[Array, ""],
     first: Int[Array, ""],
     wanted: Bool[Array, ""],
-    params: LidarParams,
 ) -> Float[Array, "n_beams"]:
     """`scan` of a known window, by XLA, wanted or not."""
     del wanted
+    tunnel, params = what
     direction = beam_directions(heading, params.n_beams)
     return jnp.minimum(cast.nearest(tunnel, first, position, direction), params.range_max)
 
 
-# One scan is cast by XLA; a batch of them in one tunnel by the fused kernels, however many `vmap`s made it.
-_cast_fused = custom_vmap(_cast)
-
-
-@_cast_fused.def_vmap
-def _cast_batch(axis_size: int, batched: Any, tunnel: Tunnel, *rest: Any) -> tuple[Array, bool]:
-    rows, params = rest[:-1], rest[-1]
-    if any(jax.tree.leaves((batched[0], batched[-1]))):
-        by_xla: Callable[..., Array] = jax.vmap(_cast, in_axes=_axes(batched))
-        return by_xla(tunnel, *rows, params), True
-    return _cast_rows(tunnel, *_spread(rows, batched[1:-1], axis_size), params), True
-
-
-@custom_vmap
-def _cast_rows(
-    tunnel: Tunnel, position: Array, heading: Array, first: Array, wanted: Array, params: LidarParams
-) -> Float[Array, "n n_beams"]:
+def _cast_rows(what: tuple[Tunnel, LidarParams], *rows: Array) -> Float[Array, "n n_beams"]:
     """Many scans in one tunnel."""
+    kernels = {}
+    if skips_unwanted(what[1]):
+        kernels["cuda"] = _by(fused.scan)
+    if native.supported():
+        from subterra_jax.native import calls  # numba is optional
 
-    def by_kernel(
-        tunnel: Tunnel, position: Array, heading: Array, first: Array, wanted: Array, params: LidarParams
+        kernels["cpu"] = _by(calls.scan)
+    by_xla: Callable[..., Array] = jax.vmap(_cast, in_axes=(None, 0, 0, 0, 0))
+    return lax.platform_dependent(what, *rows, **kernels, default=by_xla)
+
+
+def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
+    """A kernel for many scans, with the arguments of `_cast_rows`."""
+
+    def cast_rows(
+        what: tuple[Tunnel, LidarParams], position: Array, heading: Array, first: Array, wanted: Array
     ) -> Array:
-        return fused.scan(
-            tunnel, position, heading, first, wanted, jnp.asarray(params.range_max), bearings(params.n_beams)
-        )
+        tunnel, params = what
+        limit = jnp.asarray(params.range_max)
+        return kernel(tunnel, position, heading, first, wanted, limit, bearings(params.n_beams))
 
-    return lax.platform_dependent(
-        tunnel, position, heading, first, wanted, params, cuda=by_kernel, default=_cast_by_xla
-    )
+    return cast_rows
 
 
-@_cast_rows.def_vmap
-def _cast_more_rows(axis_size: int, batched: Any, tunnel: Tunnel, *rest: Any) -> tuple[Array, bool]:
-    """A further batch axis becomes part of the rows; where tunnels differ, XLA does it."""
-    rows, params = rest[:-1], rest[-1]
-    if any(jax.tree.leaves((batched[0], batched[-1]))):
-        by_xla: Callable[..., Array] = jax.vmap(_cast_by_xla, in_axes=_axes(batched))
-        return by_xla(tunnel, *rows, params), True
-    flat = [row.reshape(-1, *row.shape[2:]) for row in _spread(rows, batched[1:-1], axis_size)]
-    return _cast_rows(tunnel, *flat, params).reshape(axis_size, -1, params.n_beams), True
-
-
-_cast_by_xla = jax.vmap(_cast, in_axes=(None, 0, 0, 0, 0, None))
-
-
-def _axes(batched: Any) -> tuple[Any, ...]:
-    """`in_axes` that say which arguments are batched."""
-    return tuple(jax.tree.map(lambda is_batched: 0 if is_batched else None, batched))
-
-
-def _spread(rows: tuple[Array, ...], batched: Any, axis_size: int) -> list[Array]:
-    """All rows with a batch axis."""
-    return [
-        row if is_batched else jnp.broadcast_to(row, (axis_size, *row.shape))
-        for row, is_batched in zip(rows, batched, strict=True)
-    ]
+# One scan is cast by XLA; a batch of them in one tunnel by the kernels, however many `vmap`s made it.
+_cast_by_kernels = rowwise(_cast, lambda what, *rows: _cast_rows(what, *rows))
 
 
 def bearings(n_beams: int) -> Float[np.ndarray, "n_beams"]:

@@ -1,22 +1,12 @@
-"""The planar tunnel as its file describes it: float64 NumPy on the host, every lining variant, checked on reading."""
+"""The planar tunnel as its file describes it: float64 NumPy on the host, every lining variant."""
 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import re
-from importlib import resources
-from importlib.resources.abc import Traversable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from subterra_jax.errors import TunnelError
-
-SCHEMA = "subterra.tunnel/1"
-PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
-GENERATED = re.compile(r"control|procedural:.*")  # names of tunnels that are made, not read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,140 +143,4 @@ def _cut(wall: Wall, start: float, end: float) -> Wall:
     return Wall(
         vertex=np.concatenate([cut[:1], wall.vertex[keep], cut[1:]]),
         station=np.concatenate([ends[:1], wall.station[keep], ends[1:]]) - start,
-    )
-
-
-class _Fields:
-    """Checked access to the fields of one tunnel file; every complaint names the file and the field."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                self.data = {name: data[name] for name in data.files}
-        except FileNotFoundError as error:
-            raise TunnelError(f"{path}: no such tunnel file") from error
-        except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
-            raise TunnelError(f"{path}: not a readable .npz archive ({error})") from error
-
-    def fail(self, field: str, problem: str) -> TunnelError:
-        return TunnelError(f"{self.path}: field '{field}' {problem}")
-
-    def text(self, field: str) -> str:
-        if field not in self.data:
-            raise self.fail(field, "is missing")
-        if self.data[field].shape != () or self.data[field].dtype.kind != "U":
-            raise self.fail(field, f"must be one string, is {self.data[field].dtype} of shape {self.data[field].shape}")
-        return str(self.data[field])
-
-    def numbers(self, field: str, *shape: int | None) -> np.ndarray:
-        """A finite float64 array of the given shape; None stands for any size."""
-        if field not in self.data:
-            raise self.fail(field, "is missing")
-        value = self.data[field]
-        if value.dtype.kind not in "fiu":
-            raise self.fail(field, f"must hold numbers, holds {value.dtype}")
-        if value.ndim != len(shape) or any(w is not None and w != h for w, h in zip(shape, value.shape, strict=True)):
-            wanted = ", ".join("any" if w is None else str(w) for w in shape)
-            raise self.fail(field, f"must have shape ({wanted}), has {value.shape}")
-        if not np.all(np.isfinite(value)):
-            where = np.argwhere(~np.isfinite(value))[0].tolist()
-            raise self.fail(field, f"has a value that is not finite, at index {where}")
-        return value.astype(np.float64)
-
-    def wall(self, side: str, lining: str) -> Wall:
-        field = f"{side}_{lining}"
-        vertex = self.numbers(field, None, 2)
-        if len(vertex) < 2:
-            raise self.fail(field, f"needs at least 2 vertices, has {len(vertex)}")
-        station = self.numbers(f"{side}_station_{lining}", len(vertex))
-        if np.any(np.diff(station) < 0.0):
-            raise self.fail(f"{side}_station_{lining}", f"decreases at index {np.argmax(np.diff(station) < 0.0)}")
-        return Wall(vertex, station)
-
-
-def tunnel_file(path: str | Path | None) -> Traversable:
-    """The file that a path, the name of a packaged tunnel, or None (the default one) stands for."""
-    name = PACKAGED[0] if path is None else str(path)
-    return resources.files("subterra_jax") / "data" / f"{name}.npz" if name in PACKAGED else Path(name)
-
-
-def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
-    """Read and check a `tunnel.npz`, or make a tunnel that goes by a name.
-
-    Args:
-        path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); `control`, the bore without
-            landmarks; or `procedural:SPLIT:INDEX`, one of the family. None is the first packaged one.
-
-    Returns:
-        The tunnel with every lining variant; `Tunnel.from_plan` makes it ready for the device.
-
-    Raises:
-        TunnelError: The file cannot be read, or a field is missing or wrong; the message names both. Or there is no
-            such generated tunnel.
-    """
-    if GENERATED.fullmatch(str(path)):
-        from subterra_jax.procedural import named  # it makes what this module defines
-
-        return named(str(path))
-    with resources.as_file(tunnel_file(path)) as file:
-        return _read(file)
-
-
-def tunnel_digest(path: str | Path | None = None) -> str:
-    """SHA-256 of what `load_tunnel` would load: of the file, or of a generated tunnel's arrays."""
-    if not GENERATED.fullmatch(str(path)):
-        return hashlib.sha256(tunnel_file(path).read_bytes()).hexdigest()
-    plan = load_tunnel(path)
-    arrays = [plan.station, plan.centre, plan.tangent, plan.elevation, plan.half_width]
-    for name, lining in plan.linings.items():
-        arrays.append(np.frombuffer(name.encode(), np.uint8))
-        for wall in (lining.left, lining.right):
-            arrays += [wall.vertex, wall.station]
-        arrays.append(lining.furniture)
-    return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
-
-
-def _read(path: Path) -> TunnelPlan:
-    fields = _Fields(path)
-    if fields.text("schema") != SCHEMA:
-        raise fields.fail("schema", f"must be {SCHEMA!r}, is {fields.text('schema')!r}")
-    station = fields.numbers("station", None)
-    n = len(station)
-    if n < 2:
-        raise fields.fail("station", f"needs at least 2 values, has {n}")
-    step = np.diff(station)
-    if station[0] != 0.0 or np.any(step <= 0.0) or np.any(np.abs(step - step.mean()) > 1e-6 * station[-1]):
-        raise fields.fail("station", "must be a uniform, growing grid that starts at 0")
-    tangent = fields.numbers("tangent", n, 2)
-    if np.any(np.abs(np.linalg.norm(tangent, axis=1) - 1.0) > 1e-3):
-        raise fields.fail("tangent", "must hold unit vectors")
-    half_width = fields.numbers("half_width", n)
-    if np.any(half_width <= 0.0):
-        raise fields.fail("half_width", "must be positive")
-    # Files written before the field was thought of do not have it.
-    ring_pitch = float(fields.numbers("ring_pitch")) if "ring_pitch" in fields.data else 0.0
-    if ring_pitch < 0.0:
-        raise fields.fail("ring_pitch", f"must not be negative, is {ring_pitch}")
-    names: Any = fields.data.get("lining")
-    if names is None:
-        raise fields.fail("lining", "is missing")
-    if names.ndim != 1 or names.dtype.kind != "U" or len(names) == 0:
-        raise fields.fail("lining", f"must be a list of names, is {names.dtype} of shape {names.shape}")
-    return TunnelPlan(
-        name=fields.text("name"),
-        provenance=fields.text("provenance"),
-        station=station,
-        centre=fields.numbers("centre", n, 2),
-        tangent=tangent,
-        elevation=fields.numbers("elevation", n),
-        half_width=half_width,
-        lidar_height=float(fields.numbers("lidar_height")),
-        linings={
-            str(name): Lining(
-                fields.wall("left", name), fields.wall("right", name), fields.numbers(f"furniture_{name}", None, 4)
-            )
-            for name in names
-        },
-        ring_pitch=ring_pitch,
     )

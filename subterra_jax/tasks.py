@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -16,12 +16,12 @@ from subterra_jax.faults import FaultParams
 from subterra_jax.lidar import LidarParams
 from subterra_jax.obstacles import ObstacleParams
 from subterra_jax.odometry import OdometryParams
-from subterra_jax.plan import TunnelPlan
 from subterra_jax.reward import GoalRewardParams, RewardParams
 from subterra_jax.rules import Relocalise, Rule, StopAt, Traverse, TurnBack
 from subterra_jax.slip import SlipParams
+from subterra_jax.sources import Source, resolve
 from subterra_jax.state import EnvParams, GoalParams, StartParams
-from subterra_jax.tunnel import CONTACT_REACH, Tunnel, resolve
+from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.vehicle import VehicleParams
 from subterra_jax.wander import WanderParams
 
@@ -84,8 +84,8 @@ TASKS: dict[str, Task] = {
 
 def make(
     id: str,
-    tunnel: Tunnel | TunnelPlan | str | Path | None = None,
-    lining: str = "pockets",
+    tunnel: Source | Sequence[Source] = None,
+    lining: str | None = None,
     estimates: bool = False,
     **overrides: Any,
 ) -> tuple[TunnelEnv, EnvParams]:
@@ -93,10 +93,11 @@ def make(
 
     Args:
         id: A key of `TASKS`.
-        tunnel: A tunnel file, the name of a packaged tunnel, a plan from `load_tunnel`, or a ready `Tunnel`, one or
-            several, which is taken as it is, neither cut to the task's piece nor given another lining. None is the
-            packaged tunnel.
-        lining: Variant of the walls: `pockets` (the default, as in the recorded bore), `smooth` or `furnished`.
+        tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
+            one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
+            another lining. None is the packaged tunnel.
+        lining: Variant of the walls: `pockets` (as in the recorded bore), `smooth` or `furnished`. None is `pockets`,
+            or the first where a tunnel has none.
         estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
             estimation track. It does not move the robot; `info` tells its error.
         **overrides: Fields of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`.

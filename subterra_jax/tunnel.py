@@ -3,7 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.blocks import build_blocks, padded
-from subterra_jax.plan import TunnelPlan, load_tunnel
+from subterra_jax.plan import TunnelPlan
 from subterra_jax.windows import separation, windows
 
 CONTACT_REACH = 0.8
@@ -42,7 +41,8 @@ class Tunnel:
         wall: Row of x and row of y of the vertices of each block, from the middle of its box, m; the last one repeated
             as padding.
         reach: Largest range for which the scan window was made, m.
-        n_scan: Blocks in a scan window; even, and blocks half a window apart are further apart than `reach`.
+        n_scan: Blocks in a scan window; even, and blocks half a window apart are further apart than `reach`. Every
+            window, counted up to the next power of two, holds blocks of one tunnel, padding, or nothing.
         n_contact: Blocks in a contact window.
         n_candidates: Blocks in which a beam looks for its hit, nearest first.
     """
@@ -222,39 +222,3 @@ def foot(tunnel: Tunnel, position: Float[Array, "2"], near: Float[Array, ""]) ->
         lateral = tangent_x * from_y - tangent_y * from_x
         station = station + tangent_x * from_x + tangent_y * from_y
     return Foot(station=station, lateral=lateral, half_width=half_width, tangent=jnp.stack([tangent_x, tangent_y]))
-
-
-Source = Tunnel | TunnelPlan | str | Path | None
-
-
-def resolve(
-    tunnel: Source | Sequence[Source],
-    lining: str | None,
-    piece: tuple[float, float] | None,
-    reach: float,
-) -> Tunnel:
-    """A device tunnel from whatever a user names one by.
-
-    Args:
-        tunnel: A ready `Tunnel`, taken as it is; a plan; a file or a name, as for `load_tunnel`; None for the packaged
-            tunnel; or a list of such things, which becomes one stack.
-        lining: The variant of the walls; None is `pockets`, or the first where a tunnel has none.
-        piece: Start and length of the piece to cut out, m; None keeps the whole tunnel. A length beyond the tunnel's
-            end is shortened to it.
-        reach: Largest range that will be asked for, m.
-
-    Raises:
-        TunnelError: A file is unreadable or wrong, or there is no such tunnel or lining.
-        ValueError: A ready tunnel was made for shorter ranges, or the list is empty.
-    """
-    if isinstance(tunnel, list | tuple):
-        return Tunnel.stack([resolve(each, lining, piece, reach) for each in tunnel])
-    if isinstance(tunnel, Tunnel):
-        if tunnel.reach < reach:
-            raise ValueError(f"the tunnel was made for ranges up to {tunnel.reach} m, got range_max={reach}")
-        return tunnel
-    plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
-    if piece is not None:
-        start, length = piece
-        plan = plan.slice(start, min(length, plan.length - start))
-    return Tunnel.from_plan(plan, lining, reach=reach)

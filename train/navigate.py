@@ -1,120 +1,166 @@
-"""Trains a navigation policy: `python -m train.navigate --task Subterra/TraverseShort-v0 --out DIR`."""
+"""Trains a navigation policy: `python -m train.navigate --task Subterra/TraverseShort-v0 --out DIR`.
+
+`--memory gru` trains one that remembers where it is, for the tasks that end with a stop at a goal; `--seeds 0 1 2 3 4`
+trains several at once, each into a folder of its own.
+"""
 
 import argparse
 import dataclasses
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 import jax
 import tyro
 
-from train import cli, curve, policies, ppo, runfolder
-from train.config import PPOConfig, check, make_config
+from train import cli, policies, ppo, recurrent, seeds
+from train.config import PPOConfig, TrainConfig, check, make_config
 from train.errors import ConfigError
-from train.evaluate import EVALUATION_SEED, evaluate
+from train.evaluate import check_episodes
 from train.learner import Learner
-from train.log import Bar, RunLog
+from train.log import Bar
+from train.recurrent.config import RecurrentConfig
+from train.session import Session
 
 _DEFAULT_TASK = "Subterra/TraverseShort-v0"
+_MEMORIES = ("none", "gru")
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Trains a navigation policy by PPO. The defaults of the settings follow from `--task` and `--preset`.
+    """Trains a navigation policy by PPO. The defaults of the settings follow from `--task`, `--memory` and `--preset`.
 
     Attributes:
         out: Run folder to write: checkpoint/, config.json, log.jsonl, episodes.csv, curve.png, evaluation.json.
         task: Task id.
-        tunnel: Tunnel file; the packaged tunnel if left out.
-        lining: Variant of the walls.
+        tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, `procedural:train:7`,
+            or of several `procedural:train:0-255`, of which each episode draws one.
+        lining: Variant of the walls; `pockets` if left out, or the first where a tunnel has none.
+        memory: `none`: a perceptron over a few observations. `gru`: a network that remembers, with an estimation head.
         preset: `cpu` or `gpu`; what jax runs on if left out.
+        seeds: Train these seeds at once, into `out/seed-<k>`, and draw them together; one run of `--seed` if left out.
         resume: Go on from the checkpoint in `out`; only the limits on training may differ.
         overwrite: Throw away the run that `out` holds.
-        evaluation_episodes: Episodes of the evaluation after training.
+        evaluation_episodes: Episodes of the evaluation after training, the first of the task's 500.
         config: Settings of PPO.
     """
 
     out: Path
     task: str = _DEFAULT_TASK
     tunnel: Path | None = None
-    lining: str = "pockets"
+    lining: str | None = None
+    memory: Literal["none", "gru"] = "none"
     preset: str | None = None
+    seeds: tuple[int, ...] = ()
     resume: bool = False
     overwrite: bool = False
     evaluation_episodes: int = 200
     config: Annotated[PPOConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=PPOConfig)
 
 
+@dataclasses.dataclass(frozen=True)
+class RecurrentCommand(Command):
+    """The same for a policy with memory."""
+
+    config: Annotated[RecurrentConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(  # type: ignore[assignment]
+        default_factory=RecurrentConfig
+    )
+
+
 def parse(arguments: list[str]) -> Command:
-    """The command line, with the defaults of the task and preset that it names itself.
+    """The command line, with the defaults of the task, memory and preset that it names itself.
 
     Raises:
-        ConfigError: There is no such task or preset.
+        ConfigError: There is no such task, memory or preset.
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--task", default=_DEFAULT_TASK)
+    early.add_argument("--memory", default=_MEMORIES[0])
     early.add_argument("--preset", default=None)
     named, _ = early.parse_known_args(arguments)
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
-    default = make_config(named.task, preset)
-    return tyro.cli(Command, args=arguments, default=Command(out=tyro.MISSING, preset=preset, config=default))
+    if named.memory not in _MEMORIES:
+        raise ConfigError(f"unknown memory {named.memory!r}; there are {', '.join(_MEMORIES)}")
+    if named.memory == "gru":
+        policies.known_task(named.task)
+        remembering: Any = recurrent.config.make_config(named.task, preset)
+        default: Command = RecurrentCommand(out=tyro.MISSING, memory="gru", preset=preset, config=remembering)
+    else:
+        default = Command(out=tyro.MISSING, preset=preset, config=make_config(named.task, preset))
+    return tyro.cli(type(default), args=arguments, default=default)
+
+
+def make_learner(world: policies.World, config: TrainConfig, axes: tuple[str, ...] = ()) -> ppo.Trainable:
+    """What trains with such settings.
+
+    Raises:
+        ConfigError: A setting makes no sense, or no such network can learn this task.
+    """
+    if isinstance(config, RecurrentConfig):
+        return recurrent.learner.RecurrentLearner(world.env, world.params, config, axes)
+    assert isinstance(config, PPOConfig)
+    return Learner(world.env, world.params, config, axes)
 
 
 def command(arguments: Command) -> int:
-    """Trains, then draws the curve and evaluates the best policy.
+    """Trains, then draws the curve and evaluates the policy that was kept.
 
     Returns:
         Exit status: 0, or 130 after Ctrl-C, with the checkpoint saved.
     """
-    config = check(arguments.config)
-    if arguments.evaluation_episodes < 1:
-        raise ConfigError(f"evaluation_episodes must be at least 1, got {arguments.evaluation_episodes}")
-    world = policies.open_world(arguments.task, arguments.tunnel, arguments.lining)
-    learner = Learner(world.env, world.params, config)
-    run = runfolder.RunFolder(arguments.out, world, learner)
-    snapshot = None
-    if arguments.resume:
-        snapshot = run.resume()
+    config = arguments.config
+    if isinstance(config, RecurrentConfig):
+        recurrent.config.check(config)
     else:
-        run.start(overwrite=arguments.overwrite)
+        check(config)
+    check_episodes(arguments.evaluation_episodes, "evaluation_episodes")
+    seeds.check(arguments.seeds)
+    world = policies.open_world(arguments.task, arguments.tunnel, arguments.lining)
+    if arguments.seeds:
+        return _several(arguments, world)
+    session = Session(arguments.out, world, make_learner(world, config))
+    snapshot = session.folder.begin(resume=arguments.resume, overwrite=arguments.overwrite)
+    return _single(session, snapshot, arguments.evaluation_episodes)
 
-    started = time.perf_counter()
-    log = RunLog(run.path, snapshot.iteration if snapshot else 0, snapshot.window.count if snapshot else 0)
+
+def _single(session: Session, snapshot: ppo.Snapshot | None, episodes: int) -> int:
+    started, config, world = time.perf_counter(), session.learner.config, session.world
+    session.open(snapshot)
     bar = Bar(config.steps, snapshot.iteration * config.steps_per_iteration if snapshot else 0)
     with cli.deferred_interrupt() as interrupt:
 
         def watch(now: ppo.Snapshot) -> bool:
-            log.write(now.record, now.rows)
             bar.show(now.record)
-            if now.iteration % config.checkpoint_every == 0 or interrupt.wanted:
-                run.save(now)
+            session.note(now, save=interrupt.wanted)
             return interrupt.wanted
 
         try:
-            snapshot = ppo.train(world.env, world.params, config, learner=learner, snapshot=snapshot, watch=watch)
+            last = ppo.train(world.env, world.params, config, learner=session.learner, snapshot=snapshot, watch=watch)
         finally:
             bar.close()
-            log.close()
-        run.save(snapshot)
-        curve.write_curve([run.path], run.path / "curve.png")
+            session.close()
+        session.finish(last)
         if interrupt.wanted:
-            print(f"interrupted after {snapshot.iteration} iterations; go on with --resume", file=sys.stderr)
+            print(f"interrupted after {last.iteration} iterations; go on with --resume", file=sys.stderr)
             return cli.EXIT_INTERRUPTED
-
-    scores = evaluate(
-        world.env,
-        world.params,
-        learner.networks,
-        snapshot.policy,
-        arguments.evaluation_episodes,
-        EVALUATION_SEED,
-    )
-    run.write_json("evaluation.json", {"schema": "subterra.evaluation/1", **world.facts, **scores})
-    cli.table(f"{world.task}, seed {config.seed}: best policy, no exploration noise", scores)
-    _tell(snapshot, time.perf_counter() - started)
+    session.score(last, episodes)
+    _tell(last, time.perf_counter() - started)
     return 0
+
+
+def _several(arguments: Command, world: policies.World) -> int:
+    sessions = []
+    for seed in arguments.seeds:
+        config = dataclasses.replace(arguments.config, seed=seed)
+        sessions.append(Session(arguments.out / f"seed-{seed}", world, make_learner(world, config, seeds.axes())))
+    return seeds.run(
+        arguments.out,
+        sessions,
+        resume=arguments.resume,
+        overwrite=arguments.overwrite,
+        episodes=arguments.evaluation_episodes,
+    )
 
 
 def _tell(snapshot: ppo.Snapshot, seconds: float) -> None:

@@ -4,18 +4,22 @@ import dataclasses
 import hashlib
 from importlib import metadata
 from pathlib import Path
-from typing import Any
-
-import jax
-import numpy as np
+from typing import Any, TypeAlias
 
 import subterra_jax as st
-from subterra_jax.plan import tunnel_file
-from train import checkpoint, normalize
+from subterra_jax.procedural import expand
+from subterra_jax.sources import tunnel_digest
+from train import checkpoint
 from train.errors import CheckpointError, ConfigError
-from train.networks import Layout, Networks, Policy
+from train.networks import Layout, Networks
+from train.recurrent.network import RecurrentLayout, RecurrentNetworks
 
 _PACKAGES = ("subterra-jax", "jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
+AnyNetworks: TypeAlias = Networks | RecurrentNetworks
+_KINDS: dict[str, Any] = {
+    Networks.kind: (Layout, Networks),
+    RecurrentNetworks.kind: (RecurrentLayout, RecurrentNetworks),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,18 +39,32 @@ class World:
     facts: dict[str, Any]
 
 
-def open_world(task: str, tunnel: Path | None, lining: str) -> World:
-    """A task on a tunnel file, or on the packaged tunnel.
-
-    Raises:
-        ConfigError: There is no such task.
-        TunnelError: The tunnel file is missing or wrong, or has no such lining.
-    """
+def known_task(task: str) -> None:
+    """Raises `ConfigError` where there is no such task."""
     if task not in st.TASKS:
         raise ConfigError(f"unknown task {task!r}; there are {', '.join(st.TASKS)}")
-    plan = st.load_tunnel(tunnel)
-    env, params = st.make(task, tunnel=plan, lining=lining)
-    content = tunnel_file(tunnel).read_bytes()
+
+
+def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) -> World:
+    """A task on a tunnel file or on one that goes by a name; the packaged tunnel, and the usual lining, where None.
+
+    `procedural:train:0-255` stands for several tunnels, of which each episode draws one.
+
+    Raises:
+        ConfigError: There is no such task, or the tunnel has no room for it.
+        TunnelError: The tunnel file is missing or wrong, or has no such lining.
+    """
+    known_task(task)
+    names = [tunnel] if tunnel is None else expand(str(tunnel))
+    plans = [st.load_tunnel(name) for name in names]
+    lining = lining or plans[0].default_lining
+    try:
+        env, params = st.make(task, tunnel=plans if len(plans) > 1 else plans[0], lining=lining)
+    except st.SubterraError:
+        raise
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    digests = [tunnel_digest(name) for name in names]
     return World(
         task,
         env,
@@ -54,14 +72,14 @@ def open_world(task: str, tunnel: Path | None, lining: str) -> World:
         {
             "task": task,
             "lining": lining,
-            "tunnel": plan.name,
-            "tunnel_provenance": plan.provenance,
-            "tunnel_sha256": hashlib.sha256(content).hexdigest(),
+            "tunnel": plans[0].name if len(plans) == 1 else str(tunnel),
+            "tunnel_provenance": plans[0].provenance,
+            "tunnel_sha256": digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest(),
         },
     )
 
 
-def load_policy(folder: Path) -> tuple[Networks, Policy, dict[str, Any]]:
+def load_policy(folder: Path) -> tuple[AnyNetworks, Any, dict[str, Any]]:
     """The policy of a run folder, or of one checkpoint in it.
 
     Returns:
@@ -71,32 +89,13 @@ def load_policy(folder: Path) -> tuple[Networks, Policy, dict[str, Any]]:
         CheckpointError: It is missing, damaged, or does not fit the network that it names itself.
     """
     stored = checkpoint.load(folder)
+    layout_of, networks_of = _KINDS[stored.facts.get("kind", "mlp")]
     try:
-        layout = Layout(**{name: _tuples(value) for name, value in stored.facts["layout"].items()})
+        layout = layout_of(**{name: _tuples(value) for name, value in stored.facts["layout"].items()})
     except (KeyError, TypeError, AttributeError) as error:
         raise CheckpointError(f"{stored.path}: field 'layout' of {checkpoint.FACTS} is missing or wrong") from error
-    networks = Networks(layout)
-    return networks, stored.restore("policy", policy_shapes(networks)), stored.facts
-
-
-def policy_shapes(networks: Networks) -> Policy:
-    """A policy of these networks with shapes in place of arrays."""
-    return jax.eval_shape(
-        lambda key: Policy(networks.init(key)["policy"], normalize.init((networks.layout.n_observation,))),
-        jax.random.key(0),
-    )
-
-
-def check_fits(layout: Layout, world: World, source: Path) -> None:
-    """Raises `CheckpointError` where a policy cannot drive in a world."""
-    wanted = world.env.observation_size(world.params)
-    if layout.n_observation != wanted:
-        raise CheckpointError(
-            f"{source}: made for observations of {layout.n_observation} numbers, {world.task} has {wanted}"
-        )
-    bounds = world.env.action_space(world.params)
-    if not (np.allclose(layout.action_low, bounds.low) and np.allclose(layout.action_high, bounds.high)):
-        raise CheckpointError(f"{source}: made for actions up to {layout.action_high}, {world.task} has {bounds.high}")
+    networks = networks_of(layout)
+    return networks, stored.restore("policy", networks.policy_shapes()), stored.facts
 
 
 def versions() -> dict[str, str]:

@@ -43,6 +43,8 @@ def write_geometry(
     mjcf.write_scene(folder, name, bore, with_niches, walls["smooth"], track, config, furnished)
     solid.export(folder / "meshes" / "solid.ply")
     lining.export(folder / "meshes" / "lining.ply")
+    smooth = mesh.open_lining(mesh.as_trimesh(solids["smooth"]), bore)
+    smooth.export(folder / "meshes" / "lining_smooth.ply")
     bore.save(folder / "bore.npz")
     segments = {"furnished": planar_segments(furnished.pieces, bore, track.elevation, height)}
     planar.save(folder / "tunnel.npz", name, provenance, bore, track.elevation, height, walls, segments)

@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from scene.bore import NAIL
 from scene.writing import mesh, planar, track
 
 
@@ -35,6 +38,19 @@ def test_pockets_are_recesses_of_13_cm_with_upright_sides(bore, walls):
     assert (across > 2.9).sum() >= 2 * (len(bore.pocket) // 2)
 
 
+def test_the_ring_pitch_is_that_of_the_joints(bore):
+    joints = np.delete(np.arange(0.4, bore.length, 1.4), [3, 9])
+    assert planar.ring_pitch(replace(bore, ring_station=joints)) == pytest.approx(1.4)
+    assert planar.ring_pitch(replace(bore, ring_station=joints[:0])) == 0.0
+
+
+def test_a_survey_of_every_fifth_ring_takes_the_pitch_of_the_joints_that_nails_bridge(bore):
+    nail = np.zeros(24, NAIL)
+    nail["station"] = np.repeat(np.arange(1.5, 18.0, 1.5), 3)[:24] + np.tile([-0.01, 0.0, 0.01], 8)
+    surveyed = replace(bore, ring_station=np.arange(0.0, 24.0, 7.0), nail=nail)
+    assert planar.ring_pitch(surveyed) == pytest.approx(1.5)
+
+
 def test_the_tunnel_file_holds_every_field_of_the_format(bore, walls, tmp_path):
     laid = track.lay(bore, track.TrackConfig())
     planar.save(
@@ -46,6 +62,7 @@ def test_the_tunnel_file_holds_every_field_of_the_format(bore, walls, tmp_path):
         n = len(data["station"])
         assert data["centre"].shape == data["tangent"].shape == (n, 2)
         assert data["elevation"].shape == data["half_width"].shape == (n,)
+        assert data["ring_pitch"].shape == ()
         for variant in data["lining"]:
             for side in ("left", "right"):
                 assert data[f"{side}_{variant}"].shape == (*data[f"{side}_station_{variant}"].shape, 2)

@@ -1,16 +1,20 @@
 """Tunnel files: what is wrong with a broken one is said with its file and its field."""
 
+import hashlib
+
 import numpy as np
 import pytest
 
 import subterra_jax as st
 from subterra_jax import reference
+from subterra_jax.sources import tunnel_digest
 from tests.subterra_jax import tunnels
 
 
 @pytest.fixture
 def arrays():
-    return tunnels.tunnel_arrays(tunnels.s_bend(100.0, 100.0, lead=10.0), roughness=0.01)
+    made = tunnels.tunnel_arrays(tunnels.s_bend(100.0, 100.0, lead=10.0), roughness=0.01)
+    return {**made, "ring_pitch": np.array(1.5)}
 
 
 def test_the_packaged_tunnel_has_its_length_and_linings():
@@ -34,6 +38,8 @@ def test_the_packaged_tunnel_has_its_length_and_linings():
         ("elevation", lambda a: None),
         ("half_width", lambda a: -a),
         ("lidar_height", lambda a: np.zeros(2)),
+        ("ring_pitch", lambda a: np.array(-1.5)),
+        ("ring_pitch", lambda a: np.zeros(2)),
         ("lining", lambda a: np.zeros(2)),
         ("left_smooth", lambda a: None),
         ("left_smooth", lambda a: a[:1]),
@@ -84,6 +90,24 @@ def test_a_slice_keeps_the_walls_and_opens_its_ends(plan_of, arrays, lining):
 def test_a_slice_beyond_the_tunnel_is_refused(plan_of, arrays, start, length):
     with pytest.raises(ValueError, match="does not lie within"):
         plan_of(arrays).slice(start, length)
+
+
+def test_the_ring_pitch_is_read_and_is_0_in_a_file_without_it(plan_of, arrays):
+    assert plan_of(arrays).ring_pitch == 1.5
+    assert float(st.Tunnel.from_plan(plan_of(arrays)).ring_pitch) == 1.5
+    assert plan_of(arrays).slice(10.0, 20.0).ring_pitch == 1.5
+    arrays.pop("ring_pitch")
+    assert plan_of(arrays).ring_pitch == 0.0
+    assert st.load_tunnel("subterra-351").ring_pitch == pytest.approx(1.5, abs=1e-3)
+    assert st.load_tunnel("metro-asbuilt").ring_pitch == pytest.approx(1.5, abs=1e-9)
+
+
+def test_a_digest_tells_tunnels_apart_and_is_that_of_the_file_where_there_is_one(tmp_path, arrays):
+    path = tunnels.write_tunnel(tmp_path / "t.npz", arrays)
+    assert tunnel_digest(path) == hashlib.sha256(path.read_bytes()).hexdigest()
+    names = ("control", "procedural:test:1", "procedural:test:2", None)
+    assert len({tunnel_digest(name) for name in names}) == 4
+    assert tunnel_digest("procedural:test:1") == tunnel_digest("procedural:test:1")
 
 
 def test_both_packaged_tunnels_load_by_name():

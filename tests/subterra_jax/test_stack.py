@@ -13,15 +13,15 @@ from subterra_jax.tunnel import Tunnel, foot, node_at
 from tests.subterra_jax import tunnels
 
 PARAMS = lidar.LidarParams()
+LININGS = ("pockets", "smooth", "furnished")
 
 
 @pytest.fixture(scope="module")
 def plans(plan_of) -> list[st.TunnelPlan]:
-    """Four tunnels that differ in length, width, bends, lining and ring pitch, the third shorter than a window."""
+    """Tunnels that differ in length, width, bends and lining, the second shorter than a window."""
     packaged = st.load_tunnel()
     return [
         packaged.slice(100.0, 90.0),
-        plan_of(tunnels.tunnel_arrays(tunnels.s_bend(150.0, 60.0), half_width=2.6)),
         plan_of(tunnels.tunnel_arrays(tunnels.straight(24.0), half_width=3.0)),
         packaged.slice(200.0, 60.0),
     ]
@@ -29,8 +29,7 @@ def plans(plan_of) -> list[st.TunnelPlan]:
 
 @pytest.fixture(scope="module")
 def alone(plans) -> list[Tunnel]:
-    linings = ("pockets", "pockets", "smooth", "furnished")
-    return [Tunnel.from_plan(plan, lining) for plan, lining in zip(plans, linings, strict=True)]
+    return [Tunnel.from_plan(plan, lining) for plan, lining in zip(plans, LININGS, strict=True)]
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +92,7 @@ def test_a_batch_may_mix_the_tunnels_of_a_stack(plans, alone, together):
 
 
 def test_each_tunnel_of_a_stack_agrees_with_its_own_walls(plans, together):
-    linings = ("pockets", "pockets", "smooth", "furnished")
-    for i, (plan, lining, poses) in enumerate(zip(plans, linings, poses_in(plans, 400), strict=True)):
+    for i, (plan, lining, poses) in enumerate(zip(plans, LININGS, poses_in(plans, 400), strict=True)):
         ranges = look(together, jnp.full(len(poses.station), i), *vars(poses).values())[0]
         result = reference.agreement(plan.lining(lining).segments, poses, np.asarray(ranges))
         assert result.n_wrong == 0
@@ -117,20 +115,21 @@ def test_the_fused_kernels_see_each_tunnel_of_a_stack(plans, alone):
     position, heading, station = (np.concatenate(part) for part in zip(*(vars(p).values() for p in poses), strict=True))
     index, rows = np.repeat([0, 1], 24), (jnp.asarray(position), jnp.asarray(heading))
     first = jax.vmap(lambda i, s: stacked.scan_first[node_at(stacked.pick(i), s)])(index, station)
-    ranges = fused.scan(stacked.walls, *rows, first, jnp.ones(48, bool), jnp.float32(30.0), lidar.bearings(16))
-    truth = look(stacked, index, position, heading, station)[0]
-    np.testing.assert_allclose(ranges, truth, atol=1e-4)
+    ranges = fused.scan(stacked.walls, *rows, first, jnp.ones(48, bool), jnp.float32(30.0), lidar.bearings(2))
+    walls = [plan.lining(lining).segments for plan, lining in zip(plans, LININGS, strict=True)][:2]
+    truth = [reference.scan(w, p.position, p.heading, 2) for w, p in zip(walls, poses, strict=True)]
+    np.testing.assert_allclose(ranges, np.concatenate(truth), atol=1e-3)
 
 
 def test_a_batch_of_different_tunnels_and_lidars_goes_to_the_kernels_as_rows(plans, together, monkeypatch):
     """Otherwise it would fall back to XLA on a GPU, which is several times slower there."""
-    poses, index = poses_in(plans, 8)[0], jnp.arange(8) % 2 * 3
+    poses, index = poses_in(plans, 8)[0], jnp.arange(8) % 2 * 2
     params = lidar.LidarParams(range_max=jnp.linspace(5.0, 30.0, 8), range_sigma=jnp.linspace(0.0, 0.1, 8))
 
     def scans() -> jax.Array:
         one = lambda i, p, h, s, lidar_params: lidar.scan(together.pick(i), p, h, s, lidar_params)  # noqa: E731
         rows = (jnp.asarray(value[:8]) for value in vars(poses).values())
-        return jax.vmap(one)(index, *rows, params)
+        return jax.jit(jax.vmap(one))(index, *rows, params)
 
     by_xla, kernel, calls = scans(), lidar._cast_rows, []
     monkeypatch.setattr(lidar, "_cast_rows", lambda *args: calls.append(args) or kernel(*args))
@@ -142,13 +141,13 @@ def test_a_batch_of_different_tunnels_and_lidars_goes_to_the_kernels_as_rows(pla
 def test_a_stack_of_one_is_that_one_and_picks_itself(alone):
     assert Tunnel.stack(alone[:1]) is alone[0]
     assert alone[0].pick(0) is alone[0]
-    assert (alone[0].count, Tunnel.stack(alone[:3]).count) == (1, 3)
+    assert (alone[0].count, Tunnel.stack(alone[:2]).count) == (1, 2)
 
 
 def test_an_empty_stack_and_a_stack_of_stacks_are_refused(alone, together):
     with pytest.raises(ValueError, match="at least one"):
         Tunnel.stack([])
-    with pytest.raises(ValueError, match="tunnel 1 is a stack of 4"):
+    with pytest.raises(ValueError, match="tunnel 1 is a stack of 3"):
         Tunnel.stack([alone[0], together])
 
 

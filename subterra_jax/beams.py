@@ -1,0 +1,83 @@
+"""Where the beams of common LiDARs look: unit vectors in the sensor's frame, x ahead, y to the left, z upwards.
+
+They feed `lidar3d.scan`. One frame or sweep is taken from one pose: the sensor's own motion during it is the caller's.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+# Source: the speeds reported for the two prisms of Livox's Mid-40, turns a second; they have no small common period.
+_PRISMS = (7294.0 / 60.0, -4664.0 / 60.0)
+
+
+def planar(n_beams: int = 16) -> Float[np.ndarray, "n_beams 3"]:
+    """A planar LiDAR, as in `lidar.scan`: beam 0 straight ahead, the others counter-clockwise, evenly spaced."""
+    bearing = np.arange(_at_least_one("n_beams", n_beams)) * (2.0 * np.pi / n_beams)
+    return _unit(bearing, np.zeros(n_beams))
+
+
+def spinning(elevations: Float[np.ndarray, "n_rings"], n_columns: int) -> Float[np.ndarray, "n 3"]:
+    """A turning head: columns counter-clockwise from straight ahead, all rings of a column before the next.
+
+    Args:
+        elevations: Of the rings, rad.
+        n_columns: Columns in a turn.
+
+    Raises:
+        ValueError: There is no column, or an elevation is not below a right angle.
+    """
+    elevations = np.asarray(elevations, np.float64)
+    if not np.all(np.abs(elevations) < np.pi / 2):
+        raise ValueError(f"elevations must lie between -pi/2 and pi/2 rad, got {elevations.tolist()}")
+    azimuth = np.arange(_at_least_one("n_columns", n_columns)) * (2.0 * np.pi / n_columns)
+    return _unit(np.repeat(azimuth, len(elevations)), np.tile(elevations, n_columns))
+
+
+def vlp16(n_columns: int = 1800) -> Float[np.ndarray, "n 3"]:
+    """Velodyne VLP-16: 16 rings from -15° to 15°.
+
+    Source: VLP-16 user manual; at 10 turns/s it fires 1,808 times in a turn.
+    """
+    return spinning(np.deg2rad(np.arange(-15.0, 16.0, 2.0)), n_columns)
+
+
+def os1(n_columns: int = 1024) -> Float[np.ndarray, "n 3"]:
+    """Ouster OS1-64: 64 rings evenly over 45°, the uppermost first.
+
+    Source: OS1 hardware user manual. Its four columns of beams with slightly different azimuths are left out.
+    """
+    return spinning(np.deg2rad(np.linspace(22.5, -22.5, 64)), n_columns)
+
+
+def rosette(
+    n_beams: int = 24_000,
+    start: float = 0.0,
+    duration: float = 0.1,
+    half_fov: tuple[float, float] = (np.deg2rad(35.2), np.deg2rad(38.6)),
+) -> Float[np.ndarray, "n_beams 3"]:
+    """A pattern that never repeats, as a Livox scans with two counter-rotating prisms.
+
+    The shape of the instrument's pattern, not a copy of it: Livox does not publish the angles.
+
+    Args:
+        n_beams: Beams.
+        start: Time of the first beam, s; the next sweep begins at `start + duration`.
+        duration: Of the sweep, s.
+        half_fov: Half of the field of view across and upright, rad. The default is the Avia's 70.4° by 77.2°.
+    """
+    time = start + np.arange(_at_least_one("n_beams", n_beams)) * (duration / n_beams)
+    first, second = (2.0 * np.pi * rate * time for rate in _PRISMS)
+    azimuth = half_fov[0] * 0.5 * (np.cos(first) + np.cos(second))
+    return _unit(azimuth, half_fov[1] * 0.5 * (np.sin(first) + np.sin(second)))
+
+
+def _unit(azimuth: np.ndarray, elevation: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    level = np.cos(elevation)
+    vectors = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+    return vectors.astype(np.float32)
+
+
+def _at_least_one(name: str, count: int) -> int:
+    if count < 1:
+        raise ValueError(f"{name} must be at least 1, got {count}")
+    return count

@@ -1,0 +1,147 @@
+"""Domain randomisation: environments of one batch that differ in any number of their params."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from subterra_jax.blocks import LIDAR_GAP
+from subterra_jax.state import EnvParams
+from subterra_jax.tunnel import CONTACT_REACH
+
+
+@dataclasses.dataclass(frozen=True)
+class LogUniform:
+    """A range in which every ratio is as likely as any other.
+
+    Attributes:
+        low: Least value, above 0.
+        high: Largest value.
+    """
+
+    low: float
+    high: float
+
+
+Range = tuple[int | float, int | float] | LogUniform
+
+
+def randomize(
+    key: PRNGKeyArray, params: EnvParams, ranges: Mapping[str, Range], n_envs: int
+) -> tuple[EnvParams, EnvParams]:
+    """Params of a batch of environments, each with its own draw.
+
+        params, axes = randomize(key, params, {"lidar.range_sigma": (0.0, 0.1), "vehicle.speed_max": (1.0, 2.0)}, 1024)
+        batch = AutoReset(env, params_axes=axes)
+
+    The draw is made once, for all episodes of an environment; what an episode draws by itself (biases, slip, goals,
+    which tunnel of a stack) stays as it is. Everything may vary without slowing the fused kernels of a GPU but the
+    tunnel, which is refused: several tunnels belong in one stack.
+
+    Args:
+        key: Source of the draws. What is drawn for one name does not depend on the other names.
+        params: What all environments share but for the named numbers.
+        ranges: By dotted name of a number in `params`: least and largest value, drawn uniformly, or `LogUniform`. Whole
+            numbers are drawn with both ends included.
+        n_envs: How many environments.
+
+    Returns:
+        The params with `(n_envs, ...)` where a name was given, and the same tree with 0 there and None elsewhere, for
+        `AutoReset.params_axes`; it can be hashed, as a static argument must.
+
+    Raises:
+        ValueError: A name is unknown, static or part of the tunnel, a range is empty or has a value that the simulator
+            cannot honour, or `n_envs` is below 1.
+    """
+    if n_envs < 1:
+        raise ValueError(f"n_envs must be at least 1, got {n_envs}")
+    leaves = {name: _find(params, name) for name in ranges}
+    bounds = {name: _bounds(name, wanted, leaves[name]) for name, wanted in ranges.items()}
+    _check(params, bounds)
+    axes = jax.tree.map(lambda _: None, params)
+    for name, leaf in leaves.items():
+        own_key = jax.random.fold_in(key, zlib.crc32(name.encode()))
+        drawn = _draw(own_key, leaf.dtype, (n_envs, *leaf.shape), *bounds[name], isinstance(ranges[name], LogUniform))
+        params, axes = _replaced(params, name.split("."), drawn), _replaced(axes, name.split("."), 0)
+    return params, axes
+
+
+def _find(params: EnvParams, name: str) -> Array:
+    """The number of a dotted name, or what is wrong with that name."""
+    node: Any = params
+    path = name.split(".")
+    for depth, part in enumerate(path):
+        here = ".".join(path[:depth]) or "the params"
+        if node is None:
+            raise ValueError(f"no {name!r} to randomise: this task has no {here}")
+        fields = {f.name: f for f in dataclasses.fields(node)} if dataclasses.is_dataclass(node) else {}
+        if part not in fields:
+            raise ValueError(f"no {name!r} to randomise: {here} has {', '.join(fields) or 'no parts'}")
+        if depth == 0 and part == "tunnel":
+            raise ValueError(f"{name!r} cannot be randomised: the tunnel is one for all; stack several instead")
+        if not fields[part].metadata.get("pytree_node", True):
+            raise ValueError(f"{name!r} cannot be randomised: it is static, because the shape of arrays depends on it")
+        node = getattr(node, part)
+    if node is None or dataclasses.is_dataclass(node):
+        raise ValueError(f"{name!r} is no number" if node is not None else f"this task has no {name!r} to randomise")
+    return jnp.asarray(node)
+
+
+def _bounds(name: str, wanted: Range, leaf: Array) -> tuple[int | float, int | float]:
+    """Least and largest value of a range, or what is wrong with it."""
+    log = isinstance(wanted, LogUniform)
+    low, high = (wanted.low, wanted.high) if isinstance(wanted, LogUniform) else wanted
+    if not (np.isfinite(low) and np.isfinite(high) and low <= high):
+        raise ValueError(f"range of {name!r} must be finite and not empty, got {low} to {high}")
+    if log and low <= 0.0:
+        raise ValueError(f"log-uniform range of {name!r} must be above 0, got {low} to {high}")
+    if jnp.issubdtype(leaf.dtype, jnp.integer) and (log or low != int(low) or high != int(high)):
+        raise ValueError(f"range of {name!r} must be uniform and of whole numbers, got {low} to {high}")
+    return low, high
+
+
+def _check(params: EnvParams, bounds: dict[str, tuple[int | float, int | float]]) -> None:
+    """Refuse ranges of which some combination would be simulated wrongly."""
+
+    def extremes(name: str) -> tuple[int | float, int | float]:
+        value = _find(params, name)
+        return bounds.get(name, (float(np.min(value)), float(np.max(value))))
+
+    furthest = extremes("lidar.range_max")[1]
+    if furthest > params.tunnel.reach + 1e-6:
+        raise ValueError(
+            f"'lidar.range_max' goes up to {furthest:g} m, but the tunnel was made for {params.tunnel.reach:g} m"
+        )
+    gap = extremes("vehicle.radius")[0] - extremes("vehicle.speed_max")[1] * extremes("vehicle.period")[1]
+    if gap < LIDAR_GAP - 1e-6:
+        raise ValueError(
+            f"the least 'vehicle.radius' less one step at the largest 'vehicle.speed_max' leaves {gap:.2f} m between "
+            f"LiDAR and walls, needed are {LIDAR_GAP} m"
+        )
+    if (largest := extremes("vehicle.radius")[1]) > CONTACT_REACH:
+        raise ValueError(f"'vehicle.radius' goes up to {largest:g} m, walls are looked for within {CONTACT_REACH} m")
+
+
+def _draw(
+    key: PRNGKeyArray, dtype: Any, shape: tuple[int, ...], low: int | float, high: int | float, log: bool
+) -> Array:
+    """Numbers between two bounds."""
+    if jnp.issubdtype(dtype, jnp.integer):
+        return jax.random.randint(key, shape, int(low), int(high) + 1, dtype)
+    if log:
+        return jnp.clip(jnp.exp(jax.random.uniform(key, shape, dtype, np.log(low), np.log(high))), low, high)
+    return jax.random.uniform(key, shape, dtype, low, high)
+
+
+def _replaced(node: Any, path: list[str], value: Any) -> Any:
+    """A tree of dataclasses with one part exchanged."""
+    if len(path) > 1:
+        value = _replaced(getattr(node, path[0]), path[1:], value)
+    return dataclasses.replace(node, **{path[0]: value})

@@ -1,0 +1,143 @@
+"""What a LiDAR sees in a scene folder, as triangles in the tunnel frame: lining, bed, sleepers, rails, furniture."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from subterra_jax.errors import TunnelError
+
+if TYPE_CHECKING:
+    import mujoco
+
+_BORE_SCHEMA = "subterra.bore/1"
+_SCENES = {"smooth": "scene.xml", "pockets": "scene.xml", "furnished": "scene_furnished.xml"}
+_LINING = ("lining", "recess", "floor")
+# Bolts and clips of a few centimetres, which would be half of all triangles.
+SMALL = ("fastening", "nails")
+_LARGEST_SEEN_GROUP = 1
+_BOX_FACES = np.array([(0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5), (2, 3, 7), (2, 7, 6),
+                       (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])  # fmt: skip
+_BOX_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """The centreline of a bore.
+
+    Attributes:
+        station: Uniform, from 0, m, `(n,)`.
+        position: m, `(n, 3)`.
+        tangent: Unit vectors of growing station, `(n, 3)`.
+    """
+
+    station: Float[np.ndarray, "n"]
+    position: Float[np.ndarray, "n 3"]
+    tangent: Float[np.ndarray, "n 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Triangles:
+    """A surface: `vertices (v, 3)` in the tunnel frame, m, and `faces (f, 3)`, rows of them."""
+
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+
+
+def joined(parts: list[Triangles]) -> Triangles:
+    """Several surfaces as one."""
+    before = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + offset for part, offset in zip(parts, before, strict=False)]
+    return Triangles(
+        np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)]),
+        np.concatenate([np.empty((0, 3), np.int64), *faces]),
+    )
+
+
+def read_axis(path: Path) -> Axis:
+    """The centreline in a `bore.npz`.
+
+    Raises:
+        TunnelError: The file cannot be read, is of another schema, or lacks a field.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if str(data["schema"]) != _BORE_SCHEMA:
+                raise TunnelError(f"{path}: field 'schema' must be {_BORE_SCHEMA!r}, is {str(data['schema'])!r}")
+            return Axis(*(np.asarray(data[name], np.float64) for name in ("station", "position", "tangent")))
+    except (OSError, KeyError, ValueError, EOFError) as error:
+        raise TunnelError(f"{path}: not a bore file ({error})") from error
+
+
+def read_mesh(path: Path) -> Triangles:
+    """A mesh file.
+
+    Raises:
+        TunnelError: There is none, it cannot be read, or it holds no triangle.
+    """
+    import trimesh
+
+    if not path.is_file():
+        raise TunnelError(f"{path}: no such mesh; was the scene built by an older version?")
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # each of its readers raises its own
+        raise TunnelError(f"{path}: not a readable mesh ({error})") from error
+    if not len(getattr(mesh, "faces", ())):
+        raise TunnelError(f"{path}: holds no triangle")
+    return Triangles(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+
+
+def read_scene(folder: Path, lining: str = "pockets", leave_out: tuple[str, ...] = SMALL) -> Triangles:
+    """All that is drawn in a scene.
+
+    Args:
+        folder: A scene folder.
+        lining: `smooth`, `pockets`, or `furnished`, which brings the furniture along.
+        leave_out: Kinds of geom, by the first part of their names, that are not wanted.
+
+    Raises:
+        TunnelError: No such lining, or a file of the folder is missing or spoiled.
+    """
+    if lining not in _SCENES:
+        raise TunnelError(f"{folder}: there is no lining {lining!r}; a scene has {', '.join(_SCENES)}")
+    smooth = lining == "smooth"
+    parts = _drawn(folder / _SCENES[lining], (*leave_out, *(_LINING if smooth else ())))
+    return joined([*parts, read_mesh(folder / "meshes" / "lining_smooth.ply")] if smooth else parts)
+
+
+def _drawn(path: Path, leave_out: tuple[str, ...]) -> list[Triangles]:
+    """The meshes and boxes of a MuJoCo scene that a camera sees."""
+    import mujoco
+
+    if not path.is_file():
+        raise TunnelError(f"{path}: no such scene")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise TunnelError(f"{path}: MuJoCo refuses the scene ({error})") from error
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    seen = np.flatnonzero(model.geom_group <= _LARGEST_SEEN_GROUP)
+    kinds = [model.geom(geom).name.split("_")[0] for geom in seen]
+    parts = (_shape(model, data, int(geom)) for geom, kind in zip(seen, kinds, strict=True) if kind not in leave_out)
+    return [part for part in parts if len(part.faces)]
+
+
+def _shape(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> Triangles:
+    """One geom in the world; shapes other than meshes and boxes have no triangles here, and scenes have none."""
+    import mujoco
+
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        mesh = model.geom_dataid[geom]
+        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        vertices = model.mesh_vert[first : first + count].astype(np.float64)
+        first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+        faces = model.mesh_face[first : first + count].astype(np.int64)
+    elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
+        vertices, faces = _BOX_CORNERS * model.geom_size[geom], _BOX_FACES
+    else:
+        vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
+    return Triangles(vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom], faces)

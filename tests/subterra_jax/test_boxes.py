@@ -1,0 +1,82 @@
+"""Boxes around pieces of wall: known rectangles, lids over pockets, and windows found by brute force."""
+
+import numpy as np
+import pytest
+
+from subterra_jax import blocks, boxes, procedural, reference
+from subterra_jax.tunnel import Tunnel
+from subterra_jax.windows import separation, windows
+
+
+def test_the_box_of_a_turned_rectangle_is_that_rectangle():
+    direction = np.array([np.cos(0.3), np.sin(0.3)])
+    normal = np.array([-direction[1], direction[0]])
+    corners = [[7.0, 3.0] + a * 2.0 * direction + b * 0.25 * normal for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+    centre, half, thickness = boxes.thin_boxes(np.array([corners]), np.array([4]))
+    np.testing.assert_allclose(centre[0], [7.0, 3.0], atol=1e-6)
+    # Which of its sides counts as the long axis is left open.
+    assert sorted([np.linalg.norm(half[0]), thickness[0]]) == pytest.approx([0.25, 2.0], abs=3e-5)
+    assert min(abs(half[0] @ normal), abs(half[0] @ direction)) < 1e-6
+
+
+def test_a_box_encloses_its_piece_and_lies_along_a_nearly_straight_one():
+    rng = np.random.default_rng(1)
+    pieces = np.stack([np.linspace(0.0, 2.0, 9) + np.zeros((50, 1)), rng.normal(0.0, 0.01, (50, 9))], axis=-1)
+    centre, half, thickness = boxes.thin_boxes(pieces, np.full(50, 9))
+    length = np.linalg.norm(half, axis=1)
+    along = half / length[:, None]
+    off = pieces - centre[:, None]
+    assert (np.abs(np.einsum("nki,ni->nk", off, along)) <= length[:, None] + 1e-9).all()
+    across = off[..., 1] * along[:, None, 0] - off[..., 0] * along[:, None, 1]
+    assert (np.abs(across) <= thickness[:, None] + 1e-9).all()
+    np.testing.assert_allclose(length, 1.0, atol=0.01)
+    assert thickness.max() < 0.04
+
+
+def test_a_piece_is_boxed_as_it_is_alone_and_a_repeated_point_gets_a_box():
+    rng = np.random.default_rng(0)
+    pieces, count = np.cumsum(rng.normal(0.1, 0.2, (40, 6, 2)), axis=1), rng.integers(2, 7, 40)
+    pieces[7] = pieces[7, :1]
+    together = boxes.thin_boxes(pieces, count)
+    for i in range(40):
+        for many, one in zip(together, boxes.thin_boxes(pieces[i : i + 1], count[i : i + 1]), strict=True):
+            np.testing.assert_array_equal(many[i], one[0])
+    assert together[2][7] == pytest.approx(boxes.BOX_MARGIN, abs=1e-7)
+
+
+def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
+    def wall(depth: float) -> np.ndarray:
+        return np.array([[0.0, 0.0], [0.5, 0.0], [0.5, depth], [1.5, depth], [1.5, 0.0], [2.0, 0.0]])
+
+    pieces = np.stack([wall(0.13), wall(1.0), wall(0.13)])
+    hull, size = boxes.lidded(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
+    assert size.tolist() == [2, 6, 6]
+    np.testing.assert_array_equal(hull[0, :2], [[0.0, 0.0], [2.0, 0.0]])
+
+
+def test_the_distance_to_a_segment_is_that_to_its_line_or_its_nearer_end():
+    point = np.array([[0.0, 2.0], [5.0, 4.0], [-4.0, 0.0]])
+    np.testing.assert_allclose(boxes.distance_to_segment(point, np.zeros(2), np.array([2.0, 0.0])), [2.0, 5.0, 2.0])
+
+
+def test_windows_hold_every_block_within_reach_found_one_by_one():
+    plan = procedural.plan(3, linings=("pockets",)).slice(40.0, 90.0)
+    cut = blocks.build_blocks(plan, plan.lining("pockets"), 2.0, 16)
+    first, size = windows(plan, cut, 12.0)
+    apart = separation(cut, 12.0)
+    vertex = cut.offset + cut.centre[:, None]
+    segments = [np.hstack([v[:-1], v[1:]]) for v in vertex]
+    for node in range(0, len(plan.station), 15):
+        near = [i for i, s in enumerate(segments) if reference.clearance(s, plan.centre[node : node + 1])[0] < 12.0]
+        assert first[node] <= min(near)
+        assert max(near) < first[node] + size
+    for i in range(0, len(segments) - apart, 7):
+        ends = reference.clearance(np.concatenate(segments[i + apart :]), vertex[i])
+        assert ends.min() > 12.0
+
+
+def test_a_tunnel_ten_times_as_long_has_no_larger_windows():
+    long = procedural.ProceduralConfig(length=(3510.0, 3510.0))
+    tunnel = Tunnel.from_plan(procedural.plan(4, long, linings=("pockets",)))
+    assert float(tunnel.length) == pytest.approx(3510.0)
+    assert tunnel.n_scan <= procedural.family("train", 8).n_scan + 4
