@@ -2,17 +2,30 @@
 
 import numpy as np
 
+from subterra_jax.obstacles import Boxes
 from subterra_jax.tunnel import Tunnel
 
 BACKGROUND = (250, 250, 248)
 WALL = (60, 60, 66)
 BEAM = (240, 190, 120)
 ROBOT = (30, 110, 200)
+GOAL = (40, 160, 90)
+BOX = (150, 90, 60)
 
 
-def wall_points(tunnel: Tunnel, step: float = 0.04) -> np.ndarray:
-    """Points along every wall segment, at most `step` metres apart, `(n, 2)`, m."""
-    vertex = np.asarray(tunnel.box)[:2].T[:, :, None] + np.asarray(tunnel.wall)
+def wall_points(tunnel: Tunnel, first: int, step: float = 0.04) -> np.ndarray:
+    """Points along the walls that a LiDAR can see.
+
+    Args:
+        tunnel: The tunnel.
+        first: First block of the window, an entry of `tunnel.scan_first`.
+        step: Largest distance between points, m.
+
+    Returns:
+        Points, m, `(n, 2)`.
+    """
+    window = slice(first, first + tunnel.n_scan)
+    vertex = np.asarray(tunnel.box[:2, window]).T[:, :, None] + np.asarray(tunnel.wall[window])
     start, end = (part.transpose(0, 2, 1).reshape(-1, 2) for part in (vertex[:, :, :-1], vertex[:, :, 1:]))
     return _along(start, end, step)
 
@@ -26,6 +39,17 @@ def _along(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
     return start[owner] + share * (end[owner] - start[owner])
 
 
+def _filled(boxes: Boxes, position: np.ndarray, view: float, step: float) -> np.ndarray:
+    """Points all over the boxes that may be seen."""
+    points = [np.zeros((0, 2))]
+    for centre, axis, half in zip(boxes.centre, boxes.axis, boxes.half, strict=True):
+        if np.abs(centre - position).max() < view:
+            along, across = (np.arange(-side, side, step) for side in half)
+            u, v = (part.reshape(-1, 1) for part in np.meshgrid(along, across))
+            points.append(centre + u * axis + v * np.array([-axis[1], axis[0]]))
+    return np.concatenate(points)
+
+
 def top_down(
     walls: np.ndarray,
     position: np.ndarray,
@@ -34,6 +58,8 @@ def top_down(
     ranges: np.ndarray,
     view: float = 24.0,
     size: int = 480,
+    goal: np.ndarray | None = None,
+    boxes: Boxes | None = None,
 ) -> np.ndarray:
     """The robot from above, in the middle of the picture, x to the right and y up.
 
@@ -45,6 +71,8 @@ def top_down(
         ranges: Its LiDAR ranges, m, beam 0 straight ahead, counter-clockwise.
         view: Width of what is seen, m.
         size: Width and height of the picture, pixels.
+        goal: Both ends of a line across the tunnel, m, `(2, 2)`; None or empty for no goal.
+        boxes: Boxes that stand in the way.
 
     Returns:
         Picture `(size, size, 3)`, uint8.
@@ -61,6 +89,11 @@ def top_down(
     angle = heading + np.arange(len(ranges)) * (2.0 * np.pi / len(ranges))
     tips = position + ranges[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     paint(_along(np.broadcast_to(position, tips.shape), tips, 1.0 / scale), BEAM)
+    if goal is not None and len(goal):
+        for shift in (0.0, 1.0 / scale):
+            paint(_along(goal[:1] + shift, goal[1:] + shift, 0.5 / scale), GOAL)
+    if boxes is not None:
+        paint(_filled(boxes, position, view, 0.5 / scale), BOX)
     # Twice, half a pixel apart, so that walls are two pixels wide.
     for shift in (0.0, 0.6 / scale):
         paint(walls + shift, WALL)

@@ -19,6 +19,8 @@ from subterra_jax.relief import Relief
 N_SWEEPS = 400
 # One in how many of the rays a sweep takes on, first and while no more are left than the second; none fewer than FEW.
 SHARES, FEW = (8, 64), 64
+# Rays that go through the sweeps together: an H200 casts 78 M rays/s in one batch of 2¹⁸ and 3 M rays/s in one of 2²¹.
+CHUNK = 1 << 18
 
 
 def scan(
@@ -105,6 +107,25 @@ def _cast_rays(
     limits: Float[Array, "n"],
 ) -> Float[Array, "n"]:
     """Any rays in one relief, each from the block that holds its origin."""
+    rays = (origins, directions, blocks, limits)
+    n = len(limits)
+    if n <= CHUNK:
+        return _cast_chunk(relief, *rays)
+    # The last chunk is filled up with the first rays.
+    n_chunks = -(-n // CHUNK)
+    which = jnp.arange(n_chunks * CHUNK).reshape(n_chunks, CHUNK) % n
+    chunks = lax.map(lambda chosen: _cast_chunk(relief, *(part[chosen] for part in rays)), which)
+    return chunks.reshape(-1)[:n]
+
+
+def _cast_chunk(
+    relief: Relief,
+    origins: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"],
+    blocks: Int[Array, "n"],
+    limits: Float[Array, "n"],
+) -> Float[Array, "n"]:
+    """A sweep of all rays, then sweeps of ever fewer that are not done."""
     n = len(limits)
     rays = march.Ray(jnp.zeros(n), blocks, jnp.zeros(n, jnp.int32), jnp.full(n, jnp.inf))
     rays = march.sweep(relief, rays, origins, directions, limits)

@@ -155,3 +155,14 @@ def test_the_planar_lidars_noise_leaves_a_beam_without_echo_alone(reliefs):
     noisy = np.asarray(lidar.add_noise(jnp.asarray(ranges), jnp.ones(N_BEAMS), lidar.LidarParams(range_sigma=0.1)))
     assert noisy[0] == np.float32(30.0)
     np.testing.assert_allclose(noisy[4], ranges[4] + 0.1, atol=1e-6)
+
+
+def test_a_batch_cast_in_chunks_gives_what_it_gives_in_one(reliefs, monkeypatch):
+    rng = np.random.default_rng(1)
+    origin = np.column_stack([rng.uniform(5.0, 40.0, 8), rng.uniform(-1.0, 1.0, (8, 2))]).astype(np.float32)
+    station = jnp.asarray(origin[:, 0])
+    beam = jnp.asarray(beams.planar(7), jnp.float32)
+    whole = jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["bend"], origin, beam, station, 30.0)
+    monkeypatch.setattr(lidar3d, "CHUNK", 25)
+    parts = jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["bend"], origin, beam, station, 30.0)
+    np.testing.assert_array_equal(whole, parts)

@@ -1,0 +1,105 @@
+"""Gymnax 1.0's interface: `reset(key, params)` and `step(key, state, action, params)` that begins anew by itself.
+
+It needs no Gymnax to be installed; Gymnax's wrappers run on it where there is one.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from subterra_jax.env import Box, Info, TunnelEnv
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tasks import make
+
+
+class BoxSpace:
+    """A box with Gymnax's methods, jittable.
+
+    Args:
+        box: The bounds.
+    """
+
+    def __init__(self, box: Box):
+        self.low, self.high = jnp.asarray(box.low), jnp.asarray(box.high)
+        self.shape, self.dtype = box.shape, jnp.float32
+
+    def sample(self, key: PRNGKeyArray) -> Float[Array, "n"]:
+        """A uniform draw; standard normal where there are no bounds, exponential beyond the one there is."""
+        has_low, has_high = jnp.isfinite(self.low), jnp.isfinite(self.high)
+        low, high = jnp.where(has_low, self.low, 0.0), jnp.where(has_high, self.high, 0.0)
+        keys = jax.random.split(key, 3)
+        inside = low + jax.random.uniform(keys[0], self.shape) * (high - low)
+        tail, bell = jax.random.exponential(keys[1], self.shape), jax.random.normal(keys[2], self.shape)
+        open_ended = jnp.where(has_low, low + tail, jnp.where(has_high, high - tail, bell))
+        return jnp.where(has_low & has_high, inside, open_ended)
+
+    def contains(self, x: Float[Array, "n"]) -> Bool[Array, ""]:
+        """Whether every number lies within its bounds; False where one is NaN."""
+        return jnp.all((x >= self.low) & (x <= self.high))
+
+
+class SubterraGymnax:
+    """One environment with Gymnax's methods; hashable, so that Gymnax's wrappers may jit over it.
+
+    Args:
+        task: Id of the task.
+        **options: As for `subterra_jax.make`.
+    """
+
+    def __init__(self, task: str = "Subterra/Traverse-v0", **options: Any):
+        self.env: TunnelEnv
+        self.env, self._params = make(task, **options)
+
+    @property
+    def default_params(self) -> EnvParams:
+        """Params of the task as it was made."""
+        return self._params
+
+    @property
+    def name(self) -> str:
+        """Id of the task."""
+        return self.env.id
+
+    @property
+    def num_actions(self) -> int:
+        """Numbers in one action."""
+        return self.env.action_size
+
+    def action_space(self, params: EnvParams | None = None) -> BoxSpace:
+        """Bounds of an action."""
+        return BoxSpace(self.env.action_space(self._or_default(params)))
+
+    def observation_space(self, params: EnvParams | None = None) -> BoxSpace:
+        """Bounds of an observation."""
+        return BoxSpace(self.env.observation_space(self._or_default(params)))
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: PRNGKeyArray, params: EnvParams | None = None) -> tuple[Float[Array, "n_obs"], State]:
+        """Begin an episode."""
+        return self.env.reset(key, self._or_default(params))
+
+    @partial(jax.jit, static_argnums=0)
+    def step(
+        self, key: PRNGKeyArray, state: State, action: Float[Array, "n_action"], params: EnvParams | None = None
+    ) -> tuple[Float[Array, "n_obs"], State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
+        """Take one step; where it ends the episode, observation and state are those of the next, freshly drawn.
+
+        Returns:
+            Observation, state, reward, terminated, truncated and info, in which `final_observation` is the step's own
+            observation, and `done` is whether the episode ended.
+        """
+        params = self._or_default(params)
+        step_key, reset_key = jax.random.split(key)
+        stepped_obs, stepped, reward, terminated, truncated, info = self.env.step(step_key, state, action, params)
+        begun_obs, begun = self.env.reset(reset_key, params)
+        done = terminated | truncated
+        obs, state = jax.tree.map(
+            lambda new, old: jnp.where(done, new, old), (begun_obs, begun), (stepped_obs, stepped)
+        )
+        return obs, state, reward, terminated, truncated, {**info, "final_observation": stepped_obs, "done": done}
+
+    def _or_default(self, params: EnvParams | None) -> EnvParams:
+        return self._params if params is None else params

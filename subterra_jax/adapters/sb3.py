@@ -1,0 +1,89 @@
+"""Stable-Baselines3: a `VecEnv` over the batch, `PPO("MlpPolicy", SubterraVecEnv(256))`."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from subterra_jax.adapters.missing import MissingLibraryError
+from subterra_jax.adapters.rows import EnvRow
+from subterra_jax.adapters.spaces import Observation, as_observation
+from subterra_jax.adapters.vector import SubterraVectorEnv
+
+try:
+    from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+except ImportError as missing:
+    raise MissingLibraryError(__name__, "stable-baselines3") from missing
+
+
+class SubterraVecEnv(VecEnv):
+    """A batch of environments that begin anew by themselves, each with a fresh draw.
+
+    A finished environment's `info` has `terminal_observation`, and `TimeLimit.truncated` tells the horizon from an
+    ending. Environment i seeded with s + i does what a single `SubterraEnv` seeded with s + i does, up to rounding.
+
+    Args:
+        num_envs: How many.
+        task: Id of the task. One that adds to the paper's observation gives a dict, for `MultiInputPolicy`.
+        flat: Give the bare vector for every task, for `MlpPolicy`.
+        **options: As for `SubterraEnv`.
+    """
+
+    def __init__(self, num_envs: int, task: str = "Subterra/Traverse-v0", flat: bool = False, **options: Any):
+        self._envs = SubterraVectorEnv(num_envs, AutoresetMode.SAME_STEP, task, flat=flat, **options)
+        self._rows = [EnvRow(self._envs, index) for index in range(num_envs)]
+        self._action = np.zeros((0,), np.float32)
+        super().__init__(num_envs, self._envs.single_observation_space, self._envs.single_action_space)
+        self.metadata["render_fps"] = self._envs.metadata["render_fps"]
+
+    def reset(self) -> Observation:
+        """Begin an episode everywhere; seeds given by `seed` are used once."""
+        obs, _ = self._envs.reset(seed=list(self._seeds))
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self._reset_seeds()
+        self._reset_options()
+        return obs
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for `step_wait`."""
+        self._action = actions
+
+    def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Observations to act on next, rewards (float32), dones and one `info` for each environment."""
+        obs, reward, terminated, truncated, told = self._envs.advance(self._action)
+        columns = {name: values.tolist() for name, values in told.info.items()}
+        columns["TimeLimit.truncated"] = (truncated & ~terminated).tolist()
+        infos = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        done = terminated | truncated
+        for index in np.flatnonzero(done):
+            infos[index]["terminal_observation"] = as_observation(np.array(told.obs[index]), self._envs.fields)
+        return obs, np.array(reward), done, infos
+
+    def close(self) -> None:
+        """Release the renderer, if there is one."""
+        self._envs.close()
+
+    def get_images(self) -> Sequence[np.ndarray | None]:
+        """A picture of each environment."""
+        return self._envs.render() or [None] * self.num_envs
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """An attribute of each environment: one of `EnvRow`, or one that was set before."""
+        return [getattr(self._rows[index], attr_name) for index in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Keep a value with each environment for `get_attr`; nothing in the simulator changes by it."""
+        for index in self._get_indices(indices):
+            setattr(self._rows[index], attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of `EnvRow` for each environment."""
+        return [
+            getattr(self._rows[index], method_name)(*method_args, **method_kwargs)
+            for index in self._get_indices(indices)
+        ]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
+        """No environment is wrapped by itself: the batch as a whole is."""
+        return [False for _ in self._get_indices(indices)]
