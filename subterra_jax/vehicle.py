@@ -1,9 +1,15 @@
 """The robot: a unicycle that does exactly what it is told, and the walls it must not touch."""
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
+from subterra_jax import native
+from subterra_jax.rows import rowwise
 from subterra_jax.tunnel import Tunnel, node_at
 
 
@@ -77,7 +83,14 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
     Returns:
         Distance, m; exact up to 0.8 m, and never below 0.8 m where the truth is beyond.
     """
-    window = tunnel.contact_first[node_at(tunnel, station)] + jnp.arange(tunnel.n_contact)
+    first = tunnel.contact_first[node_at(tunnel, station)]
+    take: Callable[..., Array] = _gap_by_kernel if native.supported() else _gap
+    return take(tunnel.walls, position, first)
+
+
+def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> Float[Array, ""]:
+    """`clearance` in a known window, by XLA."""
+    window = first + jnp.arange(tunnel.n_contact)
     vertex = (tunnel.box[:2, window].T - position)[:, :, None] + tunnel.wall[window]
     x0, y0, x1, y1 = vertex[:, 0, :-1], vertex[:, 1, :-1], vertex[:, 0, 1:], vertex[:, 1, 1:]
     edge_x, edge_y = x1 - x0, y1 - y0
@@ -86,6 +99,17 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
     share = jnp.clip(-(x0 * edge_x + y0 * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
     near_x, near_y = x0 + share * edge_x, y0 + share * edge_y
     return jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y))
+
+
+def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
+    """Many points in one tunnel."""
+    from subterra_jax.native import calls  # numba is optional
+
+    by_xla: Callable[..., Array] = jax.vmap(_gap, in_axes=(None, 0, 0))
+    return lax.platform_dependent(tunnel, position, first, cpu=calls.clearance, default=by_xla)
+
+
+_gap_by_kernel = rowwise(_gap, _gap_rows)
 
 
 def in_contact(

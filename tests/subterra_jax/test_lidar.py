@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from subterra_jax import lidar, reference
-from subterra_jax.plan import TunnelPlan, load_tunnel
+from subterra_jax.plan import TunnelPlan
+from subterra_jax.sources import load_tunnel
 from subterra_jax.tunnel import Tunnel
 from tests.subterra_jax import tunnels
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from subterra_jax import reference, vehicle
-from subterra_jax.plan import load_tunnel
+from subterra_jax.sources import load_tunnel
 from subterra_jax.tunnel import Tunnel, foot
 from tests.subterra_jax import tunnels
 

@@ -1,0 +1,200 @@
+"""Sixteen numbers at a time: vector types for numba, so that a kernel says what is to be a SIMD instruction.
+
+LLVM splits the vectors into whatever registers the processor has. Operators and comparisons work between vectors and
+between a vector and a number of its kind; comparisons of floats are false where one is NaN.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+N_LANES = 16
+
+_FLOAT, _INT, _BOOL = ir.FloatType(), ir.IntType(32), ir.IntType(1)
+
+
+class Lanes(types.Type):
+    """A vector of 16 elements; its values live in registers, never in an array of Python's."""
+
+    def __init__(self, name: str, element: ir.Type, scalar: types.Type) -> None:
+        super().__init__(name=f"lanes of {name}")
+        self.vector = ir.VectorType(element, N_LANES)
+        self.scalar = scalar
+
+
+FLOATS = Lanes("float32", _FLOAT, types.float32)
+INTS = Lanes("int32", _INT, types.int32)
+MASK = Lanes("bool", _BOOL, types.boolean)
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, lanes: Lanes) -> None:
+        super().__init__(dmm, lanes, lanes.vector)
+
+
+def _widen(builder: ir.IRBuilder, kind: types.Type, value: ir.Value) -> ir.Value:
+    """A vector as it is; a number in every lane of one."""
+    if isinstance(kind, Lanes):
+        return value
+    vector = ir.VectorType(value.type, N_LANES)
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, _INT(0))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_INT, N_LANES), [0] * N_LANES))
+
+
+def _define(
+    op: Callable[..., Any], kinds: tuple[Lanes, ...], result: Lanes | None, emit: Callable[..., ir.Value]
+) -> None:
+    """Teach numba a binary operator; `emit` gets the builder, the kind and two vectors."""
+
+    class Template(AbstractTemplate):
+        def generic(self, args: Any, kws: Any) -> Any:
+            kind = next((arg for arg in args if isinstance(arg, Lanes)), None)
+            if kind not in kinds or any(isinstance(arg, Lanes) and arg is not kind for arg in args):
+                return None
+            return signature(result or kind, *(arg if arg is kind else kind.scalar for arg in args))
+
+    infer_global(op)(Template)
+    for kind in kinds:
+
+        def lower(context: Any, builder: Any, sig: Any, args: Any, kind: Lanes = kind) -> ir.Value:
+            return emit(builder, kind, *(_widen(builder, *pair) for pair in zip(sig.args, args, strict=True)))
+
+        for pair in ((kind, kind), (kind, kind.scalar), (kind.scalar, kind)):
+            lower_builtin(op, *pair)(lower)
+
+
+def _comparison(sign: str) -> Callable[..., ir.Value]:
+    def emit(builder: ir.IRBuilder, kind: Lanes, a: ir.Value, b: ir.Value) -> ir.Value:
+        return builder.fcmp_ordered(sign, a, b) if kind is FLOATS else builder.icmp_signed(sign, a, b)
+
+    return emit
+
+
+_define(operator.add, (FLOATS,), None, lambda builder, _, a, b: builder.fadd(a, b))
+_define(operator.sub, (FLOATS,), None, lambda builder, _, a, b: builder.fsub(a, b))
+_define(operator.mul, (FLOATS,), None, lambda builder, _, a, b: builder.fmul(a, b))
+_define(operator.truediv, (FLOATS,), None, lambda builder, _, a, b: builder.fdiv(a, b))
+_define(operator.and_, (INTS, MASK), None, lambda builder, _, a, b: builder.and_(a, b))
+_define(operator.or_, (INTS, MASK), None, lambda builder, _, a, b: builder.or_(a, b))
+for _op, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
+    _define(_op, (FLOATS, INTS), MASK, _comparison(_sign))
+_define(operator.eq, (FLOATS, INTS), MASK, _comparison("=="))
+
+
+def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: list[ir.Value]) -> ir.Value:
+    """A call of one of LLVM's own functions."""
+    function = builder.module.globals.get(name)
+    if function is None:
+        function = ir.Function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)
+    return builder.call(function, args)
+
+
+@intrinsic
+def where(typing: Any, mask: Any, then: Any, otherwise: Any) -> Any:
+    """Lane by lane `then` where the mask is set, else `otherwise`; one of the two may be a number."""
+    kind = then if isinstance(then, Lanes) else otherwise
+    sig = signature(kind, MASK, *(arg if arg is kind else kind.scalar for arg in (then, otherwise)))
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        return builder.select(args[0], *(_widen(builder, *pair) for pair in zip(sig.args[1:], args[1:], strict=True)))
+
+    return sig, emit
+
+
+@intrinsic
+def magnitude(typing: Any, values: Any) -> Any:
+    """Absolute values."""
+    return signature(FLOATS, FLOATS), lambda context, builder, sig, args: _call(
+        builder, f"llvm.fabs.v{N_LANES}f32", FLOATS.vector, args
+    )
+
+
+@intrinsic
+def root(typing: Any, values: Any) -> Any:
+    """Square roots."""
+    return signature(FLOATS, FLOATS), lambda context, builder, sig, args: _call(
+        builder, f"llvm.sqrt.v{N_LANES}f32", FLOATS.vector, args
+    )
+
+
+@intrinsic
+def least(typing: Any, values: Any) -> Any:
+    """The least of 16 integers."""
+    return signature(types.int32, INTS), lambda context, builder, sig, args: _call(
+        builder, f"llvm.vector.reduce.smin.v{N_LANES}i32", _INT, args
+    )
+
+
+@intrinsic
+def numbered(typing: Any) -> Any:
+    """The number of each lane, 0 to 15."""
+    return signature(INTS), lambda context, builder, sig, args: ir.Constant(INTS.vector, list(range(N_LANES)))
+
+
+@intrinsic
+def following(typing: Any, values: Any) -> Any:
+    """Each lane's follower's value; the last lane keeps its own."""
+    order = ir.Constant(ir.VectorType(_INT, N_LANES), [*range(1, N_LANES), N_LANES - 1])
+    return signature(values, values), lambda context, builder, sig, args: builder.shuffle_vector(
+        args[0], args[0], order
+    )
+
+
+@intrinsic
+def bits(typing: Any, value: Any) -> Any:
+    """The bits of floats as integers; those of floats that are not negative sort like them."""
+    result = INTS if value is FLOATS else types.int32
+    return signature(result, value), lambda context, builder, sig, args: builder.bitcast(
+        args[0], INTS.vector if value is FLOATS else _INT
+    )
+
+
+@intrinsic
+def from_bits(typing: Any, value: Any) -> Any:
+    """The float that has the bits of an integer."""
+    return signature(types.float32, types.int32), lambda context, builder, sig, args: builder.bitcast(args[0], _FLOAT)
+
+
+def _address(context: Any, builder: Any, kind: Any, array: ir.Value, index: ir.Value) -> ir.Value:
+    """Where 16 elements of a flat contiguous array begin."""
+    data = context.make_array(kind)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), FLOATS.vector.as_pointer())
+
+
+@intrinsic
+def load(typing: Any, array: Any, index: Any) -> Any:
+    """16 consecutive elements of a flat contiguous float32 array; bounds are not checked."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        return builder.load(_address(context, builder, sig.args[0], args[0], args[1]), align=4)
+
+    return signature(FLOATS, array, types.intp), emit
+
+
+@intrinsic
+def load_some(typing: Any, array: Any, index: Any, mask: Any) -> Any:
+    """As `load`, but lanes outside the mask are 0 and their memory is not touched."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        address = _address(context, builder, sig.args[0], args[0], args[1])
+        zero = ir.Constant(FLOATS.vector, None)
+        return _call(builder, f"llvm.masked.load.v{N_LANES}f32.p0", FLOATS.vector, [address, _INT(4), args[2], zero])
+
+    return signature(FLOATS, array, types.intp, MASK), emit
+
+
+@intrinsic
+def store(typing: Any, array: Any, index: Any, values: Any) -> Any:
+    """Write 16 consecutive elements of a flat contiguous float32 array; bounds are not checked."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        builder.store(args[2], _address(context, builder, sig.args[0], args[0], args[1]), align=4)
+        return context.get_dummy_value()
+
+    return signature(types.void, array, types.intp, FLOATS), emit
