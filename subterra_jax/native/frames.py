@@ -41,7 +41,7 @@ def read32(typing: Any, address: Any) -> Any:
     )
 
 
-def _writer(kind: types.Integer) -> Any:
+def _writer(kind: Any) -> Any:
     """A compiled function that puts an integer at an address."""
 
     @intrinsic

@@ -1,7 +1,5 @@
 """The kernels as custom calls of XLA: what they read from a frame, and the machine code that XLA calls."""
 
-import hashlib
-from pathlib import Path
 from typing import Any, no_type_check
 
 import jax
@@ -9,12 +7,13 @@ from numba import cfunc, njit, types
 
 from subterra_jax.native.clearance import clearance_rows
 from subterra_jax.native.frames import argument, capsule, floats, ints, result, size, wants_work
+from subterra_jax.native.keeping import code_kept
 from subterra_jax.native.scan import scan_rows
 from subterra_jax.native.threads import shared_out
 
 SCAN, CLEARANCE = "subterra_scan", "subterra_clearance"
 # Machine code lives as long as the object that made it.
-_kept: list[Any] = []
+_alive: list[Any] = []
 
 
 @njit
@@ -63,38 +62,23 @@ _scan_all = shared_out(_scan, 32, "subterra_scan_helper")
 _clearance_all = shared_out(_clearance, 256, "subterra_clearance_helper")
 
 
-def _sources() -> str:
-    """Digest of what the machine code is made from: numba itself looks only at the file of the outermost function."""
-    files = sorted(Path(__file__).parent.glob("*.py"))
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
+@no_type_check
+def _scan_handler(frame):
+    """The custom call that scans."""
+    if wants_work(frame):
+        _scan_all(frame, size(result(frame, 0), 0))
+    return 0
 
 
-def _scan_handler(sources: str) -> Any:
-    """The custom call that scans. A variable of the closure is part of what numba recognises kept code by."""
-
-    @cfunc(types.intp(types.intp), cache=True)
-    @no_type_check
-    def handler(frame):
-        if len(sources) > 0 and wants_work(frame):
-            _scan_all(frame, size(result(frame, 0), 0))
-        return 0
-
-    return handler
+@no_type_check
+def _clearance_handler(frame):
+    """The custom call that measures clearances."""
+    if wants_work(frame):
+        _clearance_all(frame, size(result(frame, 0), 0))
+    return 0
 
 
-def _clearance_handler(sources: str) -> Any:
-    """The custom call that measures clearances; as `_scan_handler`."""
-
-    @cfunc(types.intp(types.intp), cache=True)
-    @no_type_check
-    def handler(frame):
-        if len(sources) > 0 and wants_work(frame):
-            _clearance_all(frame, size(result(frame, 0), 0))
-        return 0
-
-    return handler
-
-
-for _name, _make in ((SCAN, _scan_handler), (CLEARANCE, _clearance_handler)):
-    _kept.append(_make(_sources()))
-    jax.ffi.register_ffi_target(_name, capsule(_kept[-1].address), platform="cpu")
+with code_kept() as kept:
+    for _name, _handler in ((SCAN, _scan_handler), (CLEARANCE, _clearance_handler)):
+        _alive.append(cfunc(types.intp(types.intp), cache=kept)(_handler))
+        jax.ffi.register_ffi_target(_name, capsule(_alive[-1].address), platform="cpu")

@@ -1,5 +1,8 @@
 """The CPU's kernels against XLA, which is compared with the truth elsewhere."""
 
+import os
+import subprocess
+import sys
 import threading
 from functools import partial
 
@@ -123,3 +126,22 @@ def test_the_compiled_step_calls_the_kernels(plan):
     tunnel, poses = Tunnel.from_plan(plan, "pockets"), poses_in(plan, 10)
     assert "subterra_scan" in scans.lower(tunnel, poses, by_kernel).as_text()
     assert "subterra_scan" not in scans.lower(tunnel, poses, by_xla).as_text()
+
+
+@pytest.mark.slow
+def test_code_kept_by_one_process_serves_another_and_no_other_version(tmp_path):
+    program = (
+        "import jax, subterra_jax as st; env, params = st.make('Subterra/TraverseShort-v0'); b = st.AutoReset(env);"
+        "obs, _ = jax.jit(b.reset, static_argnums=2)(jax.random.key(0), params, 64); print(float(obs.sum()))"
+    )
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    told = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+        )
+        told.append(done.stdout)
+    assert told[0] == told[1]
+    versions = list((tmp_path / "subterra" / "native").iterdir())
+    assert len(versions) == 1
+    assert list(versions[0].rglob("*.nbc"))
