@@ -1,0 +1,166 @@
+"""Random and extreme actions over all tasks: nothing that is observed, paid or remembered may leave its space.
+
+`python -m benchmarks.soak --steps 10000000`
+"""
+
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax.experimental import checkify
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+from rich.console import Console
+
+import subterra_jax as st
+from subterra_jax.errors import SubterraError
+
+_EXTREMES = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, -0.0, 1e-38)
+_CHUNK = 100
+_CHECKED_ENVS, _CHECKED_STEPS = 8, 50
+
+
+class SoakError(SubterraError):
+    """A soak that cannot be run as asked."""
+
+
+@dataclass(frozen=True)
+class SoakConfig:
+    """What to run.
+
+    Attributes:
+        steps: Environment steps, all tasks together.
+        tasks: Ids of tasks; none given: all.
+        n_envs: Environments in a batch.
+        tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given.
+        lining: Variant of the walls.
+        checkify: Run a short piece of each task under `jax.experimental.checkify` as well.
+        seed: Seed of everything.
+    """
+
+    steps: int = 10_000_000
+    tasks: tuple[str, ...] = ()
+    n_envs: int = 1024
+    tunnel: str | None = None
+    lining: str = "pockets"
+    checkify: bool = True
+    seed: int = 0
+
+
+def wild_actions(key: PRNGKeyArray, n_envs: int, low: np.ndarray, high: np.ndarray) -> Float[Array, "n_envs n_action"]:
+    """Actions of which a third lies inside the box, a third up to ten times outside of it, and a third is extreme.
+
+    In every eighth environment all actions lie inside, or hardly an episode would go on for long.
+    """
+    shape = (n_envs, len(low))
+    inside_key, outside_key, kind_key, which_key = jax.random.split(key, 4)
+    inside = low + (high - low) * jax.random.uniform(inside_key, shape)
+    outside = 10.0 * np.maximum(np.abs(low), np.abs(high)) * jax.random.uniform(outside_key, shape, minval=-1.0)
+    extreme = jnp.asarray(_EXTREMES, jnp.float32)[jax.random.randint(which_key, shape, 0, len(_EXTREMES))]
+    kind = jnp.where((jnp.arange(n_envs) % 8 == 0)[:, None], 0, jax.random.randint(kind_key, shape, 0, 3))
+    return jnp.where(kind == 0, inside, jnp.where(kind == 1, outside, extreme))
+
+
+def _violations(
+    state: Any, obs: Float[Array, "n_envs n_obs"], reward: Float[Array, "n_envs"], low: np.ndarray, high: np.ndarray
+) -> dict[str, Int[Array, ""]]:
+    """How many numbers are not what they should be, by name."""
+    leaves = jax.tree_util.tree_flatten_with_path(state)[0]
+    found = {
+        f"state{jax.tree_util.keystr(path)} not finite": jnp.sum(~jnp.isfinite(leaf))
+        for path, leaf in leaves
+        if jnp.issubdtype(leaf.dtype, jnp.floating)
+    }
+    # Written so that a NaN counts as outside.
+    found["observation outside its space"] = jnp.sum(~((obs >= low) & (obs <= high)))
+    found["observation not finite"] = jnp.sum(~jnp.isfinite(obs))
+    found["reward not finite"] = jnp.sum(~jnp.isfinite(reward))
+    return found
+
+
+def soak(env: st.TunnelEnv, params: st.EnvParams, n_envs: int, n_steps: int, seed: int) -> dict[str, int]:
+    """Violations by name in at least `n_steps` environment steps; empty where there are none."""
+    batch, space, actions = st.AutoReset(env), env.observation_space(params), env.action_space(params)
+
+    @jax.jit
+    def chunk(key: PRNGKeyArray, state: Any, params: st.EnvParams) -> tuple[Any, dict[str, Int[Array, ""]]]:
+        def step(state: Any, key: PRNGKeyArray) -> tuple[Any, dict[str, Int[Array, ""]]]:
+            action_key, step_key = jax.random.split(key)
+            action = wild_actions(action_key, n_envs, actions.low, actions.high)
+            obs, state, reward, _, _, info = batch.step(step_key, state, action, params)
+            both = jnp.concatenate([obs, info["final_observation"]])
+            return state, _violations(state, both, reward, space.low, space.high)
+
+        state, counts = jax.lax.scan(step, state, jax.random.split(key, _CHUNK))
+        return state, jax.tree.map(jnp.sum, counts)
+
+    key = jax.random.key(seed)
+    state = jax.jit(lambda key, params: batch.reset(key, params, n_envs)[1])(key, params)
+    total: dict[str, int] = {}
+    for i in range(-(-n_steps // (n_envs * _CHUNK))):
+        state, counts = chunk(jax.random.fold_in(key, i + 1), state, params)
+        for name, count in jax.device_get(counts).items():
+            total[name] = total.get(name, 0) + int(count)
+    return {name: count for name, count in total.items() if count}
+
+
+def checked(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str | None:
+    """First complaint of checkify about a reset and some steps: NaN made, division by 0, index out of range."""
+    actions = env.action_space(params)
+
+    def drive(key: PRNGKeyArray, params: st.EnvParams) -> Array:
+        obs, state = jax.vmap(env.reset, (0, None))(jax.random.split(key, _CHECKED_ENVS), params)
+
+        def step(carry: tuple[Any, Array], key: PRNGKeyArray) -> tuple[tuple[Any, Array], None]:
+            action_key, step_key = jax.random.split(key)
+            action = wild_actions(action_key, _CHECKED_ENVS, actions.low, actions.high)
+            keys = jax.random.split(step_key, _CHECKED_ENVS)
+            obs, state, *_ = jax.vmap(env.step, (0, 0, 0, None))(keys, carry[0], action, params)
+            return (state, obs), None
+
+        return jax.lax.scan(step, (state, obs), jax.random.split(key, _CHECKED_STEPS))[0][1]
+
+    errors = checkify.float_checks | checkify.index_checks
+    error, _ = jax.jit(checkify.checkify(drive, errors=errors))(jax.random.key(seed), params)
+    return error.get()
+
+
+def run(config: SoakConfig, console: Console) -> bool:
+    """Runs every task; whether all of them are clean.
+
+    Raises:
+        SubterraError: A number out of range, or no such tunnel.
+        ValueError: No such task.
+    """
+    for name, value in (("steps", config.steps), ("n_envs", config.n_envs)):
+        if value < 1:
+            raise SoakError(f"{name} must be at least 1, got {value}")
+    tasks = config.tasks or tuple(st.TASKS)
+    plan = st.load_tunnel(config.tunnel)
+    made = [st.make(task, plan, config.lining, estimates=True) for task in tasks]
+    clean = True
+    for task, (env, params) in zip(tasks, made, strict=True):
+        complaints = soak(env, params, config.n_envs, -(-config.steps // len(tasks)), config.seed)
+        told = [f"{name}: {count}" for name, count in complaints.items()]
+        if config.checkify and (complaint := checked(env, params, config.seed)) is not None:
+            told.append(f"checkify: {complaint.splitlines()[0]}")
+        clean = clean and not told
+        console.print(f"{task}: {'; '.join(told) or 'clean'}")
+    return clean
+
+
+def main() -> int:
+    """Entry point: 0 where everything is clean, 1 where not, 2 for a user's mistake."""
+    config = tyro.cli(SoakConfig, description=__doc__)
+    try:
+        return 0 if run(config, Console(highlight=False)) else 1
+    except (SubterraError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(main())

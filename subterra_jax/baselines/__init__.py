@@ -1,0 +1,1 @@
+"""Agents that need no learning; `agent` says what an agent is."""

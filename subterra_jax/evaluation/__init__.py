@@ -1,0 +1,10 @@
+"""Scores of an agent on fixed episodes.
+
+episodes (which) ─► harness (drive) ─► tally (score as it goes) ─► records ─► summary (means, intervals, normalised)
+"""
+
+from subterra_jax.evaluation.episodes import Episodes, listed_episodes
+from subterra_jax.evaluation.harness import evaluate
+from subterra_jax.evaluation.records import Records
+
+__all__ = ["Episodes", "Records", "evaluate", "listed_episodes"]

@@ -1,0 +1,85 @@
+"""How often one can stop in time without looking at the walls: what the drift of the task allows, by theory.
+
+float64 on the host, sharing no code with the simulator or the agents, so that an agent above its bound is a leak.
+"""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from subterra_jax.state import EnvParams
+from subterra_jax.wander import WanderParams
+
+_STRETCH = 0.5  # m over which a wandering error is taken to be constant
+_GOALS = 200
+
+
+def stop_bounds(params: EnvParams) -> dict[str, float]:
+    """Expected success of a stop at the goal, 0 to 1, from commands, from odometry, and from the best of both.
+
+    Args:
+        params: A task with slip and a goal; goals are drawn uniformly between its bounds.
+
+    Returns:
+        `command`, `odometry` and `fused`, to the first order in the errors. `fused` is the most that anybody can have
+        who knows the task's priors and sees no walls.
+    """
+    assert params.goal is not None
+    assert params.slip is not None
+    low = float(params.goal.low)
+    high = max(low, min(float(params.goal.high), float(np.min(params.tunnel.length)) - float(params.goal.margin)))
+    distance = low + (high - low) * (np.arange(_GOALS) + 0.5) / _GOALS - float(params.start.station)
+    slip, odometry, metre = params.slip, params.odometry, _noise_of_a_metre(params)
+    variances = {
+        "command": (slip.gain_sigma * distance) ** 2 + _wandered(distance, slip.wander),
+        "odometry": (odometry.distance_bias_sigma * distance) ** 2 + _wandered(distance, odometry.wander),
+        "fused": _fused(distance, params),
+    }
+    variances["odometry"] = variances["odometry"] + metre * distance
+    tolerance, start = float(params.goal.tolerance), float(params.start.station_sigma) ** 2
+    return {name: _within(tolerance, np.sqrt(variance + start)) for name, variance in variances.items()}
+
+
+def _within(tolerance: float, sigma: Float[np.ndarray, " n"]) -> float:
+    """Mean probability of an error within a tolerance."""
+    return float(np.mean([math.erf(tolerance / (math.sqrt(2.0) * max(s, 1e-9))) for s in sigma]))
+
+
+def _noise_of_a_metre(params: EnvParams) -> float:
+    """Variance that the odometer's noise of each step adds in a metre at full speed, m² / m."""
+    step = float(np.max(params.vehicle.speed_max * params.vehicle.period))
+    return float(params.odometry.distance_sigma) ** 2 / step
+
+
+def _wandered(distance: Float[np.ndarray, " n"], wander: WanderParams | None) -> Float[np.ndarray, " n"]:
+    """Variance of the integral of a wandering error, m²."""
+    if wander is None:
+        return np.zeros_like(distance)
+    sigma, length = float(wander.sigma), float(wander.length)
+    return 2.0 * sigma**2 * length * (distance + length * np.expm1(-distance / length))
+
+
+def _fused(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
+    """Variance of the true distance given commands and readings, m²: a Kalman filter's, which needs no data.
+
+    Its state is the station, the constant and the wandering slip, the constant and the wandering scale error.
+    """
+    assert params.slip is not None
+    slip, odometry = params.slip, params.odometry
+    wanders = (None, None, slip.wander, None, odometry.wander)
+    sigma = np.array([0.0, slip.gain_sigma, 0.0, odometry.distance_bias_sigma, 0.0])
+    stationary = np.array([0.0 if w is None else float(w.sigma) ** 2 for w in wanders])
+    keep = np.array([1.0 if w is None else math.exp(-_STRETCH / float(w.length)) for w in wanders])
+    noise = max(_noise_of_a_metre(params) / _STRETCH, 1e-15)
+    moved, read = np.eye(5), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    moved[0, 1:3] = _STRETCH
+    covariance, found = np.diag(sigma**2 + stationary), [0.0]
+    for _ in range(math.ceil(distance.max() / _STRETCH)):
+        spread = covariance @ read
+        covariance = covariance - np.outer(spread, spread) / (read @ spread + noise)
+        # The error of the whole stretch becomes known as the reading of that stretch is.
+        covariance = moved @ covariance @ moved.T
+        covariance = covariance * np.outer(keep, keep) + np.diag((1.0 - keep**2) * stationary)
+        found.append(covariance[0, 0])
+    return np.interp(distance, _STRETCH * np.arange(len(found)), found)

@@ -1,0 +1,218 @@
+"""Fixed episodes, and scores with known answers."""
+
+import dataclasses
+import hashlib
+from importlib import resources
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import struct
+
+import subterra_jax as st
+from subterra_jax.baselines.agent import observed, shown
+from subterra_jax.baselines.registry import AgentError, make_agent, register
+from subterra_jax.evaluation import Records, evaluate, listed_episodes
+from subterra_jax.evaluation import episodes as lists
+from subterra_jax.evaluation.bounds import stop_bounds
+from subterra_jax.evaluation.episodes import EvaluationError
+from subterra_jax.evaluation.estimates import add_estimate, crps, start_estimates
+from subterra_jax.evaluation.summary import area, interquartile_mean, interval, normalised, summary
+from tests.subterra_jax import tunnels
+
+
+def test_the_list_is_the_one_whose_hash_is_known_and_holds_500_seeds_of_every_task():
+    data = (resources.files("subterra_jax") / "data" / "evaluation.json").read_bytes()
+    assert hashlib.sha256(data).hexdigest() == lists.SHA256
+    assert data == lists.draw_list(tuple(st.TASKS))
+    seeds = np.stack([lists.listed_seeds(task) for task in st.TASKS])
+    assert seeds.shape == (len(st.TASKS), 500)
+    assert len(np.unique(seeds)) == seeds.size
+    assert seeds.min() >= 2**30
+
+
+def test_a_list_that_was_altered_is_refused(monkeypatch):
+    monkeypatch.setattr(lists, "SHA256", "0" * 64)
+    lists._listed.cache_clear()
+    with pytest.raises(EvaluationError, match=r"evaluation\.json has SHA-256"):
+        lists.listed_seeds("Subterra/StopAt-v0")
+    lists._listed.cache_clear()
+
+
+def test_episodes_are_spread_evenly_over_severities_and_tunnels():
+    _, params = st.make("Subterra/FaultedShort-v0")
+    episodes = listed_episodes("Subterra/FaultedShort-v0", params)
+    assert np.bincount(episodes.severity).tolist() == [100] * 5
+    assert np.bincount(episodes.group).tolist() == [50] * 10
+    two = dataclasses.replace(params, tunnel=st.Tunnel.stack([params.tunnel] * 2))
+    episodes = listed_episodes("Subterra/FaultedShort-v0", two)
+    assert (
+        np.unique(np.stack([episodes.severity, episodes.tunnel]), axis=1, return_counts=True)[1].tolist() == [50] * 10
+    )
+
+
+@pytest.mark.parametrize("n", [0, 501])
+def test_a_number_of_episodes_that_the_list_has_not_is_refused(n):
+    _, params = st.make("Subterra/StopAtShort-v0")
+    with pytest.raises(EvaluationError, match=f"episodes must be 1 to 500, got {n}"):
+        listed_episodes("Subterra/StopAtShort-v0", params, n)
+
+
+@struct.dataclass
+class Dawdler:
+    """Drives straight on at a speed drawn at the start and stops for good at a station of its own estimate."""
+
+    stop: float = 1e6
+    name: str = struct.field(pytree_node=False, default="dawdler")
+    uses_lidar: bool = struct.field(pytree_node=False, default=False)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=True)
+
+    def begin(self, key, obs, params):
+        return jnp.zeros(())
+
+    def act(self, key, memory, obs, params, known):
+        speed = jnp.where(known["station"] < self.stop, 2.0, 0.0)
+        yaw_rate = -2.0 * known["heading_sin"] - 0.8 * known["lateral"]
+        return jnp.stack([speed, yaw_rate, known["station"] + 1.0, jnp.zeros(()), jnp.ones(())]), memory + 1.0
+
+
+def test_an_episode_depends_on_its_seed_and_its_tunnel_and_not_on_the_others_driven_with_it(plan_of):
+    plans = [plan_of(tunnels.tunnel_arrays(pieces)) for pieces in (tunnels.straight(70.0), tunnels.arc(80.0, 60.0))]
+    stacked = st.Tunnel.stack([st.Tunnel.from_plan(plan, "pockets") for plan in plans])
+    env, params = st.make("Subterra/StopAtShort-v0", tunnel=stacked)
+    agent, episodes = make_agent("dead-reckoning", params), listed_episodes(env.id, params, 5)
+    together = evaluate(env, params, agent, episodes)
+    apart = evaluate(env, params, agent, episodes, batch=3)
+    for name, values in vars(together).items():
+        np.testing.assert_array_equal(values, getattr(apart, name), err_msg=name)
+    assert together.tunnel.tolist() == [0, 1, 0, 1, 0]
+    assert len(np.unique(together.goal_error)) == 5
+    # One tunnel turns left and the other does not: a wrong pick would hit a wall of the bend.
+    assert not together.contact.any()
+    assert (np.abs(together.goal_error) < 5.0).all()
+
+
+def test_coverage_ends_at_nine_tenths_as_published_and_progress_goes_on_to_the_mouth():
+    env, params = st.make("Subterra/TraverseShort-v0")
+    episodes = listed_episodes(env.id, params, 3)
+    through = evaluate(env, params, Dawdler(), episodes)
+    assert through.success.all()
+    assert ((through.coverage >= 0.9) & (through.coverage < 0.905)).all()
+    assert (through.progress == 1.0).all()
+    assert (through.time < 29.0).all()
+    short = evaluate(env, params, Dawdler(stop=30.0), episodes)
+    assert not short.success.any()
+    np.testing.assert_allclose(short.progress, 0.5, atol=0.01)
+    np.testing.assert_array_equal(short.progress, short.coverage)
+    np.testing.assert_allclose(short.time, 60.0)
+    # It says that it is a metre further than at the start of each period, and moves 0.2 m in one.
+    np.testing.assert_allclose(through.axial_rms, 0.8, atol=0.02)
+    np.testing.assert_allclose(through.spl, 54.0 / through.travelled, rtol=1e-4)
+
+
+def test_who_says_what_he_does_not_use_does_not_get_it():
+    env, params = st.make("Subterra/ReturnShort-v0")
+    flat = jnp.arange(21.0)
+    assert np.isnan(observed(env, params, flat, sees=False).flat[:16]).all()
+    seen = observed(env, params, flat)
+    assert (seen.distance, seen.heading, seen.goal, seen.ring_pitch, seen.flag) == (16.0, 17.0, 18.0, 19.0, 20.0)
+    hidden = shown(params, sees_map=False).tunnel
+    assert np.isnan(hidden.grid).all()
+    assert np.isnan(hidden.wall).all()
+    assert hidden.length == params.tunnel.length
+
+
+def test_a_name_is_registered_once():
+    with pytest.raises(AgentError, match="there is an agent 'oracle' already"):
+        register("oracle", lambda params: Dawdler())
+    with pytest.raises(AgentError, match="no agent 'nobody'"):
+        make_agent("nobody", None)
+
+
+def test_crps_of_a_normal_distribution_is_the_integral_that_defines_it():
+    for error, sigma in ((0.0, 1.0), (0.7, 0.5), (-3.0, 2.0)):
+        x = np.linspace(-60.0, 60.0, 600_001)
+        from scipy.stats import norm
+
+        squared = (norm.cdf(x, error, sigma) - (x >= 0.0)) ** 2
+        np.testing.assert_allclose(crps(jnp.float32(error), jnp.float32(sigma)), np.trapezoid(squared, x), rtol=1e-3)
+
+
+def tallied(errors, pitch=1.5, tolerance=1.0):
+    tally = start_estimates()
+    for step, error in enumerate(errors, 1):
+        tally = add_estimate(
+            tally, jnp.float32(error), jnp.zeros(()), jnp.int32(step), jnp.float32(tolerance), jnp.float32(pitch)
+        )
+    return tally
+
+
+def test_cycle_slips_count_the_rings_that_are_left_for_good():
+    assert tallied([0.0, 0.7, 0.8, 0.7, 0.0]).slips == 0
+    assert tallied([0.0, 1.5, 1.4, 1.6]).slips == 1
+    assert tallied([0.0, 3.0, 0.0]).slips == 4
+    # Where it began is no slip, and without rings there are none.
+    assert tallied([3.0, 3.0]).slips == 0
+    assert tallied([0.0, 9.0], pitch=0.0).slips == 0
+
+
+def test_time_to_lock_is_the_last_time_the_estimate_was_beyond_the_tolerance():
+    assert tallied([0.5, 2.0, 0.5, 0.5]).unlocked == 2
+    assert tallied([0.5, 0.5]).unlocked == 0
+
+
+def test_the_interquartile_mean_is_the_mean_of_the_middle_half():
+    assert interquartile_mean(np.array([100.0, 1.0, 2.0, -50.0])) == 1.5
+    assert interquartile_mean(np.arange(1.0, 9.0)) == 4.5
+    # Of five values the second and fourth count three quarters each.
+    np.testing.assert_allclose(interquartile_mean(np.array([0.0, 1.0, 2.0, 4.0, 9.0])), (0.75 + 2.0 + 3.0) / 2.5)
+
+
+def test_the_bootstrap_interval_of_a_mean_is_that_of_the_normal_law():
+    values = np.random.default_rng(1).standard_normal((10, 50))
+    low, high = interval(values, lambda drawn: drawn.mean(axis=(-2, -1)))
+    half = 1.96 * np.sqrt(values.var(axis=1).mean() / values.size)
+    np.testing.assert_allclose([low, high], [values.mean() - half, values.mean() + half], atol=0.15 * half)
+    assert interval(np.ones((10, 5)), lambda drawn: drawn.mean(axis=(-2, -1))) == (1.0, 1.0)
+
+
+def test_scores_lie_between_dead_reckoning_and_the_oracle():
+    assert normalised(0.5, 0.25, 0.75) == 0.5
+    assert normalised(1.0, 1.0, 1.0) is None
+    assert area(np.arange(5.0), np.array([1.0, 1.0, 0.5, 0.0, 0.0])) == 0.5
+
+
+def test_records_survive_json_and_nothing_measured_is_no_number():
+    n = 20
+    columns = {field.name: np.full(n, np.nan) for field in dataclasses.fields(Records)}
+    columns |= {name: np.zeros(n, int) for name in ("seed", "tunnel")}
+    columns |= {"group": np.arange(n) // 2, "severity": np.arange(n) % 2, "travelled": np.full(n, 50.0)}
+    columns |= {"success": np.arange(n) % 2 == 0, "contact": np.arange(n) < 5}
+    records = Records(**columns)
+    again = Records.from_columns(records.as_columns())
+    for name, values in vars(records).items():
+        np.testing.assert_array_equal(values, getattr(again, name))
+    found = summary(records)
+    assert found["success"] == 0.5
+    assert found["axial_rms"] is None
+    assert found["contacts_per_100m"] == 0.5
+    assert found["success_by_severity"] == {0: 1.0, 1: 0.0}
+    assert found["success_area"] == 0.5
+
+
+def test_the_bounds_are_those_of_a_closed_form_where_there_is_one():
+    _, params = st.make("Subterra/StopAtShort-v0")
+    still = dataclasses.replace(params.slip.wander, sigma=0.0)
+    steady = dataclasses.replace(
+        params,
+        slip=dataclasses.replace(params.slip, wander=still),
+        odometry=dataclasses.replace(params.odometry, wander=still, distance_sigma=1e-6),
+        goal=dataclasses.replace(params.goal, low=40.0, high=40.0),
+    )
+    from math import erf, sqrt
+
+    # Two independent measurements of one scale, each good to 2 %, make 1.41 % together.
+    found = stop_bounds(steady)
+    for name, sigma in (("command", 0.8), ("odometry", 0.8), ("fused", 0.8 / sqrt(2.0))):
+        np.testing.assert_allclose(found[name], erf(0.25 / (sqrt(2.0) * sigma)), rtol=2e-3)

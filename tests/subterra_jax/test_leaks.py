@@ -1,0 +1,120 @@
+"""Nobody knows what he has not measured: the leak tests of the task design."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.baselines.registry import make_agent, names
+from subterra_jax.evaluation import evaluate, listed_episodes
+from subterra_jax.evaluation.bounds import stop_bounds
+from tests.subterra_jax.panel import panel
+
+N = 200
+BLIND = ("blind-forward", "heading-hold", "random")
+STOPPING = ("command-integrator", "dead-reckoning", "fused", "oracle")
+
+
+def three_errors(bound: float, n: int = N) -> float:
+    """Three standard errors of a success rate of n episodes."""
+    return 3.0 * np.sqrt(bound * (1.0 - bound) / n)
+
+
+@pytest.fixture(scope="module")
+def control():
+    """The short stop where no wall tells a station, a way to drive it, and its bounds."""
+    env, params = st.make("Subterra/StopAtShort-v0", tunnel=st.load_tunnel("control").slice(0.0, 65.0), lining="smooth")
+    agents = [make_agent(name, params) for name in STOPPING + BLIND]
+    episodes = listed_episodes(env.id, params, N)
+
+    def success(name, **spoilt):
+        return evaluate(env, params, panel(agents, (STOPPING + BLIND).index(name), **spoilt), episodes).success.mean()
+
+    return success, stop_bounds(params)
+
+
+def test_the_command_integrator_stops_as_often_as_theory_says_and_no_more(control):
+    success, bounds = control
+    assert abs(success("command-integrator") - bounds["command"]) < three_errors(bounds["command"])
+
+
+def test_the_odometer_stops_as_often_as_theory_says_and_no_more(control):
+    success, bounds = control
+    assert abs(success("dead-reckoning") - bounds["odometry"]) < three_errors(bounds["odometry"])
+
+
+def test_fusing_both_stops_as_often_as_theory_says_and_no_more(control):
+    success, bounds = control
+    assert abs(success("fused") - bounds["fused"]) < three_errors(bounds["fused"])
+
+
+@pytest.mark.parametrize("name", BLIND)
+def test_nobody_without_lidar_is_above_the_fused_bound(control, name):
+    success, bounds = control
+    assert success(name) < bounds["fused"] + three_errors(bounds["fused"])
+
+
+def test_the_truth_stops_always_so_that_the_bounds_are_those_of_knowing_not_of_driving(control):
+    success, _ = control
+    assert success("oracle") == 1.0
+
+
+def test_who_is_always_told_the_same_goal_stops_as_often_as_chance_has_it(control):
+    success, _ = control
+    # Goals lie within 50 m, and a stop counts within 0.25 m on either side.
+    chance = 0.5 / 50.0
+    assert success("oracle", goal=35.0) < chance + three_errors(chance)
+
+
+def test_who_gets_the_beams_in_the_wrong_order_cannot_traverse():
+    env, params = st.make("Subterra/TraverseShort-v0")
+    agents, episodes = [make_agent("dead-reckoning", params)], listed_episodes(env.id, params, 50)
+    order = np.random.default_rng(0).permutation(16)
+    assert evaluate(env, params, panel(agents), episodes).success.all()
+    assert evaluate(env, params, panel(agents, order=order), episodes).success.mean() < 0.1
+
+
+@pytest.mark.slow
+def test_every_episode_of_one_environment_has_biases_of_its_own():
+    env, params = st.make("Subterra/StopAtShort-v0", horizon=1)
+    batch = st.AutoReset(env)
+    _, state = batch.reset(jax.random.key(0), params, 2)
+    step = jax.jit(batch.step)
+    drawn = []
+    for i in range(6):
+        drawn.append([state.odometry.distance_bias, state.odometry.heading_bias, state.slip.gain, state.slip.yaw])
+        _, state, *_ = step(jax.random.key(1 + i), state, jnp.zeros((2, 2)), params)
+    for bias in np.asarray(drawn).reshape(6, 4, 2).transpose(1, 2, 0).reshape(8, 6):
+        assert len(np.unique(bias)) == 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(names()) - {"oracle"}))
+def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points(name):
+    env, params = st.make("Subterra/StopAt-v0", tunnel="control", lining="smooth")
+    bound = stop_bounds(params)["fused"]
+    agent = make_agent(name, params)
+    success = evaluate(env, params, agent, listed_episodes(env.id, params)).success.mean()
+    print(f"{name}: {100 * success:.1f} %, bound {100 * bound:.1f} %")
+    # Three points, and the error of 500 episodes.
+    assert success <= bound + 0.03 + three_errors(bound, 500)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "bound"), [("command-integrator", "command"), ("dead-reckoning", "odometry"), ("fused", "fused")]
+)
+def test_over_the_whole_list_dead_reckoning_lands_at_its_bounds(name, bound):
+    env, params = st.make("Subterra/StopAt-v0")
+    expected = stop_bounds(params)[bound]
+    success = evaluate(env, params, make_agent(name, params), listed_episodes(env.id, params)).success.mean()
+    print(f"{name}: {100 * success:.1f} %, bound {100 * expected:.1f} %")
+    assert abs(success - expected) < three_errors(expected, 500)
+
+
+@pytest.mark.slow
+def test_over_the_whole_list_the_middle_line_traverses_always():
+    env, params = st.make("Subterra/Traverse-v0")
+    records = evaluate(env, params, make_agent("dead-reckoning", params), listed_episodes(env.id, params))
+    assert records.success.all()
