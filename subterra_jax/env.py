@@ -195,7 +195,7 @@ class TunnelEnv:
         }
         if state.faults is not None:
             info["severity"] = state.faults.severity
-        reading = plant.read_odometer(state, wheels, noise, params)
+        reading = plant.read_odometer(state, wheels, place.tangent, noise, params)
         after = dataclasses.replace(
             state,
             position=position,

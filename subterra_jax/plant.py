@@ -54,10 +54,13 @@ def clearance(
     return jnp.minimum(clear, obstacles.clearance(state.obstacles, station, position, tunnel, params.obstacles))
 
 
-def read_odometer(state: State, wheels: Float[Array, "2"], noise: StepNoise, params: EnvParams) -> OdometryState:
+def read_odometer(
+    state: State, wheels: Float[Array, "2"], tangent: Float[Array, "2"], noise: StepNoise, params: EnvParams
+) -> OdometryState:
     """The odometer after a step; while it is frozen its readings stay where they are and its errors go on."""
     period = jnp.asarray(params.vehicle.period)
-    reading = odometry.advance_odometry(state.odometry, wheels, period, noise.odometry, params.odometry)
+    backward = jnp.cos(state.heading) * tangent[0] + jnp.sin(state.heading) * tangent[1] < 0.0
+    reading = odometry.advance_odometry(state.odometry, wheels, period, noise.odometry, params.odometry, backward)
     if state.faults is None:
         return reading
     frozen = faults.frozen(state.faults)

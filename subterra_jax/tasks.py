@@ -49,7 +49,7 @@ class Task:
 def _parts(start: StartParams | None = None, goal: dict[str, Any] | None = None, **further: Any) -> dict[str, Any]:
     """What every task from T1 on has: slip, odometry that wanders, a goal and its reward."""
     return {
-        "odometry": OdometryParams(wander=WanderParams(sigma=0.01)),
+        "odometry": OdometryParams(wander=WanderParams(sigma=0.01), backward_bias_sigma=0.02),
         "reward": GoalRewardParams(),
         "slip": SlipParams(),
         "goal": GoalParams(**(goal or {})),

@@ -58,3 +58,15 @@ def test_odometry_measures_the_motion_with_a_scale_that_wanders():
     state = advance(state, jnp.array([1.0, 0.0]), jnp.float32(0.1), step_noise, params)
     distance = np.asarray(state.distance, np.float64)
     assert abs(distance.std() - 0.001) < 3 * 0.001 / np.sqrt(2 * N)
+
+
+def test_a_bias_of_one_direction_does_not_cancel_out_and_back():
+    params = odometry.OdometryParams(0.0, 0.0, 0.0, 0.0, backward_bias_sigma=0.02)
+    noise = jax.random.normal(jax.random.key(2), (N, params.n_reset_noise))
+    start = jax.vmap(odometry.start_odometry, (0, None))(noise, params)
+    advance = jax.vmap(odometry.advance_odometry, (0, None, None, None, None, None))
+    step = lambda backward: advance(  # noqa: E731
+        start, jnp.array([1.0, 0.0]), jnp.float32(1.0), jnp.zeros(2), params, backward
+    )
+    np.testing.assert_array_equal(step(False).distance, np.ones(N, np.float32))
+    assert abs(np.asarray(step(True).distance, np.float64).std() - 0.02) < 3 * 0.02 / np.sqrt(2 * N)

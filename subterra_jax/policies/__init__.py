@@ -1,0 +1,9 @@
+"""Trained policies that drive without the trainer.
+
+files (safetensors + JSON) ─► load ─► feedforward or recurrent, an Agent of `subterra_jax.baselines`
+"""
+
+from subterra_jax.policies.files import PolicyError, name_for, released
+from subterra_jax.policies.loading import check_fits, from_tensors, load, register_released
+
+__all__ = ["PolicyError", "check_fits", "from_tensors", "load", "name_for", "register_released", "released"]

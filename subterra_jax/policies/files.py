@@ -1,0 +1,118 @@
+"""Policies on disk: tensors in `NAME.safetensors`, everything else in `NAME.json` beside it.
+
+A safetensors file is eight bytes of header length, little-endian, a JSON header with type, shape and place of every
+tensor, and their bytes. Only float32 is used here. Format: github.com/huggingface/safetensors, README.
+"""
+
+import hashlib
+import json
+import struct
+from dataclasses import dataclass
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from subterra_jax.errors import SubterraError
+
+SCHEMA = "subterra.policy/1"
+TENSORS, FACTS = ".safetensors", ".json"
+_FACTS = ("name", "kind", "task", "layout", "tensors_sha256")
+
+
+class PolicyError(SubterraError):
+    """A policy is missing, damaged, or does not fit the task."""
+
+
+@dataclass(frozen=True)
+class PolicyFile:
+    """A policy as it was read.
+
+    Attributes:
+        path: The tensors' file, for messages.
+        facts: The JSON file: name, kind (`mlp` or `gru`), task, layout, and where it comes from.
+        tensors: By name.
+    """
+
+    path: str
+    facts: dict[str, Any]
+    tensors: dict[str, np.ndarray]
+
+
+def released() -> dict[str, Traversable]:
+    """The packaged policies by name."""
+    folder = _folder()
+    if not folder.is_dir():
+        return {}
+    found = {entry.name.removesuffix(TENSORS): entry for entry in folder.iterdir() if entry.name.endswith(TENSORS)}
+    return dict(sorted(found.items()))
+
+
+def _folder() -> Traversable:
+    return resources.files("subterra_jax") / "data" / "policies"
+
+
+def name_for(task: str) -> str:
+    """Name of the released policy of a task: `StopAt-v0` for `Subterra/StopAt-v0`."""
+    return task.removeprefix("Subterra/")
+
+
+def read(source: str | Path) -> PolicyFile:
+    """Reads a policy.
+
+    Args:
+        source: A `.safetensors` file with its `.json` beside it, or the name of a released policy.
+
+    Raises:
+        PolicyError: It is missing, damaged, or its two files do not belong together.
+    """
+    packaged, place = released(), str(source)
+    if place in packaged:
+        tensors: Traversable = packaged[place]
+        facts = _folder() / (place + FACTS)
+    else:
+        tensors, facts = Path(place), Path(place.removesuffix(TENSORS) + FACTS)
+    if not tensors.is_file():
+        raise PolicyError(f"{source}: no such policy; released are {', '.join(packaged) or 'none'}")
+    content = tensors.read_bytes()
+    return PolicyFile(str(source), _facts(facts, content), parse(content, str(source)))
+
+
+def parse(content: bytes, name: str) -> dict[str, np.ndarray]:
+    """The tensors of a safetensors file.
+
+    Raises:
+        PolicyError: It is cut short or is something else; the message begins with `name`.
+    """
+    try:
+        (size,) = struct.unpack("<Q", content[:8])
+        header, data = json.loads(content[8 : 8 + size]), content[8 + size :]
+        header.pop("__metadata__", None)
+        return {key: _tensor(entry, data) for key, entry in header.items()}
+    except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise PolicyError(f"{name}: damaged policy: not a readable safetensors file ({error})") from error
+
+
+def _tensor(entry: dict[str, Any], data: bytes) -> np.ndarray:
+    begin, end = entry["data_offsets"]
+    if entry["dtype"] != "F32":
+        raise ValueError(f"type {entry['dtype']}, not F32")
+    if end > len(data):
+        raise ValueError(f"{len(data)} bytes of tensors, not {end}")
+    return np.frombuffer(data[begin:end], "<f4").reshape(entry["shape"])
+
+
+def _facts(path: Traversable, tensors: bytes) -> dict[str, Any]:
+    try:
+        facts = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise PolicyError(f"{path}: damaged policy: no readable facts") from error
+    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
+        raise PolicyError(f"{path}: field 'schema' must be {SCHEMA!r}")
+    if missing := [name for name in _FACTS if name not in facts]:
+        raise PolicyError(f"{path}: field {missing[0]!r} is missing")
+    if hashlib.sha256(tensors).hexdigest() != facts["tensors_sha256"]:
+        raise PolicyError(f"{path}: damaged policy: the tensors beside it have another SHA-256")
+    return facts

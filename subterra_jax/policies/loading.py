@@ -1,0 +1,111 @@
+"""From tensors and facts to an agent, and whether it fits a task."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from subterra_jax.baselines import registry
+from subterra_jax.baselines.agent import Observed
+from subterra_jax.env import TunnelEnv
+from subterra_jax.policies.feedforward import FeedForward
+from subterra_jax.policies.files import PolicyError, PolicyFile, read, released
+from subterra_jax.policies.recurrent import Recurrent
+from subterra_jax.rules import StopAt, TurnBack
+from subterra_jax.state import EnvParams
+
+Agent = FeedForward | Recurrent
+KINDS = ("mlp", "gru")
+_N_FURTHER = 13  # features of a recurrent policy that are no beams; each beam is seen twice
+
+
+def load(source: str | Path) -> tuple[Agent, dict[str, Any]]:
+    """A policy and its facts.
+
+    Args:
+        source: A `.safetensors` file, or the name of a released policy.
+
+    Raises:
+        PolicyError: It is missing or damaged.
+    """
+    file = read(source)
+    return _checked(file), file.facts
+
+
+def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], name: str) -> Agent:
+    """An agent of tensors in memory.
+
+    Args:
+        kind: `mlp` or `gru`.
+        layout: `action_low`, `action_high`, and `frames` or `bin_width`.
+        tensors: By name, as the agent's class says.
+        name: Name on the leaderboard.
+
+    Raises:
+        KeyError: Something is missing in the layout.
+        ValueError: There is no such kind.
+    """
+    low, high = (jnp.asarray(layout[key], jnp.float32) for key in ("action_low", "action_high"))
+    arrays = {key: jnp.asarray(value) for key, value in tensors.items()}
+    if kind == "mlp":
+        return FeedForward(arrays, low, high, frames=int(layout["frames"]), name=name)
+    if kind == "gru":
+        return Recurrent(arrays, low, high, bin_width=float(layout["bin_width"]), name=name)
+    raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
+
+
+def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+    """Refuses a policy that cannot drive here.
+
+    Raises:
+        PolicyError: The observations or the actions are others than those it was made for.
+    """
+    size, bounds = env.observation_size(params), env.action_space(params)
+    if isinstance(agent, Recurrent):
+        if not isinstance(env.rule, StopAt) or isinstance(env.rule, TurnBack):
+            raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
+        wanted, made_for = params.lidar.n_beams, (agent.n_features - _N_FURTHER) // 2
+        if wanted != made_for:
+            raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
+    elif agent.n_observation != size:
+        raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")
+    high = np.asarray(agent.high)
+    if not np.allclose(high, bounds.high[: len(high)]):
+        raise PolicyError(f"{source}: made for actions up to {high.tolist()}, {env.id} has {bounds.high.tolist()}")
+
+
+def register_released() -> tuple[str, ...]:
+    """Adds every released policy to the baselines, as `policy:NAME`; those there already stay.
+
+    Returns:
+        Their names.
+    """
+    names = tuple(f"policy:{name}" for name in released())
+    for name in names:
+        if name not in registry.names():
+            registry.register(name, lambda params, name=name: load(name.removeprefix("policy:"))[0])  # type: ignore[misc]
+    return names
+
+
+def _checked(file: PolicyFile) -> Agent:
+    """The agent of a file, driven once on paper so that a missing or misshapen tensor is found here."""
+    facts = file.facts
+    try:
+        agent = from_tensors(facts["kind"], facts["layout"], file.tensors, facts["name"])
+        _try(agent)
+    except (KeyError, TypeError, ValueError) as error:
+        raise PolicyError(f"{file.path}: tensors and layout do not belong together ({error})") from error
+    return agent
+
+
+def _try(agent: Agent) -> None:
+    """Lets it act on shapes alone."""
+    if isinstance(agent, FeedForward):
+        jax.eval_shape(agent.answer, jax.ShapeDtypeStruct((agent.frames, agent.n_observation), jnp.float32))
+        return
+    zero, ranges = jnp.zeros(()), jnp.zeros((agent.n_features - _N_FURTHER) // 2)
+    seen = Observed(flat=ranges, ranges=ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero)
+    jax.eval_shape(agent.answer, agent.blank(), seen, zero)
