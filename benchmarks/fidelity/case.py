@@ -2,11 +2,12 @@
 
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import Any, TypeVar
 
 import numpy as np
+import trimesh
 
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
@@ -36,9 +37,47 @@ class Case:
     tolerance: float = 1.0
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
+    def fresh(self) -> "Case":
+        """The same with nothing computed, of its references either."""
+        bare: dict[str, Any] = {
+            name: None if reference is None else replace(reference, cache={})
+            for name, reference in (("hold", self.hold), ("fit", self.fit), ("truth", self.truth))
+        }
+        return replace(self, **bare, cache={})
+
+    def let_go(self, category: str) -> None:
+        """Forgets what is marked as of no use once a category is done, of the references too, and what meshes keep.
+
+        Edges, adjacency and normals that `trimesh` keeps beside a mesh are several times the mesh.
+        """
+        caches = [self.cache, SHARED, *(reference.cache for reference in (self.hold, self.truth) if reference)]
+        for cache in caches:
+            for key in [key for key in cache if _UNTIL.get(key[:2]) == category]:
+                del cache[key]
+        meshes = [value for value in self.cache.values() if isinstance(value, trimesh.Trimesh)]
+        for mesh in (*meshes, self.candidate.lining, self.candidate.solid):
+            mesh._cache.clear()
+
     def rng(self, id: str) -> np.random.Generator:
         """Random numbers of one metric; other metrics do not shift them."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(id.encode()),)))
+
+
+SHARED: dict[tuple[Any, ...], Any] = {}  # what was computed from released files, for all cases of this process
+_UNTIL: dict[tuple[str, str], str] = {}
+
+
+def until(category: str) -> Callable[[Callable[[Case], Result]], Callable[[Case], Result]]:
+    """Marks a large result as the last of whose users a category is; asked for again, it is computed again.
+
+    On top of `derived`, `of_hold` or `of_truth`. A mark that is wrong costs time and no more.
+    """
+
+    def mark(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
+        _UNTIL[function.__module__, function.__qualname__] = category
+        return function
+
+    return mark
 
 
 def derived(function: Callable[[Case], Result]) -> Callable[[Case], Result]:

@@ -30,7 +30,7 @@ def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
     wall.merge_vertices(digits_vertex=6)
     return replace(
         base, name="truth", lining=wall, solid=capped(wall), bore=_bore(truth), track=_track(truth, base.track),
-        nails=part(truth, ("nail",)),
+        nails=part(truth, ("nail",)), bed=trimesh.Trimesh(),
     )  # fmt: skip
 
 
@@ -41,17 +41,16 @@ def part(truth: Truth, names: tuple[str, ...]) -> trimesh.Trimesh:
 
 
 def capped(lining: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The open surface with each rim closed by a fan."""
-    edges, count = np.unique(lining.edges_sorted, axis=0, return_counts=True)
-    rim = edges[count == 1]
+    """The open surface, wound alike everywhere, with each rim closed by a fan that is wound as it is."""
+    _, first, count = np.unique(lining.edges_sorted, axis=0, return_index=True, return_counts=True)
+    rim = lining.edges[first[count == 1]]
     loops = trimesh.graph.connected_components(rim, min_len=3)
     vertices, faces = [np.asarray(lining.vertices)], [np.asarray(lining.faces)]
     for number, loop in enumerate(loops):
-        inside = rim[np.isin(rim, loop).all(axis=1)]
+        back = rim[np.isin(rim, loop).all(axis=1)][:, ::-1]  # the neighbour of a face runs its edge the other way
         vertices.append(lining.vertices[loop].mean(axis=0)[None])
-        faces.append(np.column_stack([inside, np.full(len(inside), len(lining.vertices) + number)]))
+        faces.append(np.column_stack([back, np.full(len(back), len(lining.vertices) + number)]))
     solid = trimesh.Trimesh(np.vstack(vertices), np.vstack(faces), process=False)
-    trimesh.repair.fix_winding(solid)
     if solid.volume < 0.0:
         solid.invert()
     return solid

@@ -1,6 +1,7 @@
 """What `python -m benchmarks.fidelity` can do; each command leaves files in `--out` that the others take up."""
 
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from scene.files import require_output_folder
 
 CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
 SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
-MIDDLING = (("N02", 2.0), ("N25", 30.0))  # corruptions that the sweep must keep below the reconstruction
+MIDDLING = (("N02", 2.0), ("N25", 30.0))  # corruptions that the sweep makes where `controls` has not left them
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,17 @@ def run_controls(config: ControlsConfig) -> None:
 
 
 def run_sweep(config: SweepConfig) -> None:
-    """Moves thresholds, tolerances and seeds, and says how far the scores follow."""
+    """Moves thresholds, tolerances and seeds, and says how far the scores follow.
+
+    Whatever `controls` has left in `--out` takes part in the order that must be kept.
+    """
     opened = open_case(config)
     candidates = dict(opened.values)
-    bench = runner.Bench(opened.case, candidates["base"], config.out / "controls")
-    for outcome in runner.run(bench, [Job(*one) for one in MIDDLING], processes=1):
-        candidates[outcome.job.name] = outcome.values
+    foreign = config.out / given.FOREIGN
+    known = foreign if foreign.exists() else None
+    bench = runner.Bench(opened.case, candidates["base"], config.out / "controls", known)
+    runner.run(bench, [Job(*one) for one in MIDDLING], processes=1)
+    candidates |= {outcome.job.name: outcome.values for outcome in bench.kept() if sweep.ranked(outcome.job)}
     rows = sweep.thresholds(candidates)
     for kind, runs in _recomputed(opened, config).items():
         rows += sweep.others(kind, runs, candidates["base"])
@@ -126,14 +132,19 @@ def run_report(inputs: Inputs) -> None:
 def _recomputed(opened: Opened, config: SweepConfig) -> dict[str, dict[str, dict[str, Value]]]:
     base = opened.values["base"]
     found: dict[str, dict[str, dict[str, Value]]] = {"tolerance": {}, "seed": {}}
-    fresh_case = replace(opened.case, cache={})
-    changed = [("tolerance", f"x{k}", replace(fresh_case, tolerance=k, cache={})) for k in config.tolerances]
-    changed += [("seed", str(seed), replace(fresh_case, seed=seed, cache={})) for seed in config.seeds]
-    for kind, name, fresh in changed:
+    for kind, name, fresh in _variants(opened.case, config):
         same = kind == "seed" and fresh.seed == opened.case.seed
         found[kind][name] = base if same else evaluate(fresh, judge.geometry(), base)
         print(f"{kind} {name}: done", flush=True)
     return found
+
+
+def _variants(case: Case, config: SweepConfig) -> Iterator[tuple[str, str, Case]]:
+    """The case with other tolerances and seeds, nothing of it computed."""
+    for factor in config.tolerances:
+        yield "tolerance", f"x{factor}", replace(case.fresh(), tolerance=factor)
+    for seed in config.seeds:
+        yield "seed", str(seed), replace(case.fresh(), seed=seed)
 
 
 def _report(opened: Opened) -> dict[str, Any]:

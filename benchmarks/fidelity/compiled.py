@@ -73,6 +73,14 @@ def nails_of(model: mujoco.MjModel) -> trimesh.Trimesh:
     return concatenated([geom_mesh(model, data, geom) for geom in named])
 
 
+def bed_of(model: mujoco.MjModel) -> trimesh.Trimesh:
+    """The bed of the compiled scene where it is seen: a slab above the invert of a round bore, else nothing."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    seen = [g for g in range(model.ngeom) if model.geom(g).name.startswith("bed_") and model.geom_group[g] == 0]
+    return concatenated([geom_mesh(model, data, geom) for geom in seen])
+
+
 def concatenated(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     """Several meshes as one; none gives an empty one."""
     if not meshes:

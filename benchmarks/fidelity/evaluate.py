@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection
 
 from benchmarks.fidelity import registry, table
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.memory import give_back
 from benchmarks.fidelity.value import Value
 
 
@@ -21,9 +22,15 @@ def evaluate(
         reuse: Values of a case that differs in nothing that the other categories read.
         advance: Called with each id when it is done.
     """
-    rows, values = table.load(), {}
+    rows, values, last = table.load(), {}, ""
     for id, entry in registry.registered().items():
-        wanted = categories is None or rows[id].category in categories
-        values[id] = registry.compute(case, id, entry) if wanted or reuse is None else reuse[id]
+        category = rows[id].category
+        if reuse is not None and categories is not None and category not in categories:
+            values[id] = reuse[id]
+        else:
+            if category != last:
+                case.let_go(last)
+                give_back()
+            values[id], last = registry.compute(case, id, entry), category
         advance(id)
     return values

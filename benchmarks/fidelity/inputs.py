@@ -9,7 +9,8 @@ from pathlib import Path
 from benchmarks.fidelity.candidate import load
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.errors import FidelityError
-from benchmarks.fidelity.references import HoldConfig, file_hash, load_hold, load_truth
+from benchmarks.fidelity.filehash import file_hash
+from benchmarks.fidelity.references import HoldConfig, load_hold, load_truth
 from scene.errors import SubterraError
 from scene.files import require_input
 
@@ -17,6 +18,7 @@ PACKAGED = "subterra-351"
 PACKAGED_LENGTH = 351
 HELD_OUT = "os1"
 SIGMA = {"os1": 0.03, "ouster": 0.03, "velodyne": 0.03, "vlp16": 0.03, "livox": 0.02}  # m, data sheets
+FOREIGN = "foreign-scene"  # folder
 FOREIGN_SEED = 1000
 
 
@@ -87,6 +89,10 @@ def read(inputs: Inputs) -> Case:
     poses = inputs.fit_trajectory or inputs.trajectory
     if inputs.fit_recording is not None and poses is not None:
         fit = load_hold(inputs.fit_recording, poses, candidate.origin, inputs.hold)
+        if fit.hash not in [entry.get("sha256") for entry in candidate.manifest.get("inputs", [])]:
+            raise FidelityError(
+                f"{inputs.fit_recording}: is not what {inputs.scene} was built from; its manifest has another SHA-256"
+            )
     truth = None if inputs.truth is None else load_truth(inputs.truth, candidate.origin)
     return Case(candidate, hold, fit, truth, inputs.seed)
 
@@ -125,7 +131,7 @@ def built_from(scene: Path, recording: Path) -> bool:
 
 def foreign(case: Case, folder: Path) -> Path:
     """A scene of another tunnel of the same class and length, made where it is missing, for N33."""
-    scene = folder / "foreign-scene"
+    scene = folder / FOREIGN
     if not (scene / "manifest.json").exists():
         survey = folder / "foreign-survey"
         make("scene.survey", "--length", round(case.candidate.length), "--seed", FOREIGN_SEED, "--out", survey)

@@ -1,18 +1,20 @@
 """Runs the whole judgement of a case: reconstruction, null tubes, ceiling, leaks, and the verdict over all of it."""
 
-import gc
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from benchmarks.fidelity import leaks, scoring, store, table
+from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.ceiling import truth_candidate
 from benchmarks.fidelity.controls import verdicts
 from benchmarks.fidelity.controls.verdicts import Base
 from benchmarks.fidelity.evaluate import evaluate
+from benchmarks.fidelity.memory import give_back
 from benchmarks.fidelity.null import null_tube
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.value import Value
@@ -56,31 +58,44 @@ def geometry() -> tuple[str, ...]:
 
 
 def values_of(case: Case, folder: Path) -> dict[str, dict[str, Value]]:
-    """Raw values of the reconstruction, its null tubes and the ceiling; kept in `values.json` and taken up again."""
+    """Raw values of the reconstruction, its null tubes and the ceiling.
+
+    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
+    """
     path, key = folder / "values.json", store.case_hash(case)
-    if path.exists():
-        content = json.loads(path.read_text())
-        if content.get("schema") == SCHEMA and content.get("key") == key:
-            return {name: store.load_values(entry) for name, entry in content["values"].items()}
-    candidates = {
-        "base": case.candidate,
-        "null": null_tube(case.candidate),
-        "null_bare": null_tube(case.candidate, False),
-    }
-    if case.truth is not None:
-        candidates["ceiling"] = truth_candidate(case.truth, case.candidate)
-    values: dict[str, dict[str, Value]] = {}
+    values = _kept(path, key)
+    candidates = _candidates(case)
     with progress_bar() as progress:
-        for name, candidate in candidates.items():
+        for name in [name for name in candidates if name not in values]:
             stage = progress.start(f"metrics of {name}", table.COUNT)
-            one = replace(case, candidate=candidate, cache={})
+            one = replace(case, candidate=candidates[name](), cache={})
             chosen = None if name == "base" else geometry()
             values[name] = evaluate(one, chosen, values.get("base"), partial(_advance, stage))
+            dumped = {name: store.dump_values(entry) for name, entry in values.items()}
+            store.write_json(path, {"schema": SCHEMA, "key": key, "values": dumped}, digits=17)
             one.cache.clear()
-            gc.collect()  # meshes and their rays refer to each other
-    dumped = {name: store.dump_values(entry) for name, entry in values.items()}
-    store.write_json(path, {"schema": SCHEMA, "key": key, "values": dumped}, digits=17)
+            give_back()
     return values
+
+
+def _candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
+    """What is scored of a case, the reconstruction first."""
+    made: dict[str, Callable[[], Candidate]] = {
+        "base": lambda: case.candidate,
+        "null": lambda: null_tube(case.candidate),
+        "null_bare": lambda: null_tube(case.candidate, False),
+    }
+    if (truth := case.truth) is not None:
+        made["ceiling"] = lambda: truth_candidate(truth, case.candidate)
+    return made
+
+
+def _kept(path: Path, key: str) -> dict[str, dict[str, Value]]:
+    """What an earlier run of the same case left; nothing where there is none."""
+    content = json.loads(path.read_text()) if path.exists() else {}
+    if content.get("schema") != SCHEMA or content.get("key") != key:
+        return {}
+    return {name: store.load_values(entry) for name, entry in content["values"].items()}
 
 
 def _advance(stage: Stage, id: str) -> None:

@@ -41,7 +41,7 @@ def null_tube(candidate: Candidate, sleepers: bool = True) -> Candidate:
     name = f"{candidate.name} as null tube" + ("" if sleepers else " without track")
     return replace(
         candidate, name=name, lining=lining, solid=solid, bore=constant, track=track, extra=trimesh.Trimesh(),
-        nails=trimesh.Trimesh(),
+        nails=trimesh.Trimesh(), bed=candidate.bed if sleepers else trimesh.Trimesh(),
     )  # fmt: skip
 
 

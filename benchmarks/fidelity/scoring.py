@@ -145,7 +145,7 @@ def reasons_against(
 
     Args:
         scored: The candidate.
-        null: The null tube on the same references.
+        null: The null tube on the same references; without any there is nothing that it could be told apart by.
         median_skill: Over the metrics with H or T evidence.
         undetected: Negative controls that were not detected; empty also where controls were not run.
         loud: Invariance controls that moved.
@@ -162,7 +162,7 @@ def reasons_against(
         if value is not None and value < PASS_CATEGORY
     ]
     found += [f"gate {id} failed with {scored.scores[id].value.value}" for id in scored.failed_gates]
-    if null is not None and scored.overall is not None and null.overall is not None:
+    if null is not None and scored.overall is not None and null.overall is not None and scored.evidence is not None:
         lead = scored.overall - null.overall
         if lead < PASS_LEAD:
             found.append(f"only {lead:.1f} points above the null tube; {PASS_LEAD:g} are asked")

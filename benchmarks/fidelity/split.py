@@ -14,7 +14,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import Writer as Writer2
 
 from benchmarks.fidelity.errors import FidelityError
-from benchmarks.fidelity.references import file_hash
+from benchmarks.fidelity.filehash import file_hash
 from benchmarks.fidelity.store import write_json
 from scene.cli import progress_bar
 from scene.files import replace_folder, require_input

@@ -19,6 +19,7 @@ NOT_VALUES = (
     "figures",
     "__main__.py",
     "commands.py",
+    "memory.py",
     "inputs.py",
     "judge.py",
     "scoring.py",
@@ -137,6 +138,7 @@ def candidate_hash(candidate: Candidate) -> str:
         candidate.solid,
         candidate.extra,
         candidate.nails,
+        candidate.bed,
         candidate.track.sleeper_mesh,
         candidate.track.rail_mesh,
     ):

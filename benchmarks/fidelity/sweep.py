@@ -7,6 +7,9 @@ import numpy as np
 from scipy.stats import kendalltau, qmc
 
 from benchmarks.fidelity import scoring, table
+from benchmarks.fidelity.controls import catalogue
+from benchmarks.fidelity.controls.invariance import INVARIANCES
+from benchmarks.fidelity.controls.kept import Job
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Map
 from benchmarks.fidelity.value import Value
@@ -22,6 +25,11 @@ TAU_LIMIT = 0.95
 
 Maps = dict[str, Map]
 Values = dict[str, Value]
+
+
+def ranked(job: Job) -> bool:
+    """Whether a control's outcome has a place in the order: invariances change nothing, and cheats no geometry."""
+    return job.control not in INVARIANCES and bool(catalogue.load()[job.control].falls)
 
 
 def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
@@ -49,7 +57,8 @@ def thresholds(candidates: dict[str, Values]) -> list[dict[str, Any]]:
     """Scores all candidates through every run's maps.
 
     Args:
-        candidates: Raw values by name; the first is the reconstruction, the others must stay below it, save `ceiling`.
+        candidates: Raw values by name; the first is the reconstruction. Null tubes, and whatever else scores less
+            save `ceiling`, must stay below it.
     """
     before = {name: scoring.score_all(values) for name, values in candidates.items()}
     return [
@@ -74,7 +83,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
         moves, worst = [row["delta"] for row in own], max(row["category_delta"] for row in own)
         found[kind] = {
             "runs": len(own), "least": min(moves), "most": max(moves), "sd": float(np.std(moves)),
-            "category": worst, "order_kept": all(row["order_kept"] for row in own),
+            "category": worst, "lower": own[0]["lower"], "order_kept": all(row["order_kept"] for row in own),
             "verdicts": sorted({row["meets"] for row in own}), "least_tau": min(row["tau"] for row in own),
         }  # fmt: skip
         found[kind]["within"] = _within(kind, own, moves, worst)
@@ -96,13 +105,14 @@ def _row(kind: str, name: str, before: dict[str, Scored], after: dict[str, Score
     old, new = before[first], after[first]
     moved = {c: (new.categories[c] or 0.0) - (v or 0.0) for c, v in old.categories.items()}
     worst = max(moved, key=lambda c: abs(moved[c]))
-    below = [s.overall or 0.0 for c, s in after.items() if c not in (first, "ceiling")]
+    others = {c: s.overall or 0.0 for c, s in before.items() if c not in (first, "ceiling")}
+    lower = [c for c, score in others.items() if c.startswith("null") or score < (old.overall or 0.0)]
     ranks = [[s.overall or 0.0 for s in scored.values()] for scored in (before, after)]
     return {
         "kind": kind, "run": name, "global": new.overall, "delta": (new.overall or 0.0) - (old.overall or 0.0),
         "category_delta": abs(moved[worst]), "category": worst, "categories": new.categories,
         "meets": not scoring.reasons_against(new, after.get("null"), None, [], [], []),
-        "order_kept": all((new.overall or 0.0) > value for value in below),
+        "order_kept": all((new.overall or 0.0) > (after[c].overall or 0.0) for c in lower), "lower": len(lower),
         "tau": float(kendalltau(*ranks).statistic) if len(before) > 2 else 1.0,
         "saturated": new.saturated, "others": {c: s.overall for c, s in after.items() if c != first},
     }  # fmt: skip

@@ -1,5 +1,6 @@
 """The command, from input to files, and what it says of bad input."""
 
+import hashlib
 import json
 import re
 import subprocess
@@ -51,6 +52,9 @@ def test_the_scene_folder_holds_everything_the_format_asks_for(scene):
     assert manifest["provenance"]["sleepers"] == "by standard"
     assert manifest["count"]["sleepers"] == 41
     assert len(manifest["inputs"][0]["sha256"]) == 64
+    lining = (scene / "meshes" / "lining.ply").read_bytes()
+    assert manifest["files"]["meshes/lining.ply"] == hashlib.sha256(lining).hexdigest()
+    assert {"scene.xml", "bore.npz", "tunnel.npz"} < set(manifest["files"])
 
 
 def test_whole_meshes_are_in_the_tunnel_frame(scene):

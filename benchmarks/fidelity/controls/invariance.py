@@ -76,7 +76,7 @@ def moved_together(case: Case, rng: np.random.Generator) -> Case:
     turned = {name: getattr(bore, name) @ turn.T for name in ("tangent", "lateral", "up")}
     made = replace(
         candidate, lining=mesh(candidate.lining), solid=mesh(candidate.solid), extra=mesh(candidate.extra),
-        nails=mesh(candidate.nails),
+        nails=mesh(candidate.nails), bed=mesh(candidate.bed),
         bore=replace(bore, position=move(bore.position), **turned),
         track=replace(
             track, sleeper=move(track.sleeper) if len(track.sleeper) else track.sleeper,

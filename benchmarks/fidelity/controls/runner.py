@@ -1,16 +1,14 @@
 """Runs controls side by side, keeps what is done, and judges what each did to the scores."""
 
-import gc
 import multiprocessing
 import re
 import tempfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +20,7 @@ from benchmarks.fidelity.controls.catalogue import OUT_OF_SCENE, Setting
 from benchmarks.fidelity.controls.invariance import INVARIANCES
 from benchmarks.fidelity.controls.kept import Job, Outcome
 from benchmarks.fidelity.evaluate import evaluate
+from benchmarks.fidelity.memory import give_back
 from benchmarks.fidelity.value import Value
 from scene.cli import progress_bar
 
@@ -46,10 +45,19 @@ class Bench:
     foreign: Path | None = None
     compute: Evaluate = evaluate
 
-    def key(self) -> str:
-        """Of the base: a kept result of another base is not taken up."""
-        other = "" if self.foreign is None else str(self.foreign.resolve())
-        return sha256(f"{store.case_hash(self.case)} {store.controls_hash()} {other}".encode()).hexdigest()
+    def key(self, job: Job) -> str:
+        """Of base and code, for N33 of the foreign scene too: a kept result of others is not taken up."""
+        other = "" if self.foreign is None or job.control != "N33" else store.candidate_hash(_foreign(self))
+        return sha256(f"{self._own} {other}".encode()).hexdigest()
+
+    @cached_property
+    def _own(self) -> str:
+        return f"{store.case_hash(self.case)} {store.controls_hash()}"
+
+    def kept(self) -> list[Outcome]:
+        """What earlier runs left of this base, in the order of `jobs`."""
+        found = (kept.read(self.folder, job, self.key(job)) for job in jobs(foreign=self.foreign is not None))
+        return [outcome for outcome in found if outcome is not None]
 
 
 def jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
@@ -70,10 +78,10 @@ def is_bold(job: Job) -> bool:
 
 def run(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcome]:
     """Does the jobs, in their order; those kept from an earlier run of the same base are read."""
-    key, done = bench.key(), {}
+    done: dict[Job, Outcome] = {}
     todo = []
     for job in wanted:
-        known = kept.read(bench.folder, job, key)
+        known = kept.read(bench.folder, job, bench.key(job))
         if known is None:
             todo.append(job)
         else:
@@ -84,7 +92,7 @@ def run(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcome]:
             stage.resume(len(done))
         for outcome in _computed(bench, todo, processes):
             done[outcome.job] = outcome
-            kept.write(bench.folder, outcome, key)
+            kept.write(bench.folder, outcome, bench.key(outcome.job))
             stage.advance()
     return [done[job] for job in wanted]
 
@@ -132,7 +140,7 @@ def _start(bench: Bench) -> None:
 
 def _in_worker(job: Job) -> Outcome:
     outcome = one(_worker["bench"], job)
-    gc.collect()  # meshes and their rays refer to each other: without it a worker grows by 100 MB a control
+    give_back()
     return outcome
 
 
@@ -141,17 +149,8 @@ def _computed(bench: Bench, todo: list[Job], processes: int) -> Iterator[Outcome
         yield from (one(bench, job) for job in todo)
         return
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, _start, (_without_caches(bench),))
+    pool = ProcessPoolExecutor(processes, context, _start, (replace(bench, case=bench.case.fresh()),))
     try:
         yield from pool.map(_in_worker, todo)
     finally:
         pool.shutdown(cancel_futures=True)  # an interrupt waits for what is under way, not for all that was asked
-
-
-def _without_caches(bench: Bench) -> Bench:
-    case = bench.case
-    bare: dict[str, Any] = {
-        name: None if reference is None else replace(reference, cache={})
-        for name, reference in (("hold", case.hold), ("fit", case.fit), ("truth", case.truth))
-    }
-    return replace(bench, case=replace(case, **bare, cache={}))

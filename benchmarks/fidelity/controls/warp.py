@@ -34,6 +34,7 @@ def warped(candidate: Candidate, move: Map) -> Candidate:
         track=warped_track(candidate.track, move),
         extra=warped_mesh(candidate.extra, move),
         nails=warped_mesh(candidate.nails, move),
+        bed=warped_mesh(candidate.bed, move),
     )
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from benchmarks.fidelity.case import Case, derived, of_hold
+from benchmarks.fidelity.case import Case, derived, of_hold, until
 from benchmarks.fidelity.derive.path import sensor_path
-from benchmarks.fidelity.derive.surface import intersector
+from benchmarks.fidelity.derive.surface import intersector, normals
 
 _NEAR = 1.0  # m over which the path's frame is taken as straight: less than a millimetre at a radius of 500 m
 
@@ -72,6 +72,7 @@ def returns(case: Case) -> Returns:
     return Returns(hold.scan[order], hold.origin[order], direction, hold.range[order], points, local, heading)
 
 
+@until("LIN")
 @derived
 def paired(case: Case) -> Paired:
     """Every held-out return's beam, cast in everything visible of the candidate."""
@@ -79,7 +80,7 @@ def paired(case: Case) -> Paired:
     reach, face = rays.first(real.origin, real.direction)
     cosine = np.zeros(len(face))
     hit = face >= 0
-    normal = rays.mesh.triangles_cross[face[hit]]
+    normal = normals(rays.mesh, face[hit])
     length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
     cosine[hit] = np.abs(np.einsum("ij,ij->i", normal, real.direction[hit])) / length
     return Paired(reach, face, np.minimum(cosine, 1.0), reach - real.range)
@@ -101,6 +102,7 @@ def local_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n
     return local
 
 
+@until("OCC")
 @derived
 def _draws(case: Case) -> dict[str, Float[np.ndarray, " n"]]:
     return {}

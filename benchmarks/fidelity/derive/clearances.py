@@ -7,7 +7,7 @@ import shapely
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, derived, of_hold, of_truth
+from benchmarks.fidelity.case import Case, derived, of_hold, of_truth, until
 from benchmarks.fidelity.derive import profiles
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.derive.freeplane import truth_caster
@@ -46,6 +46,7 @@ def _places(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "k 3
     return station, reference_curve(case).point(grid.reshape(-1, 3))
 
 
+@until("F3D")
 @of_truth
 def _truth_nearest(case: Case) -> Nearest:
     assert case.truth is not None

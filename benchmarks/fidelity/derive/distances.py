@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, derived, of_hold
+from benchmarks.fidelity.case import Case, derived, of_hold, until
 from benchmarks.fidelity.derive.beams import at, paired, returns
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.derive.packing import cells
 from benchmarks.fidelity.derive.path import sensor_path
-from benchmarks.fidelity.derive.surface import lattice, nearest, surface
+from benchmarks.fidelity.derive.surface import lattice, nearest, normals, surface
 from benchmarks.fidelity.references import Hold
 
 MOST = 120_000
@@ -58,19 +58,21 @@ def thinned(case: Case) -> Int[np.ndarray, " k"]:
     return np.linspace(0, count - 1, min(count, MOST)).astype(int)
 
 
+@until("DIS")
 @of_hold
 def cloud_tree(case: Case) -> cKDTree:
     """Of all held-out returns."""
     return cKDTree(returns(case).points, balanced_tree=False)
 
 
+@until("CMP")
 @derived
 def to_mesh(case: Case) -> ToMesh:
     """Distances of held-out points to everything visible of the candidate; nothing is registered first."""
     pick, real = thinned(case), returns(case)
     points = real.points[pick]
     distance, closest, face = nearest(case).query(points)
-    normal = surface(case).triangles_cross[face]
+    normal = normals(surface(case), face)
     side = np.einsum("ij,ij->i", normal, points - closest) * np.einsum("ij,ij->i", normal, real.origin[pick] - closest)
     bore = case.candidate.bore
     local = Curve(bore.station, bore.position).local(points)

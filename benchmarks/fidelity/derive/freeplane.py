@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, distance_transform_edt
 from skimage.morphology import skeletonize
 
-from benchmarks.fidelity.case import Case, derived, of_truth
+from benchmarks.fidelity.case import Case, derived, of_truth, until
 from benchmarks.fidelity.derive import carving
 from benchmarks.fidelity.derive.grids import ROUND, Lattice, lattice_of, object_points, reached, true_objects
 from benchmarks.fidelity.derive.profiles import grouped_median
@@ -149,6 +149,7 @@ def medial_axis(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
     return skeletonize(binary_opening(padded, np.ones((2 * _SPUR + 1,) * 2)))[20:-20, 1:-1]
 
 
+@until("NAV")
 @of_truth
 def truth_caster(case: Case) -> Caster:
     """Rays in all of the true surface."""

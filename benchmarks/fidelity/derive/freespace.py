@@ -6,13 +6,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.ndimage import binary_closing, distance_transform_edt, label
 
-from benchmarks.fidelity.case import Case, derived, of_hold, of_truth
+from benchmarks.fidelity.case import Case, derived, of_hold, of_truth, until
 from benchmarks.fidelity.derive import surface
 from benchmarks.fidelity.derive.curve import Curve, candidate_curve, truth_curve
 from benchmarks.fidelity.derive.reference_axis import hold_curve
 
 _CELL = (0.5, 0.25, 0.25)  # m along, left, up
 _SAMPLES = 0.10  # m between samples of a surface
+_AT_ONCE = 300_000  # points, whose coordinates take 100 MB on their way
 _PAD = 0.3  # m beyond the walls; more would give leaks room to loop in
 _KEPT = 0.05  # m; pairs of less persistence are the grid's
 _MIDDLE = 0.5  # m about the curve, in which the flood starts
@@ -38,10 +39,12 @@ class Grid:
 
     def occupied(self, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "a b c"]:
         """Cells with a point in them; points outside the box are left out."""
-        index = np.floor((self.curve.local(points) - self.low) / self.cell).astype(int)
-        index = index[((index >= 0) & (index < self.shape)).all(axis=1)]
         cells = np.zeros(self.shape, bool)
-        cells[tuple(index.T)] = True
+        for start in range(0, len(points), _AT_ONCE):
+            local = self.curve.local(points[start : start + _AT_ONCE])
+            index = np.floor((local - self.low) / self.cell).astype(int)
+            index = index[((index >= 0) & (index < self.shape)).all(axis=1)]
+            cells[tuple(index.T)] = True
         return cells
 
     def on_curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -70,12 +73,14 @@ def _grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Grid:
     return Grid(curve, cell, low, (int(shape[0]), int(shape[1]), int(shape[2])))
 
 
+@until("TOP")
 @derived
 def samples(case: Case) -> Float[np.ndarray, "k 3"]:
     """Points all over the candidate's visible surface."""
     return surface.lattice(surface.surface(case), _SAMPLES)[0]
 
 
+@until("TOP")
 @of_truth
 def _truth_samples(case: Case) -> Float[np.ndarray, "k 3"]:
     assert case.truth is not None

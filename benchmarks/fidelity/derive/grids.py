@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
-from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.case import Case, derived, until
 from benchmarks.fidelity.compiled import concatenated
 from benchmarks.fidelity.derive import carving
 from benchmarks.fidelity.derive.curve import Curve
@@ -102,6 +102,7 @@ def lattice_of(case: Case, edge: float) -> Lattice:
     return Lattice(curve, start, (int(curve.length / edge), int(count[0]), int(count[1])), edge)
 
 
+@until("F3D")
 @derived
 def air(case: Case) -> Air:
     """Both, in voxels."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, derived, of_hold
+from benchmarks.fidelity.case import Case, derived, of_hold, until
 from benchmarks.fidelity.derive.beams import returns, synthetic
 
 NEIGHBOURS = 24
@@ -70,6 +70,7 @@ def real_planes(case: Case) -> Planes:
     return planes(points, cloud_tree(case), points[chosen(case)])
 
 
+@until("DIS")
 @derived
 def synthetic_tree(case: Case) -> tuple[Float[np.ndarray, "m 3"], cKDTree]:
     """The synthetic points that there are, and their tree."""

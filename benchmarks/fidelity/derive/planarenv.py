@@ -14,7 +14,7 @@ from benchmarks.fidelity.derive import released, surface
 from benchmarks.fidelity.derive.released import of_released
 from benchmarks.fidelity.derive.scenerays import scene_ranges
 from subterra_jax import lidar, odometry
-from subterra_jax.state import EnvParams, State
+from subterra_jax.state import EnvParams, State, StepNoise
 
 TASK = "Subterra/Traverse-v0"
 LINING = "pockets"
@@ -85,7 +85,7 @@ def viewer(case: Case) -> Callable[[Poses, jax.Array], np.ndarray]:
         zero = jnp.zeros(2)
         odometer = odometry.start_odometry(zero, params.odometry)
         state = State(xy, heading, station, zero[0], station, zero, odometer, jnp.zeros((), jnp.int32))
-        return env.observe(state, normal, params)[: params.lidar.n_beams]
+        return env.observe(state, StepNoise(zero, normal), params)[: params.lidar.n_beams]
 
     compiled = jax.jit(jax.vmap(look))
     return lambda at, normal: np.asarray(compiled(*_plan(at), normal), float)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.fidelity.case import Case, derived, of_hold
+from benchmarks.fidelity.case import Case, derived, of_hold, until
 from benchmarks.fidelity.derive import profiles
 from benchmarks.fidelity.derive.beams import returns
 from benchmarks.fidelity.derive.curve import Curve, candidate_curve, truth_curve
@@ -78,6 +78,7 @@ def hold_local(case: Case) -> Float[np.ndarray, "k 3"]:
     return hold_curve(case).local(hold_points(case))
 
 
+@until("LIN")
 @derived
 def lining_caster(case: Case) -> Caster:
     """Rays in the lining alone."""

@@ -7,17 +7,16 @@ from collections.abc import Callable
 from functools import wraps
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
-from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.case import SHARED, Case, derived
 from benchmarks.fidelity.compiled import Track, track_of
 
 Result = TypeVar("Result")
-_KEPT: dict[tuple[Any, ...], Any] = {}
 
 
 def of_released(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[Case], Result]]:
@@ -33,9 +32,9 @@ def of_released(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[C
         def once(case: Case) -> Result:
             hashes = tuple(_HASHES[name](case) for name in reads)
             key = (function.__module__, function.__qualname__, case.seed, case.tolerance, hashes)
-            if key not in _KEPT:
-                _KEPT[key] = function(case)
-            return _KEPT[key]
+            if key not in SHARED:
+                SHARED[key] = function(case)
+            return SHARED[key]
 
         return once
 
@@ -64,7 +63,7 @@ def mesh_hash(case: Case) -> str:
     digest, judged = sha256(case.candidate.bore.position.tobytes()), case.candidate
     track = judged.track
     laid = (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh)
-    for mesh in (judged.lining, *laid, judged.extra, judged.nails):
+    for mesh in (judged.lining, *laid, judged.extra, judged.nails, judged.bed):
         digest.update(np.ascontiguousarray(mesh.vertices).tobytes() + np.ascontiguousarray(mesh.faces).tobytes())
     return digest.hexdigest()
 

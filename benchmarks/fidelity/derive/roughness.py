@@ -21,6 +21,7 @@ _FEWEST = 20
 _STEP = 0.06  # m; a plane from which a point is further away holds a pocket or an edge
 _UPRIGHT = 0.8  # |z| of a normal beyond which a plane is floor or crown
 _MEDIAN_ERROR = 1.4826 * 1.2533  # times the median absolute deviation over root n: standard error of a median
+_AT_ONCE = 100  # planes, whose pairs of points take 26 MB
 _CLOSE = 0.05  # m; two returns so near to each other differ by their noise
 
 
@@ -119,6 +120,11 @@ def _noise(
 ) -> Float[np.ndarray, " p"]:
     """Variance of one return along the normal, from pairs close to each other in the plane, m²; `nan` without."""
     points = np.where(inside[..., None], points - points[:, :1], 1e3 * (1.0 + np.arange(points.shape[1]))[:, None])
+    parts = [slice(start, start + _AT_ONCE) for start in range(0, len(points), _AT_ONCE)]
+    return np.concatenate([_pair_noise(points[part], normal[part]) for part in parts])
+
+
+def _pair_noise(points: Float[np.ndarray, "p k 3"], normal: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
     gap = points[:, :, None] - points[:, None]
     across = np.einsum("pkli,pi->pkl", gap, normal)
     pair = np.triu(np.sum(gap**2, axis=-1) - across**2 < _CLOSE**2, 1)

@@ -12,7 +12,7 @@ from benchmarks.fidelity.derive.released import of_released
 
 LINING = ("lining", "recess", "floor")  # what pieces of the lining are called
 VISIBLE = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups that a camera draws
-_OURS = {*LINING, "sleeper", "rail", "fastening", "fastenings"}  # what geoms of lining and track are called
+_OURS = {"bed", *LINING, "sleeper", "rail", "fastening", "fastenings"}  # what geoms of lining and track are called
 _EYES = 100
 _RAYS = 1000
 
@@ -47,7 +47,7 @@ def pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r
     reach, geom = scene_ranges(model, eye, way)
     flat = way.reshape(-1, 3)
     mesh = surface.intersector(case).first(np.repeat(eye, way.shape[1], axis=0), flat)[0]
-    # A bed that is a slab, nails and lamps are of the scene alone.
+    # Nails and lamps are of the scene alone.
     ours = np.array([model.geom(k).name.split("_")[0] in _OURS for k in range(model.ngeom)] + [True])
     return Pairs(reach, mesh, ours[geom])
 

@@ -8,7 +8,7 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.signal import detrend
 
-from benchmarks.fidelity.case import Case, derived, of_hold, of_truth
+from benchmarks.fidelity.case import Case, derived, of_hold, of_truth, until
 from benchmarks.fidelity.derive import profiles
 from benchmarks.fidelity.derive.curve import Curve, truth_curve
 from benchmarks.fidelity.derive.reference_axis import hold_curve, hold_local, lining_caster, reference_curve
@@ -54,6 +54,7 @@ def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
     return trimesh.Trimesh(truth.surface.vertices, truth.surface.faces[kept], process=False)
 
 
+@until("F2D")
 @of_truth
 def truth_shell(case: Case) -> Caster:
     """Rays in the true bore: lining with its joints and pockets, floor; no track."""

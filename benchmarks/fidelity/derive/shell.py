@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from benchmarks.fidelity.case import Case, derived
+from benchmarks.fidelity.case import Case, derived, until
 
 _WELD_DIGITS = 6  # a format with float32 keeps corners together and moves them by less
 _MOUTH = 0.15  # m from the plane of a mouth: its rim need not be cut straight
@@ -58,24 +58,28 @@ def edges(mesh: trimesh.Trimesh) -> Edges:
     return Edges(ends, count, np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1))
 
 
+@until("TOP")
 @derived
 def lining(case: Case) -> trimesh.Trimesh:
     """The lining, welded."""
     return welded(case.candidate.lining)
 
 
+@until("TOP")
 @derived
 def solid(case: Case) -> trimesh.Trimesh:
     """The solid, welded."""
     return welded(case.candidate.solid)
 
 
+@until("TOP")
 @derived
 def lining_edges(case: Case) -> Edges:
     """Edges of the welded lining."""
     return edges(lining(case))
 
 
+@until("MSH")
 @derived
 def solid_edges(case: Case) -> Edges:
     """Edges of the welded solid."""
@@ -125,6 +129,7 @@ class Hits:
     cosine: Float[np.ndarray, " k"]
 
 
+@until("TOP")
 @derived
 def axis_hits(case: Case) -> Hits:
     """Rays in random directions from random places of the axis, into the lining alone."""

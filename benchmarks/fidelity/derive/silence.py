@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from benchmarks.fidelity.case import Case, derived
-from benchmarks.fidelity.derive.surface import intersector
+from benchmarks.fidelity.derive.surface import intersector, normals
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def silence(case: Case) -> Silence:
     rays = intersector(case)
     reach, face = rays.first(hold.origin, hold.direction)
     met = np.flatnonzero((face >= 0) & (reach <= hold.range_max))
-    normal = rays.mesh.triangles_cross[face[met]]
+    normal = normals(rays.mesh, face[met])
     cosine = np.abs(np.einsum("ij,ij->i", normal, hold.direction[met]))
     cosine /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
     order = np.argsort(cosine / np.maximum(reach[met], 0.1) ** 2, kind="stable")

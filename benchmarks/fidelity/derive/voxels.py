@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
-from benchmarks.fidelity.case import Case, derived, of_hold
+from benchmarks.fidelity.case import Case, derived, of_hold, until
 from benchmarks.fidelity.derive.beams import local_at, noisy, returns
 from benchmarks.fidelity.derive.packing import cells
 
@@ -37,6 +37,7 @@ class Occupied:
     station: Float[np.ndarray, " i"]
 
 
+@until("OCC")
 @derived
 def occupied(case: Case) -> Occupied:
     """Held-out and synthetic points, and what is known about the voxels near them."""

@@ -63,7 +63,12 @@ def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
         {"svg.hashsalt": "subterra", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
     ):
         for name, draw in _figures():
-            drawn = draw(sheet)
+            try:
+                drawn = draw(sheet)
+            except Exception as error:  # a recording that shows too little, or a spoilt candidate, costs its own figure
+                print(f"{name} is left out: {error}", flush=True)
+                plt.close("all")
+                continue
             if drawn is None:
                 continue
             figure, caption = drawn

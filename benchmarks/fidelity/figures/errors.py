@@ -10,7 +10,7 @@ from benchmarks.fidelity.derive.surface import nearest
 from benchmarks.fidelity.figures import Drawn, Sheet
 from benchmarks.fidelity.figures.style import BLUE, DIVERGING, GREY, INK, ORANGE, RED, binned
 
-_LIMIT = 10.0  # cm
+_LIMIT = 5.0  # cm
 
 
 def unrolled(sheet: Sheet) -> Drawn | None:
@@ -22,8 +22,9 @@ def unrolled(sheet: Sheet) -> Drawn | None:
     middle = np.median(local[:, 2])
     angle = np.degrees(np.arctan2(local[:, 2] - middle, local[:, 1]))
     order = np.argsort(np.abs(found.signed))
-    picture = axes.scatter(found.station[order], angle[order], c=100 * found.signed[order], s=0.6, lw=0, cmap=DIVERGING,
+    picture = axes.scatter(found.station[order], angle[order], c=100 * found.signed[order], s=1.5, lw=0, cmap=DIVERGING,
                            vmin=-_LIMIT, vmax=_LIMIT, rasterized=True)  # fmt: skip
+    axes.set_facecolor("0.8")  # points near the mesh are nearly white
     axes.set(xlabel="station, m", ylabel="angle from left\ntowards up, deg", yticks=(-180, -90, 0, 90, 180))
     figure.colorbar(picture, label="signed distance, cm", extend="both")
     return (

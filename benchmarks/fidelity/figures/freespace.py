@@ -57,7 +57,7 @@ def plan(sheet: Sheet) -> Drawn | None:
         frameon=False,
     )
     map_axis.set(ylabel="left, m")
-    room.set(xlabel="station, m", ylabel="largest clearance, m", ylim=(0, None))
+    room.set(xlabel="station, m", ylabel="largest clearance, m", ylim=(0, 1.1 * room.dataLim.y1))
     room.legend(frameon=False, loc="lower right")
     return (
         figure,

@@ -31,6 +31,7 @@ def categories(sheet: Sheet) -> Drawn:
         yticks=range(len(order)),
         yticklabels=[f"{c}  {entries[c]['name']}" for c in order],
         xlim=(0, 103),
+        ylim=(-0.7, len(order) - 0.3),
         xlabel="score",
     )
     line = plt.Line2D

@@ -8,12 +8,14 @@ from xml.etree import ElementTree
 
 import pytest
 
-from benchmarks.fidelity import judge, report, scoring, sweep, table
+from benchmarks.fidelity import figures, judge, report, scoring, sweep, table
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.controls import verdicts
+from benchmarks.fidelity.controls.invariance import INVARIANCES
 from benchmarks.fidelity.controls.kept import Job, Outcome
-from benchmarks.fidelity.controls.runner import Bench, failures, one, run
+from benchmarks.fidelity.controls.runner import Bench, failures, jobs, one, run
 from benchmarks.fidelity.controls.verdicts import Base
+from benchmarks.fidelity.figures import scores
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.value import Value, missing
 from tests.benchmarks.fidelity import tube
@@ -108,6 +110,31 @@ def test_the_order_is_lost_where_the_null_tube_overtakes() -> None:
     assert not any(row["order_kept"] for row in rows)
 
 
+def test_the_order_of_every_candidate_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = {"base": values(0.95), "null": values(0.5), "N02-2": values(0.7), "N25-30": values(0.6)}
+    rows = sweep.thresholds(made)
+    assert {row["lower"] for row in rows} == {3}
+    assert all(row["order_kept"] and row["tau"] == pytest.approx(1.0) for row in rows)
+    assert sweep.summary(rows)["common"]["lower"] == 3
+    maps = {id: replace(row.map, good=row.map.bad, bad=row.map.good) for id, row in table.load().items()}
+    monkeypatch.setattr(sweep, "threshold_maps", lambda: iter([("common", "turned round", maps)]))
+    (turned,) = sweep.thresholds(made)
+    assert not turned["order_kept"]
+    assert turned["tau"] < 0.0
+
+
+def test_invariances_and_cheats_have_no_place_in_the_order() -> None:
+    ranked = [job for job in jobs() if sweep.ranked(job)]
+    assert {job.control for job in jobs()} - {job.control for job in ranked} == {*INVARIANCES, "N35", "N36"}
+
+
+def test_without_any_reference_nothing_is_asked_over_the_null_tube() -> None:
+    entries = table.load()
+    alone = {id: v if set(entries[id].evidence) <= set("SK") else missing("none") for id, v in values(0.98).items()}
+    assert judge.judged({"base": alone, "null": alone}, []).verdict == "PASS"
+    assert judge.judged({"base": values(0.98), "null": values(0.98)}, []).verdict == "FAIL"
+
+
 def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
     case = replace(tube.case(), hold=None, truth=None, cache={})
     made = {
@@ -137,6 +164,20 @@ def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
     }
 
 
+def test_a_figure_that_cannot_be_drawn_costs_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def broken(sheet: figures.Sheet) -> None:
+        raise ValueError("too little of the section")
+
+    monkeypatch.setattr(figures, "_figures", lambda: iter([("F00-broken", broken), ("F13", scores.categories)]))
+    case = replace(tube.case(), hold=None, truth=None, cache={})
+    judgement = judge.judged({"base": values(0.98), "null": values(0.7)}, [])
+    report.write(tmp_path, case, Inputs(), judgement, None, None)
+    assert "F00-broken is left out: too little of the section" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"F13.png", "F13.svg"}
+
+
 def test_the_same_values_write_the_same_bytes(tmp_path: Path) -> None:
     case = replace(tube.case(), hold=None, truth=None, cache={})
     judgement = judge.judged({"base": values(0.98), "null": values(0.7)}, [])
@@ -144,6 +185,30 @@ def test_the_same_values_write_the_same_bytes(tmp_path: Path) -> None:
         report.write(tmp_path / name, case, Inputs(), judgement, None, None)
     for file in ("report.json", "metrics.csv", "report.html", "figures/F13-categories.svg"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes()
+
+
+def test_a_run_that_was_cut_short_goes_on_with_the_next_candidate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def evaluate(one: Case, *rest: object) -> Values:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(one.candidate.name)
+        return values(0.9)
+
+    monkeypatch.setattr(judge, "evaluate", evaluate)
+    case = tube.case().fresh()
+    with pytest.raises(KeyboardInterrupt):
+        judge.values_of(case, tmp_path)
+    first, done = done, []
+    found = judge.values_of(case, tmp_path)
+    assert first == ["tube", "tube as null tube"]
+    assert done == ["tube as null tube without track", "truth"]
+    assert list(found) == ["base", "null", "null_bare", "ceiling"]
+    assert judge.values_of(case, tmp_path) == found
+    assert len(done) == 2
 
 
 def test_controls_are_kept_and_taken_up_again(tmp_path: Path) -> None:
