@@ -26,10 +26,13 @@ class AutoReset:
         env: The environment.
         params_axes: `in_axes` of the params for `vmap`: None (the default) shares one set of params, 0 gives each
             environment its own, a pytree of the two mixes them.
+        axes: Names of the axes along which batches are vmapped themselves. They then agree on what is to be computed
+            in a step; batches that do not would have all of it computed in every step.
     """
 
     env: TunnelEnv
     params_axes: Any = None
+    axes: tuple[str, ...] = ()
 
     def reset(self, key: PRNGKeyArray, params: EnvParams, n_envs: int) -> tuple[Obs, State]:
         """Begin an episode in each of `n_envs` environments.
@@ -114,6 +117,8 @@ class AutoReset:
             return jnp.where(done[:, None], again, obs)
 
         n_done = jnp.sum(done)
+        if self.axes:
+            n_done = jax.lax.pmax(n_done, self.axes)
         branch = jnp.where(n_done == 0, 0, jnp.where(n_done <= n_few, 1, 2))
         return jax.lax.switch(branch, [lambda: obs, few, everybody])
 

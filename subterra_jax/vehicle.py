@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import native
 from subterra_jax.rows import rowwise
-from subterra_jax.tunnel import Tunnel, node_at
+from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at
 
 
 @struct.dataclass
@@ -81,7 +81,7 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
         station: Its station, m.
 
     Returns:
-        Distance, m; exact up to 0.8 m, and never below 0.8 m where the truth is beyond.
+        Distance, m; exact up to 0.8 m, and exactly that where the truth is beyond.
     """
     first = tunnel.contact_first[node_at(tunnel, station)]
     take: Callable[..., Array] = _gap_by_kernel if native.supported() else _gap
@@ -98,7 +98,7 @@ def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> 
     # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
     share = jnp.clip(-(x0 * edge_x + y0 * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
     near_x, near_y = x0 + share * edge_x, y0 + share * edge_y
-    return jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y))
+    return jnp.minimum(jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y)), CONTACT_REACH)
 
 
 def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:

@@ -86,7 +86,7 @@ def save(run: Path, iteration: int, trees: dict[str, Any], facts: dict[str, Any]
         shutil.rmtree(leftover, ignore_errors=True)
     fresh.mkdir(parents=True)
     # At least one axis each: Orbax gives scalars back as Python numbers.
-    ocp.PyTreeCheckpointer().save((fresh / ARRAYS).resolve(), {k: np.atleast_1d(v) for k, v in arrays.items()})
+    _arrays_file().save((fresh / ARRAYS).resolve(), {k: np.atleast_1d(v) for k, v in arrays.items()})
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     whole = {"schema": SCHEMA, **facts, "shapes": shapes, "digest": _digest(arrays)}
     (fresh / FACTS).write_text(json.dumps(whole, indent=1) + "\n")
@@ -96,13 +96,13 @@ def save(run: Path, iteration: int, trees: dict[str, Any], facts: dict[str, Any]
     return place
 
 
-def load(folder: Path) -> Stored:
-    """Reads the newest checkpoint of a run folder, or the checkpoint that `folder` itself is.
+def load(folder: Path, iteration: int | None = None) -> Stored:
+    """Reads the newest checkpoint of a run folder, or that of an iteration, or the checkpoint that `folder` itself is.
 
     Raises:
         CheckpointError: There is none, or it is damaged.
     """
-    place = _find(folder)
+    place = _find(folder) if iteration is None else folder / FOLDER / f"{iteration:08d}"
     try:
         facts = json.loads((place / FACTS).read_text())
     except (OSError, ValueError) as error:
@@ -110,7 +110,7 @@ def load(folder: Path) -> Stored:
     if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
         raise CheckpointError(f"{place}: field 'schema' of {FACTS} must be {SCHEMA!r}")
     try:
-        restored = ocp.PyTreeCheckpointer().restore((place / ARRAYS).resolve())
+        restored = _arrays_file().restore((place / ARRAYS).resolve())
         arrays = {name: np.asarray(restored[name]).reshape(shape) for name, shape in facts["shapes"].items()}
     except Exception as error:  # a truncated file surfaces as whatever the storage library makes of it
         raise CheckpointError(f"{place}: damaged checkpoint: its arrays cannot be read") from error
@@ -122,6 +122,20 @@ def load(folder: Path) -> Stored:
 def exists(run: Path) -> bool:
     """Whether a run folder holds a checkpoint."""
     return bool(_numbered(run / FOLDER))
+
+
+def iterations(run: Path) -> list[int]:
+    """Iterations of which a run folder holds checkpoints, in order."""
+    return [int(place.name) for place in _numbered(run / FOLDER)]
+
+
+def _arrays_file() -> ocp.Checkpointer:
+    """Orbax for this process alone: of several that train together, others neither write nor wait for it."""
+    me = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process{me}"
+    )
+    return ocp.Checkpointer(ocp.PyTreeCheckpointHandler(multiprocessing_options=alone), multiprocessing_options=alone)
 
 
 def _find(folder: Path) -> Path:

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from train.networks import Policy
-from train.rollout import Finished
+from train.report import Ended
 
 WINDOW = 100
 COLUMNS = np.dtype(
@@ -17,6 +16,7 @@ COLUMNS = np.dtype(
         ("success", np.bool_),
         ("length", np.int64),
         ("episode_return", np.float32),
+        ("contact", np.bool_),
     ]
 )
 
@@ -35,24 +35,23 @@ class EpisodeWindow:
         self.count = count
         self.last = np.zeros(0, COLUMNS) if last is None else last
 
-    def add(self, finished: Finished, step: int) -> np.ndarray:
+    def add(self, ended: Ended, step: int, n_envs: int) -> np.ndarray:
         """Takes in one unroll.
 
         Args:
-            finished: The unroll's episodes, on the host, `(time, env)`.
+            ended: The unroll's episodes, on the host.
             step: Environment steps before the unroll, all environments together.
+            n_envs: Environments stepped together.
 
         Returns:
             The new rows of `COLUMNS`: `episode` counts from 1; `step` is the number of environment steps, all
             environments together, at the end of the control period in which the episode finished.
         """
-        done = np.asarray(finished.done)
-        time, env = np.nonzero(done)
-        rows = np.zeros(len(time), COLUMNS)
-        rows["episode"] = self.count + 1 + np.arange(len(time))
-        rows["step"] = step + (time + 1) * done.shape[1]
-        for name in ("coverage", "success", "length", "episode_return"):
-            rows[name] = np.asarray(getattr(finished, name))[time, env]
+        rows = np.zeros(len(ended.index), COLUMNS)
+        rows["episode"] = self.count + 1 + np.arange(len(rows))
+        rows["step"] = step + (ended.index // n_envs + 1) * n_envs
+        for name in ("coverage", "success", "length", "episode_return", "contact"):
+            rows[name] = getattr(ended, name)
         self.count += len(rows)
         self.last = np.concatenate([self.last, rows])[-WINDOW:]
         return rows
@@ -91,11 +90,14 @@ class Best:
 
     score: tuple[float, float]
     iteration: int
-    policy: Policy
+    policy: Any
 
     @staticmethod
-    def of(best: "Best | None", window: EpisodeWindow, iteration: int, policy: Policy) -> "Best":
-        """The better one of `best` and the policy that has just driven; before a hundred episodes, the latter."""
+    def of(best: "Best | None", window: EpisodeWindow, iteration: int, policy: Any, *, keep: bool = True) -> "Best":
+        """The better one of `best` and the policy that has just driven; before a hundred episodes, the latter.
+
+        Without `keep` always the latter: where a task becomes harder while it is learnt, scores do not compare.
+        """
         # An unfinished hundred scores below every finished one, so that a lucky first episode wins nothing.
         score = (window.mean("success") or 0.0, window.mean("episode_return") or 0.0) if window.full else (-1.0, 0.0)
-        return best if best is not None and best.score > score else Best(score, iteration, policy)
+        return best if keep and best is not None and best.score > score else Best(score, iteration, policy)

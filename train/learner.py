@@ -8,10 +8,11 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
-from train import frames, gae, normalize, update
+from train import frames, gae, normalize, parts, update
 from train.config import PPOConfig, check
 from train.networks import Layout, Networks, Policy
-from train.rollout import Drive, Finished, Rollout, begin, collect
+from train.report import Report, report
+from train.rollout import Drive, Rollout, begin, collect
 
 
 @struct.dataclass
@@ -37,33 +38,29 @@ class TrainState:
     iteration: Int[Array, ""]
 
 
-@struct.dataclass
-class Report:
-    """What the host wants to know of one iteration.
-
-    Attributes:
-        finished: Episodes that ended.
-        metrics: Scalars by name.
-        policy: The policy that drove, before it learnt from this iteration.
-    """
-
-    finished: Finished
-    metrics: dict[str, Float[Array, ""]]
-    policy: Policy
-
-
-class Learner:
+class Learner(parts.Whole):
     """The two pure functions of training, `init` and `iterate`, for one environment and one config.
 
     Both may be jitted, and vmapped over seeds.
+
+    Args:
+        env: A navigation environment, as `st.make` returns it.
+        params: Its parameters.
+        config: Settings.
+        axes: Names of the axes along which `iterate` is vmapped.
+        split: Names of the axes along which environments are split; see `spread.py`.
 
     Raises:
         ConfigError: A setting makes no sense.
     """
 
-    def __init__(self, env: Any, params: Any, config: PPOConfig) -> None:
-        self.config = check(config)
-        self.env = st.batch.AutoReset(env)
+    state_type = TrainState
+
+    def __init__(
+        self, env: Any, params: Any, config: PPOConfig, axes: parts.Parts = (), split: parts.Parts = ()
+    ) -> None:
+        self.config, self.axes, self.split = check(config), axes, split
+        self.env = st.batch.AutoReset(env, axes=axes)
         self.networks = Networks(make_layout(env, params, config))
 
     def init(self, key: PRNGKeyArray, params: Any) -> TrainState:
@@ -78,46 +75,62 @@ class Learner:
             ),
             statistics=normalize.init((self.networks.layout.n_observation,)),
             return_statistics=normalize.init(()),
-            discounted=jnp.zeros(self.config.n_envs, jnp.float32),
-            drive=begin(self.env, params, key_reset, self.config.n_envs, self.config.frames),
+            discounted=jnp.zeros(self.config.part_envs, jnp.float32),
+            drive=begin(
+                self.env, params, parts.own_key(key_reset, self.split), self.config.part_envs, self.config.frames
+            ),
             key=key_rest,
             iteration=jnp.int32(0),
         )
+
+    def policy_of(self, state: TrainState) -> Policy:
+        """The policy that would drive next."""
+        return Policy(state.student.weights["policy"], state.statistics)
 
     def iterate(self, state: TrainState, params: Any) -> tuple[TrainState, Report]:
         """Drives one unroll and learns from it."""
         config, student = self.config, state.student
         key, key_drive, key_learn = jax.random.split(state.key, 3)
         drive, rollout, finished, terms = collect(
-            self.env, params, self.networks, student.weights, state.statistics, state.drive, key_drive, config.unroll
+            self.env,
+            params,
+            self.networks,
+            student.weights,
+            state.statistics,
+            state.drive,
+            parts.own_key(key_drive, self.split),
+            config.unroll,
+            self.axes,
         )
         discounted, returns = normalize.discounted_returns(
             state.discounted, rollout.reward, finished.done, config.discount
         )
-        return_statistics = normalize.update(state.return_statistics, returns)
+        return_statistics = normalize.update(state.return_statistics, returns, self.split)
         lesson = self._lesson(state, rollout, drive, return_statistics.std)
-        learnt, parts = update.learn(student, self.networks, state.statistics, lesson, key_learn, config)
+        learnt, losses = update.learn(student, self.networks, state.statistics, lesson, key_learn, config, self.split)
         # The first iteration only fills the statistics: what it saw was not yet normalised.
         learnt = jax.tree.map(lambda new, old: jnp.where(state.iteration == 0, old, new), learnt, student)
 
         metrics = {
-            **parts,
-            **terms,
+            **losses,
+            **parts.mean(terms, self.split),
             "learning_rate": learnt.learning_rate,
             "reward_scale": return_statistics.std,
-            "explained_variance": 1.0 - jnp.var(lesson.advantage) / (jnp.var(lesson.target) + 1e-8),
+            "explained_variance": parts.mean(
+                1.0 - jnp.var(lesson.advantage) / (jnp.var(lesson.target) + 1e-8), self.split
+            ),
         }
         after = TrainState(
             student=learnt,
             # Refreshed after learning, so that the probabilities compared while learning share one normalisation.
-            statistics=normalize.update(state.statistics, rollout.observation),
+            statistics=normalize.update(state.statistics, rollout.observation, self.split),
             return_statistics=return_statistics,
             discounted=discounted,
             drive=drive,
             key=key,
             iteration=state.iteration + 1,
         )
-        return after, Report(finished, metrics, Policy(student.weights["policy"], state.statistics))
+        return after, report(finished, metrics, self.policy_of(state))
 
     def _lesson(self, before: TrainState, rollout: Rollout, after: Drive, scale: Float[Array, ""]) -> update.Lesson:
         """Advantages and value targets of an unroll that led from `before` to `after`."""

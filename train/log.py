@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 LOG, EPISODES = "log.jsonl", "episodes.csv"
-_HEADER = "episode,step,coverage,success,length"
+_HEADER = "episode,step,coverage,success,length,contact"
 _PLAIN_EVERY = 10.0
 
 
@@ -37,7 +37,7 @@ class RunLog:
         self._log.write(json.dumps(record, allow_nan=False) + "\n")
         for row in rows:
             self._episodes.write(
-                f"{row['episode']},{row['step']},{row['coverage']:.9g},{row['success']:d},{row['length']}\n"
+                f"{row['episode']},{row['step']},{row['coverage']:.9g},{row['success']:d},{row['length']},{row['contact']:d}\n"
             )
         self._log.flush()
         self._episodes.flush()
@@ -57,7 +57,7 @@ class Bar:
     """
 
     def __init__(self, steps: int, done: int = 0) -> None:
-        self._console = Console(stderr=True)
+        self._console, self._steps = Console(stderr=True), steps
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -74,15 +74,16 @@ class Bar:
         if self._progress.disable:
             self._console.print("compiling")
 
-    def show(self, record: dict[str, Any]) -> None:
-        """Shows one iteration."""
+    def show(self, record: dict[str, Any], of: str = "") -> None:
+        """Shows one iteration, of one of several runs where it is named."""
         text = (
-            f"{record['step']:,} steps  {record['timing']['steps_per_second']:,}/s  "
+            f"{of + '  ' if of else ''}{record['step']:,} steps  {record['timing']['steps_per_second']:,}/s  "
             f"coverage {_percent(record['coverage_mean_100'])}  success {_percent(record['success_mean_100'])}"
         )
         self._progress.update(self._task, completed=record["step"], description=text)
         if self._progress.disable and time.monotonic() - self._told > _PLAIN_EVERY:
-            self._console.print(text)
+            left = (self._steps - record["step"]) / max(record["timing"]["steps_per_second"], 1)
+            self._console.print(f"{text}  at most {left:,.0f} s left")
             self._told = time.monotonic()
 
     def close(self) -> None:

@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
-from train import cli, policies, ppo, recurrent, seeds
+from train import cli, cluster, policies, ppo, recurrent, seeds, spread
+from train.cluster import Cluster
 from train.config import PPOConfig, TrainConfig, check, make_config
 from train.errors import ConfigError
 from train.evaluate import check_episodes
@@ -43,6 +44,7 @@ class Command:
         resume: Go on from the checkpoint in `out`; only the limits on training may differ.
         overwrite: Throw away the run that `out` holds.
         evaluation_episodes: Episodes of the evaluation after training, the first of the task's 500.
+        cluster: Other processes to train with.
         config: Settings of PPO.
     """
 
@@ -56,6 +58,7 @@ class Command:
     resume: bool = False
     overwrite: bool = False
     evaluation_episodes: int = 200
+    cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Cluster)
     config: Annotated[PPOConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=PPOConfig)
 
 
@@ -78,7 +81,11 @@ def parse(arguments: list[str]) -> Command:
     early.add_argument("--task", default=_DEFAULT_TASK)
     early.add_argument("--memory", default=_MEMORIES[0])
     early.add_argument("--preset", default=None)
+    early.add_argument("--coordinator")
+    early.add_argument("--processes", type=int)
+    early.add_argument("--process", type=int)
     named, _ = early.parse_known_args(arguments)
+    cluster.join(Cluster(named.coordinator, named.processes, named.process))
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
     if named.memory not in _MEMORIES:
         raise ConfigError(f"unknown memory {named.memory!r}; there are {', '.join(_MEMORIES)}")
@@ -97,10 +104,15 @@ def make_learner(world: policies.World, config: TrainConfig, axes: tuple[str, ..
     Raises:
         ConfigError: A setting makes no sense, or no such network can learn this task.
     """
+    spreads = config.parts > 1
+    names = ((spread.PART,), spread.SPLIT) if spreads else (axes,)
+    learner: Any
     if isinstance(config, RecurrentConfig):
-        return recurrent.learner.RecurrentLearner(world.env, world.params, config, axes)
-    assert isinstance(config, PPOConfig)
-    return Learner(world.env, world.params, config, axes)
+        learner = recurrent.learner.RecurrentLearner(world.env, world.params, config, *names)
+    else:
+        assert isinstance(config, PPOConfig)
+        learner = Learner(world.env, world.params, config, *names)
+    return spread.Spread(learner) if spreads else learner
 
 
 def command(arguments: Command) -> int:
@@ -131,9 +143,12 @@ def _single(session: Session, snapshot: ppo.Snapshot | None, episodes: int) -> i
     with cli.deferred_interrupt() as interrupt:
 
         def watch(now: ppo.Snapshot) -> bool:
-            bar.show(now.record)
-            session.note(now, save=interrupt.wanted)
-            return interrupt.wanted
+            # Processes that train together stop together: at the end.
+            stop = interrupt.wanted and jax.process_count() == 1
+            if cluster.leads():
+                bar.show(now.record)
+            session.note(now, save=stop)
+            return stop
 
         try:
             last = ppo.train(world.env, world.params, config, learner=session.learner, snapshot=snapshot, watch=watch)
@@ -144,6 +159,8 @@ def _single(session: Session, snapshot: ppo.Snapshot | None, episodes: int) -> i
         if interrupt.wanted:
             print(f"interrupted after {last.iteration} iterations; go on with --resume", file=sys.stderr)
             return cli.EXIT_INTERRUPTED
+    if not cluster.leads():
+        return 0
     session.score(last, episodes)
     _tell(last, time.perf_counter() - started)
     return 0
@@ -151,6 +168,8 @@ def _single(session: Session, snapshot: ppo.Snapshot | None, episodes: int) -> i
 
 def _several(arguments: Command, world: policies.World) -> int:
     sessions = []
+    if arguments.config.parts > 1:
+        raise ConfigError(f"parts = {arguments.config.parts} cannot be trained for several seeds at once")
     for seed in arguments.seeds:
         config = dataclasses.replace(arguments.config, seed=seed)
         sessions.append(Session(arguments.out / f"seed-{seed}", world, make_learner(world, config, seeds.axes())))

@@ -54,6 +54,8 @@ class Policy:
 class Networks:
     """A Gaussian squashed by tanh onto the action range, and a value; both read the same stack."""
 
+    kind = "mlp"
+
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
         self.n_action = len(layout.action_low)
@@ -76,6 +78,13 @@ class Networks:
         key_policy, key_value = jax.random.split(key)
         flat = jnp.zeros((1, self.layout.frames * self.layout.n_observation))
         return {"policy": self._policy.init(key_policy, flat), "value": self._value.init(key_value, flat)}
+
+    def policy_shapes(self) -> Policy:
+        """A policy with shapes in place of arrays."""
+        return jax.eval_shape(
+            lambda key: Policy(self.init(key)["policy"], normalize.init((self.layout.n_observation,))),
+            jax.random.key(0),
+        )
 
     def parameters(
         self, weights: Weights, statistics: normalize.Statistics, stack: Float[Array, "*batch frames obs"]

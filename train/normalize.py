@@ -22,9 +22,9 @@ def init(shape: tuple[int, ...]) -> Statistics:
     )  # Brax starts with Python numbers, which would compile everything twice
 
 
-def update(statistics: Statistics, batch: Float[Array, "..."]) -> Statistics:
-    """The statistics after one more batch, whose leading axes are all batch axes."""
-    return running_statistics.update(statistics, batch, std_min_value=_STD_MIN)
+def update(statistics: Statistics, batch: Float[Array, "..."], parts: tuple[str, ...] = ()) -> Statistics:
+    """The statistics after one more batch, whose leading axes are all batch axes, of all parts."""
+    return running_statistics.update(statistics, batch, std_min_value=_STD_MIN, pmap_axis_name=parts or None)
 
 
 def normalize(observation: Float[Array, "*batch obs"], statistics: Statistics) -> Float[Array, "*batch obs"]:

@@ -1,23 +1,57 @@
 """Training from start to end: `train` compiles one iteration, repeats it, and keeps the best policy.
 
-The host only counts finished episodes and decides when to stop; what an iteration is stands in `learner.py`.
+The host only counts finished episodes and decides when to stop; what an iteration is stands in `learner.py`, and in
+`recurrent/learner.py` for networks with memory.
 """
 
 import dataclasses
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
 
 from train import compiling
-from train.config import PPOConfig
+from train.config import PPOConfig, TrainConfig
 from train.episodes import COLUMNS, Best, EpisodeWindow
 from train.errors import TrainingError
-from train.learner import Learner, Report, TrainState
-from train.networks import Policy
+from train.fetching import fetch
+from train.learner import Learner
+from train.report import Ended, Report
+
+
+class Trainable(Protocol):
+    """What can be trained here: `Learner`, or `recurrent.learner.RecurrentLearner`.
+
+    Attributes:
+        networks: With `kind`, `layout` and `policy_shapes`.
+    """
+
+    networks: Any
+
+    @property
+    def config(self) -> Any:
+        """A `TrainConfig`."""
+
+    def init(self, key: Any, params: Any) -> Any:
+        """The state of an untrained run."""
+
+    def iterate(self, state: Any, params: Any) -> tuple[Any, Report]:
+        """One iteration."""
+
+    def policy_of(self, state: Any) -> Any:
+        """The policy in a state."""
+
+    def place(self, state: Any) -> Any:
+        """A state that was read from a checkpoint, where it belongs."""
+
+    def share(self, tree: Any) -> Any:
+        """What every part of it reads, where it belongs."""
+
+    def gather(self, state: Any) -> Any:
+        """A state as a checkpoint holds it."""
 
 
 @dataclasses.dataclass
@@ -35,7 +69,7 @@ class Snapshot:
     """
 
     iteration: int
-    state: TrainState
+    state: Any
     window: EpisodeWindow
     best: Best
     solved_for: int = 0
@@ -43,7 +77,7 @@ class Snapshot:
     rows: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, COLUMNS))
 
     @property
-    def policy(self) -> Policy:
+    def policy(self) -> Any:
         """The policy to keep."""
         return self.best.policy
 
@@ -51,21 +85,27 @@ class Snapshot:
 Watcher = Callable[[Snapshot], bool | None]
 
 
-def begin(learner: Learner, params: Any) -> Snapshot:
+def begin(learner: Trainable, params: Any) -> Snapshot:
     """An untrained run."""
-    state = jax.jit(learner.init, compiler_options=compiling.options())(jax.random.PRNGKey(learner.config.seed), params)
+    key = learner.share(jax.random.PRNGKey(learner.config.seed))
+    state = jax.jit(learner.init, compiler_options=compiling.options())(key, learner.share(params))
+    return started(learner, state)
+
+
+def started(learner: Trainable, state: Any) -> Snapshot:
+    """An untrained run from its state."""
     window = EpisodeWindow()
     # A copy: the state's own arrays are given up to the next iteration.
-    untrained = jax.tree.map(np.asarray, Policy(state.student.weights["policy"], state.statistics))
+    untrained = jax.tree.map(np.asarray, learner.policy_of(state))
     return Snapshot(0, state, window, Best.of(None, window, 0, untrained))
 
 
 def train(
     env: Any,
     params: Any,
-    config: PPOConfig,
+    config: TrainConfig,
     *,
-    learner: Learner | None = None,
+    learner: Trainable | None = None,
     snapshot: Snapshot | None = None,
     watch: Watcher | None = None,
 ) -> Snapshot:
@@ -75,7 +115,7 @@ def train(
         env: A navigation environment, as `st.make` returns it.
         params: Its parameters.
         config: Settings.
-        learner: Made of the same three; built here if left out.
+        learner: Made of the same three; one without memory is built here if left out.
         snapshot: Where to go on from; its state is used up. The beginning if left out.
         watch: Called after every iteration; training ends early if it returns True.
 
@@ -86,41 +126,71 @@ def train(
         ConfigError: A setting makes no sense.
         TrainingError: The loss is no longer finite.
     """
-    learner = learner or Learner(env, params, config)
+    if learner is None:
+        assert isinstance(config, PPOConfig)
+        learner = Learner(env, params, config)
     snapshot = snapshot or begin(learner, params)
-    if snapshot.iteration >= config.iterations or _solved(snapshot, config):
+    if finished(snapshot, config):
         return snapshot
+    params = learner.share(params)
     began = time.perf_counter()
     iterate = jax.jit(learner.iterate, donate_argnums=0).lower(snapshot.state, params).compile(compiling.options())
-    compile_seconds = time.perf_counter() - began
-    while snapshot.iteration < config.iterations and not _solved(snapshot, config):
+    compiled = time.perf_counter()
+    while not finished(snapshot, config):
         before = time.perf_counter()
         state, report = iterate(snapshot.state, params)
-        snapshot = _advance(snapshot, state, report, config)
-        now = time.perf_counter()
-        # Apart from this field, two runs of one seed log the same bytes.
-        snapshot.record["timing"] = {
-            "seconds": round(now - began, 3),
-            "compile_seconds": round(compile_seconds, 3),
-            "steps_per_second": round(config.steps_per_iteration / (now - before)),
-        }
+        snapshot = advance(snapshot, state, report.policy, *fetch(report), config)
+        snapshot.record["timing"] = timing(began, compiled, before, config.steps_per_iteration)
         if watch is not None and watch(snapshot):
             break
     return snapshot
 
 
-def _solved(snapshot: Snapshot, config: PPOConfig) -> bool:
-    return snapshot.solved_for >= config.stop_patience
+def finished(snapshot: Snapshot, config: TrainConfig) -> bool:
+    """Whether a run has come to its end."""
+    return snapshot.iteration >= config.iterations or snapshot.solved_for >= config.stop_patience
 
 
-def _advance(before: Snapshot, state: TrainState, report: Report, config: PPOConfig) -> Snapshot:
-    """The snapshot after one iteration, read from the device."""
-    finished, metrics = jax.device_get((report.finished, report.metrics))
+def timing(began: float, compiled: float, before: float, steps: int) -> dict[str, Any]:
+    """The one field in which two runs of one seed log something else.
+
+    Args:
+        began: When the run, or this part of it, began to compile, s.
+        compiled: When it had compiled.
+        before: When the iteration began.
+        steps: Environment steps in it.
+    """
+    now = time.perf_counter()
+    return {
+        "seconds": round(now - began, 3),
+        "compile_seconds": round(compiled - began, 3),
+        "steps_per_second": round(steps / (now - before)),
+    }
+
+
+def advance(
+    before: Snapshot, state: Any, policy: Any, ended: Ended, metrics: dict[str, np.ndarray], config: TrainConfig
+) -> Snapshot:
+    """The snapshot after one iteration.
+
+    Args:
+        before: The one before; its window is moved on.
+        state: Everything on the device.
+        policy: The one that drove.
+        ended: Episodes that ended, on the host.
+        metrics: Scalars, on the host.
+        config: Settings.
+
+    Raises:
+        TrainingError: A scalar is no longer finite.
+    """
     iteration, window = before.iteration + 1, before.window
-    rows = window.add(finished, before.iteration * config.steps_per_iteration)
-    broken = [name for name, value in metrics.items() if not math.isfinite(value)]
-    if broken:
-        raise TrainingError(f"iteration {iteration}: {broken[0]} is no longer finite; a smaller learning_rate may help")
+    if broken := [name for name, value in metrics.items() if not math.isfinite(value)]:
+        raise TrainingError(
+            f"iteration {iteration}: {', '.join(broken)} {'is' if len(broken) == 1 else 'are'} no longer finite; "
+            "the last checkpoint is good, and a smaller learning_rate may help"
+        )
+    rows = window.add(ended, before.iteration * config.steps_per_iteration, config.n_envs)
     coverage, success = window.mean("coverage"), window.mean("success")
     holds = window.full and (coverage or 0.0) >= config.stop_coverage and success == 1.0
     record = {
@@ -131,13 +201,16 @@ def _advance(before: Snapshot, state: TrainState, report: Report, config: PPOCon
         "success_mean_100": success,
         "return_mean_100": window.mean("episode_return"),
         "length_mean_100": window.mean("length"),
+        "finished": len(rows),
+        "finished_success": float(rows["success"].mean()) if len(rows) else None,
+        "finished_contact": float(rows["contact"].mean()) if len(rows) else None,
         **{name: float(value) for name, value in sorted(metrics.items())},
     }
     return Snapshot(
         iteration=iteration,
         state=state,
         window=window,
-        best=Best.of(before.best, window, iteration, report.policy),
+        best=Best.of(before.best, window, iteration, policy, keep=config.KEEPS_BEST),
         solved_for=before.solved_for + 1 if holds else 0,
         record=record,
         rows=rows,

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from train import frames, normalize
 from train.networks import Networks, Weights
+from train.report import Finished
 
 
 @struct.dataclass
@@ -53,25 +54,6 @@ class Rollout:
     final_value: Float[Array, "time env"]
 
 
-@struct.dataclass
-class Finished:
-    """The episodes that ended during an unroll, in place: read a field only where `done`.
-
-    Attributes:
-        done: Whether the step was its episode's last.
-        coverage: Share of the tunnel covered, 0 to 1.
-        success: Whether the task's goal was met.
-        episode_return: Undiscounted reward of the episode.
-        length: Steps of the episode.
-    """
-
-    done: Bool[Array, "time env"]
-    coverage: Float[Array, "time env"]
-    success: Bool[Array, "time env"]
-    episode_return: Float[Array, "time env"]
-    length: Int[Array, "time env"]
-
-
 def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, n_frames: int) -> Drive:
     """Every environment at the start of an episode."""
     observation, env_state = env.reset(key, params, n_envs)
@@ -92,6 +74,7 @@ def collect(
     drive: Drive,
     key: PRNGKeyArray,
     n_steps: int,
+    axes: tuple[str, ...] = (),
 ) -> tuple[Drive, Rollout, Finished, dict[str, Float[Array, ""]]]:
     """Drives `n_steps` control periods with the sampled policy.
 
@@ -104,6 +87,7 @@ def collect(
         drive: Where the environments are.
         key: For actions and environments.
         n_steps: Length of the unroll.
+        axes: Names of the axes along which this is vmapped.
 
     Returns:
         Where the environments are afterwards, the stored unroll, the episodes that ended in it, and the mean of every
@@ -124,7 +108,7 @@ def collect(
             return networks.value(weights["value"], statistics, final)
 
         # Truncation is rare: most steps pay nothing for it.
-        final_value = jax.lax.cond(jnp.any(truncated), value_of_final, lambda: jnp.zeros_like(reward))
+        final_value = jax.lax.cond(anywhere(truncated, axes), value_of_final, lambda: jnp.zeros_like(reward))
         total, length = now.episode_return + reward, now.age + 1
         stored = Rollout(
             observation=now.stack[:, -1],
@@ -136,7 +120,7 @@ def collect(
             truncated=truncated,
             final_value=jnp.where(truncated, final_value, 0.0),
         )
-        finished = Finished(done, info["coverage"], info["success"], total, length)
+        finished = Finished(done, info["coverage"], info["success"], info["contact"], total, length)
         terms = {name: jnp.mean(value) for name, value in info.items() if name.startswith("reward_")}
         after = Drive(
             env_state=env_state,
@@ -148,3 +132,12 @@ def collect(
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
     return after, stored, finished, jax.tree.map(jnp.mean, terms)
+
+
+def anywhere(flag: Bool[Array, "env"], axes: tuple[str, ...]) -> Bool[Array, ""]:
+    """Whether a flag is up in any environment, those of other copies along vmapped axes included.
+
+    A condition that differs between copies would have both of its branches computed for all of them.
+    """
+    up = jnp.any(flag)
+    return jax.lax.pmax(up, axes) if axes else up

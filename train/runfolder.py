@@ -9,17 +9,14 @@ from typing import Any
 
 import jax
 
-from train import checkpoint, policies, ppo
-from train.config import PPOConfig
+from train import checkpoint, cluster, policies, ppo
+from train.config import TrainConfig
 from train.episodes import Best, EpisodeWindow
-from train.errors import ConfigError, RunFolderError
-from train.learner import Learner
+from train.errors import CheckpointError, ConfigError, RunFolderError
 from train.log import EPISODES, LOG
 
 CONFIG = "config.json"
 _FILES = (CONFIG, LOG, EPISODES, "curve.png", "curve.csv", "evaluation.json")
-# The limits on training may change when a run goes on; nothing else may.
-_LIMITS = ("steps", "stop_coverage", "stop_patience", "checkpoint_every")
 
 
 class RunFolder:
@@ -34,7 +31,7 @@ class RunFolder:
         RunFolderError: No folder can be written there.
     """
 
-    def __init__(self, path: Path, world: policies.World, learner: Learner) -> None:
+    def __init__(self, path: Path, world: policies.World, learner: ppo.Trainable) -> None:
         for place in (path, *path.parents):
             if place.exists():
                 if not place.is_dir():
@@ -43,6 +40,21 @@ class RunFolder:
                     raise RunFolderError(f"{place}: cannot be written to")
                 break
         self.path, self._world, self._learner = path, world, learner
+
+    def begin(self, *, resume: bool, overwrite: bool) -> ppo.Snapshot | None:
+        """The snapshot to go on from; None for a new run, for which the folder is then ready.
+
+        Raises:
+            RunFolderError: As `start`.
+            CheckpointError: As `resume`.
+            ConfigError: As `resume`.
+        """
+        if resume:
+            return self.resume()
+        if not cluster.leads():
+            return None
+        self.start(overwrite=overwrite)
+        return None
 
     def start(self, *, overwrite: bool) -> None:
         """Makes the folder ready for a new run.
@@ -61,47 +73,55 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         self._write_config()
 
-    def resume(self) -> ppo.Snapshot:
-        """The newest checkpoint of the folder.
+    def resume(self, iteration: int | None = None) -> ppo.Snapshot:
+        """The newest checkpoint of the folder, or that of an iteration.
 
         Raises:
             CheckpointError: There is none, it is damaged, or it is of another network.
             ConfigError: It was trained on something else or with other settings.
         """
-        stored = checkpoint.load(self.path)
+        stored = checkpoint.load(self.path, iteration)
         config, facts = self._learner.config, stored.facts
+        if facts.get("kind", "mlp") != self._learner.networks.kind:
+            raise CheckpointError(
+                f"{self.path}: made for another network: {facts.get('kind', 'mlp')}, not {self._learner.networks.kind}"
+            )
         for name, value in self._world.facts.items():
             if facts["world"].get(name) != value:
                 raise ConfigError(f"{self.path}: was trained with {name} = {facts['world'].get(name)}, not {value}")
         for name, value in _plain(config).items():
-            if name not in _LIMITS and facts["config"].get(name) != value:
+            if name not in config.LIMITS and facts["config"].get(name) != value:
                 raise ConfigError(f"{self.path}: was trained with {name} = {facts['config'].get(name)}, not {value}")
         shapes = jax.eval_shape(self._learner.init, jax.random.PRNGKey(0), self._world.params)
         best = facts["best"]
         snapshot = ppo.Snapshot(
             iteration=facts["iteration"],
-            state=jax.tree.map(jax.numpy.asarray, stored.restore("state", shapes)),
+            state=self._learner.place(stored.restore("state", shapes)),
             window=EpisodeWindow.from_json(facts["window"]),
             best=Best(
                 score=(best["success"], best["episode_return"]),
                 iteration=best["iteration"],
-                policy=stored.restore("policy", policies.policy_shapes(self._learner.networks)),
+                policy=stored.restore("policy", self._learner.networks.policy_shapes()),
             ),
             solved_for=facts["solved_for"],
         )
-        self._write_config()
+        if cluster.leads():
+            self._write_config()
         return snapshot
 
     def save(self, snapshot: ppo.Snapshot) -> None:
         """Writes a checkpoint, from which the policy can be used and the run can go on."""
-        score = snapshot.best.score
+        score, state = snapshot.best.score, self._learner.gather(snapshot.state)
+        if not cluster.leads():
+            return
         checkpoint.save(
             self.path,
             snapshot.iteration,
-            {"policy": snapshot.policy, "state": snapshot.state},
+            {"policy": snapshot.policy, "state": state},
             {
                 "world": self._world.facts,
                 "task": self._world.task,
+                "kind": self._learner.networks.kind,
                 "layout": dataclasses.asdict(self._learner.networks.layout),
                 "config": _plain(self._learner.config),
                 "iteration": snapshot.iteration,
@@ -124,6 +144,7 @@ class RunFolder:
             {
                 "schema": "subterra.run/1",
                 **self._world.facts,
+                "kind": self._learner.networks.kind,
                 "config": _plain(self._learner.config),
                 "device": f"{device.platform}: {device.device_kind}",
                 "versions": policies.versions(),
@@ -131,5 +152,5 @@ class RunFolder:
         )
 
 
-def _plain(config: PPOConfig) -> dict[str, Any]:
+def _plain(config: TrainConfig) -> dict[str, Any]:
     return json.loads(json.dumps(dataclasses.asdict(config)))

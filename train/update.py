@@ -8,7 +8,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from train import frames, normalize
+from train import frames, normalize, parts
 from train.config import PPOConfig
 from train.networks import Networks, Weights
 from train.rollout import Rollout
@@ -66,6 +66,7 @@ def loss(
     lesson: Lesson,
     key: PRNGKeyArray,
     config: PPOConfig,
+    split: parts.Parts = (),
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Loss of one minibatch and its parts.
 
@@ -78,12 +79,12 @@ def loss(
 
     log_ratio = networks.distribution.log_prob(parameters, rollout.raw_action) - rollout.log_prob
     ratio = jnp.exp(log_ratio)
-    advantage = (lesson.advantage - jnp.mean(lesson.advantage)) / (jnp.std(lesson.advantage) + 1e-8)
+    advantage = parts.normalised(lesson.advantage, split)
     clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
     policy_loss = -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))
     value_loss = jnp.mean(jnp.square(value - lesson.target))
     entropy = jnp.mean(networks.distribution.entropy(parameters, key))
-    parts = {
+    losses = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "entropy": entropy,
@@ -91,7 +92,7 @@ def loss(
         "kl": jnp.mean(ratio - 1.0 - log_ratio),
         "clipped": jnp.mean(jnp.abs(ratio - 1.0) > config.clip),
     }
-    return policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy, parts
+    return policy_loss + config.value_weight * value_loss - config.entropy_weight * entropy, losses
 
 
 def learn(
@@ -101,6 +102,7 @@ def learn(
     lesson: Lesson,
     key: PRNGKeyArray,
     config: PPOConfig,
+    split: parts.Parts = (),
 ) -> tuple[Student, dict[str, Float[Array, ""]]]:
     """Every epoch and minibatch of one iteration.
 
@@ -111,20 +113,21 @@ def learn(
 
     def minibatch(now: Student, chosen_and_key: tuple[Array, PRNGKeyArray]) -> tuple[Student, dict[str, Array]]:
         chosen, key_now = chosen_and_key
-        gradients, parts = jax.grad(loss, has_aux=True)(
-            now.weights, networks, statistics, lesson.of(chosen), key_now, config
+        gradients, losses = parts.mean(
+            jax.grad(loss, has_aux=True)(now.weights, networks, statistics, lesson.of(chosen), key_now, config, split),
+            split,
         )
         direction, moments = adam.update(gradients, now.moments)
         weights = optax.apply_updates(now.weights, jax.tree.map(lambda d: -now.learning_rate * d, direction))
-        return Student(weights, moments, _follow(now.learning_rate, parts["kl"], config)), parts
+        return Student(weights, moments, _follow(now.learning_rate, losses["kl"], config)), losses
 
     def epoch(now: Student, key_now: PRNGKeyArray) -> tuple[Student, dict[str, Array]]:
         key_order, key_loss = jax.random.split(key_now)
-        order = jax.random.permutation(key_order, config.n_envs).reshape(config.minibatches, config.minibatch_envs)
+        order = jax.random.permutation(key_order, config.part_envs).reshape(config.minibatches, config.minibatch_envs)
         return jax.lax.scan(minibatch, now, (order, jax.random.split(key_loss, config.minibatches)))
 
-    student, parts = jax.lax.scan(epoch, student, jax.random.split(key, config.epochs))
-    return student, jax.tree.map(jnp.mean, parts)
+    student, losses = jax.lax.scan(epoch, student, jax.random.split(key, config.epochs))
+    return student, jax.tree.map(jnp.mean, losses)
 
 
 def _follow(learning_rate: Array, kl: Array, config: PPOConfig) -> Array:

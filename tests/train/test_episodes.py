@@ -5,12 +5,18 @@ import numpy as np
 
 from train import curve, normalize
 from train.episodes import Best, EpisodeWindow
+from train.fetching import fetch
 from train.networks import Policy
-from train.rollout import Finished
+from train.report import Finished, Report, in_a_row, report
 
 
 def finished(done, coverage, success, episode_return, length):
-    return Finished(*(jnp.asarray(x) for x in (done, coverage, success, episode_return, length)))
+    return Finished(*(jnp.asarray(x) for x in (done, coverage, success, ~success, episode_return, length)))
+
+
+def add(window, unroll, step):
+    ended, _ = fetch(report(unroll, {}, None))
+    return window.add(ended, step, unroll.done.shape[1])
 
 
 def random_unroll(rng, n_steps=20, n_envs=9, p_done=0.1):
@@ -27,7 +33,7 @@ def random_unroll(rng, n_steps=20, n_envs=9, p_done=0.1):
 def test_episodes_are_ordered_by_step_and_then_by_environment():
     done = np.array([[False, True, True], [True, False, True]])
     coverage = np.array([[9, 0.1, 0.2], [0.3, 9, 0.4]], np.float32)
-    rows = EpisodeWindow().add(finished(done, coverage, done, coverage, np.full((2, 3), 7, np.int32)), step=60)
+    rows = add(EpisodeWindow(), finished(done, coverage, done, coverage, np.full((2, 3), 7, np.int32)), step=60)
     np.testing.assert_array_equal(rows["coverage"], np.array([0.1, 0.2, 0.3, 0.4], np.float32))
     np.testing.assert_array_equal(rows["episode"], [1, 2, 3, 4])
     np.testing.assert_array_equal(rows["step"], [63, 63, 66, 66])
@@ -36,11 +42,35 @@ def test_episodes_are_ordered_by_step_and_then_by_environment():
 def test_the_window_holds_exactly_the_last_hundred_episodes():
     rng, window, every = np.random.default_rng(0), EpisodeWindow(), []
     for unroll in range(20):
-        every.extend(window.add(random_unroll(rng), step=180 * unroll).tolist())
+        every.extend(add(window, random_unroll(rng), step=180 * unroll).tolist())
         coverage = [row[2] for row in every][-100:]
         assert window.mean("coverage") == np.float32(coverage).mean(dtype=np.float64)
     assert window.full
     assert window.count == len(every) > 200
+
+
+def test_more_episodes_than_there_is_room_for_are_fetched_all_the_same():
+    unroll = random_unroll(np.random.default_rng(3), n_steps=64, n_envs=40, p_done=0.5)
+    small = in_a_row(unroll)
+    assert int(small.count) > len(small.index)
+    ended, _ = fetch(Report(unroll, small, {}, None))
+    time, env = np.nonzero(unroll.done)
+    np.testing.assert_array_equal(ended.index, time * 40 + env)
+    np.testing.assert_array_equal(ended.coverage, unroll.coverage[time, env])
+    np.testing.assert_array_equal(ended.contact, ~np.asarray(unroll.success)[time, env])
+
+
+def test_few_episodes_are_the_same_rows_without_the_unroll():
+    unroll = random_unroll(np.random.default_rng(4), n_steps=64, n_envs=40, p_done=0.02)
+    ended, _ = fetch(Report(unroll, in_a_row(unroll), {}, None))
+    time, env = np.nonzero(unroll.done)
+    np.testing.assert_array_equal(ended.index, time * 40 + env)
+    np.testing.assert_array_equal(ended.length, unroll.length[time, env])
+
+
+def test_a_policy_that_is_not_to_be_kept_gives_way_to_a_later_one_that_does_worse():
+    best = Best.of(None, full_window(0.9, 10.0), 1, named("first"), keep=False)
+    assert Best.of(best, full_window(0.1, 1.0), 2, named("later"), keep=False).policy.weights == "later"
 
 
 def test_a_window_without_episodes_has_no_mean():
@@ -49,7 +79,7 @@ def test_a_window_without_episodes_has_no_mean():
 
 def test_a_window_survives_json_exactly():
     window = EpisodeWindow()
-    window.add(random_unroll(np.random.default_rng(1)), step=0)
+    add(window, random_unroll(np.random.default_rng(1)), step=0)
     again = EpisodeWindow.from_json(json.loads(json.dumps(window.to_json())))
     assert again.count == window.count
     np.testing.assert_array_equal(again.last, window.last)
@@ -59,7 +89,7 @@ def full_window(success, episode_return):
     ones = np.ones((1, 100), np.float32)
     succeeded = np.arange(100)[None] < 100 * success
     window = EpisodeWindow()
-    window.add(finished(ones > 0, ones, succeeded, ones * episode_return, ones.astype(np.int32)), step=0)
+    add(window, finished(ones > 0, ones, succeeded, ones * episode_return, ones.astype(np.int32)), step=0)
     return window
 
 

@@ -7,19 +7,30 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from train.recurrent import senses
+from subterra_jax.policies import senses
 from train.recurrent.network import RecurrentNetworks, Weights
+from train.report import Finished
 
 
 @struct.dataclass
 class Drive:
-    """Where the environments are between two unrolls."""
+    """Where the environments are between two unrolls.
+
+    Attributes:
+        env_state: State of the batch of environments.
+        observation: To act upon next.
+        reckoning: Dead reckoning of each episode so far.
+        hidden: Memory.
+        first: The observation begins an episode.
+        episode_return: Undiscounted reward of each episode so far.
+    """
 
     env_state: Any
     observation: Float[Array, "env obs"]
     reckoning: senses.Reckoning
     hidden: Float[Array, "env hidden"]
     first: Bool[Array, "env"]
+    episode_return: Float[Array, "env"]
 
 
 @struct.dataclass
@@ -104,7 +115,14 @@ def truth(env: Any, params: Any, state: Any, view: View, error: Float[Array, "en
 def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, hidden: int) -> Drive:
     """Every environment at the start of an episode."""
     observation, state = env.reset(key, params, n_envs)
-    return Drive(state, observation, senses.start((n_envs,)), jnp.zeros((n_envs, hidden)), jnp.ones(n_envs, bool))
+    return Drive(
+        env_state=state,
+        observation=observation,
+        reckoning=senses.start((n_envs,)),
+        hidden=jnp.zeros((n_envs, hidden)),
+        first=jnp.ones(n_envs, bool),
+        episode_return=jnp.zeros(n_envs),
+    )
 
 
 def collect(
@@ -115,14 +133,15 @@ def collect(
     drive: Drive,
     key: PRNGKeyArray,
     n_steps: int,
-) -> tuple[Drive, Rollout, dict[str, Float[Array, ""]]]:
+) -> tuple[Drive, Rollout, Finished, dict[str, Float[Array, ""]]]:
     """Drives `n_steps` control periods with the sampled policy.
 
     Returns:
-        Where the environments are afterwards, the stored unroll, and sums over its finished episodes and steps.
+        Where the environments are afterwards, the stored unroll, the episodes that ended in it, and means per step: of
+        every reward term, and of how far off estimate and dead reckoning are (m).
     """
 
-    def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, dict[str, Array]]]:
+    def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, Finished, dict[str, Array]]]:
         key_action, key_env = jax.random.split(key_now)
         view = look(env.env, params, now.observation, now.reckoning)
         hidden, _ = networks.remember(weights, view.features[None], now.hidden, now.first[None])
@@ -146,17 +165,22 @@ def collect(
             terminated=terminated,
             truncated=truncated,
         )
-        sums = {
-            "episodes": jnp.sum(done),
-            "successes": jnp.sum(done & info["success"]),
-            "contacts": jnp.sum(done & info["contact"]),
-            "steps": jnp.float32(done.shape[0]),
-            "estimate_error": jnp.sum(jnp.abs(stored.error - thought.error)),
-            "reckoning_error": jnp.sum(jnp.abs(stored.error)),
-            **{name: jnp.sum(value) for name, value in info.items() if name.startswith("reward_")},
+        terms = {
+            "estimate_error": jnp.mean(jnp.abs(stored.error - thought.error)),
+            "reckoning_error": jnp.mean(jnp.abs(stored.error)),
+            **{name: jnp.mean(value) for name, value in info.items() if name.startswith("reward_")},
         }
-        after = Drive(state, observation, senses.advance(now.reckoning, action, done), hidden, done)
-        return after, (stored, sums)
+        total, length = now.episode_return + reward, now.env_state.steps + 1
+        finished = Finished(done, info["coverage"], info["success"], info["contact"], total, length)
+        after = Drive(
+            env_state=state,
+            observation=observation,
+            reckoning=senses.advance(now.reckoning, action, done),
+            hidden=hidden,
+            first=done,
+            episode_return=jnp.where(done, 0.0, total),
+        )
+        return after, (stored, finished, terms)
 
-    after, (stored, sums) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
-    return after, stored, jax.tree.map(jnp.sum, sums)
+    after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
+    return after, stored, finished, jax.tree.map(jnp.mean, terms)

@@ -9,10 +9,15 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
-from train import gae, normalize
+from subterra_jax.rules import StopAt, TurnBack
+from train import gae, normalize, parts
+from train.errors import ConfigError
+from train.recurrent import curriculum
 from train.recurrent import drive as driving
 from train.recurrent.config import RecurrentConfig, check
-from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Weights
+from train.recurrent.layout import make_layout
+from train.recurrent.network import RecurrentNetworks, Weights, without_critic
+from train.report import Report, report
 
 
 @struct.dataclass
@@ -48,16 +53,24 @@ class Lesson:
     target: Float[Array, "time env"]
 
 
-class RecurrentLearner:
+class RecurrentLearner(parts.Whole):
     """The two pure functions of training, `init` and `iterate`, for one environment and one config.
 
+    Both may be jitted, and vmapped over seeds.
+
     Raises:
-        ConfigError: A setting makes no sense.
+        ConfigError: A setting makes no sense, or the task is not one of driving to a goal and stopping there.
     """
 
-    def __init__(self, env: Any, params: Any, config: RecurrentConfig) -> None:
-        self.config = check(config)
-        self.env = st.batch.AutoReset(env)
+    state_type = TrainState
+
+    def __init__(
+        self, env: Any, params: Any, config: RecurrentConfig, axes: parts.Parts = (), split: parts.Parts = ()
+    ) -> None:
+        self.config, self.axes, self.split = check(config), axes, split
+        if not isinstance(env.rule, StopAt) or isinstance(env.rule, TurnBack):
+            raise ConfigError(f"memory = gru learns to drive to a goal and stop, which {env.id} does not ask for")
+        self.env = st.batch.AutoReset(env, axes=axes)
         self.networks = RecurrentNetworks(make_layout(env, params, config))
         rate = optax.cosine_decay_schedule(
             config.learning_rate, config.iterations * config.epochs * config.minibatches, alpha=0.1
@@ -72,44 +85,45 @@ class RecurrentLearner:
             weights=weights,
             moments=self.optimizer.init(weights),
             return_statistics=normalize.init(()),
-            discounted=jnp.zeros(config.n_envs, jnp.float32),
-            drive=driving.begin(self.env, self.nearer(params, 0.0), key_reset, config.n_envs, config.hidden),
+            discounted=jnp.zeros(config.part_envs, jnp.float32),
+            drive=driving.begin(
+                self.env,
+                curriculum.nearer(params, 0.0, self.config.detour),
+                parts.own_key(key_reset, self.split),
+                config.part_envs,
+                config.hidden,
+            ),
             key=key_rest,
             iteration=jnp.int32(0),
         )
 
-    def nearer(self, params: Any, progress: Any) -> Any:
-        """The task with goals as far away as is fit after a share of the training: a third of them at first."""
-        share = jnp.clip(progress / max(self.config.detour, 1e-6), 0.0, 1.0)
-        goal = params.goal
-        far = (1.0 + 2.0 * share) / 3.0
-        high = jnp.maximum(goal.low, goal.high * far * far)
-        # A stop is ten steps below 5 cm/s, which no random policy ever does: at first one slow step is enough.
-        still_steps = jnp.maximum(1, jnp.floor(goal.still_steps * jnp.minimum(2.0 * share, 1.0))).astype(jnp.int32)
-        still_speed = goal.still_speed + 0.15 * (1.0 - jnp.minimum(2.0 * share, 1.0))
-        goal = goal.replace(
-            low=goal.low * (0.3 + 0.7 * share), high=high, still_steps=still_steps, still_speed=still_speed
-        )
-        return params.replace(goal=goal)
+    def policy_of(self, state: TrainState) -> dict[str, Weights]:
+        """The policy that would drive next."""
+        return without_critic(state.weights)
 
-    def iterate(self, state: TrainState, params: Any) -> tuple[TrainState, dict[str, Float[Array, ""]]]:
+    def iterate(self, state: TrainState, params: Any) -> tuple[TrainState, Report]:
         """Drives one unroll and learns from it."""
         config = self.config
         key, key_drive, key_learn = jax.random.split(state.key, 3)
-        task = self.nearer(params, state.iteration / config.iterations)
-        after, rollout, sums = driving.collect(
-            self.env, task, self.networks, state.weights, state.drive, key_drive, config.unroll
+        task = curriculum.nearer(params, state.iteration / config.iterations, config.detour)
+        after, rollout, finished, terms = driving.collect(
+            self.env,
+            task,
+            self.networks,
+            state.weights,
+            state.drive,
+            parts.own_key(key_drive, self.split),
+            config.unroll,
         )
-        done = rollout.terminated | rollout.truncated
-        discounted, returns = normalize.discounted_returns(state.discounted, rollout.reward, done, config.discount)
-        statistics = normalize.update(state.return_statistics, returns)
+        discounted, returns = normalize.discounted_returns(
+            state.discounted, rollout.reward, finished.done, config.discount
+        )
+        statistics = normalize.update(state.return_statistics, returns, self.split)
         lesson = self._lesson(state, rollout, after, task, statistics.std)
-        (weights, moments), parts = self._learn(state, lesson, key_learn)
-        metrics = {**jax.tree.map(jnp.mean, parts), **sums, "reward_scale": statistics.std}
-        return (
-            TrainState(weights, moments, statistics, discounted, after, key, state.iteration + 1),
-            metrics,
-        )
+        (weights, moments), losses = self._learn(state, lesson, key_learn)
+        metrics = {**jax.tree.map(jnp.mean, losses), **parts.mean(terms, self.split), "reward_scale": statistics.std}
+        learnt = TrainState(weights, moments, statistics, discounted, after, key, state.iteration + 1)
+        return learnt, report(finished, metrics, self.policy_of(state))
 
     def _lesson(
         self, before: TrainState, rollout: driving.Rollout, after: driving.Drive, params: Any, scale: Array
@@ -146,13 +160,13 @@ class RecurrentLearner:
                 lesson.hidden[chosen],
                 *jax.tree.map(lambda x: x[:, chosen], (lesson.rollout, lesson.advantage, lesson.target)),
             )
-            gradients, parts = jax.grad(self._loss, has_aux=True)(weights, part, key_now)
+            gradients, losses = parts.mean(jax.grad(self._loss, has_aux=True)(weights, part, key_now), self.split)
             updates, moments = self.optimizer.update(gradients, moments)
-            return (optax.apply_updates(weights, updates), moments), parts
+            return (optax.apply_updates(weights, updates), moments), losses
 
         def epoch(now: tuple[Any, Any], key_now: PRNGKeyArray) -> tuple[Any, dict[str, Array]]:
             key_order, key_loss = jax.random.split(key_now)
-            order = jax.random.permutation(key_order, config.n_envs).reshape(config.minibatches, -1)
+            order = jax.random.permutation(key_order, config.part_envs).reshape(config.minibatches, -1)
             return jax.lax.scan(minibatch, now, (order, jax.random.split(key_loss, config.minibatches)))
 
         return jax.lax.scan(epoch, (state.weights, state.moments), jax.random.split(key, config.epochs))
@@ -167,9 +181,9 @@ class RecurrentLearner:
         value = networks.value(weights, rollout.truth)
         log_ratio = networks.distribution.log_prob(thought.parameters, rollout.raw_action) - rollout.log_prob
         ratio = jnp.exp(log_ratio)
-        advantage = (lesson.advantage - jnp.mean(lesson.advantage)) / (jnp.std(lesson.advantage) + 1e-8)
+        advantage = parts.normalised(lesson.advantage, self.split)
         clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
-        parts = {
+        losses = {
             "policy_loss": -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage)),
             "value_loss": jnp.mean(jnp.square(value - lesson.target)),
             "entropy": jnp.mean(networks.distribution.entropy(thought.parameters, key)),
@@ -178,13 +192,13 @@ class RecurrentLearner:
             "kl": jnp.mean(ratio - 1.0 - log_ratio),
         }
         total = (
-            parts["policy_loss"]
-            + config.value_weight * parts["value_loss"]
-            - config.entropy_weight * parts["entropy"]
-            + config.estimate_weight * parts["estimate_loss"]
-            + config.phase_weight * parts["phase_loss"]
+            losses["policy_loss"]
+            + config.value_weight * losses["value_loss"]
+            - config.entropy_weight * losses["entropy"]
+            + config.estimate_weight * losses["estimate_loss"]
+            + config.phase_weight * losses["phase_loss"]
         )
-        return total, parts
+        return total, losses
 
     def _missed(self, logits: Float[Array, "*batch bins"], error: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Cross entropy with the truth shared between its two nearest bins."""
@@ -196,34 +210,3 @@ class RecurrentLearner:
         low = jnp.take_along_axis(log_share, lower[..., None], axis=-1)
         high = jnp.take_along_axis(log_share, lower[..., None] + 1, axis=-1)
         return -((1.0 - share) * low + share * high)[..., 0]
-
-
-_SLACK = 0.25
-
-
-def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayout:
-    """The network that `config` asks for on this environment; nothing is compiled for it."""
-    bounds = env.action_space(params)
-    observation = jax.ShapeDtypeStruct((1, env.observation_size(params)), jnp.float32)
-    batch = st.batch.AutoReset(env)
-    shapes = jax.eval_shape(lambda obs: _shapes(env, batch, params, obs), observation)
-    return RecurrentLayout(
-        n_features=shapes[0].shape[-1],
-        n_truth=shapes[1].shape[-1],
-        # To stand must not lie at the end of a tanh; the environment reads a speed below 0 as 0.
-        action_low=(float(bounds.low[0]) - _SLACK * float(bounds.high[0]), float(bounds.low[1])),
-        action_high=tuple(float(bound) for bound in bounds.high[:2]),
-        hidden=config.hidden,
-        bins=config.bins,
-        bin_width=config.bin_width,
-        init_std=config.init_std,
-        min_std=config.min_std,
-    )
-
-
-def _shapes(env: Any, batch: Any, params: Any, observation: Array) -> tuple[Array, Array]:
-    from train.recurrent import senses
-
-    _, state = batch.reset(jax.random.key(0), params, 1)
-    view = driving.look(env, params, observation, senses.start((1,)))
-    return view.features, driving.truth(env, params, state, view, jnp.zeros(1))

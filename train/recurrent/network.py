@@ -1,4 +1,4 @@
-"""A GRU with three heads (what to do, where one is, which part of a ring one is at) and a critic that sees the truth."""
+"""A GRU with three heads (what to do, where one is, which part of a ring) and a critic that sees the truth."""
 
 import dataclasses
 import math
@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from subterra_jax.policies import senses
 from train.brax_parts import MLP, NormalTanhDistribution
 
 Weights = Any
@@ -93,11 +94,16 @@ class Thought:
 class RecurrentNetworks:
     """The network of a layout; its weights are `memory`, `estimate`, `phase`, `policy` and `critic`."""
 
+    kind = "gru"
+
     def __init__(self, layout: RecurrentLayout) -> None:
         self.layout = layout
         n_action = len(layout.action_low)
         self.n_action = n_action
         self.distribution = NormalTanhDistribution(n_action, min_std=layout.min_std)
+        self._memory: Any
+        self._estimate: Any
+        self._phase: Any
         self._memory, self._estimate, self._phase = Memory(layout.hidden), nn.Dense(layout.bins), nn.Dense(2)
         self._policy = MLP(
             layer_sizes=(layout.hidden, self.distribution.param_size),
@@ -108,7 +114,7 @@ class RecurrentNetworks:
         self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
         spread = math.log(math.expm1(layout.init_std - layout.min_std))
         self._offset = jnp.concatenate([jnp.zeros(n_action), jnp.full(n_action, spread)])
-        self.centres = (jnp.arange(layout.bins) - 0.5 * (layout.bins - 1)) * layout.bin_width
+        self.centres = senses.centres(layout.bins, layout.bin_width)
 
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
         """Untrained weights."""
@@ -120,9 +126,13 @@ class RecurrentNetworks:
             "memory": self._memory.init(keys[0], features, hidden[0], jnp.zeros((1, 1), bool)),
             "estimate": self._estimate.init(keys[1], hidden),
             "phase": self._phase.init(keys[2], hidden),
-            "policy": self._policy.init(keys[3], jnp.zeros((1, layout.hidden + _N_AIM))),
+            "policy": self._policy.init(keys[3], jnp.zeros((1, layout.hidden + senses.N_AIM))),
             "critic": self._critic.init(keys[4], jnp.zeros((1, layout.n_truth))),
         }
+
+    def policy_shapes(self) -> dict[str, Weights]:
+        """What a policy is, the weights but the critic's, with shapes in place of arrays."""
+        return without_critic(jax.eval_shape(self.init, jax.random.key(0)))
 
     def remember(
         self, weights: dict[str, Weights], features: Array, state: Array, first: Array
@@ -146,7 +156,7 @@ class RecurrentNetworks:
         spread = jnp.sum(share * jnp.square(self.centres - error[..., None]), axis=-1)
         log_sigma = 0.5 * jnp.log(spread + self.layout.bin_width**2 / 12.0)
         # The policy aims with the estimate but must not bend it to its own ends.
-        aim = _aim(jax.lax.stop_gradient(ahead - error), jax.lax.stop_gradient(log_sigma))
+        aim = senses.aim(jax.lax.stop_gradient(ahead - error), jax.lax.stop_gradient(log_sigma))
         parameters = self._policy.apply(weights["policy"], jnp.concatenate([hidden, aim], axis=-1)) + self._offset
         return Thought(parameters, logits, self._phase.apply(weights["phase"], hidden), error, log_sigma)
 
@@ -159,10 +169,6 @@ class RecurrentNetworks:
         return self._low + 0.5 * (jnp.tanh(raw) + 1.0) * (self._high - self._low)
 
 
-_N_AIM = 5
-
-
-def _aim(ahead: Float[Array, "*batch"], log_sigma: Float[Array, "*batch"]) -> Float[Array, "*batch 5"]:
-    """The way to go at several scales, from the last decimetres on."""
-    scaled = [jnp.tanh(ahead / scale) for scale in (0.5, 2.0, 10.0)]
-    return jnp.stack([*scaled, jnp.clip(ahead / 100.0, -1.0, 4.0), log_sigma], axis=-1)
+def without_critic(weights: dict[str, Weights]) -> dict[str, Weights]:
+    """The weights of which a policy is made."""
+    return {name: part for name, part in weights.items() if name != "critic"}

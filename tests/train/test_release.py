@@ -1,0 +1,159 @@
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import subterra_jax as st
+from subterra_jax import policies
+from subterra_jax.baselines.agent import Observed
+from subterra_jax.policies import senses
+from tests.train.conftest import TASK, call
+from train import evaluate, frames, networks, normalize, release
+from train.agents import agent_of
+from train.recurrent.config import RecurrentConfig
+from train.recurrent.layout import make_layout
+from train.recurrent.network import RecurrentNetworks, without_critic
+
+GOAL_TASK = "Subterra/StopAtShort-v0"
+
+
+@pytest.fixture(scope="module")
+def perceptron():
+    nets = networks.Networks(networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16, 8), 0.5, 0.01))
+    data = 3.0 * jax.random.normal(jax.random.PRNGKey(0), (50, 18)) + 1.0
+    weights = jax.tree.map(lambda x: x + 0.1, nets.init(jax.random.PRNGKey(1))["policy"])
+    return nets, networks.Policy(weights, normalize.update(normalize.init((18,)), data))
+
+
+@pytest.fixture(scope="module")
+def gru():
+    env, params = st.make(GOAL_TASK)
+    nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
+    weights = jax.tree.map(lambda x: x + 0.05, nets.init(jax.random.PRNGKey(1)))
+    return nets, without_critic(weights)
+
+
+@pytest.fixture
+def released(gru, tmp_path):
+    out = tmp_path / "mine.safetensors"
+    release.write(out, *gru, {"task": GOAL_TASK, "world": {"lining": "pockets"}})
+    return out
+
+
+def readings(n_steps):
+    """Observations of an episode with a goal, made up."""
+    rng = np.random.default_rng(0)
+    for step in range(n_steps):
+        ranges = jnp.asarray(rng.uniform(1.0, 6.0, 16), jnp.float32)
+        distance, heading = jnp.float32(0.19 * step), jnp.float32(0.1 * rng.normal())
+        flat = jnp.concatenate([ranges, jnp.stack([distance, heading, 40.0, 1.35])])
+        yield Observed(flat, ranges, distance, heading, jnp.float32(40.0), jnp.float32(1.35))
+
+
+def test_a_perceptron_drives_without_the_trainer_as_it_does_with_it(perceptron):
+    nets, policy = perceptron
+    agent, stack, memory = agent_of(nets, policy), None, None
+    for obs in readings(6):
+        seen = Observed(obs.flat[:18], obs.ranges, obs.distance, obs.heading)
+        stack = frames.start(seen.flat, 4) if stack is None else frames.push(stack, seen.flat, jnp.zeros((), bool))
+        memory = agent.begin(None, seen, None) if memory is None else memory
+        action, memory = agent.act(None, memory, seen, None, None)
+        np.testing.assert_allclose(action[:2], nets.act(policy, stack), rtol=1e-5)
+        assert np.isnan(action[2])
+
+
+def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(gru):
+    nets, weights = gru
+    agent, start = agent_of(nets, weights), jnp.float32(5.0)
+    memory, hidden, reckoning = agent.blank(), jnp.zeros((1, 12)), senses.start((1,))
+    answer = jax.jit(agent.answer)
+    for obs in readings(12):
+        odometry = jnp.stack([obs.distance, obs.heading])[None]
+        goal, pitch = obs.goal[None] - start, obs.ring_pitch[None]
+        seen = senses.features(obs.ranges[None], odometry, goal, pitch, reckoning)
+        hidden, _ = nets.remember(weights, seen[None], hidden, jnp.zeros((1, 1), bool))
+        reckoned = senses.fused(reckoning, obs.distance[None])
+        thought = nets.think(weights, hidden, goal - reckoned)
+        wanted = nets.action(thought.parameters[..., :2])
+        action, memory = answer(memory, obs, start)
+        np.testing.assert_allclose(action[:2], wanted[0], rtol=2e-4, atol=2e-5)
+        moved = 0.1 * max(float(wanted[0, 0]), 0.0)
+        np.testing.assert_allclose(action[2], start + reckoned[0] + thought.error[0] + moved, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(action[3], thought.log_sigma[0], rtol=1e-4, atol=1e-5)
+        reckoning = senses.advance(reckoning, wanted, jnp.zeros(1, bool))
+
+
+def test_released_tensors_are_what_the_safetensors_library_reads_and_act_alike(gru, released):
+    agent, facts = policies.load(released)
+    assert facts["kind"] == "gru"
+    for name, tensor in load_file(released).items():
+        np.testing.assert_array_equal(agent.tensors[name], tensor)
+    obs = next(readings(1))
+    for one, other in zip(
+        agent.answer(agent.blank(), obs, jnp.float32(0.0))[0],
+        agent_of(*gru).answer(agent.blank(), obs, jnp.float32(0.0))[0],
+        strict=True,
+    ):
+        assert one == other
+    again = released.with_name("again.safetensors")
+    release.write(again, *gru, {"task": GOAL_TASK, "world": {}})
+    assert again.read_bytes() == released.read_bytes()
+
+
+def test_loading_a_policy_needs_nothing_but_jax(released):
+    code = (
+        "import sys, subterra_jax.policies as p\n"
+        f"agent, facts = p.load({str(released)!r})\n"
+        "print(agent.name, sorted({'train', 'brax', 'orbax', 'safetensors', 'optax'} & set(sys.modules)))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout == "mine []\n"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.0005, 0.01, 0.5, 0.999])
+def test_a_policy_cut_short_is_a_clear_error(released, share):
+    content = released.read_bytes()
+    released.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(policies.PolicyError, match=r"mine.*damaged policy"):
+        policies.load(released)
+
+
+def test_tensors_that_are_not_those_of_the_facts_are_refused(released, perceptron):
+    facts = json.loads(release.facts_file(released).read_text())
+    release.write(released, *perceptron, {"task": TASK, "world": {}})
+    other = json.loads(release.facts_file(released).read_text())
+    release.facts_file(released).write_text(json.dumps(facts))
+    with pytest.raises(policies.PolicyError, match="another SHA-256"):
+        policies.load(released)
+    release.facts_file(released).write_text(json.dumps({**facts, "tensors_sha256": other["tensors_sha256"]}))
+    with pytest.raises(policies.PolicyError, match="do not belong together"):
+        policies.load(released)
+
+
+def test_a_policy_is_refused_where_it_cannot_drive(released, perceptron):
+    agent, _ = policies.load(released)
+    policies.check_fits(agent, *st.make(GOAL_TASK), released)
+    for task in (TASK, "Subterra/ReturnShort-v0", "Subterra/RelocaliseShort-v0"):
+        with pytest.raises(policies.PolicyError, match=f"which {task} does not ask for"):
+            policies.check_fits(agent, *st.make(task), released)
+    with pytest.raises(policies.PolicyError, match="observations of 18 numbers"):
+        policies.check_fits(agent_of(*perceptron), *st.make(GOAL_TASK), "mine")
+
+
+def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, tmp_path, capsys):
+    out = tmp_path / "corridor.safetensors"
+    line = ("--tunnel", str(tunnel), "--episodes", "100")
+    assert call(release.main, str(trained), "--out", str(out), *line) == 0
+    capsys.readouterr()
+    assert call(evaluate.main, "--policy", str(out), "--task", TASK, *line, "--json") == 0
+    saved = json.loads((trained / "evaluation.json").read_text())
+    saved.pop("schema")
+    assert json.loads(capsys.readouterr().out) == saved
+    assert json.loads(release.facts_file(out).read_text())["scores"] == saved
+    assert call(release.main, str(trained), "--out", str(tmp_path / "corridor.bin")) == 2
+    assert "out must end in .safetensors" in capsys.readouterr().err

@@ -1,0 +1,39 @@
+"""A trained policy, of either kind, as an agent of the evaluation and as tensors by name."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+from subterra_jax.policies import from_tensors
+from subterra_jax.policies.loading import Agent
+from train.policies import AnyNetworks
+
+_NOT_FOR_DRIVING = "phase"  # it teaches the memory, and nobody asks it
+
+
+def agent_of(networks: AnyNetworks, policy: Any, name: str | None = None) -> Agent:
+    """An agent that drives without exploration noise.
+
+    Args:
+        networks: What the policy belongs to.
+        policy: The policy.
+        name: Name on the leaderboard; `ppo-mlp` or `ppo-gru` if left out.
+    """
+    layout = dataclasses.asdict(networks.layout)
+    return from_tensors(networks.kind, layout, tensors_of(networks, policy), name or f"ppo-{networks.kind}")
+
+
+def tensors_of(networks: AnyNetworks, policy: Any) -> dict[str, np.ndarray]:
+    """What driving needs of a policy, by the names that `subterra_jax.policies` knows."""
+    if networks.kind == "mlp":
+        parts = {"policy": policy.weights, "statistics": {"mean": policy.statistics.mean, "std": policy.statistics.std}}
+    else:
+        parts = {name: part for name, part in policy.items() if name != _NOT_FOR_DRIVING}
+    leaves = jax.tree_util.tree_flatten_with_path(jax.device_get(parts))[0]
+    return {_name(path): np.asarray(leaf, np.float32) for path, leaf in leaves}
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".").replace(".params.", ".")
