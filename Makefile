@@ -14,7 +14,7 @@ demo: $(STAMP)   ## survey -> bag -> scene -> training -> out/demo/report.html, 
 	$(BIN)/python -m benchmarks.demo --out out/demo
 
 test: lint       ## linter, type checker, and every test that is not marked slow
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	$(BIN)/python -m pytest -m slow

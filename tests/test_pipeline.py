@@ -1,5 +1,7 @@
 """Across the rooms: a scene built from a cloud, and the environment that runs in it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -32,7 +34,8 @@ def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np
 
     def scan(position, heading, station):
         here = state.replace(position=position, heading=heading, station=station)
-        return env.observe(here, jnp.zeros(16), params)[:16]
+        noise = env.draw_step(jax.random.key(0), (), params)
+        return env.observe(here, dataclasses.replace(noise, ranges=jnp.zeros(16)), params)[:16]
 
     return np.asarray(jax.jit(jax.vmap(scan))(poses.position, poses.heading, poses.station))
 
