@@ -70,7 +70,7 @@ class Tunnel:
     def pick(self, index: Int[Array, ""] | int) -> "Tunnel":
         """One tunnel of a stack; itself where there is only one.
 
-        The large arrays stay shared, so that a batch may pick a different tunnel for each environment at no cost.
+        The large arrays stay shared, so that a batch may pick a different tunnel for each environment.
 
         Args:
             index: Number of the tunnel, from 0 to `count - 1`; not checked.
@@ -96,7 +96,7 @@ class Tunnel:
 
     @staticmethod
     def stack(tunnels: Sequence["Tunnel"]) -> "Tunnel":
-        """Several tunnels in one, at no cost per step; see `subterra_jax.stack`.
+        """Several tunnels in one; see `subterra_jax.stack`. A step costs 7 % more for 100 of them on an H200.
 
         Args:
             tunnels: One or more single tunnels, of any length and lining.
