@@ -1,7 +1,7 @@
 """Several tunnels in one: their nodes and blocks one after another, with padding between.
 
-A step reads one window of blocks wherever it lies; what a stack costs is memory that no longer fits a cache: 7 % for 100
-tunnels and 58 % for 1,000 on an H200, half as much again for 100 on a CPU.
+A step reads one window of blocks wherever it lies; what a stack costs is memory that no longer fits a cache: 7 % for
+100 tunnels and 58 % for 1,000 on an H200, half as much again for 100 on a CPU.
 """
 
 from collections.abc import Sequence
