@@ -6,12 +6,12 @@ from subterra_jax import batch, procedural
 from subterra_jax.batch import AutoReset, rollout
 from subterra_jax.env import TunnelEnv
 from subterra_jax.errors import SubterraError, TunnelError
-from subterra_jax.plan import TunnelPlan
 from subterra_jax.randomize import LogUniform, randomize
-from subterra_jax.sources import load_tunnel
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import TASKS, make
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.sources import load_tunnel
 
 __all__ = [
     "TASKS",

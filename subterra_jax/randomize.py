@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from subterra_jax.blocks import LIDAR_GAP
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import CONTACT_REACH
+from subterra_jax.tunnel.blocks import LIDAR_GAP
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from subterra_jax.plan import TunnelPlan
+from subterra_jax.tunnel.plan import TunnelPlan
 
 # Numbers in one chunk of the table of rays by points; small enough to stay in a processor's cache.
 _CHUNK = 200_000

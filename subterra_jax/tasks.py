@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.blocks import LIDAR_GAP
 from subterra_jax.env import TunnelEnv
 from subterra_jax.faults import FaultParams
 from subterra_jax.lidar import LidarParams
@@ -19,9 +18,10 @@ from subterra_jax.odometry import OdometryParams
 from subterra_jax.reward import GoalRewardParams, RewardParams
 from subterra_jax.rules import Relocalise, Rule, StopAt, Traverse, TurnBack
 from subterra_jax.slip import SlipParams
-from subterra_jax.sources import Source, resolve
 from subterra_jax.state import EnvParams, GoalParams, StartParams
 from subterra_jax.tunnel import CONTACT_REACH
+from subterra_jax.tunnel.blocks import LIDAR_GAP
+from subterra_jax.tunnel.sources import Source, resolve
 from subterra_jax.vehicle import VehicleParams
 from subterra_jax.wander import WanderParams
 

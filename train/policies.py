@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import subterra_jax as st
 from subterra_jax.procedural import expand
-from subterra_jax.sources import tunnel_digest
+from subterra_jax.tunnel.sources import tunnel_digest
 from train import checkpoint
 from train.errors import CheckpointError, ConfigError
 from train.networks import Layout, Networks

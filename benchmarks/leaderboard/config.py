@@ -8,7 +8,7 @@ import subterra_jax as st
 from subterra_jax.baselines import registry
 from subterra_jax.errors import SubterraError
 from subterra_jax.evaluation.episodes import N_LISTED
-from subterra_jax.plan import TunnelPlan
+from subterra_jax.tunnel.plan import TunnelPlan
 
 
 class LeaderboardError(SubterraError):

@@ -21,7 +21,7 @@ from benchmarks.rays.scenefiles import DEFAULT_SCENE, meshed_linings, require_sc
 from benchmarks.rays.tilted import compare_tilted
 from benchmarks.throughput.facts import environment_facts
 from subterra_jax.errors import SubterraError
-from subterra_jax.sources import load_tunnel
+from subterra_jax.tunnel.sources import load_tunnel
 
 SCHEMA = "subterra.rays/1"
 _progress = Console(stderr=True, highlight=False)

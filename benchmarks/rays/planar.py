@@ -18,8 +18,8 @@ from benchmarks.rays.agreement import EDGE_JUMP, EDGE_TURN, Agreement
 from benchmarks.rays.scenefiles import reference_surface
 from scene.bore import load
 from subterra_jax import lidar, reference
-from subterra_jax.plan import TunnelPlan
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.plan import TunnelPlan
 
 _BATCH = 1000
 

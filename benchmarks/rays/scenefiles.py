@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from benchmarks.rays.errors import RaysError
-from subterra_jax.plan import TunnelPlan
-from subterra_jax.surface import SMALL, Triangles, joined, read_mesh, read_scene
+from subterra_jax.lidar3d.surface import SMALL, Triangles, joined, read_mesh, read_scene
+from subterra_jax.tunnel.plan import TunnelPlan
 
 DEFAULT_SCENE = Path("build/subterra-351")
 _WHOLE = {"smooth": "lining_smooth.ply", "pockets": "lining.ply"}

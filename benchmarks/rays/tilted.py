@@ -14,8 +14,8 @@ from benchmarks.fidelity.derive.surface import Caster
 from benchmarks.rays.agreement import EDGE_JUMP, EDGE_TURN, Agreement
 from benchmarks.rays.scenefiles import reference_surface
 from subterra_jax import lidar3d
-from subterra_jax.plan import TunnelPlan
-from subterra_jax.relief import Relief
+from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.tunnel.plan import TunnelPlan
 
 RANGE_MAX, TILT = 30.0, np.deg2rad(20.0)
 _ELEVATION = np.deg2rad(25.0)  # highest of a beam over its sensor's plane

@@ -6,7 +6,7 @@ from math import ceil
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.plan import Lining, TunnelPlan, Wall
+from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 
 @dataclass(frozen=True)

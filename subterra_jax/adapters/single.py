@@ -15,8 +15,8 @@ from subterra_jax.adapters.packing import pack, unpacker
 from subterra_jax.adapters.spaces import Observation, as_observation
 from subterra_jax.adapters.streams import start_streams, take_key
 from subterra_jax.adapters.views import make_view
-from subterra_jax.sources import Source
 from subterra_jax.tasks import make
+from subterra_jax.tunnel.sources import Source
 
 
 class SubterraEnv(Env[Observation, np.ndarray]):

@@ -16,8 +16,8 @@ from subterra_jax.adapters.report import Report
 from subterra_jax.adapters.spaces import Observation, as_observation
 from subterra_jax.adapters.streams import start_streams
 from subterra_jax.adapters.views import make_view
-from subterra_jax.sources import Source
 from subterra_jax.tasks import make
+from subterra_jax.tunnel.sources import Source
 
 
 class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):

@@ -10,8 +10,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.blocks import PADDING_CENTRE
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.blocks import PADDING_CENTRE
 
 BEND_REACH = 6.0  # m over which the bend of the centreline is measured: as far as the most slanting useful beam reaches
 _ROWS = 2048  # vertices looked up at once

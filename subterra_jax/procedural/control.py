@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from subterra_jax.plan import Lining, TunnelPlan
 from subterra_jax.procedural.alignment import Alignment
 from subterra_jax.procedural.walls import wall
+from subterra_jax.tunnel.plan import Lining, TunnelPlan
 
 _LENGTH, _RADIUS, _HALF_WIDTH = 351.0, 300.0, 2.825
 _GRID_STEP, _WALL_STEP, _LIDAR_HEIGHT = 0.25, 0.25, 0.7

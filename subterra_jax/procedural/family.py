@@ -7,11 +7,11 @@ for learning, `val` for choices, `test` for figures that are published.
 import re
 
 from subterra_jax.errors import TunnelError
-from subterra_jax.plan import TunnelPlan
 from subterra_jax.procedural.config import ProceduralConfig
 from subterra_jax.procedural.control import control
 from subterra_jax.procedural.generate import LININGS, plan
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.plan import TunnelPlan
 
 SPLIT_SIZE = 1_000_000
 SPLITS = {"train": 0, "val": SPLIT_SIZE, "test": 2 * SPLIT_SIZE}

@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 
-from subterra_jax.plan import Lining, TunnelPlan, Wall
 from subterra_jax.procedural import walls
 from subterra_jax.procedural.alignment import Alignment, draw_alignment
 from subterra_jax.procedural.config import ProceduralConfig
+from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 LININGS = ("smooth", "pockets", "furnished")
 _SIDES = {"left": 1.0, "right": -1.0}

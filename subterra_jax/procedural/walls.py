@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.plan import Wall
 from subterra_jax.procedural.alignment import Alignment
+from subterra_jax.tunnel.plan import Wall
 
 _FINE = 8  # samples of a random course in one correlation length
 _END = 0.1  # of a tunnel, where there are no recesses, m

@@ -13,8 +13,8 @@ from benchmarks.rays.agreement import Agreement
 from scene.writing.geometry import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay
-from subterra_jax.relief import Relief
-from subterra_jax.surface import read_mesh, read_scene
+from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.lidar3d.surface import read_mesh, read_scene
 from tests.scene.conftest import arc_bore
 
 RAYS = 6400

@@ -12,8 +12,8 @@ from tests.subterra_jax import checking, tunnels
 
 # A no-op where another room's tests have imported the simulator before.
 with install_import_hook("subterra_jax", f"{checking.__name__}.check_functions"):
-    from subterra_jax.plan import TunnelPlan
-    from subterra_jax.sources import load_tunnel
+    from subterra_jax.tunnel.plan import TunnelPlan
+    from subterra_jax.tunnel.sources import load_tunnel
 
 
 @pytest.fixture(scope="session")

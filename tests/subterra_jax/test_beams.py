@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax import beams, lidar
+from subterra_jax import lidar
+from subterra_jax.lidar3d import beams
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from subterra_jax import blocks, boxes, procedural, reference
-from subterra_jax.tunnel import Tunnel
-from subterra_jax.windows import separation, windows
+from subterra_jax import procedural, reference
+from subterra_jax.tunnel import Tunnel, blocks, boxes
+from subterra_jax.tunnel.windows import separation, windows
 
 
 def test_the_box_of_a_turned_rectangle_is_that_rectangle():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from subterra_jax import lidar, reference
-from subterra_jax.plan import TunnelPlan
-from subterra_jax.sources import load_tunnel
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.sources import load_tunnel
 from tests.subterra_jax import tunnels
 
 PARAMS = lidar.LidarParams()

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax import beams, lidar, lidar3d
-from subterra_jax.relief import Relief
-from subterra_jax.surface import Axis, Triangles
+from subterra_jax import lidar, lidar3d
+from subterra_jax.lidar3d import beams, casting
+from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.lidar3d.surface import Axis, Triangles
 from tests.subterra_jax import surfaces
 
 RADIUS, LENGTH = 2.0, 60.0
@@ -163,6 +164,6 @@ def test_a_batch_cast_in_chunks_gives_what_it_gives_in_one(reliefs, monkeypatch)
     station = jnp.asarray(origin[:, 0])
     beam = jnp.asarray(beams.planar(7), jnp.float32)
     whole = jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["bend"], origin, beam, station, 30.0)
-    monkeypatch.setattr(lidar3d, "CHUNK", 25)
+    monkeypatch.setattr(casting, "CHUNK", 25)
     parts = jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["bend"], origin, beam, station, 30.0)
     np.testing.assert_array_equal(whole, parts)

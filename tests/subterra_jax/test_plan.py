@@ -7,7 +7,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import reference
-from subterra_jax.sources import tunnel_digest
+from subterra_jax.tunnel.sources import tunnel_digest
 from tests.subterra_jax import tunnels
 
 

@@ -9,8 +9,8 @@ import subterra_jax as st
 from subterra_jax import procedural, reference
 from subterra_jax.procedural.alignment import Alignment
 from subterra_jax.procedural.walls import wander
-from subterra_jax.sources import resolve
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.sources import resolve
 from tests.subterra_jax.test_lidar import check_exact
 
 CONFIG = procedural.ProceduralConfig()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from subterra_jax import frames, surface, voxels
 from subterra_jax.errors import TunnelError
-from subterra_jax.relief import Relief
+from subterra_jax.lidar3d import frames, surface, voxels
+from subterra_jax.lidar3d.relief import Relief
 from tests.subterra_jax import surfaces
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from subterra_jax import reference, vehicle
-from subterra_jax.sources import load_tunnel
 from subterra_jax.tunnel import Tunnel, foot
+from subterra_jax.tunnel.sources import load_tunnel
 from tests.subterra_jax import tunnels
 
 PARAMS = jax.tree.map(jnp.asarray, vehicle.VehicleParams())

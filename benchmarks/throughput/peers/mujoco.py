@@ -14,7 +14,7 @@ import numpy as np
 import subterra_jax as st
 from benchmarks.throughput.peers.walls import Scene
 from benchmarks.throughput.timing import Speed, Timing
-from subterra_jax.plan import TunnelPlan
+from subterra_jax.tunnel.plan import TunnelPlan
 
 PACKAGE = "mujoco"
 ABOUT = "paper's route: one environment in Python, mj_multiRay, one core"

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.throughput.errors import ThroughputError
-from subterra_jax.plan import TunnelPlan
+from subterra_jax.tunnel.plan import TunnelPlan
 
 _HALF_HEIGHT = 1.0  # of extruded walls above and below the LiDAR, m
 

@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from subterra_jax.blocks import Blocks
-from subterra_jax.boxes import distance_to_segment
-from subterra_jax.plan import TunnelPlan
+from subterra_jax.tunnel.blocks import Blocks
+from subterra_jax.tunnel.boxes import distance_to_segment
+from subterra_jax.tunnel.plan import TunnelPlan
 
 _ROWS = 128  # segments looked at together: near enough to one another that they share most of their blocks
 

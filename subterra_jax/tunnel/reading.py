@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.errors import TunnelError
-from subterra_jax.plan import Lining, TunnelPlan, Wall
+from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 SCHEMA = "subterra.tunnel/1"
 

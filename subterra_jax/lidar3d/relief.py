@@ -8,9 +8,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.frames import Blocks, cut_blocks
-from subterra_jax.surface import SMALL, Axis, Triangles, read_axis, read_scene
-from subterra_jax.voxels import Voxels, fill_voxels
+from subterra_jax.lidar3d.frames import Blocks, cut_blocks
+from subterra_jax.lidar3d.surface import SMALL, Axis, Triangles, read_axis, read_scene
+from subterra_jax.lidar3d.voxels import Voxels, fill_voxels
 
 
 @struct.dataclass

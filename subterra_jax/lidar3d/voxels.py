@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_cdt
 from scipy.spatial import cKDTree
 
-from subterra_jax.frames import Blocks
+from subterra_jax.lidar3d.frames import Blocks
 
 # A ray may step this far over the face of a voxel without leaving what the voxel lists, m.
 MARGIN = 1e-3

@@ -12,8 +12,9 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int
 
-from subterra_jax import march
-from subterra_jax.relief import Relief
+from subterra_jax.lidar3d import march
+from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.rows import axes, spread
 
 # Sweeps after which a ray that has met nothing is given up; the slowest of 32,000 in `subterra-351` took 13.
 N_SWEEPS = 400
@@ -158,11 +159,6 @@ def _sweep_until(
 def _cast_more_rays(axis_size: int, batched: Any, relief: Relief, *rows: Array) -> tuple[Array, bool]:
     """A further batch axis becomes part of the rays; where reliefs differ, each is cast by itself."""
     if any(jax.tree.leaves(batched[0])):
-        axes = tuple(jax.tree.map(lambda is_batched: 0 if is_batched else None, batched))
-        return jax.vmap(_cast_rays.fun, in_axes=axes)(relief, *rows), True
-    spread = [
-        row if is_batched else jnp.broadcast_to(row, (axis_size, *row.shape))
-        for row, is_batched in zip(rows, batched[1:], strict=True)
-    ]
-    flat = [row.reshape(-1, *row.shape[2:]) for row in spread]
+        return jax.vmap(_cast_rays.fun, in_axes=axes(batched))(relief, *rows), True
+    flat = [row.reshape(-1, *row.shape[2:]) for row in spread(rows, batched[1:], axis_size)]
     return _cast_rays(relief, *flat).reshape(axis_size, -1), True

@@ -11,9 +11,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.blocks import build_blocks, padded
-from subterra_jax.plan import TunnelPlan
-from subterra_jax.windows import separation, windows
+from subterra_jax.tunnel.blocks import build_blocks, padded
+from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.windows import separation, windows
 
 CONTACT_REACH = 0.8
 _CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
@@ -96,7 +96,7 @@ class Tunnel:
 
     @staticmethod
     def stack(tunnels: Sequence["Tunnel"]) -> "Tunnel":
-        """Several tunnels in one; see `subterra_jax.stack`. A step costs 7 % more for 100 of them on an H200.
+        """Several tunnels in one; see `subterra_jax.tunnel.stack`. A step costs 7 % more for 100 of them on an H200.
 
         Args:
             tunnels: One or more single tunnels, of any length and lining.
@@ -104,7 +104,7 @@ class Tunnel:
         Raises:
             ValueError: There are none, or one is a stack itself.
         """
-        from subterra_jax.stack import stack  # it needs this class
+        from subterra_jax.tunnel.stack import stack  # it needs this class
 
         return stack(tunnels)
 

@@ -10,7 +10,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.relief import Relief
+from subterra_jax.lidar3d.relief import Relief
 
 # Leaps and triangles met in one round, and rounds of a sweep.
 N_LEAPS, N_TESTED, N_ROUNDS = 2, 8, 5

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from subterra_jax.plan import TunnelPlan
 from subterra_jax.procedural import expand, named
-from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnelfile import read_tunnel
+from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.reading import read_tunnel
+from subterra_jax.tunnel.tunnel import Tunnel
 
 PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
 GENERATED = re.compile(r"control|procedural:.*")  # names of tunnels that are made, not read

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from subterra_jax.blocks import PADDING_CENTRE, PADDING_THICKNESS
-from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS
+from subterra_jax.tunnel.tunnel import Tunnel
 
 
 def stack(tunnels: Sequence[Tunnel]) -> Tunnel:

@@ -11,9 +11,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from subterra_jax.boxes import LIDAR_GAP as LIDAR_GAP
-from subterra_jax.boxes import lidded, thin_boxes
-from subterra_jax.plan import Lining, TunnelPlan, Wall
+from subterra_jax.tunnel.boxes import LIDAR_GAP as LIDAR_GAP
+from subterra_jax.tunnel.boxes import lidded, thin_boxes
+from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 # Where padding is, m, and half the thickness of its boxes: less than nothing, or a beam exactly towards them would
 # enter them and take them for the nearest.
