@@ -14,10 +14,10 @@ demo: $(STAMP)   ## survey -> bag -> scene -> training -> out/demo/report.html, 
 	$(BIN)/python -m benchmarks.demo --out out/demo
 
 test: lint       ## linter, type checker, and every test that is not marked slow
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 test-slow: $(STAMP)  ## the tests that take minutes
-	$(BIN)/python -m pytest -m slow
+	XLA_FLAGS=" " $(BIN)/python -m pytest -m slow
 
 lint: $(STAMP)   ## ruff and mypy
 	$(BIN)/ruff check .
@@ -39,7 +39,8 @@ tunnels: $(STAMP)  ## make the packaged tunnels again, byte for byte; SHARED nam
 	$(BIN)/python -m scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out build/survey-351
 	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
 		--provenance simulated --name subterra-351 --out build/subterra-351
-	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --out build/metro-asbuilt
+	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --reconstruct.lining.clock-angle 0.61 \
+		--out build/metro-asbuilt
 	for name in subterra-351 metro-asbuilt; do \
 		cp build/$$name/tunnel.npz subterra_jax/data/$$name.npz && cp build/$$name/manifest.json subterra_jax/data/$$name.json; \
 	done

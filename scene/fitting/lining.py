@@ -27,8 +27,9 @@ class LiningConfig:
         pocket_size: Length along and width around, m. An assumption: openings of 0.15–0.25 m are usual.
         pocket_depth: m. Source: 13 cm, the paper, Sec. II.
         pocket_offset: Of a pocket's middle from the joint, m. An assumption.
-        clock_angle: Of the lowest pockets below the horizontal, rad. An assumption, near the height of a robot's
-            LiDAR in a section of 5.65 m × 6.36 m.
+        clock_angle: Of the lowest pockets below the horizontal, rad. An assumption: where the plane of a robot's LiDAR
+            meets the wall in a section of 5.65 m × 6.36 m. In a round one of 5.8 m that is at 0.61; at 0.70 the plane
+            passes between two rows and the lining is smooth to the robot.
         stagger: Shift of every second joint's pockets, as a share of their spacing; 0 for straight rows.
         nail_diameter: m. Source: bolts M24 to M30.
         nail_depth: Of the nail's axis behind the wall, m. An assumption: about the middle of the pocket.

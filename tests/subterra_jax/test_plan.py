@@ -115,3 +115,16 @@ def test_both_packaged_tunnels_load_by_name():
     metro = st.load_tunnel("metro-asbuilt")
     assert metro.provenance == "measured"
     assert metro.length == pytest.approx(1283.7, abs=0.2)
+
+
+@pytest.mark.parametrize("name", ["subterra-351", "metro-asbuilt"])
+def test_the_packaged_pockets_cross_the_plane_of_the_lidar_on_both_walls(name):
+    plan = st.load_tunnel(name)
+    depth = 0.13
+    for side in ("left", "right"):
+        wall = getattr(plan.lining("pockets"), side)
+        centre = np.stack([np.interp(wall.station, plan.station, plan.centre[:, i]) for i in (0, 1)], axis=1)
+        away = np.hypot(*(wall.vertex - centre).T) - np.interp(wall.station, plan.station, plan.half_width)
+        recessed = away > 0.6 * depth
+        rings = np.unique(np.round(wall.station[recessed] / plan.ring_pitch))
+        assert len(rings) > 0.8 * plan.length / plan.ring_pitch
