@@ -10,8 +10,6 @@ from subterra_jax.policies import from_tensors
 from subterra_jax.policies.loading import Agent
 from train.policies import AnyNetworks
 
-_NOT_FOR_DRIVING = "phase"  # it teaches the memory, and nobody asks it
-
 
 def agent_of(networks: AnyNetworks, policy: Any, name: str | None = None) -> Agent:
     """An agent that drives without exploration noise.
@@ -30,7 +28,7 @@ def tensors_of(networks: AnyNetworks, policy: Any) -> dict[str, np.ndarray]:
     if networks.kind == "mlp":
         parts = {"policy": policy.weights, "statistics": {"mean": policy.statistics.mean, "std": policy.statistics.std}}
     else:
-        parts = {name: part for name, part in policy.items() if name != _NOT_FOR_DRIVING}
+        parts = policy
     leaves = jax.tree_util.tree_flatten_with_path(jax.device_get(parts))[0]
     return {_name(path): np.asarray(leaf, np.float32) for path, leaf in leaves}
 

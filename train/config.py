@@ -5,6 +5,7 @@ import math
 from typing import ClassVar
 
 import subterra_jax as st
+from train.checks import at_least, not_negative, positive, share
 from train.errors import ConfigError
 
 
@@ -187,31 +188,3 @@ def check_common(config: TrainConfig) -> None:
     share(config, "discount", "gae_lambda")
     if not 0.0 < config.min_std < config.init_std:
         raise ConfigError(f"min_std must lie between 0 and init_std = {config.init_std}, got {config.min_std}")
-
-
-def at_least(config: TrainConfig, least: int, *names: str) -> None:
-    """Raises `ConfigError` where one of the settings is less."""
-    for name in names:
-        if getattr(config, name) < least:
-            raise ConfigError(f"{name} must be at least {least}, got {getattr(config, name)}")
-
-
-def positive(config: TrainConfig, *names: str) -> None:
-    """Raises `ConfigError` where one of the settings is not above 0 and finite."""
-    for name in names:
-        if not 0.0 < getattr(config, name) < math.inf:
-            raise ConfigError(f"{name} must be positive, got {getattr(config, name)}")
-
-
-def not_negative(config: TrainConfig, *names: str) -> None:
-    """Raises `ConfigError` where one of the settings is below 0 or not finite."""
-    for name in names:
-        if not 0.0 <= getattr(config, name) < math.inf:
-            raise ConfigError(f"{name} must not be negative, got {getattr(config, name)}")
-
-
-def share(config: TrainConfig, *names: str) -> None:
-    """Raises `ConfigError` where one of the settings is no share."""
-    for name in names:
-        if not 0.0 <= getattr(config, name) <= 1.0:
-            raise ConfigError(f"{name} must lie between 0 and 1, got {getattr(config, name)}")

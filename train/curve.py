@@ -1,4 +1,8 @@
-"""The coverage curve of one or several runs: `python -m train.curve RUN [RUN ...] --out curve.png`."""
+"""The learning curve of one or several runs: `python -m train.curve RUN [RUN ...] --out curve.png`.
+
+Of the paper's task the rolling hundred's coverage and success against finished episodes, as in its Fig. 4; of the tasks
+that end at a goal, success against episodes and against steps.
+"""
 
 import dataclasses
 import json
@@ -16,16 +20,22 @@ from train.log import EPISODES
 
 GOAL = 0.9
 _COLUMNS = "episode,step,coverage_mean_100,success_mean_100"
+_EPISODE, _STEP = "finished episodes", "environment steps, millions"
+_POINTS = 4000  # of one line in the figure
+Curve = dict[str, np.ndarray]
 
 
-def read_episodes(run: Path) -> np.ndarray:
-    """`episodes.csv` of a run folder, one row per finished episode.
+def read_episodes(run: Path) -> Curve:
+    """The columns of a run folder's `episodes.csv`, one row per finished episode.
 
     Raises:
         RunFolderError: There is none, or it cannot be read.
     """
     try:
-        return np.atleast_1d(np.genfromtxt(run / EPISODES, delimiter=",", names=True, dtype=np.float64))
+        heading, *lines = (run / EPISODES).read_text().splitlines()
+        names = heading.split(",")
+        rows = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.zeros((0, len(names)))
+        return dict(zip(names, rows.T, strict=True))
     except (OSError, ValueError) as error:
         raise RunFolderError(f"{run}: no readable {EPISODES} in it") from error
 
@@ -39,42 +49,27 @@ def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
 
 
 def write_curve(runs: list[Path], png: Path) -> None:
-    """Draws the rolling-100 `measure` against episodes and steps, and writes the numbers of each run beside it.
+    """Draws the rolling hundred of every run, mean ± standard deviation over several, and writes its numbers.
 
     Args:
         runs: Run folders; each gets a `curve.csv` of its own.
         png: Where the figure goes.
+
+    Raises:
+        RunFolderError: One of them cannot be read; nothing is drawn then.
     """
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, (by_episode, by_step) = pyplot.subplots(1, 2, figsize=(10.0, 4.0), sharey=True, layout="constrained")
-    for run in runs:  # unreadable folders are refused before anything is drawn
-        read_episodes(run)
-    shown = measure(runs[0])
-    for run in runs:
-        rows = read_episodes(run)
-        coverage, success = rolling(rows["coverage"]), rolling(rows["success"])
-        curves = {"coverage": coverage, "success": success}
-        table = np.column_stack([rows["episode"], rows["step"], coverage, success])
-        fresh = run / ".curve.csv.partial"
-        np.savetxt(fresh, table, fmt=["%d", "%d", "%.9g", "%.9g"], delimiter=",", header=_COLUMNS, comments="")
-        fresh.replace(run / "curve.csv")
-        (line,) = by_episode.plot(rows["episode"], 100.0 * curves[shown], label=run.resolve().name, zorder=3)
-        by_step.plot(rows["step"] / 1e6, 100.0 * curves[shown], color=line.get_color(), zorder=3)
-        if len(runs) == 1:
-            by_episode.plot(
-                rows["episode"], 100.0 * rows[shown], ".", ms=2, alpha=0.25, color="0.5", label="single episodes"
-            )
-    if len(runs) > 1:
-        _draw_band(by_episode, [rolling(read_episodes(run)[shown]) for run in runs])
-    for axes, label in ((by_episode, "finished episodes"), (by_step, "environment steps, millions")):
-        axes.axhline(100.0 * GOAL, ls="--", lw=1.0, color="0.3", zorder=2, label=f"{100.0 * GOAL:.0f} % goal")
-        axes.set(xlabel=label, ylim=(0.0, 100.0))
-        axes.set_xlim(left=0.0)
-        axes.grid(alpha=0.3)
-    by_episode.set_ylabel(f"{shown}, %, mean of the last {WINDOW}")
-    by_episode.legend(loc="lower right")
+    curves, shown = [_curve(read_episodes(run)) for run in runs], measure(runs[0])
+    for run, curve in zip(runs, curves, strict=True):
+        _write_table(run, curve)
+    figure, panels = pyplot.subplots(1, 2, figsize=(10.0, 4.0), sharey=True, layout="constrained")
+    wanted = [("coverage", _EPISODE), ("success", _EPISODE if shown == "coverage" else _STEP)]
+    for axes, (column, against) in zip(panels, wanted, strict=True):
+        name = column if shown == "coverage" else shown
+        _draw(axes, [run.resolve().name for run in runs], curves, name, against)
+    panels[0].legend(loc="lower right", fontsize=8)
     fresh = png.with_name(f".{png.name}.partial")
     figure.savefig(fresh, dpi=120, format="png")
     fresh.replace(png)
@@ -90,15 +85,46 @@ def measure(run: Path) -> str:
     return "coverage" if "Traverse" in task else "success"
 
 
+def _curve(rows: Curve) -> Curve:
+    """Episodes, steps, and the rolling means at each episode."""
+    means = {name: rolling(rows[name]) for name in ("coverage", "success")}
+    return {"episode": rows["episode"], "step": rows["step"], **means, "single": rows["coverage"]}
+
+
+def _write_table(run: Path, curve: Curve) -> None:
+    table = np.column_stack([curve[name] for name in ("episode", "step", "coverage", "success")])
+    fresh = run / ".curve.csv.partial"
+    np.savetxt(fresh, table, fmt=["%d", "%d", "%.9g", "%.9g"], delimiter=",", header=_COLUMNS, comments="")
+    fresh.replace(run / "curve.csv")
+
+
+def _draw(axes: Any, names: list[str], curves: list[Curve], name: str, against: str) -> None:
+    """One panel: a thin line a run, and the band of several."""
+    for label, curve in zip(names, curves, strict=True):
+        x = curve["episode"] if against == _EPISODE else curve["step"] / 1e6
+        few = slice(None, None, max(1, len(x) // _POINTS))
+        axes.plot(x[few], 100.0 * curve[name][few], lw=1.0, label=label, zorder=3)
+        if len(curves) == 1 and name == "coverage":
+            axes.plot(x[few], 100.0 * curve["single"][few], ".", ms=2, alpha=0.25, color="0.5", label="single episodes")
+    if len(curves) > 1 and against == _EPISODE:
+        _draw_band(axes, [curve[name] for curve in curves])
+    if name == "coverage":
+        axes.axhline(100.0 * GOAL, ls="--", lw=1.0, color="0.3", zorder=2, label=f"{100.0 * GOAL:.0f} % goal")
+    axes.set(xlabel=against, ylabel=f"{name}, %, mean of the last {WINDOW}", ylim=(0.0, 102.0))
+    axes.set_xlim(left=0.0)
+    axes.grid(alpha=0.3)
+
+
 def _draw_band(axes: Any, curves: list[np.ndarray]) -> None:
     """Mean ± standard deviation of several runs, as far as all of them go."""
     shortest = min(len(curve) for curve in curves)
     if shortest == 0:
         return
-    table = 100.0 * np.stack([curve[:shortest] for curve in curves])
-    mean, spread, episode = table.mean(axis=0), table.std(axis=0, ddof=1), np.arange(1, shortest + 1)
-    axes.plot(episode, mean, color="black", lw=1.5, label="mean ± sd", zorder=4)
-    axes.fill_between(episode, mean - spread, mean + spread, color="black", alpha=0.2, lw=0.0, zorder=3)
+    few = slice(None, shortest, max(1, shortest // _POINTS))
+    table, episode = 100.0 * np.stack([curve[few] for curve in curves]), np.arange(1, shortest + 1)[few]
+    mean, spread = table.mean(axis=0), table.std(axis=0, ddof=1)
+    axes.plot(episode, mean, color="black", lw=1.5, label="mean ± sd", zorder=5)
+    axes.fill_between(episode, mean - spread, mean + spread, color="black", alpha=0.2, lw=0.0, zorder=4)
 
 
 @dataclasses.dataclass(frozen=True)

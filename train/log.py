@@ -1,4 +1,4 @@
-"""What a run says while it trains: a bar for people, one JSON line per iteration for programs."""
+"""What a run says while it trains: a bar for people, a line per iteration as JSON and as CSV for programs."""
 
 import json
 import time
@@ -9,13 +9,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-LOG, EPISODES = "log.jsonl", "episodes.csv"
+LOG, TABLE, EPISODES = "log.jsonl", "log.csv", "episodes.csv"
 _HEADER = "episode,step,coverage,success,length,contact"
 _PLAIN_EVERY = 10.0
 
 
 class RunLog:
-    """`log.jsonl` and `episodes.csv` of a run folder, flushed after every iteration.
+    """`log.jsonl`, the same as `log.csv`, and `episodes.csv` of a run folder, flushed after every iteration.
 
     Args:
         run: The run folder.
@@ -26,8 +26,10 @@ class RunLog:
     def __init__(self, run: Path, iteration: int = 0, episodes: int = 0) -> None:
         # A killed run may have logged more than its last checkpoint knows; those iterations come again.
         _keep_lines(run / LOG, iteration)
+        _keep_lines(run / TABLE, iteration + 1 if iteration else 0)
         _keep_lines(run / EPISODES, episodes + 1 if iteration else 0)
         self._log: TextIO = (run / LOG).open("a")
+        self._table: TextIO = (run / TABLE).open("a")
         self._episodes: TextIO = (run / EPISODES).open("a")
         if not self._episodes.tell():
             self._episodes.write(_HEADER + "\n")
@@ -35,17 +37,22 @@ class RunLog:
     def write(self, record: dict[str, Any], rows: np.ndarray) -> None:
         """Adds one iteration and the episodes that finished in it."""
         self._log.write(json.dumps(record, allow_nan=False) + "\n")
+        flat = {**record, **record["timing"]}
+        del flat["timing"]
+        if not self._table.tell():
+            self._table.write(",".join(flat) + "\n")
+        self._table.write(",".join(map(_cell, flat.values())) + "\n")
         for row in rows:
             self._episodes.write(
                 f"{row['episode']},{row['step']},{row['coverage']:.9g},{row['success']:d},{row['length']},{row['contact']:d}\n"
             )
-        self._log.flush()
-        self._episodes.flush()
+        for file in (self._log, self._table, self._episodes):
+            file.flush()
 
     def close(self) -> None:
-        """Closes both files."""
-        self._log.close()
-        self._episodes.close()
+        """Closes the files."""
+        for file in (self._log, self._table, self._episodes):
+            file.close()
 
 
 class Bar:
@@ -94,6 +101,10 @@ class Bar:
 def read_log(run: Path) -> list[dict[str, Any]]:
     """Every line of a run's log."""
     return [json.loads(line) for line in (run / LOG).read_text().splitlines()]
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None else str(value) if isinstance(value, int) else f"{value:.9g}"
 
 
 def _percent(share: float | None) -> str:

@@ -13,7 +13,8 @@ from train.episodes import WINDOW
 from train.log import read_log
 
 FILE = "seeds.json"
-_WHAT = ("episodes", "steps", "seconds", "seconds_compiled")
+_UNIT = {"episodes": 1.0, "steps": 1e3, "seconds": 1.0, "seconds_compiled": 1.0}
+_WHAT = tuple(_UNIT)
 
 
 def reached(run: Path) -> dict[str, float] | None:
@@ -41,29 +42,28 @@ def tell(out: Path, runs: list[Path], scores: list[dict[str, Any]]) -> None:
         {"run": run.name, "reached": reached(run), "last": read_log(run)[-1], "evaluation": found}
         for run, found in zip(runs, scores, strict=True)
     ]
-    console, grid = Console(), Table(title=f"to {100 * GOAL:.0f} % coverage and 100 % success of the last {WINDOW}")
-    for heading in (
-        "run",
-        "episodes",
-        "steps",
-        "s",
-        "s without compiling",
-        "coverage at the end",
-        "success, evaluated",
-    ):
-        grid.add_column(heading, justify="right")
-    for row in rows:
-        when = [f"{row['reached'][name]:,.6g}" for name in _WHAT] if row["reached"] else ["never"] * len(_WHAT)
-        covered = row["last"]["coverage_mean_100"]
-        last = "none yet" if covered is None else f"{100 * covered:.2f} %"
-        grid.add_row(row["run"], *when, last, f"{100 * row['evaluation']['success']:.1f} %")
     summary = _mean_and_spread(rows)
-    grid.add_section()
-    grid.add_row("mean ± sd", *[f"{summary[name][0]:,.6g} ± {summary[name][1]:.3g}" for name in summary])
-    console.print(grid)
+    Console().print(_table(rows, summary))
     fresh = out / f".{FILE}.partial"
     fresh.write_text(json.dumps({"schema": "subterra.seeds/1", "goal": GOAL, "mean_sd": summary, "runs": rows}) + "\n")
     fresh.replace(out / FILE)
+
+
+def _table(rows: list[dict[str, Any]], summary: dict[str, tuple[float, float]]) -> Table:
+    """A line for each seed, narrow enough for 80 columns."""
+    grid = Table(title=f"to {100 * GOAL:.0f} % coverage and 100 % success of the last {WINDOW}; at the end")
+    for heading in ("run", "episodes", "k steps", "s", "s compiled", "coverage %", "success %"):
+        grid.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        when = [f"{row['reached'][name] / _UNIT[name]:,.1f}" for name in _WHAT] if row["reached"] else ["never"] * 4
+        covered = row["last"]["coverage_mean_100"]
+        last = "none yet" if covered is None else f"{100 * covered:.2f}"
+        grid.add_row(row["run"], *when, last, f"{100 * row['evaluation']['success']:.1f}")
+    grid.add_section()
+    spread = [[f"{summary[name][k] / _UNIT[name]:,.1f}" for name in summary] for k in (0, 1)]
+    grid.add_row("mean", *spread[0])
+    grid.add_row("± sd", *spread[1])
+    return grid
 
 
 def _mean_and_spread(rows: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:

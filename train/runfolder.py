@@ -9,14 +9,15 @@ from typing import Any
 
 import jax
 
-from train import checkpoint, cluster, policies, ppo
+from train import board, checkpoint, cluster, policies
 from train.config import TrainConfig
 from train.episodes import Best, EpisodeWindow
 from train.errors import CheckpointError, ConfigError, RunFolderError
-from train.log import EPISODES, LOG
+from train.log import EPISODES, LOG, TABLE
+from train.snapshot import Snapshot, Trainable
 
 CONFIG = "config.json"
-_FILES = (CONFIG, LOG, EPISODES, "curve.png", "curve.csv", "evaluation.json")
+_FILES = (CONFIG, LOG, TABLE, EPISODES, "curve.png", "curve.csv", "evaluation.json")
 
 
 class RunFolder:
@@ -31,7 +32,7 @@ class RunFolder:
         RunFolderError: No folder can be written there.
     """
 
-    def __init__(self, path: Path, world: policies.World, learner: ppo.Trainable) -> None:
+    def __init__(self, path: Path, world: policies.World, learner: Trainable) -> None:
         for place in (path, *path.parents):
             if place.exists():
                 if not place.is_dir():
@@ -41,7 +42,7 @@ class RunFolder:
                 break
         self.path, self._world, self._learner = path, world, learner
 
-    def begin(self, *, resume: bool, overwrite: bool) -> ppo.Snapshot | None:
+    def begin(self, *, resume: bool, overwrite: bool) -> Snapshot | None:
         """The snapshot to go on from; None for a new run, for which the folder is then ready.
 
         Raises:
@@ -69,11 +70,12 @@ class RunFolder:
                 )
             for name in _FILES:
                 (self.path / name).unlink(missing_ok=True)
-            shutil.rmtree(self.path / checkpoint.FOLDER, ignore_errors=True)
+            for name in (checkpoint.FOLDER, board.FOLDER):
+                shutil.rmtree(self.path / name, ignore_errors=True)
         self.path.mkdir(parents=True, exist_ok=True)
         self._write_config()
 
-    def resume(self, iteration: int | None = None) -> ppo.Snapshot:
+    def resume(self, iteration: int | None = None) -> Snapshot:
         """The newest checkpoint of the folder, or that of an iteration.
 
         Raises:
@@ -92,9 +94,11 @@ class RunFolder:
         for name, value in _plain(config).items():
             if name not in config.LIMITS and facts["config"].get(name) != value:
                 raise ConfigError(f"{self.path}: was trained with {name} = {facts['config'].get(name)}, not {value}")
+        for name in facts["config"].keys() - _plain(config).keys():
+            raise ConfigError(f"{self.path}: was trained with {name} = {facts['config'][name]}, this run has no {name}")
         shapes = jax.eval_shape(self._learner.init, jax.random.PRNGKey(0), self._world.params)
         best = facts["best"]
-        snapshot = ppo.Snapshot(
+        snapshot = Snapshot(
             iteration=facts["iteration"],
             state=self._learner.place(stored.restore("state", shapes)),
             window=EpisodeWindow.from_json(facts["window"]),
@@ -109,7 +113,7 @@ class RunFolder:
             self._write_config()
         return snapshot
 
-    def save(self, snapshot: ppo.Snapshot) -> None:
+    def save(self, snapshot: Snapshot) -> None:
         """Writes a checkpoint, from which the policy can be used and the run can go on."""
         score, state = snapshot.best.score, self._learner.gather(snapshot.state)
         if not cluster.leads():

@@ -9,15 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from train import cli, compiling, curve, milestones, ppo
+from train import cli, compiling, curve, milestones
 from train.checkpoint import iterations
 from train.errors import ConfigError
 from train.fetching import fetch_all
 from train.log import Bar
 from train.session import Session
+from train.snapshot import Snapshot, Trainable, advance, finished, started, timing
 
 AXIS = "seed"
-Watcher = Callable[[int, ppo.Snapshot], None]
+Watcher = Callable[[int, Snapshot], None]
 
 
 def check(seeds: tuple[int, ...]) -> None:
@@ -46,12 +47,12 @@ def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def train(
-    learners: list[ppo.Trainable],
+    learners: list[Trainable],
     params: Any,
-    snapshots: list[ppo.Snapshot | None],
+    snapshots: list[Snapshot | None],
     watch: Watcher | None = None,
     stop: Callable[[], bool] = lambda: False,
-) -> list[ppo.Snapshot]:
+) -> list[Snapshot]:
     """Trains until each seed's goal has held for long enough, or its steps are used up.
 
     A seed comes to the same numbers as if it were trained alone, but for the order of floating-point sums; once it is
@@ -74,9 +75,7 @@ def train(
     if any(snapshot is None for snapshot in snapshots):
         keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
         states = jax.jit(over_seeds(first.init), compiler_options=options)(keys, params)
-        now = [
-            ppo.started(learner, state) for learner, state in zip(learners, _apart(states, len(learners)), strict=True)
-        ]
+        now = [started(learner, state) for learner, state in zip(learners, _apart(states, len(learners)), strict=True)]
     else:
         now = [snapshot for snapshot in snapshots if snapshot is not None]
         states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
@@ -89,12 +88,12 @@ def train(
         before = time.perf_counter()
         states, reports = iterate(states, params)
         told = fetch_all(reports, len(learners))
-        timing = ppo.timing(began, compiled, before, first.config.steps_per_iteration * len(learners))
+        timed = timing(began, compiled, before, first.config.steps_per_iteration * len(learners))
         parts = _apart((states, reports.policy), len(learners))
         for k, (learner, (state, policy), (ended, metrics)) in enumerate(zip(learners, parts, told, strict=True)):
             if not _done(now[k], learner):
-                now[k] = ppo.advance(now[k], state, policy, ended, metrics, learner.config)
-                now[k].record["timing"] = timing
+                now[k] = advance(now[k], state, policy, ended, metrics, learner.config)
+                now[k].record["timing"] = timed
                 if watch is not None:
                     watch(k, now[k])
     return now
@@ -113,7 +112,7 @@ def run(out: Path, sessions: list[Session], *, resume: bool, overwrite: bool, ep
     bar = Bar(config.steps, max((s.iteration for s in snapshots if s), default=0) * config.steps_per_iteration)
     with cli.deferred_interrupt() as interrupt:
 
-        def watch(k: int, now: ppo.Snapshot) -> None:
+        def watch(k: int, now: Snapshot) -> None:
             bar.show(now.record, of=f"seed {sessions[k].learner.config.seed}")
             sessions[k].note(now, save=interrupt.wanted)
 
@@ -140,13 +139,13 @@ def run(out: Path, sessions: list[Session], *, resume: bool, overwrite: bool, ep
     return 0
 
 
-def resumed(sessions: list[Session]) -> list[ppo.Snapshot | None]:
+def resumed(sessions: list[Session]) -> list[Snapshot | None]:
     """Where every seed stood, those that are not done at their last common iteration.
 
     Raises:
         ConfigError: They have none.
     """
-    found: list[ppo.Snapshot | None] = [session.folder.begin(resume=True, overwrite=False) for session in sessions]
+    found: list[Snapshot | None] = [session.folder.begin(resume=True, overwrite=False) for session in sessions]
     behind = [k for k, s in enumerate(found) if s is not None and not _done(s, sessions[k].learner)]
     common = set.intersection(*[set(iterations(sessions[k].folder.path)) for k in behind]) if behind else set()
     if behind and not common:
@@ -156,8 +155,8 @@ def resumed(sessions: list[Session]) -> list[ppo.Snapshot | None]:
     return found
 
 
-def _done(snapshot: ppo.Snapshot, learner: ppo.Trainable) -> bool:
-    return ppo.finished(snapshot, learner.config)
+def _done(snapshot: Snapshot, learner: Trainable) -> bool:
+    return finished(snapshot, learner.config)
 
 
 def _apart(tree: Any, n: int) -> list[Any]:

@@ -4,12 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from subterra_jax.evaluation.episodes import SHA256
-from train import cli, cluster, curve, ppo
+from train import board, cli, cluster, curve
 from train.agents import agent_of
 from train.evaluate import evaluate
 from train.log import RunLog
 from train.policies import World
 from train.runfolder import RunFolder
+from train.snapshot import Snapshot, Trainable
 
 EVALUATION = "evaluation.json"
 
@@ -21,39 +22,53 @@ class Session:
         path: Run folder.
         world: What is trained on.
         learner: What is trained.
+        tensorboard: Write the log for TensorBoard as well.
+
+    Raises:
+        ConfigError: What writes it is not installed.
+        RunFolderError: No folder can be written there.
     """
 
-    def __init__(self, path: Path, world: World, learner: ppo.Trainable) -> None:
+    def __init__(self, path: Path, world: World, learner: Trainable, *, tensorboard: bool = False) -> None:
         self.folder, self.world, self.learner = RunFolder(path, world, learner), world, learner
         self.log: RunLog | None = None
+        self.board: board.Board | None = None
+        self._tensorboard = tensorboard
+        if tensorboard:
+            board.check()
 
-    def open(self, snapshot: ppo.Snapshot | None) -> None:
+    def open(self, snapshot: Snapshot | None) -> None:
         """Begins to log, after a snapshot or from the beginning."""
         iteration, episodes = (snapshot.iteration, snapshot.window.count) if snapshot else (0, 0)
         if cluster.leads():
             self.log = RunLog(self.folder.path, iteration, episodes)
+            if self._tensorboard:
+                self.board = board.Board(self.folder.path, iteration * self.learner.config.steps_per_iteration)
 
-    def note(self, now: ppo.Snapshot, *, save: bool = False) -> None:
+    def note(self, now: Snapshot, *, save: bool = False) -> None:
         """Logs an iteration; writes a checkpoint where one is due, or asked for."""
         if self.log is not None:
             self.log.write(now.record, now.rows)
+        if self.board is not None:
+            self.board.write(now.record)
         if save or now.iteration % self.learner.config.checkpoint_every == 0:
             self.folder.save(now)
 
     def close(self) -> None:
         """Closes the log."""
-        if self.log is not None:
-            self.log.close()
-            self.log = None
+        for open_log in (self.log, self.board):
+            if open_log is not None:
+                open_log.close()
+        self.log = self.board = None
 
-    def finish(self, snapshot: ppo.Snapshot) -> None:
+    def finish(self, snapshot: Snapshot) -> None:
         """Writes the last checkpoint and the curve."""
         self.folder.save(snapshot)
         if not cluster.leads():
             return
         curve.write_curve([self.folder.path], self.folder.path / "curve.png")
 
-    def score(self, snapshot: ppo.Snapshot, episodes: int) -> dict[str, Any]:
+    def score(self, snapshot: Snapshot, episodes: int) -> dict[str, Any]:
         """Evaluates the policy that was kept, writes `evaluation.json`, and prints the scores."""
         agent = agent_of(self.learner.networks, snapshot.policy)
         found = evaluate(self.world, agent, episodes)

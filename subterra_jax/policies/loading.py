@@ -11,19 +11,20 @@ import numpy as np
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
+from subterra_jax.policies import senses
 from subterra_jax.policies.feedforward import FeedForward
 from subterra_jax.policies.files import PolicyError, PolicyFile, read, released
 from subterra_jax.policies.recurrent import Recurrent
-from subterra_jax.rules import StopAt, TurnBack
+from subterra_jax.rules import StopAt
 from subterra_jax.state import EnvParams
 
 Agent = FeedForward | Recurrent
 KINDS = ("mlp", "gru")
-_N_FURTHER = 13  # features of a recurrent policy that are no beams; each beam is seen twice
+GAIT = "walk"
 
 
-def load(source: str | Path) -> tuple[Agent, dict[str, Any]]:
-    """A policy and its facts.
+def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
+    """A policy and its facts: an `Agent`, or of a gait the `WalkPolicy` of `subterra_jax.b2.policy`.
 
     Args:
         source: A `.safetensors` file, or the name of a released policy.
@@ -32,6 +33,10 @@ def load(source: str | Path) -> tuple[Agent, dict[str, Any]]:
         PolicyError: It is missing or damaged.
     """
     file = read(source)
+    if file.facts["kind"] == GAIT:
+        from subterra_jax.b2.policy import of_file  # it moves legs and drives no task
+
+        return of_file(file), file.facts
     return _checked(file), file.facts
 
 
@@ -39,7 +44,7 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
     """An agent of tensors in memory.
 
     Args:
-        kind: `mlp` or `gru`.
+        kind: One of `KINDS`.
         layout: `action_low`, `action_high`, and `frames` or `bin_width`.
         tensors: By name, as the agent's class says.
         name: Name on the leaderboard.
@@ -53,6 +58,8 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
     if kind == "mlp":
         return FeedForward(arrays, low, high, frames=int(layout["frames"]), name=name)
     if kind == "gru":
+        if (version := int(layout.get("senses", 1))) != senses.VERSION:
+            raise ValueError(f"made for senses of version {version}, this release has {senses.VERSION}; train it anew")
         return Recurrent(arrays, low, high, bin_width=float(layout["bin_width"]), name=name)
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
 
@@ -65,9 +72,9 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
     """
     size, bounds = env.observation_size(params), env.action_space(params)
     if isinstance(agent, Recurrent):
-        if not isinstance(env.rule, StopAt) or isinstance(env.rule, TurnBack):
+        if not isinstance(env.rule, StopAt):
             raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
-        wanted, made_for = params.lidar.n_beams, (agent.n_features - _N_FURTHER) // 2
+        wanted, made_for = params.lidar.n_beams, (agent.n_features - senses.N_FURTHER) // 2
         if wanted != made_for:
             raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
     elif agent.n_observation != size:
@@ -78,12 +85,12 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
 
 
 def register_released() -> tuple[str, ...]:
-    """Adds every released policy to the baselines, as `policy:NAME`; those there already stay.
+    """Adds every released policy that drives to the baselines, as `policy:NAME`; those there already stay.
 
     Returns:
         Their names.
     """
-    names = tuple(f"policy:{name}" for name in released())
+    names = tuple(f"policy:{name}" for name in released() if not name.startswith("B2Walk"))
     for name in names:
         if name not in registry.names():
             registry.register(name, lambda params, name=name: load(name.removeprefix("policy:"))[0])  # type: ignore[misc]
@@ -106,6 +113,6 @@ def _try(agent: Agent) -> None:
     if isinstance(agent, FeedForward):
         jax.eval_shape(agent.answer, jax.ShapeDtypeStruct((agent.frames, agent.n_observation), jnp.float32))
         return
-    zero, ranges = jnp.zeros(()), jnp.zeros((agent.n_features - _N_FURTHER) // 2)
+    zero, ranges = jnp.zeros(()), jnp.zeros((agent.n_features - senses.N_FURTHER) // 2)
     seen = Observed(flat=ranges, ranges=ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero)
     jax.eval_shape(agent.answer, agent.blank(), seen, zero)

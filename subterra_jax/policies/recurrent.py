@@ -17,7 +17,7 @@ class Memory:
 
     Attributes:
         hidden: Of the GRU.
-        reckoning: Dead reckoning since the start.
+        reckoning: Dead reckoning and rings since the start.
     """
 
     hidden: Float[Array, "hidden"]
@@ -58,7 +58,8 @@ class Recurrent:
 
     def blank(self) -> Memory:
         """The memory before the first step."""
-        return Memory(jnp.zeros(self.tensors["memory.recurrent"].shape[0]), senses.start(()))
+        n_beams = (self.n_features - senses.N_FURTHER) // 2
+        return Memory(jnp.zeros(self.tensors["memory.recurrent"].shape[0]), senses.start((), n_beams))
 
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
@@ -71,18 +72,24 @@ class Recurrent:
         """Action and memory, from the observation and the believed start (m)."""
         assert obs.goal is not None
         assert obs.ring_pitch is not None
-        odometry = jnp.stack([obs.distance, obs.heading])
-        seen = senses.features(obs.ranges, odometry, obs.goal - start, obs.ring_pitch, memory.reckoning)
-        hidden = self._remember(memory.hidden, seen)
+        part = {
+            "ranges": obs.ranges,
+            "odometry": jnp.stack([obs.distance, obs.heading]),
+            "goal": obs.goal[None],
+            "ring_pitch": obs.ring_pitch[None],
+            **({} if obs.flag is None else {"flag": obs.flag[None]}),
+        }
+        seen = senses.look(part, start, memory.reckoning)
+        hidden = self._remember(memory.hidden, seen.features)
         error, log_sigma = self._estimate(hidden)
-        station = start + senses.fused(memory.reckoning, obs.distance) + error
-        aim = senses.aim(obs.goal - station, log_sigma)
+        aim = senses.aim(seen.ahead - error, log_sigma)
         parameters = perceptron(self.tensors, "policy", jnp.concatenate([hidden, aim]), jax.nn.swish)
         action = squash(parameters[:2], self.low, self.high)
-        after = Memory(hidden, senses.advance(memory.reckoning, action, False))
+        after = Memory(hidden, senses.advance(seen.reckoning, action, False))
         # The estimate is asked for the end of this control period.
-        there = station + senses.PERIOD * jnp.maximum(action[0], 0.0)
-        return jnp.stack([action[0], action[1], there, log_sigma, jnp.ones(())]), after
+        direction = 1.0 - 2.0 * seen.reckoning.back
+        there = start + seen.station + error + direction * senses.PERIOD * jnp.maximum(action[0], 0.0)
+        return jnp.stack([action[0], action[1], there, log_sigma, direction]), after
 
     def _remember(self, before: Float[Array, "hidden"], seen: Float[Array, "n"]) -> Float[Array, "hidden"]:
         """The hidden state one step later."""
@@ -93,7 +100,7 @@ class Recurrent:
         return update * before + (1.0 - update) * jnp.tanh(given[2] + reset * kept[2])
 
     def _estimate(self, hidden: Float[Array, "hidden"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Expected true less reckoned distance, m, and log of its standard deviation."""
+        """Expected true less tracked distance, m, and log of its standard deviation."""
         share = jax.nn.softmax(dense(self.tensors, "estimate", hidden))
         centres = senses.centres(share.shape[-1], self.bin_width)
         error = jnp.sum(share * centres)

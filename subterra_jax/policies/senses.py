@@ -1,88 +1,165 @@
-"""What a network with memory is shown: beams that make a pocket stand out, and dead reckoning done for it.
+"""What a network with memory is shown: beams that make a pocket stand out, rings counted, dead reckoning done.
 
-Training and released policies share these functions; what they compute is part of what a policy is.
+Training and released policies share these functions; what they compute is part of what a policy is, and `VERSION` says
+which they are.
 """
+
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
+from subterra_jax.baselines import rings
+
+VERSION = 2
 PERIOD = 0.1  # s, of control
 HALF_WIDTH = 2.8  # m, about which side beams are shown
 N_AIM = 5
-# Command and odometry err independently; these are their inverse variances for slips of 2 % + 2 % and 2 % + 1 %.
-_COMMAND_SHARE = 0.4
+N_FURTHER = 18  # features that are no beams; each beam is seen twice
+# rad; who has turned by so much since the flag was raised faces the start.
+_TURNED = 2.2
+Parts = Mapping[str, Float[Array, "*env n"]]
 
 
 @struct.dataclass
 class Reckoning:
-    """Dead reckoning from the start of an episode.
+    """Dead reckoning from the start of an episode, and the rings counted on the way.
 
     Attributes:
+        rings: The ring tracker.
         commanded: Sum of the commanded distance, m.
+        step: Distance commanded since the last look, m.
+        reading: Odometer at the last look, m.
         action: Last action, m/s and rad/s.
         begun: Steps since the episode began.
+        flag: 1 once the flag of a task with a way back was seen, else 0.
+        flagged_at: Heading then, rad.
+        back: 1 from the turn on, else 0.
     """
 
+    rings: rings.RingTrack
     commanded: Float[Array, "*env"]
+    step: Float[Array, "*env"]
+    reading: Float[Array, "*env"]
     action: Float[Array, "*env 2"]
     begun: Float[Array, "*env"]
+    flag: Float[Array, "*env"]
+    flagged_at: Float[Array, "*env"]
+    back: Float[Array, "*env"]
 
 
-def start(batch: tuple[int, ...]) -> Reckoning:
+@struct.dataclass
+class Sight:
+    """A look at an observation.
+
+    Attributes:
+        features: Inputs of the network, all of order 1.
+        station: Station less that of the start by rings and dead reckoning, m.
+        ahead: Where to go, less `station`, m: to the goal, once the flag is raised to the start.
+        reckoning: With this look; for `advance`.
+    """
+
+    features: Float[Array, "*env n"]
+    station: Float[Array, "*env"]
+    ahead: Float[Array, "*env"]
+    reckoning: Reckoning
+
+
+def start(batch: tuple[int, ...], n_beams: int) -> Reckoning:
     """Nothing driven yet."""
-    return Reckoning(jnp.zeros(batch), jnp.zeros((*batch, 2)), jnp.zeros(batch))
+    zero = jnp.zeros(batch)
+    return Reckoning(
+        rings=rings.start(batch, n_beams),
+        commanded=zero,
+        step=zero,
+        reading=zero,
+        action=jnp.zeros((*batch, 2)),
+        begun=zero,
+        flag=zero,
+        flagged_at=zero,
+        back=zero,
+    )
+
+
+def look(part: Parts, begin: Float[Array, ""] | float, now: Reckoning) -> Sight:
+    """Takes an observation in; every observation is to be looked at once.
+
+    Args:
+        part: `ranges` (m), `odometry` (distance, m, and heading, rad), `goal` (chainage, m), `ring_pitch` (m; 0 where
+            there are no rings) and, in a task with a way back, `flag`, each with a last axis.
+        begin: Believed chainage of the start, m.
+        now: Reckoning so far.
+    """
+    reading, heading = part["odometry"][..., 0], part["odometry"][..., 1]
+    goal, pitch = part["goal"][..., 0] - begin, part["ring_pitch"][..., 0]
+    flag = part["flag"][..., 0] if "flag" in part else jnp.zeros_like(reading)
+    flagged_at = jnp.where((flag > 0.5) & (now.flag < 0.5), heading, now.flagged_at)
+    turned = jnp.abs(jnp.mod(heading - flagged_at + jnp.pi, 2.0 * jnp.pi) - jnp.pi)
+    back = jnp.where((flag > 0.5) & (turned > _TURNED), 1.0, now.back)
+    moved = rings.moved(now.step, reading - now.reading)
+    track = rings.advance(now.rings, part["ranges"], moved, 1.0 - 2.0 * back, pitch)
+    seen = now.replace(rings=track, reading=reading, flag=flag, flagged_at=flagged_at, back=back)  # type: ignore[attr-defined]
+    ahead = jnp.where(flag > 0.5, 0.0, goal) - track.station
+    return Sight(_features(part["ranges"], heading, ahead, pitch, seen), track.station, ahead, seen)
 
 
 def advance(now: Reckoning, action: Float[Array, "*env 2"], done: Bool[Array, "*env"] | bool) -> Reckoning:
     """After an action; all anew where an episode ended with it."""
-    keep = 1.0 - jnp.asarray(done, jnp.float32)
-    commanded = now.commanded + PERIOD * jnp.maximum(action[..., 0], 0.0)
-    return Reckoning(keep * commanded, keep[..., None] * action, keep * (now.begun + 1.0))
+    keep = 1.0 - jnp.broadcast_to(jnp.asarray(done, jnp.float32), now.begun.shape)
+    step = PERIOD * jnp.maximum(action[..., 0], 0.0)
+    return Reckoning(
+        rings=rings.anew(now.rings, keep),
+        commanded=keep * (now.commanded + step),
+        step=keep * step,
+        reading=keep * now.reading,
+        action=keep[..., None] * action,
+        begun=keep * (now.begun + 1.0),
+        flag=keep * now.flag,
+        flagged_at=keep * now.flagged_at,
+        back=keep * now.back,
+    )
 
 
-def fused(now: Reckoning, distance: Float[Array, "*env"]) -> Float[Array, "*env"]:
-    """Distance driven as command and odometry together have it, m."""
-    return _COMMAND_SHARE * now.commanded + (1.0 - _COMMAND_SHARE) * distance
+def instead(before: Reckoning, after: Reckoning, action: Float[Array, "*env 2"]) -> Reckoning:
+    """The reckoning after an action of which somebody else made another; `before` is that before the look at it."""
+    step = PERIOD * jnp.maximum(action[..., 0], 0.0)
+    return after.replace(commanded=before.commanded + step, step=step, action=action)  # type: ignore[attr-defined]
 
 
-def features(
+def _features(
     ranges: Float[Array, "*env n_beams"],
-    odometry: Float[Array, "*env 2"],
-    goal: Float[Array, "*env"],
+    heading: Float[Array, "*env"],
+    ahead: Float[Array, "*env"],
     pitch: Float[Array, "*env"],
-    now: Reckoning,
+    seen: Reckoning,
 ) -> Float[Array, "*env n"]:
-    """Inputs of the network, all of order 1.
-
-    Args:
-        ranges: Ranges, m.
-        odometry: Dead-reckoned distance (m) and heading (rad).
-        goal: Chainage of the goal less that of the start, m.
-        pitch: Distance between rings, m; 0 where there are none.
-        now: Dead reckoning so far.
-    """
     n_beams = ranges.shape[-1]
     side = np.abs(np.sin(np.arange(n_beams) * (2.0 * np.pi / n_beams))).astype(np.float32)
     # A pocket of 13 cm is nothing in 30 m; across the tunnel it is a third of the scale.
     across = jnp.clip((ranges * side - HALF_WIDTH) / 0.3, -3.0, 3.0)
-    reckoned = fused(now, odometry[..., 0])
-    ahead, turn = goal - reckoned, 2.0 * jnp.pi / jnp.maximum(pitch, 0.5)
-    single = [
-        jnp.sin(turn * odometry[..., 0]),
-        jnp.cos(turn * odometry[..., 0]),
-        jnp.sin(turn * now.commanded),
-        jnp.cos(turn * now.commanded),
-        (odometry[..., 0] - now.commanded) / 3.0,
-        odometry[..., 1],
-        reckoned / 100.0,
+    track, turn = seen.rings, 2.0 * jnp.pi / jnp.maximum(pitch, 0.5)
+    single: list[Any] = [
+        jnp.sin(turn * track.station),
+        jnp.cos(turn * track.station),
+        jnp.clip(5.0 * track.innovation, -2.0, 2.0),
+        track.strength,
+        20.0 * track.rate,
+        (track.station - track.reckoned) / 3.0,
+        (seen.reading - seen.commanded) / 3.0,
+        jnp.sin(heading),
+        jnp.cos(heading),
+        track.station / 100.0,
         jnp.tanh(ahead / 3.0),
         jnp.tanh(ahead / 30.0),
         (pitch - 1.35) / 0.15,
-        jnp.minimum(now.begun, 10.0) / 10.0,
+        jnp.minimum(seen.begun, 10.0) / 10.0,
+        seen.flag,
+        seen.back,
     ]
-    return jnp.concatenate([across, ranges / 30.0, now.action, jnp.stack(single, axis=-1)], axis=-1)
+    return jnp.concatenate([across, ranges / 30.0, seen.action, jnp.stack(single, axis=-1)], axis=-1)
 
 
 def aim(ahead: Float[Array, "*env"], log_sigma: Float[Array, "*env"]) -> Float[Array, "*env 5"]:
@@ -97,5 +174,5 @@ def aim(ahead: Float[Array, "*env"], log_sigma: Float[Array, "*env"]) -> Float[A
 
 
 def centres(bins: int, width: float) -> Float[np.ndarray, "bins"]:
-    """Middles of the bins of the estimation head, m of true less reckoned distance."""
+    """Middles of the bins of the estimation head, m of true less tracked distance."""
     return ((np.arange(bins) - 0.5 * (bins - 1)) * width).astype(np.float32)

@@ -14,9 +14,8 @@ class RecurrentConfig(TrainConfig):
         hidden: Width of the GRU and of the layers around it.
         bins: Bins of the estimation head.
         bin_width: Their width, m.
-        estimate_weight: Weight of the estimation head's loss; with 0, and `phase_weight` 0, reward alone teaches.
-        phase_weight: Weight of the loss of the phase between two rings.
-        detour: Share of the training after which goals are as far away as the task has them.
+        estimate_weight: Weight of the estimation head's loss; with 0 reward alone teaches.
+        curriculum: Share of the training after which goals are as far away as the task has them.
     """
 
     steps: int = 260_000_000
@@ -29,10 +28,9 @@ class RecurrentConfig(TrainConfig):
     checkpoint_every: int = 20
     hidden: int = 256
     bins: int = 160
-    bin_width: float = 0.25
+    bin_width: float = 0.125
     estimate_weight: float = 0.5
-    phase_weight: float = 1.0
-    detour: float = 0.4
+    curriculum: float = 0.4
 
     # Goals and learning rate follow the share of `steps` that is done.
     LIMITS: ClassVar[tuple[str, ...]] = ("checkpoint_every",)
@@ -72,6 +70,6 @@ def check(config: RecurrentConfig) -> RecurrentConfig:
     at_least(config, 1, "hidden")
     at_least(config, 3, "bins")
     positive(config, "bin_width")
-    not_negative(config, "estimate_weight", "phase_weight")
-    share(config, "detour")
+    not_negative(config, "estimate_weight")
+    share(config, "curriculum")
     return config

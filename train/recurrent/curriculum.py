@@ -5,15 +5,15 @@ from typing import Any
 import jax.numpy as jnp
 
 
-def nearer(params: Any, progress: Any, detour: float) -> Any:
+def nearer(params: Any, progress: Any, until: float) -> Any:
     """The task with goals as far away as is fit after a share of the training: a third of them at first.
 
     Args:
         params: The task.
         progress: Share of the training that is done.
-        detour: Share after which goals are as far away as the task has them.
+        until: Share after which goals are as far away as the task has them.
     """
-    share = jnp.clip(progress / max(detour, 1e-6), 0.0, 1.0)
+    share = jnp.clip(progress / max(until, 1e-6), 0.0, 1.0)
     goal = params.goal
     far = (1.0 + 2.0 * share) / 3.0
     high = jnp.maximum(goal.low, goal.high * far * far)

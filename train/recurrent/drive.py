@@ -19,7 +19,7 @@ class Drive:
     Attributes:
         env_state: State of the batch of environments.
         observation: To act upon next.
-        reckoning: Dead reckoning of each episode so far.
+        reckoning: Dead reckoning and rings of each episode so far.
         hidden: Memory.
         first: The observation begins an episode.
         episode_return: Undiscounted reward of each episode so far.
@@ -40,9 +40,8 @@ class Rollout:
     Attributes:
         features: Inputs of the network.
         first: The episode begins with this step.
-        ahead: Goal less reckoned distance, m.
-        error: True less reckoned distance, m: what the estimation head is to learn.
-        phase: Sine and cosine of the true place between two rings.
+        ahead: Goal less tracked distance, m.
+        error: True less tracked distance, m: what the estimation head is to learn.
         truth: Inputs of the critic.
         raw_action: The draw before the tanh.
         log_prob: Its log density when it was drawn.
@@ -55,7 +54,6 @@ class Rollout:
     first: Bool[Array, "time env"]
     ahead: Float[Array, "time env"]
     error: Float[Array, "time env"]
-    phase: Float[Array, "time env 2"]
     truth: Float[Array, "time env n"]
     raw_action: Float[Array, "time env action"]
     log_prob: Float[Array, "time env"]
@@ -64,26 +62,13 @@ class Rollout:
     truncated: Bool[Array, "time env"]
 
 
-@struct.dataclass
-class View:
-    """An observation with what was made of it."""
-
-    features: Float[Array, "env n"]
-    ahead: Float[Array, "env"]
-    reckoned: Float[Array, "env"]
-    pitch: Float[Array, "env"]
-
-
-def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> View:
+def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> senses.Sight:
     """The inputs of the network for a batch of observations."""
     part = {name: observation[..., where] for name, where in env.fields(params).items()}
-    goal, pitch = part["goal"][..., 0] - params.start.station, part["ring_pitch"][..., 0]
-    reckoned = senses.fused(reckoning, part["odometry"][..., 0])
-    features = senses.features(part["ranges"], part["odometry"], goal, pitch, reckoning)
-    return View(features, goal - reckoned, reckoned, pitch)
+    return senses.look(part, params.start.station, reckoning)
 
 
-def truth(env: Any, params: Any, state: Any, view: View, error: Float[Array, "env"]) -> Float[Array, "env n"]:
+def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Array, "env"]) -> Float[Array, "env n"]:
     """What the critic is shown: the true state, and how wrong the agent's estimate of it is.
 
     Args:
@@ -91,11 +76,11 @@ def truth(env: Any, params: Any, state: Any, view: View, error: Float[Array, "en
         params: Its params.
         state: Batched state.
         view: What the agent sees.
-        error: The agent's own estimate of true less reckoned distance, m.
+        error: The agent's own estimate of true less tracked distance, m.
     """
     known = jax.vmap(env.privileged, (0, None))(state, params)
     ahead = known["to_goal"]
-    wrong = view.reckoned + params.start.station + error - known["station"]
+    wrong = view.station + params.start.station + error - known["station"]
     parts = [
         known["offset"],
         known["heading_sin"],
@@ -118,7 +103,7 @@ def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, hidden: int) ->
     return Drive(
         env_state=state,
         observation=observation,
-        reckoning=senses.start((n_envs,)),
+        reckoning=senses.start((n_envs,), params.lidar.n_beams),
         hidden=jnp.zeros((n_envs, hidden)),
         first=jnp.ones(n_envs, bool),
         episode_return=jnp.zeros(n_envs),
@@ -138,7 +123,7 @@ def collect(
 
     Returns:
         Where the environments are afterwards, the stored unroll, the episodes that ended in it, and means per step: of
-        every reward term, and of how far off estimate and dead reckoning are (m).
+        every reward term, and of how far off estimate, ring tracker and dead reckoning are (m).
     """
 
     def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, Finished, dict[str, Array]]]:
@@ -151,13 +136,11 @@ def collect(
         observation, state, reward, terminated, truncated, info = env.step(key_env, now.env_state, action, params)
         done = terminated | truncated
         station = now.env_state.station - params.start.station
-        angle = 2.0 * jnp.pi * station / jnp.maximum(view.pitch, 0.5)
         stored = Rollout(
             features=view.features,
             first=now.first,
             ahead=view.ahead,
-            error=station - view.reckoned,
-            phase=jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1),
+            error=station - view.station,
             truth=truth(env.env, params, now.env_state, view, thought.error),
             raw_action=raw,
             log_prob=networks.distribution.log_prob(thought.parameters, raw),
@@ -167,7 +150,8 @@ def collect(
         )
         terms = {
             "estimate_error": jnp.mean(jnp.abs(stored.error - thought.error)),
-            "reckoning_error": jnp.mean(jnp.abs(stored.error)),
+            "tracking_error": jnp.mean(jnp.abs(stored.error)),
+            "reckoning_error": jnp.mean(jnp.abs(station - view.reckoning.rings.reckoned)),
             **{name: jnp.mean(value) for name, value in info.items() if name.startswith("reward_")},
         }
         total, length = now.episode_return + reward, now.env_state.steps + 1
@@ -175,7 +159,7 @@ def collect(
         after = Drive(
             env_state=state,
             observation=observation,
-            reckoning=senses.advance(now.reckoning, action, done),
+            reckoning=senses.advance(view.reckoning, action, done),
             hidden=hidden,
             first=done,
             episode_return=jnp.where(done, 0.0, total),

@@ -8,11 +8,23 @@ from jaxtyping import Array
 
 import subterra_jax as st
 from subterra_jax.policies import senses
+from subterra_jax.rules import StopAt
+from train.errors import ConfigError
 from train.recurrent import drive as driving
 from train.recurrent.config import RecurrentConfig
 from train.recurrent.network import RecurrentLayout
 
 _SLACK = 0.25
+
+
+def require_goal(env: Any) -> None:
+    """Refuses what such a network cannot do.
+
+    Raises:
+        ConfigError: The task has no goal.
+    """
+    if not isinstance(env.rule, StopAt):
+        raise ConfigError(f"memory = gru learns to drive to a goal and stop, which {env.id} does not ask for")
 
 
 def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayout:
@@ -37,5 +49,5 @@ def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayo
 
 def _shapes(env: Any, batch: Any, params: Any, observation: Array) -> tuple[Array, Array]:
     _, state = batch.reset(jax.random.key(0), params, 1)
-    view = driving.look(env, params, observation, senses.start((1,)))
+    view = driving.look(env, params, observation, senses.start((1,), params.lidar.n_beams))
     return view.features, driving.truth(env, params, state, view, jnp.zeros(1))

@@ -9,13 +9,12 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
-from subterra_jax.rules import StopAt, TurnBack
 from train import gae, normalize, parts
-from train.errors import ConfigError
 from train.recurrent import curriculum
 from train.recurrent import drive as driving
 from train.recurrent.config import RecurrentConfig, check
-from train.recurrent.layout import make_layout
+from train.recurrent.estimation import missed
+from train.recurrent.layout import make_layout, require_goal
 from train.recurrent.network import RecurrentNetworks, Weights, without_critic
 from train.report import Report, report
 
@@ -59,7 +58,7 @@ class RecurrentLearner(parts.Whole):
     Both may be jitted, and vmapped over seeds.
 
     Raises:
-        ConfigError: A setting makes no sense, or the task is not one of driving to a goal and stopping there.
+        ConfigError: A setting makes no sense, or the task has no goal to drive to and stop at.
     """
 
     state_type = TrainState
@@ -68,8 +67,7 @@ class RecurrentLearner(parts.Whole):
         self, env: Any, params: Any, config: RecurrentConfig, axes: parts.Parts = (), split: parts.Parts = ()
     ) -> None:
         self.config, self.axes, self.split = check(config), axes, split
-        if not isinstance(env.rule, StopAt) or isinstance(env.rule, TurnBack):
-            raise ConfigError(f"memory = gru learns to drive to a goal and stop, which {env.id} does not ask for")
+        require_goal(env)
         self.env = st.batch.AutoReset(env, axes=axes)
         self.networks = RecurrentNetworks(make_layout(env, params, config))
         rate = optax.cosine_decay_schedule(
@@ -88,7 +86,7 @@ class RecurrentLearner(parts.Whole):
             discounted=jnp.zeros(config.part_envs, jnp.float32),
             drive=driving.begin(
                 self.env,
-                curriculum.nearer(params, 0.0, self.config.detour),
+                curriculum.nearer(params, 0.0, self.config.curriculum),
                 parts.own_key(key_reset, self.split),
                 config.part_envs,
                 config.hidden,
@@ -105,7 +103,7 @@ class RecurrentLearner(parts.Whole):
         """Drives one unroll and learns from it."""
         config = self.config
         key, key_drive, key_learn = jax.random.split(state.key, 3)
-        task = curriculum.nearer(params, state.iteration / config.iterations, config.detour)
+        task = curriculum.nearer(params, state.iteration / config.iterations, config.curriculum)
         after, rollout, finished, terms = driving.collect(
             self.env,
             task,
@@ -188,7 +186,6 @@ class RecurrentLearner(parts.Whole):
             "value_loss": jnp.mean(jnp.square(value - lesson.target)),
             "entropy": jnp.mean(networks.distribution.entropy(thought.parameters, key)),
             "estimate_loss": jnp.mean(self._missed(thought.logits, rollout.error)),
-            "phase_loss": jnp.mean(jnp.square(thought.phase - rollout.phase)),
             "kl": jnp.mean(ratio - 1.0 - log_ratio),
         }
         total = (
@@ -196,17 +193,9 @@ class RecurrentLearner(parts.Whole):
             + config.value_weight * losses["value_loss"]
             - config.entropy_weight * losses["entropy"]
             + config.estimate_weight * losses["estimate_loss"]
-            + config.phase_weight * losses["phase_loss"]
         )
         return total, losses
 
     def _missed(self, logits: Float[Array, "*batch bins"], error: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
         """Cross entropy with the truth shared between its two nearest bins."""
-        bins, width = self.config.bins, self.config.bin_width
-        place = jnp.clip(error / width + 0.5 * (bins - 1), 0.0, bins - 1.001)
-        lower = jnp.floor(place).astype(jnp.int32)
-        share = (place - lower)[..., None]
-        log_share = jax.nn.log_softmax(logits)
-        low = jnp.take_along_axis(log_share, lower[..., None], axis=-1)
-        high = jnp.take_along_axis(log_share, lower[..., None] + 1, axis=-1)
-        return -((1.0 - share) * low + share * high)[..., 0]
+        return missed(logits, error, self.config.bin_width)

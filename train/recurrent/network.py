@@ -1,4 +1,4 @@
-"""A GRU with three heads (what to do, where one is, which part of a ring) and a critic that sees the truth."""
+"""A GRU with two heads (what to do, where one is) and a critic that sees the truth."""
 
 import dataclasses
 import math
@@ -29,6 +29,7 @@ class RecurrentLayout:
         bin_width: Their width, m.
         init_std: Standard deviation of the untrained policy before the tanh.
         min_std: Its floor.
+        senses: Version of what it is shown.
     """
 
     n_features: int
@@ -40,6 +41,7 @@ class RecurrentLayout:
     bin_width: float
     init_std: float
     min_std: float
+    senses: int = senses.VERSION
 
 
 class Memory(nn.Module):
@@ -78,21 +80,19 @@ class Thought:
 
     Attributes:
         parameters: Of the action distribution, before the tanh.
-        logits: Of the bins of true less reckoned distance.
-        phase: Sine and cosine of the place between two rings.
-        error: Expected true less reckoned distance, m.
+        logits: Of the bins of true less tracked distance.
+        error: Expected true less tracked distance, m.
         log_sigma: Log of its standard deviation, m.
     """
 
     parameters: Float[Array, "*batch p"]
     logits: Float[Array, "*batch bins"]
-    phase: Float[Array, "*batch 2"]
     error: Float[Array, "*batch"]
     log_sigma: Float[Array, "*batch"]
 
 
 class RecurrentNetworks:
-    """The network of a layout; its weights are `memory`, `estimate`, `phase`, `policy` and `critic`."""
+    """The network of a layout; its weights are `memory`, `estimate`, `policy` and `critic`."""
 
     kind = "gru"
 
@@ -103,8 +103,7 @@ class RecurrentNetworks:
         self.distribution = NormalTanhDistribution(n_action, min_std=layout.min_std)
         self._memory: Any
         self._estimate: Any
-        self._phase: Any
-        self._memory, self._estimate, self._phase = Memory(layout.hidden), nn.Dense(layout.bins), nn.Dense(2)
+        self._memory, self._estimate = Memory(layout.hidden), nn.Dense(layout.bins)
         self._policy = MLP(
             layer_sizes=(layout.hidden, self.distribution.param_size),
             activation=jax.nn.swish,
@@ -118,16 +117,15 @@ class RecurrentNetworks:
 
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
         """Untrained weights."""
-        keys = jax.random.split(key, 5)
+        keys = jax.random.split(key, 4)
         layout = self.layout
         hidden = jnp.zeros((1, 1, layout.hidden))
         features = jnp.zeros((1, 1, layout.n_features))
         return {
             "memory": self._memory.init(keys[0], features, hidden[0], jnp.zeros((1, 1), bool)),
             "estimate": self._estimate.init(keys[1], hidden),
-            "phase": self._phase.init(keys[2], hidden),
-            "policy": self._policy.init(keys[3], jnp.zeros((1, layout.hidden + senses.N_AIM))),
-            "critic": self._critic.init(keys[4], jnp.zeros((1, layout.n_truth))),
+            "policy": self._policy.init(keys[2], jnp.zeros((1, layout.hidden + senses.N_AIM))),
+            "critic": self._critic.init(keys[3], jnp.zeros((1, layout.n_truth))),
         }
 
     def policy_shapes(self) -> dict[str, Weights]:
@@ -148,7 +146,7 @@ class RecurrentNetworks:
         Args:
             weights: Weights.
             hidden: Hidden states.
-            ahead: Goal less reckoned distance, m.
+            ahead: Goal less tracked distance, m.
         """
         logits = self._estimate.apply(weights["estimate"], hidden)
         share = jax.nn.softmax(logits)
@@ -158,7 +156,7 @@ class RecurrentNetworks:
         # The policy aims with the estimate but must not bend it to its own ends.
         aim = senses.aim(jax.lax.stop_gradient(ahead - error), jax.lax.stop_gradient(log_sigma))
         parameters = self._policy.apply(weights["policy"], jnp.concatenate([hidden, aim], axis=-1)) + self._offset
-        return Thought(parameters, logits, self._phase.apply(weights["phase"], hidden), error, log_sigma)
+        return Thought(parameters, logits, error, log_sigma)
 
     def value(self, weights: dict[str, Weights], truth: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
         """Expected return, in units of the reward scale."""

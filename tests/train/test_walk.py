@@ -1,0 +1,138 @@
+"""Training of the walking robot: settings, networks, scores and release; what it learns, a slow test tells."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.b2 import policy as gaits
+from subterra_jax.policies.files import PolicyError
+from train import release, walk
+from train.errors import ConfigError
+from train.networks import Policy
+from train.walk_config import WalkConfig, make_config
+from train.walk_network import WalkLayout, WalkNetworks
+from train.walk_score import score
+
+N_SEEN, N_TRUTH = 56, 12
+
+
+@pytest.fixture(scope="module")
+def networks():
+    layout = WalkLayout(N_SEEN + N_TRUTH, (-1.0,) * 12, (1.0,) * 12, 1, (32, 16), 0.3, 0.03, N_SEEN)
+    return WalkNetworks(layout)
+
+
+@pytest.fixture(scope="module")
+def policy(networks):
+    shapes = networks.policy_shapes()
+    keys = iter(jax.random.split(jax.random.key(0), 100))
+    random = jax.tree.map(lambda leaf: 0.3 * jax.random.normal(next(keys), leaf.shape), shapes.weights)
+    mean = jnp.linspace(-1.0, 1.0, N_SEEN + N_TRUTH)
+    statistics = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes.statistics)
+    return Policy(random, statistics.replace(mean=mean, std=jnp.full(N_SEEN + N_TRUTH, 2.0)))
+
+
+def records(n_steps=200, n_robots=4, speed=0.5, asked=0.6):
+    velocity, wanted = np.zeros((n_steps, n_robots, 3)), np.zeros((n_steps, n_robots, 3))
+    velocity[..., 0], wanted[..., 0] = speed, asked
+    flags = {name: np.zeros((n_steps, n_robots), bool) for name in ("fall", "over", "contact")}
+    return {"velocity": velocity, "asked": wanted, "effort": np.full((n_steps, n_robots), 300.0), **flags}
+
+
+def test_the_policy_does_not_see_the_truth_and_the_critic_does(networks, policy):
+    weights = networks.init(jax.random.key(1))
+    stack = jax.random.normal(jax.random.key(2), (3, 1, N_SEEN + N_TRUTH))
+    otherwise = stack.at[..., N_SEEN:].add(1.0)
+    np.testing.assert_array_equal(networks.act(policy, stack), networks.act(policy, otherwise))
+    values = [networks.value(weights["value"], policy.statistics, seen) for seen in (stack, otherwise)]
+    assert not np.allclose(*values)
+
+
+def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_path):
+    out = tmp_path / "gait.safetensors"
+    release.write(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
+    loaded, facts = gaits.load(out)
+    seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
+    np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), networks.act(policy, seen[:, None]), atol=1e-6)
+    assert facts["kind"] == "walk"
+    assert loaded.n_observation == N_SEEN
+    gaits.check_fits(loaded, N_SEEN, out)
+    with pytest.raises(PolicyError, match="made for observations of 56 numbers, the B2 gives 60"):
+        gaits.check_fits(loaded, 60, out)
+
+
+def test_a_missing_gait_is_refused_by_name(tmp_path):
+    with pytest.raises(PolicyError, match="no such policy"):
+        gaits.load(tmp_path / "none.safetensors")
+
+
+def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
+    out = tmp_path / "gait.safetensors"
+    release.write(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
+    facts = out.with_suffix(".json")
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "mlp"}))
+    with pytest.raises(PolicyError, match="kind 'mlp', which is no gait"):
+        gaits.load(out)
+
+
+def test_a_constant_lag_is_scored_as_what_it_is():
+    found = score(records(), 0.02)
+    assert found["velocity_error"] == pytest.approx(0.1)
+    assert found["yaw_rate_error"] == 0.0
+    assert found["falls"] == 0.0
+    assert found["power"] == pytest.approx(300.0)
+
+
+def test_swaying_within_a_stride_is_no_tracking_error():
+    swaying = records(speed=0.6)
+    swaying["velocity"][..., 1] = 0.3 * np.sin(2.0 * np.pi * np.arange(200) / 20.0)[:, None]
+    assert score(swaying, 0.02)["velocity_error"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_one_fall_of_four_is_a_quarter_and_what_comes_after_it_does_not_count():
+    fallen = records()
+    fallen["fall"][100, 2] = True
+    fallen["over"][101:, 2] = True
+    fallen["velocity"][101:, 2] = 50.0
+    fallen["effort"][101:, 2] = 1e9
+    found = score(fallen, 0.02)
+    assert found["falls"] == 0.25
+    assert found["velocity_error"] == pytest.approx(0.1)
+    assert found["power"] == pytest.approx(300.0)
+
+
+def test_settings_that_make_no_sense_are_refused_before_anything_is_compiled(tmp_path):
+    with pytest.raises(ConfigError, match="robots must be at least 1, got 0"):
+        walk.command(walk.Command(out=tmp_path / "run", robots=0))
+    with pytest.raises(ConfigError, match="n_envs = 100 cannot be divided into minibatches = 32"):
+        walk.command(walk.Command(out=tmp_path / "run", config=WalkConfig(n_envs=100)))
+    with pytest.raises(ConfigError, match=r"release must end in \.safetensors"):
+        walk.command(walk.Command(out=tmp_path / "run", release=tmp_path / "gait.bin"))
+    with pytest.raises(ConfigError, match="either a tunnel or a scene"):
+        walk.command(walk.Command(out=tmp_path / "run", tunnel=tmp_path / "t.npz", scene=tmp_path))
+    with pytest.raises(ConfigError, match="unknown preset 'tpu'"):
+        walk.parse(["--out", str(tmp_path / "run"), "--preset", "tpu"])
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_critic_s_observation_is_the_policy_s_and_more():
+    env, params = st.make("Subterra/B2Walk-v0", privileged=True)
+    plain = dataclasses.replace(env, privileged=False)
+    assert plain.observation_size(params) == N_SEEN
+    assert env.observation_size(params) == N_SEEN + N_TRUTH
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_it_learns_on_a_cpu(tmp_path):
+    config = dataclasses.replace(make_config("cpu"), steps=600_000)
+    assert walk.command(walk.Command(out=tmp_path / "run", robots=32, config=config)) == 0
+    lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    paid = np.array([line["reward_velocity"] + line["reward_yaw_rate"] for line in lines])
+    assert paid[-10:].mean() > paid[10:20].mean() * 1.02
+    assert (tmp_path / "run" / "evaluation.json").exists()

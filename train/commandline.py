@@ -1,0 +1,114 @@
+"""The command line of `train.navigate`; its defaults follow from the task, the memory, the teacher and the machine."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import tyro
+
+from train import cluster, policies
+from train.cluster import Cluster
+from train.config import PPOConfig, make_config
+from train.errors import ConfigError
+from train.recurrent import config as recurrent_config
+from train.recurrent import distill_config
+from train.recurrent.config import RecurrentConfig
+from train.recurrent.distill_config import DistillConfig
+
+_DEFAULT_TASK = "Subterra/TraverseShort-v0"
+_MEMORIES = ("none", "gru")
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Trains a navigation policy; defaults follow from `--task`, `--memory`, `--teacher` and `--preset`.
+
+    Attributes:
+        out: Run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json.
+        task: Task id.
+        tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, `procedural:train:7`,
+            or of several `procedural:train:0-255`, of which each episode draws one.
+        lining: Variant of the walls; `pockets` if left out, or the first where a tunnel has none.
+        memory: `none`: a perceptron over a few observations. `gru`: a network that remembers, with an estimation head;
+            with `--teacher oracle` (any baseline, policy file or run folder) it learns from a teacher, else by reward.
+        preset: `cpu` or `gpu`; what jax runs on if left out.
+        seeds: Train these seeds at once, into `out/seed-<k>`, and draw them together; one run of `--seed` if left out.
+        resume: Go on from the checkpoint in `out`; only the limits on training may differ.
+        overwrite: Throw away the run that `out` holds.
+        tensorboard: Write the log for TensorBoard as well, into `out/tensorboard`.
+        evaluation_episodes: Episodes of the evaluation after training, the first of the task's 500.
+        cluster: Other processes to train with.
+        config: Settings of PPO.
+    """
+
+    out: Path
+    task: str = _DEFAULT_TASK
+    tunnel: Path | None = None
+    lining: str | None = None
+    memory: Literal["none", "gru"] = "none"
+    preset: str | None = None
+    seeds: tuple[int, ...] = ()
+    resume: bool = False
+    overwrite: bool = False
+    tensorboard: bool = False
+    evaluation_episodes: int = 200
+    cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Cluster)
+    config: Annotated[PPOConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=PPOConfig)
+
+
+@dataclasses.dataclass(frozen=True)
+class RecurrentCommand(Command):
+    """The same for a policy with memory."""
+
+    config: Annotated[RecurrentConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(  # type: ignore[assignment]
+        default_factory=RecurrentConfig
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class DistillCommand(Command):
+    """The same for a policy with memory that has a teacher."""
+
+    config: Annotated[DistillConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(  # type: ignore[assignment]
+        default_factory=DistillConfig
+    )
+
+
+def parse(arguments: list[str]) -> Command:
+    """The command line, with the defaults of the task, memory and preset that it names itself.
+
+    Raises:
+        ConfigError: There is no such task, memory or preset.
+    """
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--task", default=_DEFAULT_TASK)
+    early.add_argument("--memory", default=_MEMORIES[0])
+    early.add_argument("--teacher")
+    early.add_argument("--preset")
+    early.add_argument("--coordinator")
+    early.add_argument("--processes", type=int)
+    early.add_argument("--process", type=int)
+    named, _ = early.parse_known_args(arguments)
+    cluster.join(Cluster(named.coordinator, named.processes, named.process))
+    preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
+    default = _default(named.task, named.memory, named.teacher, preset)
+    return tyro.cli(type(default), args=arguments, default=default, prog="python -m train.navigate")
+
+
+def _default(task: str, memory: str, teacher: str | None, preset: str) -> Command:
+    """The command for a task, with every setting filled in."""
+    if memory not in _MEMORIES:
+        raise ConfigError(f"unknown memory {memory!r}; there are {', '.join(_MEMORIES)}")
+    if memory == "none" and teacher is not None:
+        raise ConfigError(f"teacher = {teacher} teaches a policy with memory; give --memory gru as well")
+    config: Any
+    if memory == "none":
+        return Command(out=tyro.MISSING, preset=preset, config=make_config(task, preset))
+    policies.known_task(task)
+    if teacher is None:
+        config = recurrent_config.make_config(task, preset)
+        return RecurrentCommand(out=tyro.MISSING, memory="gru", preset=preset, config=config)
+    config = distill_config.make_config(task, preset)
+    return DistillCommand(out=tyro.MISSING, memory="gru", preset=preset, config=config)

@@ -1,0 +1,169 @@
+"""Distillation: a student with memory learns to do what a teacher would, wherever the student's own driving leads."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+import subterra_jax as st
+from subterra_jax.baselines.agent import Agent
+from train import parts
+from train.recurrent import drive as driving
+from train.recurrent import lessons
+from train.recurrent.distill_config import DistillConfig, check
+from train.recurrent.estimation import missed
+from train.recurrent.layout import make_layout, require_goal
+from train.recurrent.network import RecurrentNetworks, Weights, without_critic
+from train.report import Report, report
+
+# Beyond this an action counts as wrong by its distance before the tanh, not by the square of it: who does not know
+# whether the goal is passed then stops where that is as likely as not, and not where it has become certain.
+_KNEE = 0.05
+# Advice this near the end of the range is as good as the end, which no number before the tanh can reach. Compared after
+# the tanh, a student at full speed would not feel that it ought to stop.
+_END = 0.98
+_STANDS = 0.05  # m/s
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that one iteration hands to the next.
+
+    Attributes:
+        weights: Of the networks.
+        moments: State of the optimiser.
+        drive: Where the environments are.
+        key: For everything random from here on.
+        iteration: Iterations done.
+    """
+
+    weights: dict[str, Weights]
+    moments: Any
+    drive: lessons.Classroom
+    key: PRNGKeyArray
+    iteration: Int[Array, ""]
+
+
+class DistillLearner(parts.Whole):
+    """The two pure functions of training, `init` and `iterate`, for one environment, teacher and config.
+
+    Args:
+        env: An environment, as `st.make` returns it.
+        params: Its parameters.
+        config: Settings.
+        teacher: Who is asked.
+        axes: Names of the axes along which `iterate` is vmapped.
+        split: Names of the axes along which environments are split; see `spread.py`.
+
+    Raises:
+        ConfigError: A setting makes no sense, or no such network can do this task.
+
+    Source: Ross, Gordon, Bagnell, A Reduction of Imitation Learning and Structured Prediction to No-Regret Online
+    Learning, 2011 (DAgger), with whole episodes driven by one of the two and a fresh rollout in place of the sum of
+    all.
+    """
+
+    state_type = TrainState
+
+    def __init__(
+        self,
+        env: Any,
+        params: Any,
+        config: DistillConfig,
+        teacher: Agent,
+        axes: parts.Parts = (),
+        split: parts.Parts = (),
+    ) -> None:
+        self.config, self.axes, self.split = check(config), axes, split
+        require_goal(env)
+        self.env, self.teacher = st.batch.AutoReset(env, axes=axes), teacher
+        self.networks = RecurrentNetworks(make_layout(env, params, config))
+        updates = config.iterations * config.epochs * config.minibatches
+        rate = optax.cosine_decay_schedule(config.learning_rate, updates, alpha=0.02)
+        self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
+
+    def init(self, key: PRNGKeyArray, params: Any) -> TrainState:
+        """An untrained network and every environment at the start of an episode."""
+        key_weights, key_reset, key_rest = jax.random.split(key, 3)
+        weights, config = self.networks.init(key_weights), self.config
+        student = driving.begin(self.env, params, parts.own_key(key_reset, self.split), config.part_envs, config.hidden)
+        return TrainState(
+            weights=weights,
+            moments=self.optimizer.init(weights),
+            drive=lessons.begin(self.env.env, self.teacher, params, student),
+            key=key_rest,
+            iteration=jnp.int32(0),
+        )
+
+    def policy_of(self, state: TrainState) -> dict[str, Weights]:
+        """The policy that would drive next."""
+        return without_critic(state.weights)
+
+    def iterate(self, state: TrainState, params: Any) -> tuple[TrainState, Report]:
+        """Drives one unroll and learns from it."""
+        config = self.config
+        key, key_drive, key_learn = jax.random.split(state.key, 3)
+        progress = state.iteration / config.iterations
+        taught = 1.0 - jnp.clip(progress / max(config.handover, 1e-6), 0.0, 1.0)
+        after, rollout, finished, terms = lessons.collect(
+            self.env,
+            params,
+            self.teacher,
+            self.networks,
+            state.weights,
+            state.drive,
+            parts.own_key(key_drive, self.split),
+            config.unroll,
+            taught,
+        )
+        (weights, moments), losses = self._learn_from(state, rollout, key_learn)
+        metrics = {**jax.tree.map(jnp.mean, losses), **parts.mean(terms, self.split)}
+        learnt = TrainState(weights, moments, after, key, state.iteration + 1)
+        return learnt, report(finished, metrics, self.policy_of(state))
+
+    def _learn_from(
+        self, state: TrainState, rollout: lessons.Advised, key: PRNGKeyArray
+    ) -> tuple[tuple[dict[str, Weights], Any], dict[str, Array]]:
+        config, begun = self.config, state.drive.student.hidden
+
+        def minibatch(now: tuple[Any, Any], chosen: Array) -> tuple[Any, dict[str, Array]]:
+            weights, moments = now
+            part = jax.tree.map(lambda x: x[:, chosen], rollout)
+            wrong = jax.grad(self._imitation, has_aux=True)(weights, begun[chosen], part)
+            gradients, losses = parts.mean(wrong, self.split)
+            updates, moments = self.optimizer.update(gradients, moments)
+            return (optax.apply_updates(weights, updates), moments), losses
+
+        def epoch(now: tuple[Any, Any], key_now: PRNGKeyArray) -> tuple[Any, dict[str, Array]]:
+            order = jax.random.permutation(key_now, config.part_envs).reshape(config.minibatches, -1)
+            return jax.lax.scan(minibatch, now, order)
+
+        return jax.lax.scan(epoch, (state.weights, state.moments), jax.random.split(key, config.epochs))
+
+    def _imitation(
+        self, weights: dict[str, Weights], begun: Float[Array, "env hidden"], rollout: lessons.Advised
+    ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+        """How far the student is from the teacher, and what the estimation heads got wrong."""
+        config, networks = self.config, self.networks
+        _, hidden = networks.remember(weights, rollout.features, begun, rollout.first)
+        thought = networks.think(weights, hidden, rollout.ahead)
+        apart = thought.parameters[..., : networks.n_action] - self._before_tanh(rollout.advice)
+        losses = {
+            "imitation_loss": jnp.mean(optax.huber_loss(apart, delta=_KNEE)) / _KNEE,
+            "estimate_loss": jnp.mean(missed(thought.logits, rollout.error, config.bin_width)),
+        }
+        total = config.imitation_weight * losses["imitation_loss"] + config.estimate_weight * losses["estimate_loss"]
+        return total, losses
+
+    def _before_tanh(self, advice: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
+        """The number before the tanh that makes such an action, or one that comes to the same."""
+        layout = self.networks.layout
+        low, high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
+        # Who is to stand is taught to back up, which the robot reads as standing: the step between driving and standing
+        # then lies in the middle of what the network does, not at the end that it comes to last.
+        stands = (advice[..., 0] < _STANDS)[..., None] & (jnp.arange(advice.shape[-1]) == 0)
+        share = 2.0 * (jnp.where(stands, low, advice) - low) / (high - low) - 1.0
+        return jnp.arctanh(jnp.clip(share, -_END, _END))
