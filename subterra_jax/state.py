@@ -67,17 +67,17 @@ class GoalState:
 
     Attributes:
         station: Chainage of the goal, m.
-        start: True chainage of the start, m.
         still: Steps that the robot has stood.
-        flag: 1 once the goal has been reached, else 0.
-        travelled: True distance driven, m.
+        start: True chainage of the start, m, where one is to return to it.
+        flag: 1 once the goal has been reached, else 0, where one is to return.
+        travelled: True distance driven, m, where that is limited.
     """
 
     station: Float[Array, ""]
-    start: Float[Array, ""]
     still: Int[Array, ""]
-    flag: Float[Array, ""]
-    travelled: Float[Array, ""]
+    start: Float[Array, ""] | None = None
+    flag: Float[Array, ""] | None = None
+    travelled: Float[Array, ""] | None = None
 
 
 @struct.dataclass

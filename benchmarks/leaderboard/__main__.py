@@ -11,7 +11,7 @@ from rich.console import Console
 
 from benchmarks.leaderboard import figure, report
 from benchmarks.leaderboard.board import scores, totals
-from benchmarks.leaderboard.config import LeaderboardConfig, checked, worlds
+from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, checked, worlds
 from benchmarks.leaderboard.entries import entry_of, write
 from benchmarks.throughput.facts import environment_facts
 from subterra_jax.errors import SubterraError
@@ -27,7 +27,9 @@ def run(config: LeaderboardConfig) -> None:
         ValueError: A tunnel in which a task has no room.
     """
     config = checked(config)
-    asked = [(task, world, agent) for world in worlds(config) for task in config.tasks for agent in config.agents]
+    asked = [
+        (task, world, agent) for world in worlds(config) for task in config.tasks for agent in agents_for(config, task)
+    ]
     entries = []
     for number, (task, world, agent) in enumerate(asked, 1):
         began = time.monotonic()

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import subterra_jax as st
+from subterra_jax import policies
 from subterra_jax.baselines import registry
 from subterra_jax.errors import SubterraError
 from subterra_jax.evaluation.episodes import N_LISTED
@@ -21,7 +22,8 @@ class LeaderboardConfig:
 
     Attributes:
         tasks: Ids of tasks, as `Subterra/StopAt-v0` or `StopAt`; none given: all.
-        agents: Names of agents; none given: all that are registered.
+        agents: Names of agents, baselines or `policy:NAME` for a released policy; none given: all baselines, and the
+            policy that was released for the task.
         tunnels: Tunnel files, or names of packaged tunnels.
         linings: Variants of the walls; a tunnel that has only one, as `control`, is driven with that.
         episodes: Episodes of each task, the first of its 500; with faults evenly over the severities.
@@ -72,10 +74,19 @@ def checked(config: LeaderboardConfig) -> LeaderboardConfig:
     if config.out.exists() and not config.out.is_dir():
         raise LeaderboardError(f"{config.out}: is not a folder")
     tasks = tuple(_task(name) for name in config.tasks) or tuple(st.TASKS)
-    agents = config.agents or registry.names()
-    if unknown := [name for name in agents if name not in registry.names()]:
+    policies.register_released()
+    if unknown := [name for name in config.agents if name not in registry.names()]:
         raise LeaderboardError(f"no agent {unknown[0]!r}; there are {', '.join(registry.names())}")
-    return dataclasses.replace(config, tasks=_once(tasks), agents=_once(agents))
+    return dataclasses.replace(config, tasks=_once(tasks), agents=_once(config.agents))
+
+
+def agents_for(config: LeaderboardConfig, task: str) -> tuple[str, ...]:
+    """Names of the agents that are to drive a task; `config` is one that `checked` has returned."""
+    if config.agents:
+        return config.agents
+    own = policies.PREFIX + policies.name_for(task)
+    baselines = tuple(name for name in registry.names() if not name.startswith(policies.PREFIX))
+    return baselines + ((own,) if own in registry.names() else ())
 
 
 def worlds(config: LeaderboardConfig) -> list[World]:

@@ -25,9 +25,9 @@ class Relocalise(Rule):
         assert params.goal is not None
         assert noise.goal is not None
         room = jnp.maximum(tunnel.length - 2.0 * params.goal.margin, 0.0)
-        start, zero = params.goal.margin + room * noise.goal[1], jnp.zeros(())
+        start = params.goal.margin + room * noise.goal[1]
         backwards = (noise.goal[2] < 0.5).astype(jnp.float32)
-        return start, backwards, GoalState(start, start, jnp.zeros((), jnp.int32), zero, zero)
+        return start, backwards, GoalState(start, jnp.zeros((), jnp.int32), travelled=jnp.zeros(()))
 
     def fields(self, params: EnvParams) -> dict[str, Bounds]:
         """Distance between rings of the lining, m; 0 where there are none."""
@@ -44,6 +44,7 @@ class Relocalise(Rule):
         assert params.goal is not None
         assert step.before.goal is not None
         goal = step.before.goal
+        assert goal.travelled is not None
         still, stopped = stood(step, params.goal)
         along = step.place.tangent
         forward = jnp.cos(step.heading) * along[0] + jnp.sin(step.heading) * along[1] > 0.0

@@ -73,9 +73,8 @@ class StopAt(Rule):
     def begin(self, noise: ResetNoise, tunnel: Tunnel, params: EnvParams) -> tuple[Array, Array, GoalState]:
         """Near the mouth, facing forward, with a goal ahead."""
         assert params.goal is not None
-        start, zero = drawn_start(noise, params), jnp.zeros(())
-        station = drawn_goal(noise, tunnel, params.goal)
-        return start, zero, GoalState(station, start, jnp.zeros((), jnp.int32), zero, zero)
+        goal = GoalState(drawn_goal(noise, tunnel, params.goal), jnp.zeros((), jnp.int32))
+        return drawn_start(noise, params), jnp.zeros(()), goal
 
     def fields(self, params: EnvParams) -> dict[str, Bounds]:
         """Chainage of the goal (m) and distance between rings of the lining (m; 0 where there are none)."""
@@ -97,5 +96,5 @@ class StopAt(Rule):
         success = stopped & (jnp.abs(error) <= params.goal.tolerance)
         nearer = jnp.abs(step.before.station - goal.station) - jnp.abs(error)
         terms = pay(step, params, success=success, stopped=stopped, failed=step.contact, error=error, nearer=nearer)
-        after = dataclasses.replace(goal, still=still, travelled=goal.travelled + step.moved)
+        after = dataclasses.replace(goal, still=still)
         return Verdict(success, stopped, terms, after, {"goal_error": error, "stopped": stopped})

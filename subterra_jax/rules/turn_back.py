@@ -7,13 +7,18 @@ from jaxtyping import Array, Float
 
 from subterra_jax.rules.rule import Bounds, Step, Verdict
 from subterra_jax.rules.stop import StopAt, pay, stood
-from subterra_jax.state import EnvParams, State
+from subterra_jax.state import EnvParams, GoalState, ResetNoise, State
 from subterra_jax.tunnel import Tunnel
 
 
 @dataclasses.dataclass(frozen=True)
 class TurnBack(StopAt):
     """Success is a stop within the tolerance of the start after the flag at the goal was raised."""
+
+    def begin(self, noise: ResetNoise, tunnel: Tunnel, params: EnvParams) -> tuple[Array, Array, GoalState]:
+        """As for `StopAt`, the flag down."""
+        start, backwards, goal = super().begin(noise, tunnel, params)
+        return start, backwards, dataclasses.replace(goal, start=start, flag=jnp.zeros(()))
 
     def fields(self, params: EnvParams) -> dict[str, Bounds]:
         """As for `StopAt`, and the flag: 1 once the goal has been reached."""
@@ -22,6 +27,7 @@ class TurnBack(StopAt):
     def observe(self, state: State, tunnel: Tunnel) -> list[Float[Array, ""]]:
         """The same in the order of `fields`."""
         assert state.goal is not None
+        assert state.goal.flag is not None
         return [*super().observe(state, tunnel), state.goal.flag]
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
@@ -29,6 +35,8 @@ class TurnBack(StopAt):
         assert params.goal is not None
         assert step.before.goal is not None
         goal = step.before.goal
+        assert goal.start is not None
+        assert goal.flag is not None
         still, stopped = stood(step, params.goal)
         station, back = step.place.station, jnp.abs(step.place.station - goal.start)
         reached = jnp.abs(station - goal.station) <= params.goal.flag_reach
@@ -37,7 +45,7 @@ class TurnBack(StopAt):
         to_go = _to_go(station, goal.station, goal.start, flag)
         nearer = _to_go(step.before.station, goal.station, goal.start, goal.flag) - to_go
         terms = pay(step, params, success=success, stopped=stopped, failed=step.contact, error=to_go, nearer=nearer)
-        after = dataclasses.replace(goal, still=still, flag=flag, travelled=goal.travelled + step.moved)
+        after = dataclasses.replace(goal, still=still, flag=flag)
         told = {"goal_error": station - goal.start, "stopped": stopped, "flag": flag > 0.5}
         return Verdict(success, stopped, terms, after, told)
 

@@ -12,6 +12,7 @@ from benchmarks.leaderboard import __main__ as command
 from benchmarks.leaderboard import entries as entry_module
 from benchmarks.leaderboard import figure, report
 from benchmarks.leaderboard.board import scores, totals
+from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, checked
 from benchmarks.leaderboard.entries import Entry
 from subterra_jax.evaluation import Records
 from subterra_jax.evaluation.episodes import SHA256
@@ -32,6 +33,8 @@ def run(monkeypatch, *arguments: str) -> int:
         (("--episodes", "501"), "error: episodes must be at most 500, got 501"),
         (("--batch", "0"), "error: batch must be at least 1, got 0"),
         (("--tunnels", "no.npz"), "error: no.npz: no such tunnel file"),
+        (("--agents", "policy:Fly-v0"), "error: no agent 'policy:Fly-v0'; there are random"),
+        (("--tasks", "Relocalise", "--agents", "policy:StopAt-v0"), "error: policy:StopAt-v0: a policy that drives to"),
         (("--linings", "velvet"), "error: tunnel 'subterra-351' has no lining 'velvet'"),
     ],
 )
@@ -41,6 +44,13 @@ def test_what_cannot_be_had_is_one_sentence_and_status_2(monkeypatch, capsys, tm
     assert told.startswith(sentence)
     assert told.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_where_no_agent_is_named_the_policy_released_for_the_task_drives_beside_the_baselines():
+    config = checked(LeaderboardConfig(tasks=("TraverseShort", "RelocaliseShort")))
+    with_policy, without = (agents_for(config, task) for task in config.tasks)
+    assert set(with_policy) - set(without) == {"policy:TraverseShort-v0"}
+    assert {"ring-count", "particle-filter", "oracle"} <= set(without)
 
 
 def test_what_was_driven_is_kept_and_read_by_the_next_run(monkeypatch, tmp_path):
