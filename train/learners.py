@@ -7,16 +7,20 @@ from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.policies import PolicyError, check_fits
 from train import policies, spread
+from train.agents import weights_of
 from train.config import PPOConfig, TrainConfig, check
 from train.errors import CheckpointError, ConfigError
 from train.evaluate import open_agent
 from train.learner import Learner
+from train.parts import Parts
 from train.recurrent import config as recurrent_config
 from train.recurrent import distill_config
 from train.recurrent.config import RecurrentConfig
 from train.recurrent.distill import DistillLearner
 from train.recurrent.distill_config import DistillConfig
+from train.recurrent.layout import make_layout
 from train.recurrent.learner import RecurrentLearner
+from train.recurrent.network import RecurrentNetworks
 from train.snapshot import Trainable
 
 
@@ -42,17 +46,29 @@ def make_learner(world: policies.World, config: TrainConfig, axes: tuple[str, ..
         ConfigError: A setting makes no sense, no such network can learn this task, or no such teacher knows it.
     """
     spreads = config.parts > 1
-    names = ((spread.PART,), spread.SPLIT) if spreads else (axes,)
+    names: tuple[Parts, Parts] = ((spread.PART,), spread.SPLIT) if spreads else (axes, ())
     learner: Any
     if isinstance(config, DistillConfig):
         teacher = open_teacher(config.teacher, world)
-        learner = DistillLearner(world.env, world.params, config, teacher, *names)
+        learner = DistillLearner(world.env, world.params, config, teacher, *names, begun=_begun(world, config))
     elif isinstance(config, RecurrentConfig):
-        learner = RecurrentLearner(world.env, world.params, config, *names)
+        learner = RecurrentLearner(world.env, world.params, config, *names, begun=_begun(world, config))
     else:
         assert isinstance(config, PPOConfig)
         learner = Learner(world.env, world.params, config, *names)
     return spread.Spread(learner) if spreads else learner
+
+
+def _begun(world: policies.World, config: RecurrentConfig) -> dict[str, Any] | None:
+    """Weights of the policy to begin with."""
+    if config.begin_from is None:
+        return None
+    try:
+        agent, _ = open_agent(Path(config.begin_from), None)
+    except (PolicyError, CheckpointError) as error:
+        raise ConfigError(f"begin_from = {config.begin_from}: {error}") from error
+    networks = RecurrentNetworks(make_layout(world.env, world.params, config))
+    return weights_of(networks, agent.tensors, config.begin_from)
 
 
 def open_teacher(name: str, world: policies.World) -> Agent:

@@ -14,6 +14,7 @@ from benchmarks.leaderboard.board import scores, totals
 from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, checked, worlds
 from benchmarks.leaderboard.entries import entry_of, write
 from benchmarks.throughput.facts import environment_facts
+from scene.arguments import parse
 from subterra_jax.errors import SubterraError
 
 _progress = Console(stderr=True, highlight=False)
@@ -48,7 +49,11 @@ def run(config: LeaderboardConfig) -> None:
 
 def main() -> int:
     """Entry point; the status is 2 for a user's mistake and 130 for an interrupt, after which a run can go on."""
-    config = tyro.cli(LeaderboardConfig, description=__doc__)
+    config = parse(
+        lambda words: tyro.cli(
+            LeaderboardConfig, args=words, prog="python -m benchmarks.leaderboard", description=__doc__
+        )
+    )
     try:
         run(config)
     except (SubterraError, ValueError) as error:

@@ -11,6 +11,8 @@ from subterra_jax.errors import SubterraError
 from subterra_jax.evaluation.episodes import N_LISTED
 from subterra_jax.tunnel.plan import TunnelPlan
 
+OWN = "released-policy"  # the one that was released for the task at hand
+
 
 class LeaderboardError(SubterraError):
     """A leaderboard that cannot be made as it was asked for."""
@@ -22,8 +24,8 @@ class LeaderboardConfig:
 
     Attributes:
         tasks: Ids of tasks, as `Subterra/StopAt-v0` or `StopAt`; none given: all.
-        agents: Names of agents, baselines or `policy:NAME` for a released policy; none given: all baselines, and the
-            policy that was released for the task.
+        agents: Names of agents: baselines, `policy:NAME` for a released policy, or `released-policy` for the one
+            released for the task; none given: all baselines, and that one.
         tunnels: Tunnel files, or names of packaged tunnels.
         linings: Variants of the walls; a tunnel that has only one, as `control`, is driven with that.
         episodes: Episodes of each task, the first of its 500; with faults evenly over the severities.
@@ -75,7 +77,7 @@ def checked(config: LeaderboardConfig) -> LeaderboardConfig:
         raise LeaderboardError(f"{config.out}: is not a folder")
     tasks = tuple(_task(name) for name in config.tasks) or tuple(st.TASKS)
     policies.register_released()
-    if unknown := [name for name in config.agents if name not in registry.names()]:
+    if unknown := [name for name in config.agents if name not in (*registry.names(), OWN)]:
         raise LeaderboardError(f"no agent {unknown[0]!r}; there are {', '.join(registry.names())}")
     return dataclasses.replace(config, tasks=_once(tasks), agents=_once(config.agents))
 
@@ -84,9 +86,8 @@ def agents_for(config: LeaderboardConfig, task: str) -> tuple[str, ...]:
     """Names of the agents that are to drive a task; `config` is one that `checked` has returned."""
     if config.agents:
         return config.agents
-    own = policies.PREFIX + policies.name_for(task)
     baselines = tuple(name for name in registry.names() if not name.startswith(policies.PREFIX))
-    return baselines + ((own,) if own in registry.names() else ())
+    return baselines + ((OWN,) if policies.name_for(task) in policies.released() else ())
 
 
 def worlds(config: LeaderboardConfig) -> list[World]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import subterra_jax as st
-from benchmarks.leaderboard.config import LeaderboardError, World
+from benchmarks.leaderboard.config import OWN, LeaderboardError, World
 from benchmarks.throughput.facts import version
 from subterra_jax import policies
 from subterra_jax.baselines.registry import make_agent
@@ -58,6 +58,7 @@ def entry_of(folder: Path, task: str, world: World, agent: str, episodes: int, b
         LeaderboardError: The folder cannot be written.
         PolicyError: A policy that was made for another task.
     """
+    name = policies.PREFIX + policies.name_for(task) if agent == OWN else agent
     inputs = {
         "schema": SCHEMA,
         "evaluation": SHA256,
@@ -67,16 +68,16 @@ def entry_of(folder: Path, task: str, world: World, agent: str, episodes: int, b
         "agent": agent,
         "episodes": episodes,
         "version": version("subterra-jax"),
-        **_weights(agent),
+        **_weights(name),
     }
     path = folder / f"{_plain(task)}.{_plain(world.title)}.{_plain(agent)}.json"
     if (found := _read(path, inputs)) is not None:
         records = Records.from_columns(found["records"])
         return Entry(task, world.title, agent, found["traits"], records, found.get("bounds")), True
     env, params = st.make(task, world.plan, world.lining, estimates=True)
-    driver = make_agent(agent, params)
-    if agent.startswith(policies.PREFIX):
-        policies.check_fits(driver, env, params, agent)  # type: ignore[arg-type]
+    driver = make_agent(name, params)
+    if name.startswith(policies.PREFIX):
+        policies.check_fits(driver, env, params, name)  # type: ignore[arg-type]
     traits = {name: bool(getattr(driver, name)) for name in ("uses_lidar", "uses_map", "privileged")}
     records = evaluate(env, params, driver, listed_episodes(task, params, episodes), batch)
     plain = type(env.rule) is StopAt and params.obstacles is None and params.faults is None
@@ -115,8 +116,8 @@ def _read(path: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
 
 def _weights(agent: str) -> dict[str, str]:
     """Which weights a released policy has: another release under the same name is driven anew."""
-    name = agent.removeprefix(policies.PREFIX)
-    return {} if name == agent else {"policy": policies.load(name)[1]["tensors_sha256"]}
+    policy = agent.removeprefix(policies.PREFIX)
+    return {} if policy == agent else {"policy": policies.load(policy)[1]["tensors_sha256"]}
 
 
 def _digest(world: World) -> str:

@@ -4,6 +4,6 @@ files (safetensors + JSON) ─► load ─► feedforward or recurrent, an Agent
 """
 
 from subterra_jax.policies.files import PolicyError, name_for, released
-from subterra_jax.policies.loading import check_fits, from_tensors, load, register_released
+from subterra_jax.policies.loading import PREFIX, check_fits, from_tensors, load, register_released
 
-__all__ = ["PolicyError", "check_fits", "from_tensors", "load", "name_for", "register_released", "released"]
+__all__ = ["PREFIX", "PolicyError", "check_fits", "from_tensors", "load", "name_for", "register_released", "released"]

@@ -20,6 +20,7 @@ from subterra_jax.state import EnvParams
 
 Agent = FeedForward | Recurrent
 KINDS = ("mlp", "gru")
+PREFIX = "policy:"  # of the names of released policies among the agents
 GAIT = "walk"
 
 
@@ -90,10 +91,10 @@ def register_released() -> tuple[str, ...]:
     Returns:
         Their names.
     """
-    names = tuple(f"policy:{name}" for name in released() if not name.startswith("B2Walk"))
+    names = tuple(PREFIX + name for name in released() if not name.startswith("B2Walk"))
     for name in names:
         if name not in registry.names():
-            registry.register(name, lambda params, name=name: load(name.removeprefix("policy:"))[0])  # type: ignore[misc]
+            registry.register(name, lambda params, name=name: load(name.removeprefix(PREFIX))[0])  # type: ignore[misc]
     return names
 
 

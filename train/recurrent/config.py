@@ -15,6 +15,9 @@ class RecurrentConfig(TrainConfig):
         bins: Bins of the estimation head.
         bin_width: Their width, m.
         estimate_weight: Weight of the estimation head's loss; with 0 reward alone teaches.
+        begin_from: Policy to begin from, not from nothing: a run folder, a file, or the name of a released one. What a
+            student has learnt from a teacher is made better by reward so.
+        warm_up: Share of the training in which only the critic learns, where there is a policy to begin with.
         curriculum: Share of the training after which goals are as far away as the task has them.
     """
 
@@ -30,6 +33,8 @@ class RecurrentConfig(TrainConfig):
     bins: int = 160
     bin_width: float = 0.125
     estimate_weight: float = 0.5
+    begin_from: str | None = None
+    warm_up: float = 0.05
     curriculum: float = 0.4
 
     # Goals and learning rate follow the share of `steps` that is done.
@@ -71,5 +76,5 @@ def check(config: RecurrentConfig) -> RecurrentConfig:
     at_least(config, 3, "bins")
     positive(config, "bin_width")
     not_negative(config, "estimate_weight")
-    share(config, "curriculum")
+    share(config, "curriculum", "warm_up")
     return config

@@ -1,5 +1,6 @@
 """Distillation: a student with memory learns to do what a teacher would, wherever the student's own driving leads."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -57,6 +58,7 @@ class DistillLearner(parts.Whole):
         teacher: Who is asked.
         axes: Names of the axes along which `iterate` is vmapped.
         split: Names of the axes along which environments are split; see `spread.py`.
+        begun: Weights of a policy to begin with.
 
     Raises:
         ConfigError: A setting makes no sense, or no such network can do this task.
@@ -76,8 +78,9 @@ class DistillLearner(parts.Whole):
         teacher: Agent,
         axes: parts.Parts = (),
         split: parts.Parts = (),
+        begun: Mapping[str, Any] | None = None,
     ) -> None:
-        self.config, self.axes, self.split = check(config), axes, split
+        self.config, self.axes, self.split, self.begun = check(config), axes, split, begun or {}
         require_goal(env)
         self.env, self.teacher = st.batch.AutoReset(env, axes=axes), teacher
         self.networks = RecurrentNetworks(make_layout(env, params, config))
@@ -88,7 +91,8 @@ class DistillLearner(parts.Whole):
     def init(self, key: PRNGKeyArray, params: Any) -> TrainState:
         """An untrained network and every environment at the start of an episode."""
         key_weights, key_reset, key_rest = jax.random.split(key, 3)
-        weights, config = self.networks.init(key_weights), self.config
+        config, given = self.config, jax.tree.map(jnp.asarray, dict(self.begun))
+        weights = {**self.networks.init(key_weights), **given}
         student = driving.begin(self.env, params, parts.own_key(key_reset, self.split), config.part_envs, config.hidden)
         return TrainState(
             weights=weights,

@@ -28,7 +28,7 @@ class DistillConfig(RecurrentConfig):
 
 _PRESETS: dict[str, dict[str, float | int]] = {
     "gpu": {},
-    "cpu": {"steps": 20_000_000, "n_envs": 512, "hidden": 96, "minibatches": 8, "checkpoint_every": 10},
+    "cpu": {"steps": 10_000_000, "n_envs": 256, "hidden": 96, "minibatches": 8},
 }
 
 

@@ -1,5 +1,6 @@
 """One iteration of PPO with memory as one pure function."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -57,6 +58,14 @@ class RecurrentLearner(parts.Whole):
 
     Both may be jitted, and vmapped over seeds.
 
+    Args:
+        env: An environment, as `st.make` returns it.
+        params: Its parameters.
+        config: Settings.
+        axes: Names of the axes along which `iterate` is vmapped.
+        split: Names of the axes along which environments are split; see `spread.py`.
+        begun: Weights of a policy to begin with.
+
     Raises:
         ConfigError: A setting makes no sense, or the task has no goal to drive to and stop at.
     """
@@ -64,12 +73,19 @@ class RecurrentLearner(parts.Whole):
     state_type = TrainState
 
     def __init__(
-        self, env: Any, params: Any, config: RecurrentConfig, axes: parts.Parts = (), split: parts.Parts = ()
+        self,
+        env: Any,
+        params: Any,
+        config: RecurrentConfig,
+        axes: parts.Parts = (),
+        split: parts.Parts = (),
+        begun: Mapping[str, Any] | None = None,
     ) -> None:
         self.config, self.axes, self.split = check(config), axes, split
         require_goal(env)
         self.env = st.batch.AutoReset(env, axes=axes)
         self.networks = RecurrentNetworks(make_layout(env, params, config))
+        self.begun = begun or {}
         rate = optax.cosine_decay_schedule(
             config.learning_rate, config.iterations * config.epochs * config.minibatches, alpha=0.1
         )
@@ -78,7 +94,10 @@ class RecurrentLearner(parts.Whole):
     def init(self, key: PRNGKeyArray, params: Any) -> TrainState:
         """An untrained network and every environment at the start of an episode."""
         key_weights, key_reset, key_rest = jax.random.split(key, 3)
-        weights, config = self.networks.init(key_weights), self.config
+        weights, config = (
+            {**self.networks.init(key_weights), **jax.tree.map(jnp.asarray, dict(self.begun))},
+            self.config,
+        )
         return TrainState(
             weights=weights,
             moments=self.optimizer.init(weights),
@@ -118,7 +137,8 @@ class RecurrentLearner(parts.Whole):
         )
         statistics = normalize.update(state.return_statistics, returns, self.split)
         lesson = self._lesson(state, rollout, after, task, statistics.std)
-        (weights, moments), losses = self._learn(state, lesson, key_learn)
+        warm = (state.iteration >= config.warm_up * config.iterations) if self.begun else True
+        (weights, moments), losses = self._learn(state, lesson, jnp.asarray(warm, jnp.float32), key_learn)
         metrics = {**jax.tree.map(jnp.mean, losses), **parts.mean(terms, self.split), "reward_scale": statistics.std}
         learnt = TrainState(weights, moments, statistics, discounted, after, key, state.iteration + 1)
         return learnt, report(finished, metrics, self.policy_of(state))
@@ -147,7 +167,7 @@ class RecurrentLearner(parts.Whole):
         return Lesson(before.drive.hidden, rollout, advantage, advantage + value)
 
     def _learn(
-        self, state: TrainState, lesson: Lesson, key: PRNGKeyArray
+        self, state: TrainState, lesson: Lesson, warm: Float[Array, ""], key: PRNGKeyArray
     ) -> tuple[tuple[dict[str, Weights], Any], dict[str, Array]]:
         config = self.config
 
@@ -158,7 +178,7 @@ class RecurrentLearner(parts.Whole):
                 lesson.hidden[chosen],
                 *jax.tree.map(lambda x: x[:, chosen], (lesson.rollout, lesson.advantage, lesson.target)),
             )
-            gradients, losses = parts.mean(jax.grad(self._loss, has_aux=True)(weights, part, key_now), self.split)
+            gradients, losses = parts.mean(jax.grad(self._loss, has_aux=True)(weights, part, warm, key_now), self.split)
             updates, moments = self.optimizer.update(gradients, moments)
             return (optax.apply_updates(weights, updates), moments), losses
 
@@ -170,7 +190,7 @@ class RecurrentLearner(parts.Whole):
         return jax.lax.scan(epoch, (state.weights, state.moments), jax.random.split(key, config.epochs))
 
     def _loss(
-        self, weights: dict[str, Weights], lesson: Lesson, key: PRNGKeyArray
+        self, weights: dict[str, Weights], lesson: Lesson, warm: Float[Array, ""], key: PRNGKeyArray
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
         """Clipped objective, value, and what the estimation heads got wrong."""
         config, rollout, networks = self.config, lesson.rollout, self.networks
@@ -189,9 +209,8 @@ class RecurrentLearner(parts.Whole):
             "kl": jnp.mean(ratio - 1.0 - log_ratio),
         }
         total = (
-            losses["policy_loss"]
+            warm * (losses["policy_loss"] - config.entropy_weight * losses["entropy"])
             + config.value_weight * losses["value_loss"]
-            - config.entropy_weight * losses["entropy"]
             + config.estimate_weight * losses["estimate_loss"]
         )
         return total, losses

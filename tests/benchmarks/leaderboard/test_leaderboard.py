@@ -49,7 +49,7 @@ def test_what_cannot_be_had_is_one_sentence_and_status_2(monkeypatch, capsys, tm
 def test_where_no_agent_is_named_the_policy_released_for_the_task_drives_beside_the_baselines():
     config = checked(LeaderboardConfig(tasks=("TraverseShort", "RelocaliseShort")))
     with_policy, without = (agents_for(config, task) for task in config.tasks)
-    assert set(with_policy) - set(without) == {"policy:TraverseShort-v0"}
+    assert set(with_policy) - set(without) == {"released-policy"}
     assert {"ring-count", "particle-filter", "oracle"} <= set(without)
 
 
