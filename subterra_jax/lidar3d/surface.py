@@ -122,11 +122,13 @@ def _drawn(path: Path, leave_out: tuple[str, ...]) -> list[Triangles]:
     mujoco.mj_kinematics(model, data)
     seen = np.flatnonzero(model.geom_group <= _LARGEST_SEEN_GROUP)
     kinds = [model.geom(geom).name.split("_")[0] for geom in seen]
-    parts = (_shape(model, data, int(geom)) for geom, kind in zip(seen, kinds, strict=True) if kind not in leave_out)
+    parts = (
+        geom_triangles(model, data, int(geom)) for geom, kind in zip(seen, kinds, strict=True) if kind not in leave_out
+    )
     return [part for part in parts if len(part.faces)]
 
 
-def _shape(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> Triangles:
+def geom_triangles(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> Triangles:
     """One geom in the world; shapes other than meshes and boxes have no triangles here, and scenes have none."""
     import mujoco
 

@@ -1,0 +1,93 @@
+"""The command: `python -m subterra_jax.viewer`."""
+
+import argparse
+import logging
+import os
+import sys
+import time
+import warnings
+from pathlib import Path
+
+from subterra_jax.errors import SubterraError
+from subterra_jax.viewer.config import LOOPBACK, ViewerConfig
+
+_EXAMPLE = "example: python -m subterra_jax.viewer --scene build/tunnel --task StopAt --driver particle-filter"
+
+
+def parsed(arguments: list[str] | None = None) -> ViewerConfig:
+    """The configuration that a command line asks for; exits with status 2 where it is malformed."""
+    default = ViewerConfig()
+    parser = argparse.ArgumentParser(
+        prog="python -m subterra_jax.viewer", description="Shows episodes in the browser.", epilog=_EXAMPLE
+    )
+    add = parser.add_argument
+    add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build: its lining, track and tunnel")
+    add("--tunnel", action="append", default=[], metavar="NAME|FILE", help="offer this tunnel too; may be repeated")
+    add("--lining", default=default.lining, metavar="NAME", help="pockets (default), smooth or furnished")
+    add("--task", default=default.task, metavar="ID", help="first task, as StopAt or Subterra/StopAt-v0 (the default)")
+    add("--driver", default=default.agent, metavar="NAME", help="who drives first: a baseline, or policy:StopAt-v0")
+    add("--policy", action="append", default=[], type=Path, metavar="FILE", help="offer this .safetensors as driver")
+    add("--seed", type=int, default=default.seed, metavar="N", help="seed of the first episode")
+    add(
+        "--recordings",
+        type=Path,
+        default=default.recordings,
+        metavar="DIR",
+        help="where episodes and pictures are saved",
+    )
+    add("--replay", type=Path, metavar="FILE", help="begin with this recorded episode")
+    add("--host", default=default.host, metavar="ADDRESS", help="listen here; the default is this machine alone")
+    add("--port", type=int, default=default.port, metavar="N", help="first port to try")
+    given = parser.parse_args(arguments)
+    return ViewerConfig(
+        scene=given.scene,
+        tunnels=tuple(given.tunnel),
+        lining=given.lining,
+        task=given.task,
+        agent=given.driver,
+        policies=tuple(given.policy),
+        seed=given.seed,
+        recordings=given.recordings,
+        replay=given.replay,
+        host=given.host,
+        port=given.port,
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; the status is 2 for a user's mistake."""
+    config = parsed(arguments)
+    # What strangers send is refused without a word: a traceback for each would bury what matters.
+    for name in ("websockets.server", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    try:
+        from subterra_jax.viewer.serving import Viewer
+
+        _compile_once()
+        viewer = Viewer(config)
+    except ModuleNotFoundError as error:
+        print(f"error: {error.name} is not installed: pip install 'subterra-jax[viewer]'", file=sys.stderr)
+        return 2
+    except (SubterraError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
+    if config.host not in (LOOPBACK, "localhost", "::1"):
+        print(f"listening on {config.host}: whoever reaches this address can drive, and save in {config.recordings}")
+    try:
+        while True:
+            time.sleep(3600.0)
+    except KeyboardInterrupt:
+        viewer.stop()
+    return 0
+
+
+def _compile_once() -> None:
+    """One episode at a time is a CPU's work, and what was compiled once is kept."""
+    import jax
+
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_compilation_cache_dir", str(base / "subterra" / "viewer"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

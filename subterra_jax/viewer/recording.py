@@ -1,0 +1,168 @@
+"""One recorded episode: everything that is needed to show it again, in one `.npz`."""
+
+import dataclasses
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from subterra_jax.viewer.errors import RecordingError
+
+SCHEMA = "subterra.episode/1"
+_TEXTS = ("task", "agent", "tunnel", "tunnel_sha256", "lining")
+_NUMBERS = ("seed", "period", "radius", "range_max", "length", "start", "goal", "success", "contact")
+_SHAPES: dict[str, tuple[str | int, ...]] = {
+    "position": ("t", 2),
+    "heading": ("t",),
+    "station": ("t",),
+    "odometry": ("t", 2),
+    "ranges": ("t", "n_beams"),
+    "command": ("t", 2),
+    "estimate": ("t", 2),
+    "reward": ("t",),
+    "coverage": ("t",),
+    "cloud": ("t", "k", 3),
+    "boxes": ("b", 6),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """An episode, or as much of it as has been driven. Row 0 of a series is the start, row t comes after step t.
+
+    Attributes:
+        task: Id of the task.
+        agent: Name of who drove.
+        tunnel: Name of the tunnel as the viewer lists it.
+        tunnel_sha256: Digest of that tunnel, from `tunnel_digest`.
+        lining: Variant of the walls.
+        seed: Seed of the episode.
+        period: Control period, s.
+        radius: Radius of the robot, m.
+        range_max: A beam that hits nothing reports this, m.
+        length: Length of the course, m.
+        start: Station at which the robot believes to start, m.
+        goal: Station of the goal, m; NaN where there is none.
+        success: 1 where the task was achieved, else 0.
+        contact: 1 where it ended at a wall or an obstacle, else 0.
+        position: True position, tunnel frame, m.
+        heading: True heading, rad.
+        station: True station, m.
+        odometry: Dead-reckoned distance (m) and heading (rad) as observed.
+        ranges: LiDAR ranges as observed, m.
+        command: Speed (m/s) and yaw rate (rad/s) that led here; 0 in row 0.
+        estimate: Estimated station and its standard deviation, m; NaN from one who makes none, and in row 0.
+        reward: Reward of the step that led here.
+        coverage: Share of the tunnel covered.
+        cloud: Some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `k` is 0
+            for one who has none.
+        boxes: Obstacles: middle x, y (m), unit vector along the first side, half sides (m).
+    """
+
+    task: str
+    agent: str
+    tunnel: str
+    tunnel_sha256: str
+    lining: str
+    seed: float
+    period: float
+    radius: float
+    range_max: float
+    length: float
+    start: float
+    goal: float
+    success: float
+    contact: float
+    position: Float[np.ndarray, "t 2"]
+    heading: Float[np.ndarray, "t"]
+    station: Float[np.ndarray, "t"]
+    odometry: Float[np.ndarray, "t 2"]
+    ranges: Float[np.ndarray, "t n_beams"]
+    command: Float[np.ndarray, "t 2"]
+    estimate: Float[np.ndarray, "t 2"]
+    reward: Float[np.ndarray, "t"]
+    coverage: Float[np.ndarray, "t"]
+    cloud: Float[np.ndarray, "t k 3"]
+    boxes: Float[np.ndarray, "b 6"]
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    @property
+    def duration(self) -> float:
+        """Time from the first row to the last, s."""
+        return round((len(self) - 1) * self.period, 3)
+
+    @property
+    def file_name(self) -> str:
+        """A name for its file; the same episode always has the same one."""
+        parts = (self.task.split("/")[-1], self.agent, Path(self.tunnel).stem, self.lining, str(int(self.seed)))
+        plain = ("".join(c if c.isalnum() or c in "-." else "-" for c in part) for part in parts)
+        return "_".join(plain) + ".npz"
+
+    def extended(self, rows: dict[str, Any], success: float, contact: float) -> "Recording":
+        """The same with further rows of every series."""
+        series: dict[str, Any] = {name: np.concatenate([getattr(self, name), values]) for name, values in rows.items()}
+        return dataclasses.replace(self, success=success, contact=contact, **series)
+
+
+def save(recording: Recording, path: Path) -> None:
+    """Writes an episode, under a temporary name first; the same episode gives the same bytes.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, schema=np.array(SCHEMA), **vars(recording))
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(buffer.getvalue())
+        os.replace(partial, path)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def load(path: Path) -> Recording:
+    """Reads an episode.
+
+    Raises:
+        RecordingError: There is no such file, it is no recording, or a field is missing or misshapen.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            fields = {name: data[name] for name in data.files}
+    except FileNotFoundError as error:
+        raise RecordingError(f"{path}: no such recording") from error
+    except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
+        raise RecordingError(f"{path}: not a readable recording ({error})") from error
+    if str(fields.get("schema")) != SCHEMA:
+        raise RecordingError(f"{path}: field 'schema' must be {SCHEMA!r}, is {str(fields.get('schema'))!r}")
+    texts: dict[str, Any] = {name: str(_field(path, fields, name, (), "U")) for name in _TEXTS}
+    numbers: dict[str, Any] = {name: float(_field(path, fields, name, (), "fiub")) for name in _NUMBERS}
+    series: dict[str, Any] = {name: _field(path, fields, name, shape, "f") for name, shape in _SHAPES.items()}
+    sizes = {len(values) for name, values in series.items() if name != "boxes"}
+    if len(sizes) != 1 or 0 in sizes:
+        raise RecordingError(f"{path}: its series must have one length of at least 1, have {sorted(sizes)}")
+    for name in ("position", "heading", "station", "odometry", "reward", "coverage"):
+        if not np.isfinite(series[name]).all():
+            raise RecordingError(f"{path}: field {name!r} has a value that is not finite")
+    if not (np.isfinite(numbers["period"]) and numbers["period"] > 0.0):
+        raise RecordingError(f"{path}: field 'period' must be positive, is {numbers['period']}")
+    return Recording(**texts, **numbers, **series)
+
+
+def _field(path: Path, fields: dict[str, Any], name: str, shape: tuple[str | int, ...], kinds: str) -> Any:
+    """One array of the right kind and rank."""
+    if name not in fields:
+        raise RecordingError(f"{path}: field {name!r} is missing")
+    value = fields[name]
+    fits = value.ndim == len(shape) and all(
+        isinstance(want, str) or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if value.dtype.kind not in kinds or not fits:
+        raise RecordingError(f"{path}: field {name!r} must have shape {shape}, is {value.dtype} of {value.shape}")
+    return value

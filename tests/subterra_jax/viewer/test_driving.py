@@ -1,0 +1,67 @@
+"""Episodes as the viewer drives them."""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.baselines.registry import make_agent
+from subterra_jax.errors import SubterraError
+from subterra_jax.evaluation import Episodes, evaluate
+from subterra_jax.policies.feedforward import FeedForward
+from subterra_jax.viewer import drivers
+from subterra_jax.viewer.driving import drive
+from tests.subterra_jax import tunnels
+
+_NAMES = {"tunnel": "t", "tunnel_sha256": "0", "lining": "smooth", "agent": "blind-forward"}
+
+
+@pytest.fixture(scope="module")
+def task(plan_of):
+    plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
+    return st.make("Subterra/Traverse-v0", tunnel=plan, lining="smooth")
+
+
+@pytest.fixture(scope="module")
+def parts(task):
+    env, params = task
+    return list(drive(env, params, make_agent("blind-forward", params), 5, _NAMES))
+
+
+def test_an_episode_is_the_one_that_the_evaluation_drives(task, parts):
+    env, params = task
+    one = np.zeros(1, np.int32)
+    record = evaluate(
+        env, params, make_agent("blind-forward", params), Episodes(np.array([5], np.uint32), one, one, one)
+    )
+    whole = parts[-1]
+    assert (whole.success, whole.contact) == (record.success[0], record.contact[0])
+    np.testing.assert_allclose(whole.duration, record.time[0], atol=1e-3)
+    np.testing.assert_allclose(whole.coverage[-1], record.coverage[0], atol=1e-5)
+    travelled = np.linalg.norm(np.diff(whole.position, axis=0), axis=1).sum()
+    np.testing.assert_allclose(travelled, record.travelled[0], rtol=1e-4)
+    np.testing.assert_allclose(whole.estimate[-1, 0] - whole.station[-1], record.axial_final[0], atol=1e-3)
+
+
+def test_an_episode_grows_from_its_start_and_keeps_what_it_had(parts):
+    assert len(parts[0]) == 1
+    assert len(parts) > 2
+    for before, after in itertools.pairwise(parts):
+        assert len(after) > len(before)
+        np.testing.assert_array_equal(after.station[: len(before)], before.station)
+    assert np.isnan(parts[-1].estimate[0]).all()
+    assert np.isfinite(parts[-1].estimate[1:]).all()
+
+
+def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
+    plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
+    few = FeedForward({"statistics.mean": jnp.zeros(3)}, jnp.zeros(2), jnp.ones(2), frames=1)
+    monkeypatch.setattr(drivers.registry, "make_agent", lambda name, params: few)
+    with pytest.raises(SubterraError, match="few: made for observations of 3 numbers, Subterra/Traverse-v0 has 18"):
+        next(drivers.episode(plan, "0", "t", "smooth", "Subterra/Traverse-v0", "few", 0))
+
+
+def test_baselines_and_released_policies_are_offered():
+    assert {"particle-filter", "oracle", "policy:StopAt-v0"} <= set(drivers.offer(()))
