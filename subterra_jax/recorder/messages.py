@@ -1,0 +1,130 @@
+"""ROS 2 messages of standard types, serialised as CDR."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from subterra_jax.adapters.missing import MissingLibraryError
+from subterra_jax.recorder.poses import Poses
+
+EPOCH = 1_700_000_000  # s: stamp of the start, the same for every episode
+_FIELDS = (("x", 7, 0), ("y", 7, 4), ("z", 7, 8), ("ring", 4, 12))  # name, sensor_msgs/PointField type, byte
+POINT = np.dtype({
+    "names": ["x", "y", "z", "ring"], "formats": ["<f4", "<f4", "<f4", "<u2"], "offsets": [0, 4, 8, 12], "itemsize": 16,
+})  # fmt: skip
+
+
+@functools.cache
+def store() -> Any:
+    """The message types of ROS 2 Jazzy.
+
+    Raises:
+        MissingLibraryError: `rosbags` is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingLibraryError("subterra_jax.recorder", "rosbags") from error
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def nanoseconds(time: float) -> int:
+    """Stamp of a time in s since the start, ns since 1970."""
+    return EPOCH * 1_000_000_000 + round(time * 1e9)
+
+
+def _make(name: str) -> Callable[..., Any]:
+    return store().types[name]
+
+
+def _header(time: float, frame: str) -> Any:
+    seconds, rest = divmod(nanoseconds(time), 1_000_000_000)
+    stamp = _make("builtin_interfaces/msg/Time")(sec=seconds, nanosec=rest)
+    return _make("std_msgs/msg/Header")(stamp=stamp, frame_id=frame)
+
+
+def _vector(values: Float[np.ndarray, "3"], kind: str = "Vector3") -> Any:
+    return _make(f"geometry_msgs/msg/{kind}")(*(float(value) for value in values))
+
+
+def _quaternion(values: Float[np.ndarray, "4"]) -> Any:
+    return _make("geometry_msgs/msg/Quaternion")(*(float(value) for value in values))
+
+
+def _twist(linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"]) -> Any:
+    return _make("geometry_msgs/msg/Twist")(linear=_vector(linear), angular=_vector(angular))
+
+
+def laser_scan(time: float, frame: str, ranges: np.ndarray, range_max: float, period: float) -> Any:
+    """`sensor_msgs/LaserScan`; a beam that hit nothing reports exactly `range_max`, as in the task."""
+    step = 2.0 * np.pi / len(ranges)
+    return _make("sensor_msgs/msg/LaserScan")(
+        header=_header(time, frame), angle_min=0.0, angle_max=float(step * (len(ranges) - 1)), angle_increment=step,
+        time_increment=0.0, scan_time=period, range_min=0.0, range_max=range_max,
+        ranges=np.asarray(ranges, np.float32), intensities=np.zeros(0, np.float32),
+    )  # fmt: skip
+
+
+def odometry(poses: Poses, k: int, frame: str) -> Any:
+    """`nav_msgs/Odometry` of `base_link`, its twist from the last pose to this one; covariances are not stated."""
+    before, zero = max(k - 1, 0), np.zeros(3)
+    linear, angular, rotation = zero, zero, poses.rotation
+    if k > 0:
+        period = poses.time[k] - poses.time[before]
+        linear = rotation[k].inv().apply(poses.position[k] - poses.position[before]) / period
+        angular = (rotation[before].inv() * rotation[k]).as_rotvec() / period
+    pose = _make("geometry_msgs/msg/Pose")(
+        position=_vector(poses.position[k], "Point"), orientation=_quaternion(rotation[k].as_quat(canonical=True))
+    )
+    return _make("nav_msgs/msg/Odometry")(
+        header=_header(poses.time[k], frame), child_frame_id="base_link",
+        pose=_make("geometry_msgs/msg/PoseWithCovariance")(pose=pose, covariance=np.zeros(36)),
+        twist=_make("geometry_msgs/msg/TwistWithCovariance")(twist=_twist(linear, angular), covariance=np.zeros(36)),
+    )  # fmt: skip
+
+
+def transform(time: float, parent: str, child: str, position: np.ndarray, quaternion: np.ndarray) -> Any:
+    """`geometry_msgs/TransformStamped`; quaternion x, y, z, w."""
+    move = _make("geometry_msgs/msg/Transform")(translation=_vector(position), rotation=_quaternion(quaternion))
+    return _make("geometry_msgs/msg/TransformStamped")(
+        header=_header(time, parent), child_frame_id=child, transform=move
+    )
+
+
+def transforms(parts: list[Any]) -> Any:
+    """`tf2_msgs/TFMessage`."""
+    return _make("tf2_msgs/msg/TFMessage")(transforms=parts)
+
+
+def command(time: float, speed: float, yaw_rate: float) -> Any:
+    """`geometry_msgs/TwistStamped` of a command, m/s and rad/s."""
+    twist = _twist(np.array([speed, 0.0, 0.0]), np.array([0.0, 0.0, yaw_rate]))
+    return _make("geometry_msgs/msg/TwistStamped")(header=_header(time, "base_link"), twist=twist)
+
+
+def imu(time: float, gyro: Float[np.ndarray, "3"], accel: Float[np.ndarray, "3"]) -> Any:
+    """`sensor_msgs/Imu` without an orientation, which a covariance of -1 says."""
+    unknown = np.zeros(9)
+    unknown[0] = -1.0
+    return _make("sensor_msgs/msg/Imu")(
+        header=_header(time, "imu"), orientation=_quaternion(np.array([0.0, 0.0, 0.0, 1.0])),
+        orientation_covariance=unknown, angular_velocity=_vector(gyro), angular_velocity_covariance=np.zeros(9),
+        linear_acceleration=_vector(accel), linear_acceleration_covariance=np.zeros(9),
+    )  # fmt: skip
+
+
+def point_cloud(time: float, points: Float[np.ndarray, "n 3"], ring: np.ndarray) -> Any:
+    """`sensor_msgs/PointCloud2` of the returns of one sweep: x, y, z (m) and ring."""
+    rows = np.zeros(len(points), POINT)
+    rows["x"], rows["y"], rows["z"] = points.T
+    rows["ring"] = ring
+    field = _make("sensor_msgs/msg/PointField")
+    return _make("sensor_msgs/msg/PointCloud2")(
+        header=_header(time, "lidar"), height=1, width=len(rows),
+        fields=[field(name=name, offset=place, datatype=kind, count=1) for name, kind, place in _FIELDS],
+        is_bigendian=False, point_step=POINT.itemsize, row_step=POINT.itemsize * len(rows),
+        data=rows.view(np.uint8).reshape(-1), is_dense=True,
+    )  # fmt: skip

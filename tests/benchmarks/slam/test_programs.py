@@ -1,0 +1,181 @@
+"""From recordings to scores: the set, the libraries, the folders; and what a tube does to an odometry."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from benchmarks.fidelity.derive.surface import Caster
+from benchmarks.slam import libraries, reading
+from benchmarks.slam.__main__ import command
+from benchmarks.slam.errors import SlamError
+from benchmarks.slam.recordset import SetConfig, planned
+from scene.poses.trajectory import load_tum
+from scene.writing.geometry import write_geometry
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import TrackConfig, lay
+from subterra_jax.lidar3d.surface import read_scene
+from subterra_jax.recorder.sensing import CLOUD_SIGMA
+from tests.benchmarks.slam.tracks import EPOCH, line, write_axis, write_tum
+from tests.scene.conftest import arc_bore
+
+STEP = 0.2
+
+
+def bare(ways: np.ndarray, k: int) -> np.ndarray:
+    """A sweep in a square bore without ends: the same wherever along it one stands."""
+    del k
+    reach = 2.5 / np.maximum(np.abs(ways[:, 1:]).max(axis=1), 1e-9)
+    return ways[reach < 25.0] * reach[reach < 25.0, None]
+
+
+def landmarks(ways: np.ndarray, k: int) -> np.ndarray:
+    """A sweep among things that stand still, 0.2 m further each time."""
+    return 12.0 * ways * np.linspace(0.2, 1.0, len(ways))[:, None] - [STEP * k, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("name", ["kiss-icp", "genz-icp"])
+def test_an_odometry_that_is_right_among_landmarks_does_not_move_along_a_bare_bore(name):
+    library, version = libraries.installed(name)
+    assert version
+    ways = np.random.default_rng(0).normal(size=(6000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    ends = [
+        libraries.run(library, [(EPOCH + 0.1 * k, world(ways, k)) for k in range(16)])[1][-1, :3, 3]
+        for world in (landmarks, bare)
+    ]
+    np.testing.assert_allclose(ends[0], [15 * STEP, 0.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(ends[1], 0.0, atol=0.05)
+
+
+def test_unknown_and_missing_libraries_are_named(monkeypatch):
+    with pytest.raises(SlamError, match="no library 'fast'; there are kiss-icp, genz-icp"):
+        libraries.installed("fast")
+    missing = libraries.Library("no-such-package", reading.CLOUDS, lambda: None)
+    monkeypatch.setitem(libraries.LIBRARIES, "absent", missing)
+    with pytest.raises(SlamError, match="sweep 0 holds no point"):
+        libraries.run(missing._replace(make=lambda: np.eye), [(EPOCH, np.zeros((0, 3)))])
+    with pytest.raises(SlamError, match="there is no sweep"):
+        libraries.run(missing, [])
+    with pytest.raises(SlamError, match="absent needs no-such-package, which is not installed"):
+        libraries.installed("absent")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A set of one recording with clouds of a bend of 24 m, what two programs make of it, and their scores."""
+    folder = tmp_path_factory.mktemp("slam")
+    scene = folder / "scene"
+    scene.mkdir()
+    bore = arc_bore()
+    write_geometry(scene, "arc", "simulated", bore, lay(bore, TrackConfig()), SceneConfig())
+    wanted = ("--tasks", "TraverseShort", "--episodes", "1", "--steps", "30", "--columns", "120", "--beams", "180")
+    assert command(["record", "--scene", str(scene), "--out", str(folder / "set"), *wanted]) == 0
+    for name in ("wheel-odometry", "kiss-icp", "kiss-icp-planar"):
+        asked = ("--library", name, "--recordings", str(folder / "set"), "--out", str(folder / name))
+        assert command(["run", *asked]) == 0
+    programs = [str(folder / name) for name in ("wheel-odometry", "kiss-icp", "kiss-icp-planar")]
+    told = ("--truth", str(folder / "set" / "truth"), "--piece", "2", "--out", str(folder / "scores"))
+    assert command(["score", "--estimate", *programs, *told]) == 0
+    return folder
+
+
+def test_a_set_keeps_truth_apart_and_its_clouds_lie_on_the_walls(made):
+    recording = made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording"
+    assert not list((made / "set" / "recordings").rglob("*truth*"))
+    assert "secret" not in (made / "set" / "set.json").read_text()
+    assert (made / "set" / "truth" / "TraverseShort-pockets-000" / "lidar.tum").is_file()
+    clouds, flat = list(reading.clouds(recording)), list(reading.planar(recording))
+    assert len(clouds) == len(flat) == 31
+    surface = read_scene(made / "scene", "pockets")
+    caster = Caster(trimesh.Trimesh(surface.vertices, surface.faces, process=False))
+    truth = load_tum(made / "set" / "truth" / "TraverseShort-pockets-000" / "lidar.tum")
+    for (time, points), sigma in ((clouds[20], CLOUD_SIGMA), (flat[20], 0.05)):
+        (place,), turn = truth.at(np.array([time]))
+        distance = np.linalg.norm(points, axis=1)
+        reach = caster.first(np.broadcast_to(place, points.shape), turn.apply(points / distance[:, None]))[0]
+        error = distance - reach
+        assert np.median(np.abs(error)) == pytest.approx(0.674 * sigma, rel=0.25)
+        assert abs(np.median(error)) < 0.3 * sigma
+
+
+def test_programs_are_scored_side_by_side(made):
+    content = json.loads((made / "scores" / "scores.json").read_text())
+    scores = {row["program"]: row for row in content["scores"]}
+    assert set(scores) == {"wheel-odometry", "kiss-icp", "kiss-icp-planar"}
+    for row in scores.values():
+        assert row["covered"] == pytest.approx(1.0)
+        assert row["distance"] == pytest.approx(6.0, rel=0.1)
+        assert row["across_rms"] < 0.5
+    assert scores["wheel-odometry"]["drift"] < 8.0
+    text = (made / "scores" / "scores.md").read_text()
+    assert text.count("TraverseShort-pockets-000") == 3
+    assert (made / "scores" / "scores.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_there_is_not_done_again(made, capsys):
+    pose = made / "kiss-icp" / "TraverseShort-pockets-000.tum"
+    before = pose.stat().st_mtime_ns
+    asked = ("--library", "kiss-icp", "--recordings", str(made / "set"), "--out", str(made / "kiss-icp"))
+    assert command(["run", *asked]) == 0
+    assert "there already" in capsys.readouterr().err
+    assert pose.stat().st_mtime_ns == before
+    assert command(["record", "--out", str(made / "set"), "--tasks", "TraverseShort", "--secret", "1"]) == 2
+    assert "was recorded with other settings" in capsys.readouterr().err
+
+
+def test_a_truncated_or_foreign_recording_is_one_sentence(made, tmp_path, capsys):
+    bag = tmp_path / "recordings" / "one" / "recording"
+    shutil.copytree(made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording", bag)
+    with pytest.raises(SlamError, match=r"has no topic /other; it has /cmd_vel, /imu"):
+        next(reading.clouds(bag, "/other"))
+    data = (bag / "recording.mcap").read_bytes()
+    (bag / "recording.mcap").write_bytes(data[: len(data) // 2])
+    out = ("--out", str(tmp_path / "out"))
+    assert command(["run", "--library", "kiss-icp", "--recordings", str(tmp_path), *out]) == 2
+    told = capsys.readouterr().err
+    assert "not a whole recording" in told
+    assert told.count("\n") == 1
+    assert command(["run", "--library", "kiss-icp", "--recordings", str(tmp_path / "none"), *out]) == 2
+    assert "holds no recordings" in capsys.readouterr().err
+    blocked = ("--recordings", str(made / "set"), "--out", str(bag / "recording.json"))
+    assert command(["run", "--library", "wheel-odometry", *blocked]) == 2
+    assert "cannot be written (File exists)" in capsys.readouterr().err
+
+
+def test_boxes_and_faults_are_recorded_without_clouds_and_a_driver_knows_the_way(tmp_path):
+    config = SetConfig(tmp_path, tasks=("StopAt", "Obstructed", "Relocalise"), episodes=2, scene=tmp_path)
+    found = dict(planned(config))
+    assert list(found)[:2] == ["StopAt-pockets-000", "StopAt-pockets-001"]
+    assert found["StopAt-pockets-000"].cloud == "vlp16"
+    assert found["Obstructed-pockets-001"].cloud == "none"
+    assert found["Relocalise-pockets-000"].agent == "particle-filter"
+    with pytest.raises(SlamError, match="no task 'Fly'"):
+        planned(SetConfig(tmp_path, tasks=("Fly",)))
+
+
+def test_a_secret_gives_episodes_that_are_in_no_list(tmp_path):
+    def seeds(secret: int) -> list[int]:
+        plan = planned(SetConfig(tmp_path, tasks=("StopAt", "Return"), secret=secret))
+        assert all(one.episode is None for _, one in plan)
+        return [one.seed for _, one in plan]
+
+    assert len(set(seeds(1) + seeds(2))) == 12
+    assert seeds(1) == seeds(1)
+
+
+def test_a_folder_without_anything_to_score_is_refused(tmp_path, capsys):
+    truth = write_tum(tmp_path / "truth" / "one" / "lidar.tum", *line())
+    write_axis(truth.parent / "axis.csv", line()[1])
+    mine = write_tum(tmp_path / "mine" / "one.tum", *line()).parent
+    asked = ("--truth", str(tmp_path / "truth"))
+    assert command(["score", "--estimate", str(mine), *asked]) == 0
+    assert command(["score", "--estimate", str(mine / "one.tum"), *asked]) == 0
+    capsys.readouterr()
+    write_tum(tmp_path / "others" / "two.tum", *line())
+    for given, sentence in ((tmp_path / "others", "holds no NAME.tum"), (tmp_path / "nobody", "no such file")):
+        assert command(["score", "--estimate", str(given), *asked]) == 2
+        assert sentence in capsys.readouterr().err

@@ -1,0 +1,171 @@
+"""The scorer: errors whose size is known, `evo` beside it, and what it refuses."""
+
+import copy
+
+import numpy as np
+import pytest
+from evo.core import metrics as evo_metrics
+from evo.core import sync, units
+from evo.tools import file_interface
+from scipy.spatial.transform import Rotation
+
+from benchmarks.slam.__main__ import command
+from benchmarks.slam.errors import SlamError
+from benchmarks.slam.score import score_files
+from tests.benchmarks.slam.tracks import bend, line, write_axis, write_tum
+
+MOVE = Rotation.from_rotvec([0.1, -0.2, 1.9]), np.array([40.0, -7.0, 3.0])
+NAMES = ("rmse", "mean", "median", "std", "min", "max")
+
+
+def moved(position: np.ndarray, rotation: Rotation) -> tuple[np.ndarray, Rotation]:
+    return MOVE[0].apply(position) + MOVE[1], MOVE[0] * rotation
+
+
+@pytest.mark.parametrize("alignment", ["origin", "se3"])
+def test_the_truth_in_another_frame_has_no_error(tmp_path, alignment):
+    time, position, rotation = bend()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    estimate = write_tum(tmp_path / "other.tum", time, *moved(position, rotation))
+    found, _ = score_files(estimate, truth, alignment=alignment)
+    assert found.ape.max < 1e-6
+    assert found.ape_turn.max < 1e-5
+    assert found.rpe.max < 1e-6
+    assert found.drift < 1e-6
+    assert (found.name, found.covered, found.poses) == ("other", 1.0, 400)
+    unmoved, _ = score_files(estimate, truth, alignment="none")
+    assert unmoved.ape.min > 1.0
+
+
+def test_a_track_2_percent_too_short_and_5_cm_to_the_left_is_told_apart(tmp_path):
+    time, position, rotation = line()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    estimate = write_tum(tmp_path / "e.tum", time, position * [0.98, 1.0, 1.0] + [0.0, 0.05, 0.0], rotation)
+    found, curve = score_files(estimate, truth, alignment="none")
+    assert found.along_final == pytest.approx(-2.0)
+    assert found.drift == pytest.approx(2.0)
+    assert found.along_rms == pytest.approx(2.0 / np.sqrt(3.0), rel=5e-3)
+    assert found.across_rms == pytest.approx(0.05)
+    assert found.up_rms == pytest.approx(0.0, abs=1e-9)
+    assert found.piece_along == pytest.approx(2.0)
+    assert found.piece_across == pytest.approx(0.0, abs=1e-6)
+    np.testing.assert_allclose(curve.error[:, 0], -0.02 * curve.travelled, atol=1e-9)
+
+
+def test_one_who_stands_still_on_the_axis_is_off_along_a_bend_and_not_across(tmp_path):
+    time, position, rotation = bend()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    write_axis(tmp_path / "axis.csv", position)
+    still = write_tum(tmp_path / "still.tum", time, np.zeros_like(position), rotation)
+    found, curve = score_files(still, truth, alignment="none")
+    np.testing.assert_allclose(curve.error[:, 0], -curve.travelled, atol=1e-2)
+    assert found.drift == pytest.approx(100.0, abs=0.02)
+    assert found.across_rms == pytest.approx(0.0, abs=1e-3)
+    assert found.piece_along == pytest.approx(100.0, abs=1.0)
+    assert found.piece_across < 1.0
+
+
+def test_round_a_bend_the_axis_turns_along(tmp_path):
+    time, position, rotation = bend()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    ahead, aside = rotation.apply([1.0, 0.0, 0.0]), rotation.apply([0.0, 1.0, 0.0])
+    estimate = write_tum(tmp_path / "e.tum", time, position + 0.7 * ahead - 0.1 * aside, rotation)
+    by_path, _ = score_files(estimate, truth, alignment="none")
+    write_axis(tmp_path / "axis.csv", position)
+    by_file, _ = score_files(estimate, truth, alignment="none")
+    assert (by_path.axis, by_file.axis) == ("the true path", "axis.csv")
+    for found in (by_path, by_file):
+        assert found.along_rms == pytest.approx(0.7, abs=1e-3)
+        assert found.across_rms == pytest.approx(0.1, abs=5e-3)
+        assert found.up_rms == pytest.approx(0.0, abs=1e-9)
+    # The way back: by the axis, ahead is still where stations grow.
+    back = write_tum(tmp_path / "truth.tum", time, position[::-1], rotation[::-1])
+    estimate = write_tum(tmp_path / "e.tum", time, position[::-1] + 0.7 * ahead[::-1], rotation[::-1])
+    assert score_files(estimate, back, alignment="none")[0].along_final == pytest.approx(0.7, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A bend, and a noisy estimate of it in another frame, with fewer poses."""
+    folder = tmp_path_factory.mktemp("evo")
+    time, position, rotation = bend(600)
+    rng = np.random.default_rng(3)
+    drift = np.cumsum(rng.normal(0.0, 0.02, (600, 3)), axis=0)
+    turn = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.002, (600, 3)), axis=0))
+    truth = write_tum(folder / "truth.tum", time, position, rotation)
+    some = slice(3, None, 2)
+    noisy = moved(position + drift, rotation * turn)
+    return write_tum(folder / "e.tum", time[some], noisy[0][some], noisy[1][some]), truth
+
+
+@pytest.mark.parametrize("alignment", ["none", "origin", "se3"])
+def test_absolute_and_relative_errors_are_those_of_evo(pair, alignment):
+    estimate, truth = (file_interface.read_tum_trajectory_file(str(path)) for path in pair)
+    truth, estimate = sync.associate_trajectories(truth, estimate)
+    estimate = copy.deepcopy(estimate)
+    if alignment == "origin":
+        estimate.align_origin(truth)
+    elif alignment == "se3":
+        estimate.align(truth)
+    found, _ = score_files(*pair, alignment=alignment)
+    assert found.poses == estimate.num_poses == 299
+    relations = evo_metrics.PoseRelation
+    pieces = {"delta": 10.0, "delta_unit": units.Unit.meters, "pairs_from_reference": True}
+    compared = (
+        (evo_metrics.APE(relations.translation_part), found.ape),
+        (evo_metrics.APE(relations.rotation_angle_deg), found.ape_turn),
+        (evo_metrics.RPE(relations.translation_part, **pieces), found.rpe),
+    )
+    for metric, ours in compared:
+        metric.process_data((truth, estimate))
+        theirs = metric.get_all_statistics()
+        for name in NAMES:
+            assert getattr(ours, name) == pytest.approx(theirs[name], abs=1e-6), (metric, name)
+
+
+def test_stamps_between_those_of_the_truth_are_scored_against_the_pose_between(tmp_path):
+    time, position, rotation = line()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    late = position[:-1] + np.array([0.125, 0.0, 0.0])
+    estimate = write_tum(tmp_path / "e.tum", time[:-1] + 0.05, late, rotation[:-1])
+    found, _ = score_files(estimate, truth, alignment="none")
+    assert found.ape.max < 1e-6
+    assert found.covered == pytest.approx(399 / 400)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("nonsense\n", "e.tum: not a TUM trajectory"),
+        ("1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n", "e.tum: shares 0 of its 2 times (1.000 to 2.000 s) with"),
+        ("1.0 0 0 0 0 0 0 1\n", "e.tum: a TUM trajectory has at least 2 rows"),
+        ("1.0 0 nan 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n", "e.tum: row 1 is not finite"),
+    ],
+)
+def test_a_bad_estimate_is_one_sentence_and_status_2(tmp_path, capsys, content, sentence):
+    truth = write_tum(tmp_path / "truth.tum", *line())
+    estimate = tmp_path / "e.tum"
+    estimate.write_text(content)
+    out = tmp_path / "out"
+    assert command(["score", "--estimate", str(estimate), "--truth", str(truth), "--out", str(out)]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: ")
+    assert sentence in told
+    assert told.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_bad_axis_piece_or_standstill_is_refused(tmp_path):
+    truth = write_tum(tmp_path / "truth.tum", *line())
+    axis = tmp_path / "other.csv"
+    axis.write_text("a,b\n1,2\n")
+    with pytest.raises(SlamError, match=r"other\.csv: not an axis"):
+        score_files(truth, truth, axis=axis)
+    with pytest.raises(SlamError, match="piece must be above 0 m, got 0"):
+        score_files(truth, truth, piece=0.0)
+    time, position, rotation = line(20, step=0.0)
+    still = write_tum(tmp_path / "still.tum", time, position, rotation)
+    with pytest.raises(SlamError, match="nothing tells along from across"):
+        score_files(still, still)
+    with pytest.raises(SlamError, match="no alignment 'scale'"):
+        score_files(truth, truth, alignment="scale")

@@ -1,0 +1,20 @@
+"""One short episode, recorded once for all tests of this folder."""
+
+from pathlib import Path
+
+import pytest
+
+from subterra_jax.recorder import Recording, record
+
+BEAMS = 48
+
+
+@pytest.fixture(scope="session")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    out: Path = tmp_path_factory.mktemp("episode") / "one"
+    return Recording(out=out, task="StopAtShort", agent="dead-reckoning", episode=1, imu=True, beams=BEAMS)
+
+
+@pytest.fixture(scope="session")
+def trace(config):
+    return record(config)

@@ -1,0 +1,150 @@
+"""A recorded episode: the one that is scored, whole in every reader, its truth apart, the same bytes again."""
+
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.reader import read_ros2_messages
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+import subterra_jax as st
+from subterra_jax.baselines.registry import make_agent
+from subterra_jax.evaluation import evaluate, listed_episodes
+from subterra_jax.recorder import record
+from subterra_jax.recorder.__main__ import main
+from subterra_jax.recorder.messages import EPOCH, store
+
+TASK = "Subterra/StopAtShort-v0"
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+TOPICS = {"/cmd_vel", "/imu", "/odom", "/scan", "/scan_dense", "/tf", "/tf_static"}
+
+
+@pytest.fixture(scope="session")
+def messages(config, trace):
+    """Messages of the recording by topic, as rosbags reads them: stamps in s since the start, and contents."""
+    found = {}
+    with Reader(config.recording_folder) as bag:
+        for connection, time, raw in bag.messages():
+            message = TYPES.deserialize_cdr(raw, connection.msgtype)
+            found.setdefault(connection.topic, []).append((time * 1e-9 - EPOCH, message))
+    return found
+
+
+def test_the_episode_is_the_one_that_the_leaderboard_scores(config, trace):
+    env, params = st.make(TASK)
+    agent = make_agent(config.agent, params)
+    record = evaluate(env, params, agent, listed_episodes(TASK, params, 2)).where(np.array([False, True]))
+    truth = json.loads((config.truth_folder / "truth.json").read_text())
+    assert truth["seed"] == record.seed[0]
+    assert len(trace.command) * trace.period == pytest.approx(record.time[0])
+    assert truth["travelled"] == pytest.approx(record.travelled[0], abs=1e-3)
+    assert trace.success == record.success[0]
+    missed = float(trace.state.station[-1]) - trace.observation[0, env.fields(params)["goal"]][0]
+    assert missed == pytest.approx(float(record.goal_error[0]), abs=1e-3)
+
+
+def test_rosbags_reads_what_the_agent_saw_and_did(config, trace, messages):
+    n = len(trace.command)
+    assert set(messages) == TOPICS
+    assert [len(messages[topic]) for topic in ("/scan", "/odom", "/tf", "/cmd_vel")] == [n + 1, n + 1, n + 1, n]
+    ranges = np.array([message.ranges for _, message in messages["/scan"]])
+    np.testing.assert_array_equal(ranges, trace.observation[:, :16])
+    told = np.array([(m.twist.linear.x, m.twist.angular.z) for _, m in messages["/cmd_vel"]])
+    np.testing.assert_allclose(told, trace.command, rtol=1e-6)
+    np.testing.assert_allclose([time for time, _ in messages["/scan"]], trace.time, atol=1e-6)
+    one = messages["/scan"][5][1]
+    assert one.angle_min + 15 * one.angle_increment == pytest.approx(one.angle_max)
+    assert one.header.stamp.sec + 1e-9 * one.header.stamp.nanosec == pytest.approx(EPOCH + 0.5)
+
+
+def test_the_reckoned_pose_drives_the_distance_that_the_odometer_counted(trace, messages):
+    x = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for _, m in messages["/odom"]])
+    steps = np.linalg.norm(np.diff(x, axis=0), axis=1)
+    np.testing.assert_allclose(steps, np.abs(np.diff(trace.observation[:, 16])), atol=1e-5)
+    transform = messages["/tf"][-1][1].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "base_link")
+    assert transform.transform.translation.x == pytest.approx(x[-1, 0])
+    mounts = {part.child_frame_id: part.transform.translation.z for part in messages["/tf_static"][0][1].transforms}
+    assert mounts == pytest.approx({"laser": 0.7, "imu": 0.7})
+
+
+def test_mcap_and_its_ros2_decoder_read_it_by_the_definitions_inside(config, trace, messages):
+    path = config.recording_folder / "recording.mcap"
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert {channel.topic for channel in summary.channels.values()} == TOPICS
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        assert summary.statistics.message_count == sum(len(some) for some in messages.values())
+    decoded = [one.ros_msg for one in read_ros2_messages(str(path), topics=["/scan"])]
+    assert len(decoded) == len(trace.observation)
+    np.testing.assert_array_equal(np.float32(decoded[-1].ranges), trace.observation[-1, :16])
+
+
+def test_the_recording_tells_neither_seed_nor_truth(config, trace):
+    names = {path.name for path in config.recording_folder.iterdir()}
+    assert names == {"metadata.yaml", "recording.mcap", "recording.json", "odometry.tum"}
+    facts = json.loads((config.recording_folder / "recording.json").read_text())
+    assert not {"seed", "episode", "severity", "success"} & set(facts)
+    assert facts["observed"]["goal"] == pytest.approx(trace.observation[0, 18])
+    rows = np.loadtxt(config.truth_folder / "base_link.tum")
+    np.testing.assert_allclose(rows[:, 1:3], trace.state.position, atol=1e-6)
+    lidar = np.loadtxt(config.truth_folder / "lidar.tum")
+    np.testing.assert_allclose(np.linalg.norm(lidar[:, 1:4] - rows[:, 1:4], axis=1), 0.7, atol=1e-6)
+    with Reader(config.truth_folder) as bag:
+        assert {connection.topic for connection in bag.connections} == {"/tf", "/truth/odometry"}
+
+
+def test_the_same_config_gives_the_same_bytes(config, trace, tmp_path):
+    again = dataclasses.replace(config, out=tmp_path / "again")
+    record(again)
+    for folder, other in (
+        (config.recording_folder, again.recording_folder),
+        (config.truth_folder, again.truth_folder),
+    ):
+        for path in folder.iterdir():
+            assert path.read_bytes() == (other / path.name).read_bytes(), path.name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--task", "Fly"), "error: no task 'Subterra/Fly-v0'; there are"),
+        (("--agent", "nobody"), "error: no agent 'nobody'; there are random"),
+        (("--policy", "nothing"), "error: nothing: no such policy"),
+        (("--episode", "500"), "error: episodes must be 1 to 500, got 501"),
+        (("--steps", "0"), "error: steps must be at least 1, got 0"),
+        (("--seed", "-1"), "error: seed must be at least 0, got -1"),
+        (("--cloud", "vlp16"), "error: cloud 'vlp16' needs a scene folder"),
+        (("--tunnel", "no.npz"), "error: no.npz: no such tunnel file"),
+        (("--lining", "velvet"), "error: tunnel 'subterra-351' has no lining 'velvet'"),
+        (("--scene", "nowhere", "--tunnel", "control"), "error: either scene or tunnel, not both"),
+        (("--scene", "nowhere"), "error: nowhere/tunnel.npz: no such tunnel file"),
+    ],
+)
+def test_what_cannot_be_had_is_one_sentence_and_leaves_nothing(capsys, tmp_path, arguments, sentence):
+    out = tmp_path / "out"
+    assert main(["--out", str(out), "--task", "StopAtShort", *arguments]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(sentence)
+    assert told.count("\n") == 1
+    assert not out.exists()
+
+
+def test_a_missing_library_and_a_place_that_cannot_be_written_are_told(monkeypatch, capsys, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    assert main(["--out", str(blocked / "out"), "--task", "StopAtShort", "--steps", "1"]) == 2
+    assert "cannot be written (Not a directory)" in capsys.readouterr().err
+    store.cache_clear()
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    assert main(["--out", str(tmp_path / "out")]) == 2
+    assert "subterra_jax.recorder needs rosbags, which is not installed" in capsys.readouterr().err
+
+
+def test_a_recording_is_not_overwritten(config, trace, capsys):
+    assert main(["--out", str(config.out)]) == 2
+    assert "exists already" in capsys.readouterr().err

@@ -1,0 +1,132 @@
+"""What the recorder adds to an episode: poses in three dimensions, dense scans, clouds, an IMU; known answers."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import subterra_jax as st
+from subterra_jax.lidar import LidarParams
+from subterra_jax.lidar3d import Relief, beams
+from subterra_jax.lidar3d.surface import Axis, Triangles
+from subterra_jax.recorder.drive import Trace
+from subterra_jax.recorder.inertial import GRAVITY, measure
+from subterra_jax.recorder.poses import Poses, reckoned_poses, true_poses
+from subterra_jax.recorder.sensing import CLOUD_SIGMA, clouds, dense_scans
+from subterra_jax.state import State
+from tests.subterra_jax import surfaces
+from tests.subterra_jax.recorder.conftest import BEAMS
+
+
+@dataclasses.dataclass
+class Places:
+    """As much of a state as poses need."""
+
+    position: np.ndarray
+    heading: np.ndarray
+    station: np.ndarray
+
+
+def trace_of(position, heading, station, period: float = 0.1) -> Trace:
+    places = Places(np.asarray(position), np.asarray(heading), np.asarray(station))
+    return Trace(places, np.zeros((len(station), 18)), np.zeros((len(station) - 1, 2)), period, False, False)
+
+
+def test_on_a_grade_the_robot_is_pitched_by_it_and_facing_back_it_looks_down():
+    plan = st.load_tunnel("control")
+    plan = dataclasses.replace(plan, elevation=0.03 * plan.station)
+    station = np.array([10.0, 50.0])
+    tangent = np.stack([np.interp(station, plan.station, plan.tangent[:, i]) for i in range(2)], axis=-1)
+    centre = np.stack([np.interp(station, plan.station, plan.centre[:, i]) for i in range(2)], axis=-1)
+    heading = np.arctan2(tangent[:, 1], tangent[:, 0]) + np.array([0.0, np.pi])
+    poses = true_poses(trace_of(centre, heading, station), plan)
+    ahead = poses.rotation.apply([1.0, 0.0, 0.0])
+    np.testing.assert_allclose(ahead[:, 2], np.array([1.0, -1.0]) * np.sin(np.arctan(0.03)), atol=1e-6)
+    np.testing.assert_allclose(poses.rotation.apply([0.0, 1.0, 0.0])[:, 2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(poses.position[:, 2], 0.03 * station, atol=1e-9)
+
+
+def test_an_odometer_without_errors_reckons_the_true_path():
+    turn = np.linspace(0.0, 1.4 * np.pi, 60)  # past the wrap of the heading
+    step, rate = 0.2, turn[1]
+    chord = 2.0 * step / rate * np.sin(rate / 2.0)
+    moves = chord * np.stack([np.cos(turn[:-1] + rate / 2.0), np.sin(turn[:-1] + rate / 2.0)], axis=-1)
+    true = np.concatenate([[[0.0, 0.0]], np.cumsum(moves, axis=0)])
+    reading = np.column_stack([step * np.arange(60), np.arctan2(np.sin(turn), np.cos(turn))])
+    poses = reckoned_poses(trace_of(true, turn, turn), reading)
+    np.testing.assert_allclose(poses.position[:, :2], true, atol=2e-3 * step * 60)
+    np.testing.assert_allclose(poses.rotation.as_rotvec()[10, 2], turn[10], atol=1e-9)
+
+
+def test_without_noise_a_dense_scan_of_as_many_beams_is_the_tasks_own(trace):
+    _, params = st.make("Subterra/StopAtShort-v0", lidar=LidarParams(range_sigma=0.0))
+    some = dataclasses.replace(trace, state=jax.tree.map(lambda leaf: leaf[:20], trace.state))
+    some = dataclasses.replace(some, observation=trace.observation[:20])
+    exact = dense_scans(some, params, 16, seed=1)
+    assert np.std((trace.observation[:20, :16] - exact)[exact < 29.0]) == pytest.approx(0.05, rel=0.2)
+    every_third = dense_scans(some, params, BEAMS, seed=1)[:, :: BEAMS // 16]
+    np.testing.assert_allclose(every_third, exact, atol=2e-4)
+
+
+@pytest.mark.slow
+def test_a_sector_that_drops_out_is_as_wide_in_the_dense_scan():
+    env, params = st.make("Subterra/FaultedShort-v0", lidar=LidarParams(range_sigma=0.0))
+    begin = jax.jit(jax.vmap(lambda key: env.begin(env.draw_reset(key, (), params), params)))
+    states = begin(jax.random.split(jax.random.key(0), 2))
+    four = jnp.full(2, 4.0)
+    faults = dataclasses.replace(
+        states.faults, severity=0.0 * four, dropout_left=four, dropout_first=four, dropout_count=four
+    )
+    states = dataclasses.replace(states, faults=faults)
+    trace = Trace(jax.device_get(states), np.zeros((2, 18)), np.zeros((1, 2)), 0.1, False, False)
+    found = dense_scans(trace, params, 64, seed=0)
+    assert (found[:, 16:32] == 30.0).all()
+    assert (found[:, [8, 12]] < 30.0).all()
+
+
+@functools.cache
+def tube() -> Relief:
+    axis = surfaces.axis_of(30.0)
+    return Relief.from_triangles(Axis(**axis), Triangles(*surfaces.tube(axis, 2.0, 180, 31)))
+
+
+@pytest.mark.slow
+def test_a_cloud_in_a_tube_lies_on_it_with_the_sensors_noise_and_nothing_beyond_its_mouths():
+    poses = Poses(np.arange(3) * 0.1, np.array([[14.0 + k, 0.0, 0.0] for k in range(3)]), Rotation.identity(3))
+    ways = beams.vlp16(90)
+    found = np.stack(list(clouds(tube(), poses, poses.position[:, 0], ways, seed=5)))
+    across = np.hypot(ways[:, 1], ways[:, 2])
+    hit = np.isfinite(found)
+    # A beam reaches the tube after 2 m across; beyond half its length it has left through a mouth.
+    reach = 2.0 / np.maximum(across, 1e-9)
+    assert not hit[:, reach * np.abs(ways[:, 0]) > 17.0].any()
+    sure = reach * np.abs(ways[:, 0]) < 13.0
+    assert hit[:, sure].all()
+    error = found[:, sure] - reach[sure]
+    assert np.std(error) == pytest.approx(CLOUD_SIGMA, rel=0.1)
+    assert abs(np.mean(error)) < 2e-3
+    again = next(clouds(tube(), poses, poses.position[:, 0], ways, seed=5))
+    np.testing.assert_array_equal(again, found[0])
+
+
+def test_an_imu_on_a_circle_feels_the_turn_the_pull_inwards_and_gravity():
+    time, speed, rate = np.arange(0.0, 6.0, 0.1), 2.0, 0.3
+    radius = speed / rate
+    position = radius * np.stack([np.sin(rate * time), 1.0 - np.cos(rate * time), 0.0 * time], axis=-1)
+    poses = Poses(time, position, Rotation.from_rotvec(rate * time[:, None] * np.array([0.0, 0.0, 1.0])))
+    true = measure(poses, seed=0, noise=0.0)
+    inner = slice(20, -20)
+    np.testing.assert_allclose(true.gyro[inner], np.broadcast_to([0.0, 0.0, rate], true.gyro[inner].shape), atol=1e-6)
+    wanted = np.broadcast_to([0.0, speed * rate, GRAVITY], true.accel[inner].shape)
+    np.testing.assert_allclose(true.accel[inner], wanted, atol=2e-3)
+    noisy = measure(poses, seed=0)
+    assert 0.004 < np.std(noisy.gyro[:, 2] - true.gyro[:, 2]) < 0.006
+    np.testing.assert_array_equal(measure(poses, seed=0).accel, noisy.accel)
+
+
+def test_a_state_has_all_that_poses_need():
+    assert {field.name for field in dataclasses.fields(Places)} <= {field.name for field in dataclasses.fields(State)}
