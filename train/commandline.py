@@ -12,6 +12,7 @@ from train import cluster, policies
 from train.cluster import Cluster
 from train.config import PPOConfig, make_config
 from train.errors import ConfigError
+from train.legs import Legs
 from train.recurrent import config as recurrent_config
 from train.recurrent import distill_config
 from train.recurrent.config import RecurrentConfig
@@ -19,6 +20,9 @@ from train.recurrent.distill_config import DistillConfig
 
 _DEFAULT_TASK = "Subterra/TraverseShort-v0"
 _MEMORIES = ("none", "gru")
+_DESCRIPTION = """Trains a navigation policy; defaults follow from `--task`, `--memory`, `--teacher` and `--preset`.
+
+python -m train.navigate --task Subterra/StopAtShort-v0 --memory gru --teacher oracle --out out/stop"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,16 +33,19 @@ class Command:
         out: Run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json.
         task: Task id.
         tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, `procedural:train:7`,
-            or of several `procedural:train:0-255`, of which each episode draws one.
+            `procedural:train:0-255`, of which each episode draws one.
         lining: Variant of the walls; `pockets` if left out, or the first where a tunnel has none.
-        memory: `none`: a perceptron over a few observations. `gru`: a network that remembers, with an estimation head;
-            with `--teacher oracle` (any baseline, policy file or run folder) it learns from a teacher, else by reward.
+        memory: `none`: a perceptron over a few observations. `gru`: a network that remembers; it learns by reward, or
+            with `--teacher oracle` (any baseline, policy file or run folder) from a teacher.
         preset: `cpu` or `gpu`; what jax runs on if left out.
-        seeds: Train these seeds at once, into `out/seed-<k>`, and draw them together; one run of `--seed` if left out.
-        resume: Go on from the checkpoint in `out`; only the limits on training may differ.
+        seeds: Train these seeds at once, into `out/seed-<k>`, and draw them together.
+        resume: Go on from the checkpoint in `out`.
         overwrite: Throw away the run that `out` holds.
-        tensorboard: Write the log for TensorBoard as well, into `out/tensorboard`.
+        tensorboard: Write the log for TensorBoard as well.
         evaluation_episodes: Episodes of the evaluation after training, the first of the task's 500.
+        embodiment: `scout`, the round robot of the tasks; or `b2`: learnt on a planar robot that obeys as late as the
+            walking one does, then tried on four legs.
+        legs: The trial of `--embodiment b2`.
         cluster: Other processes to train with.
         config: Settings of PPO.
     """
@@ -54,6 +61,8 @@ class Command:
     overwrite: bool = False
     tensorboard: bool = False
     evaluation_episodes: int = 200
+    embodiment: Literal["scout", "b2"] = "scout"
+    legs: Legs = dataclasses.field(default_factory=Legs)
     cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Cluster)
     config: Annotated[PPOConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=PPOConfig)
 
@@ -94,7 +103,14 @@ def parse(arguments: list[str]) -> Command:
     cluster.join(Cluster(named.coordinator, named.processes, named.process))
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
     default = _default(named.task, named.memory, named.teacher, preset)
-    return tyro.cli(type(default), args=arguments, default=default, prog="python -m train.navigate")
+    return tyro.cli(
+        type(default),
+        args=arguments,
+        default=default,
+        prog="python -m train.navigate",
+        description=_DESCRIPTION,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
 
 
 def _default(task: str, memory: str, teacher: str | None, preset: str) -> Command:

@@ -6,6 +6,7 @@ that end at a goal, success against episodes and against steps.
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import tyro
 
 from train import cli
+from train.arguments import parse
 from train.episodes import WINDOW
 from train.errors import RunFolderError
 from train.log import EPISODES
@@ -149,7 +151,11 @@ def command(arguments: Command) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.curve`."""
-    cli.run(lambda: command(tyro.cli(Command)))
+    cli.run(lambda: command(parse(_read, sys.argv[1:])))
+
+
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m train.curve", description=__doc__)
 
 
 if __name__ == "__main__":

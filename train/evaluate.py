@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from subterra_jax.policies.files import TENSORS
 from subterra_jax.policies.loading import Agent
 from train import cli, policies
 from train.agents import agent_of
+from train.arguments import parse
 from train.errors import ConfigError
 from train.policies import World
 
@@ -129,7 +131,11 @@ def command(arguments: Command) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.evaluate`."""
-    cli.run(lambda: command(tyro.cli(Command)))
+    cli.run(lambda: command(parse(_read, sys.argv[1:])))
+
+
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m train.evaluate", description=__doc__)
 
 
 if __name__ == "__main__":

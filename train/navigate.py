@@ -10,7 +10,7 @@ import time
 
 import jax
 
-from train import cli, cluster, policies, ppo, seeds
+from train import arguments, cli, cluster, policies, ppo, seeds
 from train.commandline import Command, parse
 from train.errors import ConfigError
 from train.evaluate import check_episodes
@@ -30,15 +30,24 @@ def command(arguments: Command) -> int:
     checked(config)
     check_episodes(arguments.evaluation_episodes, "evaluation_episodes")
     seeds.check(arguments.seeds)
-    world = policies.open_world(arguments.task, arguments.tunnel, arguments.lining)
+    world = _world(arguments)
     if arguments.seeds:
         return _several(arguments, world)
     session = Session(arguments.out, world, make_learner(world, config), tensorboard=arguments.tensorboard)
     snapshot = session.folder.begin(resume=arguments.resume, overwrite=arguments.overwrite)
-    return _single(session, snapshot, arguments.evaluation_episodes)
+    return _single(session, snapshot, arguments)
 
 
-def _single(session: Session, snapshot: Snapshot | None, episodes: int) -> int:
+def _world(arguments: Command) -> policies.World:
+    """The task, for the robot that is to do it."""
+    if arguments.embodiment == "scout":
+        return policies.open_world(arguments.task, arguments.tunnel, arguments.lining)
+    from train import embodied  # MuJoCo is loaded only where legs are meant
+
+    return embodied.open_world(arguments.task, arguments.tunnel, arguments.lining, arguments.legs)
+
+
+def _single(session: Session, snapshot: Snapshot | None, arguments: Command) -> int:
     started, config, world = time.perf_counter(), session.learner.config, session.world
     session.open(snapshot)
     bar = Bar(config.steps, snapshot.iteration * config.steps_per_iteration if snapshot else 0)
@@ -63,7 +72,11 @@ def _single(session: Session, snapshot: Snapshot | None, episodes: int) -> int:
             return cli.EXIT_INTERRUPTED
     if not cluster.leads():
         return 0
-    session.score(last, episodes)
+    session.score(last, arguments.evaluation_episodes)
+    if arguments.embodiment == "b2" and arguments.legs.robots:
+        from train import embodied
+
+        embodied.score(session, last, arguments.tunnel, arguments.legs)
     _tell(last, time.perf_counter() - started)
     return 0
 
@@ -98,7 +111,7 @@ def _tell(snapshot: Snapshot, seconds: float) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.navigate`."""
-    cli.run(lambda: command(parse(sys.argv[1:])))
+    cli.run(lambda: command(arguments.parse(parse, sys.argv[1:])))
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ def train(
     learner: Trainable | None = None,
     snapshot: Snapshot | None = None,
     watch: Watcher | None = None,
+    deterministic: bool = True,
 ) -> Snapshot:
     """Trains until the goal has held for long enough, or the steps are used up.
 
@@ -44,6 +45,7 @@ def train(
         learner: Made of the same three; one without memory is built here if left out.
         snapshot: Where to go on from; its state is used up. The beginning if left out.
         watch: Called after every iteration; training ends early if it returns True.
+        deterministic: Whether one seed is to give one result on a GPU as well.
 
     Returns:
         The last snapshot. Its `policy` is the best one, which need not be the last.
@@ -60,7 +62,8 @@ def train(
         return snapshot
     params = learner.share(params)
     began = time.perf_counter()
-    iterate = jax.jit(learner.iterate, donate_argnums=0).lower(snapshot.state, params).compile(compiling.options())
+    options = compiling.options() if deterministic else None
+    iterate = jax.jit(learner.iterate, donate_argnums=0).lower(snapshot.state, params).compile(options)
     compiled = time.perf_counter()
     while not finished(snapshot, config):
         before = time.perf_counter()

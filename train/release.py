@@ -6,6 +6,7 @@ Two files come of it, tensors and facts, which `subterra_jax.policies` loads wit
 import dataclasses
 import hashlib
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from safetensors.numpy import save
 from subterra_jax.policies.files import FACTS, SCHEMA, TENSORS
 from train import cli, policies
 from train.agents import agent_of, tensors_of
+from train.arguments import parse
 from train.errors import ConfigError, RunFolderError
 from train.evaluate import evaluate
 
@@ -96,7 +98,11 @@ def command(arguments: Command) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.release`."""
-    cli.run(lambda: command(tyro.cli(Command)))
+    cli.run(lambda: command(parse(_read, sys.argv[1:])))
+
+
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m train.release", description=__doc__)
 
 
 if __name__ == "__main__":

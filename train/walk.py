@@ -128,7 +128,15 @@ def _one(arguments: Command, world: World, config: WalkConfig, out: Path) -> boo
             return interrupt.wanted
 
         try:
-            last = ppo.train(world.env, world.params, config, learner=session.learner, snapshot=snapshot, watch=watch)
+            last = ppo.train(
+                world.env,
+                world.params,
+                config,
+                learner=session.learner,
+                snapshot=snapshot,
+                watch=watch,
+                deterministic=config.deterministic,
+            )
         finally:
             bar.close()
             session.close()

@@ -8,7 +8,12 @@ from train.config import PPOConfig, known_preset
 
 @dataclasses.dataclass(frozen=True)
 class WalkConfig(PPOConfig):
-    """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms."""
+    """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms.
+
+    Attributes:
+        deterministic: One seed gives one result on a GPU as well. MJX adds up by scattering, which a GPU then does one
+            after the other; two runs of one seed part otherwise.
+    """
 
     steps: int = 150_000_000
     n_envs: int = 8192
@@ -26,6 +31,7 @@ class WalkConfig(PPOConfig):
     hidden: tuple[int, ...] = (512, 256, 128)
     frames: int = 1
     checkpoint_every: int = 100
+    deterministic: bool = False
 
     # Pushes and commands make the rolling hundred too noisy to choose by.
     KEEPS_BEST: ClassVar[bool] = False

@@ -76,11 +76,18 @@ def draw(run: Path) -> None:
     first = records[0] if records else {}
     names = sorted(name for name in first if name.startswith("reward_") and name != "reward_scale")
     figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4), layout="constrained")
-    for name in names:
-        left.plot(steps, [record[name] * 50.0 for record in records], label=name.removeprefix("reward_"), linewidth=1)
+    colours = pyplot.get_cmap("tab20")(np.arange(len(names)))  # there are more terms than usual colours
+    for name, colour in zip(names, colours, strict=True):
+        left.plot(
+            steps,
+            [record[name] * 50.0 for record in records],
+            label=name.removeprefix("reward_"),
+            color=colour,
+            linewidth=1,
+        )
     right.plot(steps, [record["length_mean_100"] for record in records], linewidth=1)
     left.set(xlabel="control periods, millions", ylabel="reward a second")
     right.set(xlabel="control periods, millions", ylabel="length of the last 100 episodes")
-    left.legend(fontsize=7, ncols=2)
+    left.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(run / FIGURE, dpi=110, metadata={"Software": None})
     pyplot.close(figure)

@@ -18,7 +18,15 @@ from train.recurrent.distill_config import DistillConfig, check, make_config
 
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = DistillConfig(steps=512, n_envs=4, unroll=32, minibatches=2, hidden=8, bins=9)
-SMALL = ("--n-envs=16", "--unroll=64", "--minibatches=2", "--hidden=16", "--bins=9", "--learning-rate=0.005", "--handover=1")
+SMALL = (
+    "--n-envs=16",
+    "--unroll=64",
+    "--minibatches=2",
+    "--hidden=16",
+    "--bins=9",
+    "--learning-rate=0.005",
+    "--handover=1",
+)
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +122,7 @@ def test_a_student_comes_closer_to_its_teacher_and_goes_on_after_a_kill_to_the_s
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_a_student_learns_to_stop_within_a_quarter_of_a_metre(tmp_path):
-    line = ("--task", TASK, "--memory", "gru", "--teacher", "oracle", "--preset", "cpu", "--steps=3000000")
-    assert call(navigate.main, *line, "--out", str(tmp_path / "run"), "--evaluation-episodes=200") == 0
+    line = ("--task", TASK, "--memory", "gru", "--teacher", "oracle", "--preset", "cpu")
+    assert call(navigate.main, *line, "--out", str(tmp_path / "run"), "--evaluation-episodes=500") == 0
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
-    assert found["success"] > 0.8  # dead reckoning: 0.28
+    assert found["success"] >= 0.98  # dead reckoning: 0.28

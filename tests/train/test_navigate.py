@@ -9,7 +9,7 @@ import time
 import pytest
 
 from tests.train.conftest import SMALL, TASK, call
-from train import checkpoint, curve, navigate
+from train import checkpoint, curve, evaluate, navigate
 
 
 def test_a_run_folder_holds_everything(trained):
@@ -21,6 +21,7 @@ def test_a_run_folder_holds_everything(trained):
         "curve.png",
         "episodes.csv",
         "evaluation.json",
+        "log.csv",
         "log.jsonl",
     }
     config = json.loads((trained / "config.json").read_text())
@@ -85,13 +86,20 @@ def test_a_run_resumes_only_as_what_it_was(trained, train_small, capsys, argumen
     assert message in capsys.readouterr().err
 
 
-def test_a_truncated_checkpoint_is_a_clear_error_when_resumed(trained, train_small, tmp_path, capsys):
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a thread of the storage library's
+@pytest.mark.parametrize("victim", ["facts", "arrays"])
+def test_a_truncated_checkpoint_is_one_sentence_when_resumed_or_scored(trained, train_small, tmp_path, capsys, victim):
     shutil.copytree(trained, tmp_path / "run")
-    facts = checkpoint.load(tmp_path / "run").path / checkpoint.FACTS
-    facts.write_bytes(facts.read_bytes()[:100])
+    place = checkpoint.load(tmp_path / "run").path
+    arrays = (path for path in (place / checkpoint.ARRAYS).rglob("*") if path.is_file())
+    path = place / checkpoint.FACTS if victim == "facts" else max(arrays, key=lambda path: path.stat().st_size)
+    path.write_bytes(path.read_bytes()[:100])
     status, _ = train_small("--resume", out=tmp_path / "run")
     assert status == 2
-    assert "damaged checkpoint" in capsys.readouterr().err
+    assert call(evaluate.main, "--policy", str(tmp_path / "run")) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 2
+    assert all(str(place) in error and "damaged checkpoint" in error for error in errors)
 
 
 def test_ctrl_c_saves_the_checkpoint_and_exits_with_130(tunnel, tmp_path):

@@ -11,7 +11,7 @@ import subterra_jax as st
 from tests.train.conftest import call, log_without_timing
 from train import checkpoint, navigate
 from train.errors import ConfigError
-from train.recurrent import curriculum
+from train.recurrent import curriculum, estimation
 from train.recurrent.config import RecurrentConfig, check, make_config
 from train.recurrent.layout import make_layout
 from train.recurrent.learner import RecurrentLearner
@@ -20,12 +20,6 @@ from train.recurrent.network import RecurrentNetworks
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = RecurrentConfig(steps=512, n_envs=8, unroll=32, minibatches=2, epochs=1, hidden=8, bins=9)
 SMALL = ("--n-envs=8", "--unroll=32", "--minibatches=2", "--epochs=1", "--hidden=8", "--bins=9")
-
-
-@pytest.fixture(scope="module")
-def learner():
-    env, params = st.make(TASK)
-    return RecurrentLearner(env, params, CONFIG)
 
 
 def test_memory_begins_anew_with_every_episode_and_goes_on_between_unrolls():
@@ -44,10 +38,10 @@ def test_memory_begins_anew_with_every_episode_and_goes_on_between_unrolls():
     assert np.abs(anew[0] - last[0]).max() > 1e-3
 
 
-def test_an_error_between_two_bins_is_shared_between_them(learner):
+def test_an_error_between_two_bins_is_shared_between_them():
     # Nine bins of 0.25 m about 0: the fifth has its middle at 0.
     logits = jnp.log(jnp.arange(1.0, 10.0) / 45.0)
-    missed = learner._missed(jnp.tile(logits, (3, 1)), jnp.array([0.0, 0.0625, -99.0]))
+    missed = estimation.missed(jnp.tile(logits, (3, 1)), jnp.array([0.0, 0.0625, -99.0]), 0.25)
     wanted = [np.log(45.0 / 5.0), 0.75 * np.log(45.0 / 5.0) + 0.25 * np.log(45.0 / 6.0), np.log(45.0)]
     np.testing.assert_allclose(missed, wanted, atol=2e-3)
 

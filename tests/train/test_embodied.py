@@ -1,0 +1,67 @@
+"""Navigation for the B2: what is learnt on, what is refused before anything is compiled, and the trial on legs."""
+
+import json
+
+import numpy as np
+import pytest
+
+from subterra_jax.b2 import missions
+from subterra_jax.b2.surrogate import Lag, LaggedEnv
+from subterra_jax.policies import PolicyError
+from train import embodied, navigate
+from train.commandline import parse
+from train.errors import ConfigError
+from train.legs import Legs
+
+SHORT = "Subterra/TraverseShort-v0"
+NO_TRIAL = Legs(robots=0)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return embodied.open_world(SHORT, None, None, NO_TRIAL)
+
+
+def test_the_stand_in_is_told_what_the_legs_are_told_and_obeys_as_late(world):
+    mission, params = missions.make(policy="trot")
+    assert isinstance(world.env, LaggedEnv)
+    assert world.env.lag == Lag()
+    assert world.facts["embodiment"] == "b2"
+    bounds, legs = world.env.action_space(world.params), mission.action_space(params)
+    np.testing.assert_array_equal(bounds.high, legs.high)
+    assert world.env.observation_size(world.params) == mission.observation_size(params)
+    assert float(world.params.vehicle.period) == float(params.vehicle.period)
+    assert float(world.params.start.station) == float(params.start.station)
+
+
+def test_the_scout_is_who_drives_unless_told_otherwise():
+    assert parse(["--out", "x"]).embodiment == "scout"
+    asked = parse(["--out", "x", "--embodiment", "b2", "--legs.gait", "trot", "--legs.robots", "3"])
+    assert asked.embodiment == "b2"
+    assert asked.legs == Legs(gait="trot", robots=3)
+
+
+@pytest.mark.parametrize(
+    ("task", "tunnel", "legs", "error", "said"),
+    [
+        ("Subterra/StopAt-v0", None, NO_TRIAL, ConfigError, "does not do 'Subterra/StopAt-v0'"),
+        (SHORT, None, Legs(gait="nobody"), PolicyError, "nobody: no such policy"),
+        (SHORT, None, Legs(robots=-1), ConfigError, "robots must not be negative, got -1"),
+        (SHORT, "procedural:train:0-1", NO_TRIAL, ConfigError, "the B2 walks one"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_a_sentence(task, tunnel, legs, error, said):
+    with pytest.raises(error, match=said):
+        embodied.open_world(task, tunnel, None, legs)
+
+
+@pytest.mark.slow
+def test_a_policy_learnt_on_the_stand_in_drives_robots_on_legs(tmp_path):
+    out = tmp_path / "run"
+    words = ["--out", str(out), "--embodiment", "b2", "--task", SHORT, "--steps", "600000"]
+    asked = parse([*words, "--legs.robots", "4", "--legs.engine", "mujoco", "--evaluation-episodes", "50"])
+    assert navigate.command(asked) == 0
+    told = json.loads((out / embodied.ON_LEGS).read_text())
+    assert told["robots"] == 4
+    assert told["success_percent"] == 100.0
+    assert told["fall_percent"] == 0.0
