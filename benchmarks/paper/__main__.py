@@ -1,0 +1,175 @@
+"""Makes the paper's figures at print size; what is made is not made again."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from benchmarks.fidelity.errors import FidelityError
+from benchmarks.fidelity.filehash import file_hash
+from benchmarks.paper import bore_view, learning, occupancy, pipeline, sheet, steps
+from benchmarks.paper.errors import PaperError
+from benchmarks.paper.material import Material, read_truth
+from benchmarks.paper.sheet import Drawing
+from scene.arguments import parse
+from scene.errors import SubterraError as SceneError
+from scene.files import require_output_folder
+from subterra_jax.errors import SubterraError
+
+OF_A_SURVEY: dict[int, Callable[[Material], Drawing]] = {1: bore_view.draw, 2: pipeline.draw, 3: occupancy.draw}
+LEARNING = 4
+_LIBRARIES = ("matplotlib", "mujoco", "numpy", "jax")
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """Figures 1 to 4 of the paper as PDF and PNG, each with its data (CSV) and where it comes from (JSON).
+
+    Example: python -m benchmarks.paper --out out/figures
+
+    Attributes:
+        out: Folder to write. What is made in it is not made again.
+        figures: Which: 1 recording and bore, 2 pipeline, 3 occupancy, 4 learning curves.
+        length: Of the survey that is simulated where none is given, m.
+        seed: Of that survey.
+        survey: Folder of a survey with `survey.bag`, `survey_os1.bag` and their trajectories, instead.
+        scene: Scene folder built from it, instead of building it.
+        runs: Folder with the run folders `seed-*` of `train.navigate` on T0, instead of training five seeds.
+        provenance: Printed below figures 1 to 3; read from the scene's manifest if left out.
+    """
+
+    out: Path = Path("out/figures")
+    figures: tuple[int, ...] = (1, 2, 3, 4)
+    length: float = 60.0
+    seed: int = 0
+    survey: Path | None = None
+    scene: Path | None = None
+    runs: Path | None = None
+    provenance: str | None = None
+
+
+def check(config: PaperConfig) -> None:
+    """Refuses what cannot be drawn.
+
+    Raises:
+        PaperError: There is no such figure, or what is given does not go together.
+    """
+    known = (*OF_A_SURVEY, LEARNING)
+    for number in config.figures:
+        if number not in known:
+            raise PaperError(f"no figure {number}; there are {', '.join(map(str, known))}")
+    if config.scene is not None and config.survey is None:
+        raise PaperError(f"scene {config.scene} needs the survey that it was built from: which of its LiDARs held out?")
+    for path in (config.survey, config.scene, config.runs):
+        if path is not None and not path.is_dir():
+            raise PaperError(f"{path}: no such folder")
+    require_output_folder(config.out)
+
+
+def make(config: PaperConfig) -> None:
+    """Makes what is missing, step by step.
+
+    Raises:
+        SubterraError: A step failed, or an input is missing or broken.
+    """
+    check(config)
+    config.out.mkdir(parents=True, exist_ok=True)
+    material = None
+    if set(config.figures) & set(OF_A_SURVEY) or config.runs is None:
+        material = _surveyed(config)
+    with sheet.style():
+        for number in config.figures:
+            if number == LEARNING:
+                _learning(config, material)
+            elif material is not None:
+                inputs = _hashes([material.scene / "manifest.json", material.survey / "groundtruth_os1.tum"])
+                draw = partial(OF_A_SURVEY[number], material)
+                _figure(config, number, _provenance(config, material), inputs, draw)
+
+
+def _surveyed(config: PaperConfig) -> Material:
+    """The survey and its scene, once they are there."""
+    survey, scene = config.survey or config.out / "survey", config.scene or config.out / "scene"
+    if config.survey is None:
+        steps.make(steps.survey_step(survey, config.length, config.seed))
+    if config.scene is None:
+        name = survey.name if config.survey else f"subterra-{config.length:g}"
+        provenance = "simulated" if read_truth(survey) else "measured"
+        steps.make(steps.scene_step(scene, survey, name, provenance))
+    material = Material(survey, scene)
+    material.check()
+    return material
+
+
+def _learning(config: PaperConfig, material: Material | None) -> None:
+    folder = config.runs or config.out / "training"
+    if config.runs is None and material is not None:
+        steps.make(steps.training_step(folder, material.scene))
+    runs = learning.find_runs(folder)
+    inputs = _hashes([run / name for run in runs for name in ("config.json", "episodes.csv")])
+    _figure(config, LEARNING, learning.provenance(runs), inputs, partial(learning.draw, runs))
+
+
+def _figure(
+    config: PaperConfig, number: int, provenance: str, inputs: dict[str, str], draw: Callable[[], Drawing]
+) -> None:
+    """Draws one figure unless it is there, of the same inputs and code."""
+    name = f"fig{number}"
+    told = {
+        "provenance": provenance,
+        "inputs": inputs,
+        "versions": {library: version(library) for library in _LIBRARIES},
+    }
+    key = sha256(json.dumps([number, told, sheet.code_hash()], sort_keys=True).encode()).hexdigest()
+    if sheet.is_made(config.out, name, key):
+        print(f"figure {number}: {config.out / name}.pdf is there", flush=True)
+        return
+    print(f"figure {number}: drawing", flush=True)
+    sheet.save(draw(), config.out, name, {**told, "key": key})
+    print(f"figure {number}: {config.out / name}.pdf", flush=True)
+
+
+def _provenance(config: PaperConfig, material: Material) -> str:
+    """One line: what the survey is, and that a simulated one is."""
+    if config.provenance is not None:
+        return config.provenance
+    if not material.simulated:
+        return f"Survey {material.survey.name}, {material.manifest.get('input_provenance')}."
+    facts = read_truth(material.survey)
+    told = f"{facts['truth']}, {facts['length']:g} m, seed {facts['seed']}; python -m scene.survey" if facts else ""
+    return f"Simulated survey ({told or material.survey.name}); no real recording."
+
+
+def _hashes(paths: list[Path]) -> dict[str, str]:
+    """SHA-256 of files by their last two names."""
+    found: dict[str, Any] = {}
+    for path in paths:
+        if not path.exists():
+            raise PaperError(f"{path}: no such file")
+        found[f"{path.parent.name}/{path.name}"] = file_hash(path)
+    return found
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point: 0 once every figure is there, 2 for a user's mistake, 130 after Ctrl-C."""
+    config = parse(lambda words: tyro.cli(PaperConfig, args=words, prog="python -m benchmarks.paper"), args)
+    try:
+        make(config)
+    except (SubterraError, SceneError, FidelityError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+"""Fig. 4: coverage and success of the last hundred episodes against finished episodes, over seeds."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks.fidelity.figures.style import BLUE, INK, ORANGE
+from benchmarks.paper.errors import PaperError
+from benchmarks.paper.sheet import COLUMN, Drawing
+from train.curve import GOAL, read_episodes, rolling
+from train.episodes import WINDOW
+
+_COLOURS = {"coverage": BLUE, "success": ORANGE}
+_MOST_POINTS = 1500  # of a line in the figure: more than its dots in print
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """Run folders `seed-*` of a folder, by their number.
+
+    Raises:
+        PaperError: There is none.
+    """
+    runs = [path for path in folder.glob("seed-*") if path.name[5:].isdigit() and (path / "config.json").exists()]
+    if not runs:
+        raise PaperError(f"{folder}: holds no run folders seed-0, seed-1, ... of train.navigate")
+    return sorted(runs, key=lambda path: int(path.name[5:]))
+
+
+def task_of(runs: list[Path]) -> str:
+    """The task that all runs are of.
+
+    Raises:
+        PaperError: They are of several, or of one whose curve is not coverage.
+    """
+    tasks = [str(read_config(run).get("task")) for run in runs]
+    for run, task in zip(runs, tasks, strict=True):
+        if task != tasks[0]:
+            raise PaperError(f"{run}: is a run of {task}, but {runs[0].name} of {tasks[0]}")
+    if "Traverse" not in tasks[0]:
+        raise PaperError(f"{runs[0].parent}: its runs are of {tasks[0]}; the figure shows coverage, that is T0")
+    return tasks[0]
+
+
+def provenance(runs: list[Path]) -> str:
+    """What was learnt, in which tunnel, on what."""
+    first = read_config(runs[0])
+    tunnel = f"{first.get('tunnel')} ({first.get('tunnel_provenance', 'no')} survey)"
+    device = str(first.get("device")).rpartition(": ")[2]
+    return f"train.navigate, {first.get('task')} in {tunnel}, {len(runs)} seeds, on {device}."
+
+
+def read_config(run: Path) -> dict[str, Any]:
+    """A run's `config.json`.
+
+    Raises:
+        PaperError: It cannot be read.
+    """
+    try:
+        return dict(json.loads((run / "config.json").read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        raise PaperError(f"{run / 'config.json'}: cannot be read ({error})") from error
+
+
+def draw(runs: list[Path]) -> Drawing:
+    """A thin line a seed, the mean and one standard deviation about it.
+
+    Raises:
+        PaperError: The runs are not of one task, it is not T0, or no episode finished.
+        RunFolderError: One of them cannot be read.
+    """
+    facts: dict[str, Any] = {"task": task_of(runs), "runs": [run.name for run in runs]}
+    episodes = [read_episodes(run) for run in runs]
+    shortest = min(len(one["episode"]) for one in episodes)
+    if not shortest:
+        raise PaperError(f"{runs[0].parent}: one of its runs finished no episode")
+    figure, panels = plt.subplots(2, 1, figsize=(COLUMN, 3.3), sharex=True, layout="constrained")
+    columns: dict[str, np.ndarray] = {"episode": np.arange(1, shortest + 1)}
+    for axes, name in zip(panels, _COLOURS, strict=True):
+        table = np.stack([rolling(one[name])[:shortest] for one in episodes])
+        mean, spread = table.mean(axis=0), table.std(axis=0, ddof=min(1, len(table) - 1))
+        columns |= {f"{name}_{run.name}": row for run, row in zip(runs, table, strict=True)}
+        columns |= {f"{name}_mean": mean, f"{name}_sd": spread}
+        _panel(axes, name, 100.0 * table, 100.0 * mean, 100.0 * spread)
+        facts[f"{name}_last"] = {"mean": float(mean[-1]), "sd": float(spread[-1])}
+    panels[1].set_xlabel("finished episodes")
+    facts["first_at_goal"] = _first_at_goal(columns["coverage_mean"])
+    return Drawing(figure, _caption(facts, len(runs), shortest), columns, facts)
+
+
+def _panel(axes: Any, name: str, table: Float[np.ndarray, "s n"], mean: np.ndarray, spread: np.ndarray) -> None:
+    n = table.shape[1]
+    few = np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).round().astype(int))
+    episode, colour = few + 1, _COLOURS[name]
+    for k, row in enumerate(table):
+        axes.plot(episode, row[few], color="0.6", lw=0.5, label=None if k else "one seed", zorder=2)
+    low, high = np.clip(mean - spread, 0.0, 100.0), np.clip(mean + spread, 0.0, 100.0)
+    axes.fill_between(episode, low[few], high[few], color=colour, alpha=0.3, lw=0.0, label="± sd", zorder=1)
+    axes.plot(episode, mean[few], color=colour, lw=1.4, label="mean", zorder=3)
+    if name == "coverage":
+        axes.axhline(100.0 * GOAL, color=INK, lw=0.8, ls="--", label=f"{100 * GOAL:.0f} % goal", zorder=4)
+    axes.set(ylabel=f"{name}, %\n(mean of the last {WINDOW})", ylim=(-3.0, 104.0), xlim=(0, n))
+    axes.set_yticks((0, 25, 50, 75, 100))
+    axes.grid(alpha=0.25, lw=0.4)
+    axes.legend(loc="lower right", frameon=False, handlelength=1.6)
+
+
+def _first_at_goal(mean: Float[np.ndarray, " n"]) -> int | None:
+    """First full hundred whose mean coverage over seeds is at the goal."""
+    there = np.flatnonzero(mean[WINDOW - 1 :] >= GOAL)
+    return int(there[0]) + WINDOW if len(there) else None
+
+
+def _caption(facts: dict[str, Any], n_runs: int, shortest: int) -> str:
+    last = {name: facts[f"{name}_last"] for name in _COLOURS}
+    told = ", ".join(f"{name} {100 * one['mean']:.2f} ± {100 * one['sd']:.2f} %" for name, one in last.items())
+    reached = facts["first_at_goal"]
+    when = (
+        f"Mean coverage reaches {100 * GOAL:.0f} % after {reached} episodes" if reached else "The goal is not reached"
+    )
+    return (
+        f"Learning curves of PPO on {facts['task']}: coverage and success of the last {WINDOW} episodes, mean ± "
+        f"standard deviation over {n_runs} seeds. {when}; after {shortest}: {told}."
+    )

@@ -1,0 +1,127 @@
+"""What has to be there before figures can be drawn: survey, scene, training; each made once."""
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.fidelity.filehash import file_hash
+from benchmarks.fidelity.store import write_json
+from benchmarks.paper.errors import PaperError
+
+TASK = "Subterra/TraverseShort-v0"
+SEEDS = (0, 1, 2, 3, 4)
+SURVEY_FILES = ("survey.bag", "groundtruth.tum", "survey_os1.bag", "groundtruth_os1.tum")
+SCENE_FILES = ("scene.xml", "bore.npz", "tunnel.npz", "cloud.ply", "manifest.json")
+_RUN_FILES = ("config.json", "episodes.csv")
+_INTERRUPTED = 130  # what every command of the project ends with after Ctrl-C
+_MARK = "subterra.figure-step/1"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command that leaves a folder.
+
+    Attributes:
+        name: For people.
+        words: After `python -m`.
+        out: The folder.
+        files: Below it, that must be there for the step to be done.
+        inputs: Files that decide what comes out: where one changes, the step is done again.
+        again: Words that are added where an earlier run of the same words did not end.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    out: Path
+    files: tuple[str, ...]
+    inputs: tuple[Path, ...] = ()
+    again: tuple[str, ...] = ()
+
+    @property
+    def mark(self) -> Path:
+        """Says with which words the folder was made, and whether that came to its end."""
+        return self.out.parent / f"{self.out.name}.step.json"
+
+
+def survey_step(out: Path, length: float, seed: int) -> Step:
+    """The simulated survey on the real metro's alignment, with the OS1 that is held out beside the Avia."""
+    words = f"scene.survey --truth metro --length {length:g} --seed {seed} --sensors avia os1 --scan-every 10 --out"
+    return Step("survey", (*words.split(), str(out)), out, SURVEY_FILES)
+
+
+def scene_step(out: Path, survey: Path, name: str, provenance: str) -> Step:
+    """The scene, from the Avia alone."""
+    given = ("--trajectory", str(survey / "groundtruth.tum"), "--provenance", provenance, "--name", name)
+    words = ("scene.build", str(survey / "survey.bag"), *given, "--out", str(out))
+    return Step("scene", words, out, SCENE_FILES, inputs=(survey / "groundtruth.tum",))
+
+
+def training_step(out: Path, scene: Path) -> Step:
+    """Five seeds of T0 in the reconstructed bore."""
+    seeds = tuple(str(seed) for seed in SEEDS)
+    words = ("--task", TASK, "--tunnel", str(scene / "tunnel.npz"), "--seeds", *seeds, "--preset", "cpu")
+    files = ("seeds.json", *(f"seed-{seed}/{file}" for seed in SEEDS for file in _RUN_FILES))
+    made_of = (scene / "tunnel.npz",)
+    return Step("training", ("train.navigate", *words, "--out", str(out)), out, files, made_of, again=("--resume",))
+
+
+def done(step: Step) -> bool:
+    """Whether the step came to its end with the same words, and its files are still there."""
+    return _marked(step) == "done" and all((step.out / file).exists() for file in step.files)
+
+
+def make(step: Step) -> None:
+    """Runs a step that is not done; its own progress goes to this process's stderr.
+
+    Raises:
+        PaperError: It failed.
+        KeyboardInterrupt: It was interrupted.
+    """
+    if done(step):
+        print(f"{step.name}: {step.out} is there", flush=True)
+        return
+    began = _marked(step) == "begun"
+    words = (*step.words, *(step.again if began and _can_resume(step) else _afresh(step)))
+    print(f"{step.name}: python -m {' '.join(words)}", flush=True)
+    step.out.parent.mkdir(parents=True, exist_ok=True)
+    _write_mark(step, "begun")
+    started = time.monotonic()
+    status = subprocess.run([sys.executable, "-m", *words], stdout=sys.stderr, check=False).returncode
+    if status == _INTERRUPTED:
+        raise KeyboardInterrupt
+    missing = [file for file in step.files if not (step.out / file).exists()]
+    if status or missing:
+        why = f"ended with status {status}" if status else f"left no {missing[0]}"
+        raise PaperError(f"{step.out}: python -m {words[0]} {why}")
+    _write_mark(step, "done")
+    print(f"{step.name}: {time.monotonic() - started:.0f} s", flush=True)
+
+
+def _afresh(step: Step) -> tuple[str, ...]:
+    """Training refuses to write over another run unless told."""
+    return ("--overwrite",) if step.again else ()
+
+
+def _can_resume(step: Step) -> bool:
+    return all((step.out / f"seed-{seed}" / "checkpoint").exists() for seed in SEEDS)
+
+
+def _marked(step: Step) -> str | None:
+    """`begun` or `done` where the mark is of the same words and inputs."""
+    try:
+        mark = json.loads(step.mark.read_text())
+        same = mark["words"] == list(step.words) and mark["inputs"] == _hashes(step)
+        return str(mark["state"]) if same else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _write_mark(step: Step, state: str) -> None:
+    write_json(step.mark, {"schema": _MARK, "state": state, "words": list(step.words), "inputs": _hashes(step)})
+
+
+def _hashes(step: Step) -> dict[str, str]:
+    return {path.name: file_hash(path) for path in step.inputs if path.exists()}
