@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 export XLA_PYTHON_CLIENT_PREALLOCATE ?= false
 
-.PHONY: demo test test-slow lint setup tunnels clean help
+.PHONY: demo test test-slow reproduce figures docs lint setup tunnels clean help
 
 help:            ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## */\t/' | expand -t 16
@@ -18,6 +18,15 @@ test: lint       ## linter, type checker, and every test that is not marked slow
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	XLA_FLAGS=" " $(BIN)/python -m pytest -m slow
+
+reproduce: $(STAMP)  ## the README's numbers again, those that a CPU can, about 45 minutes; says which differ
+	$(BIN)/python -m benchmarks.reproduce --shared $(SHARED)
+
+figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores; goes on where it stopped
+	$(BIN)/python -m benchmarks.paper --out out/figures
+
+docs: $(STAMP)   ## the documentation into build/site, warnings as errors, nothing fetched
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 lint: $(STAMP)   ## ruff and mypy
 	$(BIN)/ruff check .

@@ -15,6 +15,7 @@ import tyro
 
 from benchmarks import truth as truths
 from benchmarks.report import write_report
+from scene.arguments import parse
 
 TASK = "Subterra/TraverseShort-v0"
 
@@ -22,6 +23,8 @@ TASK = "Subterra/TraverseShort-v0"
 @dataclass(frozen=True)
 class DemoConfig:
     """Survey → bag → scene → MuJoCo and MJX → training on the reconstructed bore → report.
+
+    Example: python -m benchmarks.demo --length 60 --out out/demo
 
     Attributes:
         out: Folder to write.
@@ -175,4 +178,4 @@ def _odometry_figures(survey: Path, scene: Path, truth: truths.Truth, failure: s
 
 
 if __name__ == "__main__":
-    main(tyro.cli(DemoConfig))
+    main(parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo")))

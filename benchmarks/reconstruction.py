@@ -10,7 +10,7 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -22,6 +22,8 @@ from benchmarks.fidelity.candidate import load
 from benchmarks.fidelity.derive import surface
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.truth import compare, load_truth
+from scene.arguments import parse
+from scene.cli import EXIT_BAD_INPUT
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class ReconstructionConfig:
     seeds: tuple[int, ...] = (201, 202)
     length: float = 60.0
     truth: str = "paper"
-    poses: tuple[str, ...] = ("given", "control")
+    poses: tuple[Literal["given", "control"], ...] = ("given", "control")
     out: Path = Path("out/reconstruction")
 
 
@@ -159,8 +161,19 @@ def _run(module: str, *arguments: object) -> float:
 
 def main() -> None:
     """The command."""
-    config = tyro.cli(ReconstructionConfig, description=__doc__)
-    config.out.mkdir(parents=True, exist_ok=True)
+    config = parse(
+        lambda words: tyro.cli(
+            ReconstructionConfig, args=words, prog="python -m benchmarks.reconstruction", description=__doc__
+        )
+    )
+    if not config.seeds:
+        print("error: seeds must name at least one survey", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        print(f"error: {config.out}: cannot be made a folder: {error.strerror}", file=sys.stderr)
+        sys.exit(EXIT_BAD_INPUT)
     rows = measure(config)
     show(rows, Console())
     facts = {"config": asdict(config) | {"out": str(config.out)}, "provenance": "simulated", "rows": rows}

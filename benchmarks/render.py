@@ -12,6 +12,9 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from scene.arguments import parse
+from scene.cli import EXIT_BAD_INPUT
+
 # MuJoCo chooses its GL backend when it is imported, so each is tried in a process of its own.
 _BACKENDS = ("egl", "osmesa", "glfw")
 _TIMEOUT = 120.0
@@ -22,6 +25,8 @@ _LOOK_AHEAD = 8.0  # m
 @dataclass(frozen=True)
 class RenderConfig:
     """Renders a scene as one of its cameras sees it.
+
+    Example: python -m benchmarks.render build/tunnel --camera chase --out view.png
 
     Attributes:
         scene: Scene folder, or an MJCF file.
@@ -82,5 +87,18 @@ def main(config: RenderConfig) -> None:
     renderer.close()
 
 
+def command() -> int:
+    """The command line; a user's mistake, or no OpenGL, is one sentence and status 2."""
+    config = parse(lambda words: tyro.cli(RenderConfig, args=words, prog="python -m benchmarks.render"))
+    import mujoco
+
+    try:
+        main(config)
+    except (OSError, ValueError, KeyError, mujoco.FatalError) as fault:
+        print(f"error: {config.scene}: {' '.join(str(fault).split())}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    return 0
+
+
 if __name__ == "__main__":
-    main(tyro.cli(RenderConfig))
+    sys.exit(command())

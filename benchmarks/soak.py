@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from rich.console import Console
 
 import subterra_jax as st
+from scene.arguments import parse
 from subterra_jax.errors import SubterraError
 
 _EXTREMES = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, -0.0, 1e-38)
@@ -154,7 +155,9 @@ def run(config: SoakConfig, console: Console) -> bool:
 
 def main() -> int:
     """Entry point: 0 where everything is clean, 1 where not, 2 for a user's mistake."""
-    config = tyro.cli(SoakConfig, description=__doc__)
+    config = parse(
+        lambda words: tyro.cli(SoakConfig, args=words, prog="python -m benchmarks.soak", description=__doc__)
+    )
     try:
         return 0 if run(config, Console(highlight=False)) else 1
     except (SubterraError, ValueError) as error:

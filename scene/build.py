@@ -1,6 +1,8 @@
 """`python -m scene.build INPUT --out DIR`: a recording in; scene, bore, tunnel and manifest out."""
 
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +10,7 @@ import mujoco
 import numpy as np
 import tyro
 
+from scene.arguments import parse
 from scene.cli import progress_bar, run
 from scene.errors import FitError, RecordingError
 from scene.files import replace_folder, require_output_folder
@@ -68,7 +71,7 @@ def _say(started: float, text: str) -> None:
     print(f"[{time.monotonic() - started:6.1f} s] {text}", flush=True)
 
 
-def main(
+def command(
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="input", metavar="INPUT")],
     /,
     out: Path,
@@ -78,7 +81,7 @@ def main(
     fresh: bool = False,
     keep_every: float = 5.0,
     config: Annotated[BuildConfig, tyro.conf.arg(name="")] = _DEFAULT,
-) -> None:
+) -> Callable[[], Reconstruction]:
     """Builds a scene from a recording.
 
     Example: python -m scene.build survey.bag --trajectory groundtruth.tum --out build/tunnel
@@ -95,9 +98,21 @@ def main(
         keep_every: Least time between two partial results, s.
         config: Settings.
     """
+    return partial(
+        build, source, out, trajectory, config, control, calibration, Partial(beside(out), fresh, keep_every)
+    )
+
+
+def main() -> None:
+    """Runs the command."""
     np.seterr(all="ignore")
-    build(source, out, trajectory, config, control, calibration, Partial(beside(out), fresh, keep_every))
+    wanted = parse(lambda words: tyro.cli(command, prog="python -m scene.build", args=words))
+
+    def act() -> None:
+        wanted()
+
+    run(act)
 
 
 if __name__ == "__main__":
-    run(lambda: tyro.cli(main))
+    main()

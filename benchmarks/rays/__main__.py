@@ -20,6 +20,7 @@ from benchmarks.rays.planar import compare_planar
 from benchmarks.rays.scenefiles import DEFAULT_SCENE, meshed_linings, require_scene
 from benchmarks.rays.tilted import compare_tilted
 from benchmarks.throughput.facts import environment_facts
+from scene.arguments import parse
 from subterra_jax.errors import SubterraError
 from subterra_jax.tunnel.sources import load_tunnel
 
@@ -133,7 +134,12 @@ def main(config: RaysConfig) -> int:
 def command(arguments: list[str] | None = None) -> int:
     """The command line; a user's mistake is one sentence and status 2."""
     try:
-        return main(tyro.cli(RaysConfig, args=arguments, description=__doc__))
+        return main(
+            parse(
+                lambda words: tyro.cli(RaysConfig, args=words, prog="python -m benchmarks.rays", description=__doc__),
+                arguments,
+            )
+        )
     except SubterraError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

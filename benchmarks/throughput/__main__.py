@@ -17,6 +17,7 @@ from benchmarks.throughput.measure import arithmetic_floor, environment_loop, fl
 from benchmarks.throughput.peers.run import Route, measure_peer, wanted
 from benchmarks.throughput.timing import Timing, measure
 from benchmarks.throughput.variants import measure_lengths, measure_linings
+from scene.arguments import parse
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -67,7 +68,11 @@ def run(config: ThroughputConfig) -> result.Result:
 
 def main() -> int:
     """Measures, prints, writes; the status is 1 if the LiDAR is not exact."""
-    config = tyro.cli(ThroughputConfig, prog="python -m benchmarks.throughput", description=__doc__)
+    config = parse(
+        lambda words: tyro.cli(
+            ThroughputConfig, args=words, prog="python -m benchmarks.throughput", description=__doc__
+        )
+    )
     try:
         found = run(config)
     except (st.SubterraError, ValueError) as error:

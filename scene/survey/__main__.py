@@ -5,13 +5,14 @@ import sys
 import tyro
 from rich.console import Console
 
+from scene.arguments import parse
 from scene.survey.config import SurveyConfig, check
 from scene.survey.simulate import simulate
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the command; return its exit status, 2 for what the user can put right."""
-    config = tyro.cli(SurveyConfig, prog="python -m scene.survey", args=args)
+    config = parse(lambda words: tyro.cli(SurveyConfig, prog="python -m scene.survey", args=words), args)
     try:
         check(config)
         print(simulate(config, Console(stderr=True)))

@@ -42,7 +42,10 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class SurveyConfig:
-    """Simulate the survey of one bore and write it with its truth."""
+    """Simulate the survey of one bore and write it with its truth.
+
+    Example: python -m scene.survey --truth metro --length 60 --out build/survey
+    """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder to write to; made if missing."""

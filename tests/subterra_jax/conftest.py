@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import jax
 import pytest
 from jaxtyping import install_import_hook
 
@@ -26,12 +25,3 @@ def plan_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[dict[str, Any
         return load_tunnel(path)
 
     return write_and_load
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compile_once(tmp_path_factory: pytest.TempPathFactory):
-    """The same program is compiled once for all tests of this folder."""
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    yield
-    jax.config.update("jax_compilation_cache_dir", before)

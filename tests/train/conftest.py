@@ -2,7 +2,6 @@ import json
 import sys
 from pathlib import Path
 
-import jax
 import pytest
 from jaxtyping import install_import_hook
 
@@ -28,15 +27,6 @@ def call(main, *arguments: str) -> int:
     finally:
         sys.argv = before
     return caught.value.code
-
-
-@pytest.fixture(scope="session", autouse=True)
-def compile_once(tmp_path_factory):
-    """The same program is compiled once for all tests of this folder."""
-    before = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("compiled")))
-    yield
-    jax.config.update("jax_compilation_cache_dir", before)
 
 
 @pytest.fixture(scope="session")

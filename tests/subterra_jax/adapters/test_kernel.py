@@ -38,7 +38,7 @@ def test_a_function_of_many_operations_becomes_one_call_with_the_same_result():
     x = np.linspace(0.0, 1.0, 300, dtype=np.float32)
     compiled = compile_as_one_kernel(many, x)
     for got, expected in zip(compiled(x), jax.jit(many)(x), strict=True):
-        np.testing.assert_allclose(got, expected, rtol=1e-6)
+        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6)  # sums of numbers of order one
     entry = compiled.as_text().split("ENTRY", 1)[1]
     assert "fusion(" not in entry
     assert entry.count(" call(") == 1

@@ -1,0 +1,56 @@
+"""How programs are compiled while the tests run: cheaply, and once for all workers of a run.
+
+Most of what the simulator's tests take is XLA compiling programs that run for a moment. Without LLVM's optimisations
+and fusion emitters it compiles five times as fast, and what comes out runs a third as fast. Set `XLA_FLAGS` to
+anything, say `XLA_FLAGS=" "`, and the tests run what users run; `make test-slow` does.
+"""
+
+import gc
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+# Before jax is imported: XLA reads its flags once, and what a test starts inherits them.
+# A flag that an XLA does not know ends the process: the emitters can be left out of jax 0.10 and no longer of 0.12.
+_EMITTERS = "--xla_cpu_use_fusion_emitters=false " if version("jax").startswith("0.10.") else ""
+os.environ.setdefault("XLA_FLAGS", f"{_EMITTERS}--xla_backend_optimization_level=0")
+_OWN_CACHE = None
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run; its workers find it set
+    _OWN_CACHE = os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="subterra-compiled-")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+    # With a size, jax guards the folder by a lock: two workers may want the same program at once.
+    os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(8 * 2**30))
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+_CROWDED = 2.5e9
+
+
+def pytest_collection_finish() -> None:
+    """Tells the garbage collector to leave alone what was imported: half of the fidelity suite's time was its walks."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_unconfigure() -> None:
+    """Leaves no compiled programs behind."""
+    if _OWN_CACHE is not None:
+        shutil.rmtree(_OWN_CACHE, ignore_errors=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_memory() -> Iterator[None]:
+    """Forgets compiled programs between files once the process has grown large; the folder still has them."""
+    yield
+    if _resident() > _CROWDED:
+        jax.clear_caches()
+
+
+def _resident() -> float:
+    """Memory of this process, bytes; 0 where the system does not say."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0.0
