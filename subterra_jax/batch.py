@@ -2,16 +2,20 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax import lidar
-from subterra_jax.env import Info, TunnelEnv
-from subterra_jax.state import EnvParams, State, StepNoise
+from subterra_jax.env import Info
 
+# `TunnelEnv` and what belongs to it, or another environment with the same parts: the walking robot's, say.
+Env: TypeAlias = Any
+EnvParams: TypeAlias = Any
+State: TypeAlias = Any
+StepNoise: TypeAlias = Any
 Obs = Float[Array, "n_envs n_obs"]
 Policy = Callable[[PRNGKeyArray, Obs], Float[Array, "n_envs n_action"]]
 
@@ -30,7 +34,7 @@ class AutoReset:
             in a step; batches that do not would have all of it computed in every step.
     """
 
-    env: TunnelEnv
+    env: Env
     params_axes: Any = None
     axes: tuple[str, ...] = ()
 
@@ -86,7 +90,7 @@ class AutoReset:
         The fused kernels take all scans in one go and skip those that nobody wants, of environments that have not
         finished.
         """
-        if lidar.skips_unwanted(params.lidar):
+        if hasattr(params, "lidar") and lidar.skips_unwanted(params.lidar):
             twice = lambda one, other: jnp.concatenate([one, other])  # noqa: E731
             both_states, both_noises = jax.tree.map(twice, (merged, noise), (stepped, noise))
             both_params = self._of_batched(params, lambda leaf: twice(leaf, leaf))

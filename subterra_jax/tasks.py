@@ -26,6 +26,8 @@ from subterra_jax.vehicle import VehicleParams
 from subterra_jax.wander import WanderParams
 
 SHORT_LENGTH = 60.0
+WALKING = "Subterra/B2Walk-v0"
+ON_LEGS = ("Subterra/B2Traverse-v0",)
 _SHORT_GOALS = {"low": 10.0, "high": 60.0, "margin": 5.0, "tolerance": 0.25}
 
 
@@ -88,11 +90,12 @@ def make(
     lining: str | None = None,
     estimates: bool = False,
     **overrides: Any,
-) -> tuple[TunnelEnv, EnvParams]:
+) -> tuple[Any, Any]:
     """Make an environment and its params.
 
     Args:
-        id: A key of `TASKS`.
+        id: A key of `TASKS`; or `Subterra/B2Walk-v0` or `Subterra/B2Traverse-v0`, for
+            which `subterra_jax.b2.tasks.make` and `subterra_jax.b2.missions.make` say what else there is.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
             another lining. None is the packaged tunnel.
@@ -103,12 +106,20 @@ def make(
         **overrides: Fields of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`.
 
     Returns:
-        The static environment, and params whose every leaf is an array.
+        The static environment (a `TunnelEnv`), and params whose every leaf is an array (`EnvParams`).
 
     Raises:
         ValueError: No such task, no such field, or a value that the simulator cannot honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
+    if id == WALKING:
+        from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
+
+        return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
+    if id in ON_LEGS:
+        from subterra_jax.b2 import missions
+
+        return missions.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
     if id not in TASKS:
         raise ValueError(f"no task {id!r}; there are {', '.join(TASKS)}")
     task = TASKS[id]

@@ -2,10 +2,11 @@
 
 from gymnasium.envs import registration
 
-from subterra_jax.tasks import TASKS
+from subterra_jax.tasks import ON_LEGS, TASKS
 
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
+_ON_LEGS = "subterra_jax.b2.gym:B2Env"  # MuJoCo is loaded by who makes one
 
 
 def register() -> None:
@@ -13,3 +14,6 @@ def register() -> None:
     for task in TASKS:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
+    for task in ON_LEGS:
+        if task not in registration.registry:
+            registration.register(id=task, entry_point=_ON_LEGS, kwargs={"task": task})

@@ -1,0 +1,106 @@
+"""How many B2s come through a tunnel on their legs: `python -m benchmarks.b2_traverse --robots 100`.
+
+Every robot is drawn anew: friction, mass, gains, sensor noise. `--engine mujoco` has the same robots walk in MuJoCo's
+own engine, on the host; with `--scene DIR` in the scene itself.
+"""
+
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from subterra_jax import policies
+from subterra_jax.b2 import missions, trial
+from subterra_jax.b2.policy import RELEASED
+from subterra_jax.baselines import registry
+from subterra_jax.tunnel.sources import load_tunnel
+from train import cli
+from train.evaluate import open_agent
+
+
+@dataclass(frozen=True)
+class Command:
+    """Lets B2s traverse a tunnel.
+
+    Attributes:
+        robots: How many.
+        seed: Of their draws.
+        agent: Who steers: a baseline, a run folder of `train.navigate --embodiment b2`, or a policy's file or name.
+        policy: The gait: a file, the name of a released one, or `trot`.
+        engine: `mjx`, or `mujoco` in C on the host.
+        tunnel: File or name; the packaged tunnel if left out.
+        scene: A built scene folder, instead of a tunnel.
+        length: Only so many metres of the tunnel; 0 is all of it. A policy that was trained on all of it has never been
+            near a far mouth; to try it for a while only, lower `coverage`.
+        coverage: Share of the tunnel that counts as success.
+        odometer: `legs`, the robot's own, or `drift`.
+        speed: Largest speed that may be commanded, m/s.
+        out: File to which the figures are written as JSON.
+    """
+
+    robots: int = 100
+    seed: int = 0
+    agent: str = "dead-reckoning"
+    policy: str = RELEASED
+    engine: Literal["mjx", "mujoco"] = "mjx"
+    tunnel: str | None = None
+    scene: Path | None = None
+    length: float = 0.0
+    coverage: float = 0.9
+    odometer: Literal["legs", "drift"] = "legs"
+    speed: float = missions.VEHICLE.speed_max
+    out: Path | None = None
+
+
+def opened(name: str, env: Any, params: Any) -> Any:
+    """An agent by its name, file or run folder, known to fit."""
+    if name in registry.names():
+        return registry.make_agent(name, params)
+    agent, _ = open_agent(Path(name), None)
+    policies.check_fits(agent, env, params, name)
+    return agent
+
+
+def tell(now: trial.Walk) -> None:
+    """How the robots are, on one line."""
+    falls, contacts = int(np.sum(now.fall)), int(np.sum(now.contact))
+    counts = f"{int(np.sum(now.over))} of {len(now.over)} over, {falls} falls, {contacts} contacts"
+    print(f"\rstation {np.median(now.state.station):6.1f} m, {counts}", end="", file=sys.stderr, flush=True)
+
+
+def command(arguments: Command) -> None:
+    """Drives and prints."""
+    tunnel: Any = arguments.tunnel
+    if arguments.length:
+        plan = load_tunnel(arguments.tunnel)
+        tunnel = plan.slice(0.0, min(arguments.length, plan.length))
+    env, params = missions.make(
+        tunnel=tunnel,
+        scene=arguments.scene,
+        policy=arguments.policy,
+        engine=arguments.engine,
+        odometer=arguments.odometer,
+        goal_coverage=arguments.coverage,
+        vehicle=missions.VEHICLE.replace(speed_max=arguments.speed),  # type: ignore[attr-defined]
+    )
+    agent, started = opened(arguments.agent, env, params), time.perf_counter()
+    found = trial.figures(*trial.drive(env, params, agent, arguments.robots, arguments.seed, tell), params)
+    print(file=sys.stderr)
+    found["wall_seconds"] = time.perf_counter() - started
+    cli.table(f"{arguments.robots} B2s, {arguments.engine}, gait {arguments.policy}, {arguments.agent}", found)
+    if arguments.out is not None:
+        arguments.out.write_text(json.dumps({**vars(arguments), **found}, default=str, indent=1) + "\n")
+
+
+def main() -> None:
+    """Entry point of `python -m benchmarks.b2_traverse`."""
+    cli.run(lambda: command(tyro.cli(Command)))
+
+
+if __name__ == "__main__":
+    main()

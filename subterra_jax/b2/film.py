@@ -1,0 +1,121 @@
+"""A film of a B2 on its way: `python -m subterra_jax.b2.film run.webp --scene build/tunnel --seconds 20`."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from subterra_jax.b2.gym import B2Env  # first: it says how MuJoCo is to draw
+from subterra_jax.b2.policy import RELEASED
+from subterra_jax.b2.view import Moment, PictureError
+
+# isort: split
+import jax
+import numpy as np
+
+from subterra_jax import policies
+from subterra_jax.baselines.agent import observed
+from subterra_jax.baselines.registry import make_agent, names
+from subterra_jax.errors import SubterraError
+
+_EVERY = 3  # one picture for so many control periods of 20 ms
+_DURATION = 20 * _EVERY  # of a picture, ms
+_ANIMATED = (".gif", ".webp")
+
+
+class Driver:
+    """An agent that is asked step by step."""
+
+    def __init__(self, env: B2Env, name: str):
+        params, mission = env.params, env.mission
+        agent: Any
+        if name in names():
+            agent = make_agent(name, params)
+        else:
+            agent, _ = policies.load(name)
+            policies.check_fits(agent, mission, params, name)
+        key = jax.random.key(0)
+        self._begin = jax.jit(lambda obs: agent.begin(key, observed(mission, params, obs), params))
+        self._act = jax.jit(lambda memory, obs: agent.act(key, memory, observed(mission, params, obs), params, None))
+        self._memory: Any = None
+
+    def act(self, obs: np.ndarray) -> np.ndarray:
+        """The command `[v, ω]` for an observation."""
+        if self._memory is None:
+            self._memory = self._begin(obs)
+        action, self._memory = self._act(self._memory, obs)
+        return np.asarray(action[:2])
+
+    def forget(self) -> None:
+        """Begin anew with the next observation."""
+        self._memory = None
+
+
+def shoot(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.ndarray]:
+    """Pictures of an episode, one for every 60 ms of it, `(height, width, 3)` uint8 each; fewer if it ends before.
+
+    Raises:
+        PictureError: There is no OpenGL.
+    """
+    physics: Any = env.mission.walk.physics
+    moments: list[Moment] = []
+    count = 0
+    physics.bench.watch = lambda data: moments.append(Moment.of(data))
+    pictures = []
+    try:
+        obs, _ = env.reset(seed=seed)
+        for _ in range(round(seconds / float(env.params.vehicle.period))):
+            moments.clear()
+            obs, _, terminated, truncated, _ = env.step(driver.act(obs))
+            around, first = env.around(), -count % _EVERY
+            pictures += [env.camera().snap(moment, around) for moment in moments[first::_EVERY]]
+            count += len(moments)
+            if terminated or truncated:
+                break
+    finally:
+        physics.bench.watch = None
+    return pictures
+
+
+def write(path: Path, pictures: list[np.ndarray]) -> None:
+    """Writes a film; its ending says in which format: `.webp` or `.gif`, ten times as large; `.mp4` with ffmpeg.
+
+    Raises:
+        PictureError: Nothing here writes that format.
+    """
+    try:
+        import imageio.v3 as imageio
+
+        how = {"duration": _DURATION, "loop": 0} if path.suffix in _ANIMATED else {"fps": 1000 / _DURATION}
+        imageio.imwrite(path, np.stack(pictures), **how)
+    except (ImportError, OSError, ValueError, TypeError) as cause:
+        raise PictureError(f"{path} cannot be written: {cause}; .webp and .gif need imageio, .mp4 ffmpeg") from cause
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point: 0, or 2 for a user's mistake."""
+    parser = argparse.ArgumentParser(prog="python -m subterra_jax.b2.film", description=__doc__)
+    parser.add_argument("out", type=Path, help="file to write: .webp, .gif or .mp4")
+    parser.add_argument("--scene", type=Path, help="built scene folder to walk in; the packaged tunnel if left out")
+    parser.add_argument("--policy", default=RELEASED, help="gait: a file, the name of a released one, or trot")
+    parser.add_argument("--agent", default="dead-reckoning", help="who steers: a baseline, or a policy's file or name")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--height", type=int, default=360)
+    asked = parser.parse_args(arguments)
+    try:
+        size = {"width": asked.width, "height": asked.height}
+        env = B2Env(scene=asked.scene, policy=asked.policy, render_mode="rgb_array", **size)
+        pictures = shoot(env, Driver(env, asked.agent), asked.seconds, asked.seed)
+        write(asked.out, pictures)
+        env.close()
+    except (SubterraError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{asked.out}: {len(pictures)} pictures")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,186 @@
+"""The B2 in Gymnasium and the hierarchy beneath: one compiled step for all of it."""
+
+import dataclasses
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.b2 import missions, posing
+from subterra_jax.b2.model import RobotError
+from subterra_jax.b2.track import TrackError
+from subterra_jax.policies import PolicyError
+
+ID = "Subterra/B2Traverse-v0"
+QUIET = {"rate": 0.0, "gravity": 0.0, "angle": 0.0, "speed": 0.0}
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return st.load_tunnel().slice(0.0, 40.0)
+
+
+@pytest.fixture(scope="module")
+def env(plan):
+    """One environment, compiled with less zeal: half the time, the same numbers to rounding."""
+    made = gymnasium.make(ID, tunnel=plan, policy="trot", walk={"sensor": missions.SensorParams(**QUIET)})
+    inner: Any = made.unwrapped
+    key, params, _action = jax.random.key(0), inner.params, jnp.zeros(2)
+    options = {"xla_backend_optimization_level": 0}
+    inner._reset = inner._reset.lower(key, params).compile(options)
+    _, state = inner._reset(key, params)
+    inner._step = inner._step.lower(key, state, np.zeros(2, np.float32), params).compile(options)
+    return made
+
+
+def drive(env, action, n_steps, seed=1):
+    env.reset(seed=seed)
+    return [env.step(np.asarray(action, np.float32)) for _ in range(n_steps)]
+
+
+def changed(env, **fields):
+    """Another state of the environment's robot."""
+    inner = env.unwrapped
+    inner.state = dataclasses.replace(inner.state, **fields)
+
+
+def with_body(state, qpos):
+    body = dataclasses.replace(state.walk.body, qpos=jnp.asarray(qpos, jnp.float32))
+    return dataclasses.replace(state.walk, body=body)
+
+
+def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env):
+    planar, _ = st.make("Subterra/Traverse-v0")
+    assert env.observation_space.shape == (18,)
+    np.testing.assert_allclose(env.action_space.high, [0.8, 0.8])
+    np.testing.assert_allclose(env.action_space.low, [0.0, -0.8])
+    assert env.unwrapped.mission.rule == planar.rule
+    assert env.metadata["render_fps"] == 5
+
+
+def test_told_to_walk_it_walks_and_its_legs_know_how_far(env):
+    told = drive(env, (0.6, 0.0), 20)
+    start, info, obs = told[4][4]["station"], told[-1][4], told[-1][0]
+    assert not any(step[2] for step in told)
+    assert 1.0 < info["station"] - start < 2.5  # in 3 s
+    walked = info["station"] - 2.0
+    assert obs[16] == pytest.approx(walked, rel=0.15)
+    assert isinstance(info["station"], float)
+    assert isinstance(info["fall"], bool)
+    paid = sum(value for name, value in info.items() if name.startswith("reward_"))
+    assert told[-1][1] == pytest.approx(paid, rel=1e-4)
+
+
+def test_told_to_stand_it_stands_and_a_nan_is_a_zero(env):
+    told = drive(env, (0.0, 0.0), 15)
+    assert abs(told[-1][4]["station"] - told[9][4]["station"]) < 0.02  # once the feet are settled
+    again = drive(env, (np.nan, np.nan), 15)
+    np.testing.assert_array_equal(told[-1][0], again[-1][0])
+
+
+def test_the_same_seed_gives_the_same_walk_and_another_one_another(env):
+    walks = [np.stack([step[0] for step in drive(env, (0.5, 0.2), 4, seed)]) for seed in (7, 7, 8)]
+    np.testing.assert_array_equal(walks[0], walks[1])
+    assert not np.array_equal(walks[0], walks[2])
+
+
+def test_a_fall_ends_the_episode_and_is_no_success(env):
+    env.reset(seed=0)
+    state = env.unwrapped.state
+    qpos = np.array(state.walk.body.qpos)
+    qpos[3:7] = [np.cos(0.8), np.sin(0.8), 0.0, 0.0]
+    changed(env, walk=with_body(state, qpos))
+    _, _, terminated, truncated, info = env.step(np.zeros(2, np.float32))
+    assert terminated
+    assert not truncated
+    assert info["fall"]
+    assert not info["success"]
+
+
+def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
+    env.reset(seed=0)
+    state, params = env.unwrapped.state, env.unwrapped.params
+    at = np.argmin(np.abs(plan.station - 2.0))
+    lateral = float(plan.half_width[at]) - 0.3
+    normal = np.array([-plan.tangent[at, 1], plan.tangent[at, 0]])
+    qpos = np.array(state.walk.body.qpos)
+    qpos[:2] += (lateral - float(state.lateral)) * normal
+    turn = float(posing.yaw(state.walk.body.qpos[3:7])) + 1.2
+    qpos[3:7] = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
+    changed(env, walk=with_body(state, qpos), lateral=jnp.float32(lateral))
+    _, _, terminated, _, info = env.step(np.array([0.8, 0.0], np.float32))
+    assert terminated
+    assert info["contact"]
+    assert not info["success"]
+    assert float(params.walk.tunnel.length) == pytest.approx(40.0)
+
+
+def test_success_is_the_share_of_the_tunnel_that_the_rule_asks_for(env):
+    inner, params = env.unwrapped, env.unwrapped.params
+    inner.params = dataclasses.replace(params, goal_coverage=jnp.float32(0.052))
+    try:
+        told = []
+        env.reset(seed=2)
+        while not (told and (told[-1][2] or told[-1][3])) and len(told) < 20:
+            told.append(env.step(np.array([0.8, 0.0], np.float32)))
+    finally:
+        inner.params = params
+    assert told[-1][2]
+    assert told[-1][4]["success"]
+    assert told[-1][4]["coverage"] >= 0.052
+
+
+def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
+    with pytest.raises(PolicyError, match="no-such-gait: no such policy"):
+        st.make(ID, plan, policy="no-such-gait")
+    with pytest.raises(ValueError, match="no engine 'bullet'"):
+        st.make(ID, plan, policy="trot", engine="bullet")
+    with pytest.raises(ValueError, match=r"every 0\.2 s"):
+        st.make(ID, plan, policy="trot", vehicle=missions.VEHICLE.replace(period=0.1))
+    with pytest.raises(ValueError, match="no field"):
+        st.make(ID, plan, policy="trot", obstacles=None)
+    narrow = dataclasses.replace(plan, half_width=np.full_like(plan.half_width, 0.3))
+    with pytest.raises(RobotError, match=r"0\.60 m wide"):
+        st.make(ID, narrow, policy="trot")
+    (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
+    shutil.copy(Path(st.__file__).parent / "data" / "subterra-351.npz", tmp_path / "tunnel.npz")
+    with pytest.raises(TrackError, match="no track to walk on"):
+        st.make(ID, scene=tmp_path, policy="trot")
+
+
+DRAW = """
+import sys
+import imageio.v3 as imageio
+import numpy as np
+import subterra_jax as st
+from subterra_jax.b2.gym import B2Env
+from subterra_jax.b2.view import PictureError
+env = B2Env(tunnel=st.load_tunnel().slice(0.0, 10.0), policy="trot", render_mode="rgb_array", width=160, height=120)
+env.reset(seed=0)
+try:
+    np.save(sys.argv[1], env.render())
+except PictureError as cause:
+    sys.exit(str(cause))
+env.close()
+"""
+
+
+@pytest.mark.slow
+def test_the_robot_is_drawn_where_there_is_opengl(tmp_path):
+    """In a process of its own: MuJoCo chooses how to draw when it is imported, which other tests have done before."""
+    file = tmp_path / "picture.npy"
+    done = subprocess.run([sys.executable, "-c", DRAW, str(file)], capture_output=True, text=True, check=False)
+    if "cannot draw" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    picture = np.load(file)
+    assert picture.shape == (120, 160, 3)
+    assert picture.std() > 10.0

@@ -1,0 +1,78 @@
+"""What a LiDAR sees that leans with the trunk: known answers in a straight corridor."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from subterra_jax import lidar
+from subterra_jax.b2 import constants as b2
+from subterra_jax.b2 import sight
+from subterra_jax.b2.track import by_standard
+from subterra_jax.lidar import LidarParams
+from subterra_jax.tunnel import Tunnel
+from tests.subterra_jax.tunnels import straight, tunnel_arrays
+
+SENSOR = LidarParams(fused=False)
+ANCHOR, HEIGHT = 50, 0.5  # of the trunk's middle over the sleepers, m
+
+
+@pytest.fixture(scope="module")
+def world(plan_of):
+    plan = plan_of(tunnel_arrays(straight(80.0)))
+    return plan, SimpleNamespace(track=by_standard(plan), tunnel=Tunnel.from_plan(plan, "smooth"))
+
+
+@pytest.fixture(scope="module")
+def look(world):
+    _, params = world
+
+    @jax.jit
+    def ranges(quaternion, offset):
+        body = SimpleNamespace(qpos=jnp.concatenate([offset, quaternion, jnp.zeros(12)]))
+        walk = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR))
+        return sight.scan(walk, params.track.station[ANCHOR], params, SENSOR, None)
+
+    return lambda quaternion, lateral=0.0: ranges(jnp.asarray(quaternion), jnp.array([0.0, lateral, HEIGHT]))
+
+
+def leaning(angle, axis):
+    """A quaternion of a turn about x (roll), y (pitch) or z (yaw)."""
+    return np.cos(angle / 2), *(np.sin(angle / 2) * np.eye(3)["xyz".index(axis)])
+
+
+def test_level_it_sees_what_the_planar_lidar_sees_from_the_same_place(world, look):
+    _, params = world
+    yaw, station = 0.1, params.track.station[ANCHOR]
+    mount = b2.LIDAR[0] * np.array([np.cos(yaw), np.sin(yaw)]) + [0.0, 0.3]
+    place = params.track.position[ANCHOR, :2] + jnp.asarray(mount, jnp.float32)
+    planar = jax.jit(lidar.scan)(params.tunnel, place, jnp.float32(yaw), station, SENSOR)
+    np.testing.assert_allclose(look(leaning(yaw, "z"), 0.3), planar, rtol=1e-4)
+
+
+def test_nose_down_the_beam_ahead_ends_on_the_ballast(world, look):
+    plan, params = world
+    pitch = 0.1
+    height = HEIGHT + b2.LIDAR[2] * np.cos(pitch) - b2.LIDAR[0] * np.sin(pitch) + float(params.track.protrusion)
+    ranges = look(leaning(pitch, "y"))
+    assert float(ranges[0]) == pytest.approx(height / np.sin(pitch), rel=1e-4)
+    half_width = float(np.interp(0.6 * ANCHOR, plan.station, plan.half_width))
+    assert float(ranges[4]) == pytest.approx(half_width, rel=1e-3)  # the beam to the side has stayed level
+
+
+def test_rolled_the_beams_to_the_sides_are_longer_by_the_cosine(world, look):
+    plan, _ = world
+    roll = -0.1  # the left side goes down
+    half_width = float(np.interp(0.6 * ANCHOR, plan.station, plan.half_width))
+    aside = -b2.LIDAR[2] * np.sin(roll)
+    ranges = look(leaning(roll, "x"))
+    assert float(ranges[4]) == pytest.approx((half_width - aside) / np.cos(roll), rel=1e-3)
+    assert float(ranges[12]) == pytest.approx((half_width + aside) / np.cos(roll), rel=1e-3)
+
+
+def test_on_its_back_nothing_is_nan(look):
+    for angle in (np.pi / 2, np.pi):
+        assert np.isfinite(look(leaning(angle, "x"))).all()
+        assert np.isfinite(look(leaning(angle, "y"))).all()

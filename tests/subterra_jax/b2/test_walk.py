@@ -1,0 +1,225 @@
+"""The walking environment in MJX."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.b2 import constants as b2
+from subterra_jax.b2 import driver, physics, rotation
+from subterra_jax.b2.model import RobotError
+from subterra_jax.b2.tasks import make
+from subterra_jax.b2.track import TrackError
+from tests.subterra_jax.b2.conftest import N_ROBOTS
+from tests.subterra_jax.tunnels import straight, tunnel_arrays
+
+
+def run(walking, seconds, params, seed=0):
+    """Zero actions for a while; last state, and what every step told."""
+    _, state = walking.reset(seed, params)
+    told = []
+    for k in range(round(seconds / 0.02)):
+        _, state, _, terminated, _, info = walking.step(1000 * seed + k, state, params=params)
+        told.append({"terminated": terminated, **info})
+    return state, {name: np.stack([step[name] for step in told]) for name in told[0]}
+
+
+def test_under_no_command_the_zero_action_stands_on_sleepers(walking):
+    _, told = run(walking, 2.0, walking.told((0.0, 0.0, 0.0)))
+    assert not told["terminated"].any()
+    settled = told["station"][60:]  # once the feet have found the ballast
+    assert np.abs(settled - settled[0]).max() < 0.05
+
+
+def test_the_zero_action_walks_as_told_over_sleepers(walking):
+    state, told = run(walking, 4.0, walking.told((0.6, 0.0, 0.0)))
+    assert not told["terminated"].any()
+    moved = (told["station"][-1] - told["station"][99]) * np.asarray(state.facing)
+    np.testing.assert_allclose(moved / 2.0, 0.6, atol=0.25)
+    assert np.abs(np.asarray(state.body.qpos[:, :2])).max() < 1.5
+
+
+def test_terms_of_the_reward_sum_to_the_reward_and_the_info_has_the_contract_s_keys(walking):
+    _, state = walking.reset(1)
+    _, _, reward, _, _, info = walking.step(1, state)
+    paid = sum(np.asarray(value) for name, value in info.items() if name.startswith("reward_"))
+    np.testing.assert_allclose(reward, paid, rtol=1e-5)
+    assert {"coverage", "station", "lateral", "contact", "success", "fall", "final_observation"} <= info.keys()
+
+
+def test_the_same_key_gives_the_same_step_and_another_one_another(walking):
+    first, state = walking.reset(2)
+    again, _ = walking.reset(2)
+    other, _ = walking.reset(3)
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, other)
+    one, two, three = (walking.step(seed, state)[0] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, two)
+    assert not np.allclose(one, three)
+
+
+def test_the_observation_has_the_size_and_the_parts_it_claims(walking):
+    obs, _ = walking.reset(4)
+    assert obs.shape == (N_ROBOTS, walking.env.observation_size(walking.params))
+    fields = walking.env.fields(walking.params)
+    assert max(part.stop for part in fields.values()) == obs.shape[1]
+    np.testing.assert_allclose(np.linalg.norm(obs[:, fields["gravity"]], axis=1), 1.0, atol=0.1)
+    np.testing.assert_allclose(obs[:, fields["action"]], 0.0)
+
+
+def test_resets_lie_all_along_the_tunnel_and_face_both_ways(walking):
+    states = [walking.reset(seed)[1] for seed in range(8)]
+    anchors = np.concatenate([state.anchor for state in states]) * 0.6
+    facing = np.concatenate([state.facing for state in states])
+    assert anchors.min() > 24.0
+    assert anchors.max() < 351.0 - 24.0
+    assert np.ptp(anchors) > 200.0
+    assert 10 < (facing > 0).sum() < 54
+
+
+def test_robots_differ_within_their_ranges(walking):
+    _, state = walking.reset(5)
+    for values, (low, high) in ((state.build.friction, (0.4, 1.0)), (state.build.mass, (0.8, 1.05))):
+        assert np.ptp(np.asarray(values)) > 0.0
+        assert low <= np.asarray(values).min() <= np.asarray(values).max() <= high
+
+
+def test_a_fall_terminates_and_the_next_episode_begins_elsewhere(walking):
+    _, state = walking.reset(6)
+    sunk = dataclasses.replace(state, body=dataclasses.replace(state.body, qpos=state.body.qpos.at[0, 2].add(-0.35)))
+    _, after, reward, terminated, truncated, info = walking.step(6, sunk)
+    np.testing.assert_array_equal(terminated, [True] + [False] * (N_ROBOTS - 1))
+    assert not truncated.any()
+    assert float(info["reward_fall"][0]) == float(walking.params.reward.fall)
+    assert int(after.steps[0]) == 0
+    assert int(after.anchor[0]) != int(state.anchor[0])
+    assert int(after.steps[1]) == 1
+    assert float(reward[0]) < float(reward[1])
+
+
+def test_the_horizon_truncates_as_a_success(walking):
+    params = dataclasses.replace(walking.params, horizon=jnp.int32(1))
+    _, state = walking.reset(7)
+    _, _, _, terminated, truncated, info = walking.step(7, state, params=params)
+    assert truncated.all()
+    assert not terminated.any()
+    assert info["success"].all()
+
+
+def test_a_nan_in_the_action_is_read_as_nothing(walking):
+    _, state = walking.reset(8)
+    zero = walking.step(8, state)[0]
+    spoiled = walking.step(8, state, jnp.full((N_ROBOTS, 12), jnp.nan))[0]
+    np.testing.assert_array_equal(zero, spoiled)
+
+
+def test_random_extreme_actions_leave_no_nan(walking):
+    _, state = walking.reset(9)
+    for k in range(50):
+        action = jnp.sign(jax.random.normal(jax.random.key(k), (N_ROBOTS, 12)))
+        obs, state, reward, _, _, info = walking.step(k, state, action)
+    assert np.isfinite(obs).all()
+    assert np.isfinite(reward).all()
+    assert np.isfinite(info["final_observation"]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_million_physics_steps_under_random_extreme_torques_leave_no_nan(walking):
+    """Offsets of ± 3 rad saturate every servo."""
+    n_robots, params = 250, dataclasses.replace(walking.params, action_scale=jnp.full(3, 3.0))
+
+    def step(state, key):
+        action = jnp.sign(jax.random.normal(key, (n_robots, 12)))
+        obs, state, reward, terminated, _, _ = walking.batch.step(key, state, action, params)
+        return state, (jnp.isfinite(obs).all() & jnp.isfinite(reward).all(), terminated.mean())
+
+    _, state = jax.jit(walking.batch.reset, static_argnums=2)(jax.random.key(0), params, n_robots)
+    _, (finite, fallen) = jax.jit(lambda s: jax.lax.scan(step, s, jax.random.split(jax.random.key(1), 800)))(state)
+    assert finite.all()
+    assert fallen.sum() > 1.0
+
+
+def test_a_robot_that_leaves_the_numbers_is_a_fall_and_spoils_nobody(walking):
+    _, state = walking.reset(10)
+    wild = dataclasses.replace(state, body=dataclasses.replace(state.body, qvel=state.body.qvel.at[0].set(1e30)))
+    obs, _, reward, terminated, _, _ = walking.step(10, wild)
+    assert bool(terminated[0])
+    assert np.isfinite(obs).all()
+    assert np.isfinite(reward).all()
+
+
+def beside(walking, state, lateral):
+    """The same robots moved aside to that lateral offset, m."""
+    turned = walking.params.track.quaternion[state.anchor]
+    aim = jax.vmap(rotation.rotate, in_axes=(0, None))(turned, jnp.array([0.0, 1.0, 0.0]))
+    away = lateral - jax.vmap(driver.locate)(state.body, turned).lateral
+    aside = state.body.qpos.at[:, :3].add(away[:, None] * aim)
+    return dataclasses.replace(state, body=dataclasses.replace(state.body, qpos=aside))
+
+
+def test_a_wall_is_told_as_contact(walking):
+    _, state = walking.reset(11)
+    assert walking.step(11, beside(walking, state, 2.7))[5]["contact"].all()
+    assert not walking.step(11, state)[5]["contact"].any()
+
+
+def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
+    params = walking.told((0.0, 0.3, 0.0))
+    _, state = walking.reset(12, params)
+    state, reached, touched = beside(walking, state, 2.3 * state.facing), [], False
+    for k in range(150):
+        _, state, _, _, _, info = walking.step(k, state, params=params)
+        reached.append(np.abs(info["lateral"]))
+        touched = touched or bool(info["contact"].any())
+    assert touched
+    assert np.max(reached[0]) < 2.4
+    assert 2.45 < np.max(reached) < 2.825 - 0.1
+
+
+def wrench(lateral, speed=0.0, half_width=2.8):
+    """Of the walls on a robot that far to the left, moving there."""
+    qpos = jnp.zeros(19).at[1].set(lateral).at[2].set(0.5).at[3].set(1.0)
+    body = physics.Body(qpos, jnp.zeros(18).at[1].set(speed), jnp.zeros(18))
+    around = physics.Surroundings(
+        (jnp.zeros((7, 3)), jnp.zeros((7, 4))), jnp.array([1.0, 0, 0, 0]), jnp.float32(half_width)
+    )
+    return np.asarray(physics.wall_wrench(body, around))
+
+
+def test_walls_push_back_where_the_robot_is_in_them_and_nowhere_else():
+    np.testing.assert_array_equal(wrench(0.0), 0.0)
+    np.testing.assert_array_equal(wrench(2.5), 0.0)
+    np.testing.assert_allclose(wrench(2.6), [0.0, -2.0 * 2e4 * 0.025, 0.0, 0.0, 0.0, 0.0], rtol=1e-3, atol=1e-3)
+    assert wrench(-2.6)[1] > 0.0
+    assert wrench(2.6, speed=0.2)[1] < wrench(2.6)[1]
+    # Walls do not hold a robot that leaves them.
+    assert wrench(2.6, speed=-5.0)[1] == 0.0
+
+
+def test_a_tunnel_narrower_than_the_robot_is_refused_with_its_width(plan_of):
+    narrow = plan_of(tunnel_arrays(straight(20.0), half_width=0.28))
+    with pytest.raises(RobotError, match=r"is 0\.56 m wide at 0\.0 m; the B2 needs 0\.65 m"):
+        make(tunnel=narrow)
+
+
+def test_a_scene_without_a_track_is_refused(tmp_path, plan_of):
+    np.savez(tmp_path / "tunnel.npz", **tunnel_arrays(straight(20.0)))
+    (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
+    with pytest.raises(TrackError, match="no track to walk on"):
+        st.make("Subterra/B2Walk-v0", scene=tmp_path)
+
+
+def test_a_misspelt_field_is_refused_by_name():
+    with pytest.raises(ValueError, match="no field \\['horizn'\\] in WalkParams"):
+        st.make("Subterra/B2Walk-v0", horizn=3)
+
+
+def test_contacts_and_rows_stay_as_few_as_they_are_meant_to_be(walking):
+    data = walking.env.physics.blank
+    assert data._impl.contact.dist.shape[0] == 8
+    assert data._impl.nefc == 12 + 4 * 8
+    assert walking.env.physics.host.body("base_link").mass[0] == pytest.approx(b2.TRUNK.mass)
