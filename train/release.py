@@ -19,6 +19,7 @@ from train.agents import agent_of, tensors_of
 from train.arguments import parse
 from train.errors import ConfigError, RunFolderError
 from train.evaluate import evaluate
+from train.legs import Legs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +82,7 @@ def command(arguments: Command) -> None:
     if arguments.out.suffix != TENSORS:
         raise ConfigError(f"out must end in {TENSORS}, got {arguments.out}")
     networks, policy, stored = policies.load_policy(arguments.run)
-    world = policies.open_world(stored["task"], arguments.tunnel, arguments.lining)
+    world = _world(stored, arguments)
     found = evaluate(world, agent_of(networks, policy), arguments.episodes)
     facts = {
         "task": stored["task"],
@@ -94,6 +95,15 @@ def command(arguments: Command) -> None:
     }
     write(arguments.out, networks, policy, facts)
     cli.table(str(arguments.out), {name: value for name, value in found.items() if value is not None})
+
+
+def _world(stored: dict[str, Any], arguments: Command) -> policies.World:
+    """Where the policy is scored: what it was trained on, be it the stand-in of a robot on legs."""
+    if stored["world"].get("embodiment") is None:
+        return policies.open_world(stored["task"], arguments.tunnel, arguments.lining)
+    from train import embodied  # MuJoCo is loaded only where legs are meant
+
+    return embodied.open_world(stored["task"], arguments.tunnel, arguments.lining, Legs(robots=0))
 
 
 def main() -> None:

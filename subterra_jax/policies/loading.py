@@ -91,7 +91,7 @@ def register_released() -> tuple[str, ...]:
     Returns:
         Their names.
     """
-    names = tuple(PREFIX + name for name in released() if not name.startswith("B2Walk"))
+    names = tuple(PREFIX + name for name in released() if not name.startswith("B2"))
     for name in names:
         if name not in registry.names():
             registry.register(name, lambda params, name=name: load(name.removeprefix(PREFIX))[0])  # type: ignore[misc]

@@ -14,6 +14,7 @@ from benchmarks.leaderboard import figure, report
 from benchmarks.leaderboard.board import scores, totals
 from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, checked
 from benchmarks.leaderboard.entries import Entry
+from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Records
 from subterra_jax.evaluation.episodes import SHA256
 
@@ -51,6 +52,9 @@ def test_where_no_agent_is_named_the_policy_released_for_the_task_drives_beside_
     with_policy, without = (agents_for(config, task) for task in config.tasks)
     assert set(with_policy) - set(without) == {"released-policy"}
     assert {"ring-count", "particle-filter", "oracle"} <= set(without)
+    # What a robot on legs has learnt does not drive the planar one.
+    assert "policy:StopAt-v0" in registry.names()
+    assert not any(name.startswith("policy:B2") for name in registry.names())
 
 
 def test_what_was_driven_is_kept_and_read_by_the_next_run(monkeypatch, tmp_path):
