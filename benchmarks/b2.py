@@ -20,6 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 import subterra_jax as st
+from scene.arguments import parse
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.window import WindowConfig
@@ -39,6 +40,8 @@ VARIANTS: dict[str, Physics] = {
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Measures physics steps per second of the B2 on its window of track.
+
+    Example: python -m benchmarks.b2 --robots 8192 --variants all
 
     Attributes:
         robots: At once.
@@ -142,10 +145,14 @@ def command(arguments: Command) -> int:
     return 0 if all(figures["finite"] for figures in found.values()) else 1
 
 
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m benchmarks.b2")
+
+
 def main() -> int:
     """Entry point of `python -m benchmarks.b2`; a user's mistake is one sentence and status 2."""
     try:
-        return command(tyro.cli(Command))
+        return command(parse(_read))
     except (st.SubterraError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from scene.arguments import parse
 from subterra_jax.b2.film import Driver
 from subterra_jax.b2.gym import B2Env
 from subterra_jax.b2.policy import RELEASED
@@ -29,6 +30,8 @@ class LagError(SubterraError):
 @dataclass(frozen=True)
 class Command:
     """Identifies the lags of a gait.
+
+    Example: python -m benchmarks.b2_lag --robots 6 --steps 150
 
     Attributes:
         policy: The gait: a file, the name of a released one, or `trot`.
@@ -87,9 +90,13 @@ def command(arguments: Command) -> None:
     cli.table(f"gait {arguments.policy}", {**dataclasses.asdict(lag), "steps": len(told), "ended_early": cut})
 
 
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m benchmarks.b2_lag")
+
+
 def main() -> None:
     """Entry point of `python -m benchmarks.b2_lag`."""
-    cli.run(lambda: command(tyro.cli(Command)))
+    cli.run(lambda: command(parse(_read)))
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
+from scene.arguments import parse
 from subterra_jax import policies
 from subterra_jax.b2 import missions, trial
 from subterra_jax.b2.policy import RELEASED
@@ -26,6 +27,8 @@ from train.evaluate import open_agent
 @dataclass(frozen=True)
 class Command:
     """Lets B2s traverse a tunnel.
+
+    Example: python -m benchmarks.b2_traverse --robots 100 --agent B2Traverse-v0 --engine mujoco
 
     Attributes:
         robots: How many.
@@ -97,9 +100,13 @@ def command(arguments: Command) -> None:
         arguments.out.write_text(json.dumps({**vars(arguments), **found}, default=str, indent=1) + "\n")
 
 
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m benchmarks.b2_traverse")
+
+
 def main() -> None:
     """Entry point of `python -m benchmarks.b2_traverse`."""
-    cli.run(lambda: command(tyro.cli(Command)))
+    cli.run(lambda: command(parse(_read)))
 
 
 if __name__ == "__main__":

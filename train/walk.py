@@ -16,6 +16,7 @@ import tyro
 from subterra_jax.b2 import tasks
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
+from train import arguments as reading
 from train import cli, ppo, seeds
 from train.config import check
 from train.errors import ConfigError
@@ -29,6 +30,8 @@ from train.walk_session import WalkSession
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Trains a gait by PPO. The defaults of the settings follow from `--preset`.
+
+    Example: python -m train.walk --out out/walk --seeds 0 1 2 --release out/walk.safetensors
 
     Attributes:
         out: Run folder to write: checkpoint/, config.json, log.jsonl, episodes.csv, curve.png, evaluation.json.
@@ -67,7 +70,7 @@ def parse(arguments: list[str]) -> Command:
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
     on_cpu = {"robots": 64} if preset == "cpu" else {}
     default = Command(out=tyro.MISSING, preset=preset, config=make_config(preset), **on_cpu)  # type: ignore[arg-type]
-    return tyro.cli(Command, args=arguments, default=default)
+    return tyro.cli(Command, args=arguments, default=default, prog="python -m train.walk")
 
 
 def open_world(tunnel: Path | None, scene: Path | None) -> World:
@@ -152,7 +155,7 @@ def _one(arguments: Command, world: World, config: WalkConfig, out: Path) -> boo
 
 def main() -> None:
     """Entry point of `python -m train.walk`."""
-    cli.run(lambda: command(parse(sys.argv[1:])))
+    cli.run(lambda: command(reading.parse(parse, sys.argv[1:])))
 
 
 if __name__ == "__main__":
