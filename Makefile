@@ -17,7 +17,7 @@ test: lint       ## linter, type checker, and every test that is not marked slow
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal
 
 test-slow: $(STAMP)  ## the tests that take minutes
-	XLA_FLAGS=" " $(BIN)/python -m pytest -m slow
+	XLA_FLAGS= $(BIN)/python -m pytest -m slow
 
 reproduce: $(STAMP)  ## the README's numbers again, those that a CPU can, about 45 minutes; says which differ
 	$(BIN)/python -m benchmarks.reproduce --shared $(SHARED)

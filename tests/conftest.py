@@ -1,8 +1,8 @@
 """How programs are compiled while the tests run: cheaply, and once for all workers of a run.
 
 Most of what the simulator's tests take is XLA compiling programs that run for a moment. Without LLVM's optimisations
-and fusion emitters it compiles five times as fast, and what comes out runs a third as fast. Set `XLA_FLAGS` to
-anything, say `XLA_FLAGS=" "`, and the tests run what users run; `make test-slow` does.
+and fusion emitters it compiles five times as fast, and what comes out runs a third as fast. Where `XLA_FLAGS` is set,
+be it to nothing, the tests run with that: `make test-slow` runs what users run.
 """
 
 import gc

@@ -17,7 +17,7 @@ MORE = ("--stop-coverage=2", "--checkpoint-every=1", "--evaluation-episodes=2", 
 
 def processes(n_devices: int, *lines: tuple[str, ...]) -> None:
     """Runs commands of `train.navigate` at the same time, each with so many CPU devices."""
-    flags = os.environ.get("XLA_FLAGS", "") + f" --xla_force_host_platform_device_count={n_devices}"
+    flags = f"--xla_force_host_platform_device_count={n_devices} " + os.environ.get("XLA_FLAGS", "")
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     started = [
         subprocess.Popen([sys.executable, "-m", "train.navigate", *line], env=environment, stderr=subprocess.PIPE)
