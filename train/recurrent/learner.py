@@ -205,7 +205,7 @@ class RecurrentLearner(parts.Whole):
             "policy_loss": -jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage)),
             "value_loss": jnp.mean(jnp.square(value - lesson.target)),
             "entropy": jnp.mean(networks.distribution.entropy(thought.parameters, key)),
-            "estimate_loss": jnp.mean(self._missed(thought.logits, rollout.error)),
+            "estimate_loss": jnp.mean(missed(thought.logits, rollout.error, config.bin_width)),
             "kl": jnp.mean(ratio - 1.0 - log_ratio),
         }
         total = (
@@ -214,7 +214,3 @@ class RecurrentLearner(parts.Whole):
             + config.estimate_weight * losses["estimate_loss"]
         )
         return total, losses
-
-    def _missed(self, logits: Float[Array, "*batch bins"], error: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-        """Cross entropy with the truth shared between its two nearest bins."""
-        return missed(logits, error, self.config.bin_width)
