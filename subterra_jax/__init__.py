@@ -12,6 +12,7 @@ from subterra_jax.tasks import TASKS, make
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
+from subterra_jax.tunnel.stack import stack
 
 __all__ = [
     "TASKS",
@@ -30,6 +31,7 @@ __all__ = [
     "procedural",
     "randomize",
     "rollout",
+    "stack",
 ]
 
 if importlib.util.find_spec("gymnasium") is not None:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from subterra_jax.b2 import ids
 from subterra_jax.env import TunnelEnv
 from subterra_jax.faults import FaultParams
 from subterra_jax.lidar import LidarParams
@@ -26,8 +27,6 @@ from subterra_jax.vehicle import VehicleParams
 from subterra_jax.wander import WanderParams
 
 SHORT_LENGTH = 60.0
-WALKING = "Subterra/B2Walk-v0"
-ON_LEGS = ("Subterra/B2Traverse-v0",)
 _SHORT_GOALS = {"low": 10.0, "high": 60.0, "margin": 5.0, "tolerance": 0.25}
 
 
@@ -112,11 +111,11 @@ def make(
         ValueError: No such task, no such field, or a value that the simulator cannot honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
-    if id == WALKING:
+    if id == ids.WALK:
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
         return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
-    if id in ON_LEGS:
+    if id in ids.MISSIONS:
         from subterra_jax.b2 import missions
 
         return missions.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from typing import Annotated
 import jax
 import tyro
 
-from subterra_jax.b2 import tasks
+from subterra_jax.b2 import ids, tasks
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train import arguments as reading
@@ -86,14 +86,14 @@ def open_world(tunnel: Path | None, scene: Path | None) -> World:
     plan = load_tunnel(file)
     env, params = tasks.make(tunnel=None if scene else plan, scene=scene, privileged=True)
     facts = {
-        "task": tasks.WALK,
+        "task": ids.WALK,
         "lining": plan.default_lining,
         "tunnel": plan.name,
         "tunnel_provenance": plan.provenance,
         "tunnel_sha256": tunnel_digest(file),
         "track": "by standard" if scene is None else "of the scene",
     }
-    return World(tasks.WALK, env, params, facts)
+    return World(ids.WALK, env, params, facts)
 
 
 def command(arguments: Command) -> int:

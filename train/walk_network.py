@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.policies.loading import GAIT
+from subterra_jax.policies.files import GAIT
 from train import normalize
 from train.learner import Learner, make_layout
 from train.networks import Layout, Networks, Policy, Weights

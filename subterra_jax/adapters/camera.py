@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.adapters.missing import MissingLibraryError
-from subterra_jax.adapters.views import tunnel_of
 from subterra_jax.env import TunnelEnv
 from subterra_jax.errors import SubterraError
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.reading import tunnel_of
 from subterra_jax.tunnel.sources import load_tunnel
 
 if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.get("DISPLAY"):

@@ -2,7 +2,8 @@
 
 from gymnasium.envs import registration
 
-from subterra_jax.tasks import ON_LEGS, TASKS
+from subterra_jax.b2 import ids
+from subterra_jax.tasks import TASKS
 
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
@@ -14,6 +15,6 @@ def register() -> None:
     for task in TASKS:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
-    for task in ON_LEGS:
+    for task in ids.MISSIONS:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_ON_LEGS, kwargs={"task": task})

@@ -13,6 +13,7 @@ from subterra_jax.drawing import top_down, wall_points
 from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.reading import tunnel_of
 
 VIEWS = ("top", "mujoco")
 
@@ -99,8 +100,3 @@ def _line_across(tunnel: Tunnel, station: float) -> np.ndarray:
     middle = np.array(centre) + beyond * np.array([tangent_x, tangent_y])
     across = half_width * np.array([-tangent_y, tangent_x])
     return np.stack([middle - across, middle + across])
-
-
-def tunnel_of(scene: Path) -> Path:
-    """The tunnel file beside a scene."""
-    return (scene if scene.is_dir() else scene.parent) / "tunnel.npz"

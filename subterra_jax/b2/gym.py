@@ -16,7 +16,7 @@ if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.ge
 
 from subterra_jax.adapters import spaces
 from subterra_jax.adapters.streams import start_streams, take_key
-from subterra_jax.b2 import missions
+from subterra_jax.b2 import ids, missions
 from subterra_jax.b2 import policy as gaits
 from subterra_jax.b2.physics import Surroundings
 from subterra_jax.b2.policy import WalkPolicy
@@ -46,7 +46,7 @@ class B2Env(Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        task: str = missions.TRAVERSE,
+        task: str = ids.TRAVERSE,
         tunnel: TunnelPlan | str | Path | None = None,
         lining: str | None = None,
         *,

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 from subterra_jax.b2 import policy as gaits
 from subterra_jax.b2.engine import MujocoPhysics
 from subterra_jax.b2.hierarchy import PERIODS, MissionEnv
+from subterra_jax.b2.ids import MISSIONS, TRAVERSE
 from subterra_jax.b2.mission import MissionParams
 from subterra_jax.b2.params import SensorParams, VarietyParams
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.policy import WalkPolicy
-from subterra_jax.b2.tasks import WALK, as_arrays
+from subterra_jax.b2.tasks import as_arrays
 from subterra_jax.b2.tasks import make as make_walk
 from subterra_jax.b2.world import SceneWalk
 from subterra_jax.lidar import LidarParams
@@ -25,8 +26,6 @@ from subterra_jax.state import EnvParams, StartParams
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.vehicle import VehicleParams
 
-TRAVERSE = "Subterra/B2Traverse-v0"
-MISSIONS = (TRAVERSE,)
 TROT = "trot"  # the gait as it is written down, without a trained policy
 ENGINES = ("mjx", "mujoco")
 

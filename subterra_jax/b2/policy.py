@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.policies.files import PolicyError, PolicyFile, read
+from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read
 from subterra_jax.policies.layers import Tensors, perceptron
-from subterra_jax.policies.loading import GAIT
 
 RELEASED = "B2Walk-v0"
 _CLIP = 10.0  # standard deviations

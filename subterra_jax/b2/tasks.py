@@ -10,17 +10,16 @@ import numpy as np
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.gait import GaitParams
+from subterra_jax.b2.ids import WALK
 from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.params import CommandParams, SensorParams, VarietyParams, WalkParams, WalkRewardParams
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import Track, by_standard, from_scene
 from subterra_jax.b2.walk import WalkEnv
-from subterra_jax.tasks import WALKING
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
 
-WALK = WALKING
 _ROOM = 0.1  # to either side of the robot's envelope, m
 
 

@@ -19,6 +19,7 @@ from subterra_jax.errors import SubterraError
 
 SCHEMA = "subterra.policy/1"
 TENSORS, FACTS = ".safetensors", ".json"
+GAIT = "walk"  # the kind that moves legs and drives no task
 _FACTS = ("name", "kind", "task", "layout", "tensors_sha256")
 
 

@@ -13,7 +13,7 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
 from subterra_jax.policies import senses
 from subterra_jax.policies.feedforward import FeedForward
-from subterra_jax.policies.files import PolicyError, PolicyFile, read, released
+from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.recurrent import Recurrent
 from subterra_jax.rules import StopAt
 from subterra_jax.state import EnvParams
@@ -21,7 +21,6 @@ from subterra_jax.state import EnvParams
 Agent = FeedForward | Recurrent
 KINDS = ("mlp", "gru")
 PREFIX = "policy:"  # of the names of released policies among the agents
-GAIT = "walk"
 
 
 def load(source: str | Path) -> tuple[Any, dict[str, Any]]:

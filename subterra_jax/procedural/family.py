@@ -12,6 +12,7 @@ from subterra_jax.procedural.control import control
 from subterra_jax.procedural.generate import LININGS, plan
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel.stack import stack
 
 SPLIT_SIZE = 1_000_000
 SPLITS = {"train": 0, "val": SPLIT_SIZE, "test": 2 * SPLIT_SIZE}
@@ -58,7 +59,7 @@ def family(
     if lining not in LININGS:
         raise TunnelError(f"the family has no lining {lining!r}; it has {', '.join(LININGS)}")
     seeds = [seed_of(split, first + i) for i in range(n)]
-    return Tunnel.stack([Tunnel.from_plan(plan(s, config, linings=(lining,)), lining, reach=reach) for s in seeds])
+    return stack([Tunnel.from_plan(plan(s, config, linings=(lining,)), lining, reach=reach) for s in seeds])
 
 
 def expand(name: str) -> list[str]:

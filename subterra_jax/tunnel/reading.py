@@ -108,3 +108,8 @@ def read_tunnel(path: Path) -> TunnelPlan:
         },
         ring_pitch=ring_pitch,
     )
+
+
+def tunnel_of(scene: Path) -> Path:
+    """The tunnel file of a scene folder, or the one beside an MJCF file."""
+    return (scene if scene.is_dir() else scene.parent) / "tunnel.npz"

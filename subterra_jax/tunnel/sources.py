@@ -12,6 +12,7 @@ import numpy as np
 from subterra_jax.procedural import expand, named
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.reading import read_tunnel
+from subterra_jax.tunnel.stack import stack
 from subterra_jax.tunnel.tunnel import Tunnel
 
 PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
@@ -87,7 +88,7 @@ def resolve(
     if isinstance(tunnel, str | Path) and len(names := expand(str(tunnel))) > 1:
         tunnel = names
     if tunnel is not None and not isinstance(tunnel, TunnelPlan | str | Path):
-        return Tunnel.stack([resolve(each, lining, piece, reach) for each in tunnel])
+        return stack([resolve(each, lining, piece, reach) for each in tunnel])
     plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
     if piece is not None:
         start, length = piece

@@ -1,7 +1,6 @@
 """The tunnel on the device, or many of them: what the simulator reads at every step, as one pytree."""
 
 import dataclasses
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -93,20 +92,6 @@ class Tunnel:
         return dataclasses.replace(
             self, length=length, spacing=spacing, ring_pitch=ring_pitch, first_node=first_node, n_nodes=n_nodes
         )
-
-    @staticmethod
-    def stack(tunnels: Sequence["Tunnel"]) -> "Tunnel":
-        """Several tunnels in one; see `subterra_jax.tunnel.stack`. A step costs 7 % more for 100 of them on an H200.
-
-        Args:
-            tunnels: One or more single tunnels, of any length and lining.
-
-        Raises:
-            ValueError: There are none, or one is a stack itself.
-        """
-        from subterra_jax.tunnel.stack import stack  # it needs this class
-
-        return stack(tunnels)
 
     @classmethod
     def from_plan(

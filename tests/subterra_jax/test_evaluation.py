@@ -44,7 +44,7 @@ def test_episodes_are_spread_evenly_over_severities_and_tunnels():
     episodes = listed_episodes("Subterra/FaultedShort-v0", params)
     assert np.bincount(episodes.severity).tolist() == [100] * 5
     assert np.bincount(episodes.group).tolist() == [50] * 10
-    two = dataclasses.replace(params, tunnel=st.Tunnel.stack([params.tunnel] * 2))
+    two = dataclasses.replace(params, tunnel=st.stack([params.tunnel] * 2))
     episodes = listed_episodes("Subterra/FaultedShort-v0", two)
     assert (
         np.unique(np.stack([episodes.severity, episodes.tunnel]), axis=1, return_counts=True)[1].tolist() == [50] * 10
@@ -79,7 +79,7 @@ class Dawdler:
 
 def test_an_episode_depends_on_its_seed_and_its_tunnel_and_not_on_the_others_driven_with_it(plan_of):
     plans = [plan_of(tunnels.tunnel_arrays(pieces)) for pieces in (tunnels.straight(70.0), tunnels.arc(80.0, 60.0))]
-    stacked = st.Tunnel.stack([st.Tunnel.from_plan(plan, "pockets") for plan in plans])
+    stacked = st.stack([st.Tunnel.from_plan(plan, "pockets") for plan in plans])
     env, params = st.make("Subterra/StopAtShort-v0", tunnel=stacked)
     agent, episodes = make_agent("dead-reckoning", params), listed_episodes(env.id, params, 5)
     together = evaluate(env, params, agent, episodes)

@@ -85,7 +85,7 @@ def test_the_map_is_where_the_normal_of_the_centreline_meets_the_walls(plan, tun
 
 def test_a_stack_holds_the_map_of_each_of_its_tunnels(plan):
     alone = [st.Tunnel.from_plan(plan, "pockets"), st.Tunnel.from_plan(plan.slice(20.0, 50.0), "smooth")]
-    stack = st.Tunnel.stack(alone)
+    stack = st.stack(alone)
     walls = wall_map(stack)
     station, left = jnp.linspace(0.5, 49.5, 40), jnp.arange(40) % 2 == 0
     for index, tunnel in enumerate(alone):

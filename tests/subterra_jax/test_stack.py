@@ -10,6 +10,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import fused, lidar, reference, vehicle
 from subterra_jax.tunnel import Tunnel, foot, node_at
+from subterra_jax.tunnel.stack import stack
 from tests.subterra_jax import tunnels
 
 PARAMS = lidar.LidarParams()
@@ -34,7 +35,7 @@ def alone(plans) -> list[Tunnel]:
 
 @pytest.fixture(scope="module")
 def together(alone) -> Tunnel:
-    return Tunnel.stack(alone)
+    return stack(alone)
 
 
 @jax.jit
@@ -111,7 +112,7 @@ def test_no_window_reaches_the_neighbour(alone, together):
 
 def test_the_fused_kernels_see_each_tunnel_of_a_stack(plans, alone):
     poses = [reference.Poses(*(v[:24] for v in vars(p).values())) for p in poses_in(plans[:2], 30)]
-    stacked = Tunnel.stack(alone[:2])
+    stacked = stack(alone[:2])
     position, heading, station = (np.concatenate(part) for part in zip(*(vars(p).values() for p in poses), strict=True))
     index, rows = np.repeat([0, 1], 24), (jnp.asarray(position), jnp.asarray(heading))
     first = jax.vmap(lambda i, s: stacked.scan_first[node_at(stacked.pick(i), s)])(index, station)
@@ -139,16 +140,16 @@ def test_a_batch_of_different_tunnels_and_lidars_goes_to_the_kernels_as_rows(pla
 
 
 def test_a_stack_of_one_is_that_one_and_picks_itself(alone):
-    assert Tunnel.stack(alone[:1]) is alone[0]
+    assert stack(alone[:1]) is alone[0]
     assert alone[0].pick(0) is alone[0]
-    assert (alone[0].count, Tunnel.stack(alone[:2]).count) == (1, 2)
+    assert (alone[0].count, stack(alone[:2]).count) == (1, 2)
 
 
 def test_an_empty_stack_and_a_stack_of_stacks_are_refused(alone, together):
     with pytest.raises(ValueError, match="at least one"):
-        Tunnel.stack([])
+        stack([])
     with pytest.raises(ValueError, match="tunnel 1 is a stack of 3"):
-        Tunnel.stack([alone[0], together])
+        stack([alone[0], together])
 
 
 def test_padding_is_never_taken_for_a_wall(plan_of):

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.change import significance
 from benchmarks.fidelity.derive.distances import BOOTSTRAP, mean_distance, to_mesh
+from benchmarks.fidelity.derive.extent import bins
 from benchmarks.fidelity.derive.noise import real_planes
-from benchmarks.fidelity.derive.path import bins
 from benchmarks.fidelity.registry import metric
 from benchmarks.fidelity.value import Value, estimate, missing, number
 

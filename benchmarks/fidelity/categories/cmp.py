@@ -6,8 +6,8 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import returns
 from benchmarks.fidelity.derive.density import density_aware_chamfer
 from benchmarks.fidelity.derive.distances import BOOTSTRAP, to_cloud, to_mesh
+from benchmarks.fidelity.derive.extent import bins
 from benchmarks.fidelity.derive.observed import phantom
-from benchmarks.fidelity.derive.path import bins
 from benchmarks.fidelity.registry import metric
 from benchmarks.fidelity.value import Value, estimate, number
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import returns
-from benchmarks.fidelity.derive.path import bins, mouths
+from benchmarks.fidelity.derive.extent import bins
+from benchmarks.fidelity.derive.path import mouths
 from benchmarks.fidelity.derive.voxels import dilated, iou, occupied, shell, tolerant
 from benchmarks.fidelity.registry import metric
 from benchmarks.fidelity.value import Value, number

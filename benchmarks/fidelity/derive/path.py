@@ -1,7 +1,7 @@
 """The way that the held-out sensor went: coordinates in which no candidate has a say."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.signal import savgol_filter
 
 from benchmarks.fidelity.case import Case, of_hold
@@ -9,7 +9,6 @@ from benchmarks.fidelity.derive.curve import Curve
 
 STEP = 1.0  # m between nodes
 _WINDOW = 11  # nodes over which the sway of the carrier is smoothed away
-BIN = 10.0  # m
 
 
 @of_hold
@@ -50,22 +49,6 @@ def _strung(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         left[order[-1]] = False
         here = nodes[order[-1]]
     return nodes[order]
-
-
-@of_hold
-def extent(case: Case) -> tuple[float, float]:
-    """Stations between which the held-out returns lie, but for one in a thousand at either end, m."""
-    from benchmarks.fidelity.derive.beams import returns
-
-    low, high = np.percentile(returns(case).local[:, 0], [0.1, 99.9])
-    return float(low), float(high)
-
-
-def bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Equal bins of about `BIN` over `extent`; what lies beyond belongs to the first and the last."""
-    low, high = extent(case)
-    count = max(round((high - low) / BIN), 1)
-    return np.clip(((station - low) / (high - low) * count).astype(int), 0, count - 1)
 
 
 def mouths(case: Case) -> tuple[float, float]:
