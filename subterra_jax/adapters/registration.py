@@ -7,7 +7,8 @@ from subterra_jax.tasks import TASKS
 
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
-_ON_LEGS = "subterra_jax.b2.gym:B2Env"  # MuJoCo is loaded by who makes one
+# MuJoCo is loaded by who makes one.
+_ON_LEGS = dict.fromkeys(ids.MISSIONS, "subterra_jax.b2.gym:B2Env") | {ids.WALK: "subterra_jax.b2.gym:B2WalkEnv"}
 
 
 def register() -> None:
@@ -15,6 +16,6 @@ def register() -> None:
     for task in TASKS:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
-    for task in ids.MISSIONS:
+    for task, entry in _ON_LEGS.items():
         if task not in registration.registry:
-            registration.register(id=task, entry_point=_ON_LEGS, kwargs={"task": task})
+            registration.register(id=task, entry_point=entry, kwargs={"task": task})

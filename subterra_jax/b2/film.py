@@ -14,20 +14,23 @@ import jax
 import numpy as np
 
 from subterra_jax import policies
+from subterra_jax.arguments import parse
 from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.registry import make_agent, names
 from subterra_jax.errors import SubterraError
+from subterra_jax.outputs import require_file
 
 _EVERY = 3  # one picture for so many control periods of 20 ms
 _DURATION = 20 * _EVERY  # of a picture, ms
 _ANIMATED = (".gif", ".webp")
+_MOST_PIXELS, _LONGEST = 4096, 3600.0  # s
 
 
 class Driver:
     """An agent that is asked step by step."""
 
     def __init__(self, env: B2Env, name: str):
-        params, mission = env.params, env.mission
+        params, mission = env.params, env.env
         agent: Any
         if name in names():
             agent = make_agent(name, params)
@@ -57,7 +60,7 @@ def shoot(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.
     Raises:
         PictureError: There is no OpenGL.
     """
-    physics: Any = env.mission.walk.physics
+    physics: Any = env.walk.physics
     moments: list[Moment] = []
     count = 0
     physics.bench.watch = lambda data: moments.append(Moment.of(data))
@@ -92,6 +95,21 @@ def write(path: Path, pictures: list[np.ndarray]) -> None:
         raise PictureError(f"{path} cannot be written: {cause}; .webp and .gif need imageio, .mp4 ffmpeg") from cause
 
 
+def _check(asked: argparse.Namespace) -> None:
+    """Refuses what cannot be shot or written, before minutes are spent on it.
+
+    Raises:
+        ValueError: A number is out of range.
+        OutputError: The file cannot be written.
+    """
+    for name, least, most in (("width", 16, _MOST_PIXELS), ("height", 16, _MOST_PIXELS), ("seed", 0, 2**31 - 1)):
+        if not least <= getattr(asked, name) <= most:
+            raise ValueError(f"{name} must be {least} to {most}, got {getattr(asked, name)}")
+    if not 0.0 < asked.seconds <= _LONGEST:
+        raise ValueError(f"seconds must be above 0 and at most {_LONGEST:g}, got {asked.seconds}")
+    require_file(asked.out, *_ANIMATED, ".mp4")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Entry point: 0, or 2 for a user's mistake."""
     parser = argparse.ArgumentParser(prog="python -m subterra_jax.b2.film", description=__doc__)
@@ -103,15 +121,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=360)
-    asked = parser.parse_args(arguments)
     try:
+        asked = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
+        _check(asked)
         size = {"width": asked.width, "height": asked.height}
         env = B2Env(scene=asked.scene, policy=asked.policy, render_mode="rgb_array", **size)
         pictures = shoot(env, Driver(env, asked.agent), asked.seconds, asked.seed)
         write(asked.out, pictures)
         env.close()
     except (SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     print(f"{asked.out}: {len(pictures)} pictures")
     return 0

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from subterra_jax.b2 import policy as gaits
 from subterra_jax.b2.engine import MujocoPhysics
 from subterra_jax.b2.hierarchy import PERIODS, MissionEnv
-from subterra_jax.b2.ids import MISSIONS, TRAVERSE
+from subterra_jax.b2.ids import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2.mission import MissionParams
 from subterra_jax.b2.params import SensorParams, VarietyParams
 from subterra_jax.b2.physics import Physics

@@ -12,10 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 
 import subterra_jax as st
 from subterra_jax.b2 import missions, posing
 from subterra_jax.b2.model import RobotError
+from subterra_jax.b2.params import CommandParams
 from subterra_jax.b2.track import TrackError
 from subterra_jax.policies import PolicyError
 
@@ -62,7 +64,7 @@ def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env
     assert env.observation_space.shape == (18,)
     np.testing.assert_allclose(env.action_space.high, [0.8, 0.8])
     np.testing.assert_allclose(env.action_space.low, [0.0, -0.8])
-    assert env.unwrapped.mission.rule == planar.rule
+    assert env.unwrapped.env.rule == planar.rule
     assert env.metadata["render_fps"] == 5
 
 
@@ -136,6 +138,32 @@ def test_success_is_the_share_of_the_tunnel_that_the_rule_asks_for(env):
     assert told[-1][2]
     assert told[-1][4]["success"]
     assert told[-1][4]["coverage"] >= 0.052
+
+
+@pytest.fixture(scope="module")
+def walk(plan):
+    onward = CommandParams(low=(0.5, 0.0, 0.0), high=(0.5, 0.0, 0.0), still=0.0)
+    return gymnasium.make("Subterra/B2Walk-v0", tunnel=plan, command=onward)
+
+
+def test_gymnasium_knows_the_walking_task_by_its_id(plan):
+    inner: Any = gymnasium.make("Subterra/B2Walk-v0", tunnel=plan).unwrapped
+    assert (inner.action_space.shape, inner.observation_space.shape) == ((12,), (56,))
+    assert inner.walk.physics.period == pytest.approx(0.02)
+    with pytest.raises(ResetNeeded):
+        inner.step(np.zeros(12))
+
+
+@pytest.mark.slow
+def test_the_zero_action_walks_as_it_is_told_in_mujoco_too(walk):
+    assert walk.action_space.shape == (12,)
+    assert walk.metadata["render_fps"] == 50
+    told = drive(walk, np.zeros(12), 150, seed=3)
+    again = drive(walk, np.full(12, np.nan), 5, seed=3)
+    np.testing.assert_array_equal(told[4][0], again[4][0])
+    assert not any(step[2] for step in told)
+    ahead = [step[4]["velocity"][0] for step in told[75:]]  # m/s, once it is under way
+    assert 0.2 < np.mean(ahead) < 0.8
 
 
 def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
