@@ -45,9 +45,11 @@ def _surveyed(poses: str, name: str, scale: float) -> Read:
 
 
 def _planar(name: str, scale: float) -> Read:
+    """Of the default lining, the mesh levelled along the track: the plane that the planar simulator is about."""
+
     def read(content: Any) -> float:
-        shares = [one["all"][name] for one in content["comparisons"] if one["title"].startswith("planar")]
-        return scale * (max(shares) if name.startswith("p") else min(shares))
+        title = "planar, pockets, levelled mesh"
+        return scale * next(one["all"][name] for one in content["comparisons"] if one["title"] == title)
 
     return read
 
