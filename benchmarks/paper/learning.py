@@ -105,7 +105,10 @@ def _panel(axes: Any, name: str, table: Float[np.ndarray, "s n"], mean: np.ndarr
     axes.set(ylabel=f"{name}, %\n(mean of the last {WINDOW})", ylim=(-3.0, 104.0), xlim=(0, n))
     axes.set_yticks((0, 25, 50, 75, 100))
     axes.grid(alpha=0.25, lw=0.4)
-    axes.legend(loc="lower right", frameon=False, handlelength=1.6)
+    # Above the axes: how soon the curves rise, and so where there is room inside, depends on the batch.
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False, handlelength=1.2, columnspacing=1.0
+    )
 
 
 def _first_at_goal(mean: Float[np.ndarray, " n"]) -> int | None:
