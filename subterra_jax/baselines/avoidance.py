@@ -3,13 +3,14 @@
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.baselines import corridor
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.corridor import Corridor
+from subterra_jax.baselines.corridor import Corridor, Robot
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.lidar import bearings
 from subterra_jax.state import EnvParams
@@ -17,7 +18,10 @@ from subterra_jax.state import EnvParams
 N_SCANS = 32  # that are remembered
 _SEEN = 6.0  # m; what lies further away is not remembered
 _AT_WALL = 0.3  # m; a hit so near a wall is the wall
-_LANES = 17
+N_LANES = 17
+_N_STEEPER, _ACROSS = 5, 1.5  # angles tried, rad at most
+_SPARE = 0.2  # m of room, beyond that at which it stands, which a way must have
+_IN_LANE = 0.1  # m; nearer than that to its lane it follows the axis
 
 
 @struct.dataclass
@@ -60,13 +64,13 @@ class Avoidance:
     angle_gain: float = 4.0
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
-    def begin(self, obs: Observed, params: EnvParams) -> Surroundings:
+    def begin(self, obs: Observed, params: Robot) -> Surroundings:
         """Nothing hit yet."""
         nowhere = jnp.full((N_SCANS, obs.ranges.shape[0]), -1e3)
         walls = corridor.first_look(obs.ranges, params)
         return Surroundings(walls, nowhere, nowhere, jnp.zeros((), jnp.int32), jnp.zeros(()))
 
-    def look(self, memory: Surroundings, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> Surroundings:
+    def look(self, memory: Surroundings, obs: Observed, command: Float[Array, "2"], params: Robot) -> Surroundings:
         """Track the walls, move the hits along, add those of this scan, choose a lane."""
         before = memory.corridor
         walls = corridor.look(corridor.moved(before, command, params), obs.ranges, params)
@@ -75,23 +79,32 @@ class Avoidance:
         along, across = _hits(walls, obs.ranges)
         along = (memory.along - ahead).at[newest].set(along)
         across = memory.across.at[newest].set(across)
-        seen = Surroundings(walls, along, across, newest, memory.lane)
+        # Else XLA works all of this out again for every lane and way that is looked along.
+        seen = jax.lax.optimization_barrier(Surroundings(walls, along, across, newest, memory.lane))
         return dataclasses.replace(seen, lane=self._lane(seen, params))
 
     def cosine(self, memory: Surroundings) -> Float[Array, ""]:
         """Of the tracked angle."""
         return jnp.cos(memory.corridor.angle)
 
-    def steer(self, memory: Surroundings, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
+    def steer(self, memory: Surroundings, speed: Float[Array, ""], params: Robot) -> Float[Array, "2"]:
         """Into the lane, and not into what stands in the way."""
-        walls = memory.corridor
-        wanted = jnp.clip(self.offset_gain * (memory.lane - walls.offset), -1.3, 1.3)
-        yaw_rate = self.angle_gain * (wanted - walls.angle)
-        room = self._room(memory, params)
+        turn = self.heading(memory, params) - memory.corridor.angle
+        room = self.room(memory, memory.corridor.angle, params)
         # Misaligned, it turns first; and it never stands, because standing for a second ends the episode.
-        aligned = jnp.clip(1.0 - jnp.abs(wanted - walls.angle), 0.1, 1.0)
+        aligned = jnp.clip(1.0 - jnp.abs(turn), 0.1, 1.0)
         allowed = jnp.maximum(jnp.minimum(self.speed * aligned, 1.5 * (room - self.headway)), 0.1)
-        return jnp.stack([jnp.minimum(speed, allowed), yaw_rate])
+        return jnp.stack([jnp.minimum(speed, allowed), self.angle_gain * turn])
+
+    def heading(self, memory: Surroundings, params: Robot) -> Float[Array, ""]:
+        """Angle to the axis at which it goes to its lane, rad; up to across the tunnel where a box is near."""
+        away = memory.lane - memory.corridor.offset
+        plain = jnp.clip(self.offset_gain * away, -1.3, 1.3)
+        # Where it creeps past a corner at the plain angle, its side meets the box before it is in the lane.
+        steeper = plain + jnp.linspace(0.0, 1.0, _N_STEEPER) * (jnp.sign(away) * _ACROSS - plain)
+        free = jax.vmap(lambda angle: self.room(memory, angle, params))(steeper) > self.headway + _SPARE
+        chosen = jnp.where(jnp.any(free), jnp.argmax(free), _N_STEEPER - 1)
+        return jnp.where(jnp.abs(away) > _IN_LANE, steeper[chosen], plain)
 
     def turned(self, memory: Surroundings) -> Surroundings:
         """What was ahead lies behind, left is right."""
@@ -101,34 +114,35 @@ class Avoidance:
             memory, corridor=turned, along=-memory.along, across=-memory.across, lane=-memory.lane
         )
 
-    def _blocked(
-        self, memory: Surroundings, lane: Float[Array, "n"], reach: float, params: EnvParams
-    ) -> Float[Array, "n"]:
-        """Distance ahead to the first hit in each lane, m; `reach` where there is none."""
+    def lanes(self, memory: Surroundings, params: Robot) -> tuple[Float[Array, "lanes"], Float[Array, "lanes"]]:
+        """Lanes from right to left, m left of the middle, and how far ahead each is free, m: at most `look_ahead`."""
+        walls = memory.corridor
         wide = params.vehicle.radius + self.margin
-        ahead = (memory.along > -wide) & (memory.along < reach)
-        inside = ahead & (jnp.abs(memory.across - lane[:, None, None]) < wide)
-        return jnp.min(jnp.where(inside, memory.along, reach), axis=(1, 2))
-
-    def _lane(self, memory: Surroundings, params: EnvParams) -> Float[Array, ""]:
-        """The lane to take: free for long, near, in the middle."""
-        walls = memory.corridor
         half = 0.5 * (walls.left + walls.right) - params.vehicle.radius - self.margin
-        lane = jnp.linspace(-1.0, 1.0, _LANES) * jnp.maximum(half, 0.1)
-        free = self._blocked(memory, lane, self.look_ahead, params)
-        away = jnp.abs(lane - walls.offset)
-        cost = 2.0 * (self.look_ahead - free) + away + 0.3 * jnp.abs(lane) + 0.5 * jnp.abs(lane - memory.lane)
-        return lane[jnp.argmin(cost)]
+        lane = jnp.linspace(-1.0, 1.0, N_LANES) * jnp.maximum(half, 0.1)
+        ahead = (memory.along > -wide) & (memory.along < self.look_ahead)
+        # A CPU would otherwise work out for each lane anew what is ahead, and take three times as long.
+        along, across = jax.lax.optimization_barrier(
+            (jnp.where(ahead, memory.along, self.look_ahead).ravel(), memory.across.ravel())
+        )
+        inside = jnp.abs(across - lane[:, None]) < wide
+        return lane, jnp.min(jnp.where(inside, along, self.look_ahead), axis=1)
 
-    def _room(self, memory: Surroundings, params: EnvParams) -> Float[Array, ""]:
-        """Distance to the first hit in the way the robot now faces, m."""
-        walls = memory.corridor
-        cos, sin = jnp.cos(walls.angle), jnp.sin(walls.angle)
-        across = memory.across - walls.offset
+    def room(self, memory: Surroundings, angle: Float[Array, ""], params: Robot) -> Float[Array, ""]:
+        """Distance to the first hit in the way of a robot that faces so (rad to the axis), m; 6 where there is none."""
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        across = memory.across - memory.corridor.offset
         ahead = memory.along * cos + across * sin
         aside = across * cos - memory.along * sin
         in_way = (ahead > 0.0) & (jnp.abs(aside) < params.vehicle.radius + 0.05)
         return jnp.min(jnp.where(in_way, ahead, _SEEN))
+
+    def _lane(self, memory: Surroundings, params: Robot) -> Float[Array, ""]:
+        """The lane to take: free for long, near, in the middle."""
+        lane, free = self.lanes(memory, params)
+        away = jnp.abs(lane - memory.corridor.offset)
+        cost = 2.0 * (self.look_ahead - free) + away + 0.3 * jnp.abs(lane) + 0.5 * jnp.abs(lane - memory.lane)
+        return lane[jnp.argmin(cost)]
 
 
 def _hits(walls: Corridor, ranges: Float[Array, "n_beams"]) -> tuple[Float[Array, "n_beams"], Float[Array, "n_beams"]]:

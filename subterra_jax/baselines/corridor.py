@@ -1,18 +1,31 @@
 """What a scan says about the walls: distance to both of them, and the angle to the axis between them."""
 
+from typing import Protocol
+
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax.lidar import bearings
-from subterra_jax.state import EnvParams
-from subterra_jax.vehicle import wrap
+from subterra_jax.lidar import LidarParams, bearings
+from subterra_jax.vehicle import VehicleParams, wrap
 
 _SIDEWAYS = 0.65  # beams whose sine is larger look at a wall, not along it
 _GATE = 0.5  # m; a hit further than this from where the wall is expected is not the wall
 _TRUST, _TRUST_ANGLE = 0.5, 0.35  # of one scan
 _ECHO = 1e-3  # m below `range_max`: no echo
+
+
+class Robot(Protocol):
+    """What has to be known of a robot to see walls and boxes with its beams; the params of a task have it."""
+
+    @property
+    def vehicle(self) -> VehicleParams:
+        """How it drives."""
+
+    @property
+    def lidar(self) -> LidarParams:
+        """How it sees."""
 
 
 @struct.dataclass
@@ -35,7 +48,7 @@ class Corridor:
         return 0.5 * (self.right - self.left)
 
 
-def first_look(ranges: Float[Array, "n_beams"], params: EnvParams) -> Corridor:
+def first_look(ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
     """The walls in the first scan, with the heading taken for the axis' direction and then corrected."""
     bearing = bearings(ranges.shape[0])
     side = np.abs(np.sin(bearing))
@@ -52,7 +65,7 @@ def first_look(ranges: Float[Array, "n_beams"], params: EnvParams) -> Corridor:
     return corridor
 
 
-def moved(corridor: Corridor, command: Float[Array, "2"], params: EnvParams) -> Corridor:
+def moved(corridor: Corridor, command: Float[Array, "2"], params: Robot) -> Corridor:
     """Where the robot should be after a command."""
     period = params.vehicle.period
     angle = corridor.angle + 0.5 * command[1] * period
@@ -65,7 +78,7 @@ def turned(corridor: Corridor) -> Corridor:
     return Corridor(corridor.right, corridor.left, wrap(corridor.angle - jnp.pi))
 
 
-def look(corridor: Corridor, ranges: Float[Array, "n_beams"], params: EnvParams) -> Corridor:
+def look(corridor: Corridor, ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
     """Corrected by a scan: robust to beams without echo, dust in front of the wall, and boxes at its foot."""
     bearing = jnp.asarray(bearings(ranges.shape[0]), jnp.float32) + corridor.angle
     along, across = ranges * jnp.cos(bearing), ranges * jnp.sin(bearing)

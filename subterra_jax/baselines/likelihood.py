@@ -45,7 +45,7 @@ def fit(
     square = residual * residual / variance
     # Cauchy's weight: a large residual pulls little, but enough for a place that was lost to come back.
     weight = jnp.where(useful, 1.0 / (variance * (1.0 + square / 6.0)), 0.0)
-    shift, turn = _adjusted(residual, ends.along, weight, model, inflation)
+    shift, turn = adjusted(residual, ends.along, weight, model, inflation)
     residual = residual + shift + ends.along * turn
     each = _log_mixture(residual * residual / variance, variance, model)
     # An echo from outside of a mouth, and no echo from a wall, are a surprise.
@@ -53,8 +53,8 @@ def fit(
     surprise = jnp.where(ends.useful, jnp.log(_stray(model)), missed)
     total = jnp.sum(jnp.where(useful, each, surprise), axis=0)
     drawn = (shift / model.lateral_sigma) ** 2 + (turn / model.heading_sigma) ** 2
-    adjusted = Place(place.station, place.lateral + shift, place.heading + turn)
-    return model.power * (total - 0.5 * drawn / inflation**2), adjusted
+    moved = Place(place.station, place.lateral + shift, place.heading + turn)
+    return model.power * (total - 0.5 * drawn / inflation**2), moved
 
 
 def first_look(
@@ -67,12 +67,12 @@ def first_look(
     return place
 
 
-def _adjusted(
+def adjusted(
     residual: Float[Array, "n_beams *n"],
     along: Float[Array, "n_beams *n"],
     weight: Float[Array, "n_beams *n"],
     model: ScanModel,
-    inflation: float,
+    inflation: float = 1.0,
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Shift (m) and turn (rad) that lessen the weighted squares of `residual + shift + along * turn` most."""
     a = jnp.sum(weight, axis=0) + (inflation * model.lateral_sigma) ** -2

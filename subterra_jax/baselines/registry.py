@@ -9,6 +9,7 @@ from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle_agent import ParticleAgent
 from subterra_jax.baselines.ringcount import RingCount
+from subterra_jax.baselines.ringfilter import ring_filter
 from subterra_jax.baselines.scanmatch_odometry import scan_matching
 from subterra_jax.baselines.simple import Random
 from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
@@ -69,6 +70,7 @@ _navigator("pure-pursuit", OdometerCount(), Pursuit())
 _navigator(DEAD_RECKONING, OdometerCount(), CentreLine())
 _navigator("fused", FusedCount(), CentreLine())
 _navigator("ring-count", RingCount(), CentreLine())
+register("ring-filter", ring_filter)
 _navigator(CEILING, Truth(), CentreLine())
 register("scan-matching", scan_matching)
 register("particle-filter", ParticleAgent.of)

@@ -50,7 +50,7 @@ class RingCount:
         commanded = driven.speed * params.vehicle.period
         moved = driven.cosine * rings.moved(commanded, obs.distance - memory.reckoning.reading)
         pitch = jnp.zeros(()) if obs.ring_pitch is None else obs.ring_pitch
-        track = rings.advance(memory.track, obs.ranges, moved, driven.direction, pitch)
+        track = rings.advance(memory.track, obs.ranges, moved, driven.direction, pitch, careful=True)
         lost = jnp.exp(fused.log_sigma)
         sigma = jnp.hypot(track.strength * _LOCKED + (1.0 - track.strength) * lost, memory.start[1])
         estimate = Station(memory.start[0] + track.station, jnp.log(sigma), driven.direction)

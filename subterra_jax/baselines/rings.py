@@ -9,12 +9,12 @@ Measured on the family's test split: `docs/measurements.md`.
 """
 
 import dataclasses
-import math
 
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
+
+from subterra_jax.baselines import ringscan
 
 # Command and odometry err independently; this is the weight of the second, for slips of 2 % + 2 % and 2 % + 1 %.
 ODOMETER_SHARE = 0.6
@@ -26,9 +26,6 @@ _USUAL = 0.05  # of what a beam sees all the time, such as a bend
 _TRUST = 100.0  # in units of `_STEP`: so long a pattern is taken for one before it can be told from noise
 _CLEAR = 1.3, 3.0  # noise, in units of what an average leaves of it, and how steeply strength rises above it
 _GIVE_UP = 0.02  # of what was corrected, per `_STEP` without a pattern
-_NEAREST, _FARTHEST = 1.0, 4.5  # m to a wall; nearer is an obstacle, farther an opening or a mouth
-_CLIP = (-0.2, 0.3)  # m, of what one beam may say
-_STEEPEST = math.sqrt(0.5)  # sine of the angle to the axis: flatter beams meet a wall where bends blur the place
 _SETTLING = 2.0  # m after the start in which the usual is learnt faster
 _RATE_MOST = 0.1
 
@@ -64,7 +61,7 @@ class RingTrack:
 
 def start(batch: tuple[int, ...], n_beams: int) -> RingTrack:
     """At the start, no pattern known."""
-    zero, side = jnp.zeros(batch), len(_beams(n_beams)[0][0])
+    zero, side = jnp.zeros(batch), len(ringscan.side_beams(n_beams)[0][0])
     return RingTrack(
         station=zero,
         reckoned=zero,
@@ -96,6 +93,7 @@ def advance(
     moved: Float[Array, "*env"],
     direction: Float[Array, "*env"],
     pitch: Float[Array, "*env"],
+    careful: bool = False,
 ) -> RingTrack:
     """After a scan.
 
@@ -105,11 +103,13 @@ def advance(
         moved: Dead-reckoned distance since the last scan, m.
         direction: 1 where the robot faces growing stations, else −1.
         pitch: Distance between rings, m. Where it is 0 there are none, and this is dead reckoning.
+        careful: The scan is read by `ringscan.careful`, which sees past what stands in the tunnel, and not by
+            `ringscan.plain`, with which the first released policies were trained.
     """
     reckoned = track.reckoned + direction * moved
     station = track.station + direction * moved * (1.0 + track.rate)
     share = jnp.minimum(jnp.abs(moved) / _STEP, 2.0)
-    bump, along, valid = _bumps(ranges)
+    bump, along, valid = ringscan.careful(ranges) if careful else ringscan.plain(ranges)
     driven = track.driven + jnp.abs(moved)
     learning = _USUAL * share + jnp.where(driven < _SETTLING, 0.1, 0.0)
     usual = track.usual + learning[..., None, None] * (bump - track.usual) * valid
@@ -145,29 +145,6 @@ def anew(track: RingTrack, keep: Float[Array, "*env"]) -> RingTrack:
     parts = {field.name: getattr(track, field.name) for field in dataclasses.fields(track)}
     spread = {name: keep.reshape(keep.shape + (1,) * (part.ndim - keep.ndim)) for name, part in parts.items()}
     return RingTrack(**{name: spread[name] * part for name, part in parts.items()})
-
-
-def _beams(n_beams: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Side beams `(2, m)`, left and then right, from the front to the back; their sine and cosine."""
-    angle = np.arange(n_beams) * (2.0 * np.pi / n_beams)
-    left = np.flatnonzero(np.sin(angle) > _STEEPEST - 1e-6)
-    index = np.stack([left, (n_beams - left) % n_beams])
-    return index, np.abs(np.sin(angle[index])).astype(np.float32), np.cos(angle[index]).astype(np.float32)
-
-
-def _bumps(ranges: Float[Array, "*env n"]) -> tuple[Array, Array, Bool[Array, "*env 2 side"]]:
-    """How far each side beam's end lies behind two parallel lines fitted to all of them, and how far ahead, m."""
-    index, sine, cosine = _beams(ranges.shape[-1])
-    distance = ranges[..., index]
-    across, along = distance * sine, distance * cosine
-    valid = (across > _NEAREST) & (across < _FARTHEST)
-    number = jnp.maximum(jnp.sum(valid, axis=-1, keepdims=True), 1)
-    off = jnp.where(valid, across - jnp.sum(across * valid, axis=-1, keepdims=True) / number, 0.0)
-    ahead = jnp.where(valid, along - jnp.sum(along * valid, axis=-1, keepdims=True) / number, 0.0)
-    # Turned by a small angle, the left wall comes nearer with x and the right one goes away.
-    signed = jnp.asarray([[1.0], [-1.0]])
-    slope = jnp.sum(signed * off * ahead, axis=(-2, -1)) / (jnp.sum(ahead * ahead, axis=(-2, -1)) + 1e-3)
-    return jnp.where(valid, jnp.clip(off - slope[..., None, None] * signed * ahead, *_CLIP), 0.0), along, valid
 
 
 def _harmonics(bump: Float[Array, "*env 2 side"], phase: Float[Array, "*env 2 side"]) -> Float[Array, "*env 2 k 2"]:

@@ -34,6 +34,7 @@ class Recurrent:
         low: Smallest action, m/s and rad/s.
         high: Largest action, m/s and rad/s.
         bin_width: Of the estimation head, m.
+        shown: What it is shown.
         name: Name on the leaderboard.
     """
 
@@ -41,6 +42,7 @@ class Recurrent:
     low: Float[Array, "2"]
     high: Float[Array, "2"]
     bin_width: float = struct.field(pytree_node=False)
+    shown: senses.Senses = struct.field(pytree_node=False, default=senses.PLAIN)
     name: str = struct.field(pytree_node=False, default="ppo-gru")
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
     uses_map: bool = struct.field(pytree_node=False, default=False)
@@ -51,6 +53,11 @@ class Recurrent:
         """Inputs of the network."""
         return self.tensors["memory.Dense_0.kernel"].shape[0]
 
+    @property
+    def n_beams(self) -> int:
+        """Beams of the scans it was made for."""
+        return self.shown.n_beams(self.n_features)
+
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
         """Nothing yet."""
         del key, obs, params
@@ -58,8 +65,8 @@ class Recurrent:
 
     def blank(self) -> Memory:
         """The memory before the first step."""
-        n_beams = (self.n_features - senses.N_FURTHER) // 2
-        return Memory(jnp.zeros(self.tensors["memory.recurrent"].shape[0]), senses.start((), n_beams))
+        hidden = jnp.zeros(self.tensors["memory.recurrent"].shape[0])
+        return Memory(hidden, senses.start((), self.n_beams, self.shown))
 
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known

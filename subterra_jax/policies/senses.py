@@ -1,9 +1,10 @@
 """What a network with memory is shown: beams that make a pocket stand out, rings counted, dead reckoning done.
 
-Training and released policies share these functions; what they compute is part of what a policy is, and `VERSION` says
-which they are.
+Training and released policies share these functions; what they compute is part of what a policy is, and `VERSION` and
+`Senses` say which they are.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,16 +13,43 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax.baselines import rings
+from subterra_jax.baselines.avoidance import Surroundings
+from subterra_jax.policies import boxes
+from subterra_jax.policies.trackers import tracker
 
 VERSION = 2
 PERIOD = 0.1  # s, of control
 HALF_WIDTH = 2.8  # m, about which side beams are shown
 N_AIM = 5
-N_FURTHER = 18  # features that are no beams; each beam is seen twice
+_N_FURTHER = 18  # features that are no beams; each beam is seen twice
 # rad; who has turned by so much since the flag was raised faces the start.
 _TURNED = 2.2
 Parts = Mapping[str, Float[Array, "*env n"]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Senses:
+    """What a network is shown beside beams and dead reckoning; the policies of before there was a choice have neither.
+
+    Attributes:
+        tracker: Who counts rings, a name of `trackers.TRACKERS`.
+        boxes: Whether the boxes remembered, and the lane to take between them, are shown.
+    """
+
+    tracker: str = "loop"
+    boxes: bool = False
+
+    @property
+    def n_further(self) -> int:
+        """Features that are no beams."""
+        return _N_FURTHER + (boxes.N_FEATURES if self.boxes else 0)
+
+    def n_beams(self, n_features: int) -> int:
+        """Beams that so many features show."""
+        return (n_features - self.n_further) // 2
+
+
+PLAIN = Senses()
 
 
 @struct.dataclass
@@ -29,7 +57,7 @@ class Reckoning:
     """Dead reckoning from the start of an episode, and the rings counted on the way.
 
     Attributes:
-        rings: The ring tracker.
+        rings: What the tracker knows.
         commanded: Sum of the commanded distance, m.
         step: Distance commanded since the last look, m.
         reading: Odometer at the last look, m.
@@ -38,9 +66,11 @@ class Reckoning:
         flag: 1 once the flag of a task with a way back was seen, else 0.
         flagged_at: Heading then, rad.
         back: 1 from the turn on, else 0.
+        boxes: What is remembered of boxes, where that is shown.
+        senses: What is shown.
     """
 
-    rings: rings.RingTrack
+    rings: Any
     commanded: Float[Array, "*env"]
     step: Float[Array, "*env"]
     reading: Float[Array, "*env"]
@@ -49,6 +79,8 @@ class Reckoning:
     flag: Float[Array, "*env"]
     flagged_at: Float[Array, "*env"]
     back: Float[Array, "*env"]
+    boxes: Surroundings | None = None
+    senses: Senses = struct.field(pytree_node=False, default=PLAIN)
 
 
 @struct.dataclass
@@ -68,11 +100,20 @@ class Sight:
     reckoning: Reckoning
 
 
-def start(batch: tuple[int, ...], n_beams: int) -> Reckoning:
-    """Nothing driven yet."""
+def start(batch: tuple[int, ...], n_beams: int, shown: Senses = PLAIN) -> Reckoning:
+    """Nothing driven yet.
+
+    Args:
+        batch: Leading axes.
+        n_beams: Beams of a scan.
+        shown: What the network is shown.
+
+    Raises:
+        ValueError: There is no such tracker.
+    """
     zero = jnp.zeros(batch)
     return Reckoning(
-        rings=rings.start(batch, n_beams),
+        rings=tracker(shown.tracker).start(batch, n_beams),
         commanded=zero,
         step=zero,
         reading=zero,
@@ -81,6 +122,8 @@ def start(batch: tuple[int, ...], n_beams: int) -> Reckoning:
         flag=zero,
         flagged_at=zero,
         back=zero,
+        boxes=boxes.start(batch, n_beams) if shown.boxes else None,
+        senses=shown,
     )
 
 
@@ -99,9 +142,13 @@ def look(part: Parts, begin: Float[Array, ""] | float, now: Reckoning) -> Sight:
     flagged_at = jnp.where((flag > 0.5) & (now.flag < 0.5), heading, now.flagged_at)
     turned = jnp.abs(jnp.mod(heading - flagged_at + jnp.pi, 2.0 * jnp.pi) - jnp.pi)
     back = jnp.where((flag > 0.5) & (turned > _TURNED), 1.0, now.back)
-    moved = rings.moved(now.step, reading - now.reading)
-    track = rings.advance(now.rings, part["ranges"], moved, 1.0 - 2.0 * back, pitch)
-    seen = now.replace(rings=track, reading=reading, flag=flag, flagged_at=flagged_at, back=back)  # type: ignore[attr-defined]
+    counted = tracker(now.senses.tracker)
+    moved, near = counted.moved(now.step, reading - now.reading), now.boxes
+    if near is not None:
+        near = boxes.look(near, part["ranges"], now.action, now.begun < 0.5, back > now.back)
+        moved = moved * boxes.cosine(near)
+    track = counted.advance(now.rings, part["ranges"], moved, 1.0 - 2.0 * back, pitch)
+    seen = now.replace(rings=track, reading=reading, flag=flag, flagged_at=flagged_at, back=back, boxes=near)  # type: ignore[attr-defined]
     ahead = jnp.where(flag > 0.5, 0.0, goal) - track.station
     return Sight(_features(part["ranges"], heading, ahead, pitch, seen), track.station, ahead, seen)
 
@@ -111,7 +158,7 @@ def advance(now: Reckoning, action: Float[Array, "*env 2"], done: Bool[Array, "*
     keep = 1.0 - jnp.broadcast_to(jnp.asarray(done, jnp.float32), now.begun.shape)
     step = PERIOD * jnp.maximum(action[..., 0], 0.0)
     return Reckoning(
-        rings=rings.anew(now.rings, keep),
+        rings=tracker(now.senses.tracker).anew(now.rings, keep),
         commanded=keep * (now.commanded + step),
         step=keep * step,
         reading=keep * now.reading,
@@ -120,6 +167,8 @@ def advance(now: Reckoning, action: Float[Array, "*env 2"], done: Bool[Array, "*
         flag=keep * now.flag,
         flagged_at=keep * now.flagged_at,
         back=keep * now.back,
+        boxes=now.boxes,  # the first look of an episode replaces it
+        senses=now.senses,
     )
 
 
@@ -159,7 +208,8 @@ def _features(
         seen.flag,
         seen.back,
     ]
-    return jnp.concatenate([across, ranges / 30.0, seen.action, jnp.stack(single, axis=-1)], axis=-1)
+    near = [] if seen.boxes is None else [boxes.features(seen.boxes)]
+    return jnp.concatenate([across, ranges / 30.0, seen.action, jnp.stack(single, axis=-1), *near], axis=-1)
 
 
 def aim(ahead: Float[Array, "*env"], log_sigma: Float[Array, "*env"]) -> Float[Array, "*env 5"]:

@@ -121,6 +121,25 @@ def test_a_box_in_the_way_slows_it_down_and_has_it_choose_another_lane(params):
     assert 0.05 < avoid.steer(near, jnp.float32(2.0), params)[0] < 0.3
 
 
+def test_where_a_corner_is_near_it_turns_steeper_to_its_lane_than_where_the_way_is_free(params):
+    avoid = Avoidance()
+    clear = observation(ranges=jnp.asarray(between_walls(2.8, 2.8, 0.0)))
+    memory = dataclasses.replace(avoid.begin(clear, params), lane=jnp.float32(-1.0))
+    plain = -avoid.offset_gain
+    heading = jax.jit(avoid.heading)
+    assert heading(memory, params) == pytest.approx(plain, abs=0.05)
+    # 0.7 m on, in the way at the plain angle; across the tunnel there is room.
+    near = (0.7 * np.cos(plain), 0.7 * np.sin(plain))
+    corner = dataclasses.replace(
+        memory, along=memory.along.at[0, 0].set(near[0]), across=memory.across.at[0, 0].set(near[1])
+    )
+    steeper = heading(corner, params)
+    assert -1.5 <= steeper < plain - 0.1
+    assert avoid.room(corner, steeper, params) > avoid.headway + 0.2 > avoid.room(corner, jnp.float32(plain), params)
+    there = dataclasses.replace(corner, lane=jnp.zeros(()))
+    assert abs(heading(there, params)) < 0.05
+
+
 def test_who_knows_the_truth_comes_back_always():
     env, params = st.make("Subterra/ReturnShort-v0")
     records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env.id, params, 50))

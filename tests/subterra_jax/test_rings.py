@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.baselines import rings
+from subterra_jax.baselines import rings, ringscan
 
 HALF_WIDTH, DEPTH, PITCH, N_BEAMS = 2.8, 0.13, 1.35, 16
 ANGLE = 2.0 * np.pi * np.arange(N_BEAMS) / N_BEAMS
@@ -77,10 +77,47 @@ def test_a_batch_is_tracked_as_its_members_are():
     rng = np.random.default_rng(7)
     ranges = np.stack([scans(np.array([0.15 * i]), np.ones(1), rng)[0] for i in range(3)])
     moved, direction, pitch = jnp.full(3, 0.15), jnp.ones(3), jnp.array([1.2, 1.35, 0.0])
-    both = rings.advance(rings.start((3,), N_BEAMS), ranges, moved, direction, pitch)
+    advance = jax.jit(rings.advance)
+    both = advance(rings.start((3,), N_BEAMS), ranges, moved, direction, pitch)
     for i in range(3):
-        one = rings.advance(rings.start((), N_BEAMS), ranges[i], moved[i], direction[i], pitch[i])
+        one = advance(rings.start((), N_BEAMS), ranges[i], moved[i], direction[i], pitch[i])
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-6), both, one)
     cleared = rings.anew(both, jnp.array([1.0, 0.0, 1.0]))
     assert float(cleared.seen[1]) == 0.0
     assert float(cleared.seen[0]) == pytest.approx(float(both.seen[0]))
+
+
+def walls_seen(offset: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Noiseless ranges from beside the axis of a smooth tunnel, and how far ahead along the axis each beam ends, m."""
+    bearing = ANGLE + angle
+    with np.errstate(divide="ignore"):
+        across = np.where(np.sin(bearing) > 0.0, HALF_WIDTH - offset, HALF_WIDTH + offset)
+        ranges = np.minimum(across / np.abs(np.sin(bearing)), 30.0)
+    return ranges.astype(np.float32), ranges * np.cos(bearing)
+
+
+def test_a_careful_look_at_smooth_walls_sees_no_bump_and_places_along_the_axis_not_the_robot():
+    ranges, ahead = walls_seen(offset=1.6, angle=0.2)
+    found = jax.jit(ringscan.careful)(jnp.asarray(ranges))
+    assert found.valid.all()
+    np.testing.assert_allclose(found.bump, 0.0, atol=2e-3)
+    np.testing.assert_allclose(found.along, ahead[ringscan.side_beams(N_BEAMS)[0]], atol=2e-2)
+    # 1.2 m from the left wall and 4.4 m from the right one: along the robot the places are up to 0.9 m off.
+    assert np.abs(ringscan.plain(jnp.asarray(ranges)).along - ahead[ringscan.side_beams(N_BEAMS)[0]]).max() > 0.5
+
+
+def test_beams_that_end_on_a_box_do_not_move_the_track():
+    ranges = np.asarray(scans(np.array([3.0]), np.ones(1), np.random.default_rng(2))[0])
+    before = jax.tree.map(lambda leaf: leaf[400], jax.device_get(drive()[1]))
+    boxed, missing = np.tile(ranges, (2, 5, 1))
+    for i, blocked in enumerate(([4], [2, 3], [3, 4, 5], [4, 12], [2, 3, 13])):
+        boxed[i, blocked] *= 0.55
+        missing[i, blocked] = 30.0
+    step = jnp.float32(0.15), jnp.ones(()), jnp.float32(PITCH)
+    advance = jax.jit(
+        jax.vmap(lambda scan, careful: rings.advance(before, scan, *step, careful=careful), (0, None)), static_argnums=1
+    )
+    seen, unseen, fooled = advance(boxed, True), advance(missing, True), advance(boxed, False)
+    for field in ("station", "rate", "pattern", "usual", "innovation"):
+        np.testing.assert_allclose(getattr(seen, field), getattr(unseen, field), atol=1e-6)
+    assert (np.abs(fooled.usual - unseen.usual).max(axis=(1, 2)) > 1e-3).all()

@@ -3,7 +3,9 @@
 import dataclasses
 from typing import ClassVar
 
+from subterra_jax.policies.trackers import TRACKERS
 from train.config import TrainConfig, at_least, check_common, known_preset, not_negative, positive, share
+from train.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,6 +16,8 @@ class RecurrentConfig(TrainConfig):
         hidden: Width of the GRU and of the layers around it.
         bins: Bins of the estimation head.
         bin_width: Their width, m.
+        tracker: Who counts rings for the network, `loop` or `careful`, which sees past what stands in the tunnel; if
+            left out, the second among boxes and the first elsewhere.
         estimate_weight: Weight of the estimation head's loss; with 0 reward alone teaches.
         begin_from: Policy to begin from, not from nothing: a run folder, a file, or the name of a released one. What a
             student has learnt from a teacher is made better by reward so.
@@ -32,6 +36,7 @@ class RecurrentConfig(TrainConfig):
     hidden: int = 256
     bins: int = 160
     bin_width: float = 0.125
+    tracker: str | None = None
     estimate_weight: float = 0.5
     begin_from: str | None = None
     warm_up: float = 0.05
@@ -76,5 +81,7 @@ def check(config: RecurrentConfig) -> RecurrentConfig:
     at_least(config, 3, "bins")
     positive(config, "bin_width")
     not_negative(config, "estimate_weight")
+    if config.tracker is not None and config.tracker not in TRACKERS:
+        raise ConfigError(f"tracker must be one of {', '.join(TRACKERS)}, got {config.tracker!r}")
     share(config, "curriculum", "warm_up")
     return config

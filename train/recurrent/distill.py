@@ -93,7 +93,8 @@ class DistillLearner(parts.Whole):
         key_weights, key_reset, key_rest = jax.random.split(key, 3)
         config, given = self.config, jax.tree.map(jnp.asarray, dict(self.begun))
         weights = {**self.networks.init(key_weights), **given}
-        student = driving.begin(self.env, params, parts.own_key(key_reset, self.split), config.part_envs, config.hidden)
+        key_own, layout = parts.own_key(key_reset, self.split), self.networks.layout
+        student = driving.begin(self.env, params, key_own, config.part_envs, layout)
         return TrainState(
             weights=weights,
             moments=self.optimizer.init(weights),

@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.policies import senses
-from train.recurrent.network import RecurrentNetworks, Weights
+from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Weights
 from train.report import Finished
 
 
@@ -97,14 +97,14 @@ def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Ar
     return jnp.stack(parts, axis=-1)
 
 
-def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, hidden: int) -> Drive:
+def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, layout: RecurrentLayout) -> Drive:
     """Every environment at the start of an episode."""
     observation, state = env.reset(key, params, n_envs)
     return Drive(
         env_state=state,
         observation=observation,
-        reckoning=senses.start((n_envs,), params.lidar.n_beams),
-        hidden=jnp.zeros((n_envs, hidden)),
+        reckoning=senses.start((n_envs,), params.lidar.n_beams, layout.shown),
+        hidden=jnp.zeros((n_envs, layout.hidden)),
         first=jnp.ones(n_envs, bool),
         episode_return=jnp.zeros(n_envs),
     )

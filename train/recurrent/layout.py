@@ -29,10 +29,10 @@ def require_goal(env: Any) -> None:
 
 def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayout:
     """The network that `config` asks for on this environment; nothing is compiled for it."""
-    bounds = env.action_space(params)
+    bounds, shown = env.action_space(params), senses_of(params, config)
     observation = jax.ShapeDtypeStruct((1, env.observation_size(params)), jnp.float32)
     batch = st.batch.AutoReset(env)
-    shapes = jax.eval_shape(lambda obs: _shapes(env, batch, params, obs), observation)
+    shapes = jax.eval_shape(lambda obs: _shapes(env, batch, params, obs, shown), observation)
     return RecurrentLayout(
         n_features=shapes[0].shape[-1],
         n_truth=shapes[1].shape[-1],
@@ -44,10 +44,18 @@ def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayo
         bin_width=config.bin_width,
         init_std=config.init_std,
         min_std=config.min_std,
+        tracker=shown.tracker,
+        boxes=shown.boxes,
     )
 
 
-def _shapes(env: Any, batch: Any, params: Any, observation: Array) -> tuple[Array, Array]:
+def senses_of(params: Any, config: RecurrentConfig) -> senses.Senses:
+    """What the network is shown: what the config says, and else what the task is about."""
+    among_boxes = params.obstacles is not None
+    return senses.Senses(config.tracker or ("careful" if among_boxes else senses.PLAIN.tracker), among_boxes)
+
+
+def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Array, Array]:
     _, state = batch.reset(jax.random.key(0), params, 1)
-    view = driving.look(env, params, observation, senses.start((1,), params.lidar.n_beams))
+    view = driving.look(env, params, observation, senses.start((1,), params.lidar.n_beams, shown))
     return view.features, driving.truth(env, params, state, view, jnp.zeros(1))

@@ -108,7 +108,7 @@ class RecurrentLearner(parts.Whole):
                 curriculum.nearer(params, 0.0, self.config.curriculum),
                 parts.own_key(key_reset, self.split),
                 config.part_envs,
-                config.hidden,
+                self.networks.layout,
             ),
             key=key_rest,
             iteration=jnp.int32(0),

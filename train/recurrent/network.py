@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.policies import senses
+from subterra_jax.policies.senses import PLAIN, Senses
 from train.brax_parts import MLP, NormalTanhDistribution
 
 Weights = Any
@@ -30,6 +31,8 @@ class RecurrentLayout:
         init_std: Standard deviation of the untrained policy before the tanh.
         min_std: Its floor.
         senses: Version of what it is shown.
+        tracker: Who counts rings for it.
+        boxes: Whether it is shown the boxes remembered.
     """
 
     n_features: int
@@ -42,6 +45,13 @@ class RecurrentLayout:
     init_std: float
     min_std: float
     senses: int = senses.VERSION
+    tracker: str = PLAIN.tracker
+    boxes: bool = PLAIN.boxes
+
+    @property
+    def shown(self) -> Senses:
+        """What it is shown."""
+        return Senses(self.tracker, self.boxes)
 
 
 class Memory(nn.Module):

@@ -70,7 +70,9 @@ def driven(before: Any, after: Any, action: Float[Array, "env 2"]) -> Any:
     if isinstance(after, navigator.Memory):
         # It never takes itself to have arrived: it looks again, and says again how far to go.
         mission = dataclasses.replace(after.mission, stopped=jnp.zeros_like(after.mission.stopped))
-        return dataclasses.replace(after, command=action, mission=mission)
+        # A robot does not back up: a speed below 0 is standing.
+        driven = jnp.maximum(action, jnp.array([0.0, -jnp.inf]))
+        return dataclasses.replace(after, command=driven, mission=mission)
     if isinstance(after, recurrent.Memory):
         return dataclasses.replace(after, reckoning=senses.instead(before.reckoning, after.reckoning, action))
     return after
