@@ -9,6 +9,8 @@ import jax
 import tyro
 
 from train import cluster, policies
+from train.belief import config as belief_config
+from train.belief.config import BeliefConfig
 from train.cluster import Cluster
 from train.config import PPOConfig, make_config
 from train.errors import ConfigError
@@ -19,7 +21,7 @@ from train.recurrent.config import RecurrentConfig
 from train.recurrent.distill_config import DistillConfig
 
 _DEFAULT_TASK = "Subterra/TraverseShort-v0"
-_MEMORIES = ("none", "gru")
+_MEMORIES = ("none", "gru", "map")
 _DESCRIPTION = """Trains a navigation policy; defaults follow from `--task`, `--memory`, `--teacher` and `--preset`.
 
 python -m train.navigate --task Subterra/StopAtShort-v0 --memory gru --teacher oracle --out out/stop"""
@@ -36,7 +38,8 @@ class Command:
             `procedural:train:0-255`, of which each episode draws one.
         lining: Variant of the walls; `pockets` if left out, or the first where a tunnel has none.
         memory: `none`: a perceptron over a few observations. `gru`: a network that remembers; it learns by reward, or
-            with `--teacher oracle` (any baseline, policy file or run folder) from a teacher.
+            with `--teacher oracle` (any baseline, policy file or run folder) from a teacher. `map`: a belief over every
+            place of a known tunnel, for Relocalise; what a scan says of a place is learnt.
         preset: `cpu` or `gpu`; what jax runs on if left out.
         seeds: Train these seeds at once, into `out/seed-<k>`, and draw them together.
         resume: Go on from the checkpoint in `out`.
@@ -54,7 +57,7 @@ class Command:
     task: str = _DEFAULT_TASK
     tunnel: Path | None = None
     lining: str | None = None
-    memory: Literal["none", "gru"] = "none"
+    memory: Literal["none", "gru", "map"] = "none"
     preset: str | None = None
     seeds: tuple[int, ...] = ()
     resume: bool = False
@@ -82,6 +85,15 @@ class DistillCommand(Command):
 
     config: Annotated[DistillConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(  # type: ignore[assignment]
         default_factory=DistillConfig
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class BeliefCommand(Command):
+    """The same for a policy that has the map and keeps a belief over it."""
+
+    config: Annotated[BeliefConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(  # type: ignore[assignment]
+        default_factory=BeliefConfig
     )
 
 
@@ -117,12 +129,14 @@ def _default(task: str, memory: str, teacher: str | None, preset: str) -> Comman
     """The command for a task, with every setting filled in."""
     if memory not in _MEMORIES:
         raise ConfigError(f"unknown memory {memory!r}; there are {', '.join(_MEMORIES)}")
-    if memory == "none" and teacher is not None:
+    if memory != "gru" and teacher is not None:
         raise ConfigError(f"teacher = {teacher} teaches a policy with memory; give --memory gru as well")
     config: Any
     if memory == "none":
         return Command(out=tyro.MISSING, preset=preset, config=make_config(task, preset))
     policies.known_task(task)
+    if memory == "map":
+        return BeliefCommand(out=tyro.MISSING, memory="map", preset=preset, config=belief_config.make_config(preset))
     if teacher is None:
         config = recurrent_config.make_config(task, preset)
         return RecurrentCommand(out=tyro.MISSING, memory="gru", preset=preset, config=config)

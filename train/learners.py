@@ -8,6 +8,9 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.policies import PolicyError, check_fits
 from train import policies, spread
 from train.agents import weights_of
+from train.belief import config as belief_config
+from train.belief.config import BeliefConfig
+from train.belief.learner import BeliefLearner
 from train.config import PPOConfig, TrainConfig, check
 from train.errors import CheckpointError, ConfigError
 from train.evaluate import open_agent
@@ -34,6 +37,8 @@ def checked(config: TrainConfig) -> None:
         distill_config.check(config)
     elif isinstance(config, RecurrentConfig):
         recurrent_config.check(config)
+    elif isinstance(config, BeliefConfig):
+        belief_config.check(config)
     else:
         assert isinstance(config, PPOConfig)
         check(config)
@@ -53,6 +58,8 @@ def make_learner(world: policies.World, config: TrainConfig, axes: tuple[str, ..
         learner = DistillLearner(world.env, world.params, config, teacher, *names, begun=_begun(world, config))
     elif isinstance(config, RecurrentConfig):
         learner = RecurrentLearner(world.env, world.params, config, *names, begun=_begun(world, config))
+    elif isinstance(config, BeliefConfig):
+        learner = BeliefLearner(world.env, world.params, config, *names)
     else:
         assert isinstance(config, PPOConfig)
         learner = Learner(world.env, world.params, config, *names)

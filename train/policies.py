@@ -9,16 +9,19 @@ from typing import Any, TypeAlias
 import subterra_jax as st
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel.sources import tunnel_digest
+from subterra_jax.versions import VERSION, no_task
 from train import checkpoint
+from train.belief.network import BeliefLayout, BeliefNetworks
 from train.errors import CheckpointError, ConfigError
 from train.networks import Layout, Networks
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks
 
-_PACKAGES = ("subterra-jax", "jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
-AnyNetworks: TypeAlias = Networks | RecurrentNetworks
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
+AnyNetworks: TypeAlias = Networks | RecurrentNetworks | BeliefNetworks
 _KINDS: dict[str, Any] = {
     Networks.kind: (Layout, Networks),
     RecurrentNetworks.kind: (RecurrentLayout, RecurrentNetworks),
+    BeliefNetworks.kind: (BeliefLayout, BeliefNetworks),
 }
 
 
@@ -42,7 +45,7 @@ class World:
 def known_task(task: str) -> None:
     """Raises `ConfigError` where there is no such task."""
     if task not in st.TASKS:
-        raise ConfigError(f"unknown task {task!r}; there are {', '.join(st.TASKS)}")
+        raise ConfigError(no_task(task, st.TASKS))
 
 
 def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) -> World:
@@ -101,7 +104,7 @@ def load_policy(folder: Path) -> tuple[AnyNetworks, Any, dict[str, Any]]:
 def versions() -> dict[str, str]:
     """Versions of the libraries that a result depends on."""
     found = {package.metadata["Name"]: package.version for package in metadata.distributions()}
-    return {name: found.get(name, "not installed") for name in _PACKAGES}
+    return {"subterra-jax": VERSION, **{name: found.get(name, "not installed") for name in _PACKAGES}}
 
 
 def _tuples(value: Any) -> Any:

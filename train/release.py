@@ -13,11 +13,12 @@ from typing import Any
 import tyro
 from safetensors.numpy import save
 
+from subterra_jax.outputs import require_file
 from subterra_jax.policies.files import FACTS, SCHEMA, TENSORS
 from train import cli, policies
 from train.agents import agent_of, tensors_of
 from train.arguments import parse
-from train.errors import ConfigError, RunFolderError
+from train.errors import RunFolderError
 from train.evaluate import evaluate
 from train.legs import Legs
 
@@ -79,8 +80,7 @@ def facts_file(out: Path) -> Path:
 
 def command(arguments: Command) -> None:
     """Evaluates and writes."""
-    if arguments.out.suffix != TENSORS:
-        raise ConfigError(f"out must end in {TENSORS}, got {arguments.out}")
+    require_file(arguments.out, TENSORS)
     networks, policy, stored = policies.load_policy(arguments.run)
     world = _world(stored, arguments)
     found = evaluate(world, agent_of(networks, policy), arguments.episodes)

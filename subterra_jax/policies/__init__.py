@@ -1,9 +1,19 @@
 """Trained policies that drive without the trainer.
 
-files (safetensors + JSON) ─► load ─► feedforward or recurrent, an Agent of `subterra_jax.baselines`
+files (safetensors + JSON) ─► load ─► feedforward, recurrent, or belief, an Agent of `subterra_jax.baselines`
 """
 
 from subterra_jax.policies.files import PolicyError, name_for, released
-from subterra_jax.policies.loading import PREFIX, check_fits, from_tensors, load, register_released
+from subterra_jax.policies.loading import PREFIX, check_fits, from_tensors, load, register_released, told
 
-__all__ = ["PREFIX", "PolicyError", "check_fits", "from_tensors", "load", "name_for", "register_released", "released"]
+__all__ = [
+    "PREFIX",
+    "PolicyError",
+    "check_fits",
+    "from_tensors",
+    "load",
+    "name_for",
+    "register_released",
+    "released",
+    "told",
+]

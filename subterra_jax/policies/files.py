@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.errors import SubterraError
+from subterra_jax.versions import other_schema
 
 SCHEMA = "subterra.policy/1"
+AGAIN = "release it again from its run folder with `python -m train.release`"
 TENSORS, FACTS = ".safetensors", ".json"
 GAIT = "walk"  # the kind that moves legs and drives no task
 _FACTS = ("name", "kind", "task", "layout", "tensors_sha256")
@@ -110,8 +112,9 @@ def _facts(path: Traversable, tensors: bytes) -> dict[str, Any]:
         facts = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise PolicyError(f"{path}: damaged policy: no readable facts") from error
-    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
-        raise PolicyError(f"{path}: field 'schema' must be {SCHEMA!r}")
+    found = facts.get("schema") if isinstance(facts, dict) else None
+    if found != SCHEMA:
+        raise PolicyError(f"{path}: {other_schema(found, SCHEMA, AGAIN)}")
     if missing := [name for name in _FACTS if name not in facts]:
         raise PolicyError(f"{path}: field {missing[0]!r} is missing")
     if hashlib.sha256(tensors).hexdigest() != facts["tensors_sha256"]:

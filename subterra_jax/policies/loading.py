@@ -11,15 +11,16 @@ import numpy as np
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
-from subterra_jax.policies import senses
+from subterra_jax.policies import belief, senses
+from subterra_jax.policies.belief import Belief
 from subterra_jax.policies.feedforward import FeedForward
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.recurrent import Recurrent
-from subterra_jax.rules import StopAt
+from subterra_jax.rules import Relocalise, StopAt
 from subterra_jax.state import EnvParams
 
-Agent = FeedForward | Recurrent
-KINDS = ("mlp", "gru")
+Agent = FeedForward | Recurrent | Belief
+KINDS = ("mlp", "gru", belief.KIND)
 PREFIX = "policy:"  # of the names of released policies among the agents
 
 
@@ -45,7 +46,7 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
 
     Args:
         kind: One of `KINDS`.
-        layout: `action_low`, `action_high`, and `frames` or `bin_width`.
+        layout: `action_low`, `action_high`, and `frames`, `bin_width` or `habits`.
         tensors: By name, as the agent's class says.
         name: Name on the leaderboard.
 
@@ -60,8 +61,16 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
     if kind == "gru":
         if (version := int(layout.get("senses", 1))) != senses.VERSION:
             raise ValueError(f"made for senses of version {version}, this release has {senses.VERSION}; train it anew")
-        return Recurrent(arrays, low, high, bin_width=float(layout["bin_width"]), name=name)
+        shown = senses.Senses(str(layout.get("tracker", "loop")), bool(layout.get("boxes", False)))
+        return Recurrent(arrays, low, high, bin_width=float(layout["bin_width"]), shown=shown, name=name)
+    if kind == belief.KIND:
+        return Belief(arrays, low, high, habits=belief.Habits(**layout["habits"]), name=name)
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
+
+
+def told(agent: Any, params: EnvParams) -> Any:
+    """The agent with the map of a task, if it uses one; any other as it is."""
+    return agent.told(params) if isinstance(agent, Belief) else agent
 
 
 def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
@@ -74,9 +83,12 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
     if isinstance(agent, Recurrent):
         if not isinstance(env.rule, StopAt):
             raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
-        wanted, made_for = params.lidar.n_beams, (agent.n_features - senses.N_FURTHER) // 2
+        wanted, made_for = params.lidar.n_beams, agent.n_beams
         if wanted != made_for:
             raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
+    elif isinstance(agent, Belief):
+        if not isinstance(env.rule, Relocalise):
+            raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
     elif agent.n_observation != size:
         raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")
     high = np.asarray(agent.high)
@@ -93,7 +105,7 @@ def register_released() -> tuple[str, ...]:
     names = tuple(PREFIX + name for name in released() if not name.startswith("B2"))
     for name in names:
         if name not in registry.names():
-            registry.register(name, lambda params, name=name: load(name.removeprefix(PREFIX))[0])  # type: ignore[misc]
+            registry.register(name, lambda params, name=name: told(load(name.removeprefix(PREFIX))[0], params))  # type: ignore[misc]
     return names
 
 
@@ -113,6 +125,9 @@ def _try(agent: Agent) -> None:
     if isinstance(agent, FeedForward):
         jax.eval_shape(agent.answer, jax.ShapeDtypeStruct((agent.frames, agent.n_observation), jnp.float32))
         return
-    zero, ranges = jnp.zeros(()), jnp.zeros((agent.n_features - senses.N_FURTHER) // 2)
+    if isinstance(agent, Belief):
+        jax.eval_shape(belief.try_scan, agent.tensors)
+        return
+    zero, ranges = jnp.zeros(()), jnp.zeros(agent.n_beams)
     seen = Observed(flat=ranges, ranges=ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero)
     jax.eval_shape(agent.answer, agent.blank(), seen, zero)

@@ -7,11 +7,12 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.env import TunnelEnv
 from subterra_jax.evaluation import listed_episodes
-from subterra_jax.policies import check_fits, load
+from subterra_jax.policies import check_fits, load, told
 from subterra_jax.recorder.config import Recording, RecordingError
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.versions import no_task
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +38,8 @@ def open_world(config: Recording) -> World:
         TunnelError: The tunnel is missing or wrong.
     """
     name = config.task if config.task in TASKS else f"Subterra/{config.task}-v0"
+    if name not in TASKS:
+        raise RecordingError(no_task(config.task, TASKS))
     plan = st.load_tunnel(config.tunnel if config.scene is None else config.scene / "tunnel.npz")
     try:
         env, params = st.make(name, plan, config.lining)
@@ -61,7 +64,7 @@ def open_agent(config: Recording, world: World) -> Agent:
         return make_agent(config.agent, world.params)
     policy = load(config.policy)[0]
     check_fits(policy, dataclasses.replace(world.env, estimates=True), world.params, config.policy)
-    return policy
+    return told(policy, world.params)
 
 
 def draw(config: Recording, world: World) -> tuple[int, int | None]:

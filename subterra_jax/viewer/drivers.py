@@ -6,8 +6,7 @@ from pathlib import Path
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines import registry
-from subterra_jax.policies.feedforward import FeedForward
-from subterra_jax.policies.recurrent import Recurrent
+from subterra_jax.policies.loading import Agent
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.viewer.driving import drive
 from subterra_jax.viewer.recording import Recording
@@ -27,7 +26,7 @@ def offer(files: tuple[Path, ...]) -> tuple[str, ...]:
         agent, _ = policies.load(path)
         name = f"file:{path.stem}"
         if name not in registry.names():
-            registry.register(name, lambda params, agent=agent: agent)  # type: ignore[misc]
+            registry.register(name, lambda params, agent=agent: policies.told(agent, params))  # type: ignore[misc]
     return registry.names()
 
 
@@ -51,7 +50,7 @@ def episode(
     """
     env, params = st.make(task, tunnel=plan, lining=lining)
     driver = registry.make_agent(agent, params)
-    if isinstance(driver, FeedForward | Recurrent):
+    if isinstance(driver, Agent):
         policies.check_fits(driver, env, params, agent)
     names = {"tunnel": title, "tunnel_sha256": digest, "lining": lining, "agent": agent}
     yield from drive(env, params, driver, seed, names)
