@@ -20,10 +20,12 @@ from rich.console import Console
 from rich.table import Table
 
 import subterra_jax as st
+from benchmarks.command import status
 from scene.arguments import parse
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.window import WindowConfig
+from subterra_jax.outputs import require_file
 
 _COLUMNS = ("variant", "contacts", "rows", "MJX alone, M/s", "environment, M/s", "share", "compile, s", "falls in 20 s")
 VARIANTS: dict[str, Physics] = {
@@ -119,7 +121,7 @@ def command(arguments: Command) -> int:
 
     Raises:
         ValueError: There is no such variant, or a number is out of range.
-        SubterraError: There is no such tunnel.
+        SubterraError: There is no such tunnel, or the output cannot be written.
     """
     names = tuple(VARIANTS) if arguments.variants == ("all",) else arguments.variants
     for name in names:
@@ -128,6 +130,8 @@ def command(arguments: Command) -> int:
     for name in ("robots", "control_steps", "repeats"):
         if getattr(arguments, name) < 1:
             raise ValueError(f"{name} must be at least 1, got {getattr(arguments, name)}")
+    if arguments.out is not None:
+        require_file(arguments.out)
     device = jax.devices()[0]
     table = Table(*_COLUMNS, title=f"{arguments.robots} robots, {device.device_kind}, physics steps")
     found = {}
@@ -151,11 +155,8 @@ def _read(words: list[str]) -> Command:
 
 def main() -> int:
     """Entry point of `python -m benchmarks.b2`; a user's mistake is one sentence and status 2."""
-    try:
-        return command(parse(_read))
-    except (st.SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    arguments = parse(_read)
+    return status(lambda: command(arguments))
 
 
 if __name__ == "__main__":

@@ -5,12 +5,14 @@ added, and fits what they did.
 """
 
 import dataclasses
+import sys
 from dataclasses import dataclass
 
 import numpy as np
 import tyro
 from jaxtyping import Float
 
+from benchmarks.command import status
 from scene.arguments import parse
 from subterra_jax.b2.film import Driver
 from subterra_jax.b2.gym import B2Env
@@ -61,7 +63,7 @@ def walk(
             speed = float(rng.choice(_SPEEDS))
         if k % 3 == 0:
             turn = float(rng.uniform(-_TURN, _TURN))
-        limit = float(env.mission.action_space(env.params).high[1])
+        limit = float(env.env.action_space(env.params).high[1])
         action = np.array([speed, np.clip(driver.act(obs)[1] + turn, -limit, limit)], np.float32)
         obs, _, terminated, truncated, _ = env.step(action)
         place, faced = np.array(env.state.position), float(env.state.heading)
@@ -77,7 +79,14 @@ def walk(
 
 
 def command(arguments: Command) -> None:
-    """Walks, fits, prints."""
+    """Walks, fits, prints.
+
+    Raises:
+        LagError: A number is out of range, or nothing can be fitted.
+    """
+    for name, least in (("robots", 1), ("steps", 1), ("seed", 0)):
+        if getattr(arguments, name) < least:
+            raise LagError(f"{name} must be at least {least}, got {getattr(arguments, name)}")
     env = B2Env(policy=arguments.policy)
     driver = Driver(env, "dead-reckoning")
     walks = [walk(env, driver, arguments.seed + k, arguments.steps) for k in range(arguments.robots)]
@@ -96,7 +105,8 @@ def _read(words: list[str]) -> Command:
 
 def main() -> None:
     """Entry point of `python -m benchmarks.b2_lag`."""
-    cli.run(lambda: command(parse(_read)))
+    arguments = parse(_read)
+    sys.exit(status(lambda: command(arguments)))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ own engine, on the host; with `--scene DIR` in the scene itself.
 """
 
 import json
+import math
 import sys
 import time
 from dataclasses import dataclass
@@ -14,11 +15,13 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
+from benchmarks.command import status
 from scene.arguments import parse
 from subterra_jax import policies
 from subterra_jax.b2 import missions, trial
 from subterra_jax.b2.policy import RELEASED
 from subterra_jax.baselines import registry
+from subterra_jax.outputs import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 from train import cli
 from train.evaluate import open_agent
@@ -76,8 +79,32 @@ def tell(now: trial.Walk) -> None:
     print(f"\rstation {np.median(now.state.station):6.1f} m, {counts}", end="", file=sys.stderr, flush=True)
 
 
+def _check(arguments: Command) -> None:
+    for name, least in (("robots", 1), ("seed", 0)):
+        if getattr(arguments, name) < least:
+            raise ValueError(f"{name} must be at least {least}, got {getattr(arguments, name)}")
+    for name, most in (("coverage", 1.0), ("speed", math.inf)):
+        value = getattr(arguments, name)
+        if not 0.0 < value <= most or math.isinf(value):
+            raise ValueError(
+                f"{name} must be above 0{'' if math.isinf(most) else f' and at most {most:g}'}, got {value}"
+            )
+    if not 0.0 <= arguments.length < math.inf:
+        raise ValueError(f"length must not be negative, got {arguments.length}")
+    if arguments.scene is not None and arguments.tunnel is not None:
+        raise ValueError(f"either a tunnel or a scene, got both {arguments.tunnel} and {arguments.scene}")
+    if arguments.out is not None:
+        require_file(arguments.out)
+
+
 def command(arguments: Command) -> None:
-    """Drives and prints."""
+    """Drives and prints.
+
+    Raises:
+        ValueError: A number is out of range.
+        SubterraError: Scene, tunnel, agent or gait is missing or wrong, or the output cannot be written.
+    """
+    _check(arguments)
     tunnel: Any = arguments.tunnel
     if arguments.length:
         plan = load_tunnel(arguments.tunnel)
@@ -106,7 +133,8 @@ def _read(words: list[str]) -> Command:
 
 def main() -> None:
     """Entry point of `python -m benchmarks.b2_traverse`."""
-    cli.run(lambda: command(parse(_read)))
+    arguments = parse(_read)
+    sys.exit(status(lambda: command(arguments)))
 
 
 if __name__ == "__main__":

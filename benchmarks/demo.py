@@ -14,8 +14,11 @@ from typing import Any
 import tyro
 
 from benchmarks import truth as truths
+from benchmarks.command import status
 from benchmarks.report import write_report
 from scene.arguments import parse
+from scene.survey.config import SurveyConfig, check
+from subterra_jax.outputs import require_folder
 
 TASK = "Subterra/TraverseShort-v0"
 
@@ -100,7 +103,14 @@ def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
 
 
 def main(config: DemoConfig) -> None:
-    """Runs every stage and prints where the page is."""
+    """Runs every stage and prints where the page is.
+
+    Raises:
+        ValueError: A number is out of range.
+        SubterraError: The folder cannot be written.
+    """
+    require_folder(config.out)
+    check(SurveyConfig(config.out / "survey", length=config.length, seed=config.seed, point_rate=config.point_rate))
     started = time.monotonic()
     out, stages = config.out, Stages()
     survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))
@@ -178,4 +188,5 @@ def _odometry_figures(survey: Path, scene: Path, truth: truths.Truth, failure: s
 
 
 if __name__ == "__main__":
-    main(parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo")))
+    wanted = parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo"))
+    sys.exit(status(lambda: main(wanted)))

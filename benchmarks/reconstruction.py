@@ -10,20 +10,23 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import status
 from benchmarks.features import pocket_figures, sleeper_figures
 from benchmarks.fidelity.candidate import load
 from benchmarks.fidelity.derive import surface
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.truth import compare, load_truth
 from scene.arguments import parse
-from scene.cli import EXIT_BAD_INPUT
+from scene.survey.config import SurveyConfig, TruthName
+from scene.survey.config import check as check_survey
+from subterra_jax.outputs import require_folder
 
 
 @dataclass(frozen=True)
@@ -166,14 +169,30 @@ def main() -> None:
             ReconstructionConfig, args=words, prog="python -m benchmarks.reconstruction", description=__doc__
         )
     )
-    if not config.seeds:
-        print("error: seeds must name at least one survey", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        print(f"error: {config.out}: cannot be made a folder: {error.strerror}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
+    sys.exit(status(lambda: run(config)))
+
+
+def check(config: ReconstructionConfig) -> None:
+    """Refuses what cannot be simulated or written.
+
+    Raises:
+        ValueError: Nothing is asked for, or a number is out of range.
+        SubterraError: The folder cannot be written.
+    """
+    for name in ("seeds", "poses"):
+        if not getattr(config, name):
+            raise ValueError(f"{name} must name at least one")
+    if config.truth not in get_args(TruthName):
+        raise ValueError(f"no bore {config.truth!r}; there are {', '.join(get_args(TruthName))}")
+    for seed in config.seeds:
+        check_survey(SurveyConfig(config.out, truth=cast(TruthName, config.truth), length=config.length, seed=seed))
+    require_folder(config.out)
+
+
+def run(config: ReconstructionConfig) -> None:
+    """Measures, prints, writes."""
+    check(config)
+    config.out.mkdir(parents=True, exist_ok=True)
     rows = measure(config)
     show(rows, Console())
     facts = {"config": asdict(config) | {"out": str(config.out)}, "provenance": "simulated", "rows": rows}

@@ -12,13 +12,15 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from benchmarks.command import status
 from scene.arguments import parse
-from scene.cli import EXIT_BAD_INPUT
+from subterra_jax.outputs import require_file
 
 # MuJoCo chooses its GL backend when it is imported, so each is tried in a process of its own.
 _BACKENDS = ("egl", "osmesa", "glfw")
 _TIMEOUT = 120.0
 _LIT = 7  # OpenGL lights a scene with eight lights, the headlight among them
+_MOST_PIXELS = 8192
 _LOOK_AHEAD = 8.0  # m
 
 
@@ -90,14 +92,26 @@ def main(config: RenderConfig) -> None:
 def command() -> int:
     """The command line; a user's mistake, or no OpenGL, is one sentence and status 2."""
     config = parse(lambda words: tyro.cli(RenderConfig, args=words, prog="python -m benchmarks.render"))
+    return status(lambda: act(config))
+
+
+def act(config: RenderConfig) -> None:
+    """Renders.
+
+    Raises:
+        ValueError: What MuJoCo refuses; begins with the scene.
+        SubterraError: The picture cannot be written.
+    """
     import mujoco
 
+    for name in ("width", "height"):
+        if not 1 <= getattr(config, name) <= _MOST_PIXELS:
+            raise ValueError(f"{name} must be 1 to {_MOST_PIXELS}, got {getattr(config, name)}")
+    require_file(config.out, ".png")
     try:
         main(config)
     except (OSError, ValueError, KeyError, mujoco.FatalError) as fault:
-        print(f"error: {config.scene}: {' '.join(str(fault).split())}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    return 0
+        raise ValueError(f"{config.scene}: {fault}") from fault
 
 
 if __name__ == "__main__":

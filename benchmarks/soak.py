@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from rich.console import Console
 
 import subterra_jax as st
+from benchmarks.command import status
 from scene.arguments import parse
 from subterra_jax.errors import SubterraError
 
@@ -136,9 +137,9 @@ def run(config: SoakConfig, console: Console) -> bool:
         SubterraError: A number out of range, or no such tunnel.
         ValueError: No such task.
     """
-    for name, value in (("steps", config.steps), ("n_envs", config.n_envs)):
-        if value < 1:
-            raise SoakError(f"{name} must be at least 1, got {value}")
+    for name, least in (("steps", 1), ("n_envs", 1), ("seed", 0)):
+        if getattr(config, name) < least:
+            raise SoakError(f"{name} must be at least {least}, got {getattr(config, name)}")
     tasks = config.tasks or tuple(st.TASKS)
     plan = st.load_tunnel(config.tunnel)
     made = [st.make(task, plan, config.lining, estimates=True) for task in tasks]
@@ -158,11 +159,7 @@ def main() -> int:
     config = parse(
         lambda words: tyro.cli(SoakConfig, args=words, prog="python -m benchmarks.soak", description=__doc__)
     )
-    try:
-        return 0 if run(config, Console(highlight=False)) else 1
-    except (SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return status(lambda: 0 if run(config, Console(highlight=False)) else 1)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The bore: the reconstructed solid as a centreline with a section at every station."""
 
+import zipfile
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -135,11 +136,14 @@ def load(path: Path) -> Bore:
     try:
         with np.load(path) as data:
             if str(data["schema"]) != SCHEMA:
-                raise RecordingError(f"{path}: schema is {data['schema']}, not {SCHEMA}")
+                raise RecordingError(
+                    f"{path}: schema is {data['schema']}, not {SCHEMA}, so another version of Subterra wrote it; "
+                    "build the scene again with `python -m scene.build`"
+                )
             values = {part.name: data[part.name] for part in fields(Bore) if part.name in data}
             values.setdefault("confidence", np.full(len(values["station"]), np.nan))  # not in the first files
             return Bore(**values)
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise RecordingError(f"{path}: not a bore file ({error})") from error
 
 

@@ -18,6 +18,7 @@ from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
 from scene.reconstruct import Reconstruction, reconstruct
 from scene.resume import Partial, beside
+from scene.settings import check_number, check_settings
 
 _DEFAULT = BuildConfig()
 
@@ -43,10 +44,12 @@ def build(
         partial: Where partial results are kept; beside `out` where not given.
 
     Raises:
-        SubterraError: The input is at fault, or the output cannot be written.
+        SubterraError: The input or a setting is at fault, or the output cannot be written.
     """
     config = config or BuildConfig()
     require_output_folder(out)
+    check_settings(config)
+    check_number("keep-every", 0.0 if partial is None else partial.every)
     mounts = find_calibration(calibration)
     started = time.monotonic()
     partial = partial or Partial(beside(out))

@@ -21,7 +21,7 @@ def run(command: Callable[[], None]) -> None:
     try:
         command()
     except SubterraError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(EXIT_BAD_INPUT)
     except KeyboardInterrupt:
         print("interrupted; the output is as it was, and the same command goes on from here", file=sys.stderr)

@@ -3,6 +3,7 @@
 import ctypes
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,14 +33,23 @@ def require_output_folder(path: Path) -> Path:
     """The path itself, once it is known that a folder can be written there.
 
     Raises:
-        OutputError: A file is in the way, there or in a parent.
+        OutputError: A file is in the way, there or in a parent, or the place takes no files.
     """
     for place in (path, *path.parents):
         if place.exists():
             if not place.is_dir():
                 raise OutputError(f"{place}: is a file, so no folder {path} can be written")
+            _try(place, path)
             break
     return path
+
+
+def _try(place: Path, wanted: Path) -> None:
+    """Writes a file that vanishes at once: what permissions say is not what network and system folders do."""
+    try:
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError as error:
+        raise OutputError(f"{wanted}: cannot be written ({place}: {error.strerror})") from error
 
 
 @contextmanager

@@ -13,6 +13,9 @@ from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
 from subterra_jax.tunnel.stack import stack
+from subterra_jax.versions import VERSION
+
+__version__ = VERSION
 
 __all__ = [
     "TASKS",

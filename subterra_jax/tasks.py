@@ -24,6 +24,7 @@ from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.tunnel.blocks import LIDAR_GAP
 from subterra_jax.tunnel.sources import Source, resolve
 from subterra_jax.vehicle import VehicleParams
+from subterra_jax.versions import no_task
 from subterra_jax.wander import WanderParams
 
 SHORT_LENGTH = 60.0
@@ -120,7 +121,7 @@ def make(
 
         return missions.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
     if id not in TASKS:
-        raise ValueError(f"no task {id!r}; there are {', '.join(TASKS)}")
+        raise ValueError(no_task(id, (*TASKS, ids.WALK, *ids.MISSIONS)))
     task = TASKS[id]
     fields: dict[str, Any] = {
         "vehicle": VehicleParams(),

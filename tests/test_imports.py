@@ -1,6 +1,9 @@
 """Which room may know which: the borders of the house."""
 
 import ast
+import builtins
+import symtable
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -48,3 +51,37 @@ def test_survey_and_builder_share_no_code_but_how_a_command_line_is_read() -> No
         in_survey = path.is_relative_to(ROOT / "scene" / "survey")
         crossing = {name for name in from_scene if name.startswith("scene.survey") != in_survey} - {"scene.arguments"}
         assert not crossing, f"{path.relative_to(ROOT)} imports {crossing}"
+
+
+def tables(table: symtable.SymbolTable) -> Iterator[symtable.SymbolTable]:
+    yield table
+    for inside in table.get_children():
+        yield from tables(inside)
+
+
+def unknown(source: str, name: str) -> set[str]:
+    """Names that a module, or what is in it, looks up and that neither it nor Python makes."""
+    whole = symtable.symtable(source, name, "exec")
+    used, made = set(), {"__file__", "__name__", "__path__", "__doc__", *dir(builtins)}
+    for table in tables(whole):
+        for symbol in table.get_symbols():
+            own = symbol.is_parameter() or symbol.is_assigned()  # a function called `top` is taken for the module
+            if symbol.is_referenced() and (table is whole or (symbol.is_global() and not own)):
+                used.add(symbol.get_name())
+            if (symbol.is_assigned() or symbol.is_imported()) and (table is whole or symbol.is_declared_global()):
+                made.add(symbol.get_name())
+    annotations = [node.annotation for node in ast.walk(ast.parse(source)) if isinstance(node, ast.AnnAssign)]
+    shapes = {node.id for one in annotations for node in ast.walk(one) if isinstance(node, ast.Name)}
+    return used - made - shapes  # nobody looks up what is said of a local variable
+
+
+def test_no_name_is_used_that_nobody_made() -> None:
+    """The linters are told to leave names alone: shapes of arrays look like some."""
+    for room in ROOMS:
+        for path in files(room):
+            assert not unknown(path.read_text(), str(path)), f"{path.relative_to(ROOT)}"
+
+
+def test_a_name_that_nobody_made_is_noticed() -> None:
+    assert unknown("def f(x):\n    return x + Y", "there") == {"Y"}
+    assert not unknown("from a import Y\ndef f(x):\n    return x + Y", "there")

@@ -16,6 +16,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from subterra_jax.versions import other_schema
 from train.errors import CheckpointError
 
 SCHEMA = "subterra.checkpoint/1"
@@ -107,8 +108,9 @@ def load(folder: Path, iteration: int | None = None) -> Stored:
         facts = json.loads((place / FACTS).read_text())
     except (OSError, ValueError) as error:
         raise CheckpointError(f"{place}: damaged checkpoint: {FACTS} cannot be read") from error
-    if not isinstance(facts, dict) or facts.get("schema") != SCHEMA:
-        raise CheckpointError(f"{place}: field 'schema' of {FACTS} must be {SCHEMA!r}")
+    found = facts.get("schema") if isinstance(facts, dict) else None
+    if found != SCHEMA:
+        raise CheckpointError(f"{place / FACTS}: {other_schema(found, SCHEMA, 'train anew with `--overwrite`')}")
     try:
         restored = _arrays_file().restore((place / ARRAYS).resolve())
         arrays = {name: np.asarray(restored[name]).reshape(shape) for name, shape in facts["shapes"].items()}

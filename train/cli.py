@@ -27,7 +27,7 @@ def run(command: Callable[[], int | None]) -> None:
     try:
         sys.exit(command() or 0)
     except SubterraError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(EXIT_FAILED if isinstance(error, TrainingError) else EXIT_BAD_INPUT)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)

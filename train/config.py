@@ -5,6 +5,7 @@ import math
 from typing import ClassVar
 
 import subterra_jax as st
+from subterra_jax.versions import no_task
 from train.checks import at_least, not_negative, positive, share
 from train.errors import ConfigError
 
@@ -141,7 +142,7 @@ def make_config(task: str, preset: str = "cpu") -> PPOConfig:
     """
     known_preset(preset)
     if task not in st.TASKS:
-        raise ConfigError(f"no training preset for task {task!r}; there are presets for {', '.join(st.TASKS)}")
+        raise ConfigError(no_task(task, st.TASKS))
     different = _TASKS[task][preset] if task in _TASKS else _OTHERS[preset]
     return dataclasses.replace(_PRESETS[preset], **different)  # type: ignore[arg-type]
 

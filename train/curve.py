@@ -14,6 +14,7 @@ import matplotlib
 import numpy as np
 import tyro
 
+from subterra_jax.outputs import require_file
 from train import cli
 from train.arguments import parse
 from train.episodes import WINDOW
@@ -146,6 +147,7 @@ def command(arguments: Command) -> None:
     """Draws."""
     if not arguments.runs:
         raise RunFolderError("no run folder was named")
+    require_file(arguments.out, ".png")
     write_curve(list(arguments.runs), arguments.out)
 
 

@@ -2,13 +2,13 @@
 
 import dataclasses
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from subterra_jax.outputs import require_folder
 from train import board, checkpoint, cluster, policies
 from train.config import TrainConfig
 from train.episodes import Best, EpisodeWindow
@@ -29,17 +29,11 @@ class RunFolder:
         learner: What is trained.
 
     Raises:
-        RunFolderError: No folder can be written there.
+        OutputError: No folder can be written there.
     """
 
     def __init__(self, path: Path, world: policies.World, learner: Trainable) -> None:
-        for place in (path, *path.parents):
-            if place.exists():
-                if not place.is_dir():
-                    raise RunFolderError(f"{place}: is a file, so no folder {path} can be written")
-                if not os.access(place, os.W_OK):
-                    raise RunFolderError(f"{place}: cannot be written to")
-                break
+        require_folder(path)
         self.path, self._world, self._learner = path, world, learner
 
     def begin(self, *, resume: bool, overwrite: bool) -> Snapshot | None:

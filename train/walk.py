@@ -14,6 +14,7 @@ import jax
 import tyro
 
 from subterra_jax.b2 import ids, tasks
+from subterra_jax.outputs import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train import arguments as reading
@@ -106,8 +107,8 @@ def command(arguments: Command) -> int:
     seeds.check(arguments.seeds)
     if arguments.robots < 1:
         raise ConfigError(f"robots must be at least 1, got {arguments.robots}")
-    if arguments.release is not None and arguments.release.suffix != TENSORS:
-        raise ConfigError(f"release must end in {TENSORS}, got {arguments.release}")
+    if arguments.release is not None:
+        require_file(arguments.release, TENSORS)
     world = open_world(arguments.tunnel, arguments.scene)
     for seed in arguments.seeds or (arguments.config.seed,):
         out = arguments.out / f"seed-{seed}" if arguments.seeds else arguments.out

@@ -4,3 +4,18 @@ scene folder ─► candidate ┐
 held-out recording ┐      ├─► case ─► categories/ ─► values ─► scoring ─► report/
 truth or control   ┴─► references ┘
 """
+
+from scene.extras import require
+
+require(
+    "benchmarks.fidelity",
+    "fidelity,recordings",
+    "sklearn",
+    "skimage",
+    "gudhi",
+    "cc3d",
+    "pymeshlab",
+    "py4dgeo",
+    "jinja2",
+    "rosbags",
+)

@@ -13,10 +13,8 @@ from typing import Annotated, Any
 import tyro
 
 from benchmarks.fidelity import calibrate, commands
-from benchmarks.fidelity.errors import FidelityError
 from benchmarks.fidelity.split import SplitConfig, split
 from scene.arguments import parse
-from scene.cli import EXIT_BAD_INPUT
 from scene.cli import run as command
 
 _PROG = "python -m benchmarks.fidelity"
@@ -43,7 +41,10 @@ def main() -> None:
         sys.argv.append("run")
 
     def cut(config: SplitCommand) -> None:
-        """Cut a recording into fit, val and hold by blocks of time."""
+        """Cut a recording into fit, val and hold by blocks of time.
+
+        Example: python -m benchmarks.fidelity split recording.bag --out build/parts
+        """
         facts = split(config.recording, config.out, config.rule)
         print(", ".join(f"{name} {count} messages" for name, count in facts["messages"].items()))
 
@@ -54,13 +55,9 @@ def main() -> None:
     wrapped = {name: _flat(action) for name, action in actions.items()}
 
     def act() -> None:
-        try:
-            parse(
-                lambda words: tyro.extras.subcommand_cli_from_dict(wrapped, args=words, prog=_PROG, description=__doc__)
-            )()
-        except FidelityError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(EXIT_BAD_INPUT)
+        parse(
+            lambda words: tyro.extras.subcommand_cli_from_dict(wrapped, args=words, prog=_PROG, description=__doc__)
+        )()
 
     command(act)
 

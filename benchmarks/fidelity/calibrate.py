@@ -31,6 +31,8 @@ class CalibrateConfig:
 def run(config: CalibrateConfig) -> None:
     """Moves thresholds to where simulated surveys put them and writes them with their reasons.
 
+    Example: python -m benchmarks.fidelity calibrate --runs out/a out/b out/c
+
     Raises:
         FidelityError: Fewer surveys than asked, or a folder without their results.
     """

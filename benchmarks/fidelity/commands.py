@@ -1,6 +1,7 @@
 """What `python -m benchmarks.fidelity` can do; each command leaves files in `--out` that the others take up."""
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from benchmarks.fidelity.evaluate import evaluate
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.value import Value
-from scene.files import require_output_folder
+from scene.files import require_input, require_output_folder
 
 CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
 SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
@@ -73,14 +74,21 @@ def open_case(inputs: Inputs) -> Opened:
 
 
 def run(inputs: Inputs) -> None:
-    """Scores a scene against its references and writes the report."""
+    """Scores a scene against its references and writes the report.
+
+    Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held.bag --trajectory poses.tum
+    """
     opened = open_case(inputs)
     written = _report(opened)
     _say(written)
 
 
 def run_controls(config: ControlsConfig) -> None:
-    """Spoils the scene in 36 ways and changes nothing in 7, and says which were noticed."""
+    """Spoils the scene in 36 ways and changes nothing in 7, and says which were noticed.
+
+    Example: python -m benchmarks.fidelity controls --bold-only --out out/fidelity
+    """
+    _check_controls(config)
     opened = open_case(config)
     foreign = config.foreign
     if foreign is None and (not config.only or "N33" in config.only):
@@ -96,11 +104,28 @@ def run_controls(config: ControlsConfig) -> None:
     _say(_report(opened))
 
 
+def _check_controls(config: ControlsConfig) -> None:
+    """Refuses what cannot be run before the scene is judged, which takes minutes."""
+    known = {job.control for job in runner.jobs()}
+    if unknown := [name for name in config.only if name not in known]:
+        raise FidelityError(f"no control {unknown[0]!r}; there are {', '.join(sorted(known))}")
+    if config.processes < 1:
+        raise FidelityError(f"processes must be at least 1, got {config.processes}")
+    if config.foreign is not None:
+        require_input(config.foreign / "manifest.json")
+
+
 def run_sweep(config: SweepConfig) -> None:
     """Moves thresholds, tolerances and seeds, and says how far the scores follow.
 
     Whatever `controls` has left in `--out` takes part in the order that must be kept.
+
+    Example: python -m benchmarks.fidelity sweep --seeds 0 1 2 --out out/fidelity
     """
+    for name, values, least in (("seeds", config.seeds, 0.0), ("tolerances", config.tolerances, 1e-6)):
+        for value in values:
+            if not least <= value < math.inf:
+                raise FidelityError(f"{name} must be {'positive' if least else 'at least 0'}, got {value}")
     opened = open_case(config)
     candidates = dict(opened.values)
     foreign = config.out / given.FOREIGN
@@ -122,7 +147,10 @@ def run_sweep(config: SweepConfig) -> None:
 
 
 def run_report(inputs: Inputs) -> None:
-    """Writes the report of what earlier commands left in `--out`."""
+    """Writes the report of what earlier commands left in `--out`.
+
+    Example: python -m benchmarks.fidelity report --out out/fidelity
+    """
     resolved = given.completed(inputs)
     if not (resolved.out / "values.json").exists():
         raise FidelityError(f"{resolved.out}: holds no values.json; run the suite first")

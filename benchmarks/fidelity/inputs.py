@@ -58,6 +58,8 @@ def completed(inputs: Inputs) -> Inputs:
         SubterraError: A path does not exist.
         FidelityError: What is given does not go together.
     """
+    if inputs.seed < 0:
+        raise FidelityError(f"seed must not be negative, got {inputs.seed}")
     if inputs.scene is None:
         if inputs.recording or inputs.truth:
             raise FidelityError("--recording and --truth need --scene: what was reconstructed?")

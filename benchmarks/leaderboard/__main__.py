@@ -9,13 +9,13 @@ import time
 import tyro
 from rich.console import Console
 
+from benchmarks.command import status
 from benchmarks.leaderboard import figure, report
 from benchmarks.leaderboard.board import scores, totals
 from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, checked, worlds
 from benchmarks.leaderboard.entries import entry_of, write
 from benchmarks.throughput.facts import environment_facts
 from scene.arguments import parse
-from subterra_jax.errors import SubterraError
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -54,15 +54,7 @@ def main() -> int:
             LeaderboardConfig, args=words, prog="python -m benchmarks.leaderboard", description=__doc__
         )
     )
-    try:
-        run(config)
-    except (SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on", file=sys.stderr)
-        return 130
-    return 0
+    return status(lambda: run(config), "interrupted; the same command goes on")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,9 @@ from subterra_jax import policies
 from subterra_jax.baselines import registry
 from subterra_jax.errors import SubterraError
 from subterra_jax.evaluation.episodes import N_LISTED
+from subterra_jax.outputs import require_folder
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.versions import no_task
 
 OWN = "released-policy"  # the one that was released for the task at hand
 
@@ -67,14 +69,17 @@ def checked(config: LeaderboardConfig) -> LeaderboardConfig:
 
     Raises:
         LeaderboardError: A task or an agent that there is not, or a number out of range.
+        OutputError: The folder cannot be written.
     """
     for name, value in (("episodes", config.episodes), ("batch", config.batch)):
         if value < 1:
             raise LeaderboardError(f"{name} must be at least 1, got {value}")
     if config.episodes > N_LISTED:
         raise LeaderboardError(f"episodes must be at most {N_LISTED}, got {config.episodes}")
-    if config.out.exists() and not config.out.is_dir():
-        raise LeaderboardError(f"{config.out}: is not a folder")
+    for name in ("tunnels", "linings"):
+        if not getattr(config, name):
+            raise LeaderboardError(f"{name} must name at least one")
+    require_folder(config.out)
     tasks = tuple(_task(name) for name in config.tasks) or tuple(st.TASKS)
     policies.register_released()
     if unknown := [name for name in config.agents if name not in (*registry.names(), OWN)]:
@@ -109,7 +114,7 @@ def worlds(config: LeaderboardConfig) -> list[World]:
 def _task(name: str) -> str:
     full = name if name in st.TASKS else f"Subterra/{name}-v0"
     if full not in st.TASKS:
-        raise LeaderboardError(f"no task {name!r}; there are {', '.join(st.TASKS)}")
+        raise LeaderboardError(no_task(name, st.TASKS))
     return full
 
 

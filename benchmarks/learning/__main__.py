@@ -7,10 +7,11 @@ from typing import Literal
 
 import tyro
 
+from benchmarks.command import status
 from benchmarks.learning import ours, report
 from benchmarks.throughput.facts import environment_facts, version
 from scene.arguments import parse
-from subterra_jax.errors import SubterraError
+from subterra_jax.outputs import require_folder
 from train import policies
 from train.errors import ConfigError
 
@@ -47,9 +48,11 @@ def run(command: Command) -> None:
     policies.known_task(command.task)
     if "Traverse" not in command.task:
         raise ConfigError(f"task {command.task} is not one of coverage")
-    for name in ("steps", "our_steps"):
-        if getattr(command, name) < 1:
-            raise ConfigError(f"{name} must be at least 1, got {getattr(command, name)}")
+    for name, least in (("steps", 1), ("our_steps", 1), ("seed", 0)):
+        if getattr(command, name) < least:
+            raise ConfigError(f"{name} must be at least {least}, got {getattr(command, name)}")
+    policies.open_world(command.task, command.tunnel)
+    require_folder(command.out)
     try:
         from benchmarks.learning import stable_baselines
     except ImportError as missing:
@@ -67,12 +70,7 @@ def main() -> int:
     command = parse(
         lambda words: tyro.cli(Command, args=words, prog="python -m benchmarks.learning", description=__doc__)
     )
-    try:
-        run(command)
-    except (SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return status(lambda: run(command))
 
 
 if __name__ == "__main__":

@@ -12,16 +12,16 @@ from typing import Any
 
 import tyro
 
-from benchmarks.fidelity.errors import FidelityError
+from benchmarks.command import status
 from benchmarks.fidelity.filehash import file_hash
 from benchmarks.paper import bore_view, learning, occupancy, pipeline, sheet, steps
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.material import Material, read_truth
 from benchmarks.paper.sheet import Drawing
 from scene.arguments import parse
-from scene.errors import SubterraError as SceneError
 from scene.files import require_output_folder
-from subterra_jax.errors import SubterraError
+from scene.survey.config import SurveyConfig
+from scene.survey.config import check as check_survey
 
 OF_A_SURVEY: dict[int, Callable[[Material], Drawing]] = {1: bore_view.draw, 2: pipeline.draw, 3: occupancy.draw}
 LEARNING = 4
@@ -62,6 +62,8 @@ def check(config: PaperConfig) -> None:
         PaperError: There is no such figure, or what is given does not go together.
     """
     known = (*OF_A_SURVEY, LEARNING)
+    if not config.figures:
+        raise PaperError(f"figures must name at least one of {', '.join(map(str, known))}")
     for number in config.figures:
         if number not in known:
             raise PaperError(f"no figure {number}; there are {', '.join(map(str, known))}")
@@ -70,6 +72,14 @@ def check(config: PaperConfig) -> None:
     for path in (config.survey, config.scene, config.runs):
         if path is not None and not path.is_dir():
             raise PaperError(f"{path}: no such folder")
+    if config.survey is None:
+        check_survey(SurveyConfig(config.out / "survey", truth="metro", length=config.length, seed=config.seed))
+    else:
+        steps.require(config.survey, steps.SURVEY_FILES)
+    if config.scene is not None:
+        steps.require(config.scene, steps.SCENE_FILES)
+    if config.runs is not None and LEARNING in config.figures:
+        learning.find_runs(config.runs)
     require_output_folder(config.out)
 
 
@@ -160,15 +170,7 @@ def _hashes(paths: list[Path]) -> dict[str, str]:
 def main(args: list[str] | None = None) -> int:
     """Entry point: 0 once every figure is there, 2 for a user's mistake, 130 after Ctrl-C."""
     config = parse(lambda words: tyro.cli(PaperConfig, args=words, prog="python -m benchmarks.paper"), args)
-    try:
-        make(config)
-    except (SubterraError, SceneError, FidelityError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
-        return 130
-    return 0
+    return status(lambda: make(config), "interrupted; the same command goes on from here")
 
 
 if __name__ == "__main__":

@@ -56,6 +56,8 @@ class Pose:
 class CameraConfig:
     """Renders a scene from a place of its own.
 
+    Example: python -m benchmarks.paper.camera build/tunnel/scene.xml --at 5 0 1.5 --ahead 1 0 0 --out view.png
+
     Attributes:
         scene: MJCF file.
         at: Place in the tunnel frame, m.

@@ -17,7 +17,7 @@ from benchmarks.figures import scene_points
 from benchmarks.paper.camera import Pose, picture
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.recorded import Frame, Place, load_frame
-from benchmarks.paper.steps import SCENE_FILES, SURVEY_FILES
+from benchmarks.paper.steps import SCENE_FILES, SURVEY_FILES, require
 
 _PLACE = 0.3  # of the bore's length: what lies ahead there fills the frame
 _RADIUS = 8.0  # m about it, where the frame may be taken
@@ -40,10 +40,8 @@ class Material:
 
     def check(self) -> None:
         """Raises `PaperError` naming the first file that is missing."""
-        for folder, files in ((self.survey, SURVEY_FILES), (self.scene, SCENE_FILES)):
-            for file in files:
-                if not (folder / file).exists():
-                    raise PaperError(f"{folder / file}: no such file")
+        require(self.survey, SURVEY_FILES)
+        require(self.scene, SCENE_FILES)
 
     @cached_property
     def manifest(self) -> dict[str, Any]:

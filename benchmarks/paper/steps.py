@@ -68,6 +68,13 @@ def training_step(out: Path, scene: Path) -> Step:
     return Step("training", ("train.navigate", *words, "--out", str(out)), out, files, made_of, again=("--resume",))
 
 
+def require(folder: Path, files: tuple[str, ...]) -> None:
+    """Raises `PaperError` naming the first file that is missing in a folder."""
+    for file in files:
+        if not (folder / file).exists():
+            raise PaperError(f"{folder / file}: no such file")
+
+
 def done(step: Step) -> bool:
     """Whether the step came to its end with the same words, and its files are still there."""
     return _marked(step) == "done" and all((step.out / file).exists() for file in step.files)

@@ -13,6 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import status
 from benchmarks.rays.agreement import Agreement
 from benchmarks.rays.errors import RaysError
 from benchmarks.rays.figure import histograms
@@ -21,7 +22,7 @@ from benchmarks.rays.scenefiles import DEFAULT_SCENE, meshed_linings, require_sc
 from benchmarks.rays.tilted import compare_tilted
 from benchmarks.throughput.facts import environment_facts
 from scene.arguments import parse
-from subterra_jax.errors import SubterraError
+from subterra_jax.outputs import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 
 SCHEMA = "subterra.rays/1"
@@ -53,10 +54,13 @@ def run(config: RaysConfig) -> tuple[list[Agreement], dict[str, float]]:
     """All comparisons, and rays per second of the 3-D LiDAR by lining.
 
     Raises:
-        SubterraError: The folder is no scene, or lacks what was asked for.
+        SubterraError: The folder is no scene, or lacks what was asked for; or the output cannot be written.
     """
-    if config.n < 1:
-        raise RaysError(f"n must be at least 1, got {config.n}")
+    for name, least in (("n", 1), ("seed", 0)):
+        if getattr(config, name) < least:
+            raise RaysError(f"{name} must be at least {least}, got {getattr(config, name)}")
+    if config.out is not None:
+        require_file(config.out, ".json")
     for kind in config.kinds:
         if kind not in ("planar", "3d"):
             raise RaysError(f"there is no kind {kind!r}; there are planar and 3d")
@@ -133,16 +137,10 @@ def main(config: RaysConfig) -> int:
 
 def command(arguments: list[str] | None = None) -> int:
     """The command line; a user's mistake is one sentence and status 2."""
-    try:
-        return main(
-            parse(
-                lambda words: tyro.cli(RaysConfig, args=words, prog="python -m benchmarks.rays", description=__doc__),
-                arguments,
-            )
-        )
-    except SubterraError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    config = parse(
+        lambda words: tyro.cli(RaysConfig, args=words, prog="python -m benchmarks.rays", description=__doc__), arguments
+    )
+    return status(lambda: main(config))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,6 @@
 """Recordings for SLAM programs, and scores of their poses.
 
-`python -m benchmarks.slam record --scene build/tunnel --out out/slam/set`
-`python -m benchmarks.slam run --library kiss-icp --recordings out/slam/set --out out/slam/kiss-icp`
-`python -m benchmarks.slam score --estimate out/slam/kiss-icp --truth out/slam/set/truth --out out/slam/scores`
+Example: python -m benchmarks.slam record --scene build/tunnel --out out/slam/set
 """
 
 import sys
@@ -12,20 +10,32 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks import command as ending
 from benchmarks.slam import figure, report
 from benchmarks.slam.errors import SlamError
 from benchmarks.slam.judge import Judged, ScoreConfig, judge
 from benchmarks.slam.recordset import SetConfig, make_set
 from benchmarks.slam.trial import RunConfig, run_all
 from benchmarks.throughput.facts import environment_facts
-from subterra_jax.errors import SubterraError
+from scene.arguments import parse
 
 _progress = Console(stderr=True, highlight=False)
 
+_PROG = "python -m benchmarks.slam"
+_RECORD = f"""Record listed episodes, the truth held apart.
+
+Example: {_PROG} record --scene build/tunnel --linings smooth pockets --out out/slam/set"""
+_RUN = f"""Run a LiDAR odometry library on recordings.
+
+Example: {_PROG} run --library kiss-icp --recordings out/slam/set --out out/slam/kiss-icp"""
+_SCORE = f"""Score TUM files against the truth.
+
+Example: {_PROG} score --estimate out/slam/kiss-icp --truth out/slam/set/truth --out out/slam/scores"""
+
 Command = (
-    Annotated[SetConfig, tyro.conf.subcommand("record", description="Record listed episodes, the truth held apart.")]
-    | Annotated[RunConfig, tyro.conf.subcommand("run", description="Run a LiDAR odometry library on recordings.")]
-    | Annotated[ScoreConfig, tyro.conf.subcommand("score", description="Score TUM files against the truth.")]
+    Annotated[SetConfig, tyro.conf.subcommand("record", description=_RECORD)]
+    | Annotated[RunConfig, tyro.conf.subcommand("run", description=_RUN)]
+    | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
 )
 
 
@@ -77,15 +87,8 @@ def _write(config: ScoreConfig, found: list[Judged]) -> None:
 
 def command(arguments: list[str] | None = None) -> int:
     """The command line; a user's mistake is one sentence and status 2."""
-    try:
-        main(tyro.cli(Command, args=arguments, description=__doc__))
-    except SubterraError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on", file=sys.stderr)
-        return 130
-    return 0
+    config = parse(lambda words: tyro.cli(Command, args=words, prog=_PROG, description=__doc__), arguments)
+    return ending.status(lambda: main(config), "interrupted; the same command goes on")
 
 
 if __name__ == "__main__":

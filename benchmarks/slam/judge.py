@@ -44,8 +44,11 @@ def judge(config: ScoreConfig) -> list[Judged]:
     """Every estimate that was given.
 
     Raises:
-        SlamError: A file is missing or wrong, or a folder holds no estimate of a recording whose truth is known.
+        SlamError: None was given, a file is missing or wrong, or a folder holds no estimate of a recording whose
+            truth is known.
     """
+    if not config.estimate:
+        raise SlamError("estimate must name at least one file or folder")
     return [judged for given in config.estimate for judged in _judge(given, config)]
 
 

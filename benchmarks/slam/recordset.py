@@ -8,8 +8,12 @@ from pathlib import Path
 from typing import Literal
 
 from benchmarks.slam.errors import SlamError
+from subterra_jax.evaluation.episodes import N_LISTED
 from subterra_jax.recorder import Recording, record
+from subterra_jax.recorder.config import checked
+from subterra_jax.recorder.world import open_world
 from subterra_jax.tasks import TASKS
+from subterra_jax.versions import no_task
 
 SCHEMA = "subterra.recording-set/1"
 RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"
@@ -54,15 +58,19 @@ def planned(config: SetConfig) -> list[tuple[str, Recording]]:
     """The recordings of a set by name: `StopAt-pockets-000`.
 
     Raises:
-        SlamError: There is no such task, or nothing to record.
+        SlamError: There is no such task, nothing to record, or a number is out of range.
     """
     if config.episodes < 1 or not config.tasks or not config.linings:
         raise SlamError(f"nothing to record: {config.episodes} episodes of tasks {config.tasks}, {config.linings}")
+    if config.episodes > N_LISTED and config.secret is None:
+        raise SlamError(f"episodes must be at most {N_LISTED}, which is what the list has, got {config.episodes}")
+    if config.secret is not None and config.secret < 0:
+        raise SlamError(f"secret must not be negative, got {config.secret}")
     found = []
     for task in config.tasks:
         short = task.removeprefix("Subterra/").removesuffix("-v0")
         if f"Subterra/{short}-v0" not in TASKS:
-            raise SlamError(f"no task {task!r}; there are {', '.join(TASKS)}")
+            raise SlamError(no_task(task, TASKS))
         for lining in config.linings:
             for episode in range(config.episodes):
                 name = f"{short}-{lining}-{episode:03d}"
@@ -96,6 +104,7 @@ def make_set(config: SetConfig) -> Iterator[tuple[str, bool]]:
         SubterraError: A recording cannot be made.
     """
     plan = planned(config)
+    _check(plan)
     settings = {key: value for key, value in dataclasses.asdict(config).items() if key not in ("out", "tasks")}
     _settle(config.out / TRUTH / INDEX, json.dumps({"schema": SCHEMA, "config": settings}, indent=1, default=str))
     for name, one in plan:
@@ -106,6 +115,15 @@ def make_set(config: SetConfig) -> Iterator[tuple[str, bool]]:
     told = {key: value for key, value in settings.items() if key != "secret"}
     content = {"schema": SCHEMA, "recordings": [name for name, _ in plan], "config": told}
     (config.out / INDEX).write_text(json.dumps(content, indent=1, default=str) + "\n")
+
+
+def _check(plan: list[tuple[str, Recording]]) -> None:
+    """Refuses a set before anything of it is written: its numbers and folders, and each task once with each lining."""
+    for _, one in plan:
+        if not one.recording_folder.is_dir():
+            checked(one)
+    for one in {(one.task, one.lining): one for _, one in plan}.values():
+        open_world(one)
 
 
 def _settle(path: Path, settings: str) -> None:

@@ -9,6 +9,7 @@ import tyro
 from rich.console import Console
 
 import subterra_jax as st
+from benchmarks.command import status
 from benchmarks.throughput import figure, report, result
 from benchmarks.throughput.config import ThroughputConfig, check
 from benchmarks.throughput.exactness import measure_exactness
@@ -67,17 +68,19 @@ def run(config: ThroughputConfig) -> result.Result:
 
 
 def main() -> int:
-    """Measures, prints, writes; the status is 1 if the LiDAR is not exact."""
+    """Entry point; the status is 1 if the LiDAR is not exact, and 2 for a user's mistake."""
     config = parse(
         lambda words: tyro.cli(
             ThroughputConfig, args=words, prog="python -m benchmarks.throughput", description=__doc__
         )
     )
+    return status(lambda: tell(config))
+
+
+def tell(config: ThroughputConfig) -> int:
+    """Measures, prints, writes; the status is 1 where a number is not finite or a ray is wrong."""
     try:
         found = run(config)
-    except (st.SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except FloatingPointError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

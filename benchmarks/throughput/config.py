@@ -1,5 +1,6 @@
 """What to measure, and the sizes that a machine is measured at where none are given."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -74,13 +75,15 @@ def check(config: ThroughputConfig) -> None:
     Raises:
         ThroughputError: Naming the option and its value.
     """
-    for name, least in (("steps", 1), ("repeats", 1), ("poses", 0), ("seconds", 0)):
+    for name, least in (("steps", 1), ("repeats", 1), ("poses", 0), ("seed", 0)):
         if getattr(config, name) < least:
             raise ThroughputError(f"--{name} must be at least {least}, got {getattr(config, name)}")
-    if any(size < 1 for size in (*config.n, config.studied())):
-        raise ThroughputError(f"a batch holds at least 1 environment, got {min(*config.n, config.studied())}")
-    if any(length <= 0.0 for length in config.lengths):
-        raise ThroughputError(f"--lengths must be positive, got {min(config.lengths)}")
+    for size in (*config.n, config.studied()):
+        if size < 1:
+            raise ThroughputError(f"a batch holds at least 1 environment, got {size}")
+    for name, value in (("seconds", config.seconds), *(("lengths", length) for length in config.lengths)):
+        if not 0.0 < value < math.inf:
+            raise ThroughputError(f"--{name} must be positive, got {value}")
     if len(config.peers) > 1 and {"auto", "none"} & set(config.peers):
         raise ThroughputError(f"--peers takes auto, none, or names, got {' '.join(config.peers)}")
 

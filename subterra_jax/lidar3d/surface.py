@@ -1,6 +1,7 @@
 """What a LiDAR sees in a scene folder, as triangles in the tunnel frame: lining, bed, sleepers, rails, furniture."""
 
 import dataclasses
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from subterra_jax.errors import TunnelError
+from subterra_jax.tunnel.reading import AGAIN
+from subterra_jax.versions import other_schema
 
 if TYPE_CHECKING:
     import mujoco
@@ -64,10 +67,10 @@ def read_axis(path: Path) -> Axis:
     """
     try:
         with np.load(path, allow_pickle=False) as data:
-            if str(data["schema"]) != _BORE_SCHEMA:
-                raise TunnelError(f"{path}: field 'schema' must be {_BORE_SCHEMA!r}, is {str(data['schema'])!r}")
+            if (found := str(data["schema"])) != _BORE_SCHEMA:
+                raise TunnelError(f"{path}: {other_schema(found, _BORE_SCHEMA, AGAIN)}")
             return Axis(*(np.asarray(data[name], np.float64) for name in ("station", "position", "tangent")))
-    except (OSError, KeyError, ValueError, EOFError) as error:
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise TunnelError(f"{path}: not a bore file ({error})") from error
 
 

@@ -1,12 +1,12 @@
 """Record an episode for SLAM programs: MCAP with ROS 2 messages, TUM, and the truth apart.
 
-Example: `python -m subterra_jax.recorder --task StopAt --agent dead-reckoning --seed 7 --imu --out out/episode`;
-with a LiDAR in three dimensions: `… --scene build/tunnel --cloud vlp16`.
+Example: python -m subterra_jax.recorder --task StopAt --agent dead-reckoning --seed 7 --imu --out out/episode
 """
 
 import sys
 
 from subterra_jax.adapters.missing import MissingLibraryError
+from subterra_jax.arguments import parse
 from subterra_jax.errors import SubterraError
 from subterra_jax.recorder import Recording, record
 
@@ -18,10 +18,13 @@ def main(arguments: list[str] | None = None) -> int:
             import tyro
         except ImportError as error:
             raise MissingLibraryError("subterra_jax.recorder", "tyro") from error
-        config = tyro.cli(Recording, args=arguments, description=__doc__)
+        config = parse(
+            lambda words: tyro.cli(Recording, args=words, prog="python -m subterra_jax.recorder", description=__doc__),
+            sys.argv[1:] if arguments is None else arguments,
+        )
         trace = record(config)
     except SubterraError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted: nothing was written", file=sys.stderr)

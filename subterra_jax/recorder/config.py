@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from subterra_jax.errors import SubterraError
 from subterra_jax.lidar3d import beams
+from subterra_jax.outputs import require_folder
 
 CloudName = Literal["none", "vlp16", "os1"]
 _BEAMS: dict[str, tuple[Callable[[int], np.ndarray], int]] = {"vlp16": (beams.vlp16, 16), "os1": (beams.os1, 64)}
@@ -87,6 +88,7 @@ def checked(config: Recording) -> Recording:
 
     Raises:
         RecordingError: They are not; says which and why.
+        OutputError: A folder cannot be written.
     """
     least = {"columns": 8, "every": 1, "beams": 0, "seed": 0}
     if config.steps is not None:
@@ -107,4 +109,5 @@ def checked(config: Recording) -> Recording:
     for folder in (config.recording_folder, config.truth_folder):
         if folder.exists():
             raise RecordingError(f"{folder}: exists already; recordings are not overwritten")
+        require_folder(folder)
     return config

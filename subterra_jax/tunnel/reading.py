@@ -1,5 +1,6 @@
 """Reading `tunnel.npz`: every complaint names the file and the field."""
 
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +8,17 @@ import numpy as np
 
 from subterra_jax.errors import TunnelError
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
+from subterra_jax.versions import other_schema
 
 SCHEMA = "subterra.tunnel/1"
+AGAIN = "build the scene again with `python -m scene.build`"
+
+
+def spoiled(path: Path, error: Exception) -> str:
+    """Why an archive cannot be read; NumPy takes whatever is no archive for a pickle."""
+    if path.is_dir():
+        return "it is a folder"
+    return str(error) if path.stat().st_size and zipfile.is_zipfile(path) else "it is no zip file, or is cut short"
 
 
 class _Fields:
@@ -22,7 +32,7 @@ class _Fields:
         except FileNotFoundError as error:
             raise TunnelError(f"{path}: no such tunnel file") from error
         except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
-            raise TunnelError(f"{path}: not a readable .npz archive ({error})") from error
+            raise TunnelError(f"{path}: not a readable .npz archive ({spoiled(path, error)})") from error
 
     def fail(self, field: str, problem: str) -> TunnelError:
         return TunnelError(f"{self.path}: field '{field}' {problem}")
@@ -67,8 +77,8 @@ def read_tunnel(path: Path) -> TunnelPlan:
         TunnelError: The file cannot be read, or a field is missing or wrong.
     """
     fields = _Fields(path)
-    if fields.text("schema") != SCHEMA:
-        raise fields.fail("schema", f"must be {SCHEMA!r}, is {fields.text('schema')!r}")
+    if (found := fields.text("schema")) != SCHEMA:
+        raise TunnelError(f"{path}: {other_schema(found, SCHEMA, AGAIN)}")
     station = fields.numbers("station", None)
     n = len(station)
     if n < 2:

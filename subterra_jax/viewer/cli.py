@@ -8,6 +8,7 @@ import time
 import warnings
 from pathlib import Path
 
+from subterra_jax.arguments import parse
 from subterra_jax.errors import SubterraError
 from subterra_jax.viewer.config import LOOPBACK, ViewerConfig
 
@@ -15,7 +16,12 @@ _EXAMPLE = "example: python -m subterra_jax.viewer --scene build/tunnel --task S
 
 
 def parsed(arguments: list[str] | None = None) -> ViewerConfig:
-    """The configuration that a command line asks for; exits with status 2 where it is malformed."""
+    """The configuration that a command line asks for.
+
+    Raises:
+        ArgumentsError: It is malformed.
+        SystemExit: Help was shown.
+    """
     default = ViewerConfig()
     parser = argparse.ArgumentParser(
         prog="python -m subterra_jax.viewer", description="Shows episodes in the browser.", epilog=_EXAMPLE
@@ -38,7 +44,7 @@ def parsed(arguments: list[str] | None = None) -> ViewerConfig:
     add("--replay", type=Path, metavar="FILE", help="begin with this recorded episode")
     add("--host", default=default.host, metavar="ADDRESS", help="listen here; the default is this machine alone")
     add("--port", type=int, default=default.port, metavar="N", help="first port to try")
-    given = parser.parse_args(arguments)
+    given = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
     return ViewerConfig(
         scene=given.scene,
         tunnels=tuple(given.tunnel),
@@ -56,7 +62,10 @@ def parsed(arguments: list[str] | None = None) -> ViewerConfig:
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point; the status is 2 for a user's mistake."""
-    config = parsed(arguments)
+    try:
+        config = parsed(arguments)
+    except SubterraError as error:
+        return _refused(error)
     # What strangers send is refused without a word: a traceback for each would bury what matters.
     for name in ("websockets.server", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -67,11 +76,9 @@ def main(arguments: list[str] | None = None) -> int:
         _compile_once()
         viewer = Viewer(config)
     except ModuleNotFoundError as error:
-        print(f"error: {error.name} is not installed: pip install 'subterra-jax[viewer]'", file=sys.stderr)
-        return 2
+        return _refused(f"{error.name} is not installed: pip install 'subterra-jax[viewer]'")
     except (SubterraError, ValueError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return _refused(error)
     print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
     if config.host not in (LOOPBACK, "localhost", "::1"):
         print(f"listening on {config.host}: whoever reaches this address can drive, and save in {config.recordings}")
@@ -81,6 +88,12 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         viewer.stop()
     return 0
+
+
+def _refused(cause: object) -> int:
+    """Tells a user's mistake on one line; the exit status."""
+    print(f"error: {' '.join(str(cause).split())}", file=sys.stderr)
+    return 2
 
 
 def _compile_once() -> None:

@@ -4,7 +4,9 @@ import socket
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from subterra_jax.outputs import require_folder
 from subterra_jax.tasks import TASKS
+from subterra_jax.versions import no_task
 from subterra_jax.viewer.errors import ViewerError
 
 LOOPBACK = "127.0.0.1"
@@ -53,8 +55,8 @@ def checked(config: ViewerConfig) -> ViewerConfig:
         for needed in ("scene.xml", "tunnel.npz", "meshes"):
             if not (config.scene / needed).exists():
                 raise ViewerError(f"{config.scene} is no scene folder: {needed} is missing")
-    if config.recordings.exists() and not config.recordings.is_dir():
-        raise ViewerError(f"{config.recordings}: is not a folder")
+    if config.recordings != ViewerConfig.recordings or config.recordings.exists():
+        require_folder(config.recordings)  # where nobody named one, looking on works wherever one stands
     if config.lining not in LININGS:
         raise ViewerError(f"lining must be one of {', '.join(LININGS)}, got {config.lining!r}")
     if not 0 <= config.seed < 2**31:
@@ -63,7 +65,7 @@ def checked(config: ViewerConfig) -> ViewerConfig:
         raise ViewerError(f"port must be 0 to {2**16 - 1}, got {config.port}")
     task = config.task if config.task in TASKS else f"Subterra/{config.task}-v0"
     if task not in TASKS:
-        raise ViewerError(f"no task {config.task!r}; there are {', '.join(TASKS)}")
+        raise ViewerError(no_task(config.task, TASKS))
     return replace(config, task=task)
 
 

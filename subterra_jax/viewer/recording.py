@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from subterra_jax.tunnel.reading import spoiled
+from subterra_jax.versions import other_schema
 from subterra_jax.viewer.errors import RecordingError
 
 SCHEMA = "subterra.episode/1"
@@ -138,9 +140,10 @@ def load(path: Path) -> Recording:
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: no such recording") from error
     except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
-        raise RecordingError(f"{path}: not a readable recording ({error})") from error
-    if str(fields.get("schema")) != SCHEMA:
-        raise RecordingError(f"{path}: field 'schema' must be {SCHEMA!r}, is {str(fields.get('schema'))!r}")
+        raise RecordingError(f"{path}: not a readable recording ({spoiled(path, error)})") from error
+    found = str(fields["schema"]) if "schema" in fields else None
+    if found != SCHEMA:
+        raise RecordingError(f"{path}: {other_schema(found, SCHEMA, 'save the episode again in the viewer')}")
     texts: dict[str, Any] = {name: str(_field(path, fields, name, (), "U")) for name in _TEXTS}
     numbers: dict[str, Any] = {name: float(_field(path, fields, name, (), "fiub")) for name in _NUMBERS}
     series: dict[str, Any] = {name: _field(path, fields, name, shape, "f") for name, shape in _SHAPES.items()}

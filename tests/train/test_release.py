@@ -38,6 +38,14 @@ def gru():
     return nets, without_critic(weights)
 
 
+@pytest.fixture(scope="module")
+def among_boxes():
+    env, params = st.make("Subterra/ObstructedShort-v0")
+    nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
+    weights = jax.tree.map(lambda x: x + 0.05, nets.init(jax.random.PRNGKey(1)))
+    return nets, without_critic(weights)
+
+
 @pytest.fixture
 def released(gru, tmp_path):
     out = tmp_path / "mine.safetensors"
@@ -67,15 +75,17 @@ def test_a_perceptron_drives_without_the_trainer_as_it_does_with_it(perceptron):
         assert np.isnan(action[2])
 
 
-def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(gru):
-    nets, weights = gru
+@pytest.mark.parametrize("trained", ["gru", "among_boxes"])
+def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(request, trained):
+    nets, weights = request.getfixturevalue(trained)
     agent, start = agent_of(nets, weights), jnp.float32(5.0)
-    memory, hidden, reckoning = agent.blank(), jnp.zeros((1, 12)), senses.start((1,), 16)
-    answer = jax.jit(agent.answer)
+    assert (agent.shown.boxes, agent.n_beams) == (trained == "among_boxes", 16)
+    memory, hidden, reckoning = agent.blank(), jnp.zeros((1, 12)), senses.start((1,), 16, nets.layout.shown)
+    answer, look = jax.jit(agent.answer), jax.jit(senses.look)
     for obs in readings(12):
         odometry = jnp.stack([obs.distance, obs.heading])
         part = {"ranges": obs.ranges, "odometry": odometry, "goal": obs.goal[None], "ring_pitch": obs.ring_pitch[None]}
-        seen = senses.look({name: value[None] for name, value in part.items()}, start, reckoning)
+        seen = look({name: value[None] for name, value in part.items()}, start, reckoning)
         hidden, _ = nets.remember(weights, seen.features[None], hidden, jnp.zeros((1, 1), bool))
         thought = nets.think(weights, hidden, seen.ahead)
         wanted = nets.action(thought.parameters[..., :2])
@@ -155,4 +165,4 @@ def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, 
     assert json.loads(capsys.readouterr().out) == saved
     assert json.loads(release.facts_file(out).read_text())["scores"] == saved
     assert call(release.main, str(trained), "--out", str(tmp_path / "corridor.bin")) == 2
-    assert "out must end in .safetensors" in capsys.readouterr().err
+    assert "must end in .safetensors" in capsys.readouterr().err

@@ -10,6 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import policy as gaits
+from subterra_jax.outputs import OutputError
 from subterra_jax.policies.files import PolicyError
 from train import release, walk
 from train.errors import ConfigError
@@ -111,7 +112,7 @@ def test_settings_that_make_no_sense_are_refused_before_anything_is_compiled(tmp
         walk.command(walk.Command(out=tmp_path / "run", robots=0))
     with pytest.raises(ConfigError, match="n_envs = 100 cannot be divided into minibatches = 32"):
         walk.command(walk.Command(out=tmp_path / "run", config=WalkConfig(n_envs=100)))
-    with pytest.raises(ConfigError, match=r"release must end in \.safetensors"):
+    with pytest.raises(OutputError, match=r"must end in \.safetensors"):
         walk.command(walk.Command(out=tmp_path / "run", release=tmp_path / "gait.bin"))
     with pytest.raises(ConfigError, match="either a tunnel or a scene"):
         walk.command(walk.Command(out=tmp_path / "run", tunnel=tmp_path / "t.npz", scene=tmp_path))

@@ -22,7 +22,7 @@ from tests.subterra_jax.viewer.episodes import straight
         (["--seed", "-1"], "seed must be 0 to"),
         (["--port", "70000"], "port must be 0 to 65535, got 70000"),
         (["--host", "203.0.113.7"], "cannot listen on 203.0.113.7"),
-        (["--recordings", "/dev/null"], "/dev/null: is not a folder"),
+        (["--recordings", "/dev/null"], "/dev/null: is a file, so no folder"),
     ],
 )
 def test_a_mistake_ends_in_one_sentence_and_status_2(capsys, monkeypatch, tmp_path, arguments, says):

@@ -1,0 +1,142 @@
+"""Files and ids of another version say what to do."""
+
+import json
+import shutil
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from scene import bore
+from scene.errors import RecordingError as SceneError
+from subterra_jax import policies
+from subterra_jax.lidar3d.surface import read_axis
+from subterra_jax.policies.files import PolicyError
+from subterra_jax.versions import VERSION, no_task, other_schema
+from subterra_jax.viewer.errors import ViewerError
+from subterra_jax.viewer.recording import load as load_episode
+from subterra_jax.viewer.recording import save as save_episode
+from tests.subterra_jax.viewer.episodes import straight
+from train import checkpoint
+from train.errors import CheckpointError
+from train.policies import versions
+
+ROOT = Path(__file__).parents[2]
+
+
+def packaged(name: str) -> Path:
+    return Path(str(resources.files("subterra_jax"))) / "data" / name
+
+
+def other(path: Path, out: Path, schema: str) -> Path:
+    """A copy of an archive under another schema."""
+    with np.load(path) as data:
+        np.savez(out, **{**data, "schema": np.array(schema)})
+    return out
+
+
+def test_the_version_is_that_of_the_package():
+    assert tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"] == VERSION == st.__version__
+    assert f"version: {VERSION}" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_what_is_released_from_a_bare_checkout_knows_its_version(monkeypatch):
+    monkeypatch.setattr("train.policies.metadata.distributions", lambda: [])
+    assert versions()["subterra-jax"] == VERSION
+    assert versions()["jax"] == "not installed"
+
+
+@pytest.mark.parametrize(
+    ("found", "says"),
+    [
+        ("subterra.tunnel/0", f"written by an older Subterra (schema subterra.tunnel/0; version {VERSION} reads "),
+        ("subterra.tunnel/2", f"written by a newer Subterra (schema subterra.tunnel/2; version {VERSION} reads "),
+        ("subterra.bore/1", "field 'schema' must be 'subterra.tunnel/1', is 'subterra.bore/1'"),
+        ("subterra.tunnel/x", "field 'schema' must be 'subterra.tunnel/1', is 'subterra.tunnel/x'"),
+        (None, "field 'schema' must be 'subterra.tunnel/1', is missing"),
+    ],
+)
+def test_a_schema_is_older_newer_or_of_another_file(found, says):
+    assert other_schema(found, "subterra.tunnel/1", "build again").startswith(says)
+
+
+def test_an_older_file_is_to_be_made_again_and_a_newer_one_needs_an_update():
+    assert other_schema("a/1", "a/2", "build again").endswith("; build again")
+    assert other_schema("a/3", "a/2", "build again").endswith("; pip install --upgrade subterra-jax")
+
+
+def test_a_tunnel_of_another_version_says_what_to_do(tmp_path):
+    old = other(packaged("subterra-351.npz"), tmp_path / "old.npz", "subterra.tunnel/0")
+    with pytest.raises(st.TunnelError, match=r"old\.npz: written by an older .* `python -m scene\.build`"):
+        st.load_tunnel(old)
+    new = other(packaged("subterra-351.npz"), tmp_path / "new.npz", "subterra.tunnel/7")
+    with pytest.raises(st.TunnelError, match=r"new\.npz: written by a newer .* pip install --upgrade"):
+        st.load_tunnel(new)
+
+
+def test_a_bore_of_another_version_says_what_to_do(tmp_path):
+    np.savez(tmp_path / "bore.npz", schema=np.array("subterra.bore/0"))
+    with pytest.raises(st.TunnelError, match=r"written by an older .* `python -m scene\.build`"):
+        read_axis(tmp_path / "bore.npz")
+    with pytest.raises(SceneError, match=r"another version of Subterra wrote it; .* `python -m scene\.build`"):
+        bore.load(tmp_path / "bore.npz")
+
+
+def test_an_archive_that_was_cut_short_is_no_bore_and_no_tunnel(tmp_path):
+    cut = tmp_path / "cut.npz"
+    cut.write_bytes(packaged("subterra-351.npz").read_bytes()[:50_000])
+    with pytest.raises(st.TunnelError, match="cut short"):
+        st.load_tunnel(cut)
+    with pytest.raises(st.TunnelError, match="not a bore file"):
+        read_axis(cut)
+    with pytest.raises(SceneError, match="not a bore file"):
+        bore.load(cut)
+
+
+@pytest.mark.parametrize(("number", "says"), [(0, "older .* `python -m train.release`"), (2, "newer .* --upgrade")])
+def test_a_policy_of_another_version_says_what_to_do(tmp_path, number, says):
+    for ending in (".safetensors", ".json"):
+        shutil.copy(packaged("policies") / f"TraverseShort-v0{ending}", tmp_path / f"mine{ending}")
+    facts = json.loads((tmp_path / "mine.json").read_text())
+    (tmp_path / "mine.json").write_text(json.dumps({**facts, "schema": f"subterra.policy/{number}"}))
+    with pytest.raises(PolicyError, match=says):
+        policies.load(tmp_path / "mine.safetensors")
+
+
+def test_a_checkpoint_of_another_version_says_what_to_do(tmp_path):
+    checkpoint.save(tmp_path, 3, {"policy": {"w": np.zeros(2, np.float32)}}, {"task": "t"})
+    (facts,) = tmp_path.rglob(checkpoint.FACTS)
+    name, _, number = checkpoint.SCHEMA.rpartition("/")
+    for told, says in ((int(number) - 1, "older .*--overwrite"), (int(number) + 1, "newer .* --upgrade")):
+        facts.write_text(json.dumps({**json.loads(facts.read_text()), "schema": f"{name}/{told}"}))
+        with pytest.raises(CheckpointError, match=says):
+            checkpoint.load(tmp_path)
+
+
+def test_an_episode_of_another_version_says_what_to_do(tmp_path):
+    save_episode(straight(), tmp_path / "now.npz")
+    with np.load(tmp_path / "now.npz") as data:
+        name = str(data["schema"]).rpartition("/")[0]
+    for told, says in ((0, "older .* save the episode again"), (99, "newer .* --upgrade")):
+        with pytest.raises(ViewerError, match=says):
+            load_episode(other(tmp_path / "now.npz", tmp_path / "other.npz", f"{name}/{told}"))
+
+
+def test_an_id_of_another_version_names_the_one_there_is():
+    known = ("Subterra/StopAt-v0", "Subterra/Return-v0")
+    assert no_task("Subterra/StopAt-v1", known).endswith(
+        "has Subterra/StopAt-v0; results of two versions do not compare"
+    )
+    assert no_task("StopAt-v3", known) == no_task("Subterra/StopAt-v1", known).replace(
+        "Subterra/StopAt-v1", "StopAt-v3"
+    )
+    assert no_task("Return", known) == "no task 'Return': its id is Subterra/Return-v0"
+    assert no_task("Fly", known) == "no task 'Fly'; there are Subterra/StopAt-v0, Subterra/Return-v0"
+    with pytest.raises(ValueError, match="has Subterra/B2Traverse-v0"):
+        st.make("Subterra/B2Traverse-v1")
+    with pytest.raises(gymnasium.error.VersionNotFound, match="StopAt"):
+        gymnasium.make("subterra_jax:Subterra/StopAt-v1")

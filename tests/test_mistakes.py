@@ -1,0 +1,250 @@
+"""What a user can get wrong at a command line: one sentence, exit status 2, nothing half-written."""
+
+import os
+import runpy
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+JUNK = bytes(range(256)) * 8
+
+# Command line → what its sentence must say. `text.txt` is a file, `empty` a folder, `junk.*` are bytes of no kind,
+# `tunnel` is a scene folder of such bytes, /proc a folder in which nobody can write.
+MISTAKES = {
+    "scene.survey": "missing: --out",
+    "scene.survey --out text.txt": "text.txt",
+    "scene.survey --out o --truth moon": "'moon'",
+    "scene.survey --out o --length nan": "length must be",
+    "scene.survey --out o --seed -1": "seed must not be negative",
+    "scene.survey --out o --point-rate 0": "point_rate must be",
+    "scene.build": "missing: INPUT",
+    "scene.build none.bag --out o": "none.bag: no such file",
+    "scene.build empty --out o": "empty: of no known kind",
+    "scene.build junk.bag --out o": "junk.bag: not a whole ROS1 bag",
+    "scene.build junk.laz --out o": "junk.laz: not a readable LAS cloud",
+    "scene.build junk.bag --trajectory none.tum --out o": "none.tum: no such file",
+    "scene.build junk.bag --calibration moon --out o": "moon: no calibration of that name",
+    "scene.build junk.bag --out text.txt/x": "text.txt: is a file",
+    "scene.build junk.bag --out /proc/no/x": "/proc/no/x: cannot be written",
+    "scene.build junk.bag --out o --keep-every nan": "--keep-every must be a finite number, got nan",
+    "scene.build junk.bag --out o --track.gauge -1": "--track.gauge must not be negative, got -1",
+    "scene.build junk.bag --out o --scene.chunk-length 0": "--scene.chunk-length must be above 0",
+    "train.navigate": "missing: --out",
+    "train.navigate --out o --task StopAt": "its id is Subterra/StopAt-v0",
+    "train.navigate --out o --task Subterra/StopAt-v1": "has Subterra/StopAt-v0",
+    "train.navigate --out o --tunnel junk.npz": "junk.npz: not a readable .npz archive (it is no zip file",
+    "train.navigate --out o --tunnel empty": "empty: not a readable .npz archive (it is a folder)",
+    "train.navigate --out o --lining velvet": "no lining 'velvet'",
+    "train.navigate --out o --steps 0": "steps must be at least 1, got 0",
+    "train.navigate --out o --learning-rate nan": "learning_rate must be positive, got nan",
+    "train.navigate --out o --evaluation-episodes 501": "evaluation_episodes must be at most 500",
+    "train.navigate --out o --seeds -1": "seeds must not be negative",
+    "train.navigate --out o --resume": "o: no such folder",
+    "train.navigate --out text.txt/x": "text.txt: is a file",
+    "train.navigate --out /proc/no/x": "/proc/no/x: cannot be written",
+    "train.navigate --out o --memory gru --teacher nobody": "nobody",
+    "train.navigate --out o --memory gru --begin-from junk.safetensors": "damaged policy",
+    "train.evaluate": "a task or a policy must be named",
+    "train.evaluate --policy none": "none: no such policy",
+    "train.evaluate --policy empty": "empty: holds no checkpoint",
+    "train.evaluate --policy StopAt-v0 --episodes 0": "episodes must be at least 1",
+    "train.evaluate --policy StopAt-v0 --task Subterra/StopAt-v7": "has Subterra/StopAt-v0",
+    "train.release none --out o.safetensors": "none: no such folder",
+    "train.release empty --out o.txt": "o.txt: must end in .safetensors",
+    "train.release empty --out text.txt/o.safetensors": "text.txt: is a file",
+    "train.walk --out o --robots 0": "robots must be at least 1",
+    "train.walk --out o --scene empty": "empty/tunnel.npz: no such tunnel file",
+    "train.walk --out o --release text.txt/x.safetensors": "text.txt: is a file",
+    "train.curve": "no run folder was named",
+    "train.curve empty": "empty: no readable episodes.csv",
+    "train.curve empty --out text.txt/x.png": "text.txt: is a file",
+    "train.curve empty --out x.xyz": "x.xyz: must end in .png",
+    "benchmarks.fidelity moon": "moon",
+    "benchmarks.fidelity run --scene none --out o": "none: no such file or folder",
+    "benchmarks.fidelity run --scene empty --out o": "empty: is no scene folder",
+    "benchmarks.fidelity run --scene tunnel --seed -1 --out o": "seed must not be negative",
+    "benchmarks.fidelity run --scene tunnel --out text.txt": "text.txt: is a file",
+    "benchmarks.fidelity controls --scene tunnel --only N999 --out o": "no control 'N999'",
+    "benchmarks.fidelity controls --scene tunnel --processes 0 --out o": "processes must be at least 1",
+    "benchmarks.fidelity sweep --scene tunnel --tolerances nan --out o": "tolerances must be positive, got nan",
+    "benchmarks.fidelity report --scene tunnel --out empty": "empty: holds no values.json",
+    "benchmarks.fidelity calibrate --runs none --out o.json": "calibration needs 3",
+    "benchmarks.fidelity split junk.bag --out o": "junk.bag",
+    "benchmarks.leaderboard --out o --tasks Fly": "no task 'Fly'",
+    "benchmarks.leaderboard --out o --agents nobody": "no agent 'nobody'",
+    "benchmarks.leaderboard --out o --tunnels": "tunnels must name at least one",
+    "benchmarks.leaderboard --out o --episodes 501": "episodes must be at most 500",
+    "benchmarks.leaderboard --out text.txt/x": "text.txt: is a file",
+    "benchmarks.learning --out o --steps 0": "steps must be at least 1",
+    "benchmarks.learning --out o --seed -1": "seed must be at least 0",
+    "benchmarks.learning --out o --tunnel none": "none: no such tunnel file",
+    "benchmarks.learning --out text.txt": "text.txt: is a file",
+    "benchmarks.paper --figures --out o": "figures must name at least one",
+    "benchmarks.paper --length nan --out o": "length must be",
+    "benchmarks.paper --survey empty --out o": "empty/survey.bag: no such file",
+    "benchmarks.paper --figures 4 --runs empty --out o": "empty: holds no run folders",
+    "benchmarks.rays --scene none": "none: is no built scene",
+    "benchmarks.rays --scene empty --seed -1": "seed must be at least 0",
+    "benchmarks.rays --scene empty --out text.txt/x.json": "text.txt: is a file",
+    "benchmarks.reproduce --jobs moon --out o": "no job 'moon'",
+    "benchmarks.slam": "Expected one of {record, run, score}",
+    "benchmarks.slam record": "missing: --out",
+    "benchmarks.slam record --out o --tasks Fly": "no task 'Fly'",
+    "benchmarks.slam record --out o --linings velvet": "no lining 'velvet'",
+    "benchmarks.slam record --out o --episodes 501": "episodes must be at most 500",
+    "benchmarks.slam record --out o --columns 0 --scene tunnel": "columns must be at least 8",
+    "benchmarks.slam record --out text.txt": "text.txt",
+    "benchmarks.slam run --library moon --recordings empty --out o": "moon",
+    "benchmarks.slam run --library wheel-odometry --recordings empty --out o": "empty: holds no recordings",
+    "benchmarks.slam score --estimate --truth empty": "estimate must name at least one",
+    "benchmarks.slam score --estimate junk.tum --truth junk.tum": "junk.tum",
+    "benchmarks.throughput --seconds 0": "--seconds must be positive",
+    "benchmarks.throughput --study-n 0": "at least 1 environment, got 0",
+    "benchmarks.throughput --seed -1": "--seed must be at least 0",
+    "benchmarks.throughput --lengths nan": "--lengths must be positive, got nan",
+    "benchmarks.demo --length nan --out o": "length must be",
+    "benchmarks.demo --out text.txt": "text.txt: is a file",
+    "benchmarks.soak --seed -1": "seed must be at least 0",
+    "benchmarks.soak --tasks Fly": "no task 'Fly'",
+    "benchmarks.b2 --robots 0": "robots must be at least 1",
+    "benchmarks.b2 --variants moon": "no variant 'moon'",
+    "benchmarks.b2 --out text.txt/x.json": "text.txt: is a file",
+    "benchmarks.b2_lag --steps 0": "steps must be at least 1",
+    "benchmarks.b2_lag --policy none": "none: no such policy",
+    "benchmarks.b2_traverse --coverage nan": "coverage must be above 0 and at most 1, got nan",
+    "benchmarks.b2_traverse --policy StopAt-v0": "which is no gait",
+    "benchmarks.b2_traverse --out empty": "empty: is a folder, not a file",
+    "benchmarks.reconstruction --seeds --out o": "seeds must name at least one",
+    "benchmarks.reconstruction --truth moon --out o": "no bore 'moon'",
+    "benchmarks.render none": "none",
+    "benchmarks.render tunnel --width -5": "width must be 1 to",
+    "benchmarks.render tunnel --out text.txt/x.png": "text.txt: is a file",
+    "benchmarks.paper.camera": "missing",
+    "subterra_jax.viewer --seed x": "invalid int value: 'x'",
+    "subterra_jax.viewer --moon": "unrecognized arguments: --moon",
+    "subterra_jax.viewer --task Subterra/StopAt-v1": "has Subterra/StopAt-v0",
+    "subterra_jax.viewer --recordings /proc/no/x": "/proc/no/x: cannot be written",
+    "subterra_jax.viewer --replay junk.npz": "junk.npz: not a readable recording",
+    "subterra_jax.recorder": "missing: --out",
+    "subterra_jax.recorder --out o --task Subterra/StopAt-v1": "has Subterra/StopAt-v0",
+    "subterra_jax.recorder --out o --policy junk.safetensors": "damaged policy",
+    "subterra_jax.recorder --out o --episode 500": "500",
+    "subterra_jax.recorder --out text.txt/x": "text.txt: is a file",
+    "subterra_jax.recorder --out o --truth text.txt": "text.txt: exists already",
+    "subterra_jax.b2.film": "arguments are required: out",
+    "subterra_jax.b2.film o.webp --seconds nan": "seconds must be above 0",
+    "subterra_jax.b2.film o.webp --width -4": "width must be 16 to",
+    "subterra_jax.b2.film o.xyz": "o.xyz: must end in .gif or .webp or .mp4",
+    "subterra_jax.b2.film o.webp --scene none": "none",
+}
+COMMANDS = sorted({words.split()[0] for words in MISTAKES} - {"benchmarks.fidelity", "benchmarks.slam"}) + [
+    f"benchmarks.fidelity{part}" for part in ("", " run", " controls", " sweep", " calibrate", " split", " report")
+] + [f"benchmarks.slam{part}" for part in ("", " record", " run", " score")]  # fmt: skip
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, with things in it that are not what a command wants."""
+    (tmp_path / "text.txt").write_text("hello\n")
+    (tmp_path / "empty").mkdir()
+    for ending in ("bag", "laz", "npz", "tum", "safetensors", "json"):
+        (tmp_path / f"junk.{ending}").write_bytes(JUNK)
+    (tmp_path / "tunnel" / "meshes").mkdir(parents=True)
+    for name in ("scene.xml", "bore.npz", "tunnel.npz", "manifest.json", "meshes/lining.ply"):
+        (tmp_path / "tunnel" / name).write_bytes(JUNK)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("subterra_jax.viewer.cli._compile_once", lambda: None)
+    return tmp_path
+
+
+def run(words: list[str], monkeypatch: pytest.MonkeyPatch) -> object:
+    """Runs `python -m WORDS` in this process; its exit status."""
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(words[0], run_name="__main__", alter_sys=True)
+    return ended.value.code
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of runpy: the tests have imported the module before
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_one_sentence_and_status_2_and_leaves_nothing(words, desk, monkeypatch, capfd):
+    before = sorted(desk.rglob("*"))
+    assert run(shlex.split(words), monkeypatch) == 2
+    told = capfd.readouterr().err
+    assert told.startswith("error: ")
+    assert told.count("\n") == 1, told
+    assert MISTAKES[words] in told
+    assert sorted(desk.rglob("*")) == before
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_fits_a_screen_and_has_an_example(command, desk, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "100")
+    words = command.split()
+    assert run([*words, "--help"], monkeypatch) == 0
+    page = capsys.readouterr().out
+    assert page.count("\n") <= 45
+    assert max(map(len, page.splitlines())) <= 100
+    assert f"python -m {command} " in " ".join(page.split("\n\n", 1)[1].split())
+
+
+def test_no_command_is_left_out():
+    mains = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__main__")
+        for room in ("scene", "train", "benchmarks", "subterra_jax")
+        for path in (ROOT / room).rglob("*.py")
+        if '__name__ == "__main__"' in path.read_text()
+    }
+    assert mains == {command.split()[0] for command in COMMANDS}
+
+
+BLOCKER = """
+import os, sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == os.environ["BLOCKED"]:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Blocked())
+"""
+
+
+@pytest.mark.parametrize(
+    ("library", "words", "says"),
+    [
+        ("rosbags", "scene.build x --out o", "rosbags is not installed: pip install -e '.[recordings]'"),
+        pytest.param(
+            "orbax", "train.navigate --out o", "orbax.checkpoint is not installed", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "gudhi", "benchmarks.fidelity run", "gudhi is not installed", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "tensorboardX", "train.navigate --tensorboard --out o", "pip install 'subterra-jax[logs]'",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "stable_baselines3", "benchmarks.learning --out o", "pip install 'subterra-jax[sb3]'",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param("viser", "subterra_jax.viewer", "pip install 'subterra-jax[viewer]'", marks=pytest.mark.slow),
+        pytest.param("tyro", "subterra_jax.recorder --out o", "pip install tyro", marks=pytest.mark.slow),
+        pytest.param(
+            "rosbags", "subterra_jax.recorder --out o", "pip install rosbags", marks=pytest.mark.slow
+        ),
+    ],
+)  # fmt: skip
+def test_a_library_that_is_missing_is_named_with_what_brings_it(library, words, says, desk):
+    (desk / "blocker").mkdir()
+    (desk / "blocker" / "sitecustomize.py").write_text(BLOCKER)
+    paths = {"PYTHONPATH": f"{desk / 'blocker'}{os.pathsep}{ROOT}", "BLOCKED": library}
+    done = subprocess.run(
+        [sys.executable, "-m", *words.split()], env={**os.environ, **paths}, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert says in done.stderr
+    assert not (desk / "o").exists()
