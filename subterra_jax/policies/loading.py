@@ -13,6 +13,7 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
 from subterra_jax.policies import belief, senses
 from subterra_jax.policies.belief import Belief
+from subterra_jax.policies.belief_memory import Habits
 from subterra_jax.policies.feedforward import FeedForward
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.recurrent import Recurrent
@@ -64,7 +65,7 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
         shown = senses.Senses(str(layout.get("tracker", "loop")), bool(layout.get("boxes", False)))
         return Recurrent(arrays, low, high, bin_width=float(layout["bin_width"]), shown=shown, name=name)
     if kind == belief.KIND:
-        return Belief(arrays, low, high, habits=belief.Habits(**layout["habits"]), name=name)
+        return Belief(arrays, low, high, habits=Habits(**layout["habits"]), name=name)
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
 
 

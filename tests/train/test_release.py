@@ -34,7 +34,7 @@ def perceptron():
 def gru():
     env, params = st.make(GOAL_TASK)
     nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
-    weights = jax.tree.map(lambda x: x + 0.05, nets.init(jax.random.PRNGKey(1)))
+    weights = jax.tree.map(lambda x: x + 0.05, jax.jit(nets.init)(jax.random.PRNGKey(1)))
     return nets, without_critic(weights)
 
 
@@ -42,7 +42,7 @@ def gru():
 def among_boxes():
     env, params = st.make("Subterra/ObstructedShort-v0")
     nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
-    weights = jax.tree.map(lambda x: x + 0.05, nets.init(jax.random.PRNGKey(1)))
+    weights = jax.tree.map(lambda x: x + 0.05, jax.jit(nets.init)(jax.random.PRNGKey(1)))
     return nets, without_critic(weights)
 
 
@@ -81,20 +81,25 @@ def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(reque
     agent, start = agent_of(nets, weights), jnp.float32(5.0)
     assert (agent.shown.boxes, agent.n_beams) == (trained == "among_boxes", 16)
     memory, hidden, reckoning = agent.blank(), jnp.zeros((1, 12)), senses.start((1,), 16, nets.layout.shown)
-    answer, look = jax.jit(agent.answer), jax.jit(senses.look)
+    answer, look, advance = jax.jit(agent.answer), jax.jit(senses.look), jax.jit(senses.advance)
+
+    @jax.jit
+    def think(seen, hidden):
+        hidden, _ = nets.remember(weights, seen.features[None], hidden, jnp.zeros((1, 1), bool))
+        thought = nets.think(weights, hidden, seen.ahead)
+        return hidden, thought.error, thought.log_sigma, nets.action(thought.parameters[..., :2])
+
     for obs in readings(12):
         odometry = jnp.stack([obs.distance, obs.heading])
         part = {"ranges": obs.ranges, "odometry": odometry, "goal": obs.goal[None], "ring_pitch": obs.ring_pitch[None]}
         seen = look({name: value[None] for name, value in part.items()}, start, reckoning)
-        hidden, _ = nets.remember(weights, seen.features[None], hidden, jnp.zeros((1, 1), bool))
-        thought = nets.think(weights, hidden, seen.ahead)
-        wanted = nets.action(thought.parameters[..., :2])
+        hidden, error, log_sigma, wanted = think(seen, hidden)
         action, memory = answer(memory, obs, start)
         np.testing.assert_allclose(action[:2], wanted[0], rtol=2e-4, atol=2e-5)
-        there = start + seen.station[0] + thought.error[0] + 0.1 * max(float(wanted[0, 0]), 0.0)
+        there = start + seen.station[0] + error[0] + 0.1 * max(float(wanted[0, 0]), 0.0)
         np.testing.assert_allclose(action[2], there, rtol=1e-5, atol=1e-4)
-        np.testing.assert_allclose(action[3], thought.log_sigma[0], rtol=1e-4, atol=1e-5)
-        reckoning = senses.advance(seen.reckoning, wanted, jnp.zeros(1, bool))
+        np.testing.assert_allclose(action[3], log_sigma[0], rtol=1e-4, atol=1e-5)
+        reckoning = advance(seen.reckoning, wanted, jnp.zeros(1, bool))
 
 
 def test_released_tensors_are_what_the_safetensors_library_reads_and_act_alike(gru, released):

@@ -22,7 +22,7 @@ class BeliefLayout:
         action_low: Smallest action, m/s and rad/s.
         action_high: Largest action, m/s and rad/s.
         hidden: Widths of the network.
-        habits: Fields of `subterra_jax.policies.belief.Habits`.
+        habits: Fields of `subterra_jax.policies.belief_memory.Habits`.
     """
 
     action_low: tuple[float, ...]
