@@ -16,7 +16,7 @@ from scene.build import build
 from scene.fitting.lining import LiningConfig
 from scene.output import BuildConfig
 from scene.reconstruct import ReconstructConfig
-from subterra_jax import reference
+from subterra_jax.lidar import reference
 from tests.scene.clouds import curved_d_bore
 from tests.shared import METRO, needs_metro
 

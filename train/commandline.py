@@ -8,13 +8,14 @@ from typing import Annotated, Any, Literal
 import jax
 import tyro
 
-from train import cluster, policies
+from train import policies
+from train.b2.legs import Legs
 from train.belief import config as belief_config
 from train.belief.config import BeliefConfig
-from train.cluster import Cluster
 from train.config import PPOConfig, make_config
+from train.devices import cluster
+from train.devices.cluster import Cluster
 from train.errors import ConfigError
-from train.legs import Legs
 from train.recurrent import config as recurrent_config
 from train.recurrent import distill_config
 from train.recurrent.config import RecurrentConfig

@@ -17,9 +17,9 @@ import tyro
 from subterra_jax.outputs import require_file
 from train import cli
 from train.arguments import parse
-from train.episodes import WINDOW
 from train.errors import RunFolderError
-from train.log import EPISODES
+from train.run.episodes import WINDOW
+from train.run.log import EPISODES
 
 GOAL = 0.9
 _COLUMNS = "episode,step,coverage_mean_100,success_mean_100"

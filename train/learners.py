@@ -6,16 +6,17 @@ from typing import Any
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.policies import PolicyError, check_fits
-from train import policies, spread
+from train import policies
 from train.agents import weights_of
 from train.belief import config as belief_config
 from train.belief.config import BeliefConfig
 from train.belief.learner import BeliefLearner
 from train.config import PPOConfig, TrainConfig, check
+from train.devices import spread
+from train.devices.parts import Parts
 from train.errors import CheckpointError, ConfigError
 from train.evaluate import open_agent
-from train.learner import Learner
-from train.parts import Parts
+from train.feedforward.learner import Learner
 from train.recurrent import config as recurrent_config
 from train.recurrent import distill_config
 from train.recurrent.config import RecurrentConfig
@@ -24,7 +25,7 @@ from train.recurrent.distill_config import DistillConfig
 from train.recurrent.layout import make_layout
 from train.recurrent.learner import RecurrentLearner
 from train.recurrent.network import RecurrentNetworks
-from train.snapshot import Trainable
+from train.run.snapshot import Trainable
 
 
 def checked(config: TrainConfig) -> None:

@@ -10,14 +10,15 @@ import time
 
 import jax
 
-from train import arguments, cli, cluster, policies, ppo, seeds
+from train import arguments, cli, policies, ppo, seeds
 from train.commandline import Command, parse
+from train.devices import cluster
 from train.errors import ConfigError
 from train.evaluate import check_episodes
 from train.learners import checked, make_learner
-from train.log import Bar
-from train.session import Session
-from train.snapshot import Snapshot
+from train.run.log import Bar
+from train.run.session import Session
+from train.run.snapshot import Snapshot
 
 
 def command(arguments: Command) -> int:
@@ -42,7 +43,7 @@ def _world(arguments: Command) -> policies.World:
     """The task, for the robot that is to do it."""
     if arguments.embodiment == "scout":
         return policies.open_world(arguments.task, arguments.tunnel, arguments.lining)
-    from train import embodied  # MuJoCo is loaded only where legs are meant
+    from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
     return embodied.open_world(arguments.task, arguments.tunnel, arguments.lining, arguments.legs)
 
@@ -74,7 +75,7 @@ def _single(session: Session, snapshot: Snapshot | None, arguments: Command) -> 
         return 0
     session.score(last, arguments.evaluation_episodes)
     if arguments.embodiment == "b2" and arguments.legs.robots:
-        from train import embodied
+        from train.b2 import embodied
 
         embodied.score(session, last, arguments.tunnel, arguments.legs)
     _tell(last, time.perf_counter() - started)

@@ -10,11 +10,11 @@ import subterra_jax as st
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel.sources import tunnel_digest
 from subterra_jax.versions import VERSION, no_task
-from train import checkpoint
 from train.belief.network import BeliefLayout, BeliefNetworks
 from train.errors import CheckpointError, ConfigError
-from train.networks import Layout, Networks
+from train.feedforward.networks import Layout, Networks
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks
+from train.run import checkpoint
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
 AnyNetworks: TypeAlias = Networks | RecurrentNetworks | BeliefNetworks

@@ -10,11 +10,11 @@ from typing import Any
 
 import jax
 
-from train import compiling
 from train.config import PPOConfig, TrainConfig
-from train.fetching import fetch
-from train.learner import Learner
-from train.snapshot import Snapshot, Trainable, advance, finished, started, timing
+from train.devices import compiling
+from train.feedforward.learner import Learner
+from train.run.fetching import fetch
+from train.run.snapshot import Snapshot, Trainable, advance, finished, started, timing
 
 Watcher = Callable[[Snapshot], bool | None]
 

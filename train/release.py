@@ -18,9 +18,9 @@ from subterra_jax.policies.files import FACTS, SCHEMA, TENSORS
 from train import cli, policies
 from train.agents import agent_of, tensors_of
 from train.arguments import parse
+from train.b2.legs import Legs
 from train.errors import RunFolderError
 from train.evaluate import evaluate
-from train.legs import Legs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +101,7 @@ def _world(stored: dict[str, Any], arguments: Command) -> policies.World:
     """Where the policy is scored: what it was trained on, be it the stand-in of a robot on legs."""
     if stored["world"].get("embodiment") is None:
         return policies.open_world(stored["task"], arguments.tunnel, arguments.lining)
-    from train import embodied  # MuJoCo is loaded only where legs are meant
+    from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
     return embodied.open_world(stored["task"], arguments.tunnel, arguments.lining, Legs(robots=0))
 

@@ -9,13 +9,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from train import cli, compiling, curve, milestones
-from train.checkpoint import iterations
+from train import cli, curve
+from train.devices import compiling
 from train.errors import ConfigError
-from train.fetching import fetch_all
-from train.log import Bar
-from train.session import Session
-from train.snapshot import Snapshot, Trainable, advance, finished, started, timing
+from train.run import milestones
+from train.run.checkpoint import iterations
+from train.run.fetching import fetch_all
+from train.run.log import Bar
+from train.run.session import Session
+from train.run.snapshot import Snapshot, Trainable, advance, finished, started, timing
 
 AXIS = "seed"
 Watcher = Callable[[int, Snapshot], None]

@@ -19,13 +19,13 @@ from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train import arguments as reading
 from train import cli, ppo, seeds
+from train.b2.config import WalkConfig, make_config
+from train.b2.network import WalkLearner
+from train.b2.session import WalkSession
 from train.config import check
 from train.errors import ConfigError
-from train.log import Bar
 from train.policies import World
-from train.walk_config import WalkConfig, make_config
-from train.walk_network import WalkLearner
-from train.walk_session import WalkSession
+from train.run.log import Bar
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from train.curve import GOAL, rolling
-from train.episodes import WINDOW
+from train.run.episodes import WINDOW
 
 
 @dataclasses.dataclass(frozen=True)

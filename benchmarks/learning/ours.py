@@ -9,7 +9,7 @@ import subterra_jax as st
 from benchmarks.learning.curve import Curve
 from train import ppo
 from train.config import make_config
-from train.snapshot import Snapshot
+from train.run.snapshot import Snapshot
 
 NAME = "ours"
 

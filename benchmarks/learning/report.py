@@ -14,7 +14,7 @@ from rich.table import Table
 
 from benchmarks.learning.curve import Curve
 from train.curve import GOAL, rolling
-from train.episodes import WINDOW
+from train.run.episodes import WINDOW
 
 _HEADINGS = ("", "episodes", "steps", "s", "compiled in", "steps/s")
 

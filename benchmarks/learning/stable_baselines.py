@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from benchmarks.learning.curve import Curve
-from train.episodes import WINDOW
+from train.run.episodes import WINDOW
 
 NAME = "SB3 PPO, 1 environment"
 _FRAMES, _DISCOUNT = 4, 0.98  # as ours

@@ -12,7 +12,7 @@ from benchmarks.fidelity.figures.style import BLUE, INK, ORANGE
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.sheet import COLUMN, Drawing
 from train.curve import GOAL, read_episodes, rolling
-from train.episodes import WINDOW
+from train.run.episodes import WINDOW
 
 _COLOURS = {"coverage": BLUE, "success": ORANGE}
 _MOST_POINTS = 1500  # of a line in the figure: more than its dots in print

@@ -17,7 +17,8 @@ from benchmarks.fidelity.derive.surface import Caster
 from benchmarks.rays.agreement import EDGE_JUMP, EDGE_TURN, Agreement
 from benchmarks.rays.scenefiles import reference_surface
 from scene.bore import load
-from subterra_jax import lidar, reference
+from subterra_jax import lidar
+from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 

@@ -6,7 +6,8 @@ import jax
 import numpy as np
 
 import subterra_jax as st
-from subterra_jax import lidar, reference
+from subterra_jax import lidar
+from subterra_jax.lidar import reference
 
 # Poses scanned at a time, so that memory does not grow with their number.
 _BATCH = 1000

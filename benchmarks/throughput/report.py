@@ -8,7 +8,7 @@ from rich.table import Table
 from benchmarks.throughput.result import Result
 from benchmarks.throughput.timing import Speed
 from benchmarks.throughput.variants import Variant
-from subterra_jax.reference import Agreement
+from subterra_jax.lidar.reference import Agreement
 
 
 def show(result: Result, console: Console) -> None:

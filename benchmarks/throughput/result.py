@@ -11,7 +11,7 @@ from benchmarks.throughput.errors import ThroughputError
 from benchmarks.throughput.peers.run import Peer
 from benchmarks.throughput.timing import Speed
 from benchmarks.throughput.variants import Variant
-from subterra_jax.reference import Agreement
+from subterra_jax.lidar.reference import Agreement
 
 SCHEMA = "subterra.throughput/2"
 

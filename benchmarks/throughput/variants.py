@@ -10,7 +10,7 @@ from benchmarks.throughput.config import ThroughputConfig
 from benchmarks.throughput.exactness import measure_exactness
 from benchmarks.throughput.measure import environment_loop, spread_loop
 from benchmarks.throughput.timing import Speed, Timing, measure_in_turn
-from subterra_jax.reference import Agreement
+from subterra_jax.lidar.reference import Agreement
 
 _TASK = "Subterra/Traverse-v0"  # whose piece is the whole tunnel
 

@@ -3,11 +3,10 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from subterra_jax import cast
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import rotation
 from subterra_jax.b2.params import WalkParams, WalkState
-from subterra_jax.lidar import LidarParams
+from subterra_jax.lidar import LidarParams, cast
 from subterra_jax.lidar3d import beams, casting
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.tunnel import node_at

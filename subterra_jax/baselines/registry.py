@@ -7,10 +7,10 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.particle_agent import ParticleAgent
-from subterra_jax.baselines.ringcount import RingCount
-from subterra_jax.baselines.ringfilter import ring_filter
-from subterra_jax.baselines.scanmatch_odometry import scan_matching
+from subterra_jax.baselines.particle.agent import ParticleAgent
+from subterra_jax.baselines.rings.count import RingCount
+from subterra_jax.baselines.rings.filter import ring_filter
+from subterra_jax.baselines.scanmatch.odometry import scan_matching
 from subterra_jax.baselines.simple import Random
 from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine, HeadingHold, Pursuit

@@ -11,9 +11,10 @@ import numpy as np
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
-from subterra_jax.policies import belief, senses
-from subterra_jax.policies.belief import Belief
-from subterra_jax.policies.belief_memory import Habits
+from subterra_jax.policies import senses
+from subterra_jax.policies.belief import agent as belief
+from subterra_jax.policies.belief.agent import Belief
+from subterra_jax.policies.belief.memory import Habits
 from subterra_jax.policies.feedforward import FeedForward
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.recurrent import Recurrent

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from subterra_jax.baselines import ringgrid, rings
+from subterra_jax.baselines.rings import grid as ringgrid
+from subterra_jax.baselines.rings import loop as rings
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from subterra_jax import obstacles
 from subterra_jax.baselines.agent import Agent, observed, shown
-from subterra_jax.baselines.particle_cloud import Cloud
+from subterra_jax.baselines.particle.cloud import Cloud
 from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams, State
 from subterra_jax.viewer.recording import Recording

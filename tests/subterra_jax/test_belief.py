@@ -10,10 +10,10 @@ import pytest
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines.agent import observed
-from subterra_jax.policies import belief_grid as grid
-from subterra_jax.policies.belief import Belief
-from subterra_jax.policies.belief_memory import Habits
-from subterra_jax.policies.belief_scan import N_FEATURES
+from subterra_jax.policies.belief import grid
+from subterra_jax.policies.belief.agent import Belief
+from subterra_jax.policies.belief.memory import Habits
+from subterra_jax.policies.belief.scan import N_FEATURES
 from tests.subterra_jax import tunnels
 
 TASK = "Subterra/Relocalise-v0"

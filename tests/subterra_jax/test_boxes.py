@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from subterra_jax import procedural, reference
+from subterra_jax import procedural
+from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel, blocks, boxes
 from subterra_jax.tunnel.windows import separation, windows
 

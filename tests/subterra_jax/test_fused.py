@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import fused, lidar, reference
+from subterra_jax import lidar
+from subterra_jax.lidar import fused, reference
 from subterra_jax.tunnel import Tunnel, node_at
 
 

@@ -7,9 +7,10 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar
-from subterra_jax.baselines import likelihood, particle_scan
-from subterra_jax.baselines.particle_map import wall_map
-from subterra_jax.baselines.particle_scan import Place, ScanModel
+from subterra_jax.baselines.particle import likelihood
+from subterra_jax.baselines.particle import scan as particle_scan
+from subterra_jax.baselines.particle.scan import Place, ScanModel
+from subterra_jax.baselines.particle.wallmap import wall_map
 from subterra_jax.tunnel import at_station
 from tests.subterra_jax import tunnels
 

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.baselines import particle_belief, particle_cloud, particle_motion
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.particle import particle_filter
-from subterra_jax.baselines.particle_cloud import Cloud, CloudParams, new_cloud
-from subterra_jax.baselines.particle_map import wall_map
-from subterra_jax.baselines.particle_scan import Place
+from subterra_jax.baselines.particle import belief as particle_belief
+from subterra_jax.baselines.particle import cloud as particle_cloud
+from subterra_jax.baselines.particle import motion as particle_motion
+from subterra_jax.baselines.particle.cloud import Cloud, CloudParams, new_cloud
+from subterra_jax.baselines.particle.localiser import particle_filter
+from subterra_jax.baselines.particle.scan import Place
+from subterra_jax.baselines.particle.wallmap import wall_map
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.wander import WanderParams

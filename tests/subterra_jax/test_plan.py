@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import reference
+from subterra_jax.lidar import reference
 from subterra_jax.tunnel.sources import tunnel_digest
 from tests.subterra_jax import tunnels
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import procedural, reference
+from subterra_jax import procedural
+from subterra_jax.lidar import reference
 from subterra_jax.procedural.alignment import Alignment
 from subterra_jax.procedural.walls import wander
 from subterra_jax.tunnel import Tunnel

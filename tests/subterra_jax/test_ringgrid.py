@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.baselines import ringgrid, rings
 from subterra_jax.baselines.registry import make_agent
-from subterra_jax.baselines.ringfilter import Driving, Unhurried
+from subterra_jax.baselines.rings import grid as ringgrid
+from subterra_jax.baselines.rings import loop as rings
+from subterra_jax.baselines.rings.filter import Driving, Unhurried
 from subterra_jax.baselines.steering import HeadingHold
 from subterra_jax.evaluation import evaluate, listed_episodes
 

@@ -5,8 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.baselines import ringbank, ringbelief, ringlag, ringpattern, wallfit
-from subterra_jax.baselines.wallfit import Bumps
+from subterra_jax.baselines.rings import bank as ringbank
+from subterra_jax.baselines.rings import belief as ringbelief
+from subterra_jax.baselines.rings import lag as ringlag
+from subterra_jax.baselines.rings import pattern as ringpattern
+from subterra_jax.baselines.rings import walls as wallfit
+from subterra_jax.baselines.rings.walls import Bumps
 
 LEFT, RIGHT, SLOPE = 2.6, 3.0, 0.08
 ANGLE = 2.0 * np.pi * np.arange(16) / 16

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.baselines import rings, ringscan
+from subterra_jax.baselines.rings import loop as rings
+from subterra_jax.baselines.rings import scan as ringscan
 
 HALF_WIDTH, DEPTH, PITCH, N_BEAMS = 2.8, 0.13, 1.35, 16
 ANGLE = 2.0 * np.pi * np.arange(N_BEAMS) / N_BEAMS

@@ -8,9 +8,9 @@ import pytest
 import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.baselines.registry import make_agent
-from subterra_jax.baselines.scanmatch import N_SHIFTS, best, mismatch
-from subterra_jax.baselines.scanmatch_odometry import scan_matching
-from subterra_jax.baselines.scanmatch_profile import MatchParams, Pose, centred, empty_profile, remembered
+from subterra_jax.baselines.scanmatch.localiser import N_SHIFTS, best, mismatch
+from subterra_jax.baselines.scanmatch.odometry import scan_matching
+from subterra_jax.baselines.scanmatch.profile import MatchParams, Pose, centred, empty_profile, remembered
 from subterra_jax.evaluation import evaluate, listed_episodes
 from tests.subterra_jax import tunnels
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import fused, lidar, reference, vehicle
+from subterra_jax import lidar, vehicle
+from subterra_jax.lidar import fused, reference
 from subterra_jax.tunnel import Tunnel, foot, node_at
 from subterra_jax.tunnel.stack import stack
 from tests.subterra_jax import tunnels

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax import reference, vehicle
+from subterra_jax import vehicle
+from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel, foot
 from subterra_jax.tunnel.sources import load_tunnel
 from tests.subterra_jax import tunnels

@@ -21,9 +21,9 @@ from subterra_jax.viewer.errors import ViewerError
 from subterra_jax.viewer.recording import load as load_episode
 from subterra_jax.viewer.recording import save as save_episode
 from tests.subterra_jax.viewer.episodes import straight
-from train import checkpoint
 from train.errors import CheckpointError
 from train.policies import versions
+from train.run import checkpoint
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,7 +9,7 @@ from tests.train import corridor
 
 # Shapes in annotations are checked at run time, so that they cannot go stale. Not those of pytrees: jax also rebuilds
 # them around NumPy arrays, shapes and booleans.
-CHECKED = ("train.frames", "train.gae", "train.networks", "train.normalize")
+CHECKED = ("train.feedforward.frames", "train.gae", "train.feedforward.networks", "train.feedforward.normalize")
 with install_import_hook(CHECKED, "beartype.beartype"):
     from train import navigate
 

@@ -6,8 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train import checkpoint, networks, normalize, policies
+from train import policies
 from train.errors import CheckpointError
+from train.feedforward import networks, normalize
+from train.run import checkpoint
 
 LAYOUT = networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16,), init_std=0.5, min_std=0.01)
 FACTS = {"layout": LAYOUT.__dict__, "task": "Subterra/TraverseShort-v0"}

@@ -10,11 +10,12 @@ import pytest
 import subterra_jax as st
 from subterra_jax.baselines import registry
 from tests.train.conftest import call, log_without_timing
-from train import checkpoint, navigate
+from train import navigate
 from train.errors import ConfigError
 from train.recurrent import teacher
 from train.recurrent.distill import DistillLearner
 from train.recurrent.distill_config import DistillConfig, check, make_config
+from train.run import checkpoint
 
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = DistillConfig(steps=512, n_envs=4, unroll=32, minibatches=2, hidden=8, bins=9)

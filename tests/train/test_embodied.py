@@ -8,10 +8,11 @@ import pytest
 from subterra_jax.b2 import missions
 from subterra_jax.b2.surrogate import Lag, LaggedEnv
 from subterra_jax.policies import PolicyError
-from train import embodied, navigate
+from train import navigate
+from train.b2 import embodied
+from train.b2.legs import Legs
 from train.commandline import parse
 from train.errors import ConfigError
-from train.legs import Legs
 
 SHORT = "Subterra/TraverseShort-v0"
 NO_TRIAL = Legs(robots=0)

@@ -3,11 +3,12 @@ import json
 import jax.numpy as jnp
 import numpy as np
 
-from train import curve, normalize
-from train.episodes import Best, EpisodeWindow
-from train.fetching import fetch
-from train.networks import Policy
-from train.report import Finished, Report, in_a_row, report
+from train import curve
+from train.feedforward import normalize
+from train.feedforward.networks import Policy
+from train.run.episodes import Best, EpisodeWindow
+from train.run.fetching import fetch
+from train.run.report import Finished, Report, in_a_row, report
 
 
 def finished(done, coverage, success, episode_return, length):

@@ -10,8 +10,9 @@ from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.state import StartParams
 from tests.train.conftest import TASK, call
-from train import evaluate, networks, normalize
+from train import evaluate
 from train.agents import agent_of
+from train.feedforward import networks, normalize
 
 
 @pytest.fixture(scope="module")

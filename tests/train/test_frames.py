@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train import frames
+from train.feedforward import frames
 
 
 def online(rng, n_frames, n_steps, n_envs, p_done=0.25):

@@ -5,10 +5,11 @@ import sys
 import numpy as np
 import pytest
 
-from train import board, curve, milestones
-from train.episodes import COLUMNS
+from train import curve
 from train.errors import ConfigError
-from train.log import RunLog
+from train.run import board, milestones
+from train.run.episodes import COLUMNS
+from train.run.log import RunLog
 
 
 def record(iteration, success):

@@ -9,7 +9,8 @@ import time
 import pytest
 
 from tests.train.conftest import SMALL, TASK, call
-from train import checkpoint, curve, evaluate, navigate
+from train import curve, evaluate, navigate
+from train.run import checkpoint
 
 
 def test_a_run_folder_holds_everything(trained):

@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from train import networks, normalize
+from train.feedforward import networks, normalize
 
 LAYOUT = networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16, 16), init_std=0.5, min_std=0.01)
 

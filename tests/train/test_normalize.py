@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from train import normalize
+from train.feedforward import normalize
 
 
 def test_running_statistics_equal_those_of_all_the_data_at_once():

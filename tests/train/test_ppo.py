@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.train.conftest import log_without_timing
-from train import checkpoint
-from train.log import read_log
+from train.run import checkpoint
+from train.run.log import read_log
 
 
 @pytest.fixture(scope="module")

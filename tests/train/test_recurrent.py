@@ -9,13 +9,14 @@ import pytest
 
 import subterra_jax as st
 from tests.train.conftest import call, log_without_timing
-from train import checkpoint, navigate
+from train import navigate
 from train.errors import ConfigError
 from train.recurrent import curriculum, estimation
 from train.recurrent.config import RecurrentConfig, check, make_config
 from train.recurrent.layout import make_layout
 from train.recurrent.learner import RecurrentLearner
 from train.recurrent.network import RecurrentNetworks
+from train.run import checkpoint
 
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = RecurrentConfig(steps=512, n_envs=8, unroll=32, minibatches=2, epochs=1, hidden=8, bins=9)

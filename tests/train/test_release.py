@@ -13,8 +13,9 @@ from subterra_jax import policies
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.policies import senses
 from tests.train.conftest import TASK, call
-from train import evaluate, frames, networks, normalize, release
+from train import evaluate, release
 from train.agents import agent_of
+from train.feedforward import frames, networks, normalize
 from train.recurrent.config import RecurrentConfig
 from train.recurrent.layout import make_layout
 from train.recurrent.network import RecurrentNetworks, without_critic

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from train import frames, networks, normalize
-from train.rollout import begin, collect
+from train.feedforward import frames, networks, normalize
+from train.feedforward.rollout import begin, collect
 
 HORIZON, N_ENVS, N_STEPS, N_FRAMES = 5, 3, 12, 4
 

@@ -7,10 +7,11 @@ import pytest
 
 import subterra_jax as st
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
-from train import milestones, navigate, ppo, seeds
+from train import navigate, ppo, seeds
 from train.config import PPOConfig
 from train.errors import ConfigError
-from train.learner import Learner
+from train.feedforward.learner import Learner
+from train.run import milestones
 
 CONFIG = PPOConfig(steps=3 * 512, n_envs=16, unroll=32, minibatches=2, epochs=2, hidden=(8,), stop_coverage=2.0)
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from tests.train.conftest import TASK, call, log_without_timing
-from train import cluster, navigate
-from train.cluster import Cluster
+from train import navigate
+from train.devices import cluster
+from train.devices.cluster import Cluster
 from train.errors import ConfigError
 
 SMALL = ("--n-envs=16", "--unroll=32", "--minibatches=2", "--epochs=1", "--hidden", "8", "--parts=2", "--steps=1536")

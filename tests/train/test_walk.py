@@ -13,11 +13,11 @@ from subterra_jax.b2 import policy as gaits
 from subterra_jax.outputs import OutputError
 from subterra_jax.policies.files import PolicyError
 from train import release, walk
+from train.b2.config import WalkConfig, make_config
+from train.b2.network import WalkLayout, WalkNetworks
+from train.b2.score import score
 from train.errors import ConfigError
-from train.networks import Policy
-from train.walk_config import WalkConfig, make_config
-from train.walk_network import WalkLayout, WalkNetworks
-from train.walk_score import score
+from train.feedforward.networks import Policy
 
 N_SEEN, N_TRUTH = 56, 12
 

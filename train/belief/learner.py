@@ -9,16 +9,16 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
-from subterra_jax.baselines.particle_map import WallMap, wall_map
-from subterra_jax.policies import belief_scan
+from subterra_jax.baselines.particle.wallmap import WallMap, wall_map
+from subterra_jax.policies.belief import scan as belief_scan
 from subterra_jax.rules import Relocalise
-from train import parts
 from train.belief import lessons
 from train.belief.config import BeliefConfig, check
 from train.belief.network import BeliefNetworks, Weights, named
 from train.belief.world import layout_of
+from train.devices import parts
 from train.errors import ConfigError
-from train.report import Finished, Report, report
+from train.run.report import Finished, Report, report
 
 _OUTSIDE = -3.0  # log likelihood of a scan from beyond a mouth
 

@@ -11,14 +11,14 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
 from subterra_jax.baselines.agent import Agent
-from train import parts
+from train.devices import parts
 from train.recurrent import drive as driving
 from train.recurrent import lessons
 from train.recurrent.distill_config import DistillConfig, check
 from train.recurrent.estimation import missed
 from train.recurrent.layout import make_layout, require_goal
 from train.recurrent.network import RecurrentNetworks, Weights, without_critic
-from train.report import Report, report
+from train.run.report import Report, report
 
 # Beyond this an action counts as wrong by its distance before the tanh, not by the square of it: who does not know
 # whether the goal is passed then stops where that is as likely as not, and not where it has become certain.

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.policies import senses
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Weights
-from train.report import Finished
+from train.run.report import Finished
 
 
 @struct.dataclass

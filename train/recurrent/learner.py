@@ -10,14 +10,16 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
-from train import gae, normalize, parts
+from train import gae
+from train.devices import parts
+from train.feedforward import normalize
 from train.recurrent import curriculum
 from train.recurrent import drive as driving
 from train.recurrent.config import RecurrentConfig, check
 from train.recurrent.estimation import missed
 from train.recurrent.layout import make_layout, require_goal
 from train.recurrent.network import RecurrentNetworks, Weights, without_critic
-from train.report import Report, report
+from train.run.report import Report, report
 
 
 @struct.dataclass

@@ -12,7 +12,7 @@ from subterra_jax.policies import senses
 from train.recurrent import drive as driving
 from train.recurrent import teacher as teaching
 from train.recurrent.network import RecurrentNetworks, Weights
-from train.report import Finished
+from train.run.report import Finished
 
 
 @struct.dataclass

@@ -12,7 +12,7 @@ import subterra_jax as st
 from benchmarks.throughput.peers import gymnax, jaxnav, mujoco, walls
 from benchmarks.throughput.peers.run import Route, measure_peer, wanted
 from benchmarks.throughput.timing import Loop, Timing
-from subterra_jax import reference
+from subterra_jax.lidar import reference
 from subterra_jax.odometry import OdometryParams
 
 

@@ -12,7 +12,7 @@ from benchmarks.throughput.peers.run import Peer
 from benchmarks.throughput.result import Result
 from benchmarks.throughput.timing import Speed
 from benchmarks.throughput.variants import Variant
-from subterra_jax.reference import Agreement
+from subterra_jax.lidar.reference import Agreement
 
 
 def speed(n_envs: int, *rates: float) -> Speed:

@@ -1,0 +1,1 @@
+"""Counting the rings of the lining, without a map and without learning."""

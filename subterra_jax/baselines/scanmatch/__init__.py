@@ -1,0 +1,1 @@
+"""Scan matching against the last few scans, without a map."""

@@ -1,0 +1,143 @@
+"""Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch, by kernels (`fused`, `native`)."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from subterra_jax import native
+from subterra_jax.lidar import cast, fused
+from subterra_jax.rows import rowwise
+from subterra_jax.tunnel import Tunnel, node_at
+
+
+@struct.dataclass
+class LidarParams:
+    """Planar LiDAR model.
+
+    Attributes:
+        range_max: Largest range, m. A beam that hits nothing reports exactly this.
+        range_sigma: Standard deviation of the range noise, m.
+        n_beams: Beams in one scan; fixes array shapes, so it is static.
+        fused: Use kernels where there are any, for NVIDIA GPUs and for CPUs with numba; off, XLA does it everywhere.
+    """
+
+    range_max: float = 30.0
+    range_sigma: float = 0.05
+    n_beams: int = struct.field(pytree_node=False, default=16)
+    fused: bool = struct.field(pytree_node=False, default=True)
+
+
+def scan(
+    tunnel: Tunnel,
+    position: Float[Array, "2"],
+    heading: Float[Array, ""],
+    station: Float[Array, ""],
+    params: LidarParams,
+    wanted: Bool[Array, ""] | bool = True,
+) -> Float[Array, "n_beams"]:
+    """True ranges of one scan: beam 0 straight ahead, the others counter-clockwise, evenly spaced over the whole turn.
+
+    Args:
+        tunnel: The tunnel.
+        position: Position of the LiDAR, tunnel frame, m.
+        heading: Its heading, rad.
+        station: Its station, m; chooses the window of walls.
+        params: The LiDAR.
+        wanted: Whether anybody will look at it; where not, the ranges may be anything.
+
+    Returns:
+        Ranges without noise, m, in [0, range_max]; exactly `range_max` where a beam meets no wall within it, as when it
+        leaves through a mouth.
+    """
+    first = tunnel.scan_first[node_at(tunnel, station)]
+    by_kernels = skips_unwanted(params) or (params.fused and native.supported())
+    take: Callable[..., Array] = _cast_by_kernels if by_kernels else _cast
+    # Nothing that may differ within a batch but the rows themselves, or the kernels could not serve it.
+    beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
+    ranges = take((tunnel.walls, beams), position, heading, first, jnp.asarray(wanted))
+    return jnp.minimum(ranges, params.range_max)
+
+
+def skips_unwanted(params: LidarParams) -> bool:
+    """Whether a batch of scans is cast by the fused kernels, which cost little for scans that nobody wants."""
+    return params.fused and fused.supported(params.n_beams)
+
+
+def _cast(
+    what: tuple[Tunnel, LidarParams],
+    position: Float[Array, "2"],
+    heading: Float[Array, ""],
+    first: Int[Array, ""],
+    wanted: Bool[Array, ""],
+) -> Float[Array, "n_beams"]:
+    """`scan` of a known window, by XLA, wanted or not."""
+    del wanted
+    tunnel, params = what
+    direction = beam_directions(heading, params.n_beams)
+    return jnp.minimum(cast.nearest(tunnel, first, position, direction), params.range_max)
+
+
+def _cast_rows(what: tuple[Tunnel, LidarParams], *rows: Array) -> Float[Array, "n n_beams"]:
+    """Many scans in one tunnel."""
+    kernels = {}
+    if skips_unwanted(what[1]):
+        kernels["cuda"] = _by(fused.scan)
+    if native.supported():
+        from subterra_jax.native import calls  # numba is optional
+
+        kernels["cpu"] = _by(calls.scan)
+    by_xla: Callable[..., Array] = jax.vmap(_cast, in_axes=(None, 0, 0, 0, 0))
+    return lax.platform_dependent(what, *rows, **kernels, default=by_xla)
+
+
+def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
+    """A kernel for many scans, with the arguments of `_cast_rows`."""
+
+    def cast_rows(
+        what: tuple[Tunnel, LidarParams], position: Array, heading: Array, first: Array, wanted: Array
+    ) -> Array:
+        tunnel, params = what
+        limit = jnp.asarray(params.range_max)
+        return kernel(tunnel, position, heading, first, wanted, limit, bearings(params.n_beams))
+
+    return cast_rows
+
+
+# One scan is cast by XLA; a batch of them in one tunnel by the kernels, however many `vmap`s made it.
+_cast_by_kernels = rowwise(_cast, lambda what, *rows: _cast_rows(what, *rows))
+
+
+def bearings(n_beams: int) -> Float[np.ndarray, "n_beams"]:
+    """Of the beams from the heading, rad."""
+    return np.arange(n_beams) * (2.0 * np.pi / n_beams)
+
+
+def beam_directions(heading: Float[Array, ""], n_beams: int) -> Float[Array, "n_beams 2"]:
+    """Unit vectors of the beams in the tunnel frame."""
+    bearing = bearings(n_beams)
+    # Rotating constants keeps more digits than adding a bearing to a heading in float32.
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    along, across = np.float32(np.cos(bearing)), np.float32(np.sin(bearing))
+    return jnp.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
+
+
+def add_noise(
+    ranges: Float[Array, "n_beams"], noise: Float[Array, "n_beams"], params: LidarParams
+) -> Float[Array, "n_beams"]:
+    """Ranges as measured: true ranges plus noise, clipped to [0, range_max], m.
+
+    A beam without a hit stays at exactly `range_max`: there is no echo for the noise to be in.
+
+    Args:
+        ranges: True ranges, m.
+        noise: Standard normal numbers.
+        params: The noise's size and the largest range.
+    """
+    noisy = jnp.clip(ranges + params.range_sigma * noise, 0.0, params.range_max)
+    return jnp.where(ranges < params.range_max, noisy, params.range_max)

@@ -1,0 +1,1 @@
+"""A histogram filter on a known map, whose sensor is learnt."""

@@ -1,0 +1,1 @@
+"""The Unitree B2: learning to walk, and navigation learnt for its legs."""

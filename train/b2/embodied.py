@@ -1,0 +1,65 @@
+"""Navigation for the B2: learnt on a planar robot that obeys late, then tried on four legs with a frozen gait."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import subterra_jax as st
+from subterra_jax.b2 import missions, trial
+from subterra_jax.b2.surrogate import LaggedEnv
+from subterra_jax.slip import SlipParams
+from subterra_jax.tunnel.sources import load_tunnel
+from train import cli, policies
+from train.agents import agent_of
+from train.b2.legs import Legs
+from train.errors import ConfigError
+from train.policies import World
+from train.run.session import Session
+from train.run.snapshot import Snapshot
+
+B2 = "b2"
+ON_LEGS = "legs.json"  # what came of the trial, in the run folder
+TASKS = ("Subterra/Traverse-v0", "Subterra/TraverseShort-v0")
+# A gait is no motor: it walks a tenth faster or slower than told, and a little askew.
+_SLIP = SlipParams(gain_sigma=0.1, yaw_sigma=0.02)
+
+
+def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: Legs) -> World:
+    """A task on the planar stand-in of the B2. What the trial needs is opened as well, so that it is known to be there.
+
+    Raises:
+        ConfigError: The B2 does not do this task, or the tunnel is more than one.
+        SubterraError: As `missions.make`.
+    """
+    if task not in TASKS:
+        raise ConfigError(f"the B2 does not do {task!r}; it does {', '.join(TASKS)}")
+    if legs.robots < 0:
+        raise ConfigError(f"robots must not be negative, got {legs.robots}")
+    planar = policies.open_world(task, tunnel, lining)
+    if planar.params.tunnel.count > 1:
+        raise ConfigError(f"tunnel = {tunnel} is more than one; the B2 walks one")
+    fields: dict[str, Any] = {"vehicle": missions.VEHICLE, "start": missions.START, "slip": _SLIP}
+    _, params = st.make(task, tunnel, planar.facts["lining"], **fields)
+    if legs.robots:
+        _mission(planar, tunnel, legs)
+    env = LaggedEnv(id=task, rule=planar.env.rule)
+    return World(task, env, params, {**planar.facts, "embodiment": B2})
+
+
+def score(session: Session, snapshot: Snapshot, tunnel: Path | str | None, legs: Legs) -> dict[str, float]:
+    """Has robots walk under the policy that was kept; writes `legs.json` and prints the figures."""
+    env, params = _mission(session.world, tunnel, legs)
+    agent = agent_of(session.learner.networks, snapshot.policy)
+    found = trial.figures(*trial.drive(env, params, agent, legs.robots), params)
+    session.folder.write_json(ON_LEGS, {**dataclasses.asdict(legs), **session.world.facts, **found})
+    cli.table(f"{session.world.task}: {legs.robots} B2s in {legs.engine}, gait {legs.gait}", found)
+    return found
+
+
+def _mission(world: World, tunnel: Path | str | None, legs: Legs) -> tuple[Any, Any]:
+    """The same task on legs."""
+    plan = load_tunnel(tunnel)
+    if (piece := st.TASKS[world.task].piece) is not None:
+        start, length = piece
+        plan = plan.slice(start, min(length, plan.length - start))
+    return missions.make(tunnel=plan, lining=world.facts["lining"], policy=legs.gait, engine=legs.engine)
