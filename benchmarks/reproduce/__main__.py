@@ -14,12 +14,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import status
 from benchmarks.reproduce.claims import CLAIMS, ON_A_GPU, Claim, read_result
 from benchmarks.reproduce.errors import ReproduceError
 from benchmarks.reproduce.jobs import JOBS, run
 from benchmarks.throughput.facts import environment_facts
 from scene.arguments import parse
-from subterra_jax.errors import SubterraError
+from subterra_jax.outputs import require_folder
 
 README = Path(__file__).parents[2] / "README.md"
 _QUICK = tuple(name for name, job in JOBS.items() if job.about <= 15.0)
@@ -87,20 +88,23 @@ def show(rows: list[dict[str, Any]], readme: str, console: Console) -> None:
             console.print(f"  {found[0]}: {command}", soft_wrap=True)
 
 
+def act(config: ReproduceConfig) -> int:
+    """Measures and tells: 0 where every number is the same, 1 where one differs."""
+    console, readme = Console(highlight=False), README.read_text()
+    require_folder(config.out)
+    rows = reproduce(config, readme, console)
+    content = {"config": asdict(config), "environment": environment_facts(), "rows": rows}
+    config.out.mkdir(parents=True, exist_ok=True)
+    (config.out / "reproduce.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
+    show(rows, readme, console)
+    return int(any(row["verdict"] in ("differs", "not in the README") for row in rows))
+
+
 def main(args: list[str] | None = None) -> int:
     """Entry point: 0 where every number is the same, 1 where one differs, 2 for a user's mistake."""
     prog = "python -m benchmarks.reproduce"
     config = parse(lambda words: tyro.cli(ReproduceConfig, args=words, prog=prog, description=__doc__), args)
-    console, readme = Console(highlight=False), README.read_text()
-    try:
-        rows = reproduce(config, readme, console)
-        content = {"config": asdict(config), "environment": environment_facts(), "rows": rows}
-        (config.out / "reproduce.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
-    except (SubterraError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    show(rows, readme, console)
-    return int(any(row["verdict"] in ("differs", "not in the README") for row in rows))
+    return status(lambda: act(config))
 
 
 if __name__ == "__main__":
