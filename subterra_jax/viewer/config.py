@@ -4,6 +4,7 @@ import socket
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from subterra_jax.b2.ids import MISSIONS
 from subterra_jax.outputs import require_folder
 from subterra_jax.tasks import TASKS
 from subterra_jax.versions import no_task
@@ -63,9 +64,9 @@ def checked(config: ViewerConfig) -> ViewerConfig:
         raise ViewerError(f"seed must be 0 to {2**31 - 1}, got {config.seed}")
     if not 0 <= config.port < 2**16:
         raise ViewerError(f"port must be 0 to {2**16 - 1}, got {config.port}")
-    task = config.task if config.task in TASKS else f"Subterra/{config.task}-v0"
-    if task not in TASKS:
-        raise ViewerError(no_task(config.task, TASKS))
+    task = config.task if config.task in (*TASKS, *MISSIONS) else f"Subterra/{config.task}-v0"
+    if task not in (*TASKS, *MISSIONS):
+        raise ViewerError(no_task(config.task, (*TASKS, *MISSIONS)))
     return replace(config, task=task)
 
 

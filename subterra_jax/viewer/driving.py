@@ -15,9 +15,10 @@ from subterra_jax.baselines.agent import Agent, observed, shown
 from subterra_jax.baselines.particle.cloud import Cloud
 from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams, State
+from subterra_jax.viewer.gait import Gait
 from subterra_jax.viewer.recording import Recording
 
-_CHUNK = 100  # steps between two looks at whether the episode is over
+_CHUNK, _FEW = 100, 5  # steps between two looks at whether the episode is over, of who rolls and of who walks
 _PARTICLES = 96  # of a cloud, are kept: as many as tell its shape
 
 
@@ -36,14 +37,17 @@ def drive(env: TunnelEnv, params: EnvParams, agent: Agent, seed: int, names: dic
     Yields:
         The recording so far: first the start alone, at last the whole.
     """
-    env = dataclasses.replace(env, estimates=True)
+    env, gait = dataclasses.replace(env, estimates=True), Gait(env)
     now, first = jax.device_get(_begin(env, agent, params, jnp.uint32(seed)))
+    first["pose"] = gait.standing()
     recording = _started(env, params, now[2], seed, names, first)
     yield recording
     success = contact = 0.0
-    for step in range(0, int(params.horizon), _CHUNK):
-        now, rows = jax.device_get(_drive(env, _CHUNK, agent, params, jnp.int32(step), now))
-        n = min(int(np.argmax(rows["over"])) + 1 if rows["over"].any() else _CHUNK, int(params.horizon) - step)
+    chunk = _FEW if gait.walks else _CHUNK
+    for step in range(0, int(params.horizon), chunk):
+        now, rows = jax.device_get(_drive(env, chunk, agent, params, jnp.int32(step), now))
+        rows["pose"] = gait.taken(chunk)
+        n = min(int(np.argmax(rows["over"])) + 1 if rows["over"].any() else chunk, int(params.horizon) - step)
         success, contact = (float(rows[name][n - 1]) for name in ("success", "contact"))
         over = bool(rows["over"][n - 1])
         series = {name: values[:n] for name, values in rows.items() if name not in ("over", "success", "contact")}
@@ -104,7 +108,17 @@ def _row(
         "reward": reward,
         "coverage": cover,
         "cloud": _particles(memory),
+        "trunk": _trunk(state, params),
     }
+
+
+def _trunk(state: State, params: EnvParams) -> Array:
+    """Height of the trunk of who walks, m; 0 of who rolls."""
+    walk: Any = getattr(state, "walk", None)
+    if walk is None:
+        return jnp.zeros(())
+    track = params.walk.track  # type: ignore[attr-defined]  # of `MissionParams`
+    return track.position[walk.anchor, 2] + walk.body.qpos[2]
 
 
 def _particles(memory: Any) -> Array:

@@ -25,6 +25,8 @@ class Frame:
         heading: Of the robot, rad.
         odometry: Where the odometer alone has it, on the ground, m.
         odometry_heading: Which way it faces there, rad.
+        trunk: Of who walks, height of the trunk, tunnel frame, m.
+        pose: Of who walks, orientation w, x, y, z and joints, rad; empty for who rolls.
     """
 
     row: int
@@ -32,6 +34,8 @@ class Frame:
     heading: float
     odometry: Float[np.ndarray, "3"]
     odometry_heading: float
+    trunk: float
+    pose: Float[np.ndarray, "k"]
 
 
 class Film:
@@ -70,7 +74,16 @@ class Film:
             float(between(self._heading)),
             between(self._reckoned),
             float(between(self._reckoned_heading)),
+            float(between(self.recording.trunk)),
+            self._pose(row, after, share),
         )
+
+    def _pose(self, row: int, after: int, share: float) -> Float[np.ndarray, "k"]:
+        """The pose on the way from one row to the next."""
+        poses = self.recording.pose[after]
+        if not len(poses) or after == row:
+            return poses[-1] if len(poses) else np.zeros(0)
+        return poses[min(int(share * len(poses)), len(poses) - 1)]
 
     def beams(self, row: int) -> tuple[Float[np.ndarray, "n_beams 2 3"], np.ndarray]:
         """The scan of a row, from the LiDAR to where each beam ends, m, and which beams hit something."""

@@ -14,6 +14,7 @@ from subterra_jax.versions import other_schema
 from subterra_jax.viewer.errors import RecordingError
 
 SCHEMA = "subterra.episode/1"
+N_POSE = 16  # a quaternion and twelve joints
 _TEXTS = ("task", "agent", "tunnel", "tunnel_sha256", "lining")
 _NUMBERS = ("seed", "period", "radius", "range_max", "length", "start", "goal", "success", "contact")
 _SHAPES: dict[str, tuple[str | int, ...]] = {
@@ -28,6 +29,8 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "coverage": ("t",),
     "cloud": ("t", "k", 3),
     "boxes": ("b", 6),
+    "trunk": ("t",),
+    "pose": ("t", "m", N_POSE),
 }
 
 
@@ -62,6 +65,9 @@ class Recording:
         cloud: Some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `k` is 0
             for one who has none.
         boxes: Obstacles: middle x, y (m), unit vector along the first side, half sides (m).
+        trunk: Of who walks, height of the trunk, tunnel frame, m; else 0.
+        pose: Of who walks, on the way to this row: orientation w, x, y, z and joints (rad) at even times, the last
+            one at the row itself; `m` is 0 for who rolls, as in files from before anybody walked.
     """
 
     task: str
@@ -89,6 +95,8 @@ class Recording:
     coverage: Float[np.ndarray, "t"]
     cloud: Float[np.ndarray, "t k 3"]
     boxes: Float[np.ndarray, "b 6"]
+    trunk: Float[np.ndarray, "t"]
+    pose: Float[np.ndarray, "t m 16"]
 
     def __len__(self) -> int:
         return len(self.station)
@@ -141,6 +149,8 @@ def load(path: Path) -> Recording:
         raise RecordingError(f"{path}: no such recording") from error
     except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
         raise RecordingError(f"{path}: not a readable recording ({spoiled(path, error)})") from error
+    if "station" in fields and "pose" not in fields:
+        fields |= {"trunk": np.zeros(len(fields["station"])), "pose": np.zeros((len(fields["station"]), 0, N_POSE))}
     found = str(fields["schema"]) if "schema" in fields else None
     if found != SCHEMA:
         raise RecordingError(f"{path}: {other_schema(found, SCHEMA, 'save the episode again in the viewer')}")

@@ -3,12 +3,35 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import viser
+
+from subterra_jax.viewer.frames import Frame
+from subterra_jax.viewer.props import about_z
 
 if TYPE_CHECKING:
     import trimesh
 
 _HULL, _WHEEL, _MAST, _SENSOR = (226, 106, 24), (38, 38, 42), (92, 94, 100), (30, 34, 40)
 _WHEEL_RADIUS = 0.4  # of the robot's radius
+
+
+class Carrier:
+    """The robot on a stage.
+
+    Args:
+        scene: Where it is drawn.
+        mesh: As `robot_mesh` makes it.
+
+    Attributes:
+        nodes: Its one node.
+    """
+
+    def __init__(self, scene: viser.SceneApi, mesh: "trimesh.Trimesh"):
+        self.nodes = [scene.add_mesh_trimesh("/robot", mesh, cast_shadow=False)]
+
+    def place(self, frame: Frame) -> None:
+        """Puts it where it is at a moment."""
+        self.nodes[0].position, self.nodes[0].wxyz = frame.position, about_z(frame.heading)
 
 
 def robot_mesh(radius: float, lidar_height: float) -> "trimesh.Trimesh":

@@ -53,7 +53,7 @@ class Screening:
         Raises:
             SubterraError: The tunnel cannot be read, or has no such lining.
         """
-        piece = TASKS[choice.task].piece
+        piece = TASKS[choice.task].piece if choice.task in TASKS else None
         lining = self.scenes.lining_of(choice.tunnel, choice.lining)
         self._course = self.scenes.show(choice.tunnel, lining, np.inf if piece is None else piece[1])
         self.player.start()

@@ -7,9 +7,9 @@ from typing import Any
 import viser
 
 from subterra_jax.errors import SubterraError
-from subterra_jax.tasks import TASKS
 from subterra_jax.viewer import recording
 from subterra_jax.viewer.config import ViewerConfig
+from subterra_jax.viewer.drivers import TASKS
 from subterra_jax.viewer.errors import ViewerError
 from subterra_jax.viewer.library import Library
 from subterra_jax.viewer.panel import NO_RECORDING, Choice, Panel
@@ -35,7 +35,7 @@ class Session:
     def __init__(self, server: viser.ViserServer, config: ViewerConfig, library: Library):
         self._server, self._library = server, library
         first = Choice(next(iter(library.tunnels)), config.lining, config.task, config.agent, config.seed)
-        self.panel = Panel(server, first, tuple(library.tunnels), tuple(TASKS), library.agents, library.recordings())
+        self.panel = Panel(server, first, tuple(library.tunnels), TASKS, library.agents, library.recordings())
         self.screening = Screening(server, self.panel, library, self.complain)
         self.worker = Worker(self.complain)
         self._developing = threading.Lock()

@@ -8,8 +8,9 @@ import viser
 
 from subterra_jax.viewer.course import Course
 from subterra_jax.viewer.frames import Film, Frame
+from subterra_jax.viewer.legged import Legged
 from subterra_jax.viewer.props import about_z, boxes, gate, light
-from subterra_jax.viewer.robot import robot_mesh
+from subterra_jax.viewer.robot import Carrier, robot_mesh
 from subterra_jax.viewer.shapes import Shape
 
 TRUTH, ODOMETRY, ESTIMATE, _HIT = (64, 156, 255), (255, 120, 60), (190, 110, 255), (255, 214, 102)
@@ -35,7 +36,7 @@ class Stage:
         self.visible = {name: True for name in ("lining", "track", *_LINES)}
         server.scene.world_axes.visible = False
         light(server.scene)
-        self._robot: viser.GlbHandle | None = None
+        self._robot: Carrier | Legged | None = None
         self._ghost: viser.MeshHandle | None = None
         colours = {"beams": _HIT, "truth": TRUTH, "odometry": ODOMETRY, "estimate": ESTIMATE}
         self._lines = {
@@ -107,7 +108,8 @@ class Stage:
                 prop.remove()
             scene = self._server.scene
             mesh = robot_mesh(recording.radius, height)
-            self._robot = scene.add_mesh_trimesh("/robot", mesh, cast_shadow=False)
+            walks = recording.pose.shape[1] > 0
+            self._robot = Legged(scene) if walks else Carrier(scene, mesh)
             self._ghost = scene.add_mesh_simple(
                 "/ghost",
                 np.asarray(mesh.vertices, np.float32),
@@ -117,7 +119,12 @@ class Stage:
                 cast_shadow=False,
                 visible=self.visible["odometry"],
             )
-            self._props = [self._robot, self._ghost, *gate(self._server.scene, film), *boxes(self._server.scene, film)]
+            self._props = [
+                *self._robot.nodes,
+                self._ghost,
+                *gate(self._server.scene, film),
+                *boxes(self._server.scene, film),
+            ]
             self._row = None
 
     def show(self, film: Film, frame: Frame, full: bool) -> None:
@@ -125,7 +132,7 @@ class Stage:
         with self._lock, self._server.atomic():
             if self._robot is None or self._ghost is None:
                 return
-            self._robot.position, self._robot.wxyz = frame.position, about_z(frame.heading)
+            self._robot.place(frame)
             self._ghost.position, self._ghost.wxyz = frame.odometry, about_z(frame.odometry_heading)
             now = time.monotonic()
             if full or (self._row != (film, frame.row) and now - self._lines_at >= _LINES_EVERY):

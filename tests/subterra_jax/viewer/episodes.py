@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from subterra_jax.viewer.recording import Recording
+from subterra_jax.viewer.recording import N_POSE, Recording
 
 
 def straight(n: int = 21, **changes: Any) -> Recording:
@@ -39,5 +39,7 @@ def straight(n: int = 21, **changes: Any) -> Recording:
         "coverage": x / 60.0,
         "cloud": np.zeros((n, 0, 3), np.float32),
         "boxes": np.zeros((0, 6), np.float32),
+        "trunk": zero,
+        "pose": np.zeros((n, 0, N_POSE), np.float32),
     }
     return Recording(**{**fields, **changes})
