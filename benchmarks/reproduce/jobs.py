@@ -66,7 +66,7 @@ JOBS = {
             (
                 *_SURVEY,
                 "benchmarks.fidelity run --scene {out}/scene --recording {out}/survey/survey_os1.bag "
-                "--trajectory {out}/survey/groundtruth_os1.tum --out {out}/report",
+                "--trajectory {out}/survey/groundtruth_os1.tum --truth {out}/survey --out {out}/report",
             ),
             "report/report.json",
             15.0,
