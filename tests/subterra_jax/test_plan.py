@@ -27,7 +27,6 @@ def test_the_packaged_tunnel_has_its_length_and_linings():
 @pytest.mark.parametrize(
     ("field", "spoil"),
     [
-        ("schema", lambda a: "subterra.tunnel/99"),
         ("name", lambda a: None),
         ("provenance", lambda a: 3.0),
         ("station", lambda a: a + 1.0),
@@ -57,6 +56,12 @@ def test_a_broken_field_is_named_together_with_its_file(tmp_path, arrays, field,
         arrays[field] = spoilt
     path = tunnels.write_tunnel(tmp_path / "broken.npz", arrays)
     with pytest.raises(st.TunnelError, match=rf"broken\.npz.*'{field}'"):
+        st.load_tunnel(path)
+
+
+def test_a_tunnel_file_of_another_version_says_so(tmp_path, arrays):
+    path = tunnels.write_tunnel(tmp_path / "newer.npz", arrays | {"schema": "subterra.tunnel/99"})
+    with pytest.raises(st.TunnelError, match=r"newer\.npz: written by a newer Subterra"):
         st.load_tunnel(path)
 
 

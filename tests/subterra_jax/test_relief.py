@@ -71,7 +71,7 @@ def test_what_is_missing_or_spoiled_in_a_scene_folder_is_named(tmp_path):
     with pytest.raises(TunnelError, match=r"bore\.npz: not a bore file"):
         surface.read_axis(tmp_path / "bore.npz")
     np.savez(tmp_path / "bore.npz", schema="subterra.bore/0")
-    with pytest.raises(TunnelError, match=r"'schema' must be 'subterra\.bore/1'"):
+    with pytest.raises(TunnelError, match=r"older Subterra \(schema subterra\.bore/0"):
         surface.read_axis(tmp_path / "bore.npz")
     np.savez(tmp_path / "bore.npz", schema="subterra.bore/1", **surfaces.axis_of(10.0))
     with pytest.raises(TunnelError, match=r"scene\.xml: no such scene"):

@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar, vehicle
-from subterra_jax.lidar import fused, reference
+from subterra_jax.lidar import fused, planar, reference
 from subterra_jax.tunnel import Tunnel, foot, node_at
 from subterra_jax.tunnel.stack import stack
 from tests.subterra_jax import tunnels
@@ -133,9 +133,9 @@ def test_a_batch_of_different_tunnels_and_lidars_goes_to_the_kernels_as_rows(pla
         rows = (jnp.asarray(value[:8]) for value in vars(poses).values())
         return jax.jit(jax.vmap(one))(index, *rows, params)
 
-    by_xla, kernel, calls = scans(), lidar._cast_rows, []
-    monkeypatch.setattr(lidar, "_cast_rows", lambda *args: calls.append(args) or kernel(*args))
-    monkeypatch.setattr(lidar, "skips_unwanted", lambda params: True)
+    by_xla, kernel, calls = scans(), planar._cast_rows, []
+    monkeypatch.setattr(planar, "_cast_rows", lambda *args: calls.append(args) or kernel(*args))
+    monkeypatch.setattr(planar, "skips_unwanted", lambda params: True)
     np.testing.assert_allclose(scans(), by_xla, atol=1e-5)
     assert [call[1].shape for call in calls] == [(8, 2)]
 

@@ -83,7 +83,7 @@ def test_every_task_has_a_preset_that_makes_sense(preset):
         (("--memory", "gru", "--teacher", "oracle", "--task", "Subterra/Relocalise-v0"), "does not ask for"),
         (("--memory", "gru", "--teacher", "TraverseShort-v0", "--task", TASK), "observations of 18 numbers"),
         (("--memory", "gru", "--teacher", "oracle", "--task", TASK, "--minibatches", "7"), "minibatches = 7"),
-        (("--memory", "gru", "--task", "Subterra/Nowhere-v0"), "unknown task 'Subterra/Nowhere-v0'"),
+        (("--memory", "gru", "--task", "Subterra/Nowhere-v0"), "no task 'Subterra/Nowhere-v0'"),
         (("--memory", "lstm"), "unknown memory 'lstm'; there are none, gru"),
     ],
 )

@@ -67,7 +67,7 @@ def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--task", "Subterra/Nowhere-v0"), "unknown task 'Subterra/Nowhere-v0'"),
+        (("--task", "Subterra/Nowhere-v0"), "no task 'Subterra/Nowhere-v0'"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
         (("--lining", "velvet"), "no lining 'velvet'"),
         (("--episodes", "0"), "episodes must be at least 1, got 0"),

@@ -112,7 +112,7 @@ def test_the_same_config_gives_the_same_bytes(config, trace, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--task", "Fly"), "error: no task 'Subterra/Fly-v0'; there are"),
+        (("--task", "Fly"), "error: no task 'Fly'; there are"),
         (("--agent", "nobody"), "error: no agent 'nobody'; there are random"),
         (("--policy", "nothing"), "error: nothing: no such policy"),
         (("--episode", "500"), "error: episodes must be 1 to 500, got 501"),
@@ -138,7 +138,7 @@ def test_a_missing_library_and_a_place_that_cannot_be_written_are_told(monkeypat
     blocked = tmp_path / "file"
     blocked.write_text("")
     assert main(["--out", str(blocked / "out"), "--task", "StopAtShort", "--steps", "1"]) == 2
-    assert "cannot be written (Not a directory)" in capsys.readouterr().err
+    assert "is a file, so no folder" in capsys.readouterr().err
     store.cache_clear()
     monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
     assert main(["--out", str(tmp_path / "out")]) == 2
