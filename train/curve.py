@@ -14,9 +14,9 @@ import matplotlib
 import numpy as np
 import tyro
 
+from subterra_jax.arguments import parse
 from subterra_jax.outputs import require_file
 from train import cli
-from train.arguments import parse
 from train.errors import RunFolderError
 from train.run.episodes import WINDOW
 from train.run.log import EPISODES

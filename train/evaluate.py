@@ -9,6 +9,7 @@ from typing import Any
 import tyro
 
 from subterra_jax import policies as released
+from subterra_jax.arguments import parse
 from subterra_jax.evaluation import Records, listed_episodes
 from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
@@ -17,7 +18,6 @@ from subterra_jax.policies.files import TENSORS
 from subterra_jax.policies.loading import Agent
 from train import cli, policies
 from train.agents import agent_of
-from train.arguments import parse
 from train.errors import ConfigError
 from train.policies import World
 

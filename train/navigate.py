@@ -10,7 +10,8 @@ import time
 
 import jax
 
-from train import arguments, cli, policies, ppo, seeds
+from subterra_jax import arguments as reading
+from train import cli, policies, ppo, seeds
 from train.commandline import Command, parse
 from train.devices import cluster
 from train.errors import ConfigError
@@ -112,7 +113,7 @@ def _tell(snapshot: Snapshot, seconds: float) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.navigate`."""
-    cli.run(lambda: command(arguments.parse(parse, sys.argv[1:])))
+    cli.run(lambda: command(reading.parse(parse, sys.argv[1:])))
 
 
 if __name__ == "__main__":

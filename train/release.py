@@ -13,11 +13,11 @@ from typing import Any
 import tyro
 from safetensors.numpy import save
 
+from subterra_jax.arguments import parse
 from subterra_jax.outputs import require_file
 from subterra_jax.policies.files import FACTS, SCHEMA, TENSORS
 from train import cli, policies
 from train.agents import agent_of, tensors_of
-from train.arguments import parse
 from train.b2.legs import Legs
 from train.errors import RunFolderError
 from train.evaluate import evaluate

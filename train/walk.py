@@ -13,11 +13,11 @@ from typing import Annotated
 import jax
 import tyro
 
+from subterra_jax import arguments as reading
 from subterra_jax.b2 import ids, tasks
 from subterra_jax.outputs import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
-from train import arguments as reading
 from train import cli, ppo, seeds
 from train.b2.config import WalkConfig, make_config
 from train.b2.network import WalkLearner

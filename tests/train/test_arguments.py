@@ -1,7 +1,8 @@
 import pytest
 
+from subterra_jax import arguments
 from tests.train.conftest import call
-from train import arguments, curve, evaluate, navigate, release
+from train import curve, evaluate, navigate, release
 
 COMMANDS = {"navigate": navigate, "evaluate": evaluate, "release": release, "curve": curve}
 
