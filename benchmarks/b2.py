@@ -24,7 +24,7 @@ from benchmarks.command import status
 from scene.arguments import parse
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.physics import Physics
-from subterra_jax.b2.window import WindowConfig
+from subterra_jax.b2.track import WindowConfig
 from subterra_jax.outputs import require_file
 
 _COLUMNS = ("variant", "contacts", "rows", "MJX alone, M/s", "environment, M/s", "share", "compile, s", "falls in 20 s")

@@ -54,7 +54,7 @@ def walk(
     """One robot: what it was told and what it did, speed (m/s) and yaw rate (rad/s); until it is at an end."""
     rng, period = np.random.default_rng(seed), float(env.params.vehicle.period)
     obs, _ = env.reset(seed=seed)
-    driver.forget()
+    driver.reset()
     told, done = [], []
     position, heading = np.array(env.state.position), float(env.state.heading)
     speed = turn = 0.0

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.b2 import ids
+from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.env import TunnelEnv
 from subterra_jax.faults import FaultParams
 from subterra_jax.lidar import LidarParams
@@ -112,16 +112,16 @@ def make(
         ValueError: No such task, no such field, or a value that the simulator cannot honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
-    if id == ids.WALK:
+    if id == WALK:
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
         return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
-    if id in ids.MISSIONS:
+    if id in MISSIONS:
         from subterra_jax.b2 import missions
 
         return missions.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
     if id not in TASKS:
-        raise ValueError(no_task(id, (*TASKS, ids.WALK, *ids.MISSIONS)))
+        raise ValueError(no_task(id, (*TASKS, WALK, *MISSIONS)))
     task = TASKS[id]
     fields: dict[str, Any] = {
         "vehicle": VehicleParams(),

@@ -14,7 +14,7 @@ import jax
 import tyro
 
 from subterra_jax import arguments as reading
-from subterra_jax.b2 import ids, tasks
+from subterra_jax.b2 import WALK, tasks
 from subterra_jax.outputs import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
@@ -87,14 +87,14 @@ def open_world(tunnel: Path | None, scene: Path | None) -> World:
     plan = load_tunnel(file)
     env, params = tasks.make(tunnel=None if scene else plan, scene=scene, privileged=True)
     facts = {
-        "task": ids.WALK,
+        "task": WALK,
         "lining": plan.default_lining,
         "tunnel": plan.name,
         "tunnel_provenance": plan.provenance,
         "tunnel_sha256": tunnel_digest(file),
         "track": "by standard" if scene is None else "of the scene",
     }
-    return World(ids.WALK, env, params, facts)
+    return World(WALK, env, params, facts)
 
 
 def command(arguments: Command) -> int:

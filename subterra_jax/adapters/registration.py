@@ -2,13 +2,13 @@
 
 from gymnasium.envs import registration
 
-from subterra_jax.b2 import ids
+from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.tasks import TASKS
 
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
 # MuJoCo is loaded by who makes one.
-_ON_LEGS = dict.fromkeys(ids.MISSIONS, "subterra_jax.b2.gym:B2Env") | {ids.WALK: "subterra_jax.b2.gym:B2WalkEnv"}
+_ON_LEGS = dict.fromkeys(MISSIONS, "subterra_jax.b2.gym:B2Env") | {WALK: "subterra_jax.b2.gym:B2WalkEnv"}
 
 
 def register() -> None:

@@ -1,6 +1,11 @@
-"""The Unitree B2: model, track under its feet, an environment in which it learns to walk, and tasks on a learnt gait.
+"""The Unitree B2: its model, the track under its feet, a task in which it learns to walk, and missions on that gait.
 
-constants ─► model ─┐
-track, window ──────┴► physics (MJX) or engine (MuJoCo) ─► walk (50 Hz) ─► hierarchy (5 Hz)
-legs ─► gait ─► servos ─┘                                   ▲ policy
+constants ─► model ──► physics (MJX) or engine (MuJoCo in C) ─► walk (50 Hz) ─► hierarchy (5 Hz)
+track ───────┘                                                   ▲ policy
+kinematics ─► gait ──────────────────────────────────────────────┘
 """
+
+# Task ids. Importing them does not load MuJoCo.
+WALK = "Subterra/B2Walk-v0"
+TRAVERSE = "Subterra/B2Traverse-v0"
+MISSIONS = (TRAVERSE,)  # planar tasks, done on a learnt gait

@@ -1,4 +1,4 @@
-"""Figures of the Unitree B2, each with its source. SI; quaternions with the real part first.
+"""Masses, dimensions and limits of the Unitree B2, each with its source. SI; quaternions with the real part first.
 
 Unitree publishes three models that disagree: 74.58 kg (URDF), 83.50 kg (unitree_mujoco counts each thigh's cover twice)
 and 69.00 kg (unitree_ros' MJCF drops head, tail and rotors from the trunk but keeps their inertia); the data sheet says
@@ -24,9 +24,9 @@ class Inertial:
     """Mass and inertia of one body.
 
     Attributes:
-        mass: kg.
+        mass: Mass, kg.
         com: Centre of mass in the body's frame, m.
-        inertia: xx, yy, zz, xy, xz, yz about the centre of mass, along the body's axes, kg m².
+        inertia: Inertia xx, yy, zz, xy, xz, yz about the centre of mass, along the body's axes, kg m².
     """
 
     mass: float
@@ -34,7 +34,7 @@ class Inertial:
     inertia: tuple[float, float, float, float, float, float]
 
     def mirrored(self, left: bool, front: bool) -> "Inertial":
-        """The same part of another leg, from that of the front left leg."""
+        """Return this part of the front left leg mirrored to another leg."""
         y, x = (1.0 if left else -1.0), (1.0 if front else -1.0)
         xx, yy, zz, xy, xz, yz = self.inertia
         com = (x * self.com[0], y * self.com[1], self.com[2])
@@ -46,7 +46,7 @@ TRUNK = Inertial(
     (0.0234668098, 0.00454731996, 0.0114076538),
     (0.35833829, 1.70381349, 1.76262643, 0.0041202944, -0.132988072, 0.000657680078),
 )
-# Of the front left leg: the mean of the four, mirrored. The four differ by up to 2.5 mm in the hip's centre of mass.
+# Front left leg: the mean of the four, mirrored. The four differ by up to 2.5 mm in the hip's centre of mass.
 HIP = Inertial(
     2.9464,
     (-0.00596308342, -0.00949322427, 0.000119751561),
@@ -66,9 +66,9 @@ TOTAL_MASS = TRUNK.mass + 4.0 * (HIP.mass + THIGH.mass + CALF.mass)
 
 
 def inertial(leg: str, part: str) -> Inertial:
-    """Of one part of one leg. The thighs and calves are alike in front and behind, the hips mirrored."""
-    of_left = {"hip": HIP, "thigh": THIGH, "calf": CALF}[part]
-    return of_left.mirrored(leg in ("FL", "RL"), part != "hip" or leg in ("FL", "FR"))
+    """Return mass and inertia of one part of a leg; hind thighs and calves equal the front ones, hips are mirrored."""
+    front_left = {"hip": HIP, "thigh": THIGH, "calf": CALF}[part]
+    return front_left.mirrored(leg in ("FL", "RL"), part != "hip" or leg in ("FL", "FR"))
 
 
 GRAVITY = 9.81  # m/s²
@@ -83,18 +83,18 @@ ENVELOPE = (1.098, 0.450, 0.645)  # standing. Source: docs.westonrobot.com/robot
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """One kind of joint.
+    """Properties of one kind of joint.
 
     Attributes:
-        axis: In the body's frame.
+        axis: Axis in the body's frame.
         low: Least angle, rad.
         high: Largest angle, rad.
         torque: Largest torque, N m.
         speed: Largest speed, rad/s.
         armature: Inertia of the rotor seen through the gear, kg m². Inferred: the URDF's rotor (2.63e-4 kg m²) through
             ratios of 15 and 24, those of Unitree's motors of the same torque (M107-15, M107-24 of the H1-2).
-        stiffness: Of the position servo, N m/rad.
-        damping: Of the position servo, N m s/rad.
+        stiffness: Stiffness of the position servo, N m/rad.
+        damping: Damping of the position servo, N m s/rad.
     """
 
     axis: Vector
@@ -122,5 +122,5 @@ STAND_HEIGHT = 0.5435  # of the trunk's middle over the feet's soles in that pos
 IMU = (0.0, -0.02341, 0.04927)
 LIDAR = (0.34218, 0.0, 0.17851)
 
-# Which geoms meet: bits of `contype` and `conaffinity`, as docs/formats.md has them for scene.xml.
+# Bits of `contype` and `conaffinity`, as docs/formats.md gives them for scene.xml.
 GROUND, LOW_WALL = 4, 8

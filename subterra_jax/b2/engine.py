@@ -1,39 +1,49 @@
-"""MuJoCo's own engine in place of MJX: the same robot on the same window of track, computed in C in double precision.
+"""MuJoCo's own engine in place of MJX: the same robot, computed in C in double precision.
 
-It stands where `Physics` stands, so that everything around it, from the servos' targets to the reward, is one and the
-same code on both engines.
+`MujocoPhysics` takes the place of `Physics` on the window of track, `ScenePhysics` in a whole built scene with all of
+its sleepers, rails and walls. The rest, from the servo targets to the reward, is the same code on all engines.
 """
 
 import dataclasses
 import threading
 from collections.abc import Callable
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import physics
-from subterra_jax.b2.physics import Body, Build, Physics, Surroundings
+from subterra_jax.b2.model import robot_spec
+from subterra_jax.b2.params import Body, Build, Surroundings, WalkParams, WalkState
+from subterra_jax.b2.physics import Physics
+from subterra_jax.b2.track import TrackError
+from subterra_jax.b2.walk import WalkEnv
 
+PREFIX = "b2/"  # of the robot's names in a scene
+_SCOUT = "scout"  # the wheeled robot that a scene comes with
+_ITERATIONS, _LINE_SEARCH = 10, 20  # of the solver in a scene: accuracy costs little on one robot
 _SAFE = 0.8  # m; a trunk whose middle is this far from both walls cannot touch one within a control period
 
 
 class Workbench:
-    """One model with its data, on which robots are put in turn; a step depends on nothing that was there before.
+    """One model with its data, used for many robots in turn; a step does not depend on the robot before.
 
     Args:
         model: A model with the robot and nothing else that moves.
-        prefix: Of the robot's names in it.
+        prefix: Prefix of the robot's names in it.
 
     Attributes:
         model: The model.
         data: Its data.
-        lock: Whoever puts a robot there holds it until it is taken.
-        watch: Called with the data at the end of each control period: a film is made so. None by default.
+        lock: Lock to hold from `put` to `take`.
+        watch: Called with the data at the end of each control period, as for a film; `None` by default.
     """
 
     def __init__(self, model: mujoco.MjModel, prefix: str = ""):
@@ -47,8 +57,8 @@ class Workbench:
         self.lock = threading.Lock()
         self.watch: Callable[[mujoco.MjData], None] | None = None
 
-    def be(self, build: Build) -> None:
-        """Makes the robot one that differs from its figures as `build` says."""
+    def apply_build(self, build: Build) -> None:
+        """Gives the robot the properties of a build."""
         model, bodies = self.model, self.bodies
         model.geom_friction[self.feet, 0] = build.friction
         model.body_mass[bodies] = self._mass[bodies] * build.mass
@@ -59,18 +69,18 @@ class Workbench:
         model.actuator_biasprm[:, 2] = self._bias[:, 2] * build.damping
 
     def run(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build, n_steps: int) -> Body:
-        """Some steps of physics on the window of track.
+        """Advances a robot on the window of track.
 
         Args:
-            body: Before.
-            targets: Of the servos, rad.
-            around: What can be touched.
-            build: The robot.
-            n_steps: How many.
+            body: State before.
+            targets: Targets of the servos, rad.
+            around: Ground and walls.
+            build: Properties of the robot.
+            n_steps: Steps of physics.
         """
         data = self.data
         with self.lock:
-            self.be(build)
+            self.apply_build(build)
             self.put(body, targets)
             data.mocap_pos[:], data.mocap_quat[:] = around.ground
             if far_from_walls(body.qpos, around):
@@ -80,17 +90,17 @@ class Workbench:
                 for _ in range(n_steps):
                     data.xfrc_applied[self.trunk] = wall_wrench(data.qpos, data.qvel, around)
                     mujoco.mj_step(self.model, data)
-            return self.taken()
+            return self.take()
 
     def put(self, body: Body, targets: np.ndarray, origin: np.ndarray | float = 0.0) -> None:
-        """Puts a robot there, its position from `origin` (m), and tells its servos where to go."""
+        """Sets the state of the robot, its position from `origin` (m), and the targets of its servos."""
         data = self.data
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = body.qpos, body.qvel, body.warmstart
         data.qpos[:3] += origin
         data.ctrl[:] = targets
 
-    def taken(self, origin: np.ndarray | float = 0.0) -> Body:
-        """The robot as it is now, its position from `origin`, m."""
+    def take(self, origin: np.ndarray | float = 0.0) -> Body:
+        """Return the state of the robot, its position from `origin`, m."""
         data = self.data
         if self.watch is not None:
             self.watch(data)
@@ -101,7 +111,7 @@ class Workbench:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MujocoPhysics(Physics):
-    """`Physics` by MuJoCo in C, on the host: the robots of a batch one after another."""
+    """`Physics` by MuJoCo in C on the host; it computes the robots of a batch one after another."""
 
     @cached_property
     def bench(self) -> Workbench:
@@ -109,54 +119,132 @@ class MujocoPhysics(Physics):
         return Workbench(self.spec().compile())
 
     def run(self, body: Body, targets: Float[Array, "12"], around: Surroundings, build: Build) -> Body:
-        """One control period; see `Physics.run`."""
+        """Advances the robot by one control period; see `Physics.run`."""
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, np.float32), body)
         return jax.pure_callback(self.run_rows, shapes, body, targets, around, build, vmap_method="broadcast_all")
 
     def run_rows(self, body: Body, targets: Any, around: Surroundings, build: Build) -> Body:
-        """Any number of robots for one control period; all arrays have the same leading axes."""
+        """Advances any number of robots by one control period; all arrays have the same leading axes."""
         leaves, structure = jax.tree.flatten((body, targets, around, build))
         batch = np.shape(body.qpos)[:-1]
         leaves = [np.asarray(leaf) for leaf in leaves]
         rows = [leaf.reshape(-1, *leaf.shape[len(batch) :]) for leaf in leaves]
         after = [self.run_one(*jax.tree.unflatten(structure, [row[k] for row in rows])) for k in range(len(rows[0]))]
-        stacked: Any = [np.stack(part).reshape(*batch, -1) for part in zip(*map(_parts, after), strict=True)]
+        stacked: Any = [np.stack(part).reshape(*batch, -1) for part in zip(*map(jax.tree.leaves, after), strict=True)]
         return Body(*stacked)
 
     def run_one(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build) -> Body:
-        """One robot for one control period."""
+        """Advances one robot by one control period."""
         return self.bench.run(body, targets, around, build, self.substeps)
 
 
-def _parts(body: Body) -> tuple[Any, Any, Any]:
-    return body.qpos, body.qvel, body.warmstart
+@struct.dataclass
+class SceneSurroundings(Surroundings):
+    """`Surroundings` at a position in a scene.
+
+    Attributes:
+        origin: Position of the anchor, tunnel frame, m.
+    """
+
+    origin: Float[Array, "3"] | None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ScenePhysics(MujocoPhysics):
+    """MuJoCo in C on a scene's own geometry. Feet touch its GROUND geoms, the trunk its LOW_WALL geoms.
+
+    Attributes:
+        scene: The MJCF file.
+    """
+
+    scene: Path = Path("scene.xml")
+
+    @cached_property
+    def bench(self) -> Workbench:
+        """The scene with the robot in it."""
+        return Workbench(self.scene_spec().compile(), PREFIX)
+
+    def scene_spec(self) -> mujoco.MjSpec:
+        """Return the MJCF of the scene with the robot in it.
+
+        Raises:
+            TrackError: The scene cannot be read.
+        """
+        try:
+            spec = mujoco.MjSpec.from_file(str(self.scene))
+        except ValueError as cause:
+            raise TrackError(f"{self.scene}: not a readable scene ({cause})") from cause
+        if scout := spec.body(_SCOUT):
+            spec.delete(scout)
+        robot = robot_spec(self.robot)
+        option, own = spec.option, robot.option
+        option.timestep, option.integrator, option.cone = own.timestep, own.integrator, own.cone
+        option.disableflags = own.disableflags
+        # MuJoCo warns where the two differ when they are joined.
+        option.iterations, option.ls_iterations = own.iterations, own.ls_iterations
+        spec.attach(robot, prefix=PREFIX, frame=spec.worldbody.add_frame())
+        option.iterations, option.ls_iterations = _ITERATIONS, _LINE_SEARCH
+        return spec
+
+    def run_one(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build) -> Body:
+        """Advances one robot by one control period, in the scene's coordinates."""
+        assert isinstance(around, SceneSurroundings)
+        bench, origin = self.bench, np.asarray(around.origin, np.float64)
+        with bench.lock:
+            bench.apply_build(build)
+            bench.put(body, targets, origin)
+            mujoco.mj_step(bench.model, bench.data, self.substeps)
+            return bench.take(origin)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SceneWalk(WalkEnv):
+    """`WalkEnv` in a built scene: its physics needs the robot's position there."""
+
+    @classmethod
+    def of(cls, walk: WalkEnv, folder: Path, lining: str | None) -> "SceneWalk":
+        """Moves an environment into the scene of a folder: the one with furniture where the lining is `furnished`.
+
+        Raises:
+            TrackError: The scene cannot be read.
+        """
+        file = folder / ("scene_furnished.xml" if lining == "furnished" else "scene.xml")
+        if not file.is_file():
+            raise TrackError(f"{file} is missing")
+        own = {name: getattr(walk, name) for name in ("id", "driven", "privileged")}
+        return cls(physics=ScenePhysics(robot=walk.physics.robot, scene=file), **own)
+
+    def surroundings(self, state: WalkState, params: WalkParams) -> SceneSurroundings:
+        """Return ground and walls of the next control period, and their position."""
+        around: dict[str, Any] = vars(super().surroundings(state, params))
+        return SceneSurroundings(**around, origin=jnp.asarray(params.track.position[state.anchor]))
 
 
 def far_from_walls(qpos: Any, around: Surroundings) -> bool:
-    """Whether no wall can push the trunk within a control period."""
-    lateral = turned(np.asarray(around.quaternion), qpos[:3], back=True)[1]
+    """Return whether no wall can push the trunk within a control period."""
+    lateral = rotate_vector(np.asarray(around.quaternion), qpos[:3], back=True)[1]
     return bool(abs(lateral) < around.half_width - _SAFE)
 
 
 def wall_wrench(qpos: np.ndarray, qvel: np.ndarray, around: Surroundings) -> np.ndarray:
-    """`physics.wall_wrench` in NumPy, `(6,)`: nothing of JAX may be called while JAX waits for the host."""
+    """Computes `physics.wall_wrench` in NumPy, `(6,)`: JAX must not be called while it waits for the host."""
     track = np.asarray(around.quaternion, np.float64)
-    left = turned(track, np.array([0.0, 1.0, 0.0]))
-    spin = turned(qpos[3:7], qvel[3:6])
+    left = rotate_vector(track, np.array([0.0, 1.0, 0.0]))
+    spin = rotate_vector(qpos[3:7], qvel[3:6])
     wrench = np.zeros(6)
-    for place in physics.BUMPERS:
-        arm = turned(qpos[3:7], np.array(place))
-        lateral = turned(track, qpos[:3] + arm, back=True)[1]
-        speed = turned(track, qvel[:3] + np.cross(spin, arm), back=True)[1]
-        deep, outward = abs(lateral) + physics.BUMPER_RADIUS - float(around.half_width), np.sign(lateral)
-        push = np.clip(physics.WALL_STIFFNESS * deep + physics.WALL_DAMPING * outward * speed, 0.0, 1e4)
-        force = -outward * (push if deep > 0.0 else 0.0) * left
+    for bumper in physics.BUMPERS:
+        arm = rotate_vector(qpos[3:7], np.array(bumper))
+        lateral = rotate_vector(track, qpos[:3] + arm, back=True)[1]
+        speed = rotate_vector(track, qvel[:3] + np.cross(spin, arm), back=True)[1]
+        depth, outward = abs(lateral) + physics.BUMPER_RADIUS - float(around.half_width), np.sign(lateral)
+        push = np.clip(physics.WALL_STIFFNESS * depth + physics.WALL_DAMPING * outward * speed, 0.0, 1e4)
+        force = -outward * (push if depth > 0.0 else 0.0) * left
         wrench += np.concatenate([force, np.cross(arm, force)])
     return wrench
 
 
-def turned(quaternion: np.ndarray, vector: np.ndarray, back: bool = False) -> np.ndarray:
-    """A vector of the turned frame in the frame outside; `back`, the other way."""
+def rotate_vector(quaternion: np.ndarray, vector: np.ndarray, back: bool = False) -> np.ndarray:
+    """Rotates a vector from the turned frame into the outer frame; with `back`, the other way."""
     w, axis = float(quaternion[0]), np.asarray(quaternion[1:], np.float64) * (-1.0 if back else 1.0)
     cross = np.cross(axis, vector)
     return vector + 2.0 * (w * cross + np.cross(axis, cross))

@@ -1,11 +1,11 @@
-"""A film of a B2 on its way: `python -m subterra_jax.b2.film run.webp --scene build/tunnel --seconds 20`."""
+"""Films a walking B2: `python -m subterra_jax.b2.film run.webp --scene build/tunnel --seconds 20`."""
 
 import argparse
 import sys
 from pathlib import Path
 from typing import Any
 
-from subterra_jax.b2.gym import B2Env  # first: it says how MuJoCo is to draw
+from subterra_jax.b2.gym import B2Env  # first: it chooses how MuJoCo draws
 from subterra_jax.b2.policy import RELEASED
 from subterra_jax.b2.view import Moment, PictureError
 
@@ -20,14 +20,14 @@ from subterra_jax.baselines.registry import make_agent, names
 from subterra_jax.errors import SubterraError
 from subterra_jax.outputs import require_file
 
-_EVERY = 3  # one picture for so many control periods of 20 ms
-_DURATION = 20 * _EVERY  # of a picture, ms
+_EVERY = 3  # control periods of 20 ms per picture
+_DURATION = 20 * _EVERY  # time of a picture on screen, ms
 _ANIMATED = (".gif", ".webp")
 _MOST_PIXELS, _LONGEST = 4096, 3600.0  # s
 
 
 class Driver:
-    """An agent that is asked step by step."""
+    """An agent that chooses commands step by step."""
 
     def __init__(self, env: B2Env, name: str):
         params, mission = env.params, env.env
@@ -43,19 +43,19 @@ class Driver:
         self._memory: Any = None
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """The command `[v, ω]` for an observation."""
+        """Return the command `[v, ω]` for an observation."""
         if self._memory is None:
             self._memory = self._begin(obs)
         action, self._memory = self._act(self._memory, obs)
         return np.asarray(action[:2])
 
-    def forget(self) -> None:
-        """Begin anew with the next observation."""
+    def reset(self) -> None:
+        """Clears the memory: the agent begins anew with the next observation."""
         self._memory = None
 
 
-def shoot(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.ndarray]:
-    """Pictures of an episode, one for every 60 ms of it, `(height, width, 3)` uint8 each; fewer if it ends before.
+def film(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.ndarray]:
+    """Films an episode: one picture of `(height, width, 3)` uint8 per 60 ms; fewer if the episode ends before.
 
     Raises:
         PictureError: There is no OpenGL.
@@ -63,7 +63,7 @@ def shoot(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.
     physics: Any = env.walk.physics
     moments: list[Moment] = []
     count = 0
-    physics.bench.watch = lambda data: moments.append(Moment.of(data))
+    physics.bench.watch = lambda data: moments.append(Moment.from_data(data))
     pictures = []
     try:
         obs, _ = env.reset(seed=seed)
@@ -81,37 +81,37 @@ def shoot(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.
 
 
 def write(path: Path, pictures: list[np.ndarray]) -> None:
-    """Writes a film; its ending says in which format: `.webp` or `.gif`, ten times as large; `.mp4` with ffmpeg.
+    """Writes a film in the format of its ending: `.webp`; `.gif`, ten times as large; `.mp4`, which needs ffmpeg.
 
     Raises:
-        PictureError: Nothing here writes that format.
+        PictureError: The format cannot be written here.
     """
     try:
         import imageio.v3 as imageio
 
-        how = {"duration": _DURATION, "loop": 0} if path.suffix in _ANIMATED else {"fps": 1000 / _DURATION}
-        imageio.imwrite(path, np.stack(pictures), **how)
+        options = {"duration": _DURATION, "loop": 0} if path.suffix in _ANIMATED else {"fps": 1000 / _DURATION}
+        imageio.imwrite(path, np.stack(pictures), **options)
     except (ImportError, OSError, ValueError, TypeError) as cause:
         raise PictureError(f"{path} cannot be written: {cause}; .webp and .gif need imageio, .mp4 ffmpeg") from cause
 
 
-def _check(asked: argparse.Namespace) -> None:
-    """Refuses what cannot be shot or written, before minutes are spent on it.
+def _check(settings: argparse.Namespace) -> None:
+    """Checks the settings before minutes are spent on filming.
 
     Raises:
         ValueError: A number is out of range.
         OutputError: The file cannot be written.
     """
     for name, least, most in (("width", 16, _MOST_PIXELS), ("height", 16, _MOST_PIXELS), ("seed", 0, 2**31 - 1)):
-        if not least <= getattr(asked, name) <= most:
-            raise ValueError(f"{name} must be {least} to {most}, got {getattr(asked, name)}")
-    if not 0.0 < asked.seconds <= _LONGEST:
-        raise ValueError(f"seconds must be above 0 and at most {_LONGEST:g}, got {asked.seconds}")
-    require_file(asked.out, *_ANIMATED, ".mp4")
+        if not least <= getattr(settings, name) <= most:
+            raise ValueError(f"{name} must be {least} to {most}, got {getattr(settings, name)}")
+    if not 0.0 < settings.seconds <= _LONGEST:
+        raise ValueError(f"seconds must be above 0 and at most {_LONGEST:g}, got {settings.seconds}")
+    require_file(settings.out, *_ANIMATED, ".mp4")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point: 0, or 2 for a user's mistake."""
+    """Runs the command; returns 0, or 2 for a user's mistake."""
     parser = argparse.ArgumentParser(prog="python -m subterra_jax.b2.film", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write: .webp, .gif or .mp4")
     parser.add_argument("--scene", type=Path, help="built scene folder to walk in; the packaged tunnel if left out")
@@ -122,17 +122,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=360)
     try:
-        asked = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
-        _check(asked)
-        size = {"width": asked.width, "height": asked.height}
-        env = B2Env(scene=asked.scene, policy=asked.policy, render_mode="rgb_array", **size)
-        pictures = shoot(env, Driver(env, asked.agent), asked.seconds, asked.seed)
-        write(asked.out, pictures)
+        settings = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
+        _check(settings)
+        size = {"width": settings.width, "height": settings.height}
+        env = B2Env(scene=settings.scene, policy=settings.policy, render_mode="rgb_array", **size)
+        pictures = film(env, Driver(env, settings.agent), settings.seconds, settings.seed)
+        write(settings.out, pictures)
         env.close()
     except (SubterraError, ValueError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    print(f"{asked.out}: {len(pictures)} pictures")
+    print(f"{settings.out}: {len(pictures)} pictures")
     return 0
 
 

@@ -1,7 +1,7 @@
-"""A trot written down: from a commanded velocity and a clock to the joint targets of the servos.
+"""A scripted trot: from a commanded velocity and a clock to the joint targets of the servos.
 
-Diagonal legs step together. A foot on the ground goes back as fast as the trunk is to go forward; one in the air comes
-forward on a bow. What is learnt is added to these targets, so that the robot walks before anything has been learnt.
+Diagonal legs step together. A foot on the ground moves back as fast as the trunk should move forward. A foot in the
+air swings forward on an arc. The learnt action is added to these targets, so the robot walks before any training.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import legs
+from subterra_jax.b2 import kinematics
 
 _OFFSET = np.array([0.0, 0.5, 0.5, 0.0], np.float32)  # of each leg's clock: diagonal legs together
 _WEIGHT = b2.TOTAL_MASS * b2.GRAVITY
@@ -20,20 +20,20 @@ _WEIGHT = b2.TOTAL_MASS * b2.GRAVITY
 
 @struct.dataclass
 class GaitParams:
-    """The trot.
+    """Parameters of the trot.
 
     Attributes:
         frequency: Strides per second.
         duty: Share of a stride for which a foot is on the ground.
-        height: Of the trunk's middle over the ground, m.
-        lift: How far a foot is lifted, m: more than a sleeper stands out of the ballast.
-        spread: How far the feet stand outside the legs' own planes, m.
-        still: Commands below this, m/s (rad/s count half), are stood out, with all feet on the ground.
-        startle: Yet a robot that moves faster than this without having been told to, m/s, steps to catch itself.
-        place: How much further a foot is set down where the trunk moves faster than told, m per m/s.
-        level: Share of a measured tilt that the legs take back.
-        learn: How fast a lasting drift is met by longer or shorter strides, 1/s.
-        trim_max: By how much at most, m/s and rad/s.
+        height: Height of the trunk's middle over the ground, m.
+        lift: Height to which a foot is lifted, m: more than a sleeper stands out of the ballast.
+        spread: Distance of the feet outside the legs' own planes, m.
+        still: Commands below this, m/s (rad/s count half), are answered by standing on all feet.
+        startle: Drift above which a standing robot steps to catch itself, m/s.
+        place: Extra distance at which a foot is set down, per drift of the trunk, m per m/s.
+        level: Share of a measured tilt that the legs compensate.
+        learn: Rate at which longer or shorter strides compensate a lasting drift, 1/s.
+        trim_max: Largest such compensation, m/s and rad/s.
         slew: Fastest change of the commanded velocity, m/s² and rad/s².
     """
 
@@ -53,14 +53,14 @@ class GaitParams:
 
 @struct.dataclass
 class GaitState:
-    """Where the gait is.
+    """State of the gait.
 
     Attributes:
-        phase: Of the clock, in [0, 1).
-        velocity: What is being obeyed: forward and to the left (m/s), yaw rate (rad/s); the command, slewed.
+        phase: Phase of the clock, in [0, 1).
+        velocity: The slewed command: forward and to the left (m/s), yaw rate (rad/s).
         stride: 0 standing to 1 in full stride.
-        trim: What is added to that velocity because the robot was too slow or too fast, m/s and rad/s.
-        offset: Where each foot was set down beside its usual place, forward and to the left, m.
+        trim: Addition to that velocity because the robot was too slow or too fast, m/s and rad/s.
+        offset: Offset of each foot's landing point from the usual one, forward and to the left, m.
     """
 
     phase: Float[Array, ""]
@@ -70,8 +70,8 @@ class GaitState:
     offset: Float[Array, "4 2"]
 
 
-def begin(phase: Float[Array, ""]) -> GaitState:
-    """Standing."""
+def standing_gait(phase: Float[Array, ""]) -> GaitState:
+    """Return the gait of a robot that stands, with a given phase of its clock."""
     return GaitState(
         phase=phase, velocity=jnp.zeros(3), stride=jnp.zeros(()), trim=jnp.zeros(3), offset=jnp.zeros((4, 2))
     )
@@ -80,14 +80,13 @@ def begin(phase: Float[Array, ""]) -> GaitState:
 def advance(
     state: GaitState, command: Float[Array, "3"], drift: Float[Array, "3"], period: float, params: GaitParams
 ) -> GaitState:
-    """The gait a moment later; the clock stands while the robot does.
+    """Advances the gait by one control period; the clock stops while the robot stands.
 
     Args:
-        state: Before.
+        state: Gait before.
         command: Forward and to the left (m/s), yaw rate (rad/s).
-        drift: How much faster than told the trunk moves, forward and to the left (m/s), and turns (rad/s); as far as
-            anybody knows.
-        period: How much later, s.
+        drift: Estimated velocity of the trunk minus the slewed command, in the same order and units.
+        period: Control period, s.
         params: The trot.
     """
     most = jnp.asarray(params.slew) * period
@@ -99,22 +98,22 @@ def advance(
     phase = state.phase + jnp.where(stride > 0.0, params.frequency * period, 0.0)
     trim = jnp.clip(state.trim - params.learn * period * drift, -params.trim_max, params.trim_max) * stride
     state = GaitState(phase - jnp.floor(phase), velocity, stride, trim, state.offset)
-    return dataclasses.replace(state, offset=_place(state, drift[:2], period, params))
+    return dataclasses.replace(state, offset=_foot_offsets(state, drift[:2], period, params))
 
 
-def _place(state: GaitState, drift: Float[Array, "2"], period: float, params: GaitParams) -> Float[Array, "4 2"]:
-    """Feet in the air make for where they would stop the drift; those on the ground stay.
+def _foot_offsets(state: GaitState, drift: Float[Array, "2"], period: float, params: GaitParams) -> Float[Array, "4 2"]:
+    """Landing points: feet in the air move to where they would stop the drift; those on the ground stay.
 
     Source: Raibert, Legged Robots That Balance, 1986: foot placement.
     """
-    flies = (_leg_phase(state) >= params.duty)[:, None]
-    wanted = state.stride * params.place * jnp.clip(drift, -1.0, 1.0)
-    share = jnp.where(flies, period / 0.05, (1.0 - state.stride) * period / 0.2)
-    return state.offset + jnp.minimum(share, 1.0) * (wanted - state.offset)
+    airborne = (_leg_phase(state) >= params.duty)[:, None]
+    aim = state.stride * params.place * jnp.clip(drift, -1.0, 1.0)
+    share = jnp.where(airborne, period / 0.05, (1.0 - state.stride) * period / 0.2)
+    return state.offset + jnp.minimum(share, 1.0) * (aim - state.offset)
 
 
 def stance(state: GaitState, params: GaitParams) -> Float[Array, "4"]:
-    """How much each leg is meant to carry: 1 on the ground, 0 in the air, with short ramps between."""
+    """Return the planned share of load of each leg: 1 on the ground, 0 in the air, with short ramps between."""
     phase = _leg_phase(state)
     edge = 0.05
     on = jnp.clip(jnp.minimum(phase, params.duty - phase) / edge + 0.5, 0.0, 1.0)
@@ -123,28 +122,28 @@ def stance(state: GaitState, params: GaitParams) -> Float[Array, "4"]:
 
 
 def targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParams) -> Float[Array, "12"]:
-    """Where the servos are to go.
+    """Computes the joint targets of the servos.
 
     Args:
-        state: Where the gait is.
+        state: State of the gait.
         gravity: Direction of gravity in the trunk's axes, unit vector.
         params: The trot.
 
     Returns:
-        Joint targets, rad: the angles of the gait, and before them what the load costs a servo of finite stiffness.
+        Joint targets, rad: the angles of the gait, plus the deflection of a servo of finite stiffness under the load.
     """
-    wanted = legs.angles(foot_targets(state, gravity, params))
+    angles = kinematics.joint_angles(foot_targets(state, gravity, params))
     share = stance(state, params)
     load = _WEIGHT * share / jnp.maximum(jnp.sum(share), 1.0)
-    return (wanted + legs.carrying(wanted, load) / legs.STIFFNESS).reshape(-1)
+    return (angles + kinematics.load_torques(angles, load) / kinematics.STIFFNESS).reshape(-1)
 
 
 def foot_targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParams) -> Float[Array, "4 3"]:
-    """Where the feet are to be, from their legs' abduction axes, m."""
+    """Computes the target positions of the feet from their legs' abduction axes, m."""
     phase = _leg_phase(state)
-    x, y = legs.HIPS[:, 0], legs.HIPS[:, 1] + legs.SIDE * (b2.THIGH_Y + params.spread)
-    told = state.velocity + state.trim
-    speed_x, speed_y = told[0] - told[2] * y, told[1] + told[2] * x
+    x, y = kinematics.HIPS[:, 0], kinematics.HIPS[:, 1] + kinematics.SIDE * (b2.THIGH_Y + params.spread)
+    aim = state.velocity + state.trim
+    speed_x, speed_y = aim[0] - aim[2] * y, aim[1] + aim[2] * x
     half = 0.5 * params.duty / params.frequency
     on = 1.0 - 2.0 * phase / params.duty
     flight = jnp.clip((phase - params.duty) / (1.0 - params.duty), 0.0, 1.0)
@@ -152,12 +151,12 @@ def foot_targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParam
     forward = 2.0 * (flight - jnp.sin(2.0 * jnp.pi * flight) / (2.0 * jnp.pi)) - 1.0
     along = state.stride * jnp.where(phase < params.duty, on, forward)
     lifted = params.lift * state.stride * 0.5 * (1.0 - jnp.cos(2.0 * jnp.pi * flight))
-    # Tilt towards gravity's direction is met by longer legs on the low side.
+    # Longer legs on the low side compensate the tilt.
     level = params.level * (x * gravity[0] + y * gravity[1])
     return jnp.stack(
         [
             along * half * speed_x + state.offset[:, 0],
-            legs.SIDE * (b2.THIGH_Y + params.spread) + along * half * speed_y + state.offset[:, 1],
+            kinematics.SIDE * (b2.THIGH_Y + params.spread) + along * half * speed_y + state.offset[:, 1],
             -(params.height - b2.FOOT_RADIUS) + lifted - level,
         ],
         axis=1,
@@ -165,9 +164,11 @@ def foot_targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParam
 
 
 def _leg_phase(state: GaitState) -> Float[Array, "4"]:
+    """Phase of each leg, in [0, 1)."""
     phase = state.phase + _OFFSET
     return phase - jnp.floor(phase)
 
 
 def _size(velocity: Float[Array, "3"]) -> Float[Array, ""]:
+    """Size of a velocity, m/s; 1 rad/s of yaw rate counts as 0.5 m/s."""
     return jnp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1] + 0.25 * velocity[2] * velocity[2])

@@ -5,16 +5,15 @@ from typing import Any, Literal
 
 import jax
 
-from subterra_jax.b2 import ids
+from subterra_jax.b2 import TRAVERSE, WALK
 from subterra_jax.b2.single import SingleB2  # first: it says how MuJoCo is to draw
 
 # isort: split
 from subterra_jax.b2 import missions, tasks
 from subterra_jax.b2 import policy as gaits
-from subterra_jax.b2.engine import MujocoPhysics
+from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
 from subterra_jax.b2.params import WalkParams, WalkState
 from subterra_jax.b2.policy import WalkPolicy
-from subterra_jax.b2.world import SceneWalk
 from subterra_jax.tunnel.plan import TunnelPlan
 
 
@@ -40,7 +39,7 @@ class B2Env(SingleB2):
 
     def __init__(
         self,
-        task: str = ids.TRAVERSE,
+        task: str = TRAVERSE,
         tunnel: TunnelPlan | str | Path | None = None,
         lining: str | None = None,
         *,
@@ -83,7 +82,7 @@ class B2WalkEnv(SingleB2):
 
     def __init__(
         self,
-        task: str = ids.WALK,
+        task: str = WALK,
         tunnel: TunnelPlan | str | Path | None = None,
         lining: str | None = None,
         *,

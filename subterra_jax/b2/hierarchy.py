@@ -9,7 +9,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax import draws, lidar, odometry, vehicle
-from subterra_jax.b2 import begin, posing, sight
+from subterra_jax.b2 import draws as walk_draws
+from subterra_jax.b2 import posing, sight
 from subterra_jax.b2.mission import MissionParams, MissionResetNoise, MissionState, MissionStepNoise, Tread
 from subterra_jax.b2.params import WalkState, WalkStepNoise
 from subterra_jax.b2.walk import WalkEnv
@@ -41,12 +42,12 @@ class MissionEnv(TunnelEnv):
     def draw_reset(self, key: PRNGKeyArray, batch: tuple[int, ...], params: EnvParams) -> MissionResetNoise:
         """Random numbers for a batch of resets; row i does not depend on the size of the batch."""
         noise = draws.draw_reset(key, batch, params)
-        return MissionResetNoise(**vars(noise), walk=begin.draw_reset(jax.random.fold_in(key, 2), batch))
+        return MissionResetNoise(**vars(noise), walk=walk_draws.draw_reset(jax.random.fold_in(key, 2), batch))
 
     def draw_step(self, key: PRNGKeyArray, batch: tuple[int, ...], params: EnvParams) -> MissionStepNoise:
         """Random numbers for one step of a batch; row i does not depend on the size of the batch."""
         noise = draws.draw_step(key, batch, params)
-        return MissionStepNoise(**vars(noise), walk=begin.draw_step(jax.random.fold_in(key, 2), (*batch, PERIODS)))
+        return MissionStepNoise(**vars(noise), walk=walk_draws.draw_step(jax.random.fold_in(key, 2), (*batch, PERIODS)))
 
     def begin(self, noise: ResetNoise, params: EnvParams) -> MissionState:
         """State at the start of an episode: standing where the task has its start."""
@@ -134,7 +135,7 @@ class MissionEnv(TunnelEnv):
             if params.policy is not None:
                 action = params.policy.act(self.walk.observe(walk, drawn, params.walk))
             walk, _, fall, _, info = self.walk.advance(walk, action, drawn, params.walk)
-            felt = walk.feeling
+            felt = walk.proprioception
             # About the vertical, whichever way the trunk leans.
             turning = -jnp.sum(felt.rates * felt.gravity)
             contact, fell = (flag.astype(jnp.float32) for flag in (info["contact"], fall))

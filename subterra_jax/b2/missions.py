@@ -6,17 +6,16 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
+from subterra_jax.b2 import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2 import policy as gaits
-from subterra_jax.b2.engine import MujocoPhysics
+from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
 from subterra_jax.b2.hierarchy import PERIODS, MissionEnv
-from subterra_jax.b2.ids import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2.mission import MissionParams
-from subterra_jax.b2.params import SensorParams, VarietyParams
+from subterra_jax.b2.params import RandomisationParams, SensorParams
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.policy import WalkPolicy
 from subterra_jax.b2.tasks import as_arrays
 from subterra_jax.b2.tasks import make as make_walk
-from subterra_jax.b2.world import SceneWalk
 from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.odometry import OdometryParams
@@ -77,7 +76,7 @@ def make(
     if odometer not in ("legs", "drift"):
         raise ValueError(f"odometer must be 'legs' or 'drift', got {odometer!r}")
     # Nobody pushes the robot on its way.
-    parts = {"variety": VarietyParams(push=0.0), "sensor": SensorParams(), **(walk or {})}
+    parts = {"randomisation": RandomisationParams(push=0.0), "sensor": SensorParams(), **(walk or {})}
     physics = MujocoPhysics() if engine == "mujoco" else Physics()
     walker, walking = make_walk(WALK, tunnel, lining, scene=scene, physics=physics, driven=True, **parts)
     if scene is not None:

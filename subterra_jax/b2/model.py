@@ -1,4 +1,4 @@
-"""The B2 as MJCF, written from its figures: position servos, primitives, and feet that touch the ground."""
+"""The B2 as MJCF, written from its constants: position servos, primitives, and feet that touch the ground."""
 
 import dataclasses
 import math
@@ -7,14 +7,14 @@ from pathlib import Path
 import mujoco
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import legs
+from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.errors import SubterraError
 
 _BOX, _SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 _CAPSULE, _CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
 _ROBOT = 2  # group of the geoms
 _SHELL, _LIMB = (0.30, 0.31, 0.33, 1.0), (0.16, 0.16, 0.17, 1.0)
-_MESHES = (".obj", ".stl")
+_MESH_ENDINGS = (".obj", ".stl")
 
 
 class RobotError(SubterraError):
@@ -23,14 +23,14 @@ class RobotError(SubterraError):
 
 @dataclasses.dataclass(frozen=True)
 class RobotConfig:
-    """What is left open by the figures.
+    """Settings of the robot's model.
 
     Attributes:
-        timestep: Of the physics, s.
-        foot_friction: Of the feet on anything, whatever that is made of. Rubber on concrete; the MJCFs say 0.4.
+        timestep: Time step of the physics, s.
+        foot_friction: Friction of the feet on any material. Rubber on concrete; the MJCFs say 0.4.
         meshes: Folder of the user's own meshes, for looks alone: `base_link.obj` (or `.stl`) and so on by body, in
             the bodies' frames, m. Bodies without one keep their primitives.
-        body_touches: Bits of what the trunk touches. Falls are seen by the trunk's height, not by contact.
+        body_touches: Contact bits of what the trunk touches. A fall is judged by the trunk's height, not by contact.
     """
 
     timestep: float = 0.004
@@ -40,29 +40,27 @@ class RobotConfig:
 
 
 def robot_spec(config: RobotConfig | None = None) -> mujoco.MjSpec:
-    """The robot alone, hung from a free joint with the trunk's middle at the origin.
+    """Builds the robot alone, on a free joint with the trunk's middle at the origin.
 
     Args:
-        config: What is left open by the figures.
+        config: Settings of the model; the defaults if left out.
 
     Raises:
-        RobotError: The folder of meshes has none of a body of the robot.
+        RobotError: The folder of meshes holds no mesh of the robot.
     """
     config = config or RobotConfig()
     spec = mujoco.MjSpec()
     spec.modelname = "b2"
     spec.compiler.degree = False
-    _options(spec, config.timestep)
+    _set_options(spec, config.timestep)
     trunk = spec.worldbody.add_body(name="base_link")
     trunk.add_freejoint(name="base")
-    _weigh(trunk, b2.TRUNK)
-    _dress_trunk(trunk, config.body_touches)
+    _set_inertia(trunk, b2.TRUNK)
+    _add_trunk_geoms(trunk, config.body_touches)
     for leg in b2.LEGS:
         _add_leg(spec, trunk, leg, config)
-    for name, kind in (
-        ("gyro", mujoco.mjtSensor.mjSENS_GYRO),
-        ("accelerometer", mujoco.mjtSensor.mjSENS_ACCELEROMETER),
-    ):
+    sensors = {"gyro": mujoco.mjtSensor.mjSENS_GYRO, "accelerometer": mujoco.mjtSensor.mjSENS_ACCELEROMETER}
+    for name, kind in sensors.items():
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
     if config.meshes is not None:
         _add_meshes(spec, config.meshes)
@@ -72,27 +70,29 @@ def robot_spec(config: RobotConfig | None = None) -> mujoco.MjSpec:
 def add_stand(spec: mujoco.MjSpec) -> None:
     """Adds the key frame `stand`: the default pose on a ground at z = 0, with the targets that hold it.
 
-    It is the last thing to be added: a key frame has the sizes of the model as it is then.
+    Call this last: a key frame has the sizes of the model at that moment.
     """
-    pose, hold = legs.standing()
+    pose, hold = standing_pose()
     spec.add_key(name="stand", qpos=[0.0, 0.0, b2.STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *pose.tolist()], ctrl=hold.tolist())
 
 
-def _options(spec: mujoco.MjSpec, timestep: float) -> None:
-    """One Newton iteration with a short line search, from the last step's solution: enough for feet alone."""
+def _set_options(spec: mujoco.MjSpec, timestep: float) -> None:
+    """Sets one Newton iteration with a short line search, warm-started: enough for contacts of the feet."""
     option = spec.option
     option.timestep, option.iterations, option.ls_iterations = timestep, 1, 5
     option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtCone.mjCONE_PYRAMIDAL
-    # The servos damp inside the torque limit; nothing is left that an implicit step would help.
+    # The servos damp within the torque limit: an implicit step would not help.
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
 
 
-def _weigh(body: mujoco.MjsBody, inertial: b2.Inertial) -> None:
+def _set_inertia(body: mujoco.MjsBody, inertial: b2.Inertial) -> None:
+    """Sets mass and inertia of a body."""
     body.mass, body.ipos, body.fullinertia = inertial.mass, inertial.com, inertial.inertia
     body.explicitinertial = True
 
 
 def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: RobotConfig) -> None:
+    """Adds the three bodies of a leg, and its foot."""
     side, end = (1.0 if leg[1] == "L" else -1.0), (1.0 if leg[0] == "F" else -1.0)
     offset = {
         "hip": (end * b2.HIP_X, side * b2.HIP_Y, 0.0),
@@ -102,9 +102,9 @@ def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: Robot
     body = trunk
     for part in b2.PARTS:
         body = body.add_body(name=f"{leg}_{part}", pos=offset[part])
-        _weigh(body, b2.inertial(leg, part))
+        _set_inertia(body, b2.inertial(leg, part))
         _add_joint(spec, body, leg, part)
-        _dress_limb(body, part, side)
+        _add_limb_geoms(body, part, side)
     body.add_site(name=f"{leg}_foot", pos=(0.0, 0.0, -b2.LINK), size=(0.01,) * 3, group=4)
     body.add_geom(
         name=f"{leg}_foot", type=_SPHERE, pos=(0.0, 0.0, -b2.LINK), size=(b2.FOOT_RADIUS, 0.0, 0.0), mass=0.0,
@@ -114,19 +114,20 @@ def _add_leg(spec: mujoco.MjSpec, trunk: mujoco.MjsBody, leg: str, config: Robot
 
 
 def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, leg: str, part: str) -> None:
-    figures, name = b2.JOINT[part], f"{leg}_{part}"
+    """Adds a hinge and its position servo."""
+    joint, name = b2.JOINT[part], f"{leg}_{part}"
     body.add_joint(
-        name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE, axis=figures.axis, range=(figures.low, figures.high),
-        limited=mujoco.mjtLimited.mjLIMITED_TRUE, armature=figures.armature,
+        name=f"{name}_joint", type=mujoco.mjtJoint.mjJNT_HINGE, axis=joint.axis, range=(joint.low, joint.high),
+        limited=mujoco.mjtLimited.mjLIMITED_TRUE, armature=joint.armature,
     )  # fmt: skip
     servo = spec.add_actuator(name=name, target=f"{name}_joint", trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    servo.set_to_position(kp=figures.stiffness, kv=figures.damping)
-    servo.forcerange, servo.forcelimited = (-figures.torque, figures.torque), mujoco.mjtLimited.mjLIMITED_TRUE
-    servo.ctrlrange, servo.ctrllimited = (figures.low, figures.high), mujoco.mjtLimited.mjLIMITED_TRUE
+    servo.set_to_position(kp=joint.stiffness, kv=joint.damping)
+    servo.forcerange, servo.forcelimited = (-joint.torque, joint.torque), mujoco.mjtLimited.mjLIMITED_TRUE
+    servo.ctrlrange, servo.ctrllimited = (joint.low, joint.high), mujoco.mjtLimited.mjLIMITED_TRUE
 
 
-def _dress_trunk(trunk: mujoco.MjsBody, touches: int) -> None:
-    """The URDF's collision primitives; only the trunk's box touches anything."""
+def _add_trunk_geoms(trunk: mujoco.MjsBody, touches: int) -> None:
+    """Adds the URDF's collision primitives; only the trunk's box touches anything."""
     look = {"mass": 0.0, "contype": 0, "group": _ROBOT}
     trunk.add_geom(name="trunk", type=_BOX, size=(0.25, 0.14, 0.075), conaffinity=touches, rgba=_SHELL, **look)
     for name, x, half in (("head", 0.41, 0.02), ("tail", -0.405, 0.0125)):
@@ -142,8 +143,8 @@ def _dress_trunk(trunk: mujoco.MjsBody, touches: int) -> None:
         trunk.add_site(name=name, pos=pos, size=(0.01,) * 3, group=4)
 
 
-def _dress_limb(body: mujoco.MjsBody, part: str, side: float) -> None:
-    """Capsules in place of the URDF's boxes, for looks alone."""
+def _add_limb_geoms(body: mujoco.MjsBody, part: str, side: float) -> None:
+    """Adds capsules in place of the URDF's boxes, for looks alone."""
     look = {"mass": 0.0, "contype": 0, "conaffinity": 0, "group": _ROBOT, "rgba": _LIMB}
     if part == "hip":
         quarter = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
@@ -157,19 +158,19 @@ def _dress_limb(body: mujoco.MjsBody, part: str, side: float) -> None:
 
 
 def _add_meshes(spec: mujoco.MjSpec, folder: Path) -> None:
-    """Draws the user's meshes in place of the primitives of the bodies that have one."""
-    found = 0
+    """Adds the user's meshes; bodies that have one hide their primitives."""
+    count = 0
     for body in spec.bodies[1:]:
-        files = [folder / f"{body.name}{ending}" for ending in _MESHES]
+        files = [folder / f"{body.name}{ending}" for ending in _MESH_ENDINGS]
         file = next((path for path in files if path.is_file()), None)
         if file is None:
             continue
-        found += 1
+        count += 1
         for geom in body.geoms:
             geom.rgba = (*geom.rgba[:3], 0.0)
         spec.add_mesh(name=body.name, file=str(file.resolve()), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_MESH, meshname=body.name, mass=0.0, contype=0, conaffinity=0, group=_ROBOT
         )
-    if not found:
+    if not count:
         raise RobotError(f"{folder}: no mesh of the robot; they are looked for as base_link.obj, FL_hip.stl and so on")

@@ -1,42 +1,148 @@
-"""What the policy sees of a robot, and what only a critic may know."""
+"""Observations of the walking task: proprioception with noise, the robot's pose on the track, and privileged truth."""
 
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.b2 import driver, payment
-from subterra_jax.b2.state import WalkState
+from subterra_jax.b2 import gait, kinematics
+from subterra_jax.b2.gait import GaitParams, GaitState
+from subterra_jax.b2.kinematics import inverse, rotate
+from subterra_jax.b2.params import Body, Proprioception, SensorParams, WalkState
 from subterra_jax.b2.track import SPACING, Track
 
-_PARTS = {
+_FOLLOW = 0.35  # share of a new reading in the smoothed speed
+_FIELDS = {
     "rates": 3, "gravity": 3, "velocity": 2, "asked": 3, "told": 3, "trim": 3, "clock": 3, "angles": 12,
     "speeds": 12, "action": 12,
 }  # fmt: skip
-_FURTHER = {"true_velocity": 3, "fall_speed": 1, "place": 4, "friction": 1, "mass": 1, "phase_of_track": 2}
+_PRIVILEGED = {"true_velocity": 3, "fall_speed": 1, "place": 4, "friction": 1, "mass": 1, "phase_of_track": 2}
 
 
-def sizes(privileged: bool) -> dict[str, int]:
-    """Numbers in each named part of an observation, in their order."""
-    return {**_PARTS, **(_FURTHER if privileged else {})}
+@struct.dataclass
+class TrackPose:
+    """Pose of the robot on the track.
+
+    Attributes:
+        ahead: Distance ahead of the anchor, m.
+        lateral: Offset to the left of the axis, m.
+        height: Height of the trunk's middle over the tops of the sleepers, m.
+        forward: Direction of the trunk's x axis: components along the track and to its left.
+    """
+
+    ahead: Float[Array, ""]
+    lateral: Float[Array, ""]
+    height: Float[Array, ""]
+    forward: Float[Array, "2"]
 
 
-def felt(state: WalkState) -> Float[Array, "56"]:
-    """What the robot feels, what it was told, where its gait is, and what it did last."""
-    turn, feeling = 2.0 * jnp.pi * state.gait.phase, state.feeling
+def locate(body: Body, quaternion: Float[Array, "4"]) -> TrackPose:
+    """Computes the pose of a robot on the track.
+
+    Args:
+        body: The robot, its position from the anchor.
+        quaternion: Rotation of the anchor.
+    """
+    to_track = inverse(quaternion)
+    ahead, lateral, height = rotate(to_track, body.qpos[:3])
+    forward = rotate(to_track, rotate(body.qpos[3:7], jnp.array([1.0, 0.0, 0.0])))
+    return TrackPose(ahead, lateral, height, forward[:2])
+
+
+def gravity_direction(body: Body) -> Float[Array, "3"]:
+    """Return the direction of gravity in the trunk's axes."""
+    return rotate(inverse(body.qpos[3:7]), jnp.array([0.0, 0.0, -1.0]))
+
+
+def true_velocity(body: Body) -> Float[Array, "3"]:
+    """Return the velocity forward and to the left, level (m/s), and the yaw rate about the trunk's z (rad/s)."""
+    gravity = gravity_direction(body)
+    velocity = rotate(inverse(body.qpos[3:7]), body.qvel[:3])
+    return jnp.concatenate([level_velocity(velocity, gravity), body.qvel[5:6]])
+
+
+def measure(
+    body: Body,
+    noise: Float[Array, "30"],
+    last_velocity: Float[Array, "2"],
+    gait_state: GaitState,
+    params: SensorParams,
+    gait_params: GaitParams,
+) -> Proprioception:
+    """Simulates the readings of the robot's own sensors, and estimates its velocity from them.
+
+    Args:
+        body: True state.
+        noise: Noise in [-1, 1) of rates, gravity, angles and speeds.
+        last_velocity: Smoothed velocity of the last readings, m/s.
+        gait_state: The gait, which says which feet should stand.
+        params: Size of the noise.
+        gait_params: Parameters of the gait.
+    """
+    rates = body.qvel[3:6] + params.rate * noise[:3]
+    gravity = gravity_direction(body) + params.gravity * noise[3:6]
+    angles = body.qpos[7:] + params.angle * noise[6:18]
+    speeds = body.qvel[6:] + params.speed * noise[18:]
+    velocity = leg_velocity(rates, gravity, angles, speeds, gait.stance(gait_state, gait_params))
+    return Proprioception(rates, gravity, angles, speeds, last_velocity + _FOLLOW * (velocity - last_velocity))
+
+
+def leg_velocity(
+    rates: Float[Array, "3"],
+    gravity: Float[Array, "3"],
+    angles: Float[Array, "12"],
+    speeds: Float[Array, "12"],
+    standing: Float[Array, "4"],
+) -> Float[Array, "2"]:
+    """Estimates the level velocity of the trunk, forward and to the left, m/s; exact if standing feet do not slip."""
+    feet = kinematics.HIPS + kinematics.foot_positions(angles.reshape(4, 3))
+    motion = kinematics.foot_velocities(angles.reshape(4, 3), speeds.reshape(4, 3))
+    spin_x = rates[1] * feet[:, 2] - rates[2] * feet[:, 1]
+    spin_y = rates[2] * feet[:, 0] - rates[0] * feet[:, 2]
+    spin_z = rates[0] * feet[:, 1] - rates[1] * feet[:, 0]
+    share = standing / jnp.maximum(jnp.sum(standing), 1e-3)
+    x, y, z = (-jnp.sum(share * (motion[:, i] + spin)) for i, spin in enumerate((spin_x, spin_y, spin_z)))
+    return level_velocity(jnp.stack([x, y, z]), gravity)
+
+
+def level_velocity(velocity: Float[Array, "3"], gravity: Float[Array, "3"]) -> Float[Array, "2"]:
+    """Projects a velocity in the trunk's axes onto the level directions nearest to its forward and left, m/s."""
+    size = jnp.sqrt(jnp.maximum(gravity[0] * gravity[0] + gravity[2] * gravity[2], 1e-6))
+    # Forward, made perpendicular to gravity by turning about the trunk's y; then left, which is up × forward.
+    forward = jnp.stack([-gravity[2], 0.0, gravity[0]]) / size
+    up = -gravity
+    left = jnp.stack(
+        [
+            up[1] * forward[2] - up[2] * forward[1],
+            up[2] * forward[0] - up[0] * forward[2],
+            up[0] * forward[1] - up[1] * forward[0],
+        ]
+    )
+    return jnp.stack([jnp.sum(velocity * forward), jnp.sum(velocity * left)])
+
+
+def field_sizes(privileged: bool) -> dict[str, int]:
+    """Return the size of each named part of an observation, in order."""
+    return {**_FIELDS, **(_PRIVILEGED if privileged else {})}
+
+
+def observe_self(state: WalkState) -> Float[Array, "56"]:
+    """Return the observation of the policy: proprioception, command, state of the gait, and last action."""
+    turn, sensors = 2.0 * jnp.pi * state.gait.phase, state.proprioception
     clock = jnp.stack([jnp.cos(turn), jnp.sin(turn), state.gait.stride])
     return jnp.concatenate(
         [
-            feeling.rates, feeling.gravity, feeling.velocity, state.command, state.gait.velocity, state.gait.trim,
-            clock, feeling.angles, feeling.speeds, state.action,
+            sensors.rates, sensors.gravity, sensors.velocity, state.command, state.gait.velocity, state.gait.trim,
+            clock, sensors.angles, sensors.speeds, state.action,
         ]
     )  # fmt: skip
 
 
-def truth(state: WalkState, track: Track) -> Float[Array, "12"]:
-    """True velocity, speed of falling, place on the track, friction, mass, and where among the sleepers."""
+def observe_truth(state: WalkState, track: Track) -> Float[Array, "12"]:
+    """Return the privileged truth: velocity, speed of falling, pose, friction, mass, and phase between sleepers."""
     body, build = state.body, state.build
-    place = driver.locate(body, track.quaternion[state.anchor])
-    turn = 2.0 * jnp.pi * place.ahead / SPACING
-    own = jnp.stack([place.lateral, place.height, place.forward[0], place.forward[1]])
-    between = jnp.stack([jnp.cos(turn), jnp.sin(turn)])
-    single = jnp.stack([build.friction, build.mass])
-    return jnp.concatenate([payment.true_velocity(body), body.qvel[2:3], own, single, between])
+    pose = locate(body, track.quaternion[state.anchor])
+    turn = 2.0 * jnp.pi * pose.ahead / SPACING
+    on_track = jnp.stack([pose.lateral, pose.height, pose.forward[0], pose.forward[1]])
+    phase = jnp.stack([jnp.cos(turn), jnp.sin(turn)])
+    properties = jnp.stack([build.friction, build.mass])
+    return jnp.concatenate([true_velocity(body), body.qvel[2:3], on_track, properties, phase])

@@ -1,13 +1,9 @@
-"""What describes the walking task."""
+"""Params, state and random numbers of the walking task."""
 
 from flax import struct
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
-from subterra_jax.b2.gait import GaitParams
-from subterra_jax.b2.state import Feeling as Feeling
-from subterra_jax.b2.state import WalkResetNoise as WalkResetNoise
-from subterra_jax.b2.state import WalkState as WalkState
-from subterra_jax.b2.state import WalkStepNoise as WalkStepNoise
+from subterra_jax.b2.gait import GaitParams, GaitState
 from subterra_jax.b2.track import Track
 from subterra_jax.tunnel import Tunnel
 
@@ -16,14 +12,14 @@ Range = Array | tuple[float, float]
 
 @struct.dataclass
 class CommandParams:
-    """The driver in training: draws velocities and keeps the robot between the rails.
+    """The velocity commands of training, which keep the robot between the rails.
 
     Attributes:
         low: Least velocity forward and to the left (m/s), and yaw rate (rad/s).
-        high: Largest.
+        high: Largest velocity and yaw rate.
         hold: Mean time for which a command is held, s; holding times are exponential.
         still: Share of commands that ask to stand.
-        corridor: How far from the axis the driver lets the robot stray, m.
+        corridor: Largest distance from the axis that commands allow, m.
     """
 
     low: Array | tuple[float, float, float] = (-0.4, -0.3, -0.8)
@@ -34,14 +30,14 @@ class CommandParams:
 
 
 @struct.dataclass
-class VarietyParams:
-    """How robots differ from one another, and what happens to them. Uniform draws.
+class RandomisationParams:
+    """Domain randomisation: uniform draws of the robot's properties, and random pushes.
 
     Attributes:
-        friction: Of the feet.
-        mass: Factor on all masses; down to the data sheet's 60 kg.
-        shift: Of the trunk's centre of mass to either side, m.
-        gain: Factor on each servo's stiffness and damping.
+        friction: Range of the feet's friction.
+        mass: Range of the factor on all masses; down to the data sheet's 60 kg.
+        shift: Largest shift of the trunk's centre of mass to either side, m.
+        gain: Range of the factor on each servo's stiffness and damping.
         push: Largest change of velocity by a push, forward and sideways each, m/s.
         push_every: Mean time between pushes, s.
     """
@@ -56,13 +52,13 @@ class VarietyParams:
 
 @struct.dataclass
 class SensorParams:
-    """Uniform noise to either side of what the robot feels of itself.
+    """Largest noise of the proprioceptive sensors, uniform to either side.
 
     Attributes:
-        rate: Of the gyroscope, rad/s.
-        gravity: Of each component of gravity's direction.
-        angle: Of a joint, rad.
-        speed: Of a joint, rad/s.
+        rate: Noise of the gyroscope, rad/s.
+        gravity: Noise of each component of gravity's direction.
+        angle: Noise of a joint's angle, rad.
+        speed: Noise of a joint's speed, rad/s.
     """
 
     rate: float = 0.2
@@ -73,21 +69,21 @@ class SensorParams:
 
 @struct.dataclass
 class WalkRewardParams:
-    """Weights of the reward's terms; each is paid per second, but for the fall, which is paid once.
+    """Weights of the reward terms; each counts per second, except the fall, which counts once.
 
     Attributes:
-        velocity: exp(-error²/width²) of the velocity in plan.
-        yaw_rate: The same of the yaw rate.
-        width: m/s and rad/s.
-        alive: For not having fallen.
-        bounce: Square of the trunk's vertical velocity, m²/s².
-        roll: Square of its rates of roll and pitch, rad²/s².
-        tilt: Square of the sine of its tilt.
-        effort: Sum of the squares of all torques, N² m².
-        jerk: Sum of the squares of the changes of the action from step to step.
-        action: Sum of the squares of the action.
-        slip: Sum of the squares of the speeds in plan of feet that are meant to stand, m²/s².
-        fall: Once.
+        velocity: Weight of exp(-error²/width²) of the velocity in plan.
+        yaw_rate: Weight of exp(-error²/width²) of the yaw rate.
+        width: Error at which these two have fallen to 1/e, m/s and rad/s.
+        alive: Reward for not having fallen.
+        bounce: Weight of the square of the trunk's vertical velocity, m²/s².
+        roll: Weight of the squares of its rates of roll and pitch, rad²/s².
+        tilt: Weight of the square of the sine of its tilt.
+        effort: Weight of the sum of the squares of all torques, N² m².
+        jerk: Weight of the sum of the squares of the action's changes from step to step.
+        action: Weight of the sum of the squares of the action.
+        slip: Weight of the sum of the squares of the speeds in plan of feet that should stand, m²/s².
+        fall: Reward of a fall, once.
     """
 
     velocity: float = 2.0
@@ -106,30 +102,161 @@ class WalkRewardParams:
 
 @struct.dataclass
 class WalkParams:
-    """Everything about the task that is data.
+    """All data of the walking task.
 
     Attributes:
         tunnel: The tunnel.
         track: Its track.
         gait: The trot to which the action is added.
-        command: The driver.
-        variety: How robots differ.
-        sensor: What they feel.
-        reward: Weights.
+        command: The velocity commands.
+        randomisation: The domain randomisation.
+        sensor: Noise of proprioception.
+        reward: Weights of the reward terms.
         action_scale: Joint offset of an action of 1: hip, thigh, calf, rad.
         horizon: Steps after which an episode is truncated.
-        fall_height: A trunk lower than this over the sleepers has fallen, m.
-        fall_tilt: A trunk tilted by more has fallen, rad.
+        fall_height: Height of the trunk over the sleepers below which it has fallen, m.
+        fall_tilt: Tilt of the trunk beyond which it has fallen, rad.
     """
 
     tunnel: Tunnel
     track: Track
     gait: GaitParams
     command: CommandParams
-    variety: VarietyParams
+    randomisation: RandomisationParams
     sensor: SensorParams
     reward: WalkRewardParams
     action_scale: Array | tuple[float, float, float] = (0.2, 0.3, 0.3)
     horizon: int = 1000
     fall_height: float = 0.25
     fall_tilt: float = 1.0
+
+
+@struct.dataclass
+class Body:
+    """State of the physics; positions from the anchor.
+
+    Attributes:
+        qpos: Trunk's position (m) and quaternion, joint angles (rad).
+        qvel: Trunk's velocity (m/s, world axes) and rates (rad/s, its own axes), joint speeds (rad/s).
+        warmstart: Accelerations of the last step, from which the solver starts.
+    """
+
+    qpos: Float[Array, "19"]
+    qvel: Float[Array, "18"]
+    warmstart: Float[Array, "18"]
+
+
+@struct.dataclass
+class Build:
+    """Properties of one robot, as drawn by domain randomisation.
+
+    Attributes:
+        friction: Friction of the feet.
+        mass: Factor on every mass and inertia.
+        shift: Shift of the trunk's centre of mass, m.
+        stiffness: Factor on each servo's stiffness.
+        damping: Factor on each servo's damping.
+    """
+
+    friction: Float[Array, ""]
+    mass: Float[Array, ""]
+    shift: Float[Array, "3"]
+    stiffness: Float[Array, "12"]
+    damping: Float[Array, "12"]
+
+
+@struct.dataclass
+class Surroundings:
+    """Ground and walls that the robot may touch in one control period, from the anchor.
+
+    Attributes:
+        ground: Positions and quaternions of the window's mocap bodies.
+        quaternion: Rotation of the anchor: x along the track.
+        half_width: Half the distance between the walls, m.
+    """
+
+    ground: tuple[Float[Array, "n_mocap 3"], Float[Array, "n_mocap 4"]]
+    quaternion: Float[Array, "4"]
+    half_width: Float[Array, ""]
+
+
+@struct.dataclass
+class Proprioception:
+    """Readings of the robot's own sensors, with noise.
+
+    Attributes:
+        rates: Rates of the trunk in its own axes, rad/s.
+        gravity: Direction of gravity in the trunk's axes.
+        angles: Joint angles, rad.
+        speeds: Joint speeds, rad/s.
+        velocity: Smoothed velocity of the trunk from its standing legs, forward and to the left, m/s.
+    """
+
+    rates: Float[Array, "3"]
+    gravity: Float[Array, "3"]
+    angles: Float[Array, "12"]
+    speeds: Float[Array, "12"]
+    velocity: Float[Array, "2"]
+
+
+@struct.dataclass
+class WalkState:
+    """State of one robot. Positions are from the anchor, which keeps them small.
+
+    Attributes:
+        body: State of the physics.
+        anchor: Index of the sleeper nearest to the robot.
+        gait: State of the gait.
+        command: Commanded velocity forward and to the left (m/s), and yaw rate (rad/s).
+        drawn_command: Command as drawn, before it is changed to keep the robot between the rails.
+        facing: 1 towards growing station, -1 the other way.
+        action: Last action.
+        proprioception: Last readings of its own sensors.
+        build: Properties of this robot.
+        furthest: Largest station so far, m.
+        steps: Control periods in this episode.
+    """
+
+    body: Body
+    anchor: Int[Array, ""]
+    gait: GaitState
+    command: Float[Array, "3"]
+    drawn_command: Float[Array, "3"]
+    facing: Float[Array, ""]
+    action: Float[Array, "12"]
+    proprioception: Proprioception
+    build: Build
+    furthest: Float[Array, ""]
+    steps: Int[Array, ""]
+
+
+@struct.dataclass
+class WalkResetNoise:
+    """Random numbers of one reset: uniform in [-1, 1).
+
+    Attributes:
+        place: For station, lateral offset, heading, direction faced, clock of the gait.
+        build: For friction, mass, shift (3), stiffness (12), damping (12).
+        command: For the first command (3), and for standing.
+        sensor: Sensor noise, as in a step.
+    """
+
+    place: Float[Array, "*batch 5"]
+    build: Float[Array, "*batch 29"]
+    command: Float[Array, "*batch 4"]
+    sensor: Float[Array, "*batch 30"]
+
+
+@struct.dataclass
+class WalkStepNoise:
+    """Random numbers of one step: uniform in [-1, 1).
+
+    Attributes:
+        sensor: Noise of rates, gravity, angles and speeds.
+        command: For a new command (3), for standing, and for its arrival.
+        push: For a push (2), and for its arrival.
+    """
+
+    sensor: Float[Array, "*batch 30"]
+    command: Float[Array, "*batch 5"]
+    push: Float[Array, "*batch 3"]

@@ -9,71 +9,22 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 from jax import lax
 from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import rotation
+from subterra_jax.b2.kinematics import inverse, rotate
 from subterra_jax.b2.model import RobotConfig, add_stand, robot_spec
-from subterra_jax.b2.window import WindowConfig, add_window
+from subterra_jax.b2.params import Body, Build, Surroundings
+from subterra_jax.b2.track import WindowConfig, add_window
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx
 
-# The walls' stop: a stiff spring with damper at either end of the trunk.
+# The walls: a stiff spring with damper at either end of the trunk.
 WALL_STIFFNESS, WALL_DAMPING = 2e4, 2e3  # N/m, N s/m
 _BUMPER_X, BUMPER_RADIUS = 0.33, 0.225  # of two discs that make up the robot's envelope in plan, m
 BUMPERS = ((_BUMPER_X, 0.0, 0.0), (-_BUMPER_X, 0.0, 0.0))
-
-
-@struct.dataclass
-class Body:
-    """What physics carries from one step to the next; positions from the anchor.
-
-    Attributes:
-        qpos: Trunk's position (m) and quaternion, joint angles (rad).
-        qvel: Trunk's velocity (m/s, world axes) and rates (rad/s, its own axes), joint speeds (rad/s).
-        warmstart: Accelerations of the last step, from which the solver starts.
-    """
-
-    qpos: Float[Array, "19"]
-    qvel: Float[Array, "18"]
-    warmstart: Float[Array, "18"]
-
-
-@struct.dataclass
-class Build:
-    """How one robot differs from its figures.
-
-    Attributes:
-        friction: Of the feet.
-        mass: Factor on every mass and inertia.
-        shift: Of the trunk's centre of mass, m.
-        stiffness: Factor on each servo's stiffness.
-        damping: Factor on each servo's damping.
-    """
-
-    friction: Float[Array, ""]
-    mass: Float[Array, ""]
-    shift: Float[Array, "3"]
-    stiffness: Float[Array, "12"]
-    damping: Float[Array, "12"]
-
-
-@struct.dataclass
-class Surroundings:
-    """What the robot may touch during one control period, from the anchor.
-
-    Attributes:
-        ground: Positions and quaternions of the window's mocap bodies.
-        quaternion: Of the anchor: x along the track.
-        half_width: Half the distance between the walls, m.
-    """
-
-    ground: tuple[Float[Array, "n_mocap 3"], Float[Array, "n_mocap 4"]]
-    quaternion: Float[Array, "4"]
-    half_width: Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,11 +32,11 @@ class Physics:
     """The compiled robot. It is compared by identity, so that bound methods can be jitted.
 
     Attributes:
-        robot: What is left open by the figures.
-        window: What of the track is there to be touched.
+        robot: Settings of the robot's model.
+        window: The part of the track that can be touched.
         substeps: Steps of physics in a control period.
-        iterations: Of the solver, each step.
-        ls_iterations: Of its line search.
+        iterations: Iterations of the solver in each step.
+        ls_iterations: Iterations of its line search.
     """
 
     robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
@@ -100,7 +51,7 @@ class Physics:
         return self.substeps * self.robot.timestep
 
     def spec(self) -> mujoco.MjSpec:
-        """The robot on its window of track, as MJCF."""
+        """Return the MJCF of the robot on its window of track."""
         spec = robot_spec(self.robot)
         add_window(spec, self.window)
         spec.option.iterations, spec.option.ls_iterations = self.iterations, self.ls_iterations
@@ -120,7 +71,7 @@ class Physics:
 
     @cached_property
     def blank(self) -> mjx.Data:
-        """Data of the right shapes."""
+        """Empty data of the model."""
         with jax.ensure_compile_time_eval():
             return mjx.make_data(self.host, impl="jax")
 
@@ -132,8 +83,8 @@ class Physics:
     def _trunk(self) -> int:
         return int(self.host.body("base_link").id)
 
-    def built(self, build: Build) -> mjx.Model:
-        """The model of one robot."""
+    def model_of(self, build: Build) -> mjx.Model:
+        """Return the model of one robot."""
         model = self.model
         base = model.body_ipos[self._trunk]
         gain = model.actuator_gainprm.at[:, 0].multiply(build.stiffness)
@@ -148,15 +99,15 @@ class Physics:
         )
 
     def run(self, body: Body, targets: Float[Array, "12"], around: Surroundings, build: Build) -> Body:
-        """One control period.
+        """Advances the robot by one control period.
 
         Args:
-            body: Before.
-            targets: Of the servos, rad; they clip them to the joints' ranges.
-            around: What can be touched.
-            build: The robot.
+            body: State before the period.
+            targets: Targets of the servos, rad; the servos clip them to the joints' ranges.
+            around: Ground and walls.
+            build: Properties of the robot.
         """
-        model = self.built(build)
+        model = self.model_of(build)
         positions, quaternions = around.ground
         data = self.blank.replace(ctrl=targets, mocap_pos=positions, mocap_quat=quaternions)
 
@@ -174,25 +125,27 @@ class Physics:
 
 
 def wall_wrench(body: Body, around: Surroundings) -> Float[Array, "6"]:
-    """Force (N) and torque (N m, about the trunk's centre of mass) with which the smooth walls hold the robot.
+    """Computes the force (N) and torque (N m, about the trunk's centre of mass) of the smooth walls on the robot.
 
-    None away from them; they act on two discs, one at either end of the trunk, which together are the robot's envelope.
+    They act on two discs, one at either end of the trunk, which together are the robot's envelope. Both are zero
+    where no wall is touched.
     """
     force_sum, torque_sum = jnp.zeros(3), jnp.zeros(3)
-    back = rotation.inverse(around.quaternion)
-    left = rotation.rotate(around.quaternion, jnp.array([0.0, 1.0, 0.0]))
-    spin = rotation.rotate(body.qpos[3:7], body.qvel[3:6])
-    for place in BUMPERS:
-        arm = rotation.rotate(body.qpos[3:7], jnp.array(place))
-        lateral = rotation.rotate(back, body.qpos[:3] + arm)[1]
-        speed = rotation.rotate(back, body.qvel[:3] + _cross(spin, arm))[1]
-        deep = jnp.abs(lateral) + BUMPER_RADIUS - around.half_width
+    back = inverse(around.quaternion)
+    left = rotate(around.quaternion, jnp.array([0.0, 1.0, 0.0]))
+    spin = rotate(body.qpos[3:7], body.qvel[3:6])
+    for bumper in BUMPERS:
+        arm = rotate(body.qpos[3:7], jnp.array(bumper))
+        lateral = rotate(back, body.qpos[:3] + arm)[1]
+        speed = rotate(back, body.qvel[:3] + _cross(spin, arm))[1]
+        depth = jnp.abs(lateral) + BUMPER_RADIUS - around.half_width
         outward = jnp.sign(lateral)
-        push = jnp.clip(WALL_STIFFNESS * deep + WALL_DAMPING * outward * speed, 0.0, 1e4)
-        force = -outward * jnp.where(deep > 0.0, push, 0.0) * left
+        push = jnp.clip(WALL_STIFFNESS * depth + WALL_DAMPING * outward * speed, 0.0, 1e4)
+        force = -outward * jnp.where(depth > 0.0, push, 0.0) * left
         force_sum, torque_sum = force_sum + force, torque_sum + _cross(arm, force)
     return jnp.concatenate([force_sum, torque_sum])
 
 
 def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Cross product, written out."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -1,4 +1,4 @@
-"""A trained gait: a perceptron from what the robot feels to the offsets that are added to the trot."""
+"""A trained gait: a perceptron from proprioception to the joint offsets that are added to the trot."""
 
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ class WalkPolicy:
 
     Attributes:
         tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `policy.hidden_<i>`.
-        name: For people.
+        name: Name shown to people.
     """
 
     tensors: Tensors
@@ -29,31 +29,31 @@ class WalkPolicy:
 
     @property
     def n_observation(self) -> int:
-        """Numbers in one observation."""
+        """Size of one observation."""
         return self.tensors["statistics.mean"].shape[0]
 
     def act(self, observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
-        """The action, in [-1, 1]."""
-        seen = (observation - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
-        parameters = perceptron(self.tensors, "policy", jnp.clip(seen, -_CLIP, _CLIP), jax.nn.swish)
+        """Return the action, in [-1, 1]."""
+        scaled = (observation - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
+        parameters = perceptron(self.tensors, "policy", jnp.clip(scaled, -_CLIP, _CLIP), jax.nn.swish)
         return jnp.tanh(parameters[..., : parameters.shape[-1] // 2])
 
 
 def load(source: str | Path = RELEASED) -> tuple[WalkPolicy, dict[str, Any]]:
-    """A gait and its facts.
+    """Loads a gait and its facts.
 
     Args:
         source: A `.safetensors` file with its `.json` beside it, or the name of a released policy.
 
     Raises:
-        PolicyError: It is missing, damaged, or no gait.
+        PolicyError: The file is missing or damaged, or holds no gait.
     """
     file = read(source)
-    return of_file(file), file.facts
+    return make_policy(file), file.facts
 
 
-def of_file(file: PolicyFile) -> WalkPolicy:
-    """A gait from its file; raises `PolicyError` where it is none, or tensors are missing or misshapen."""
+def make_policy(file: PolicyFile) -> WalkPolicy:
+    """Makes a gait from its file; raises `PolicyError` for another kind of policy, or tensors that do not fit."""
     if file.facts["kind"] != GAIT:
         raise PolicyError(f"{file.path}: a policy of kind {file.facts['kind']!r}, which is no gait")
     try:
@@ -70,6 +70,6 @@ def check_fits(policy: WalkPolicy, size: int, source: str | Path) -> None:
         raise PolicyError(f"{source}: made for observations of {policy.n_observation} numbers, the B2 gives {size}")
 
 
-def still(observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
-    """The action that leaves the trot as it is."""
+def zero_action(observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
+    """Return the action that leaves the trot unchanged."""
     return jnp.zeros((*observation.shape[:-1], 12))

@@ -5,12 +5,11 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from subterra_jax.b2 import begin, legs, rotation
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.feel import feel
+from subterra_jax.b2 import draws, observation
+from subterra_jax.b2.kinematics import compose, rotate, standing_pose, yaw_quaternion
 from subterra_jax.b2.mission import MissionParams
-from subterra_jax.b2.params import WalkParams, WalkResetNoise, WalkState
-from subterra_jax.b2.physics import Body
+from subterra_jax.b2.params import Body, WalkParams, WalkResetNoise, WalkState
 from subterra_jax.state import State
 from subterra_jax.vehicle import wrap
 
@@ -27,19 +26,19 @@ def stand(plane: State, noise: WalkResetNoise, params: MissionParams) -> WalkSta
     anchor = jnp.argmin(jnp.abs(track.station - plane.station)).astype(jnp.int32)
     turned = track.quaternion[anchor]
     ahead = plane.station - track.station[anchor]
-    place = rotation.rotate(turned, jnp.stack([ahead, plane.lateral, jnp.float32(b2.STAND_HEIGHT)]))
-    facing = rotation.times(turned, rotation.yaw_only(wrap(plane.heading - yaw(turned))))
-    pose, _ = legs.standing()
+    place = rotate(turned, jnp.stack([ahead, plane.lateral, jnp.float32(b2.STAND_HEIGHT)]))
+    facing = compose(turned, yaw_quaternion(wrap(plane.heading - yaw(turned))))
+    pose, _ = standing_pose()
     body = Body(jnp.concatenate([place, facing, pose]), jnp.zeros(18), jnp.zeros(18))
-    drawn = begin.begin(noise, walk)
+    drawn = draws.begin(noise, walk)
     return dataclasses.replace(
         drawn,
         body=body,
         anchor=anchor,
         command=jnp.zeros(3),
-        wish=jnp.zeros(3),
+        drawn_command=jnp.zeros(3),
         facing=jnp.ones(()),
-        feeling=feel(body, noise.sensor, jnp.zeros(2), drawn.gait, walk.sensor, walk.gait),
+        proprioception=observation.measure(body, noise.sensor, jnp.zeros(2), drawn.gait, walk.sensor, walk.gait),
         furthest=plane.station,
     )
 
@@ -52,5 +51,5 @@ def seen_from_above(walk: WalkState, params: WalkParams) -> tuple[Float[Array, "
 
 def yaw(quaternion: Float[Array, "4"]) -> Float[Array, ""]:
     """Direction of the turned x axis, seen from above, rad."""
-    x, y, _ = rotation.rotate(quaternion, jnp.array([1.0, 0.0, 0.0]))
+    x, y, _ = rotate(quaternion, jnp.array([1.0, 0.0, 0.0]))
     return jnp.arctan2(y, x)

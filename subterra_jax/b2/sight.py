@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import rotation
+from subterra_jax.b2.kinematics import rotate
 from subterra_jax.b2.params import WalkParams, WalkState
 from subterra_jax.lidar import LidarParams, cast
 from subterra_jax.lidar3d import beams, casting
@@ -32,13 +32,13 @@ def scan(
     """
     quaternion = walk.body.qpos[3:7]
     # From the anchor: in the tunnel frame float32 would round to a tenth of a millimetre a kilometre away.
-    mount = walk.body.qpos[:3] + rotation.rotate(quaternion, jnp.array(b2.LIDAR))
+    mount = walk.body.qpos[:3] + rotate(quaternion, jnp.array(b2.LIDAR))
     origin = params.track.position[walk.anchor] + mount
     directions = jnp.asarray(beams.planar(sensor.n_beams), jnp.float32)
     if relief is not None:
         return casting.scan(relief, origin, quaternion, station, directions, sensor.range_max)
     directions = casting.rotate(quaternion, directions)
-    up = rotation.rotate(params.track.quaternion[walk.anchor], jnp.array([0.0, 0.0, 1.0]))
+    up = rotate(params.track.quaternion[walk.anchor], jnp.array([0.0, 0.0, 1.0]))
     height = jnp.sum(mount * up) + params.track.protrusion
     nearest = jnp.minimum(_walls(origin, directions, station, params), _ground(height, up, directions))
     return jnp.minimum(nearest, sensor.range_max)

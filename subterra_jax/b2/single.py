@@ -15,8 +15,7 @@ if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.ge
 
 from subterra_jax.adapters import spaces
 from subterra_jax.adapters.streams import start_streams, take_key
-from subterra_jax.b2.params import WalkParams, WalkState
-from subterra_jax.b2.physics import Surroundings
+from subterra_jax.b2.params import Surroundings, WalkParams, WalkState
 from subterra_jax.b2.view import Camera
 from subterra_jax.b2.walk import WalkEnv
 

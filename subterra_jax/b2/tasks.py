@@ -8,19 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from subterra_jax.b2 import WALK
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.gait import GaitParams
-from subterra_jax.b2.ids import WALK
 from subterra_jax.b2.model import RobotError
-from subterra_jax.b2.params import CommandParams, SensorParams, VarietyParams, WalkParams, WalkRewardParams
+from subterra_jax.b2.params import CommandParams, RandomisationParams, SensorParams, WalkParams, WalkRewardParams
 from subterra_jax.b2.physics import Physics
-from subterra_jax.b2.track import Track, by_standard, from_scene
+from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
 
-_ROOM = 0.1  # to either side of the robot's envelope, m
+_MARGIN = 0.1  # to either side of the robot's envelope, m
 
 
 def make(
@@ -34,7 +34,7 @@ def make(
     privileged: bool = False,
     **overrides: Any,
 ) -> tuple[WalkEnv, WalkParams]:
-    """Make the walking environment and its params.
+    """Makes the walking environment and its params.
 
     Args:
         id: `Subterra/B2Walk-v0`.
@@ -57,15 +57,15 @@ def make(
         raise ValueError(f"no walking task {id!r}; there is {WALK}")
     if scene is not None and tunnel is not None:
         raise ValueError(f"either a tunnel or a scene, got both {str(tunnel)!r} and {str(scene)!r}")
-    plan, track = _place(tunnel, scene)
-    check_room(plan)
+    plan, track = _load_track(tunnel, scene)
+    check_width(plan)
     known = {field.name for field in dataclasses.fields(WalkParams)} - {"tunnel", "track"}
     if unknown := set(overrides) - known:
         raise ValueError(f"no field {sorted(unknown)} in WalkParams; there are {sorted(known)}")
     fields = {
         "gait": GaitParams(),
         "command": CommandParams(),
-        "variety": VarietyParams(),
+        "randomisation": RandomisationParams(),
         "sensor": SensorParams(),
         "reward": WalkRewardParams(),
         **overrides,
@@ -76,7 +76,7 @@ def make(
 
 
 def as_arrays(params: Any) -> Any:
-    """Params whose every leaf is a 32-bit array; tuples of numbers become one array."""
+    """Turns every leaf of params into a 32-bit array; a tuple of numbers becomes one array."""
 
     def array(leaf: Any) -> jax.Array:
         leaf = jnp.asarray(leaf)
@@ -85,9 +85,9 @@ def as_arrays(params: Any) -> Any:
     return jax.tree.map(array, params, is_leaf=lambda leaf: isinstance(leaf, tuple))
 
 
-def check_room(plan: TunnelPlan) -> None:
+def check_width(plan: TunnelPlan) -> None:
     """Raises `RobotError` where a tunnel is narrower than the robot with 0.1 m to either side."""
-    needed, narrowest = b2.ENVELOPE[1] + 2.0 * _ROOM, int(np.argmin(plan.half_width))
+    needed, narrowest = b2.ENVELOPE[1] + 2.0 * _MARGIN, int(np.argmin(plan.half_width))
     if (width := 2.0 * float(plan.half_width[narrowest])) < needed:
         raise RobotError(
             f"tunnel {plan.name!r} is {width:.2f} m wide at {plan.station[narrowest]:.1f} m; "
@@ -95,9 +95,10 @@ def check_room(plan: TunnelPlan) -> None:
         )
 
 
-def _place(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> tuple[TunnelPlan, Track]:
+def _load_track(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> tuple[TunnelPlan, Track]:
+    """Tunnel and track of a scene, or of a tunnel with standard sleepers."""
     if scene is not None:
         plan = load_tunnel(Path(scene) / "tunnel.npz")
-        return plan, from_scene(Path(scene), plan)
+        return plan, read_scene_track(Path(scene), plan)
     plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
-    return plan, by_standard(plan)
+    return plan, lay_standard_track(plan)

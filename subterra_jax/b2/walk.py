@@ -1,4 +1,4 @@
-"""The environment in which the B2 learns to walk on a track: reset and step, with the contract of every other task."""
+"""The environment in which the B2 learns to walk on a track: reset, step, servos and reward terms."""
 
 import dataclasses
 
@@ -7,33 +7,45 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.b2 import begin, driver, observation, payment, servos, window
-from subterra_jax.b2.feel import feel, gravity_seen
-from subterra_jax.b2.params import WalkParams, WalkResetNoise, WalkState, WalkStepNoise
-from subterra_jax.b2.physics import BUMPER_RADIUS, BUMPERS, Body, Physics, Surroundings
-from subterra_jax.b2.rotation import rotate
+from subterra_jax.b2 import constants as b2
+from subterra_jax.b2 import draws, gait, kinematics, observation, track
+from subterra_jax.b2.observation import gravity_direction, locate, true_velocity
+from subterra_jax.b2.params import (
+    Body,
+    Build,
+    Surroundings,
+    WalkParams,
+    WalkResetNoise,
+    WalkState,
+    WalkStepNoise,
+)
+from subterra_jax.b2.physics import BUMPER_RADIUS, BUMPERS, Physics
 from subterra_jax.env import Box, Info
 from subterra_jax.tunnel import at_station
 from subterra_jax.vehicle import clearance
 
 N_ACTION = 12
+_STIFFNESS = np.tile(np.array([b2.JOINT[part].stiffness for part in b2.PARTS], np.float32), 4)
+_DAMPING = np.tile(np.array([b2.JOINT[part].damping for part in b2.PARTS], np.float32), 4)
+_TORQUE = np.tile(np.array([b2.JOINT[part].torque for part in b2.PARTS], np.float32), 4)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WalkEnv:
-    """A Unitree B2 on the track of a tunnel, told how fast to walk.
+    """A Unitree B2 on the track of a tunnel that follows velocity commands.
 
-    The action is twelve joint offsets in [-1, 1], in the order of `constants.JOINTS`, scaled by `params.action_scale`
-    and added to the targets of a trot that follows the command: the zero action walks, and stands where that is 0.
-    The observation is what the robot feels of itself: rates, gravity, the speed its legs tell, the command and what of
-    it is being obeyed, the clock of the gait, joints, last action; `fields` names the parts. An episode is terminated
-    by a fall and truncated at the horizon or at an end of the tunnel. Walls stop the robot and are told as contact.
+    The action is twelve joint offsets in [-1, 1], in the order of `constants.JOINTS`. They are scaled by
+    `params.action_scale` and added to the targets of a trot that follows the command. The zero action walks, and
+    stands where the command is 0. The observation is proprioception: rates, gravity, velocity from the legs, the
+    command and its slewed form, the clock of the gait, joints, last action; `fields` names the parts. An episode is
+    terminated by a fall, and truncated at the horizon or at an end of the tunnel. Walls stop the robot; `info` gives
+    the contact.
 
     Attributes:
         id: The Gymnasium id.
         physics: The robot on its window of track.
-        driven: The command is set from outside, in the state, and not drawn.
-        privileged: The observation is followed by what only a critic may know.
+        driven: Whether commands are set from outside, in the state, instead of drawn.
+        privileged: Whether the observation ends with the truth for a critic.
     """
 
     id: str = "Subterra/B2Walk-v0"
@@ -42,29 +54,29 @@ class WalkEnv:
     privileged: bool = False
 
     def observation_size(self, params: WalkParams) -> int:
-        """Numbers in one observation."""
-        return sum(observation.sizes(self.privileged).values())
+        """Return the size of one observation."""
+        return sum(observation.field_sizes(self.privileged).values())
 
     def fields(self, params: WalkParams) -> dict[str, slice]:
-        """Where in an observation each named part of it is."""
-        sizes = observation.sizes(self.privileged)
+        """Return the slice of each named part of an observation."""
+        sizes = observation.field_sizes(self.privileged)
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
     def observation_space(self, params: WalkParams) -> Box:
-        """Bounds of an observation: none."""
+        """Return the bounds of an observation: none."""
         size = self.observation_size(params)
         return Box(np.full(size, -np.inf, np.float32), np.full(size, np.inf, np.float32))
 
     def action_space(self, params: WalkParams) -> Box:
-        """Bounds of an action; `step` clips to them."""
+        """Return the bounds of an action; `step` clips to them."""
         return Box(-np.ones(N_ACTION, np.float32), np.ones(N_ACTION, np.float32))
 
     def reset(self, key: PRNGKeyArray, params: WalkParams) -> tuple[Float[Array, "n_obs"], WalkState]:
-        """Begin an episode anywhere along the tunnel.
+        """Begins an episode anywhere along the tunnel.
 
         Args:
-            key: Source of everything that is drawn.
+            key: Key of all draws.
             params: The task.
 
         Returns:
@@ -77,11 +89,11 @@ class WalkEnv:
     def step(
         self, key: PRNGKeyArray, state: WalkState, action: Float[Array, "12"], params: WalkParams
     ) -> tuple[Float[Array, "n_obs"], WalkState, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
-        """Take one control period of 20 ms. It does not reset: see `AutoReset`.
+        """Advances by one control period of 20 ms. It does not reset: see `AutoReset`.
 
         Args:
-            key: Source of all that is random in it.
-            state: Before.
+            key: Key of all draws.
+            state: State before.
             action: Joint offsets; clipped to [-1, 1], NaN read as 0.
             params: The task.
 
@@ -89,28 +101,28 @@ class WalkEnv:
             Observation, state, reward, terminated, truncated and info.
         """
         noise = self.draw_step(key, (), params)
-        state, gain, terminated, truncated, info = self.advance(state, action, noise, params)
-        return self.observe(state, noise, params), state, gain, terminated, truncated, info
+        state, reward, terminated, truncated, info = self.advance(state, action, noise, params)
+        return self.observe(state, noise, params), state, reward, terminated, truncated, info
 
     def draw_reset(self, key: PRNGKeyArray, batch: tuple[int, ...], params: WalkParams) -> WalkResetNoise:
-        """Random numbers for a batch of resets; row i does not depend on the size of the batch."""
-        return begin.draw_reset(key, batch)
+        """Draws random numbers for a batch of resets; row i does not depend on the size of the batch."""
+        return draws.draw_reset(key, batch)
 
     def draw_step(self, key: PRNGKeyArray, batch: tuple[int, ...], params: WalkParams) -> WalkStepNoise:
-        """Random numbers for one step of a batch; row i does not depend on the size of the batch."""
-        return begin.draw_step(key, batch)
+        """Draws random numbers for one step of a batch; row i does not depend on the size of the batch."""
+        return draws.draw_step(key, batch)
 
     def begin(self, noise: WalkResetNoise, params: WalkParams) -> WalkState:
-        """State at the start of an episode."""
-        return begin.begin(noise, params)
+        """Return the state at the start of an episode."""
+        return draws.begin(noise, params)
 
     def advance(
         self, state: WalkState, action: Float[Array, "12"], noise: WalkStepNoise, params: WalkParams
     ) -> tuple[WalkState, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
-        """Everything of a step but the observation.
+        """Computes all of a step except the observation.
 
         Args:
-            state: Before.
+            state: State before.
             action: As for `step`.
             noise: Random numbers of the step.
             params: The task.
@@ -120,48 +132,50 @@ class WalkEnv:
         """
         period = self.physics.period
         action = jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), -1.0, 1.0)
-        walking, targets = servos.command_joints(state, action, period, params)
+        gait_state, targets = command_joints(state, action, period, params)
         around = self.surroundings(state, params)
-        body = self.physics.run(_pushed(state.body, noise, period, params), targets, around, state.build)
-        sound = jnp.all(jnp.isfinite(body.qpos)) & jnp.all(jnp.isfinite(body.qvel))
-        body = jax.tree.map(lambda new, old: jnp.where(sound, new, old), body, state.body)
-        anchor, position = window.follow(params.track, state.anchor, body.qpos[:3])
+        body = self.physics.run(_push(state.body, noise, period, params), targets, around, state.build)
+        finite = jnp.all(jnp.isfinite(body.qpos)) & jnp.all(jnp.isfinite(body.qvel))
+        body = jax.tree.map(lambda new, old: jnp.where(finite, new, old), body, state.body)
+        anchor, position = track.move_anchor(params.track, state.anchor, body.qpos[:3])
         body = dataclasses.replace(body, qpos=body.qpos.at[:3].set(position))
-        place = driver.locate(body, params.track.quaternion[anchor])
-        upright = -gravity_seen(body)[2]
-        fallen = ~sound | (place.height < params.fall_height) | (upright < jnp.cos(params.fall_tilt))
-        torque = servos.torques(body, targets, state.build)
-        terms = payment.terms(body, walking, torque, action, state.action, fallen, params.reward, params.gait, period)
-        station = params.track.station[anchor] + place.ahead
+        pose = locate(body, params.track.quaternion[anchor])
+        upright = -gravity_direction(body)[2]
+        fallen = ~finite | (pose.height < params.fall_height) | (upright < jnp.cos(params.fall_tilt))
+        torque = servo_torques(body, targets, state.build)
+        terms = reward_terms(body, gait_state, torque, action, state.action, fallen, params, period)
+        station = params.track.station[anchor] + pose.ahead
         furthest, steps = jnp.maximum(state.furthest, station), state.steps + 1
         expired, outside = steps >= params.horizon, self._outside(station, params)
-        feeling = feel(body, noise.sensor, state.feeling.velocity, walking, params.sensor, params.gait)
+        proprioception = observation.measure(
+            body, noise.sensor, state.proprioception.velocity, gait_state, params.sensor, params.gait
+        )
         after = dataclasses.replace(
             state,
             body=body,
             anchor=anchor,
-            gait=walking,
+            gait=gait_state,
             action=action,
-            feeling=feeling,
+            proprioception=proprioception,
             furthest=furthest,
             steps=steps,
         )
         if not self.driven:
-            wanted, command = begin.drive(state, place, noise, period, params)
-            after = dataclasses.replace(after, wish=wanted, command=command)
+            drawn, command = draws.next_command(state, pose, noise, period, params)
+            after = dataclasses.replace(after, drawn_command=drawn, command=command)
         clear = self._clearance(after, station, params)
         info = {
             **terms,
             "station": station,
-            "lateral": place.lateral,
-            "height": place.height,
+            "lateral": pose.lateral,
+            "height": pose.height,
             "coverage": jnp.clip(furthest / params.tunnel.length, 0.0, 1.0),
             "clearance": clear,
             "contact": clear < BUMPER_RADIUS,
             "fall": fallen,
             "success": expired & ~fallen,
-            "velocity": payment.true_velocity(body),
-            "asked": walking.velocity,
+            "velocity": true_velocity(body),
+            "asked": gait_state.velocity,
             "effort": jnp.sum(jnp.abs(torque * body.qvel[6:])),
         }
         return after, sum(terms.values(), jnp.zeros(())), fallen, (expired | outside) & ~fallen, info
@@ -169,37 +183,111 @@ class WalkEnv:
     def observe(
         self, state: WalkState, noise: WalkStepNoise | None, params: WalkParams, wanted: Bool[Array, ""] | bool = True
     ) -> Float[Array, "n_obs"]:
-        """The observation of a state: what it holds already; noise and `wanted` change nothing."""
+        """Return the observation of a state, which holds it already; `noise` and `wanted` change nothing."""
         del noise, wanted
-        felt = observation.felt(state)
-        return jnp.concatenate([felt, observation.truth(state, params.track)]) if self.privileged else felt
+        own = observation.observe_self(state)
+        return jnp.concatenate([own, observation.observe_truth(state, params.track)]) if self.privileged else own
 
     def surroundings(self, state: WalkState, params: WalkParams) -> Surroundings:
-        """What the robot may touch in the next control period."""
-        track, anchor = params.track, state.anchor
-        place = driver.locate(state.body, track.quaternion[anchor])
-        ground = window.poses(track, anchor, place.ahead, self.physics.window)
-        half_width = at_station(params.tunnel, track.station[anchor] + place.ahead)[4]
-        return Surroundings(ground, track.quaternion[anchor], half_width)
+        """Return the ground and walls that the robot may touch in the next control period."""
+        sleepers, anchor = params.track, state.anchor
+        pose = locate(state.body, sleepers.quaternion[anchor])
+        ground = track.window_poses(sleepers, anchor, pose.ahead, self.physics.window)
+        half_width = at_station(params.tunnel, sleepers.station[anchor] + pose.ahead)[4]
+        return Surroundings(ground, sleepers.quaternion[anchor], half_width)
 
     def position(self, state: WalkState, params: WalkParams) -> Float[Array, "3"]:
-        """Middle of the trunk in the tunnel frame, m."""
+        """Return the middle of the trunk in the tunnel frame, m."""
         return params.track.position[state.anchor] + state.body.qpos[:3]
 
     def _clearance(self, state: WalkState, station: Float[Array, ""], params: WalkParams) -> Float[Array, ""]:
-        """From the nearer of the two discs' middles to the nearest wall, m."""
+        """Distance from the nearer disc's middle to the nearest wall, m."""
         middle = self.position(state, params)
-        ends = [middle + rotate(state.body.qpos[3:7], jnp.array(place)) for place in BUMPERS]
+        ends = [middle + kinematics.rotate(state.body.qpos[3:7], jnp.array(bumper)) for bumper in BUMPERS]
         return jnp.minimum(*[clearance(params.tunnel, end[:2], station) for end in ends])
 
     def _outside(self, station: Float[Array, ""], params: WalkParams) -> Bool[Array, ""]:
-        """Whether the track ends here."""
+        """Whether a station lies beyond the ends of the track."""
         last = params.track.station.shape[0] - 1
         return (station < params.track.station[0]) | (station > params.track.station[last])
 
 
-def _pushed(body: Body, noise: WalkStepNoise, period: float, params: WalkParams) -> Body:
-    """The robot after what may have hit it."""
-    comes = 0.5 * (noise.push[2] + 1.0) < period / params.variety.push_every
-    kick = jnp.where(comes, params.variety.push * noise.push[:2], 0.0)
+def _push(body: Body, noise: WalkStepNoise, period: float, params: WalkParams) -> Body:
+    """The robot after a push, if one arrives."""
+    arrives = 0.5 * (noise.push[2] + 1.0) < period / params.randomisation.push_every
+    kick = jnp.where(arrives, params.randomisation.push * noise.push[:2], 0.0)
     return dataclasses.replace(body, qvel=body.qvel.at[:2].add(kick))
+
+
+def command_joints(
+    state: WalkState, action: Float[Array, "12"], period: float, params: WalkParams
+) -> tuple[gait.GaitState, Float[Array, "12"]]:
+    """Advances the gait, and computes the servo targets: those of the gait plus the action's offsets, rad."""
+    sensors = state.proprioception
+    drift = jnp.concatenate([sensors.velocity, sensors.rates[2:]]) - state.gait.velocity
+    gait_state = gait.advance(state.gait, state.command, drift, period, params.gait)
+    offset = jnp.tile(jnp.asarray(params.action_scale), 4) * action
+    return gait_state, gait.targets(gait_state, sensors.gravity, params.gait) + offset
+
+
+def servo_torques(body: Body, targets: Float[Array, "12"], build: Build) -> Float[Array, "12"]:
+    """Computes the torques of the position servos, N m."""
+    torque = build.stiffness * _STIFFNESS * (targets - body.qpos[7:]) - build.damping * _DAMPING * body.qvel[6:]
+    return jnp.clip(torque, -_TORQUE, _TORQUE)
+
+
+def reward_terms(
+    body: Body,
+    gait_state: gait.GaitState,
+    torque: Float[Array, "12"],
+    action: Float[Array, "12"],
+    last_action: Float[Array, "12"],
+    fallen: Bool[Array, ""],
+    params: WalkParams,
+    period: float,
+) -> dict[str, Float[Array, ""]]:
+    """Computes the reward of one control period, by term.
+
+    Args:
+        body: State at the end of the period.
+        gait_state: The gait, which holds the slewed command and says which feet should stand.
+        torque: Torques of the servos, N m.
+        action: Action of this period.
+        last_action: Action of the period before.
+        fallen: Whether the robot has fallen.
+        params: The task, with the weights in `reward`.
+        period: Length of the control period, s.
+    """
+    weights, gravity = params.reward, gravity_direction(body)
+    error = true_velocity(body) - gait_state.velocity
+    width = weights.width * weights.width
+    change = action - last_action
+    rates = {
+        "velocity": weights.velocity * jnp.exp(-(error[0] * error[0] + error[1] * error[1]) / width),
+        "yaw_rate": weights.yaw_rate * jnp.exp(-error[2] * error[2] / width),
+        "alive": jnp.asarray(weights.alive),
+        "bounce": weights.bounce * body.qvel[2] * body.qvel[2],
+        "roll": weights.roll * (body.qvel[3] * body.qvel[3] + body.qvel[4] * body.qvel[4]),
+        "tilt": weights.tilt * (gravity[0] * gravity[0] + gravity[1] * gravity[1]),
+        "effort": weights.effort * jnp.sum(torque * torque),
+        "jerk": weights.jerk * jnp.sum(change * change),
+        "action": weights.action * jnp.sum(action * action),
+        "slip": weights.slip * _slip(body, gravity, gait_state, params.gait),
+    }
+    # A falling robot may move at any speed; the clip bounds its penalty.
+    terms = {f"reward_{name}": jnp.clip(rate, -10.0, 10.0) * period for name, rate in rates.items()}
+    return {**terms, "reward_fall": jnp.where(fallen, weights.fall, 0.0)}
+
+
+def _slip(
+    body: Body, gravity: Float[Array, "3"], gait_state: gait.GaitState, params: gait.GaitParams
+) -> Float[Array, ""]:
+    """Sum over the feet that should stand of their squared speed over ground, m²/s²."""
+    angles, speeds = body.qpos[7:], body.qvel[6:]
+    standing = gait.stance(gait_state, params)
+    velocities = [
+        observation.leg_velocity(body.qvel[3:6], gravity, angles, speeds, jnp.zeros(4).at[leg].set(1.0))
+        for leg in range(len(b2.LEGS))
+    ]
+    error = jnp.stack(velocities) - true_velocity(body)[:2]
+    return jnp.sum(standing * jnp.sum(error * error, axis=1))

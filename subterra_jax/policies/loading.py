@@ -37,9 +37,9 @@ def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
     """
     file = read(source)
     if file.facts["kind"] == GAIT:
-        from subterra_jax.b2.policy import of_file  # it moves legs and drives no task
+        from subterra_jax.b2.policy import make_policy  # it moves legs and drives no task
 
-        return of_file(file), file.facts
+        return make_policy(file), file.facts
     return _checked(file), file.facts
 
 

@@ -4,7 +4,7 @@ import socket
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from subterra_jax.b2.ids import MISSIONS
+from subterra_jax.b2 import MISSIONS
 from subterra_jax.outputs import require_folder
 from subterra_jax.tasks import TASKS
 from subterra_jax.versions import no_task

@@ -6,7 +6,7 @@ from typing import Any
 
 import subterra_jax as st
 from subterra_jax import policies, tasks
-from subterra_jax.b2.ids import MISSIONS
+from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines import registry
 from subterra_jax.policies.loading import Agent
 from subterra_jax.tunnel.plan import TunnelPlan

@@ -31,9 +31,9 @@ class Gait:
         if not self.walks:
             return np.zeros((0, N_POSE), np.float32)
         from subterra_jax.b2.hierarchy import PERIODS
-        from subterra_jax.b2.legs import standing
+        from subterra_jax.b2.kinematics import standing_pose
 
-        pose = np.concatenate([[1.0, 0.0, 0.0, 0.0], np.asarray(standing()[0], np.float64)])
+        pose = np.concatenate([[1.0, 0.0, 0.0, 0.0], np.asarray(standing_pose()[0], np.float64)])
         return np.tile(pose.astype(np.float32), (PERIODS, 1))
 
     def taken(self, n_rows: int) -> Float[np.ndarray, "n_rows m 16"]:

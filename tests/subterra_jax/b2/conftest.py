@@ -29,15 +29,15 @@ class Walking:
         return self.compiled["step"](jax.random.key(seed), state, action, self.params if params is None else params)
 
     def told(self, command, **further: Any):
-        """Params under which one command holds for ever, without pushes and without noise or variety."""
+        """Params under which one command holds for ever, without pushes and without noise or randomisation."""
         command = jnp.asarray(command, jnp.float32)
         fields = {"low": command, "high": command, "still": jnp.float32(0.0), "corridor": jnp.float32(10.0)}
-        variety, sensor = self.params.variety, self.params.sensor
-        calm = dataclasses.replace(variety, push=jnp.float32(0.0), friction=jnp.array([0.8, 0.8], jnp.float32))
+        randomisation, sensor = self.params.randomisation, self.params.sensor
+        calm = dataclasses.replace(randomisation, push=jnp.float32(0.0), friction=jnp.array([0.8, 0.8], jnp.float32))
         return dataclasses.replace(
             self.params,
             command=dataclasses.replace(self.params.command, **fields),
-            variety=calm,
+            randomisation=calm,
             sensor=jax.tree.map(jnp.zeros_like, sensor),
             **further,
         )

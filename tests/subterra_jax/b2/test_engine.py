@@ -9,8 +9,8 @@ import pytest
 
 from subterra_jax.b2 import engine, physics
 from subterra_jax.b2.engine import MujocoPhysics
-from subterra_jax.b2.physics import Body, Surroundings
-from subterra_jax.b2.servos import command_joints
+from subterra_jax.b2.params import Body, Surroundings
+from subterra_jax.b2.walk import command_joints
 
 PERIOD = 0.02
 

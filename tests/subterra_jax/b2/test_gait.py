@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.b2 import gait, legs
+from subterra_jax.b2 import gait, kinematics
 
 PERIOD, DOWN = 0.02, jnp.array([0.0, 0.0, -1.0])
 PARAMS = gait.GaitParams()
@@ -17,7 +17,7 @@ advance = jax.jit(gait.advance)
 def follow(command, seconds, drift=(0.0, 0.0, 0.0)):
     """States of the gait under a constant command."""
     command, drift = jnp.asarray(command), jnp.asarray(drift)
-    states = [gait.begin(jnp.float32(0.1))]
+    states = [gait.standing_gait(jnp.float32(0.1))]
     for _ in range(round(seconds / PERIOD)):
         states.append(advance(states[-1], command, drift, PERIOD, PARAMS))
     return states
@@ -64,9 +64,9 @@ def test_a_robot_that_is_too_slow_is_told_to_take_longer_strides():
 
 def test_servos_lead_by_what_the_load_costs_them():
     standing = follow((0.0, 0.0, 0.0), 0.5)[-1]
-    wanted = legs.angles(foot_targets(standing, DOWN, PARAMS))
+    wanted = kinematics.joint_angles(foot_targets(standing, DOWN, PARAMS))
     lead = targets(standing, DOWN, PARAMS).reshape(4, 3) - wanted
-    torque = lead * legs.STIFFNESS
+    torque = lead * kinematics.STIFFNESS
     # Carried by all four: as much as a quarter of the weight asks of the calf.
     depth = 0.35 * np.sin(-(wanted[0, 1] + wanted[0, 2])) * np.cos(wanted[0, 0])
     np.testing.assert_allclose(torque[:, 2], depth * 74.5803 * 9.81 / 4.0, rtol=1e-3)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import legs
+from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.b2.model import RobotConfig, RobotError, add_stand, robot_spec
 
 # Principal moments, from MuJoCo's own reading of the URDF (trunk) and from the mean leg, kg m².
@@ -44,7 +44,7 @@ def test_every_body_has_the_moments_of_inertia_of_the_figures(model):
 
 def test_left_and_right_legs_are_mirror_images(model):
     mass = mujoco.MjData(model)
-    mass.qpos[3], mass.qpos[7:] = 1.0, legs.standing()[0]
+    mass.qpos[3], mass.qpos[7:] = 1.0, standing_pose()[0]
     mujoco.mj_forward(model, mass)
     for left, right in (("FL", "FR"), ("RL", "RR")):
         for part in b2.PARTS:
@@ -63,7 +63,7 @@ def test_joints_have_the_limits_of_the_urdf(model):
 
 def test_the_default_pose_puts_the_trunk_at_the_height_of_the_formula(model):
     data = mujoco.MjData(model)
-    data.qpos[3], data.qpos[7:] = 1.0, legs.standing()[0]
+    data.qpos[3], data.qpos[7:] = 1.0, standing_pose()[0]
     mujoco.mj_forward(model, data)
     lowest = data.geom("FL_foot").xpos[2] - b2.FOOT_RADIUS
     assert -lowest == pytest.approx(0.35 * np.cos(0.8) + 0.35 * np.cos(-0.7) + 0.032, abs=1e-6)
@@ -87,7 +87,7 @@ def test_with_the_gains_of_the_isaac_configurations_it_collapses(on_floor):
     model.actuator_gainprm[:, 0], model.actuator_biasprm[:, 1], model.actuator_biasprm[:, 2] = 160.0, -160.0, -5.0
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
-    data.ctrl[:] = legs.standing()[0]
+    data.ctrl[:] = standing_pose()[0]
     for _ in range(1000):
         mujoco.mj_step(model, data)
     assert data.qpos[2] < 0.4

@@ -10,7 +10,7 @@ import pytest
 from subterra_jax import lidar
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import sight
-from subterra_jax.b2.track import by_standard
+from subterra_jax.b2.track import lay_standard_track
 from subterra_jax.lidar import LidarParams
 from subterra_jax.tunnel import Tunnel
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
@@ -22,7 +22,7 @@ ANCHOR, HEIGHT = 50, 0.5  # of the trunk's middle over the sleepers, m
 @pytest.fixture(scope="module")
 def world(plan_of):
     plan = plan_of(tunnel_arrays(straight(80.0)))
-    return plan, SimpleNamespace(track=by_standard(plan), tunnel=Tunnel.from_plan(plan, "smooth"))
+    return plan, SimpleNamespace(track=lay_standard_track(plan), tunnel=Tunnel.from_plan(plan, "smooth"))
 
 
 @pytest.fixture(scope="module")

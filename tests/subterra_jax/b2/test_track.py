@@ -6,14 +6,23 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.b2 import rotation, window
-from subterra_jax.b2.track import RAIL_HALF, RAIL_OFFSET, TrackError, by_standard, from_scene
+from subterra_jax.b2 import kinematics
+from subterra_jax.b2.track import (
+    RAIL_HALF,
+    RAIL_OFFSET,
+    TrackError,
+    WindowConfig,
+    lay_standard_track,
+    move_anchor,
+    read_scene_track,
+    window_poses,
+)
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
-CONFIG = window.WindowConfig()
+CONFIG = WindowConfig()
 FORWARD = jnp.array([1.0, 0.0, 0.0])
-poses, follow = jax.jit(window.poses, static_argnums=3), jax.jit(window.follow)
-rotate = jax.jit(rotation.rotate)
+poses, follow = jax.jit(window_poses, static_argnums=3), jax.jit(move_anchor)
+rotate = jax.jit(kinematics.rotate)
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +32,7 @@ def plan():
 
 @pytest.fixture(scope="module")
 def track(plan):
-    return by_standard(plan)
+    return lay_standard_track(plan)
 
 
 def write_scene(folder, yaw, grade=0.0, protrusion=0.05, count=12):
@@ -32,7 +41,7 @@ def write_scene(folder, yaw, grade=0.0, protrusion=0.05, count=12):
     across = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
     up = np.cross(along, across)
     pitched = jnp.array([np.cos(grade / 2), 0.0, -np.sin(grade / 2), 0.0])
-    turn = rotation.times(rotation.yaw_only(jnp.float32(yaw)), pitched)
+    turn = kinematics.compose(kinematics.yaw_quaternion(jnp.float32(yaw)), pitched)
     quat = " ".join(f"{q:.8f}" for q in turn)
     lines = []
     for k in range(count):
@@ -53,39 +62,39 @@ def test_sleepers_lie_on_the_centreline_across_the_tangent(plan, track):
         np.column_stack([np.interp(track.station, plan.station, values[:, i]) for i in range(2)])
         for values in (plan.centre, plan.tangent)
     )
-    forward = jax.jit(jax.vmap(rotation.rotate, in_axes=(0, None)))(track.quaternion, FORWARD)
+    forward = jax.jit(jax.vmap(kinematics.rotate, in_axes=(0, None)))(track.quaternion, FORWARD)
     np.testing.assert_allclose(track.position[:, :2], centre, atol=1e-4)
     np.testing.assert_allclose(forward[:, :2], tangent, atol=2e-3)
 
 
 def test_a_scenes_own_sleepers_are_taken_with_grade_and_protrusion(tmp_path, plan_of):
     write_scene(tmp_path, yaw=0.0, grade=0.02)
-    found = from_scene(tmp_path, plan_of(tunnel_arrays(straight(20.0))))
+    found = read_scene_track(tmp_path, plan_of(tunnel_arrays(straight(20.0))))
     np.testing.assert_allclose(found.station, 0.7 * np.cos(0.02) * np.arange(1, 13), atol=1e-5)
     np.testing.assert_allclose(found.protrusion, 0.05, atol=1e-5)
     np.testing.assert_allclose(
-        rotation.rotate(found.quaternion[3], FORWARD), [np.cos(0.02), 0.0, np.sin(0.02)], atol=1e-6
+        kinematics.rotate(found.quaternion[3], FORWARD), [np.cos(0.02), 0.0, np.sin(0.02)], atol=1e-6
     )
 
 
 def test_a_scene_without_a_track_is_refused_by_name(tmp_path, plan_of):
     (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
     with pytest.raises(TrackError, match=r"scene\.xml: 0 sleepers: the scene has no track to walk on"):
-        from_scene(tmp_path, plan_of(tunnel_arrays(straight(20.0))))
+        read_scene_track(tmp_path, plan_of(tunnel_arrays(straight(20.0))))
 
 
 def test_a_missing_scene_is_refused_by_name(tmp_path, plan_of):
     with pytest.raises(TrackError, match="not a readable scene"):
-        from_scene(tmp_path / "nowhere", plan_of(tunnel_arrays(straight(20.0))))
+        read_scene_track(tmp_path / "nowhere", plan_of(tunnel_arrays(straight(20.0))))
 
 
 def test_a_tunnel_of_three_metres_is_too_short_for_a_track(plan_of):
     with pytest.raises(TrackError, match="too short for a track"):
-        by_standard(plan_of(tunnel_arrays(straight(3.0))))
+        lay_standard_track(plan_of(tunnel_arrays(straight(3.0))))
 
 
 def test_the_window_holds_ballast_four_sleepers_and_two_rails(plan_of):
-    level = by_standard(plan_of(tunnel_arrays(straight(20.0))))
+    level = lay_standard_track(plan_of(tunnel_arrays(straight(20.0))))
     positions, quaternions = poses(level, jnp.int32(10), jnp.float32(0.1), CONFIG)
     assert positions.shape == (7, 3)
     np.testing.assert_allclose(positions[0], [0.0, 0.0, -0.06], atol=1e-6)
@@ -112,7 +121,7 @@ def test_sleepers_reach_a_metre_to_either_side_wherever_the_robot_is(track):
 
 
 def test_the_anchor_follows_the_robot_and_places_add_up_to_a_tenth_of_a_millimetre():
-    long = by_standard(st.load_tunnel("metro-asbuilt"))
+    long = lay_standard_track(st.load_tunnel("metro-asbuilt"))
     anchor, local = jnp.int32(1500), jnp.zeros(3)
     start = np.asarray(long.position[1500], np.float64)
     walked = np.zeros(3)

@@ -9,8 +9,11 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import driver, physics, rotation
+from subterra_jax.b2 import physics
+from subterra_jax.b2.kinematics import rotate
 from subterra_jax.b2.model import RobotError
+from subterra_jax.b2.observation import locate
+from subterra_jax.b2.params import Body, Surroundings
 from subterra_jax.b2.tasks import make
 from subterra_jax.b2.track import TrackError
 from tests.subterra_jax.b2.conftest import N_ROBOTS
@@ -155,8 +158,8 @@ def test_a_robot_that_leaves_the_numbers_is_a_fall_and_spoils_nobody(walking):
 def beside(walking, state, lateral):
     """The same robots moved aside to that lateral offset, m."""
     turned = walking.params.track.quaternion[state.anchor]
-    aim = jax.vmap(rotation.rotate, in_axes=(0, None))(turned, jnp.array([0.0, 1.0, 0.0]))
-    away = lateral - jax.vmap(driver.locate)(state.body, turned).lateral
+    aim = jax.vmap(rotate, in_axes=(0, None))(turned, jnp.array([0.0, 1.0, 0.0]))
+    away = lateral - jax.vmap(locate)(state.body, turned).lateral
     aside = state.body.qpos.at[:, :3].add(away[:, None] * aim)
     return dataclasses.replace(state, body=dataclasses.replace(state.body, qpos=aside))
 
@@ -183,10 +186,8 @@ def test_a_wall_stops_a_robot_that_is_told_to_walk_through_it(walking):
 def wrench(lateral, speed=0.0, half_width=2.8):
     """Of the walls on a robot that far to the left, moving there."""
     qpos = jnp.zeros(19).at[1].set(lateral).at[2].set(0.5).at[3].set(1.0)
-    body = physics.Body(qpos, jnp.zeros(18).at[1].set(speed), jnp.zeros(18))
-    around = physics.Surroundings(
-        (jnp.zeros((7, 3)), jnp.zeros((7, 4))), jnp.array([1.0, 0, 0, 0]), jnp.float32(half_width)
-    )
+    body = Body(qpos, jnp.zeros(18).at[1].set(speed), jnp.zeros(18))
+    around = Surroundings((jnp.zeros((7, 3)), jnp.zeros((7, 4))), jnp.array([1.0, 0, 0, 0]), jnp.float32(half_width))
     return np.asarray(physics.wall_wrench(body, around))
 
 

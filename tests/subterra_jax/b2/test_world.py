@@ -10,13 +10,12 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import legs
-from subterra_jax.b2.engine import MujocoPhysics
+from subterra_jax.b2.engine import MujocoPhysics, ScenePhysics, SceneSurroundings, SceneWalk
+from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.b2.model import RobotConfig
-from subterra_jax.b2.physics import Body, Build, Surroundings
+from subterra_jax.b2.params import Body, Build, Surroundings
 from subterra_jax.b2.tasks import make
 from subterra_jax.b2.track import SLEEPER_HALF, TrackError
-from subterra_jax.b2.world import Placed, ScenePhysics, SceneWalk
 
 ORIGIN = np.array([300.0, -40.0, -7.0])
 N_SLEEPERS, SPACING = 12, 0.6
@@ -49,7 +48,7 @@ def scene(folder):
 
 
 def standing(lateral=0.0, height=b2.STAND_HEIGHT):
-    pose, hold = jax.device_get(legs.standing())
+    pose, hold = jax.device_get(standing_pose())
     qpos = np.concatenate([[0.0, lateral, height], LEVEL, pose]).astype(np.float32)
     return Body(qpos, np.zeros(18, np.float32), np.zeros(18, np.float32)), hold
 
@@ -66,7 +65,7 @@ def around(k, half_width=2.0):
     rails = np.array([[0.0, 50.0, -9.0], [0.0, -50.0, -9.0]])
     positions = np.concatenate([[[0.0, 0.0, -0.06]], tops, rails]).astype(np.float32)
     window = Surroundings((positions, np.tile(LEVEL, (7, 1))), LEVEL, np.float32(half_width))
-    return window, Placed(**vars(window), origin=ORIGIN + np.array([SPACING * k, 0.0, 0.0]))
+    return window, SceneSurroundings(**vars(window), origin=ORIGIN + np.array([SPACING * k, 0.0, 0.0]))
 
 
 def test_the_scene_keeps_everything_but_the_scout(scene):

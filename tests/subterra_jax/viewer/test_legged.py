@@ -8,7 +8,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2.constants import HIP_X, STAND_HEIGHT
-from subterra_jax.b2.legs import standing
+from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.viewer import drivers
 from subterra_jax.viewer.course import Course
 from subterra_jax.viewer.frames import Film, Frame
@@ -30,7 +30,7 @@ class Scene:
 
 
 def frame(turned, trunk):
-    pose = np.concatenate([[np.cos(turned / 2), 0.0, 0.0, np.sin(turned / 2)], standing()[0]])
+    pose = np.concatenate([[np.cos(turned / 2), 0.0, 0.0, np.sin(turned / 2)], standing_pose()[0]])
     return Frame(0, np.array([3.0, 4.0, 0.0]), turned, np.zeros(3), 0.0, trunk, pose)
 
 

@@ -1,0 +1,141 @@
+"""Random draws of the walking task: an episode's start, the robot's build, and the velocity commands."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from subterra_jax.b2 import constants as b2
+from subterra_jax.b2.gait import standing_gait
+from subterra_jax.b2.kinematics import compose, rotate, standing_pose, yaw_quaternion
+from subterra_jax.b2.observation import TrackPose, locate, measure
+from subterra_jax.b2.params import (
+    Body,
+    Build,
+    CommandParams,
+    RandomisationParams,
+    WalkParams,
+    WalkResetNoise,
+    WalkState,
+    WalkStepNoise,
+)
+
+_LATERAL, _HEADING, _MARGIN = 0.2, 0.2, 25.0  # of starts: m, rad, m
+_TURN, _SIDESTEP, _AIM, _FREE = 1.5, 1.0, 1.5, 0.5  # of steering: 1/s, 1/s, rad/m, rad
+N_SENSOR = 30
+
+
+def draw_reset(key: PRNGKeyArray, batch: tuple[int, ...]) -> WalkResetNoise:
+    """Draws random numbers for a batch of resets; row i does not depend on the size of the batch."""
+    uniform = jax.random.uniform(key, (*batch, 38 + N_SENSOR), minval=-1.0)
+    return WalkResetNoise(
+        place=uniform[..., :5], build=uniform[..., 5:34], command=uniform[..., 34:38], sensor=uniform[..., 38:]
+    )
+
+
+def draw_step(key: PRNGKeyArray, batch: tuple[int, ...]) -> WalkStepNoise:
+    """Draws random numbers for one step of a batch; row i does not depend on the size of the batch."""
+    uniform = jax.random.uniform(key, (*batch, N_SENSOR + 8), minval=-1.0)
+    return WalkStepNoise(sensor=uniform[..., :N_SENSOR], command=uniform[..., N_SENSOR:-3], push=uniform[..., -3:])
+
+
+def begin(noise: WalkResetNoise, params: WalkParams) -> WalkState:
+    """Return the start of an episode: standing at a sleeper, near the axis, facing either way along the tunnel."""
+    along, lateral, heading, way, phase = noise.place
+    facing = jnp.where(way < 0.0, -1.0, 1.0)
+    anchor = _start_sleeper(along, params)
+    along_track = params.track.quaternion[anchor]
+    turn = _HEADING * heading + jnp.where(facing < 0.0, jnp.pi, 0.0)
+    # The feet stand on the tops of the sleepers, or fall the little way to the ballast.
+    position = rotate(along_track, jnp.stack([0.0, _LATERAL * lateral, b2.STAND_HEIGHT]))
+    quaternion = compose(along_track, yaw_quaternion(turn))
+    pose, _ = standing_pose()
+    body = Body(jnp.concatenate([position, quaternion, pose]), jnp.zeros(18), jnp.zeros(18))
+    gait = standing_gait(0.5 * (phase + 1.0))
+    command = draw_command(noise.command, params.command)
+    return WalkState(
+        body=body,
+        anchor=anchor,
+        gait=gait,
+        command=keep_on_track(command, locate(body, along_track), facing, params.command),
+        drawn_command=command,
+        facing=facing,
+        action=jnp.zeros(12),
+        proprioception=measure(body, noise.sensor, jnp.zeros(2), gait, params.sensor, params.gait),
+        build=_draw_build(noise.build, params.randomisation),
+        furthest=params.track.station[anchor],
+        steps=jnp.zeros((), jnp.int32),
+    )
+
+
+def _start_sleeper(along: Float[Array, ""], params: WalkParams) -> Int[Array, ""]:
+    """A sleeper at least 25 m from the ends of the track, or a quarter of a track shorter than 100 m."""
+    station = params.track.station
+    count, last = station.shape[0], station.shape[0] - 1
+    margin = jnp.minimum(_MARGIN / (station[last] - station[0]), 0.25)
+    share = margin + 0.5 * (along + 1.0) * (1.0 - 2.0 * margin)
+    return jnp.clip((share * count).astype(jnp.int32), 0, last)
+
+
+def _draw_build(noise: Float[Array, "29"], params: RandomisationParams) -> Build:
+    """Properties of one robot."""
+
+    def between(limits: Any, share: Float[Array, "..."]) -> Float[Array, "..."]:
+        return limits[0] + 0.5 * (share + 1.0) * (limits[1] - limits[0])
+
+    return Build(
+        friction=between(params.friction, noise[0]),
+        mass=between(params.mass, noise[1]),
+        shift=jnp.asarray(params.shift) * noise[2:5],
+        stiffness=between(params.gain, noise[5:17]),
+        damping=between(params.gain, noise[17:29]),
+    )
+
+
+def next_command(
+    state: WalkState, pose: TrackPose, noise: WalkStepNoise, period: float, params: WalkParams
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Return the drawn command of the next control period, and the one that keeps the robot on the track."""
+    arrives = 0.5 * (noise.command[4] + 1.0) < period / params.command.hold
+    drawn = jnp.where(arrives, draw_command(noise.command[:4], params.command), state.drawn_command)
+    return drawn, keep_on_track(drawn, pose, state.facing, params.command)
+
+
+def draw_command(noise: Float[Array, "4"], params: CommandParams) -> Float[Array, "3"]:
+    """Draws a command: uniform, or to stand.
+
+    Args:
+        noise: Uniform in [-1, 1): for the three velocities, and for standing.
+        params: Limits of the commands.
+    """
+    low, high = jnp.asarray(params.low), jnp.asarray(params.high)
+    drawn = low + 0.5 * (noise[:3] + 1.0) * (high - low)
+    return jnp.where(0.5 * (noise[3] + 1.0) < params.still, 0.0, drawn)
+
+
+def keep_on_track(
+    drawn: Float[Array, "3"], pose: TrackPose, facing: Float[Array, ""], params: CommandParams
+) -> Float[Array, "3"]:
+    """Changes a command that would lead off the track; a command to stand stays.
+
+    Args:
+        drawn: Forward and to the left (m/s), yaw rate (rad/s).
+        pose: Pose of the robot on the track.
+        facing: 1 where it should face growing station, -1 the other way.
+        params: Limits of the commands.
+    """
+    offset = facing * pose.lateral
+    heading = jnp.arctan2(facing * pose.forward[1], facing * pose.forward[0])
+    direction = jnp.where(drawn[0] < 0.0, -1.0, 1.0)
+    aim = direction * jnp.clip(-_AIM * offset, -0.5, 0.5)
+    yaw_rate = jnp.clip(drawn[2], _TURN * (aim - _FREE - heading), _TURN * (aim + _FREE - heading))
+    limit = params.corridor
+    left = jnp.clip(drawn[1], _SIDESTEP * (-limit - offset), _SIDESTEP * (limit - offset))
+    kept = jnp.clip(jnp.stack([drawn[0], left, yaw_rate]), jnp.asarray(params.low), jnp.asarray(params.high))
+    return jnp.where(is_standing(drawn), 0.0, kept)
+
+
+def is_standing(command: Float[Array, "3"]) -> Bool[Array, ""]:
+    """Return whether a command asks to stand."""
+    return (command[0] == 0.0) & (command[1] == 0.0) & (command[2] == 0.0)
