@@ -17,7 +17,7 @@ from benchmarks import truth as truths
 from benchmarks.command import status
 from benchmarks.report import write_report
 from scene.arguments import parse
-from scene.survey.config import SurveyConfig, check
+from scene.survey.config import SurveyConfig, check_survey
 from subterra_jax.outputs import require_folder
 
 TASK = "Subterra/TraverseShort-v0"
@@ -110,7 +110,9 @@ def main(config: DemoConfig) -> None:
         SubterraError: The folder cannot be written.
     """
     require_folder(config.out)
-    check(SurveyConfig(config.out / "survey", length=config.length, seed=config.seed, point_rate=config.point_rate))
+    check_survey(
+        SurveyConfig(config.out / "survey", length=config.length, seed=config.seed, point_rate=config.point_rate)
+    )
     started = time.monotonic()
     out, stages = config.out, Stages()
     survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))

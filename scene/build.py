@@ -1,10 +1,12 @@
-"""`python -m scene.build INPUT --out DIR`: a recording in; scene, bore, tunnel and manifest out."""
+"""`python -m scene.build INPUT --out DIR`: builds a scene folder from a recording."""
 
+import math
 import time
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
@@ -12,13 +14,52 @@ import tyro
 
 from scene.arguments import parse
 from scene.cli import progress_bar, run
-from scene.errors import FitError, RecordingError
+from scene.errors import FitError, RecordingError, SubterraError
 from scene.files import replace_folder, require_output_folder
 from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
 from scene.reconstruct import Reconstruction, reconstruct
-from scene.resume import Partial, beside
-from scene.settings import check_number, check_settings
+from scene.resume import Partial, partial_folder
+
+_POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
+
+
+class SettingError(SubterraError):
+    """A setting that no build can have."""
+
+
+def check_settings(config: Any, prefix: str = "") -> None:
+    """Refuses numbers that are negative or not finite, in a tree of dataclasses; some may not be 0 either.
+
+    Args:
+        config: The settings.
+        prefix: Of the options' names, for messages.
+
+    Raises:
+        SettingError: Names the option as it stands on a command line, and its value.
+    """
+    for part in fields(config):
+        value, name = getattr(config, part.name), f"{prefix}{part.name.replace('_', '-')}"
+        if is_dataclass(value):
+            check_settings(value, f"{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, (int, float)) and not isinstance(number, bool):
+                check_number(name, number)
+
+
+def check_number(name: str, value: float) -> None:
+    """Refuses one number; `name` says whether it may be 0.
+
+    Raises:
+        SettingError: Names the option and the value.
+    """
+    if not math.isfinite(value):
+        raise SettingError(f"--{name} must be a finite number, got {value}")
+    if value < 0.0:
+        raise SettingError(f"--{name} must not be negative, got {value:g}")
+    if value == 0.0 and name.endswith(_POSITIVE):
+        raise SettingError(f"--{name} must be above 0, got {value:g}")
+
 
 _DEFAULT = BuildConfig()
 
@@ -52,14 +93,14 @@ def build(
     check_number("keep-every", 0.0 if partial is None else partial.every)
     mounts = find_calibration(calibration)
     started = time.monotonic()
-    partial = partial or Partial(beside(out))
+    partial = partial or Partial(partial_folder(out))
     try:
         with progress_bar() as progress:
             result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, partial)
-        _say(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
+        _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
         with replace_folder(out) as folder:
             write_scene_folder(folder, config.name or out.name, result, config)
-            _say(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
+            _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
         partial.discard()
     except (RecordingError, FitError):
         partial.discard()  # the input is at fault, and would be again
@@ -70,7 +111,7 @@ def build(
     return result
 
 
-def _say(started: float, text: str) -> None:
+def _print_time(started: float, text: str) -> None:
     print(f"[{time.monotonic() - started:6.1f} s] {text}", flush=True)
 
 
@@ -102,7 +143,7 @@ def command(
         config: Settings.
     """
     return partial(
-        build, source, out, trajectory, config, control, calibration, Partial(beside(out), fresh, keep_every)
+        build, source, out, trajectory, config, control, calibration, Partial(partial_folder(out), fresh, keep_every)
     )
 
 

@@ -30,8 +30,8 @@ class Cloud:
     voxel: float
 
 
-def thinned(cloud: Cloud, voxel: float) -> Float[np.ndarray, "k 3"]:
-    """The cloud's points in the tunnel frame, one mean a voxel, m."""
+def thin_cloud(cloud: Cloud, voxel: float) -> Float[np.ndarray, "k 3"]:
+    """Return the cloud's points in the tunnel frame, one mean a voxel, m."""
     again = VoxelMean(voxel)
     again.add(cloud.points.astype(np.float64))
     coarse = again.cloud()
@@ -68,11 +68,11 @@ class VoxelMean:
         cell = np.floor(local / self.voxel).astype(np.int64)
         key = ((cell[:, 0] + _HALF) << 2 * _BITS) | ((cell[:, 1] + _HALF) << _BITS) | (cell[:, 2] + _HALF)
         sums = np.concatenate([local, np.ones((len(local), 1))], axis=1)
-        self._push(*_merge(key, sums))
+        self._push(*_merge_cells(key, sums))
         self.returns += int(inside.sum())
 
     def cloud(self) -> Cloud:
-        """What has been added so far."""
+        """Return the mean of each voxel of the points added so far."""
         if not self._parts or self._origin is None:
             return Cloud(np.empty((0, 3), np.float32), np.empty(0, np.float32), np.zeros(3), 0, self.voxel)
         self._compact()
@@ -82,7 +82,7 @@ class VoxelMean:
         return Cloud(points, weights.astype(np.float32), self._origin, self.returns, self.voxel)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What has been added so far, to go on with in another process.
+        """Return the state as arrays, from which another process can go on.
 
         The parts are kept as they are: merging them now would change the order of later sums, and with it the bytes.
         """
@@ -94,7 +94,7 @@ class VoxelMean:
 
     @classmethod
     def restored(cls, voxel: float, arrays: dict[str, np.ndarray]) -> "VoxelMean":
-        """The opposite of `arrays`."""
+        """Return the opposite of `arrays`."""
         again = cls(voxel)
         again._origin = None if np.isnan(arrays["origin"]).any() else arrays["origin"]
         again.finite, again.returns, again._pending = (int(count) for count in arrays["counts"])
@@ -111,11 +111,11 @@ class VoxelMean:
     def _compact(self) -> None:
         if len(self._parts) > 1:
             keys, sums = zip(*self._parts, strict=True)
-            self._parts = [_merge(np.concatenate(keys), np.concatenate(sums))]
+            self._parts = [_merge_cells(np.concatenate(keys), np.concatenate(sums))]
         self._pending = 0
 
 
-def _merge(key: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge_cells(key: np.ndarray, sums: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     order = np.argsort(key, kind="stable")
     key, sums = key[order], sums[order]
     starts = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]])) if len(key) else np.empty(0, np.intp)

@@ -1,20 +1,127 @@
-"""A reconstruction to its scene folder: geometry, manifest, preview cloud and poses."""
+"""From a reconstruction to its scene folder: geometry, manifest, preview cloud and poses."""
 
+import dataclasses
+import hashlib
+import json
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 import trimesh
 
-from scene.cloud import thinned
+from scene.bore import Bore
+from scene.cloud import thin_cloud
 from scene.errors import FitError
 from scene.poses.trajectory import save_tum
 from scene.reconstruct import ReconstructConfig, Reconstruction
-from scene.writing import manifest
-from scene.writing.geometry import SCENES, write_geometry
-from scene.writing.mjcf import SceneConfig
-from scene.writing.track import Track, TrackConfig, lay
+from scene.writing.furnished import furnish_bore, planar_segments
+from scene.writing.furniture import count_pieces
+from scene.writing.mesh import as_trimesh, build_solid, open_lining
+from scene.writing.mjcf import SceneConfig, write_scene
+from scene.writing.planar import cut_walls, save_tunnel
+from scene.writing.track import Track, TrackConfig, lay_track
+
+SCENES = ("scene.xml", "scene_furnished.xml")
+
+
+def write_geometry(
+    folder: Path, name: str, provenance: str, bore: Bore, track: Track, config: SceneConfig
+) -> tuple[dict[str, int], dict[str, str]]:
+    """Writes `bore.npz`, `tunnel.npz`, both scenes and the whole meshes.
+
+    Args:
+        folder: Where to.
+        name: Of the tunnel.
+        provenance: What kind of recording the bore comes from.
+        bore: The bore.
+        track: Its track.
+        config: How the scene is cut and dressed.
+
+    Returns:
+        How many of each asset there are, and where the furniture comes from.
+
+    Raises:
+        FitError: The bore makes no solid, or has no walls at the LiDAR's height.
+    """
+    furnished = furnish_bore(bore, track, config.furniture)
+    solids = {"smooth": build_solid(bore, pockets=False)}
+    solids["pockets"] = build_solid(bore, pockets=True) if len(bore.pocket) else solids["smooth"]
+    solids["furnished"] = build_solid(furnished.bore, pockets=True) if furnished.niches else solids["pockets"]
+    height = config.lidar_height
+    walls = {variant: cut_walls(solid, bore, track.elevation, height) for variant, solid in solids.items()}
+    solid = as_trimesh(solids["pockets"])
+    lining = open_lining(solid, bore)
+    count = write_scene(folder, name, bore, lining, walls["smooth"], track, config)
+    with_niches = open_lining(as_trimesh(solids["furnished"]), bore) if furnished.niches else lining
+    write_scene(folder, name, bore, with_niches, walls["smooth"], track, config, furnished)
+    solid.export(folder / "meshes" / "solid.ply")
+    lining.export(folder / "meshes" / "lining.ply")
+    smooth = open_lining(as_trimesh(solids["smooth"]), bore)
+    smooth.export(folder / "meshes" / "lining_smooth.ply")
+    bore.save(folder / "bore.npz")
+    segments = {"furnished": planar_segments(furnished.pieces, bore, track.elevation, height)}
+    save_tunnel(folder / "tunnel.npz", name, provenance, bore, track.elevation, height, walls, segments)
+    placed = {f"furniture_{kind}": number for kind, number in count_pieces(furnished.pieces).items()}
+    count |= {**placed, "furniture_niche": len(furnished.niches), "lining_faces": len(lining.faces)}
+    return count, {"furniture": "by standard, in the variant furnished alone"}
+
+
+MANIFEST_SCHEMA = "subterra.manifest/1"
+_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "trimesh",
+    "manifold3d",
+    "mujoco",
+    "rosbags",
+    "small-gicp",
+    "plyfile",
+    "pypcd4",
+    "laspy",
+    "lazrs",
+    "pye57",
+    "pyarrow",
+    "openpyxl",
+    "shapely",
+)
+
+
+def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
+    """Writes the manifest with schema, config, library versions and the folder's hashes added; keys sorted."""
+    whole = {
+        "schema": MANIFEST_SCHEMA,
+        "files": hash_files(path.parent),
+        "config": _json_value(dataclasses.asdict(config)),
+        "versions": {name: version(name) for name in _LIBRARIES},
+        **_json_value(content),
+    }
+    path.write_text(json.dumps(whole, indent=2, sort_keys=True) + "\n")
+
+
+def hash_files(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of each file of a folder by its name, so that a reader can check the scene."""
+    found = {}
+    for file in sorted(file for file in folder.rglob("*") if file.is_file()):
+        with file.open("rb") as opened:
+            found[file.relative_to(folder).as_posix()] = hashlib.file_digest(opened, "sha256").hexdigest()
+    return found
+
+
+def _json_value(value: Any) -> Any:
+    """Return the value in JSON's types; floats to 9 digits."""
+    if isinstance(value, dict):
+        return {str(key): _json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_json_value(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.9g}")
+    if isinstance(value, np.integer):
+        return int(value)
+    return str(value) if isinstance(value, Path) else value
+
 
 _PREVIEW_VOXEL = 0.06
 
@@ -41,7 +148,7 @@ class BuildConfig:
 def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> None:
     """Writes the six parts of a scene folder and compiles the scene once."""
     bore = result.bore
-    laid = lay(bore, config.track, result.seen.sleepers)
+    laid = lay_track(bore, config.track, result.seen.sleepers)
     count, furnished = write_geometry(folder, name, config.provenance, bore, laid, config.scene)
     content = {
         "name": name,
@@ -72,13 +179,13 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
             },
         },
     }
-    manifest.write(folder / "manifest.json", content, config)
+    write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
-        trimesh.PointCloud(thinned(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
     if result.odometry is not None:
         save_tum(result.odometry, folder / "odometry.tum")
     for scene in SCENES:
-        _compile(folder / scene)
+        _require_mujoco_loads(folder / scene)
 
 
 def _track_facts(laid: Track, result: Reconstruction) -> dict[str, Any]:
@@ -104,7 +211,7 @@ def _track_provenance(laid: Track, result: Reconstruction) -> dict[str, str]:
     }
 
 
-def _compile(path: Path) -> None:
+def _require_mujoco_loads(path: Path) -> None:
     try:
         mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""Any input to a bore: the stages from recording, cloud file or ring survey, with what each of them found."""
+"""From any input to a bore: recording, cloud file or ring survey."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -6,26 +6,107 @@ from typing import Any
 
 import numpy as np
 
-from scene.axis import Axis
-from scene.bore import Bore
+from scene.bore import Axis, Bore
 from scene.cli import Stages
 from scene.cloud import Cloud
 from scene.errors import FitError, RecordingError
 from scene.files import require_input
-from scene.fitting import assemble, lining, rings
+from scene.fitting.assemble import bore_from_sections
+from scene.fitting.assemble import describe_bore as bore_facts
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
-from scene.fitting.facts import facts as bore_facts
-from scene.fitting.lining import LiningConfig
+from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
+from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
 from scene.fitting.section import fit_sections
 from scene.fitting.trackseen import SeenTrack, find_track
 from scene.poses.calibration import UNCALIBRATED, Calibration
-from scene.poses.control import load_control
-from scene.poses.trajectory import Trajectory, load_tum
-from scene.reading.config import ReadingConfig
-from scene.reading.detect import CLOUDS, RECORDINGS, detect, sentence
-from scene.reading.ringsurvey import read_survey
-from scene.registered import Registered, from_cloud_file, from_recording, hashed
-from scene.resume import Partial
+from scene.poses.locate import Located, locate_by_control, locate_by_odometry, locate_given
+from scene.poses.registration import register_scans
+from scene.poses.trajectory import Control, Trajectory, load_control, load_tum
+from scene.reading.cloudfile import read_cloud
+from scene.reading.formats import ReadingConfig, describe, detect, own_readers
+from scene.reading.recording import Recording
+from scene.reading.ringsurvey import read_ring_survey
+from scene.resume import Partial, input_record, resume_key, total_bytes
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A cloud and where it comes from.
+
+    Attributes:
+        cloud: Thinned.
+        record: Name, size and hash of each input.
+        facts: For the manifest.
+        located: Where the LiDAR was, for a recording.
+    """
+
+    cloud: Cloud
+    record: list[dict[str, Any]]
+    facts: dict[str, Any]
+    located: Located | None = None
+
+
+def hash_inputs(paths: list[Path], progress: Stages) -> list[dict[str, Any]]:
+    """Return name, size and hash of each input, read once from end to end."""
+    return input_record(paths, progress.start("hashing the input, bytes", total_bytes(paths)).advance)
+
+
+def register_recording(
+    path: Path,
+    known: Trajectory | Control | None,
+    calibration: Calibration,
+    voxel: float,
+    reading: ReadingConfig,
+    progress: Stages,
+    partial: Partial,
+) -> Registered:
+    """Finds the poses where they are not given, and places every return.
+
+    Args:
+        path: The recording.
+        known: Of its poses.
+        calibration: Where prism and IMU sit against the LiDAR.
+        voxel: Thinning of the cloud, m.
+        reading: What is said about the recording instead of detected.
+        progress: Where the stages show how far they are.
+        partial: What an earlier build got done, and where this one keeps what it does.
+
+    Raises:
+        RecordingError: Damaged, or the poses belong to another recording.
+        FitError: The poses cannot be found, or nothing is left.
+    """
+    with Recording(path, reading.topic, reading.format) as recording:
+        print(f"detected: {describe(recording.peek())}", flush=True)
+        record = hash_inputs([path] if known is None else [path, known.path], progress)
+        partial.open(resume_key(record, voxel, reading, calibration, type(known).__name__, own_readers()))
+        if isinstance(known, Trajectory):
+            located = locate_given(known)
+        elif isinstance(known, Control):
+            located = locate_by_control(recording, known, calibration, progress, partial)
+        else:
+            located = locate_by_odometry(recording, calibration, progress, partial)
+        stage = progress.start("registering scans", recording.scan_count)
+        cloud, uncovered = register_scans(recording, located.trajectory, voxel, stage, located.most_uncovered, partial)
+        facts = {
+            **recording.facts,
+            "scans": recording.scan_count,
+            "scans_without_pose": uncovered,
+            **located.facts,
+        }
+    return Registered(cloud, record, facts, located)
+
+
+def load_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages, partial: Partial) -> Registered:
+    """Reads and thins a cloud that is registered already; arguments as for `from_recording`.
+
+    Raises:
+        RecordingError: Damaged, empty, or of no usable unit.
+    """
+    record = hash_inputs([path], progress)
+    partial.open(resume_key(record, voxel, reading, own_readers()))
+    cloud, facts = read_cloud(path, voxel, reading, progress.start("reading points", None), partial)
+    print(f"detected: {describe(facts)}", flush=True)
+    return Registered(cloud, record, facts)
 
 
 @dataclass(frozen=True)
@@ -82,7 +163,7 @@ def reconstruct(
     """Detects what the input is and builds its bore.
 
     Args:
-        source: A recording, a registered cloud or a ring survey, of any format that `scene.reading.detect` knows.
+        source: A recording, a registered cloud or a ring survey, of any format that `scene.reading.formats` knows.
         trajectory: Poses in TUM form, for a recording.
         config: See `ReconstructConfig`.
         progress: Where the stages show how far they are.
@@ -96,27 +177,28 @@ def reconstruct(
     """
     partial = partial or Partial(None)
     require_input(source)
-    found = detect(source, config.reading.format)
-    if trajectory is not None and found.format not in RECORDINGS:
+    detected = detect(source, config.reading.format)
+    kind = detected.format.kind
+    if trajectory is not None and kind != "recording":
         raise RecordingError(f"{trajectory}: a trajectory goes with a bag, but {source} is none")
-    if control is not None and found.format not in RECORDINGS:
+    if control is not None and kind != "recording":
         raise RecordingError(f"{control}: control goes with a bag, but {source} is none")
     if control is not None and trajectory is not None:
         raise RecordingError(f"{control}: control is for a recording without a trajectory, but {trajectory} is given")
     try:
-        if found.format in RECORDINGS:
+        if kind == "recording":
             known = load_tum(trajectory) if trajectory else load_control(control) if control else None
             parts = (config.voxel, config.reading, progress, partial)
-            return _from_cloud(from_recording(found.path, known, calibration, *parts), config, progress)
-        if found.format in CLOUDS:
-            cloud = from_cloud_file(found.path, config.voxel, config.reading, progress, partial)
-            return _from_cloud(cloud, config, progress)
-        return _from_rings(found.path, config, progress)
+            return _fit_cloud(register_recording(detected.path, known, calibration, *parts), config, progress)
+        if kind == "cloud":
+            cloud = load_cloud(detected.path, config.voxel, config.reading, progress, partial)
+            return _fit_cloud(cloud, config, progress)
+        return _fit_ring_survey(detected.path, config, progress)
     except FitError as error:
         raise FitError(str(error) if str(source) in str(error) else f"{source}: {error}") from error
 
 
-def _from_cloud(registered: Registered, config: ReconstructConfig, progress: Stages) -> Reconstruction:
+def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stages) -> Reconstruction:
     cloud, located = registered.cloud, registered.located
     stage = progress.start("fitting the bore", 4)
     axis = fit_centreline(cloud.points, config.centreline, cloud.origin)
@@ -125,8 +207,8 @@ def _from_cloud(registered: Registered, config: ReconstructConfig, progress: Sta
     stage.advance()
     sections = fit_sections(cloud, axis)
     stage.advance()
-    smooth = assemble.from_sections(axis, sections)
-    bore, provenance = lining.add_features(smooth, sections, cloud, config.lining)
+    smooth = bore_from_sections(axis, sections)
+    bore, provenance = add_lining(smooth, sections, cloud, config.lining)
     stage.advance()
     seen = find_track(cloud, bore) if sections.flat_floor else SeenTrack(None, None)
     stage.advance()
@@ -143,12 +225,12 @@ def _from_cloud(registered: Registered, config: ReconstructConfig, progress: Sta
     return Reconstruction(bore, cloud.origin, registered.record, facts, provenance, odometry, cloud, seen)
 
 
-def _from_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:
-    survey = read_survey(path, config.reading.unit)
-    print(f"detected: {sentence({'kind': 'ring survey', **survey.facts})}", flush=True)
-    fit = rings.fit_rings(survey)
+def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:
+    survey = read_ring_survey(path, config.reading.unit)
+    print(f"detected: {describe({'kind': 'ring survey', **survey.facts})}", flush=True)
+    fit = fit_rings(survey)
     origin = np.floor(np.median(fit.centre, axis=0))
-    bore, provenance = lining.standard(rings.bore_from_rings(fit, origin), config.lining, flat_floor=False)
+    bore, provenance = add_standard_lining(bore_from_rings(fit, origin), config.lining, flat_floor=False)
     facts = {
         "kind": "ring survey",
         **survey.facts,
@@ -162,11 +244,11 @@ def _from_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Reco
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
         "largest_target_offset": float(max(offset.max() for offset in survey.offsets)),
         "flat_floor": False,
-        **({} if survey.design is None else rings.against_design(fit, survey.design)),
+        **({} if survey.design is None else compare_with_design(fit, survey.design)),
     }
-    return Reconstruction(bore, origin, hashed([path], progress), facts, provenance)
+    return Reconstruction(bore, origin, hash_inputs([path], progress), facts, provenance)
 
 
 def _runs_against(axis: Axis, positions: np.ndarray) -> bool:
-    """Whether the sensor moved mostly towards smaller stations."""
+    """True where the sensor moved mostly towards smaller stations."""
     return bool(axis.local(positions[[0, -1]])[0] @ [-1.0, 1.0] < 0)

@@ -1,18 +1,85 @@
-"""Partial results beside the output, so that a build that was killed goes on where it was and gives the same bytes."""
+"""Partial results beside the output: a build that was killed goes on where it was and gives the same bytes."""
 
+import dataclasses
 import fcntl
+import hashlib
+import json
 import os
 import shutil
 import time
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
 from scene.errors import OutputError
 
-_KEY = "key"
-_SHARE = 0.02  # of the time, at most, goes into writing partial results
+_CHUNK = 1 << 22
+_LIBRARIES = ("numpy", "scipy", "small-gicp", "rosbags", "laspy", "lazrs", "pye57", "pyarrow", "plyfile", "pypcd4")
+
+
+def total_bytes(paths: list[Path]) -> int:
+    """Return the bytes of all inputs, a folder's files included."""
+    return sum(file.stat().st_size for path in paths for file in _files(path))
+
+
+def input_record(paths: list[Path], advance: Callable[[int], None] = lambda _: None) -> list[dict[str, Any]]:
+    """Return name, size and hash of each input; no folder names, so that the record is the same anywhere.
+
+    A folder of scans counts as one input, whose hash is that of its files' names and hashes.
+
+    Args:
+        paths: Files and folders; each byte is read once.
+        advance: Called with the number of bytes that have been read since.
+    """
+    return [_folder_record(path, advance) if path.is_dir() else _file_record(path, advance) for path in paths]
+
+
+def resume_key(record: list[dict[str, Any]], *settings: Any) -> str:
+    """Return a hex digest of all that partial results depend on: inputs, settings, libraries, and this code."""
+    root = Path(__file__).parent
+    source = hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        source.update(f"{file.relative_to(root)}\n".encode() + file.read_bytes())
+    versions = {name: version(name) for name in _LIBRARIES}
+    text = json.dumps([record, settings, versions, source.hexdigest()], sort_keys=True, default=_json_value)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    return [file for file in sorted(path.iterdir()) if file.is_file()] if path.is_dir() else [path]
+
+
+def _sha256(path: Path, advance: Callable[[int], None]) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(_CHUNK):
+            digest.update(block)
+            advance(len(block))
+    return digest.hexdigest()
+
+
+def _file_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:
+    return {"file": path.name, "bytes": path.stat().st_size, "sha256": _sha256(path, advance)}
+
+
+def _folder_record(path: Path, advance: Callable[[int], None]) -> dict[str, Any]:
+    records = [_file_record(file, advance) for file in _files(path)]
+    digest = hashlib.sha256("".join(f"{r['file']} {r['sha256']}\n" for r in records).encode())
+    size = sum(record["bytes"] for record in records)
+    return {"folder": path.name, "files": len(records), "bytes": size, "sha256": digest.hexdigest()}
+
+
+def _json_value(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    return value.tolist() if isinstance(value, np.ndarray) else str(value)
+
+
+_KEY_FILE = "key"
+_WRITING_SHARE = 0.02  # of the time, at most, goes into writing partial results
 
 
 class Partial:
@@ -45,7 +112,7 @@ class Partial:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._take()
-            place = self.folder / _KEY
+            place = self.folder / _KEY_FILE
             known = place.read_text() if place.is_file() else None
             if known != key or self.fresh:
                 if known is not None and not self.fresh:
@@ -62,7 +129,7 @@ class Partial:
         return self._open
 
     def due(self) -> bool:
-        """Whether it is time to write a growing result again; rarer where writing takes long."""
+        """Return whether it is time to write a growing result again; rarer where writing takes long."""
         return self._open and time.monotonic() >= self._next
 
     def save(self, name: str, **arrays: np.ndarray) -> None:
@@ -78,10 +145,10 @@ class Partial:
         except OSError as error:
             self._give_up(error)
         now = time.monotonic()
-        self._next = now + max(self.every, (now - started) / _SHARE if self.every else 0.0)
+        self._next = now + max(self.every, (now - started) / _WRITING_SHARE if self.every else 0.0)
 
     def load(self, name: str) -> dict[str, np.ndarray] | None:
-        """A result as it was saved; `None` where there is none that is whole."""
+        """Return a result as it was saved; `None` where there is none that is whole."""
         if not self._open or self.folder is None:
             return None
         try:
@@ -122,8 +189,8 @@ class Partial:
         self.discard()
 
 
-def beside(out: Path) -> Path:
-    """The folder for the partial results of a build that writes `out`."""
+def partial_folder(out: Path) -> Path:
+    """Return the folder for the partial results of a build that writes `out`."""
     return out.with_name(f".{out.name}.resume")
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks.truth import compare, load_truth
-from scene.axis import with_frames
+from scene.bore import make_axis
 
 ROOT = Path(__file__).parents[1]
 LENGTH, SEED = 24, 11  # a seed that the builder was not developed on
@@ -42,7 +42,7 @@ def furniture(survey):
 
 def on_the_wall(bore: dict[str, np.ndarray], origin: np.ndarray) -> np.ndarray:
     """Positions of the pockets in the survey frame, m."""
-    axis = with_frames(bore["station"], bore["position"], bore["tangent"])
+    axis = make_axis(bore["station"], bore["position"], bore["tangent"])
     pocket = bore["pocket"]
     at = axis.at(pocket["station"])
     row = np.rint(pocket["station"] / bore["station"][1]).astype(int).clip(0, len(bore["station"]) - 1)

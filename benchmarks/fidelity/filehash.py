@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from scene.inputs import input_record
+from scene.resume import input_record
 
 
 def file_hash(path: Path) -> str:

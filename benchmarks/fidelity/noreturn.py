@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from scene.reading.pointcloud2 import MESSAGE_TYPE
-from scene.reading.pointtimes import FIELDS, make_scan
 from scene.reading.recording import Recording
-from scene.reading.scan import Scan
+from scene.reading.scans import POINTCLOUD2_TYPE, TIME_FIELDS, Scan, make_scan
 
 SILENT = 1e6  # m: where the point of a beam without return is put, in its direction
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -24,7 +22,7 @@ def organised(recording: Recording) -> bool:
     for message in _messages(recording):
         names = {field.name for field in message.fields}
         whole = message.height * message.width * message.point_step == len(message.data)
-        return bool(whole and message.height > 1 and message.width > 1 and names & set(FIELDS))
+        return bool(whole and message.height > 1 and message.width > 1 and names & set(TIME_FIELDS))
     return False
 
 
@@ -77,17 +75,19 @@ def directions(
 
 
 def _messages(recording: Recording) -> Iterator[Any]:
-    connections = [c for c in recording.reader.connections if (c.topic, c.msgtype) == (recording.topic, MESSAGE_TYPE)]
+    connections = [
+        c for c in recording.reader.connections if (c.topic, c.msgtype) == (recording.topic, POINTCLOUD2_TYPE)
+    ]
     if not connections:
         return
     for _, _, raw in recording.reader.messages(connections=connections):
-        yield recording.deserialize(bytes(raw), MESSAGE_TYPE)
+        yield recording.deserialize(bytes(raw), POINTCLOUD2_TYPE)
 
 
 def _fields(message: Any) -> tuple[Float[np.ndarray, "rings columns 3"], Int[np.ndarray, "rings columns"], str]:
     order = ">" if message.is_bigendian else "<"
     fields = {f.name: (order + _TYPES[f.datatype], f.offset) for f in message.fields if f.datatype in _TYPES}
-    name = next(time for time in FIELDS if time in fields)
+    name = next(time for time in TIME_FIELDS if time in fields)
     wanted = ["x", "y", "z", name]
     layout = np.dtype({
         "names": wanted, "formats": [fields[n][0] for n in wanted], "offsets": [fields[n][1] for n in wanted],

@@ -10,7 +10,7 @@ from scipy.ndimage import minimum_filter1d
 from benchmarks.paper.errors import PaperError
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.reading.recording import Recording
-from scene.reading.scan import Scan
+from scene.reading.scans import Scan
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ import trimesh
 from benchmarks.fidelity.derive.surface import Caster
 from benchmarks.rays.agreement import EDGE_JUMP, EDGE_TURN, Agreement
 from benchmarks.rays.scenefiles import reference_surface
-from scene.bore import load
+from scene.bore import load_bore
 from subterra_jax import lidar
 from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel
@@ -39,7 +39,7 @@ def compare_planar(folder: Path, plan: TunnelPlan, lining: str, n_rays: int, see
     poses = reference.random_poses(plan, max(1, n_rays // params.n_beams), np.random.default_rng(seed))
     ranges = _simulated(plan, lining, poses, params)
     surface = reference_surface(folder, lining)
-    station = load(folder / "bore.npz").axis.local(surface.vertices)[0]
+    station = load_bore(folder / "bore.npz").axis.local(surface.vertices)[0]
     level = surface.vertices.copy()
     level[:, 2] -= np.interp(station, plan.station, plan.elevation)
     flat, straight = (Caster(trimesh.Trimesh(v, surface.faces, process=False)) for v in (level, surface.vertices))

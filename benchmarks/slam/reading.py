@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.slam.errors import SlamError
-from scene.reading.pointcloud2 import parse_pointcloud2
+from scene.reading.scans import parse_pointcloud2
 
 Sweep = tuple[float, Float[np.ndarray, "n 3"]]  # stamp, s; points in the sensor's frame, m
 CLOUDS, PLANAR = "/points", "/scan_dense"

@@ -1,29 +1,164 @@
-"""Axis and sections put together: the bore."""
+"""From axis and sections to the bore, with its types of section."""
 
-from dataclasses import replace
+import itertools
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from jaxtyping import Shaped
+from scipy.optimize import least_squares
 
-from scene.axis import Axis
-from scene.bore import POCKET, Bore, uniform_stations
-from scene.fitting import profile
+from scene.bore import POCKET, STRETCH, Axis, Bore, uniform_stations
 from scene.fitting.branches import require_no_room
+from scene.fitting.profile import measure_section
 from scene.fitting.section import Sections
-from scene.fitting.sectiontype import find_stretches
-from scene.fitting.sureness import known
+from scene.fitting.unroll import probability_known
+
+_WINDOW = 2.0  # m of bore that one fit is made to
+_PIECE = 0.5  # m of girth that vary for themselves: so many parameters has a free profile
+_ROUGH = 0.01  # m, what a wall departs from its type by without being of another
+_MOST_UNSURE = 0.01  # m: a wall known worse is not therefore of any type
+_ABOVE_FLOOR = 0.30  # m
+_BEST = 0.9  # share of the directions that a fit is judged by: a niche is no other type
+_SHORTEST = 6.0  # m
+_MIN_DIRECTIONS = 60
+FREE = "free"
+_N_PARAMETERS = {"circle": 3, "d": 3, "horseshoe": 4}
+
+
+@dataclass(frozen=True)
+class TypeFit:
+    """One type fitted to one section.
+
+    Attributes:
+        type: `circle`, `d`, `horseshoe` or `free`.
+        crown_radius: m; NaN where free.
+        wall_radius: m; infinite for a D, NaN where free.
+        rms: Of the best nine tenths of the directions, m; 0 where free.
+        cost: Akaike's criterion; the least is the best.
+    """
+
+    type: str
+    crown_radius: float
+    wall_radius: float
+    rms: float
+    cost: float
+
+
+def find_stretches(bore: Bore, flat_floor: bool, sigma: float) -> Shaped[np.ndarray, " t"]:
+    """Finds stretches of one type, of `scene.bore.STRETCH`, that cover the bore from end to end.
+
+    Args:
+        bore: The bore; its own `stretch` is not read.
+        flat_floor: Whether it stands on a floor; without, only a circle or a free profile comes into question.
+        sigma: Standard deviation of its walls, m.
+    """
+    count = max(round(bore.length / _WINDOW), 1)
+    rows = np.minimum((bore.station / max(bore.length, 1e-9) * count).astype(np.intp), count - 1)
+    noise = float(np.hypot(_ROUGH, min(sigma, _MOST_UNSURE)))
+    windows = [_fit_types(bore.angle, bore.radius[rows == k], flat_floor, noise) for k in range(count)]
+    best = [min(fits, key=lambda fit: fit.cost).type for fits in windows]
+    result = []
+    for first, last in _runs(best, max(round(_SHORTEST / _WINDOW), 1)):
+        kind = max(sorted(set(best[first:last])), key=best[first:last].count)
+        fits = [next((fit for fit in fits if fit.type == kind), fits[-1]) for fits in windows[first:last]]
+        inside = (rows >= first) & (rows < last)
+        result.append((
+            bore.length * first / count, bore.length * last / count, kind, bore.width[inside].mean(),
+            bore.height[inside].mean(), np.mean([fit.crown_radius for fit in fits]),
+            _mean_radius([fit.wall_radius for fit in fits]), np.sqrt(np.mean([fit.rms**2 for fit in fits])),
+            np.sqrt(np.mean(bore.residual_rms[inside] ** 2)), best[first:last].count(kind) / (last - first),
+        ))  # fmt: skip
+    return np.array(result, STRETCH)
+
+
+def _mean_radius(radius: list[float]) -> float:
+    """Mean by curvature, so that straight walls count."""
+    curvature = float(np.mean(1 / np.asarray(radius)))
+    return 1 / curvature if curvature else np.inf
+
+
+def _runs(best: list[str], shortest: int) -> list[tuple[int, int]]:
+    """Runs of windows of one type; a run too short joins its longer neighbour."""
+    edges = [0, *(k for k in range(1, len(best)) if best[k] != best[k - 1]), len(best)]
+    runs = [(a, b, best[a]) for a, b in itertools.pairwise(edges)]
+    while len(runs) > 1:
+        k = min(range(len(runs)), key=lambda i: runs[i][1] - runs[i][0])
+        if runs[k][1] - runs[k][0] >= shortest:
+            break
+        beside = [i for i in (k - 1, k + 1) if 0 <= i < len(runs)]
+        into = max(beside, key=lambda i: runs[i][1] - runs[i][0])
+        runs[into] = (min(runs[k][0], runs[into][0]), max(runs[k][1], runs[into][1]), runs[into][2])
+        del runs[k]
+        runs = _join_runs(runs)
+    return [(a, b) for a, b, _ in runs]
+
+
+def _join_runs(runs: list[tuple[int, int, str]]) -> list[tuple[int, int, str]]:
+    result = runs[:1]
+    for run in runs[1:]:
+        if run[2] == result[-1][2]:
+            result[-1] = (result[-1][0], run[1], run[2])
+        else:
+            result.append(run)
+    return result
+
+
+def _fit_types(angle: np.ndarray, sections: np.ndarray, flat_floor: bool, noise: float) -> list[TypeFit]:
+    """Fits every type to the median of some sections; the free profile comes last."""
+    radius, wander = np.median(sections, axis=0), float(np.median(sections.std(axis=0)))
+    y, z = radius * np.cos(angle), radius * np.sin(angle)
+    if flat_floor:
+        low = float(np.interp(-np.pi / 2, angle, z))
+        y, z = y[z > low + _ABOVE_FLOOR], z[z > low + _ABOVE_FLOOR]
+    pieces = float(np.hypot(np.diff(y), np.diff(z)).clip(max=0.5).sum()) / _PIECE
+    free = TypeFit(FREE, np.nan, np.nan, 0.0, pieces * np.log(noise**2) + 2 * pieces)
+    if len(y) < _MIN_DIRECTIONS:
+        return [free]
+    kinds = _N_PARAMETERS if flat_floor else {"circle": 3}
+    return [*(_fit_type(kind, y, z, pieces, noise, wander) for kind in kinds), free]
+
+
+def _fit_type(kind: str, y: np.ndarray, z: np.ndarray, pieces: float, noise: float, wander: float) -> TypeFit:
+    half = float(np.ptp(y)) / 2
+    crown = float(z.max()) - half
+    start = [float(y.min()) + half, crown, half] + ([0.5] if kind == "horseshoe" else [])
+    bounds = ([-np.inf, -np.inf, 0.3 * half, 0.0][: len(start)], [np.inf, np.inf, 3 * half, 1.0][: len(start)])
+
+    def misfit(shape: np.ndarray) -> np.ndarray:
+        bend = {"circle": 1.0, "d": 0.0}.get(kind, shape[-1])
+        return _distance_from_type(y - shape[0], z - shape[1], shape[2], bend)
+
+    shape = least_squares(misfit, start, bounds=bounds, loss="soft_l1", f_scale=2 * noise).x
+    bend = {"circle": 1.0, "d": 0.0}.get(kind, float(shape[-1]))
+    off = np.sort(np.abs(misfit(shape)))
+    rms = float(np.sqrt(np.mean(off[: max(int(_BEST * len(off)), 1)] ** 2)))
+    wall = float(shape[2]) / bend if bend > 1e-9 else np.inf
+    cost = pieces * np.log(rms**2 + wander**2 + noise**2) + 2 * _N_PARAMETERS[kind]
+    return TypeFit(kind, float(shape[2]), wall, rms, cost)
+
+
+def _distance_from_type(y: np.ndarray, z: np.ndarray, radius: float, bend: float) -> np.ndarray:
+    """Outward distance from a crown on walls of curvature `bend / radius`, m."""
+    crown = np.hypot(y, z) - radius
+    if bend < 1e-6:
+        return np.where(z > 0, crown, np.abs(y) - radius)
+    wall = radius / bend
+    return np.where(z > 0, crown, np.hypot(np.abs(y) + wall - radius, z) - wall)
+
 
 _MIN_COVERAGE = 0.4
 _SURE = 0.1  # quantile of the wall's uncertainty: where profiles stand, not between them
 
 
-def measured_extents(angle: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height of each section, m, `(n,)` each."""
-    extents = [profile.measure(angle, section) for section in radius]
+def measure_extents(angle: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return width and height of each section, m, `(n,)` each."""
+    extents = [measure_section(angle, section) for section in radius]
     return np.array([e.width for e in extents]), np.array([e.height for e in extents])
 
 
-def from_sections(axis: Axis, sections: Sections) -> Bore:
-    """The bore over the seen span, without lining features; stations start at its first end.
+def bore_from_sections(axis: Axis, sections: Sections) -> Bore:
+    """Return the bore over the seen span, without lining features; stations start at its first end.
 
     Raises:
         FitError: It holds a room.
@@ -37,14 +172,14 @@ def from_sections(axis: Axis, sections: Sections) -> Bore:
     share = (rows - low)[:, None]
     high = np.minimum(low + 1, grid.rows - 1)
     radius = (1 - share) * sections.radius[low] + share * sections.radius[high]
-    width, height = measured_extents(grid.angle, radius)
+    width, height = measure_extents(grid.angle, radius)
     require_no_room(station, width)
     seen = sections.weight > 0
     coverage = np.array([seen[max(row - 2, 0) : row + 3].any(axis=0).mean() for row in low])
     bore = Bore(
         station, at.position, at.tangent, at.lateral, at.up, width, height, grid.angle, radius,
         _window_mean(sections.spread, low), coverage, coverage < _MIN_COVERAGE,
-        np.empty(0), np.empty(0, POCKET), known(sections.sigma).mean(axis=1)[low],
+        np.empty(0), np.empty(0, POCKET), probability_known(sections.sigma).mean(axis=1)[low],
     )  # fmt: skip
     return replace(bore, stretch=find_stretches(bore, sections.flat_floor, float(np.quantile(sections.sigma, _SURE))))
 
@@ -53,3 +188,29 @@ def _window_mean(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Mean over the five rows, one station step, around each place."""
     padded = np.pad(rows, 2, mode="edge")
     return np.mean([padded[at + k] for k in range(5)], axis=0)
+
+
+_STRAIGHT = 1e-5  # 1/m
+
+
+def describe_bore(bore: Bore) -> dict[str, Any]:
+    """Return residual, coverage, confidence, alignment and types of section, for the manifest.
+
+    `least_plan_radius` is `None` where the bore is straight; parameters that a type of section lacks are left out.
+    """
+    axis = bore.axis
+    bend = float(np.abs(axis.curvature).max())
+    return {
+        "residual_rms": float(np.sqrt(np.mean(bore.residual_rms**2))),
+        "coverage": float(bore.coverage.mean()),
+        "confidence": float(bore.confidence.mean()),
+        "least_plan_radius": 1 / bend if bend > _STRAIGHT else None,
+        "grade": [float(axis.grade.min()), float(axis.grade.max())],
+        "sections": [_describe_stretch(stretch) for stretch in bore.stretch],
+    }
+
+
+def _describe_stretch(stretch: np.void) -> dict[str, Any]:
+    """One stretch for the manifest; a straight wall has no radius."""
+    values = {name: stretch[name].item() for name in stretch.dtype.names or ()}
+    return {name: value for name, value in values.items() if isinstance(value, str) or np.isfinite(value)}

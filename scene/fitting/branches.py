@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from scene.axis import Axis
+from scene.bore import Axis
 from scene.errors import FitError
 
 _USUAL = 1.5  # times the median reach: slices that reach further say nothing of the axis
@@ -47,7 +47,7 @@ def require_one_bore(
     """
     index = np.floor(along / length).astype(np.intp)
     count = np.bincount(index)
-    centre = _medians(nodes, index, len(count))
+    centre = _slice_medians(nodes, index, len(count))
     reach = np.zeros(len(count))
     np.maximum.at(reach, index, np.linalg.norm(nodes - centre[index], axis=1))
     usual = float(np.median(reach[count > 0]))
@@ -120,7 +120,7 @@ def require_no_room(station: Float[np.ndarray, " n"], width: Float[np.ndarray, "
             )
 
 
-def _medians(nodes: np.ndarray, index: np.ndarray, count: int) -> Float[np.ndarray, "c 3"]:
+def _slice_medians(nodes: np.ndarray, index: np.ndarray, count: int) -> Float[np.ndarray, "c 3"]:
     """Median position of each slice's nodes, m; 0 where there is none."""
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(count + 1))

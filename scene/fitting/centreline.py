@@ -1,20 +1,105 @@
-"""A cloud in, the axis of the bore out: through mid-width and mid-height, smooth, with arc length.
-
-The first guess comes from distances *along* the surface, so that no orientation or straightness is assumed; it is then
-pulled to the middle of the sections a few times.
-"""
+"""From a cloud to the axis of the bore."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.interpolate import make_lsq_spline
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
 
-from scene.axis import Axis, through
+from scene.bore import Axis, axis_through
 from scene.errors import FitError
-from scene.fitting import floor, profile
-from scene.fitting.branches import require_no_fold
-from scene.fitting.skeleton import skeleton
+from scene.fitting.branches import require_no_fold, require_one_bore
+from scene.fitting.floor import fit_floor_line, floor_radius
+from scene.fitting.profile import measure_section, section_angles
+
+SKELETON_VOXEL = 0.5
+_NEIGHBOURS = (1.2, 1.8, 2.6, 3.8)  # m; profiles may be apart, surveys have gaps
+_MIN_JOINED = 0.95
+_PART = 0.02  # of the nodes: a smaller part is clutter
+_LONGEST_GAP = 12.0  # m
+_RIM = 0.5  # m
+_SLICE = 1.5
+_TILTED = 3
+
+
+def surface_skeleton(
+    points: Float[np.ndarray, "n 3"], min_length: float, origin: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "k 3"]:
+    """Return centres of slices across the surface distance, from end to end, m.
+
+    Args:
+        points: Registered cloud, m.
+        min_length: A shorter one is refused, m.
+        origin: Of the points' frame in the input's, m, for the error message.
+
+    Raises:
+        FitError: Too short, without two ends, or with a branch or a room.
+    """
+    cells = np.unique(np.floor(points / SKELETON_VOXEL).astype(np.int64), axis=0)
+    nodes = (cells + 0.5) * SKELETON_VOXEL
+    extent = 2 * float(np.linalg.norm(nodes[:, :2] - nodes[:, :2].mean(axis=0), axis=1).max())
+    if extent < min_length:
+        raise FitError(f"the tunnel is at most {extent:.1f} m long; at least {min_length:g} m are needed")
+    graph, nodes = _surface_graph(nodes)
+
+    def distances(start: int) -> np.ndarray:
+        return dijkstra(graph, directed=False, indices=start)
+
+    from_start = distances(int(np.argmax(distances(0))))
+    from_end = distances(int(np.argmax(from_start)))
+    along = (from_start - from_end) / 2  # the half difference is square to the axis where one distance alone is tilted
+    if np.ptp(along) < min_length:
+        raise FitError(f"the tunnel is {np.ptp(along):.1f} m long; at least {min_length:g} m are needed")
+    own = require_one_bore(nodes, along - along.min(), _SLICE, SKELETON_VOXEL, origin)
+    nodes, along = nodes[own], along[own]
+    index = np.floor((along - along.min()) / _SLICE).astype(np.intp)
+    count = np.bincount(index)
+    centres = np.stack([np.bincount(index, nodes[:, axis]) / np.maximum(count, 1) for axis in range(3)], axis=1)
+    full = count > 0.4 * np.median(count)
+    if full.sum() < 6:
+        raise FitError("no tunnel in the cloud: its surface has no two ends")
+    # The last slices are tilted: at a mouth the surface distances still fan out from one point.
+    trimmed = centres[full]
+    return trimmed[_TILTED:-_TILTED] if len(trimmed) >= 4 * _TILTED else trimmed[1:-1]
+
+
+def _surface_graph(nodes: Float[np.ndarray, "k 3"]) -> tuple[csr_matrix, Float[np.ndarray, "j 3"]]:
+    """Joins nodes within a reach that grows until nearly all are connected, then bridges gaps.
+
+    What is still apart from the largest part, further than the longest gap, is left out.
+    """
+    for reach in _NEIGHBOURS:
+        pairs = cKDTree(nodes).query_pairs(reach, output_type="ndarray")
+        labels = connected_components(_join_pairs(nodes, pairs), directed=False)[1]
+        if np.bincount(labels).max() >= _MIN_JOINED * len(nodes):
+            break
+    graph = _join_pairs(nodes, np.concatenate([pairs, *_bridges(nodes, labels)]))
+    labels = connected_components(graph, directed=False)[1]
+    largest = np.flatnonzero(labels == np.bincount(labels).argmax())
+    return graph[largest][:, largest], nodes[largest]
+
+
+def _join_pairs(nodes: np.ndarray, pairs: Int[np.ndarray, "e 2"]) -> csr_matrix:
+    lengths = np.linalg.norm(nodes[pairs[:, 0]] - nodes[pairs[:, 1]], axis=1)
+    return csr_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes)))
+
+
+def _bridges(nodes: np.ndarray, labels: np.ndarray) -> list[np.ndarray]:
+    """Pairs of nodes across each gap between large parts: all nearly as close as the closest, so all around the rim."""
+    count = np.bincount(labels)
+    parts = [np.flatnonzero(labels == label) for label in np.flatnonzero(count > _PART * len(nodes))]
+    result = []
+    for k, part in enumerate(parts):
+        for other in parts[k + 1 :]:
+            distance, nearest = cKDTree(nodes[other]).query(nodes[part], distance_upper_bound=_LONGEST_GAP)
+            close = distance < distance.min() + _RIM
+            if np.isfinite(distance.min()):
+                result.append(np.stack([part[close], other[nearest[close]]], axis=1))
+    return result
+
 
 _HERE = np.zeros(3)
 _OVERRUN = 6.0
@@ -45,7 +130,7 @@ class CentrelineConfig:
 def fit_centreline(
     points: Float[np.ndarray, "n 3"], config: CentrelineConfig, origin: Float[np.ndarray, "3"] = _HERE
 ) -> Axis:
-    """The axis of the bore, from end to end of the cloud.
+    """Return the axis of the bore, from end to end of the cloud.
 
     Args:
         points: Registered cloud, z up, m.
@@ -55,11 +140,11 @@ def fit_centreline(
     Raises:
         FitError: Too short, nothing like a tunnel, or with a branch or a room.
     """
-    axis = _smooth(skeleton(points, config.min_length, origin), config.cutoff)
+    axis = _smooth_axis(surface_skeleton(points, config.min_length, origin), config.cutoff)
     stride = max(1, int(len(points) / (axis.length * _POINTS_PER_METRE)))
     sample = points[::stride].astype(np.float64)
     for _ in range(_PASSES):
-        axis = _smooth(_middles(sample, axis), config.cutoff)
+        axis = _smooth_axis(_section_middles(sample, axis), config.cutoff)
     if axis.length < config.min_length:
         raise FitError(f"the tunnel is {axis.length:.1f} m long; at least {config.min_length:g} m are needed")
     across = 2 * float(np.median(np.hypot(*axis.local(sample[:: max(1, len(sample) // 20_000)])[1:])))
@@ -69,39 +154,39 @@ def fit_centreline(
     return axis
 
 
-def _middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:
+def _section_middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:
     """Middle of each section seen well enough, one a metre."""
     extended = axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, _SPACING))
     station, lateral, upward = extended.local(points)
     index = np.rint((station - extended.station[0]) / _SPACING).astype(np.intp)
     angle, radius = np.arctan2(upward, lateral), np.hypot(lateral, upward)
     bins = np.floor((angle + np.pi) / (2 * np.pi) * _COARSE_ANGLES).astype(np.intp) % _COARSE_ANGLES
-    centres = profile.angles(_COARSE_ANGLES) + np.pi / _COARSE_ANGLES
+    centres = section_angles(_COARSE_ANGLES) + np.pi / _COARSE_ANGLES
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(len(extended.station) + 1))
     middles = []
     full = _FULL_SHARE * np.median(np.diff(bounds)[np.diff(bounds) > 0])
     for k in np.flatnonzero(np.diff(bounds) >= max(full, 1)):
         rows = order[bounds[k] : bounds[k + 1]]
-        medians = _medians(bins[rows], radius[rows])
+        medians = _bin_medians(bins[rows], radius[rows])
         seen = np.isfinite(medians)
         if seen.mean() < _MIN_SEEN:
             continue
         around = np.interp(centres, centres[seen], medians[seen], period=2 * np.pi)
-        line = floor.fit_line(lateral[rows], upward[rows])
+        line = fit_floor_line(lateral[rows], upward[rows])
         if line is not None:
-            bed = floor.radius(line, centres)
+            bed = floor_radius(line, centres)
             under_track = (np.sin(centres) < _DOWN) & (bed < around + _TRACK)
             around = np.where(under_track, bed, np.minimum(around, bed))
         around = np.minimum(around, _FURTHEST * np.median(around))
-        across, along = profile.measure(centres, around).middle
+        across, along = measure_section(centres, around).middle
         middles.append(extended.position[k] + across * extended.lateral[k] + along * extended.up[k])
     if len(middles) < 4:
         raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
     return np.asarray(middles)
 
 
-def _medians(bins: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, " m"]:
+def _bin_medians(bins: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, " m"]:
     order = np.lexsort((radius, bins))
     bounds = np.searchsorted(bins[order], np.arange(_COARSE_ANGLES + 1))
     count = np.diff(bounds)
@@ -111,8 +196,8 @@ def _medians(bins: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, " m"]:
     return np.where(count > 0, radius[order][middle], np.nan)
 
 
-def _smooth(centres: np.ndarray, cutoff: float) -> Axis:
-    """A least-squares cubic spline by chord length with two knots per `cutoff`.
+def _smooth_axis(centres: np.ndarray, cutoff: float) -> Axis:
+    """Return a least-squares cubic spline by chord length with two knots per `cutoff`.
 
     A smoothing spline would straighten its ends, by 2 cm on an arc of 150 m; this one has no end condition.
     """
@@ -121,5 +206,5 @@ def _smooth(centres: np.ndarray, cutoff: float) -> Axis:
     inner = np.linspace(0.0, chord[-1], max(pieces, 1) + 1)[1:-1]
     knots = np.concatenate([[0.0] * 4, inner, [chord[-1]] * 4])
     if len(chord) <= len(inner) + 4:
-        return through(centres, _SPACING)
-    return through(make_lsq_spline(chord, centres, knots)(chord), _SPACING)
+        return axis_through(centres, _SPACING)
+    return axis_through(make_lsq_spline(chord, centres, knots)(chord), _SPACING)

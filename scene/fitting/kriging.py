@@ -1,17 +1,13 @@
-"""Kriging along the station: what a wall does between the places where it was seen, and how sure that is.
-
-Each direction of the section is a function of the station. All share one correlation, chosen by its likelihood from
-four families and a range of lengths; the roughest family at a great length is linear interpolation, so that this is
-one of the choices.
-
-Source: Rasmussen and Williams 2006, *Gaussian Processes for Machine Learning*, chapters 2, 4.2 and 5.4.
-"""
+"""The wall between profiles some way apart."""
 
 from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import binary_closing, gaussian_filter1d
+
+from scene.fitting.unroll import Grid, cell_means, cell_medians, fill_around, fill_nearest, median_smooth
 
 _FAMILIES = ("exponential", "matern 3/2", "matern 5/2", "gaussian")
 _LENGTHS = 0.3 * 1.2 ** np.arange(20)  # m
@@ -40,7 +36,7 @@ class Correlation:
     sigma: float
 
     def __call__(self, distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-        """Correlation at a distance, m; noise apart."""
+        """Return the correlation at a distance, m, without the noise."""
         return _correlation(self.family, distance / self.length)
 
 
@@ -54,8 +50,8 @@ def _correlation(family: str, d: np.ndarray) -> np.ndarray:
     return np.exp(-(d**2))
 
 
-def choose(station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]) -> Correlation:
-    """The correlation under which the values are likeliest.
+def choose_correlation(station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]) -> Correlation:
+    """Return the correlation under which the values are likeliest.
 
     Args:
         station: Of each value, growing along the first axis, m.
@@ -64,7 +60,7 @@ def choose(station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]) -
     """
     at, y = _samples(station, value)
     seen = np.isfinite(y)
-    off = _without_line(at, y)
+    off = _remove_line(at, y)
     each = np.nanstd(np.where(seen.any(axis=1, keepdims=True), off, 0.0), axis=1)
     even = each <= _UNEVEN * np.median(each)  # a portal that flares says nothing of the walls elsewhere
     at, y, seen, off = at[even], y[even], seen[even], off[even]
@@ -81,7 +77,7 @@ def choose(station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]) -
     for family, length in product(_FAMILIES, _LENGTHS):
         shape = _correlation(family, distance / length)
         for nugget in _NUGGETS:
-            factor = np.linalg.cholesky(_masked(shape + line, seen, nugget))
+            factor = np.linalg.cholesky(_mask_unseen(shape + line, seen, nugget))
             white = np.linalg.solve(factor, y[:, :, None])
             variance = float((white**2).sum() / freedom)
             half_determinant = float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
@@ -104,8 +100,8 @@ def _samples(station: np.ndarray, value: np.ndarray) -> tuple[np.ndarray, np.nda
     )
 
 
-def _without_line(at: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Each window less the line fitted to it; NaN stays."""
+def _remove_line(at: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Subtracts from each window the line fitted to it; NaN stays."""
     mask = np.isfinite(y).astype(float)
     count = np.maximum(mask.sum(axis=1, keepdims=True), 1.0)
     filled = np.where(mask > 0, y, 0.0)
@@ -114,35 +110,35 @@ def _without_line(at: np.ndarray, y: np.ndarray) -> np.ndarray:
     return y - filled.sum(axis=1, keepdims=True) / count - slope * x
 
 
-def _masked(shape: np.ndarray, seen: Bool[np.ndarray, "m n"], nugget: float) -> np.ndarray:
-    """Covariances with unit variance; what was not seen is independent of all else and so drops out."""
+def _mask_unseen(shape: np.ndarray, seen: Bool[np.ndarray, "m n"], nugget: float) -> np.ndarray:
+    """Covariances of unit variance; an unseen value is independent of the others and so drops out."""
     both = seen[:, :, None] & seen[:, None, :]
     return np.where(both, shape, 0.0) + np.where(seen, nugget, 1.0)[:, :, None] * np.eye(shape.shape[1])
 
 
-def left_out(
+def leave_one_out(
     model: Correlation, station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
-    """Distance of each value from what the others predict of it, and that prediction's standard deviation, m.
+    """Predicts each value from the others.
 
     NaN where nothing was seen.
     """
     at, y = station.T, value.T
     seen = np.isfinite(y)
-    inverse = np.linalg.inv(_masked(model(np.abs(at[:, :, None] - at[:, None, :])), seen, model.nugget))
+    inverse = np.linalg.inv(_mask_unseen(model(np.abs(at[:, :, None] - at[:, None, :])), seen, model.nugget))
     own = np.diagonal(inverse, axis1=1, axis2=2)
     miss = np.einsum("mij,mj->mi", inverse, np.where(seen, y, 0.0)) / own
     hidden = np.where(seen, 0.0, np.nan)
     return (miss + hidden).T, (model.sigma / np.sqrt(own) + hidden).T
 
 
-def predict(
+def predict_wall(
     model: Correlation,
     station: Float[np.ndarray, "n m"],
     value: Float[np.ndarray, "n m"],
     at: Float[np.ndarray, " k"],
 ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
-    """The wall about its trend at other stations, and its standard deviation, m.
+    """Return the wall about its trend at other stations, and its standard deviation, m.
 
     Args:
         model: The correlation.
@@ -152,10 +148,126 @@ def predict(
     """
     known, y = station.T, value.T
     seen = np.isfinite(y)
-    factor = np.linalg.cholesky(_masked(model(np.abs(known[:, :, None] - known[:, None, :])), seen, model.nugget))
+    factor = np.linalg.cholesky(_mask_unseen(model(np.abs(known[:, :, None] - known[:, None, :])), seen, model.nugget))
     cross = np.where(seen[:, :, None], model(np.abs(known[:, :, None] - at[None, None, :])), 0.0)
     half = np.linalg.solve(factor, cross)
     white = np.linalg.solve(factor, np.where(seen, y, 0.0)[:, :, None])
     mean = np.einsum("mnk,mn->mk", half, white[:, :, 0])
     share = np.clip(1.0 - (half**2).sum(axis=1), 0.0, 1.0)
     return mean.T, (model.sigma * np.sqrt(share)).T
+
+
+_ROW = 0.25  # m of station that make one observation
+_CABLE = 5  # columns: what is narrower than half of it and stands off the wall is none
+_OFF = 0.03  # m
+_SIGMA = 0.7  # columns
+_TREND = 6.0  # m, standard deviation of the weights of the local line
+_OUTLIER = 4.0  # standard deviations of the prediction that leaves the value out
+_LEAST_OUTLIER = 0.10  # m
+_MOST_OUTLIERS = 0.25  # of a profile: more of it is a wall that steps, not something that stands in front of one
+_BLOCK = 20.0  # m predicted at once
+_REACH = 8.0  # m of observations beside a block; correlations further off are screened by those between
+_BESIDE = 1.0  # m beyond the ends: the outermost profiles may stand aslant
+_MIN_COUNT = 2  # points a cell
+_MIN_SEEN = 0.1  # of a profile
+_BRIDGED = 4  # columns without a return that a profile is drawn straight across
+
+
+@dataclass(frozen=True)
+class Kriged:
+    """The wall on a fine grid.
+
+    Attributes:
+        wall: m, `(rows, cols)`.
+        sigma: Its standard deviation, m, `(rows, cols)`.
+        correlation: What it rests on.
+    """
+
+    wall: Float[np.ndarray, "rows cols"]
+    sigma: Float[np.ndarray, "rows cols"]
+    correlation: Correlation
+
+
+def krige_profiles(
+    station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"], radius: Float[np.ndarray, " p"], fine: Grid
+) -> Kriged:
+    """Return the wall through profiles, followed between them as their own likeness along the bore allows.
+
+    Args:
+        station: Of the points, m.
+        angle: Of the points, rad.
+        radius: Of the points, m.
+        fine: Where the wall is wanted.
+    """
+    at, value = _observations(station, angle, radius, fine)
+    for last in (False, True):
+        about = value - _trend(at, value, at)
+        model = choose_correlation(at, value)
+        if not last:
+            value = _remove_outliers(model, at, about, value)
+    wall, sigma = np.empty((fine.rows, fine.columns)), np.empty((fine.rows, fine.columns))
+    for start in np.arange(0.0, fine.rows * fine.step, _BLOCK):
+        rows = slice(round(start / fine.step), round((start + _BLOCK) / fine.step))
+        where = fine.station[rows]
+        near = _rows_near(at, where[0], where[-1])
+        mean, sigma[rows] = predict_wall(model, at[near], about[near], where)
+        wall[rows] = mean + _trend(at, value, np.repeat(where[:, None], fine.columns, axis=1))
+    return Kriged(fill_nearest(wall), sigma, model)
+
+
+def _rows_near(at: np.ndarray, first: float, last: float) -> slice:
+    middle = np.nanmean(at, axis=1)
+    rows = np.flatnonzero((middle > first - _REACH) & (middle < last + _REACH))
+    return slice(rows[0], rows[-1] + 1) if len(rows) else slice(0, len(middle))
+
+
+def _observations(
+    station: np.ndarray, angle: np.ndarray, radius: np.ndarray, fine: Grid
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
+    """Mean station and cleaned radius of each seen cell of the profiles; empty rows are left out."""
+    grid = Grid.over(fine.start - _BESIDE, fine.start + fine.rows * fine.step + _BESIDE, _ROW, fine.columns)
+    cell = grid.cell(station, angle)
+    value = cell_medians(grid, cell, radius)
+    mean, count = cell_means(grid, cell, station, np.ones(len(station)))
+    value[count < _MIN_COUNT] = np.nan
+    rows = np.isfinite(value).mean(axis=1) > _MIN_SEEN
+    value, mean = value[rows], np.where(np.isfinite(value), mean, np.nan)[rows]
+    seen = np.isfinite(value)
+    bridged = binary_closing(np.concatenate([seen] * 3, axis=1), np.ones((1, _BRIDGED + 1), bool))
+    seen |= bridged[:, fine.columns : 2 * fine.columns]
+    return fill_around(mean), np.where(seen, _remove_cables(fill_around(value)), np.nan)
+
+
+def _remove_cables(value: np.ndarray) -> np.ndarray:
+    """Replaces what is as thin as a cable, and smooths each profile over neighbouring columns."""
+    usual = median_smooth(value, (1, _CABLE))
+    return gaussian_filter1d(np.where(np.abs(value - usual) > _OFF, usual, value), _SIGMA, axis=1, mode="wrap")
+
+
+def _trend(at: np.ndarray, value: np.ndarray, where: np.ndarray) -> Float[np.ndarray, "k m"]:
+    """Return a line fitted around each place in each direction, so that a flare or a widening is no deviation."""
+    seen = np.isfinite(value)
+    known, wanted = np.nanmedian(at, axis=1), np.median(where, axis=1)
+    apart = known[None] - wanted[:, None]
+    weight = np.exp(-0.5 * (apart / _TREND) ** 2) + 1e-9
+    y, mask = np.where(seen, value, 0.0), seen.astype(float)
+    s0, s1, s2 = (w @ mask for w in (weight, weight * apart, weight * apart**2))
+    t0, t1 = weight @ y, (weight * apart) @ y
+    spread = s0 * s2 - s1**2
+    lean = np.divide(s0 * t1 - s1 * t0, spread, out=np.zeros_like(s0), where=spread > 0.25 * s0**2)
+    middle = np.divide(t0 - lean * s1, s0, out=np.full_like(s0, np.nan), where=s0 > 1e-12)
+    return middle + lean * (where - wanted[:, None])
+
+
+def _remove_outliers(model: Correlation, at: np.ndarray, about: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return the values without those that their neighbours along the bore contradict: people, gaps, pockets."""
+    result = value.copy()
+    middle = np.median(at, axis=1)
+    for start in np.arange(middle[0], middle[-1] + 1e-6, _BLOCK):
+        near = _rows_near(at, start, start + _BLOCK)
+        miss, deviation = leave_one_out(model, at[near], about[near])
+        outlying = np.abs(miss) > np.maximum(_OUTLIER * deviation, _LEAST_OUTLIER)
+        outlying &= outlying.mean(axis=1, keepdims=True) < _MOST_OUTLIERS
+        part = result[near]
+        part[outlying] = np.nan
+    return result

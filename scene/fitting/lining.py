@@ -1,15 +1,133 @@
-"""Lining of segments: rings, pockets and nails, measured where the survey shows them, by standard where it cannot."""
+"""The lining of segments."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
+from scipy.spatial import cKDTree
 
-from scene.bore import POCKET, Bore
+from scene.bore import NAIL, POCKET, Bore
 from scene.cloud import Cloud
-from scene.fitting import nails, pockets
+from scene.fitting.assemble import FREE
+from scene.fitting.pockets import FLOOR_MARGIN, could_show_pockets, find_pockets
 from scene.fitting.section import Sections
-from scene.fitting.sectiontype import FREE
+
+_APART = (0.25, 0.80)  # m between the middles of two pockets of a pair
+_SAME_ROW = 0.12  # m around
+_HALF = (0.05, 0.04)  # m along and around of the middle of the mouth
+_DEPTHS = (0.30, 0.70)  # of the pocket's depth, between which a nail hangs
+_MIN_POINTS = 2  # on a nail, in both pockets
+_MIN_BACKS = 2  # points on the backs of a pair without a nail: it was seen, and there is none
+_USUAL = 1.0  # points on a pair in the mean: with fewer, chance decides
+_REACH = 0.12  # m around a pocket's middle
+_FRONT = np.pi / 4  # of the radius: how far the seen half of a cylinder lies before its axis, in the mean
+_RADIUS = 0.0135  # m
+
+
+@dataclass(frozen=True)
+class SeenNails:
+    """What the cloud says of each pair.
+
+    Attributes:
+        present: A nail was seen, `(b,)`.
+        absent: The backs were seen and no nail in front of them, `(b,)`.
+        confidence: Probability that what was counted is no chance, `(b,)`.
+        depth: Of the nails' axes behind the wall, m, median over all.
+    """
+
+    present: Bool[np.ndarray, " b"]
+    absent: Bool[np.ndarray, " b"]
+    confidence: Float[np.ndarray, " b"]
+    depth: float
+
+
+def pair_pockets(bore: Bore) -> Int[np.ndarray, "b 2"]:
+    """Pairs pockets of one row across one joint, as indices into `bore.pocket`, each used once."""
+    pocket = bore.pocket
+    if len(pocket) < 2:
+        return np.empty((0, 2), np.intp)
+    order = np.argsort(pocket["station"], kind="stable")
+    station, angle = pocket["station"][order], pocket["angle"][order]
+    across = float(np.median(bore.radius))
+    free, result = np.ones(len(order), bool), []
+    for k in range(len(order)):
+        if not free[k]:
+            continue
+        last = int(np.searchsorted(station, station[k] + _APART[1]))
+        ahead = np.arange(k + 1, last)
+        turn = np.abs(np.angle(np.exp(1j * (angle[ahead] - angle[k])))) * across
+        fit = ahead[free[ahead] & (turn < _SAME_ROW) & (station[ahead] - station[k] > _APART[0])]
+        if len(fit):
+            free[k] = free[fit[0]] = False
+            result.append((order[k], order[fit[0]]))
+    return np.array(result, np.intp).reshape(-1, 2)
+
+
+def make_nails(bore: Bore, pair: Int[np.ndarray, "b 2"], depth: float, diameter: float) -> Shaped[np.ndarray, " b"]:
+    """Makes nails from the middle of one pocket to that of the other, marked as not measured."""
+    first, second = bore.pocket[pair[:, 0]], bore.pocket[pair[:, 1]]
+    result = np.zeros(len(pair), NAIL)
+    result["station"] = (first["station"] + second["station"]) / 2
+    result["angle"] = np.angle(np.exp(1j * first["angle"]) + np.exp(1j * second["angle"]))
+    result["length"] = second["station"] - first["station"]
+    result["diameter"], result["depth"] = diameter, depth
+    return result
+
+
+def find_nails(bore: Bore, pair: Int[np.ndarray, "b 2"], cloud: Cloud) -> SeenNails | None:
+    """Finds the pairs that a nail joins; `None` where the cloud cannot tell.
+
+    It can where the backs of the pockets are seen as often as a nail in front of them would be.
+    """
+    if not len(pair):
+        return None
+    count, depth, backs = _count_returns(bore, cloud)
+    on_pair = count[pair].sum(axis=1)
+    on_back = backs[pair].sum(axis=1)
+    if max(float(on_pair.mean()), float(on_back.mean())) < _USUAL:
+        return None
+    present = on_pair >= _MIN_POINTS
+    behind = float(np.nanmedian(depth[pair[present]])) + _FRONT * _RADIUS if present.any() else 0.0
+    absent = ~present & (on_pair == 0) & (on_back >= _MIN_BACKS)
+    return SeenNails(present, absent, 1 - np.exp(-on_pair), behind)
+
+
+def _count_returns(
+    bore: Bore, cloud: Cloud
+) -> tuple[Int[np.ndarray, " p"], Float[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """For each pocket: points where a nail would hang, their median depth, m, and points further back."""
+    pocket, axis = bore.pocket, bore.axis
+    at = axis.at(pocket["station"])
+    row = np.clip(np.rint(pocket["station"] / bore.station[1]).astype(np.intp), 0, len(bore.station) - 1)
+    radius = np.array([
+        np.interp(a, bore.angle, bore.radius[k], period=2 * np.pi) for a, k in zip(pocket["angle"], row, strict=True)
+    ])  # fmt: skip
+    lateral, up = np.cos(pocket["angle"])[:, None] * at.lateral, np.sin(pocket["angle"])[:, None] * at.up
+    middle = at.position + radius[:, None] * (lateral + up)
+    near = cKDTree(cloud.points).query_ball_point(middle, np.hypot(_REACH, pocket["depth"].max()))
+    count, backs = np.zeros(len(pocket), np.intp), np.zeros(len(pocket), np.intp)
+    depth = np.full(len(pocket), np.nan)
+    for k, rows in enumerate(near):
+        outward = _wall_normal(bore, row[k], float(pocket["angle"][k]))
+        offset = cloud.points[rows].astype(np.float64) - middle[k]
+        along, behind = offset @ at.tangent[k], offset @ outward
+        around = offset @ np.cross(outward, at.tangent[k])
+        mouth = (np.abs(along) < _HALF[0]) & (np.abs(around) < _HALF[1])
+        low, high = np.array(_DEPTHS) * pocket["depth"][k]
+        hanging = mouth & (behind > low - 0.01) & (behind < high)
+        count[k], backs[k] = hanging.sum(), (mouth & (behind >= high)).sum()
+        if hanging.any():
+            depth[k] = np.median(behind[hanging])
+    return count, depth, backs
+
+
+def _wall_normal(bore: Bore, row: int, angle: float) -> Float[np.ndarray, "3"]:
+    """Outward unit normal of the section over 10°."""
+    turn = angle + np.deg2rad([-5.0, 5.0])
+    radius = np.interp(turn, bore.angle, bore.radius[row], period=2 * np.pi)
+    y, z = np.diff(radius * np.cos(turn))[0], np.diff(radius * np.sin(turn))[0]
+    return (z * bore.lateral[row] - y * bore.up[row]) / np.hypot(y, z)
+
 
 MEASURED, STANDARD, NONE = "measured", "by standard", "none found"
 
@@ -47,10 +165,10 @@ class LiningConfig:
     nail_depth: float = 0.06
 
 
-def add_features(
+def add_lining(
     bore: Bore, sections: Sections, cloud: Cloud | None = None, config: LiningConfig | None = None
 ) -> tuple[Bore, dict[str, str]]:
-    """The bore with its lining, and where rings, pockets and nails come from.
+    """Return the bore with its lining, and where rings, pockets and nails come from.
 
     Args:
         bore: Smooth.
@@ -59,17 +177,17 @@ def add_features(
         config: See `LiningConfig`.
     """
     config = config or LiningConfig()
-    found, joints = pockets.find_pockets(sections)
+    found, joints = find_pockets(sections)
     if len(found):
         bore = replace(bore, pocket=found, ring_station=joints)
-        return _nailed(bore, cloud, config, {"rings": MEASURED, "pockets": MEASURED})
-    if pockets.could_show(sections, config.pocket_depth):
+        return _add_nails(bore, cloud, config, {"rings": MEASURED, "pockets": MEASURED})
+    if could_show_pockets(sections, config.pocket_depth):
         return bore, {"rings": NONE, "pockets": NONE, "nails": NONE}
-    return standard(bore, config, sections.flat_floor)
+    return add_standard_lining(bore, config, sections.flat_floor)
 
 
-def standard(bore: Bore, config: LiningConfig, flat_floor: bool) -> tuple[Bore, dict[str, str]]:
-    """The bore with the lining of the configuration, marked as not measured; ring stations that it has are kept.
+def add_standard_lining(bore: Bore, config: LiningConfig, flat_floor: bool) -> tuple[Bore, dict[str, str]]:
+    """Return the bore with the lining of the configuration, marked as not measured; ring stations that it has are kept.
 
     Args:
         bore: Smooth.
@@ -80,15 +198,15 @@ def standard(bore: Bore, config: LiningConfig, flat_floor: bool) -> tuple[Bore, 
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)
     types = bore.section_type[np.clip(np.searchsorted(bore.station, joints), 0, len(bore.station) - 1)]
     joints = joints[types != FREE]
-    laid = _rows(bore, joints, config, flat_floor)
+    laid = _standard_pockets(bore, joints, config, flat_floor)
     if not config.by_standard or not len(laid):
         kept = rings if len(bore.ring_station) else {"rings": "none"}
         return bore, {**kept, "pockets": "none: the survey cannot show them", "nails": "none"}
     bore = replace(bore, pocket=laid, ring_station=bore.ring_station if len(bore.ring_station) else joints)
-    return _nailed(bore, None, config, {**rings, "pockets": STANDARD})
+    return _add_nails(bore, None, config, {**rings, "pockets": STANDARD})
 
 
-def _rows(
+def _standard_pockets(
     bore: Bore, joints: Float[np.ndarray, " j"], config: LiningConfig, flat_floor: bool
 ) -> Shaped[np.ndarray, " p"]:
     """Pockets on both sides of each joint, in rows."""
@@ -101,7 +219,7 @@ def _rows(
     length, width = config.pocket_size
     keep = (station > length) & (station < bore.length - length)
     if flat_floor:
-        keep &= _above_floor(bore, station, angle) > pockets.FLOOR_MARGIN
+        keep &= _above_floor(bore, station, angle) > FLOOR_MARGIN
     laid = np.zeros(int(keep.sum()), POCKET)
     laid["station"], laid["angle"], laid["depth"] = station[keep], angle[keep], config.pocket_depth
     laid["length"], laid["width"] = length, width
@@ -116,15 +234,15 @@ def _above_floor(bore: Bore, station: np.ndarray, angle: np.ndarray) -> Float[np
     return upward[row, column] - upward[row].min(axis=1)
 
 
-def _nailed(bore: Bore, cloud: Cloud | None, config: LiningConfig, provenance: dict[str, str]) -> tuple[Bore, dict]:
-    pairs = nails.pairs(bore)
-    found = nails.seen(bore, pairs, cloud) if cloud is not None else None
+def _add_nails(bore: Bore, cloud: Cloud | None, config: LiningConfig, provenance: dict[str, str]) -> tuple[Bore, dict]:
+    pairs = pair_pockets(bore)
+    found = find_nails(bore, pairs, cloud) if cloud is not None else None
     if found is None:
-        return replace(bore, nail=nails.laid(bore, pairs, config.nail_depth, config.nail_diameter)), {
+        return replace(bore, nail=make_nails(bore, pairs, config.nail_depth, config.nail_diameter)), {
             **provenance,
             "nails": STANDARD if len(pairs) else NONE,
         }
-    result = nails.laid(bore, pairs, found.depth if found.present.any() else config.nail_depth, config.nail_diameter)
+    result = make_nails(bore, pairs, found.depth if found.present.any() else config.nail_depth, config.nail_diameter)
     result["measured"], result["confidence"] = found.present, np.where(found.present, found.confidence, 0.0)
     if not found.present.any():
         return bore, {**provenance, "nails": NONE}

@@ -1,24 +1,124 @@
-"""Bolt pockets and ring joints, found on the wall rolled out flat.
+"""Bolt pockets and ring joints, found on the wall rolled out flat."""
 
-A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
-hidden by its own edge, so that one pocket says little about its depth or size; but the pockets of a lining come from
-one mould, and all of them together say it well.
-"""
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy.ndimage import maximum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
-from scene.fitting.pattern import CLEAR, Holes, in_pattern, in_rows, ring_joints
 from scene.fitting.section import Sections
+from scene.fitting.unroll import Grid
+
+CLEAR = 0.32  # score of a hole that nobody doubts
+_ROW_SHARE = 0.3  # of the fullest row, and of the places in a row
+_PITCHES = (0.9, 2.1)  # widths of rings in use, m
+_MIN_COHERENCE = 0.4
+_NEAR_PLACE = 0.12  # m along the bore
+_PLACES = 0.05  # m, step in which places in a ring are counted
+
+
+@dataclass(frozen=True)
+class Holes:
+    """Holes of the unrolled wall: cell and how clear each is."""
+
+    row: Int[np.ndarray, " p"]
+    column: Int[np.ndarray, " p"]
+    score: Float[np.ndarray, " p"]
+
+    def where(self, keep: Bool[np.ndarray, " p"]) -> "Holes":
+        """Return the holes for which `keep` is true."""
+        return Holes(self.row[keep], self.column[keep], self.score[keep])
+
+
+def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
+    """Return the holes that stand in the rows which the clearest of them form.
+
+    Args:
+        holes: All.
+        columns: Of the unrolled wall.
+        reach: Half the width of a row, in columns.
+    """
+    clear = np.bincount(holes.column[holes.score > CLEAR], minlength=columns).astype(float)
+    window = max(int(2 * reach) | 1, 3)
+    filled = uniform_filter(clear, window, mode="wrap") * window
+    fullest = maximum_filter(filled, 2 * window + 1, mode="wrap")
+    peaks = np.flatnonzero((filled == fullest) & (filled > max(_ROW_SHARE * filled.max(), 2)))
+    return holes.where(_near_columns(holes, peaks, columns, reach))
+
+
+def add_pattern(faint: Holes, found: Holes, grid: Grid, reach: float) -> Holes:
+    """Adds the fainter holes that stand where the pattern of the clear ones has a pocket.
+
+    Holes faint in themselves, as pockets are that the scanner looks at head on, make a row where most of its places
+    either side of the joints hold one; chance would fill about a quarter of them.
+
+    Args:
+        faint: All holes, however faint.
+        found: Those that are clear, in rows.
+        grid: Of the unrolled wall.
+        reach: Half the width of a row, in columns.
+    """
+    station = (found.row + 0.5) * grid.step
+    joints = find_ring_joints(station, grid.rows * grid.step)
+    if len(joints) < 2:
+        return found
+    pitch = float(np.median(np.diff(joints)))
+    in_place = faint.where(_stand_in_places(faint, station, joints[0], pitch, grid.step))
+    window = max(int(2 * reach) | 1, 3)
+    filled = uniform_filter(np.bincount(in_place.column, minlength=grid.columns).astype(float), window, mode="wrap")
+    everything = uniform_filter(np.bincount(faint.column, minlength=grid.columns).astype(float), window, mode="wrap")
+    places = 2 * len(joints)
+    peaks = np.flatnonzero(
+        (filled == maximum_filter(filled, 2 * window + 1, mode="wrap"))
+        & (filled * window > 2 * _ROW_SHARE * places)
+        & (filled > 0.6 * everything)
+    )
+    more = in_place.where(_near_columns(in_place, peaks, grid.columns, reach))
+    cells = np.concatenate([np.stack([h.row, h.column], axis=1) for h in (found, more)])
+    _, first = np.unique(cells, axis=0, return_index=True)
+    score = np.concatenate([found.score, more.score])
+    return Holes(cells[first, 0], cells[first, 1], score[first])
+
+
+def _stand_in_places(
+    holes: Holes, station: np.ndarray, joint: float, pitch: float, step: float
+) -> Bool[np.ndarray, " p"]:
+    """True for holes as far from their joint as the clear ones, within `_NEAR_PLACE`."""
+    bins = max(round(pitch / _PLACES), 4)
+    known = np.bincount(((station - joint) % pitch / pitch * bins).astype(int) % bins, minlength=bins).astype(float)
+    spread = uniform_filter(known, 3, mode="wrap")
+    places = np.flatnonzero((spread == maximum_filter(spread, 5, mode="wrap")) & (spread > _ROW_SHARE * spread.max()))
+    at = ((holes.row + 0.5) * step - joint) % pitch
+    apart = np.abs(at[:, None] - (places[None] + 0.5) * pitch / bins)
+    return np.minimum(apart, pitch - apart).min(axis=1) < _NEAR_PLACE
+
+
+def _near_columns(holes: Holes, peaks: np.ndarray, columns: int, reach: float) -> Bool[np.ndarray, " p"]:
+    if not len(peaks):
+        return np.zeros(len(holes.row), bool)
+    apart = np.abs((holes.column[:, None] - peaks[None] + columns / 2) % columns - columns / 2).min(axis=1)
+    return apart <= max(reach, 1.5)
+
+
+def find_ring_joints(station: Float[np.ndarray, " p"], length: float) -> Float[np.ndarray, " r"]:
+    """Finds the stations of the ring joints between the pockets, m; empty where no pitch fits."""
+    step = _PITCHES[0] ** 2 / (8 * max(length, 1.0))
+    pitch = np.arange(*_PITCHES, step)
+    wave = np.exp(2j * np.pi * station[None] / pitch[:, None]).mean(axis=1)
+    best = int(np.argmax(np.abs(wave)))
+    if np.abs(wave[best]) < _MIN_COHERENCE:
+        return np.empty(0)
+    phase = np.angle(wave[best]) / (2 * np.pi) * pitch[best] % pitch[best]
+    return np.arange(phase, length, pitch[best])
+
 
 _MODES = ("nearest", "wrap")
 _HOLE = (4, 3)  # cells of 5 cm × 1°
 _AROUND = (16, 13)
 _EXPECTED = (31, 21)
-_APART = (7, 7)
+_PEAK_WINDOW = (7, 7)
 _WEAK, _FAINT = 0.22, 0.12
 _MIN_EXPECTED = 0.2  # points a cell; with fewer on the wall a hole says nothing
 _MIN_DEPTH = 0.06
@@ -35,7 +135,7 @@ _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
-    """The pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints that they straddle, m.
+    """Return the pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints that they straddle, m.
 
     Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and
     at a pitch of rings are none: both are empty then.
@@ -45,11 +145,11 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     deficit = _deficit(sections)
     faint = _find_holes(deficit, sections)
     reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / grid.columns)
-    holes = in_rows(faint.where(faint.score > _WEAK), grid.columns, reach)
+    holes = keep_rows(faint.where(faint.score > _WEAK), grid.columns, reach)
     if len(holes.row) < _MIN_POCKETS:
         return nothing
-    holes = in_pattern(faint, holes, grid, reach)
-    row, column = _refine(deficit, sections, holes)
+    holes = add_pattern(faint, holes, grid, reach)
+    row, column = _refine_positions(deficit, sections, holes)
     station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
     slope = _slopes(sections, holes)
     length, width = _common_size(deficit, sections, holes, slope)
@@ -61,13 +161,13 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
-    pockets = pockets[_apart(pockets, float(np.median(sections.radius)))]
-    joints = ring_joints(pockets["station"], grid.rows * grid.step)
+    pockets = pockets[_drop_overlaps(pockets, float(np.median(sections.radius)))]
+    joints = find_ring_joints(pockets["station"], grid.rows * grid.step)
     return (pockets, joints) if len(joints) else nothing
 
 
-def _apart(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:
-    """Those to keep, so that none overlap: of two that do, one pocket was seen as two holes, and the fainter goes.
+def _drop_overlaps(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:
+    """Pockets to keep so that none overlap; of two that do, the fainter goes.
 
     Args:
         pockets: All, with the size of the mould.
@@ -82,8 +182,8 @@ def _apart(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray,
     return keep
 
 
-def could_show(sections: Sections, depth: float) -> bool:
-    """Whether the cloud is dense and fine enough that pockets of a depth, m, would be found in it, were there any."""
+def could_show_pockets(sections: Sections, depth: float) -> bool:
+    """Return whether pockets of a depth, m, would be found in this cloud, were there any."""
     near = uniform_filter(sections.support, _EXPECTED, mode=_MODES)[~_near_floor(sections)]
     seen = float(np.mean(near > _MIN_EXPECTED)) if near.size else 0.0
     noise = float(np.median(sections.spread))
@@ -91,7 +191,7 @@ def could_show(sections: Sections, depth: float) -> bool:
 
 
 def _deficit(sections: Sections) -> Float[np.ndarray, "rows cols"]:
-    """How much less of the wall was seen in each cell than around it: 0 as usual, 1 nothing."""
+    """Share of the wall's returns that each cell lacks against those around it: 0 none, 1 all."""
     expected = uniform_filter(sections.support, _EXPECTED, mode=_MODES)
     share = sections.support / np.maximum(expected, 1e-9)
     deficit = np.where(expected > _MIN_EXPECTED, np.clip(1 - share, -1, 1), 0.0)
@@ -110,19 +210,19 @@ def _near_floor(sections: Sections) -> np.ndarray:
 def _find_holes(deficit: np.ndarray, sections: Sections) -> Holes:
     score = uniform_filter(deficit, _HOLE, mode=_MODES) - uniform_filter(deficit, _AROUND, mode=_MODES)
     behind = maximum_filter(sections.deepest, (9, 5), mode=_MODES)
-    peak = (score == maximum_filter(score, _APART, mode=_MODES)) & (score > _FAINT) & (behind > _MIN_DEPTH)
+    peak = (score == maximum_filter(score, _PEAK_WINDOW, mode=_MODES)) & (score > _FAINT) & (behind > _MIN_DEPTH)
     row, column = np.nonzero(peak)
     return Holes(row, column, score[row, column])
 
 
 def _patches(field: np.ndarray, holes: Holes, rows: int, columns: int) -> Float[np.ndarray, "p r c"]:
-    """The field around each hole; beyond the ends the last row holds, around it wraps."""
+    """Return the field around each hole; beyond the ends the last row holds, around it wraps."""
     at_row = np.clip(holes.row[:, None] + np.arange(-rows, rows + 1), 0, field.shape[0] - 1)
     at_column = (holes.column[:, None] + np.arange(-columns, columns + 1)) % field.shape[1]
     return field[at_row[:, :, None], at_column[:, None, :]]
 
 
-def _refine(
+def _refine_positions(
     deficit: np.ndarray, sections: Sections, holes: Holes
 ) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
     """Row and column of each hole's centre of gravity, in cells.
@@ -140,7 +240,7 @@ def _refine(
 
 
 def _slopes(sections: Sections, holes: Holes) -> Float[np.ndarray, " p"]:
-    """Cosine between the wall's normal and the radius at each hole: along a wall seen aslant cells are longer."""
+    """Cosine between the wall's normal and the radius at each hole; cells on an oblique wall are longer."""
     around = 2 * np.pi / sections.grid.columns
     wall = sections.radius
     before, after = (wall[holes.row, (holes.column + step) % wall.shape[1]] for step in (-3, 3))
@@ -178,6 +278,6 @@ def _spread(profile: Float[np.ndarray, " k"]) -> float:
 
 
 def _common_depth(sections: Sections, holes: Holes, slope: np.ndarray) -> float:
-    """Depth of the mould, m: what the pockets show whose backs are seen, less what noise adds to the deepest return."""
+    """Depth of the mould, m, from the pockets whose backs are seen, less the noise of the deepest return."""
     deepest = _patches(sections.deepest, holes, 4, 2).max(axis=(1, 2)) * slope
     return float(np.quantile(deepest, _DEEP_SHARE) - _OVERSHOOT * np.median(sections.spread))

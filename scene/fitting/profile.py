@@ -27,31 +27,31 @@ class Extents:
     middle: tuple[float, float]
 
 
-def angles(count: int = N_ANGLES) -> Float[np.ndarray, " m"]:
-    """Directions of a section's radii, from lateral (left) towards up, rad, the first at -π."""
+def section_angles(count: int = N_ANGLES) -> Float[np.ndarray, " m"]:
+    """Return directions of a section's radii, from lateral (left) towards up, rad, the first at -π."""
     return -np.pi + 2 * np.pi * np.arange(count) / count
 
 
-def measure(angle: Float[np.ndarray, " m"], radius: Float[np.ndarray, " m"]) -> Extents:
-    """Extents of the polygon `radius(angle)`."""
+def measure_section(angle: Float[np.ndarray, " m"], radius: Float[np.ndarray, " m"]) -> Extents:
+    """Measures the polygon `radius(angle)`."""
     lateral, upward = radius * np.cos(angle), radius * np.sin(angle)
     height_grid = np.arange(upward.min(), upward.max(), _HEIGHT_STEP)
-    left, right = (_wall(side, lateral, upward, height_grid) for side in (1, -1))
+    left, right = (_wall_at(side, lateral, upward, height_grid) for side in (1, -1))
     chord = left - right
-    width = float(_without_noise(chord).max())
+    width = float(_average_chords(chord).max())
     long = chord >= _LONG_CHORD * width
     across = float(np.mean((left + right)[long]) / 2)
-    floor, crown = (_wall(side, upward, lateral, np.array([across]))[0] for side in (-1, 1))
+    floor, crown = (_wall_at(side, upward, lateral, np.array([across]))[0] for side in (-1, 1))
     return Extents(width, float(crown - floor), (across, float(crown + floor) / 2))
 
 
-def _without_noise(chord: np.ndarray) -> np.ndarray:
-    """Chords averaged over 0.4 m of height: a maximum of noisy values is too large; a circle loses 4 mm."""
+def _average_chords(chord: np.ndarray) -> np.ndarray:
+    """Averages chords over 0.4 m of height: a maximum of noisy values is too large. A circle loses 4 mm."""
     window = min(round(_CHORD_WINDOW / _HEIGHT_STEP), len(chord))
     return np.convolve(chord, np.full(window, 1 / window), mode="valid")
 
 
-def _wall(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _wall_at(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:
     """`across` of the polygon's half on one side, as a function of `along`."""
     half = np.sign(across) == side
     order = np.argsort(along[half], kind="stable")

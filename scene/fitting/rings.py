@@ -7,11 +7,10 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from scene.axis import Axis, through, with_frames
-from scene.bore import POCKET, STATION_STEP, STRETCH, Bore
+from scene.bore import POCKET, STATION_STEP, STRETCH, Axis, Bore, axis_through, make_axis
 from scene.errors import FitError
-from scene.fitting import profile
-from scene.fitting.sureness import UNSEEN, known
+from scene.fitting.profile import section_angles
+from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
 from scene.reading.ringsurvey import RingSurvey
 
 _MIN_POINTS = 5
@@ -42,7 +41,7 @@ class RingFit:
 
 
 def fit_rings(survey: RingSurvey) -> RingFit:
-    """A circle through each ring's points, in the plane square to the axis through the rings' centres.
+    """Return a circle through each ring's points, in the plane square to the axis through the rings' centres.
 
     Raises:
         FitError: A ring has too few points, or they lie on no circle.
@@ -72,16 +71,16 @@ def fit_rings(survey: RingSurvey) -> RingFit:
 
 
 def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
-    """A round bore through the rings; between two rings centre and radius are interpolated, and marked as filled.
+    """Return a round bore through the rings; between rings it is interpolated, and marked as filled.
 
     Args:
         fit: The rings, in order along the tunnel.
         origin: Whole-metre offset to take off, m.
     """
     centre = fit.centre - origin
-    axis = through(centre, STATION_STEP)
+    axis = axis_through(centre, STATION_STEP)
     at = _ring_stations(axis, centre)
-    angle = profile.angles()
+    angle = section_angles()
     radius = np.interp(axis.station, at, fit.radius)
     distance = np.abs(axis.station[:, None] - at[None]).min(axis=1)
     return Bore(
@@ -100,25 +99,25 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
         ring_station=at,
         pocket=np.empty(0, POCKET),
         confidence=np.interp(axis.station, at, fit.seen)
-        * known(np.hypot(np.interp(axis.station, at, fit.rms), UNSEEN * distance)),
+        * probability_known(np.hypot(np.interp(axis.station, at, fit.rms), UNSEEN_GROWTH * distance)),
         stretch=np.array([_round_stretch(axis, fit)], STRETCH),
     )
 
 
 def _round_stretch(axis: Axis, fit: RingFit) -> tuple[float | str, ...]:
-    """The whole bore as one circular stretch; no free profile was measured."""
+    """Return the whole bore as one circular stretch; no free profile was measured."""
     radius, rms = float(fit.radius.mean()), float(np.sqrt(np.mean(fit.rms**2)))
     return 0.0, axis.length, "circle", 2 * radius, 2 * radius, radius, radius, rms, np.nan, 1.0
 
 
-def against_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:
-    """Where the rings lie on the design axis, for the manifest: chainages of the ends, offsets right and up.
+def compare_with_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:
+    """Compares the rings with the design axis, for the manifest.
 
     Args:
         fit: The rings.
         design: Chainage, easting, northing, elevation, m, in order, `(d, 4)`.
     """
-    axis = with_frames(design[:, 0], design[:, 1:], _tangents(design[:, 1:]))
+    axis = make_axis(design[:, 0], design[:, 1:], _tangents(design[:, 1:]))
     chainage, left, up = axis.local(fit.centre)
     return {
         "chainage_first": float(chainage[0]),
@@ -137,7 +136,7 @@ def _tangents(centre: np.ndarray) -> np.ndarray:
 
 
 def _require_order(survey: RingSurvey, centre: np.ndarray) -> None:
-    """Rings must follow each other along the tunnel: a step is neither nothing nor backwards."""
+    """Refuses rings that do not follow each other along the tunnel."""
     step = np.diff(centre, axis=0)
     length = np.linalg.norm(step, axis=1)
     if (length < _LEAST_SPACING).any():
@@ -173,7 +172,7 @@ def _fit_circle(
     start = [0.0, 0.0, float(np.hypot(x, y).mean())]
     a, b, radius = least_squares(misfit, start, loss="soft_l1", f_scale=0.02).x
     angle = np.arctan2(y - b, x - a)
-    around = profile.angles()
+    around = section_angles()
     gap = np.abs(np.angle(np.exp(1j * (around[:, None] - angle[None])))).min(axis=1)
     moved = centre + a * lateral + b * up + ((points - centre) @ tangent).mean() * tangent
     return (

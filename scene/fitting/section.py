@@ -1,26 +1,105 @@
-"""Cloud and axis in, the section at every station out: wherever the wall goes, at the half-metre scale.
-
-A coarse grid of medians gives a first wall that pockets, rails and people cannot move. The mean residual of small
-cells against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. Where the survey
-is profiles some way apart, the wall between them is kriged instead. A flat floor is fitted as a line under the track,
-and the walls are run on straight into its corners.
-"""
+"""From cloud and axis to the section at every station."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import uniform_filter1d
 
-from scene.axis import Axis
+from scene.bore import Axis
 from scene.cloud import Cloud
 from scene.errors import FitError
-from scene.fitting import bed, profile, sparse, unroll
-from scene.fitting.seen import DENSE_STEP, OVERRUN, profile_spacing, seen_span
-from scene.fitting.sureness import sure_by_support
-from scene.fitting.unroll import Grid
+from scene.fitting.floor import Floors, clip_to_floor, extend_to_floor, find_floors, is_floor
+from scene.fitting.kriging import krige_profiles
+from scene.fitting.profile import N_ANGLES
+from scene.fitting.unroll import (
+    Grid,
+    cell_means,
+    cell_medians,
+    estimate_sigma,
+    fill_nearest,
+    median_smooth,
+    resample,
+    smooth_cells,
+)
+
+DENSE_STEP = 0.25  # m; where nearly every row of this length was seen, the survey is no row of profiles
+OVERRUN = 3.0  # m beyond the axis that are looked at
+_STEPS = (DENSE_STEP, 0.5, 1.0, 1.5, 2.0)  # m
+_MIN_ROWS_SEEN = 0.9
+_MOST_GAPS = 0.4  # of the rows: with more unseen the survey is profiles too far apart
+_END_COVERAGE = 0.4
+_DENSE = 0.7
+_TRIM_STEP = 0.05
+
+
+def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[float, float]:
+    """Return the first and last station where a fair share of the circumference was seen, m.
+
+    Raises:
+        FitError: No station shows that much.
+    """
+    grid = Grid.over(-OVERRUN, axis.length + OVERRUN, DENSE_STEP, 24)
+    cell = grid.cell(station, angle)
+    count = np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns).reshape(grid.rows, grid.columns)
+    rows = np.flatnonzero((count > 0).mean(axis=1) > _END_COVERAGE)
+    if len(rows) and len(rows) >= _DENSE * (rows[-1] - rows[0] + 1):
+        first, last = grid.start + rows[0] * grid.step, grid.start + (rows[-1] + 1) * grid.step
+        inside = station[(station >= first) & (station <= last)]
+        return _trim_end(inside, first, 1), -_trim_end(-inside, -last, 1)
+    # Profiles apart, and aslant to the axis where the bore flares: the first and the last one are the ends.
+    rows = np.flatnonzero((uniform_filter1d((count > 0).astype(float), 3, axis=0) > 0).mean(axis=1) > _END_COVERAGE)
+    if not len(rows):
+        raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
+    first, last = (grid.start + (row + 0.5) * grid.step for row in (rows[0], rows[-1]))
+    return _profile_station(station, first, 1), _profile_station(station, last, -1)
+
+
+def _profile_station(station: np.ndarray, outermost: float, inwards: int) -> float:
+    """Station of the profile whose outermost points lie near a station, m."""
+    ahead = inwards * (station - outermost)
+    return float(np.median(station[(ahead > -2 * DENSE_STEP) & (ahead < 3 * DENSE_STEP)]))
+
+
+def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
+    """Station where the returns become as many as further inside: noise puts a few beyond a mouth.
+
+    Args:
+        station: Growing inwards, m.
+        end: Where the first returns are, m.
+        behind: How far inside to look, m.
+    """
+    step = _TRIM_STEP
+    total = np.histogram(station, np.arange(end - 0.5, end + 2 * behind, step))[0]
+    reach = round(behind / step)
+    full = [k for k in range(len(total) - reach) if 2 * total[k] > np.median(total[k + 1 : k + 1 + reach]) > 0]
+    return end - 0.5 + (full[0] if full else 0) * step
+
+
+def profile_spacing(station: np.ndarray, start: float, end: float) -> float:
+    """Return the shortest row of which nearly all were seen, m; `DENSE_STEP` for a dense survey.
+
+    Raises:
+        FitError: Profiles further apart than 2 m.
+    """
+    inside = station[(station >= start) & (station <= end)]
+    for step in _STEPS:
+        edges = np.arange(start, end, step)
+        if _share_seen(np.histogram(inside, np.append(edges, end))[0] > 0, step) >= _MIN_ROWS_SEEN:
+            return step
+    raise FitError(f"profiles more than {_STEPS[-1]:g} m apart leave the wall between them unknown")
+
+
+def _share_seen(seen: np.ndarray, step: float) -> float:
+    """Share of rows seen; long runs of unseen rows, the gaps of a survey, do not count."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], (~seen).astype(int), [0]])))
+    runs = (edges[1::2] - edges[::2]) * step
+    gaps = float(runs[runs > _STEPS[-1]].sum()) / step
+    return float(seen.sum() / (len(seen) - (gaps if gaps < _MOST_GAPS * len(seen) else 0.0)))
+
 
 _COARSE_ANGLES = 120
-_FINE = (0.05, profile.N_ANGLES)
+_FINE = (0.05, N_ANGLES)
 _MEDIAN_WINDOW = (1.25, 5)  # m along, 3° columns around: a pocket fills less than a tenth of it
 _SIGMA = (0.15, 1.5)  # m along, columns around
 _NEAR_WALL = 0.05  # cells further than this from the first wall are pockets or clutter
@@ -75,7 +154,7 @@ class _Points:
 
 
 def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
-    """The sections from one end of the seen bore to the other; stations are those of `axis`.
+    """Return the sections from one end of the seen bore to the other; stations are those of `axis`.
 
     Args:
         cloud: Registered cloud.
@@ -88,35 +167,35 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
         cloud.points.astype(np.float64)
     )
     points = _Points(station, np.arctan2(upward, lateral), np.hypot(lateral, upward), cloud.weights)
-    start, end = seen_span(station, points.angle, axis)
+    start, end = visible_span(station, points.angle, axis)
     step = profile_spacing(station, start, end)
-    floors = bed.find_floors(station, lateral, upward, start, end)
+    floors = find_floors(station, lateral, upward, start, end)
     fine = Grid.over(start, end, *_FINE)
     wall = _first_wall(points, Grid.over(start, end, step, _COARSE_ANGLES), fine, floors)
     _require_open_middle(points, fine, wall)
     if step > DENSE_STEP:
-        kriged = sparse.krige(points.station, points.angle, points.radius, fine)
-        wall = kriged.wall if floors is None else _standing(kriged.wall, fine, floors)
-        return _measured(points, wall, kriged.sigma, fine, floors is not None, cloud.voxel, step)
-    wall, seen = _followed(points, wall, fine, floors)
-    return _measured(points, wall, sure_by_support(wall, seen, fine), fine, floors is not None, cloud.voxel, 0.0)
+        kriged = krige_profiles(points.station, points.angle, points.radius, fine)
+        wall = kriged.wall if floors is None else _stand_wall(kriged.wall, fine, floors)
+        return _measure_wall(points, wall, kriged.sigma, fine, floors is not None, cloud.voxel, step)
+    wall, seen = _follow_wall(points, wall, fine, floors)
+    return _measure_wall(points, wall, estimate_sigma(wall, seen, fine), fine, floors is not None, cloud.voxel, 0.0)
 
 
-def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: bed.Floors | None) -> np.ndarray:
-    wall = unroll.medians(coarse, coarse.cell(points.station, points.angle), points.radius)
+def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None) -> np.ndarray:
+    wall = cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
-    along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
-    wall = unroll.median_smooth(unroll.fill_nearest(wall), window)
+    along = median_smooth(fill_nearest(wall), (window[0], 1))
+    wall = median_smooth(fill_nearest(wall), window)
     if floors is None:
-        return unroll.resample(wall, coarse, fine)
+        return resample(wall, coarse, fine)
     # Clipped on the fine grid alone: interpolation between a wall and a floor would cut their corner off.
-    return bed.clip(unroll.resample(bed.stand_on(wall, coarse, floors, along), coarse, fine), fine, floors)
+    return clip_to_floor(resample(extend_to_floor(wall, coarse, floors, along), coarse, fine), fine, floors)
 
 
-def _standing(wall: np.ndarray, grid: Grid, floors: bed.Floors) -> np.ndarray:
-    return bed.clip(bed.stand_on(wall, grid, floors, wall), grid, floors)
+def _stand_wall(wall: np.ndarray, grid: Grid, floors: Floors) -> np.ndarray:
+    return clip_to_floor(extend_to_floor(wall, grid, floors, wall), grid, floors)
 
 
 def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:
@@ -127,29 +206,29 @@ def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:
         raise FitError(f"no tunnel in the cloud: only {hollow:.0%} of its points lie on a wall around an open middle")
 
 
-def _followed(
-    points: _Points, first: np.ndarray, fine: Grid, floors: bed.Floors | None
+def _follow_wall(
+    points: _Points, first: np.ndarray, fine: Grid, floors: Floors | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The wall at the half-metre scale, and the cells that it was fitted to."""
+    """Return the wall at the half-metre scale, and the cells that it was fitted to."""
     cell = fine.cell(points.station, points.angle)
     outward = points.radius - first.ravel()[np.maximum(cell, 0)]
-    residual, weight = unroll.means(fine, cell, outward, points.weight)
+    residual, weight = cell_means(fine, cell, outward, points.weight)
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     weight = np.where(inlier, np.minimum(weight, 50.0), 0.0)
-    correction, support = unroll.smooth(residual, weight, (_SIGMA[0] / fine.step, _SIGMA[1]))
+    correction, support = smooth_cells(residual, weight, (_SIGMA[0] / fine.step, _SIGMA[1]))
     correction *= np.clip(support / _SEEN_WEIGHT, 0.0, 1.0)
     if floors is not None:
-        correction[bed.is_floor(first, fine, floors)] = 0.0
+        correction[is_floor(first, fine, floors)] = 0.0
     return first + correction, inlier
 
 
-def _measured(
+def _measure_wall(
     points: _Points, wall: np.ndarray, sigma: np.ndarray, fine: Grid, flat_floor: bool, voxel: float, spacing: float
 ) -> Sections:
-    """What the points say of the wall that was fitted to them."""
+    """Measures what the points show of the wall that was fitted to them."""
     cell = fine.cell(points.station, points.angle)
     outward = points.radius - wall.ravel()[np.maximum(cell, 0)]
-    residual, weight = unroll.means(fine, cell, outward, points.weight)
+    residual, weight = cell_means(fine, cell, outward, points.weight)
     on_wall = (np.abs(outward) < _ON_WALL) & (cell >= 0)
     behind = (outward > _ON_WALL) & (outward < _DEEPEST) & (cell >= 0)
     support = np.bincount(cell[on_wall], minlength=wall.size).reshape(wall.shape).astype(float)

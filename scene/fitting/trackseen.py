@@ -1,13 +1,108 @@
-"""Sleepers and rails where the cloud shows them: on the floor between the walls, above the ballast."""
+"""Sleepers and rails, where the cloud shows them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.ndimage import gaussian_filter1d
 
 from scene.bore import Bore
 from scene.cloud import Cloud
-from scene.fitting.railsseen import SeenRails, find_rails
+
+_RAIL_BAND = (0.60, 0.95)  # from the axis, m
+_RAIL_LOW, _RAIL_HIGH = 0.12, 0.40  # above the bed, m
+_HEAD_LAYER = 0.02  # above and below the most frequent height, m
+_FACE = (0.012, 0.045)  # below the top of the head, m; gauge is measured 14 to 16 mm below it
+_FACE_BAND = (0.66, 0.80)  # from the axis, m
+_FACE_BLUR = 0.003  # m
+_SWAY_BLOCK = 1.0  # m
+_MIN_RAIL = 0.5  # share of the metres along which a rail must be seen
+_MIN_RETURNS = 10  # returns a metre
+
+
+@dataclass(frozen=True)
+class SeenRails:
+    """Both rails.
+
+    Attributes:
+        gauge: Between the inner faces of the heads, 12 to 45 mm below their tops, m.
+        centre: Of the track to the left of the axis, m.
+        top: Above the bed, m.
+    """
+
+    gauge: float
+    centre: float
+    top: float
+
+
+def find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:
+    """Return the rails among the points low in a bore; `None` where they are seen along too little of it.
+
+    Args:
+        station: Of each point, m.
+        lateral: To the left of the axis, m.
+        height: Above the bed, m.
+    """
+    heads = [_find_head(station, side * lateral, height) for side in (1, -1)]
+    left, right = heads
+    if left is None or right is None:
+        return None
+    sway = _sway(station, lateral, left, right)
+    tops = [float(np.median(height[head])) for head in heads]
+    faces = [_inner_face(side * (lateral - sway), height - top) for side, top in zip((1, -1), tops, strict=True)]
+    return SeenRails(faces[0] + faces[1], (faces[0] - faces[1]) / 2, float(np.mean(tops)))
+
+
+def _find_head(station: np.ndarray, across: np.ndarray, height: np.ndarray) -> Bool[np.ndarray, " n"] | None:
+    """Returns on the top of one rail; `None` where it is seen along too little of the bore."""
+    band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < _RAIL_HIGH)
+    if len(np.unique(station[band].astype(int))) < _MIN_RAIL * max(np.ptp(station), 1.0):
+        return None
+    return band & (np.abs(height - _most_frequent(height[band])) < _HEAD_LAYER)
+
+
+def _sway(station: np.ndarray, lateral: np.ndarray, left: np.ndarray, right: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Distance of the track to the left of its mean place under the axis, metre by metre, m.
+
+    Both rails sway together: the axis follows the walls, and poses are a centimetre off here and there. Unless it is
+    taken out it blurs the edges of the heads.
+    """
+    block = (station / _SWAY_BLOCK).astype(np.intp)
+    blocks = int(block.max()) + 1
+    middles = np.full((2, blocks), np.nan)
+    for k, head in enumerate((left, right)):
+        order = np.argsort(block[head], kind="stable")
+        at, bounds = lateral[head][order], np.searchsorted(block[head][order], np.arange(blocks + 1))
+        for i in range(blocks):
+            if bounds[i + 1] - bounds[i] >= _MIN_RETURNS:
+                middles[k, i] = np.median(at[bounds[i] : bounds[i + 1]])
+    middle = middles.mean(axis=0)
+    known = np.isfinite(middle)
+    if known.sum() < 2:
+        return np.zeros(len(station))
+    at = (np.flatnonzero(known) + 0.5) * _SWAY_BLOCK
+    return np.interp(station, at, middle[known] - np.median(middle[known]))
+
+
+def _most_frequent(height: np.ndarray) -> float:
+    count, edges = np.histogram(height, np.arange(_RAIL_LOW, _RAIL_HIGH, 0.004))
+    return float(edges[np.convolve(count, np.ones(3), mode="same").argmax()] + 0.002)
+
+
+def _inner_face(across: np.ndarray, below: np.ndarray) -> float:
+    """Lateral distance where most returns from the side of the head lie, m.
+
+    The side, not the edge of the top: poses that are a little off blur both, and a blurred edge moves outwards, while a
+    blurred face stays where it is.
+    """
+    step = 0.001
+    side = (below < -_FACE[0]) & (below > -_FACE[1])
+    count, edges = np.histogram(across[side], np.arange(*_FACE_BAND, step))
+    smooth = gaussian_filter1d(count.astype(float), _FACE_BLUR / step)
+    k = int(np.clip(smooth.argmax(), 1, len(smooth) - 2))
+    bend = 2 * (smooth[k - 1] - 2 * smooth[k] + smooth[k + 1])
+    return float(edges[k] + step / 2 + (step * (smooth[k - 1] - smooth[k + 1]) / bend if bend else 0.0))
+
 
 _BIN = 0.01  # m along
 _SMOOTH = 0.09  # m, box; well below a sleeper's width
@@ -45,7 +140,7 @@ class SeenTrack:
 
 
 def find_track(cloud: Cloud, bore: Bore) -> SeenTrack:
-    """Sleepers and rails on the floor of the bore.
+    """Finds sleepers and rails on the floor of the bore.
 
     Args:
         cloud: Registered cloud in the bore's frame.
@@ -85,21 +180,23 @@ def _find_sleepers(station: np.ndarray, lateral: np.ndarray, height: np.ndarray,
     spacing = float(np.median(np.diff(centre)))
     if not _SPACINGS[0] < spacing < _SPACINGS[1] or wide.sum() < _MIN_SEEN * length / spacing:
         return None
-    owner = _nearest(centre, station[near])
+    owner = _nearest_sleeper(centre, station[near])
     on_top = (np.abs(station[near] - centre[owner]) < 0.06) & (height[near] > _STEP)
     protrusion = float(np.median(height[near][on_top]))
-    place, measured = _complete(_middles(centre, station[near], height[near], protrusion), spacing, length)
+    place, measured = _complete_sleepers(
+        _sleeper_middles(centre, station[near], height[near], protrusion), spacing, length
+    )
     return SeenSleepers(place, measured, protrusion)
 
 
-def _nearest(centre: np.ndarray, station: np.ndarray) -> np.ndarray:
+def _nearest_sleeper(centre: np.ndarray, station: np.ndarray) -> np.ndarray:
     right = np.clip(np.searchsorted(centre, station), 1, len(centre) - 1)
     return np.where(station - centre[right - 1] < centre[right] - station, right - 1, right)
 
 
-def _middles(centre: np.ndarray, station: np.ndarray, height: np.ndarray, protrusion: float) -> np.ndarray:
+def _sleeper_middles(centre: np.ndarray, station: np.ndarray, height: np.ndarray, protrusion: float) -> np.ndarray:
     """Middle of each sleeper's top; its near face and the shadow behind it would pull a mean to one side."""
-    owner = _nearest(centre, station)
+    owner = _nearest_sleeper(centre, station)
     top = (np.abs(height - protrusion) < _TOP_LAYER) & (np.abs(station - centre[owner]) < _WIDTHS[1] / 2)
     order = np.lexsort((station[top], owner[top]))
     at, bounds = station[top][order], np.searchsorted(owner[top][order], np.arange(len(centre) + 1))
@@ -111,8 +208,8 @@ def _middles(centre: np.ndarray, station: np.ndarray, height: np.ndarray, protru
     return moved
 
 
-def _complete(centre: np.ndarray, spacing: float, length: float) -> tuple[np.ndarray, np.ndarray]:
-    """The seen sleepers, and one wherever the spacing asks for one that was not seen."""
+def _complete_sleepers(centre: np.ndarray, spacing: float, length: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the seen sleepers, and one wherever the spacing asks for one that was not seen."""
     places, measured = [float(centre[0])], [True]
     for following in centre[1:]:
         gap = following - places[-1]

@@ -1,10 +1,11 @@
-"""The wall rolled out flat: a grid over station and angle that holds what the returns say of each cell."""
+"""The wall rolled out flat."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.ndimage import distance_transform_edt, gaussian_filter, median_filter
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, median_filter
+from scipy.special import erf
 
 _RADIUS_STEP = 1.0 / (1 << 14)  # 0.06 mm, so that a cell and a radius fit one sortable word
 _RADIUS_BITS = 20
@@ -28,7 +29,7 @@ class Grid:
 
     @classmethod
     def over(cls, start: float, end: float, step: float, columns: int) -> "Grid":
-        """The grid that covers an interval of stations, m."""
+        """Return the grid that covers an interval of stations, m."""
         return cls(start, step, max(int(np.ceil((end - start) / step)), 1), columns)
 
     @property
@@ -42,14 +43,16 @@ class Grid:
         return -np.pi + 2 * np.pi * (np.arange(self.columns) + 0.5) / self.columns
 
     def cell(self, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"]) -> Int[np.ndarray, " p"]:
-        """Flat index of each point's cell; -1 outside the rows."""
+        """Return the flat index of each point's cell; -1 outside the rows."""
         row = np.floor((station - self.start) / self.step).astype(np.int64)
         column = np.floor((angle + np.pi) / (2 * np.pi) * self.columns).astype(np.int64) % self.columns
         return np.where((row >= 0) & (row < self.rows), row * self.columns + column, -1)
 
 
-def medians(grid: Grid, cell: Int[np.ndarray, " p"], radius: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows cols"]:
-    """Median radius of each cell, m; NaN where nothing was seen."""
+def cell_medians(
+    grid: Grid, cell: Int[np.ndarray, " p"], radius: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, "rows cols"]:
+    """Return the median radius of each cell, m; NaN where nothing was seen."""
     inside = cell >= 0
     words = np.minimum(radius[inside] / _RADIUS_STEP, (1 << _RADIUS_BITS) - 1).astype(np.uint64)
     words |= cell[inside].astype(np.uint64) << np.uint64(_RADIUS_BITS)
@@ -64,10 +67,10 @@ def medians(grid: Grid, cell: Int[np.ndarray, " p"], radius: Float[np.ndarray, "
     return result.reshape(grid.rows, grid.columns)
 
 
-def means(
+def cell_means(
     grid: Grid, cell: Int[np.ndarray, " p"], value: Float[np.ndarray, " p"], weight: Float[np.ndarray, " p"]
 ) -> tuple[Float[np.ndarray, "rows cols"], Float[np.ndarray, "rows cols"]]:
-    """Weighted mean of each cell (0 where nothing was seen) and its weight."""
+    """Return the weighted mean of each cell (0 where nothing was seen) and its weight."""
     inside = cell >= 0
     size = grid.rows * grid.columns
     total = np.bincount(cell[inside], weight[inside], size)
@@ -77,7 +80,7 @@ def means(
 
 
 def fill_nearest(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
-    """NaN cells take the value of the nearest known one; the angle wraps. All NaN stays so."""
+    """Fills NaN cells with the nearest known value; the angle wraps. A field of NaN stays."""
     unknown = np.isnan(field)
     if not unknown.any() or unknown.all():
         return field
@@ -88,16 +91,16 @@ def fill_nearest(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "ro
 
 
 def median_smooth(field: Float[np.ndarray, "rows cols"], window: tuple[int, int]) -> Float[np.ndarray, "rows cols"]:
-    """Median over a window of cells; the angle wraps, the ends hold."""
+    """Return the median over a window of cells; the angle wraps, the ends hold."""
     pad = window[1] // 2
     wrapped = np.concatenate([field[:, field.shape[1] - pad :], field, field[:, :pad]], axis=1)
     return median_filter(wrapped, window, mode="nearest")[:, pad : pad + field.shape[1]]
 
 
-def smooth(
+def smooth_cells(
     value: Float[np.ndarray, "rows cols"], weight: Float[np.ndarray, "rows cols"], sigma: tuple[float, float]
 ) -> tuple[Float[np.ndarray, "rows cols"], Float[np.ndarray, "rows cols"]]:
-    """Gaussian mean of the weighted cells, and the weight that each result rests on.
+    """Return the Gaussian mean of the weighted cells, and the weight that each result rests on.
 
     Args:
         value: Cells; those of weight 0 are not read.
@@ -110,8 +113,8 @@ def smooth(
     return np.divide(summed, total, out=np.zeros_like(summed), where=total > 1e-12), total
 
 
-def fill_along(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
-    """NaN cells by linear interpolation around each row; the angle wraps. A row of NaN alone stays so."""
+def fill_around(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows cols"]:
+    """Fills NaN cells by linear interpolation around each row; the angle wraps. A row of NaN stays."""
     result, columns = field.copy(), np.arange(field.shape[1], dtype=float)
     for row in np.flatnonzero(np.isnan(field).any(axis=1) & np.isfinite(field).any(axis=1)):
         seen = np.isfinite(field[row])
@@ -120,7 +123,7 @@ def fill_along(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "rows
 
 
 def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
-    """Linear interpolation of the coarse wall on the fine grid; the angle wraps, the ends hold."""
+    """Interpolates the coarse wall linearly on the fine grid; the angle wraps, the ends hold."""
     row = np.clip((fine.station - coarse.start) / coarse.step - 0.5, 0, coarse.rows - 1)
     low = np.minimum(row.astype(np.intp), max(coarse.rows - 2, 0))
     share = (row - low)[:, None]
@@ -129,3 +132,46 @@ def resample(wall: np.ndarray, coarse: Grid, fine: Grid) -> np.ndarray:
     left = np.floor(column).astype(np.intp)
     part = column - left
     return (1 - part) * along[:, left % coarse.columns] + part * along[:, (left + 1) % coarse.columns]
+
+
+TOLERANCE = 0.05  # m; "known" is known within this
+_AROUND = (3, 2)  # cells of 5 cm × 1° that one return speaks for
+_SEEN_SIGMA = 0.01  # m, standard deviation of a wall seen in nearly every cell
+UNSEEN_GROWTH = 0.02  # m for each metre from the nearest cell seen, however even the wall is elsewhere
+_LAGS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # m
+
+
+def estimate_sigma(
+    wall: Float[np.ndarray, "rows cols"], seen: Bool[np.ndarray, "rows cols"], grid: Grid
+) -> Float[np.ndarray, "rows cols"]:
+    """Estimates the standard deviation of a wall that was interpolated over unseen cells, m.
+
+    It is what the same wall changes by, root mean square, over the distance along the bore to the nearest cell that
+    was seen; where a whole direction was not seen, over the greatest distance that was tried, 8 m. At least
+    2 cm for each metre.
+
+    Args:
+        wall: The wall, m.
+        seen: Cells with returns on it.
+        grid: Its cells.
+    """
+    near = binary_dilation(seen, np.ones((2 * _AROUND[0] + 1, 2 * _AROUND[1] + 1), bool))
+    sampling = (grid.step, 2 * np.pi * float(np.median(wall)) / grid.columns)
+    wrapped = np.concatenate([near, near, near], axis=1)
+    distance = distance_transform_edt(~wrapped, sampling=sampling)[:, grid.columns : 2 * grid.columns]
+    lags = [lag for lag in _LAGS if round(lag / grid.step) < grid.rows] or [grid.step]
+    change = [_wall_change(wall, near, max(round(lag / grid.step), 1)) for lag in lags]
+    held = np.interp(distance, [0.0, *lags], [0.0, *np.maximum.accumulate(change)])
+    return np.hypot(_SEEN_SIGMA, np.maximum(held, UNSEEN_GROWTH * distance))
+
+
+def _wall_change(wall: np.ndarray, seen: np.ndarray, rows: int) -> float:
+    """Root mean square difference of seen cells so many rows apart, m."""
+    both = seen[rows:] & seen[:-rows]
+    difference = (wall[rows:] - wall[:-rows])[both]
+    return float(np.sqrt(np.mean(difference**2))) if len(difference) else 0.0
+
+
+def probability_known(sigma: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    """Return the probability that an error of standard deviation `sigma`, m, is below 5 cm."""
+    return erf(TOLERANCE / np.maximum(sigma, 1e-9) / np.sqrt(2))

@@ -48,31 +48,31 @@ class Calibration:
     imu: dict[str, Mount]
 
 
-def _mount(rotation: list[list[float]], shift: list[float]) -> Mount:
+def _orthonormal_mount(rotation: list[list[float]], shift: list[float]) -> Mount:
     u, _, vt = np.linalg.svd(np.array(rotation))
     return Mount(u @ vt, np.array(shift))
 
 
-def _target(shift: list[float], wxyz: list[float]) -> Mount:
+def _quaternion_mount(shift: list[float], wxyz: list[float]) -> Mount:
     return Mount(Rotation.from_quat([*wxyz[1:], wxyz[0]]).as_matrix(), np.array(shift))
 
 
 # Source: GEODE (PengYu-Team/GEODE_dataset, arXiv 2409.04961). Its scripts give (t, q wxyz), "γ to Leica", and
 # take a LiDAR pose P to P · inv(T): T maps LiDAR coordinates to the target's, whose origin is inv(T) · 0.
-_LEICA_GAMMA = _target([0.00947221, -0.308202, -0.365733], [0.999901, -0.00492765, 0.00575961, 0.0117651])
-_LEICA_BETA = _target([-0.0108864, 0.293397, -0.452674], [0.999991, 0.000903519, 0.0035434, -0.00220342])
-_GNSS_GAMMA = _target([0.0305, -0.5959, 0.0902], [0.9998828, -0.0057758, 0.0022253, 0.0140019])
-_GNSS_ALPHA = _target([0.0090, -0.2925, 0.4533], [0.9999909, -0.0009, -0.00355, 0.0022])
+_LEICA_GAMMA = _quaternion_mount([0.00947221, -0.308202, -0.365733], [0.999901, -0.00492765, 0.00575961, 0.0117651])
+_LEICA_BETA = _quaternion_mount([-0.0108864, 0.293397, -0.452674], [0.999991, 0.000903519, 0.0035434, -0.00220342])
+_GNSS_GAMMA = _quaternion_mount([0.0305, -0.5959, 0.0902], [0.9998828, -0.0057758, 0.0022253, 0.0140019])
+_GNSS_ALPHA = _quaternion_mount([0.0090, -0.2925, 0.4533], [0.9999909, -0.0009, -0.00355, 0.0022])
 # Source: GEODE, `T_IMU_LiDAR`, p_imu = T p_lidar, of the external Xsens MTi-30.
-_MTI_GAMMA = _mount(
+_MTI_GAMMA = _orthonormal_mount(
     [[0.99962, 0.027463, 0.002445], [-0.027517, 0.999299, 0.025398], [-0.001746, -0.025456, 0.999674]],
     [0.049258, -0.0125, 0.026946],
 )
-_MTI_BETA = _mount(
+_MTI_BETA = _orthonormal_mount(
     [[0.998638, 0.052001, -0.004278], [-0.051937, 0.998554, 0.0139], [0.004994, -0.013659, 0.999894]],
     [-0.027172, -0.034873, 0.062643],
 )
-_MTI_ALPHA = _mount(
+_MTI_ALPHA = _orthonormal_mount(
     [[0.9999, 0.0049, 0.0153], [-0.0050, 1.0, 0.0021], [-0.0153, -0.0022, 0.9999]], [0.0961, -0.1338, 0.3032]
 )
 # Source: FAST-LIO's avia.yaml, p_imu = p_lidar + t: axes parallel, the chip at minus this in LiDAR coordinates.
@@ -94,7 +94,7 @@ UNCALIBRATED = Calibration("none: the control is taken for the LiDAR's own origi
 
 
 def find_calibration(text: str | None) -> Calibration:
-    """A calibration from what a user wrote.
+    """Return a calibration from what a user wrote.
 
     Args:
         text: Name of a preset, path of a YAML file, or a lever arm `x,y,z` (the prism in LiDAR coordinates, m).
@@ -143,17 +143,17 @@ def load_calibration(path: Path) -> Calibration:
     for topic, entry in imus.items():
         if not isinstance(entry, dict):
             raise RecordingError(f"{path}: imu {topic} must have rotation and shift, found {entry!r:.80}")
-        rotation = _numbers(path, f"imu {topic} rotation", entry.get("rotation", np.eye(3)), (3, 3))
+        rotation = _read_numbers(path, f"imu {topic} rotation", entry.get("rotation", np.eye(3)), (3, 3))
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(rotation) < 0:
             raise RecordingError(f"{path}: imu {topic} rotation is no rotation matrix")
-        mounts[str(topic)] = _mount(
-            rotation.tolist(), _numbers(path, f"imu {topic} shift", entry.get("shift"), (3,)).tolist()
+        mounts[str(topic)] = _orthonormal_mount(
+            rotation.tolist(), _read_numbers(path, f"imu {topic} shift", entry.get("shift"), (3,)).tolist()
         )
-    prism = _numbers(path, "prism", content.get("prism", np.zeros(3)), (3,))
+    prism = _read_numbers(path, "prism", content.get("prism", np.zeros(3)), (3,))
     return Calibration(path.name, prism, {**UNCALIBRATED.imu, **mounts})
 
 
-def _numbers(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _read_numbers(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError):

@@ -1,19 +1,18 @@
-"""Inertial samples beside a LiDAR: rates and specific forces.
-
-The `orientation` field is not read. Where an instrument fills it (`/imu/data` of an Xsens MTi), a filter of its own
-made it from these same rates and forces, with errors that are neither stated nor white, and from a magnetometer that
-steel lining, rails and cables turn.
-"""
+"""IMU samples, and the attitude that follows from them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from scene.errors import RecordingError
-from scene.reading.cause import cause
+from scene.poses.calibration import Calibration, Mount
+from scene.poses.odometry import Guide
+from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
+from scene.reading.source import cause
 
 IMU_TYPE = "sensor_msgs/msg/Imu"
 GRAVITY = 9.80665  # m/s²
@@ -40,14 +39,14 @@ class Inertial:
 
 
 def imu_topics(recording: Recording) -> list[str]:
-    """Topics that carry IMU messages; the one in the LiDAR's own housing (`/livox/imu` to `/livox/lidar`) first."""
+    """Return the topics with IMU messages; that of the LiDAR's own housing (`/livox/imu`) comes first."""
     beside = recording.topic.rsplit("/", 1)[0]
     topics = sorted({c.topic for c in recording.reader.connections if c.msgtype == IMU_TYPE})
     return sorted(topics, key=lambda topic: topic.rsplit("/", 1)[0] != beside)
 
 
-def imu(recording: Recording, topic: str) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
-    """Samples in the order of the bag: time (s, of the header), rate (rad/s) and force (the topic's own unit).
+def imu_samples(recording: Recording, topic: str) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
+    """Yields samples in the order of the bag: time (s, header), rate (rad/s), force (the topic's unit).
 
     Raises:
         RecordingError: A message is damaged; says which.
@@ -68,7 +67,7 @@ def imu(recording: Recording, topic: str) -> Iterator[tuple[float, np.ndarray, n
 
 
 def read_inertial(recording: Recording, topic: str) -> Inertial | None:
-    """A whole IMU topic: sorted, repeated times and samples that are not finite dropped, force in m/s².
+    """Return a whole IMU topic: sorted, repeated times and samples that are not finite dropped, force in m/s².
 
     Returns:
         `None` where fewer than 50 samples are left.
@@ -76,7 +75,7 @@ def read_inertial(recording: Recording, topic: str) -> Inertial | None:
     Raises:
         RecordingError: Damaged, or its force is neither in g nor in m/s².
     """
-    samples = [(time, *turn, *push) for time, turn, push in imu(recording, topic)]
+    samples = [(time, *turn, *push) for time, turn, push in imu_samples(recording, topic)]
     rows = np.asarray(samples, np.float64).reshape(-1, 7)
     rows = rows[np.isfinite(rows).all(axis=1)]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
@@ -87,3 +86,44 @@ def read_inertial(recording: Recording, topic: str) -> Inertial | None:
         if low < size < high:
             return Inertial(rows[:, 0], rows[:, 1:4], rows[:, 4:] * unit, topic)
     raise RecordingError(f"{recording.path}: {topic} has a median force of {size:.3g}, which is neither g nor m/s²")
+
+
+_START_TIME = 0.2  # s; short, since a carrier sways
+_LONGEST_GAP = 2.0  # s without IMU samples
+_BY_GYRO = (np.deg2rad(0.05), 0.02)  # rad and m from one sweep to the next
+
+
+def find_inertial(recording: Recording, calibration: Calibration) -> tuple[Inertial | None, Mount | None]:
+    """Finds the first IMU whose mount is known and that ran without long pauses."""
+    for topic in imu_topics(recording):
+        if topic not in calibration.imu:
+            continue
+        inertial = read_inertial(recording, topic)
+        if inertial is not None and np.diff(inertial.times).max() < _LONGEST_GAP:
+            return inertial, calibration.imu[topic]
+    return None, None
+
+
+def gyro_guide(inertial: Inertial, mount: Mount) -> Guide:
+    """Return attitudes of the LiDAR by the gyro alone, from the first sample on."""
+    half = 0.5 * (inertial.rate[1:] + inertial.rate[:-1]) * np.diff(inertial.times)[:, None]
+    attitudes = [np.eye(3)]
+    for turn in Rotation.from_rotvec(half).as_matrix():
+        attitudes.append(attitudes[-1] @ turn)
+    turns = Rotation.from_matrix(np.asarray(attitudes) @ mount.rotation)
+    return Guide(Trajectory(inertial.times, np.zeros_like(inertial.rate), turns, inertial.topic), False, *_BY_GYRO)
+
+
+def level_rotation(
+    recording: Recording, trajectory: Trajectory, inertial: Inertial | None, mount: Mount | None
+) -> Rotation:
+    """Return the smallest turn that makes gravity vertical, averaged over the recording; none without an IMU."""
+    if inertial is None or mount is None:
+        up = recording.up_at_start(_START_TIME)
+    else:
+        inside = (inertial.times >= trajectory.times[0]) & (inertial.times <= trajectory.times[-1])
+        _, turns = trajectory.at(inertial.times[inside])
+        up = turns.apply(inertial.force[inside] @ mount.rotation).mean(axis=0)
+    if up is None or not np.linalg.norm(up) > 0:
+        return Rotation.identity()
+    return Rotation.align_vectors([[0.0, 0.0, 1.0]], [up / np.linalg.norm(up)])[0]

@@ -1,17 +1,52 @@
-"""Where the LiDAR was: as given, or from odometry alone; `controlled` has the way by control."""
+"""The poses of the LiDAR: as given, from odometry alone, or from control with odometry and IMU."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scene.cli import Stages
-from scene.poses.attitude import find_inertial, gyro_guide, levelling
-from scene.poses.calibration import Calibration
-from scene.poses.located import Located, track
-from scene.poses.tracker import LIBRARY
-from scene.poses.trajectory import Trajectory
+from scene.errors import RecordingError
+from scene.poses.calibration import Calibration, Mount
+from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
+from scene.poses.odometry import LIBRARY, Guide, Odometry, OdometryLog, estimate_odometry
+from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, odometry_problem, solve_with_heading
+from scene.poses.terms import Chain
+from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory
 from scene.reading.recording import Recording
 from scene.resume import Partial
 
 
-def given(trajectory: Trajectory) -> Located:
-    """Poses as they were given; how well they fix the length is for their maker to say."""
+@dataclass(frozen=True)
+class Located:
+    """Where the LiDAR was, and what the manifest says of it.
+
+    Attributes:
+        trajectory: Poses of the LiDAR; in the control's frame where there was one, else level from the first sweep.
+        estimated: Whether the poses were found here, so that they are worth writing down.
+        most_uncovered: Share of the scans that may lie outside the trajectory's time.
+        facts: `poses`, `length_fixed_by`, `length_uncertainty` (m, 95 %, or `None` where nobody can say) and figures.
+    """
+
+    trajectory: Trajectory
+    facts: dict[str, Any]
+    estimated: bool = True
+    most_uncovered: float = 0.05
+
+
+def run_odometry(
+    recording: Recording, guide: Guide | None, progress: Stages, partial: Partial, turn: str = "first"
+) -> Odometry:
+    """Runs LiDAR odometry as a stage of a build, with its partial results."""
+    stage = progress.start(f"LiDAR odometry, {turn} pass", recording.scan_count)
+    return estimate_odometry(recording, guide, stage, OdometryLog(partial, f"odometry-{turn}"))
+
+
+def locate_given(trajectory: Trajectory) -> Located:
+    """Takes given poses; only their maker knows how well they fix the length."""
     return Located(
         trajectory,
         {
@@ -24,16 +59,16 @@ def given(trajectory: Trajectory) -> Located:
     )
 
 
-def by_odometry(recording: Recording, calibration: Calibration, progress: Stages, partial: Partial) -> Located:
-    """LiDAR odometry, helped by the gyro where there is an IMU.
+def locate_by_odometry(recording: Recording, calibration: Calibration, progress: Stages, partial: Partial) -> Located:
+    """Locates the LiDAR by odometry, helped by the gyro where there is an IMU.
 
     Raises:
         FitError: Too few scans.
     """
     inertial, mount = find_inertial(recording, calibration)
     guide = gyro_guide(inertial, mount) if inertial and mount else None
-    trajectory = track(recording, guide, progress, partial).trajectory
-    level = levelling(recording, trajectory, inertial, mount)
+    trajectory = run_odometry(recording, guide, progress, partial).trajectory
+    level = level_rotation(recording, trajectory, inertial, mount)
     poses = Trajectory(trajectory.times, level.apply(trajectory.positions), level * trajectory.rotations, LIBRARY)
     facts = {
         "poses": LIBRARY,
@@ -43,3 +78,120 @@ def by_odometry(recording: Recording, calibration: Calibration, progress: Stages
         "length_uncertainty_from": "unknown: nobody measured the axial scale",
     }
     return Located(poses, facts)
+
+
+# Guides: what is trusted of the turn (rad) and the shift (m) from one sweep to the next.
+_BY_CONTROL = (np.deg2rad(0.1), 0.02)
+_BY_CONTROL_WITHOUT_IMU = (np.deg2rad(0.5), 0.02)
+_OUTLIER = 4.0  # standard deviations
+_END_ERROR = 0.05  # m; an end of the bore is found to this, on simulated surveys
+
+
+def locate_by_control(
+    recording: Recording, control: Control, calibration: Calibration, progress: Stages, partial: Partial
+) -> Located:
+    """Locates the LiDAR in the control's frame from control, odometry and IMU.
+
+    Raises:
+        RecordingError: The control does not overlap the recording.
+        FitError: Too few scans, or what was measured does not determine the trajectory.
+    """
+    start, end = _recording_span(recording)
+    control.require_overlap(start, end, recording.path)
+    inertial, mount = find_inertial(recording, calibration)
+    if inertial and mount:
+        problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress, partial)
+        trajectory = _lidar_poses(chain, mount)
+    else:
+        problem, chain = _solve_without_imu(recording, control, calibration, progress, partial)
+        trajectory = _lidar_poses(chain, Mount(np.eye(3), np.zeros(3)))
+    return Located(
+        trajectory,
+        {
+            "poses": f"control, {LIBRARY}" + (f", IMU {inertial.topic}" if inertial else ""),
+            "imu": inertial.topic if inertial else None,
+            "calibration": calibration.name,
+            "prism_lever": calibration.prism,
+            **_control_facts(problem, chain, control),
+        },
+        # Control often starts late and ends early; what it does not reach is left out, and counted.
+        most_uncovered=1 - MIN_CONTROL_SHARE,
+    )
+
+
+def _solve_with_imu(
+    recording: Recording,
+    inertial: Inertial,
+    mount: Mount,
+    control: Control,
+    calibration: Calibration,
+    progress: Stages,
+    partial: Partial,
+) -> tuple[Problem, Chain]:
+    lever = mount.rotation @ calibration.prism + mount.shift
+    problem, chain = inertial_problem(inertial, control, lever, Noise())
+    guess = _load_or_solve(partial, "smoothed", lambda: solve_with_heading(problem, chain), progress)
+    odometry = run_odometry(recording, Guide(_lidar_poses(guess, mount), True, *_BY_CONTROL), progress, partial)
+    whole = replace(problem, steps=imu_steps(odometry, guess, mount))
+    return whole, _load_or_solve(partial, "smoothed-again", lambda: whole.solve(guess)[0], progress)
+
+
+def _solve_without_imu(
+    recording: Recording, control: Control, calibration: Calibration, progress: Stages, partial: Partial
+) -> tuple[Problem, Chain]:
+    """Smooths twice: the first result guides the second odometry, which then slips less."""
+    guide = None
+    for turn in ("first", "second"):
+        odometry = run_odometry(recording, guide, progress, partial, turn)
+        problem, guess = odometry_problem(odometry, control, calibration.prism, Noise())
+        chain = _load_or_solve(
+            partial, f"smoothed-{turn}", functools.partial(solve_with_heading, problem, guess), progress
+        )
+        guide = Guide(_lidar_poses(chain, Mount(np.eye(3), np.zeros(3))), True, *_BY_CONTROL_WITHOUT_IMU)
+    return problem, chain
+
+
+def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str, Any]:
+    """Residuals of the control, and the uncertainty of the length that follows (95 %), for the manifest."""
+    residual = problem.sightings.residual(chain)
+    kept = np.linalg.norm(residual, axis=1) < _OUTLIER * np.sqrt(3) * problem.sightings.sigma
+    rms = float(np.sqrt(np.mean(residual[kept] ** 2))) if kept.any() else float("inf")
+    trusted = max(rms, problem.noise.control)
+    return {
+        "length_fixed_by": "control",
+        "length_uncertainty": float(np.sqrt(2) * np.hypot(2 * trusted, _END_ERROR)),
+        "length_uncertainty_from": "95 %: control residuals, and how well ends are found; not the control's own scale",
+        "control_rows": len(residual),
+        "control_rows_repeated": control.dropped,
+        "control_outliers": int((~kept).sum()),
+        "control_residual_rms": rms,
+        "control_longest_gap": float(np.diff(control.times).max()),
+    }
+
+
+def _lidar_poses(chain: Chain, mount: Mount) -> Trajectory:
+    attitude = chain.attitude @ mount.rotation
+    return Trajectory(
+        chain.times, chain.position + chain.attitude @ mount.shift, Rotation.from_matrix(attitude), LIBRARY
+    )
+
+
+def _load_or_solve(partial: Partial, name: str, solve: Callable[[], Chain], progress: Stages) -> Chain:
+    """Return a smoothed trajectory, from the partial results where an earlier build got so far."""
+    stage = progress.start("smoothing the trajectory", 1)
+    known = partial.load(name)
+    chain = Chain(**known) if known else solve()
+    # One memory layout whether read back or not: the order of later sums may depend on it.
+    arrays = {field.name: np.ascontiguousarray(getattr(chain, field.name)) for field in fields(Chain)}
+    if not known:
+        partial.save(name, **arrays)
+    stage.advance()
+    return Chain(**arrays)
+
+
+def _recording_span(recording: Recording) -> tuple[float, float]:
+    """Times of the first and the last scan, s."""
+    times = [scan.stamp for scan in recording.scans()]
+    if len(times) < 2:
+        raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
+    return times[0], times[-1]

@@ -1,22 +1,237 @@
-"""LiDAR odometry: each sweep against a map of those before it, by small-gicp, blended with what was expected of it.
+"""LiDAR odometry."""
 
-In a bore a sweep barely constrains its place along the axis, and plain registration then jumps about. Each result is
-therefore blended with the expected pose by the information of both: where the walls say little, the expectation
-stands. It comes from a guide (a gyro, or an earlier trajectory), else from going on as before.
-"""
-
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+import small_gicp
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.cli import Stage
 from scene.errors import FitError
-from scene.poses.odometrylog import OdometryLog, Tracked
-from scene.poses.tracker import LIBRARY, MIN_POINTS, Guide, Tracker
+from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
-from scene.reading.recording import Recording
+from scene.reading.recording import START, ReadPosition, Recording
+from scene.reading.scans import Scan
+from scene.resume import Partial
+
+LIBRARY = "small-gicp"
+MIN_POINTS = 100
+_RANGE = 60.0  # m
+_THINNING, _VOXEL, _REACH = 0.25, 0.5, 1.0  # m: of a sweep, of the map, of a correspondence
+_NEIGHBOURS = 10  # whose spread is a point's covariance
+_HORIZON = 100  # sweeps that an unseen voxel of the map is kept for
+_WARM_UP = 5  # sweeps before the expectation is worth anything without a guide
+_KNOTS = 11  # poses that a sweep is unwound with
+
+
+@dataclass(frozen=True)
+class Guide:
+    """What is known of the motion before the LiDAR is asked.
+
+    Attributes:
+        trajectory: Attitudes of the LiDAR, and its positions where `moves`, in any fixed frame.
+        moves: Whether the positions mean anything.
+        turn_sigma: Standard deviation of the turn from one sweep to the next, rad.
+        shift_sigma: Of the shift from one sweep to the next, m.
+    """
+
+    trajectory: Trajectory
+    moves: bool
+    turn_sigma: float
+    shift_sigma: float
+
+
+class Tracker:
+    """The map so far, and the pose of every sweep in it.
+
+    Attributes:
+        poses: Sweep to map, `(4, 4)` each.
+        thinned: The last sweep's points as they went into the map, m, `(k, 3)`: what `follow` needs of it.
+    """
+
+    def __init__(self) -> None:
+        self.thinned: Float[np.ndarray, "k 3"] = np.empty((0, 3))
+        self.poses: list[np.ndarray] = []
+        self._map = small_gicp.GaussianVoxelMap(_VOXEL)
+        self._map.set_lru(horizon=_HORIZON, clear_cycle=10)
+        self._time = 0.0
+        self._step = np.eye(4)
+        self._pace = 0.1  # s that `_step` took
+
+    def register(self, scan: Scan, middle: float, guide: Guide | None) -> np.ndarray:
+        """Adds a sweep; returns the direction in it that its walls say least about."""
+        last = self.poses[-1] if self.poses else np.eye(4)
+        gap = middle - self._time if self.poses else self._pace
+        step = self._expected(middle, gap, guide)
+        points = self._unwound(scan, middle, guide, step, gap)
+        near = points[np.linalg.norm(points, axis=1) < _RANGE]
+        # One thread: sums in one order, so that the same recording gives the same bytes.
+        source, _ = small_gicp.preprocess_points(near, _THINNING, _NEIGHBOURS, num_threads=1)
+        pose, weakest = last @ step, np.array([1.0, 0.0, 0.0])
+        if self.poses and source.size() >= MIN_POINTS:
+            result = small_gicp.align(self._map, source, pose, max_correspondence_distance=_REACH, num_threads=1)
+            if result.num_inliers >= MIN_POINTS and np.isfinite(result.T_target_source).all():
+                weakest = _weakest_direction(result.H)
+                pose = _blend_poses(result, pose, *self._sigmas(guide))
+        self.thinned = np.asarray(source.points())[:, :3]
+        self._accept(source, pose, middle)
+        return weakest
+
+    def follow(self, thinned: Float[np.ndarray, "k 3"], pose: Float[np.ndarray, "4 4"], middle: float) -> None:
+        """Adds a sweep whose pose is known from an earlier run: leaves exactly the state that `register` left then."""
+        source = small_gicp.PointCloud(thinned)
+        small_gicp.estimate_covariances(source, num_neighbors=_NEIGHBOURS, num_threads=1)
+        self._accept(source, pose, middle)
+
+    def _accept(self, source: small_gicp.PointCloud, pose: np.ndarray, middle: float) -> None:
+        if source.size() >= MIN_POINTS or not self.poses:
+            self._map.insert(source, pose)
+        if self.poses:
+            self._step, self._pace = np.linalg.inv(self.poses[-1]) @ pose, middle - self._time
+        self._time = middle
+        self.poses.append(pose)
+
+    def _sigmas(self, guide: Guide | None) -> tuple[float, float]:
+        if guide is None:
+            return (np.deg2rad(0.5), 0.02) if len(self.poses) > _WARM_UP else (np.inf, np.inf)
+        moving = guide.moves or len(self.poses) > _WARM_UP
+        return guide.turn_sigma, guide.shift_sigma if moving else np.inf
+
+    def _expected(self, middle: float, gap: float, guide: Guide | None) -> np.ndarray:
+        """Return the step from the last sweep's pose to this one's, by the guide or as the last step was."""
+        share = gap / self._pace
+        step = _pose_matrix(Rotation.from_matrix(self._step[:3, :3]) ** share, share * self._step[:3, 3])
+        if guide is not None and self.poses:
+            places, turns = guide.trajectory.at(np.array([self._time, middle]))
+            step[:3, :3] = (turns[0].inv() * turns[1]).as_matrix()
+            if guide.moves:
+                step[:3, 3] = turns[0].inv().apply(places[1] - places[0])
+        return step
+
+    def _unwound(self, scan: Scan, middle: float, guide: Guide | None, step: np.ndarray, gap: float) -> np.ndarray:
+        """Return the sweep's points as seen from where the sensor was in the middle of it, m."""
+        times = np.linspace(scan.stamp, max(2 * middle - scan.stamp, scan.stamp + 1e-6), _KNOTS)
+        share = (times - middle) / gap
+        shifts = share[:, None] * step[:3, 3]
+        if guide is None:
+            turns = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(step[:3, :3]).as_rotvec())
+        else:
+            places, turns = guide.trajectory.at(times)
+            back = turns[_KNOTS // 2].inv()
+            if guide.moves:
+                shifts = back.apply(places - places[_KNOTS // 2])
+            turns = back * turns
+        return deskew(scan, Trajectory(times, shifts, turns, LIBRARY))
+
+
+def _pose_matrix(turn: Rotation, shift: np.ndarray) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.as_matrix(), shift
+    return pose
+
+
+def _weakest_direction(information: np.ndarray) -> np.ndarray:
+    """Return the direction of least information on the shift, once the turn is free."""
+    turn, cross, shift = information[:3, :3], information[:3, 3:], information[3:, 3:]
+    return np.linalg.eigh(shift - cross.T @ np.linalg.solve(turn, cross))[1][:, 0]
+
+
+def _blend_poses(
+    result: small_gicp.RegistrationResult, expected: np.ndarray, turn_sigma: float, shift_sigma: float
+) -> np.ndarray:
+    """Return the registered pose, moved towards the expected one where that is the surer of the two.
+
+    Source: the posterior of two Gaussians, in the tangent space of the registered pose.
+    """
+    pose = result.T_target_source
+    gap = np.linalg.inv(pose) @ expected
+    way = np.concatenate([Rotation.from_matrix(gap[:3, :3]).as_rotvec(), gap[:3, 3]])
+    trust = np.diag(np.repeat([turn_sigma**-2.0, shift_sigma**-2.0], 3))
+    part = np.linalg.solve(result.H + trust, trust @ way)
+    return pose @ _pose_matrix(Rotation.from_rotvec(part[:3]), part[3:])
+
+
+@dataclass
+class TrackedSweeps:
+    """Sweeps in the order of time.
+
+    Attributes:
+        times: Middle of each, s.
+        poses: `(4, 4)` each.
+        weakest: See `Odometry`.
+        thinned: Points of each as they went into the map, m, `(k, 3)`; only of those that were read back.
+        place: How far the recording has been read.
+        done: Whether that was all of it.
+    """
+
+    times: list[float] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    weakest: list[np.ndarray] = field(default_factory=list)
+    thinned: list[np.ndarray] = field(default_factory=list)
+    place: ReadPosition = START
+    done: bool = False
+
+
+class OdometryLog:
+    """The pieces of one odometry among the partial results."""
+
+    def __init__(self, partial: Partial, name: str) -> None:
+        self._partial, self._name = partial, name
+        self._pieces = self._written = 0
+        self._fresh: list[np.ndarray] = []
+
+    def read(self) -> TrackedSweeps:
+        """Reads all whole pieces from the first on."""
+        tracked = TrackedSweeps()
+        while not tracked.done and (piece := self._piece(len(tracked.times))) is not None:
+            tracked.times.extend(float(time) for time in piece["times"])
+            tracked.poses.extend(piece["poses"])
+            tracked.weakest.extend(piece["weakest"])
+            tracked.thinned.extend(np.split(piece["points"], np.cumsum(piece["sizes"])[:-1]))
+            tracked.place = ReadPosition.from_array(piece["place"])
+            tracked.done = bool(piece["done"])
+            self._pieces += 1
+        self._written = len(tracked.times)
+        return tracked
+
+    def add(
+        self, tracked: TrackedSweeps, time: float, pose: np.ndarray, weakest: np.ndarray, thinned: np.ndarray
+    ) -> None:
+        """Appends one sweep; its points are only held until they are written."""
+        tracked.times.append(time)
+        tracked.poses.append(pose)
+        tracked.weakest.append(weakest)
+        if self._partial.keeps:
+            self._fresh.append(thinned.copy())
+
+    def due(self) -> bool:
+        """Return whether it is time to write."""
+        return self._partial.due()
+
+    def write(self, tracked: TrackedSweeps, place: ReadPosition, done: bool = False) -> None:
+        """Writes what has been added since the last piece."""
+        tracked.place, tracked.done = place, done
+        if not self._partial.keeps or not tracked.times:
+            return
+        new = slice(self._written, None)
+        self._partial.save(
+            f"{self._name}-{self._pieces:04d}",
+            start=np.array(self._written),
+            times=np.array(tracked.times[new]),
+            poses=np.array(tracked.poses[new]).reshape(-1, 4, 4),
+            weakest=np.array(tracked.weakest[new]).reshape(-1, 3),
+            sizes=np.array([len(points) for points in self._fresh], np.int64),
+            points=np.concatenate([np.empty((0, 3)), *self._fresh]),
+            place=place.as_array(),
+            done=np.array(done),
+        )
+        self._pieces, self._written, self._fresh = self._pieces + 1, len(tracked.times), []
+
+    def _piece(self, start: int) -> dict[str, np.ndarray] | None:
+        """Return the next piece, if it goes on where the last one ended."""
+        piece = self._partial.load(f"{self._name}-{self._pieces:04d}")
+        return piece if piece is not None and int(piece["start"]) == start else None
 
 
 @dataclass(frozen=True)
@@ -33,7 +248,7 @@ class Odometry:
 
 
 def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog) -> Odometry:
-    """One pose for each sweep of at least 100 returns.
+    """Estimates one pose for each sweep of at least 100 returns.
 
     Args:
         recording: The recording; each scan is read once.
@@ -51,7 +266,7 @@ def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, l
     if not tracked.done:
         for thinned, pose, middle in zip(tracked.thinned, tracked.poses, tracked.times, strict=True):
             tracker.follow(thinned, pose, middle)
-        _track(recording, guide, stage, log, tracker, tracked)
+        _track_scans(recording, guide, stage, log, tracker, tracked)
     if len(tracked.times) < 2:
         count = len(tracked.times)
         raise FitError(f"{recording.path}: only {count} scans hold {MIN_POINTS} points; too few for odometry")
@@ -60,8 +275,8 @@ def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, l
     return Odometry(poses, np.asarray(tracked.weakest))
 
 
-def _track(
-    recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog, tracker: Tracker, tracked: Tracked
+def _track_scans(
+    recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog, tracker: Tracker, tracked: TrackedSweeps
 ) -> None:
     times = tracked.times
     for scan in recording.scans(tracked.place):
@@ -77,5 +292,5 @@ def _track(
         weakest = tracker.register(scan, middle, guide)
         log.add(tracked, middle, tracker.poses[-1], weakest, tracker.thinned)
         if log.due():
-            log.write(tracked, recording.place)
-    log.write(tracked, recording.place, done=True)
+            log.write(tracked, recording.position)
+    log.write(tracked, recording.position, done=True)

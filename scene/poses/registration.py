@@ -9,8 +9,8 @@ from scene.cli import Stage
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError, RecordingError
 from scene.poses.trajectory import Trajectory
-from scene.reading.recording import START, Place, Recording
-from scene.reading.scan import Scan
+from scene.reading.recording import START, ReadPosition, Recording
+from scene.reading.scans import Scan
 from scene.resume import Partial
 
 _KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
@@ -18,7 +18,7 @@ _BATCH = 20  # sweeps thinned together
 
 
 def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
-    """The scan's points in the trajectory's frame, m."""
+    """Return the scan's points in the trajectory's frame, m."""
     span = float(scan.times.max(initial=0.0))
     knots = np.linspace(0.0, max(span, 1e-9), _KNOTS)
     positions, rotations = trajectory.at(scan.stamp + knots)
@@ -34,7 +34,7 @@ def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
     return (1 - share) * moved(low) + share * moved(low + 1)
 
 
-def register(
+def register_scans(
     recording: Recording,
     trajectory: Trajectory,
     voxel: float,
@@ -42,7 +42,7 @@ def register(
     most_uncovered: float = 0.05,
     partial: Partial | None = None,
 ) -> tuple[Cloud, int]:
-    """The registered cloud, and how many scans the trajectory did not cover.
+    """Return the registered cloud, and how many scans the trajectory did not cover.
 
     Args:
         recording: The scans.
@@ -57,9 +57,9 @@ def register(
         FitError: No point is left.
     """
     partial = partial or Partial(None)
-    state = _State(VoxelMean(voxel))
+    state = _Registration(VoxelMean(voxel))
     if (known := partial.load("cloud")) is not None:
-        state = _State.restored(known, voxel)
+        state = _Registration.restored(known, voxel)
         stage.resume(state.place.messages)
     batch = []
     for scan in recording.scans(state.place):
@@ -72,12 +72,12 @@ def register(
             state.uncovered += 1
         if len(batch) == _BATCH:
             state.thinned.add(np.concatenate(batch))
-            batch, state.place = [], recording.place
+            batch, state.place = [], recording.position
             if partial.due():
                 partial.save("cloud", **state.arrays())
     if batch:
         state.thinned.add(np.concatenate(batch))
-    state.place = recording.place
+    state.place = recording.position
     _require_covered(state, recording, trajectory, most_uncovered)
     if partial.due():
         partial.save("cloud", **state.arrays())
@@ -88,32 +88,32 @@ def register(
 
 
 @dataclass
-class _State:
+class _Registration:
     """How far a registration is, between two batches."""
 
     thinned: VoxelMean
-    place: Place = START
+    place: ReadPosition = START
     uncovered: int = 0
     span: tuple[float, float] = (np.inf, -np.inf)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """For a partial result."""
+        """Return the state as arrays, for a partial result."""
         counts = {"place": self.place.as_array(), "uncovered": np.array(self.uncovered), "span": np.array(self.span)}
         return {**counts, **self.thinned.arrays()}
 
     @classmethod
-    def restored(cls, arrays: dict[str, np.ndarray], voxel: float) -> "_State":
-        """The opposite of `arrays`."""
+    def restored(cls, arrays: dict[str, np.ndarray], voxel: float) -> "_Registration":
+        """Return the opposite of `arrays`."""
         start, end = arrays["span"]
         return cls(
             VoxelMean.restored(voxel, arrays),
-            Place.from_array(arrays["place"]),
+            ReadPosition.from_array(arrays["place"]),
             int(arrays["uncovered"]),
             (float(start), float(end)),
         )
 
 
-def _require_covered(state: _State, recording: Recording, trajectory: Trajectory, most_uncovered: float) -> None:
+def _require_covered(state: _Registration, recording: Recording, trajectory: Trajectory, most_uncovered: float) -> None:
     if state.uncovered > most_uncovered * max(recording.scan_count, 1):
         raise RecordingError(
             f"{trajectory.source}: covers {trajectory.times[0]:.2f} to {trajectory.times[-1]:.2f} s, but "

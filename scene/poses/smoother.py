@@ -1,19 +1,145 @@
-"""What was measured, brought onto one chain of knots: with an IMU, or with odometry in its place."""
+"""The trajectory of least cost: IMU or odometry, and control, on one chain of knots."""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import make_smoothing_spline
+from scipy.ndimage import gaussian_filter1d
 
 from scene.errors import FitError
-from scene.poses import headings
-from scene.poses import rotation as so3
 from scene.poses.calibration import Mount
-from scene.poses.chain import Chain, Motion
-from scene.poses.control import Control
 from scene.poses.imu import Inertial
 from scene.poses.odometry import Odometry
-from scene.poses.problem import SMOOTH_BETWEEN_SWEEPS, Noise, Problem
-from scene.poses.terms import Sightings, Steps
+from scene.poses.terms import (
+    KNOT_SIZE,
+    Chain,
+    Motion,
+    NormalEquations,
+    Sightings,
+    Steps,
+    add_biases,
+    add_motion,
+    invert_rotations,
+    rotate_vectors,
+    rotation_matrices,
+)
+from scene.poses.trajectory import Control
+
+_YAWS = np.deg2rad(np.arange(0, 360, 45))
+_TRIAL = 60.0  # s of the recording on which the mounting's heading is tried out
+_TRIAL_ITERATIONS, _ITERATIONS = 8, 25
+_CONVERGED = 1e-6  # rad and m
+_BIAS = (0.02, 0.3)  # rad/s, m/s²: what a MEMS gyro and accelerometer may start with
+_NO_BIAS = (1e-6, 1e-6)
+# Standard deviation of a position against the mean of two velocities, m: jerk · step³ / 12 of a walker's stride.
+_SMOOTH, SMOOTH_BETWEEN_SWEEPS = 2e-4, 5e-3
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What the instruments are trusted to.
+
+    Attributes:
+        control: Standard deviation of a control position in each axis, m.
+        gyro: Of one sample, rad/s. Source: GEODE, device γ.
+        accel: Of one sample, m/s²; the published figure times 3, for scale and alignment errors that nobody models.
+        gyro_walk, accel_walk: Of the biases, per √s.
+        robust: Standard deviations beyond which a measurement counts ever less.
+    """
+
+    control: float = 0.003
+    gyro: float = 5.144e-3
+    accel: float = 3 * 5.574e-3
+    gyro_walk: float = 1.088e-4
+    accel_walk: float = 1.208e-4
+    robust: float = 4.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that was measured, on one chain of knots.
+
+    Attributes:
+        motion: Rates and forces between knots.
+        sightings: Of the prism.
+        steps: Of the odometry, where it ran.
+        noise: See `Noise`.
+        inertial: Whether the rates come from an instrument, which has biases; otherwise the motion is merely smooth.
+    """
+
+    motion: Motion
+    sightings: Sightings
+    steps: Steps | None
+    noise: Noise
+    inertial: bool = True
+
+    def solve(self, chain: Chain, iterations: int = _ITERATIONS) -> tuple[Chain, float]:
+        """Return the chain of least cost near `chain`, and that cost."""
+        damping, cost = 1e-6, np.inf
+        best = chain
+        for _ in range(iterations):
+            equations = self._equations(chain)
+            if equations.cost < cost:
+                best, cost, damping = chain, equations.cost, max(damping / 10, 1e-9)
+                step = equations.solve(damping)
+                accepted = equations
+            else:
+                damping *= 100
+                step = accepted.solve(damping)
+            chain = best.moved(step)
+            if np.abs(step[:, :6]).max() < _CONVERGED:
+                break
+        return best, cost
+
+    def _equations(self, chain: Chain) -> NormalEquations:
+        reach = 1 if self.steps is None else int((self.steps.second - self.steps.first).max())
+        equations = NormalEquations(len(chain.times), KNOT_SIZE, reach)
+        noise = self.noise
+        if self.inertial:
+            add_motion(equations, chain, self.motion, _SMOOTH)
+            add_biases(equations, chain, _BIAS, (noise.gyro_walk, noise.accel_walk))
+        else:
+            add_motion(equations, chain, self.motion, SMOOTH_BETWEEN_SWEEPS)
+            add_biases(equations, chain, _NO_BIAS, _NO_BIAS)
+        self.sightings.add_to(equations, chain, noise.robust)
+        if self.steps is not None:
+            self.steps.add_to(equations, chain, noise.robust)
+        return equations
+
+
+def solve_with_heading(problem: Problem, chain: Chain) -> Chain:
+    """Solves from every mounting of the body about the vertical on the first minute, then the whole from the best."""
+    n = min(len(chain.times), int(np.searchsorted(chain.times, chain.times[0] + _TRIAL)) + 1)
+    short, piece = _first_knots(problem, chain, n)
+    trials = [short.solve(_turn_chain(piece, short.sightings.lever, yaw), _TRIAL_ITERATIONS)[1] for yaw in _YAWS]
+    guess = _turn_chain(chain, problem.sightings.lever, float(_YAWS[int(np.argmin(trials))]))
+    return problem.solve(guess)[0]
+
+
+def _turn_chain(chain: Chain, lever: np.ndarray, yaw: float) -> Chain:
+    attitude = turn_along_track(chain.times, chain.attitude, chain.velocity, yaw)
+    prism = chain.position + chain.attitude @ lever
+    return replace(chain, attitude=attitude, position=prism - attitude @ lever)
+
+
+def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain]:
+    """Return the first `n` knots and what was measured between them."""
+    motion, seen, steps = problem.motion, problem.sightings, problem.steps
+    near = seen.knot < n - 1
+    if steps is not None:
+        kept = steps.second < n
+        fields = (steps.first, steps.second, steps.turn, steps.shift, steps.turn_root, steps.shift_root)
+        steps = Steps(*(values[kept] for values in fields))
+    short = replace(
+        problem,
+        motion=replace(motion, rate=motion.rate[: n - 1], force=motion.force[: n - 1]),
+        sightings=replace(seen, knot=seen.knot[near], share=seen.share[near], position=seen.position[near]),
+        steps=steps,
+    )
+    state = (chain.attitude, chain.position, chain.velocity, chain.gyro_bias, chain.accel_bias)
+    return short, Chain(chain.times[:n], *(values[:n] for values in state))
+
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°
 # What one step of the odometry is trusted to: rad, and m across and along the bore. Measured on simulated surveys.
@@ -24,10 +150,60 @@ _IMU_STEP_KNOTS = 4
 _IMU_STEP_TURN, _IMU_STEP_ACROSS, _IMU_STEP_ALONG = np.deg2rad(0.03), 0.01, 1.0
 
 
+_LEVEL_TIME = 1.0  # s; over this a walker's accelerations cancel
+_TRACK_TIME = 10.0  # s; over this the carrier faces, on average, the way it goes
+
+
+def level_attitudes(
+    times: Float[np.ndarray, " n"], rate: Float[np.ndarray, "n 3"], force: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """Return attitudes with roll and pitch from gravity and heading from the gyro, from zero.
+
+    Args:
+        times: Evenly spaced, s.
+        rate: rad/s.
+        force: Any unit.
+    """
+    step = float(np.median(np.diff(times)))
+    up = gaussian_filter1d(force, _LEVEL_TIME / step, axis=0, mode="nearest")
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    heading = np.concatenate([[0.0], np.cumsum(np.einsum("ij,ij->i", rate, up)[:-1] * np.diff(times))])
+    # The smallest turn from `up` to the vertical.
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    size = np.linalg.norm(axis, axis=1, keepdims=True)
+    level = rotation_matrices(axis / np.maximum(size, 1e-9) * np.arctan2(size[:, 0], up[:, 2])[:, None])
+    return _rotations_about_z(heading) @ level
+
+
+def turn_along_track(
+    times: Float[np.ndarray, " n"], attitude: Float[np.ndarray, "n 3 3"], velocity: Float[np.ndarray, "n 3"], yaw: float
+) -> Float[np.ndarray, "n 3 3"]:
+    """Turns attitudes slowly about the vertical until their x axis keeps `yaw` rad left of the motion.
+
+    Args:
+        times: Evenly spaced, s.
+        attitude: Whose heading drifts slowly.
+        velocity: In the fixed frame, m/s; weighs by its size.
+        yaw: How the body is mounted.
+    """
+    step = float(np.median(np.diff(times)))
+    facing = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
+    pointer = (velocity[:, 0] + 1j * velocity[:, 1]) * np.exp(1j * (yaw - facing))
+    width = min(_TRACK_TIME, 0.25 * (times[-1] - times[0])) / step
+    smooth = gaussian_filter1d(pointer.real, width, mode="nearest") + 1j * gaussian_filter1d(
+        pointer.imag, width, mode="nearest"
+    )
+    return _rotations_about_z(np.angle(smooth)) @ attitude
+
+
+def _rotations_about_z(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 3"]:
+    return rotation_matrices(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+
+
 def inertial_problem(
     inertial: Inertial, control: Control, lever: Float[np.ndarray, "3"], noise: Noise
 ) -> tuple[Problem, Chain]:
-    """The problem of an IMU that carries a prism, and a first guess with its x axis in the direction of motion.
+    """Return the problem of an IMU that carries a prism, and a first guess with its x axis in the direction of motion.
 
     Args:
         inertial: The IMU; the body's axes are its own.
@@ -42,17 +218,17 @@ def inertial_problem(
     rate, force = (means_between(times, inertial.times, values) for values in (inertial.rate, inertial.force))
     scale = np.sqrt(spacing)
     motion = Motion(rate, force, noise.gyro * scale, noise.accel * scale, True)
-    position, velocity = smoothed(control, times)
-    attitude = headings.levelled(times, np.vstack([rate, rate[-1:]]), np.vstack([force, force[-1:]]))
+    position, velocity = smooth_control(control, times)
+    attitude = level_attitudes(times, np.vstack([rate, rate[-1:]]), np.vstack([force, force[-1:]]))
     zero = np.zeros((len(times), 3))
     chain = Chain(times, attitude, position - attitude @ lever, velocity, zero, zero)
-    return Problem(motion, sightings(control, times, lever, noise.control), None, noise), chain
+    return Problem(motion, make_sightings(control, times, lever, noise.control), None, noise), chain
 
 
 def odometry_problem(
     odometry: Odometry, control: Control, lever: Float[np.ndarray, "3"], noise: Noise
 ) -> tuple[Problem, Chain]:
-    """The problem of a LiDAR that carries a prism: attitude and cross-axis shifts from odometry, the rest from control.
+    """Return the problem of a LiDAR with a prism: attitude and cross-axis shifts from odometry, else control.
 
     Args:
         odometry: One pose a sweep; these are the knots.
@@ -68,8 +244,8 @@ def odometry_problem(
     if len(shared) < 3:
         raise FitError(f"{control.path}: only {len(shared)} sweeps lie within the control's time")
     times, turns = poses.times[shared], poses.rotations[shared].as_matrix()
-    back = so3.inverse(turns[:-1])
-    shift = so3.apply(back, np.diff(poses.positions[shared], axis=0))
+    back = invert_rotations(turns[:-1])
+    shift = rotate_vectors(back, np.diff(poses.positions[shared], axis=0))
     along = odometry.weakest[shared[1:], :, None] * odometry.weakest[shared[1:], None, :]
     n = np.arange(len(times) - 1)
     turn_root = np.broadcast_to(np.eye(3) / _STEP_TURN, along.shape)
@@ -77,21 +253,21 @@ def odometry_problem(
     steps = Steps(n, n + 1, back @ turns[1:], shift, turn_root, shift_root)
     zero = np.zeros((len(times), 3))
     free = Motion(zero[1:], zero[1:], _FREE_TURN, _FREE_SPEED, False)
-    position, velocity = smoothed(control, times)
+    position, velocity = smooth_control(control, times)
     chain = Chain(times, turns, position - turns @ lever, velocity, zero, zero)
-    seen = sightings(control, times, lever, np.hypot(noise.control, SMOOTH_BETWEEN_SWEEPS))
+    seen = make_sightings(control, times, lever, np.hypot(noise.control, SMOOTH_BETWEEN_SWEEPS))
     return Problem(free, seen, steps, noise, inertial=False), chain
 
 
-def steps_of_imu(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
-    """The odometry between every fourth knot, as steps of the IMU."""
+def imu_steps(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
+    """Return the odometry between every fourth knot, as steps of the IMU."""
     poses = odometry.trajectory
     knots = np.arange(0, len(chain.times), _IMU_STEP_KNOTS)
     knots = knots[(chain.times[knots] >= poses.times[0]) & (chain.times[knots] <= poses.times[-1])]
     places, turns = poses.at(chain.times[knots])
     attitude = turns.as_matrix() @ mount.rotation.T
     places = places + turns.apply(mount.origin)
-    back = so3.inverse(attitude[:-1])
+    back = invert_rotations(attitude[:-1])
     nearest = np.clip(np.searchsorted(poses.times, chain.times[knots[1:]]), 0, len(poses.times) - 1)
     weakest = odometry.weakest[nearest] @ mount.rotation.T
     along = weakest[:, :, None] * weakest[:, None, :]
@@ -99,7 +275,7 @@ def steps_of_imu(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
         knots[:-1],
         knots[1:],
         back @ attitude[1:],
-        so3.apply(back, np.diff(places, axis=0)),
+        rotate_vectors(back, np.diff(places, axis=0)),
         np.broadcast_to(np.eye(3) / _IMU_STEP_TURN, along.shape),
         (np.eye(3) - along) / _IMU_STEP_ACROSS + along / _IMU_STEP_ALONG,
     )
@@ -108,15 +284,15 @@ def steps_of_imu(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
 def means_between(
     knots: Float[np.ndarray, " n"], times: Float[np.ndarray, " m"], values: Float[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "k 3"]:
-    """Mean of sampled values over each interval between knots, by the trapezium rule."""
+    """Return the mean of sampled values over each interval between knots, by the trapezium rule."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(times)[:, None]
     total = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
     at = np.stack([np.interp(knots, times, column) for column in total.T], axis=1)
     return np.diff(at, axis=0) / np.diff(knots)[:, None]
 
 
-def smoothed(control: Control, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Position (m) and velocity (m/s) of the prism at any time by a smoothing spline; straight on beyond its ends."""
+def smooth_control(control: Control, times: Float[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return position (m) and velocity (m/s) of the prism by a smoothing spline; straight beyond its ends."""
     origin = control.positions[0]
     splines = [
         make_smoothing_spline(control.times - control.times[0], column, lam=1e-3)
@@ -127,10 +303,10 @@ def smoothed(control: Control, times: Float[np.ndarray, " n"]) -> tuple[np.ndarr
     return position, np.stack([spline.derivative()(since) for spline in splines], axis=1)
 
 
-def sightings(
+def make_sightings(
     control: Control, times: Float[np.ndarray, " n"], lever: Float[np.ndarray, "3"], sigma: float
 ) -> Sightings:
-    """The control rows that lie between knots.
+    """Return the control rows that lie between knots.
 
     Raises:
         FitError: None does.

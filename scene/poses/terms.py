@@ -1,15 +1,226 @@
-"""What a total station and LiDAR odometry say of a smoothed trajectory, as terms of least squares."""
+"""Least squares over a chain of knots in time: the unknowns, and one term for each kind of measurement."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import LinAlgError, solveh_banded
+from scipy.spatial.transform import Rotation
 
-from scene.poses import rotation as so3
-from scene.poses.chain import PLACE, SIZE, TURN, Chain
-from scene.poses.leastsquares import NormalEquations
+from scene.errors import FitError
+from scene.poses.imu import GRAVITY
 
+Vectors = Float[np.ndarray, "n 3"]
+Matrices = Float[np.ndarray, "n 3 3"]
+
+
+def rotation_matrices(vector: Vectors) -> Matrices:
+    """Return the matrices of rotation vectors, rad."""
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def rotation_vectors(matrix: Matrices) -> Vectors:
+    """Return the rotation vectors of matrices, rad, of length at most π."""
+    return Rotation.from_matrix(matrix).as_rotvec()
+
+
+def cross_matrices(vector: Vectors) -> Matrices:
+    """Return the matrices that take the cross product with each vector from the left."""
+    x, y, z = vector.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def invert_rotations(matrix: Matrices) -> Matrices:
+    """Return the inverse rotations."""
+    return np.swapaxes(matrix, -1, -2)
+
+
+def rotate_vectors(matrix: Matrices, vector: Vectors) -> Vectors:
+    """Turns each vector by its matrix."""
+    return np.einsum("nij,nj->ni", matrix, vector)
+
+
+class NormalEquations:
+    """The normal equations of least squares over `n` knots of `size` unknowns each.
+
+    Attributes:
+        size: Unknowns a knot.
+        reach: Largest distance in knots between two that one term joins.
+    """
+
+    def __init__(self, n: int, size: int, reach: int) -> None:
+        self.size, self.reach = size, reach
+        # scipy's lower form: entry (row, column) lies at [row - column, column].
+        self._band = np.zeros((size * (reach + 1), n * size))
+        self._right = np.zeros(n * size)
+        self.cost = 0.0
+
+    def add(
+        self,
+        residual: Float[np.ndarray, "m r"],
+        first: Int[np.ndarray, " m"],
+        jacobian_first: Float[np.ndarray, "m r s"],
+        second: Int[np.ndarray, " m"] | None = None,
+        jacobian_second: Float[np.ndarray, "m r s"] | None = None,
+    ) -> None:
+        """Adds terms already divided by their standard deviations.
+
+        Args:
+            residual: In standard deviations.
+            first: Knot of each term.
+            jacobian_first: Derivative of the residual by that knot's unknowns.
+            second: A later knot of each term, where it joins two.
+            jacobian_second: Derivative by that knot's unknowns.
+        """
+        self.cost += float(np.sum(residual**2))
+        self._block(first, first, jacobian_first, jacobian_first)
+        self._gradient(first, jacobian_first, residual)
+        if second is not None and jacobian_second is not None:
+            self._block(second, second, jacobian_second, jacobian_second)
+            self._block(second, first, jacobian_second, jacobian_first)
+            self._gradient(second, jacobian_second, residual)
+
+    def _block(self, row: np.ndarray, column: np.ndarray, left: np.ndarray, right: np.ndarray) -> None:
+        block = np.einsum("mra,mrb->mab", left, right)
+        a, b = np.arange(self.size)[:, None], np.arange(self.size)[None, :]
+        below = self.size * (row - column)[:, None, None] + a - b
+        at = self.size * column[:, None, None] + b
+        kept = below >= 0
+        place = (below * self._band.shape[1] + at)[kept]
+        self._band += np.bincount(place, block[kept], self._band.size).reshape(self._band.shape)
+
+    def _gradient(self, knot: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> None:
+        place = self.size * knot[:, None] + np.arange(self.size)
+        value = np.einsum("mrs,mr->ms", jacobian, residual)
+        self._right -= np.bincount(place.ravel(), value.ravel(), len(self._right))
+
+    def solve(self, damping: float = 0.0) -> Float[np.ndarray, "n s"]:
+        """Return the step that lowers the cost.
+
+        Args:
+            damping: Share of the diagonal added to it (Levenberg-Marquardt).
+
+        Raises:
+            FitError: Some unknown is not determined.
+        """
+        band = self._band.copy()
+        band[0] *= 1.0 + damping
+        try:
+            return solveh_banded(band, self._right, lower=True, overwrite_ab=True).reshape(-1, self.size)
+        except LinAlgError as error:
+            raise FitError(f"the trajectory is not determined by what was measured ({error})") from error
+
+
+KNOT_SIZE = 15
+_TURN, _SHIFT, _SPEED, _GYRO, _ACCEL = (slice(3 * k, 3 * k + 3) for k in range(5))
 _EYE = np.eye(3)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Knots in time, and the state of the body at each.
+
+    Attributes:
+        times: s, `(n,)`.
+        attitude: Body to fixed frame, `(n, 3, 3)`.
+        position: Of the body's origin, m, `(n, 3)`.
+        velocity: m/s, `(n, 3)`.
+        gyro_bias: rad/s, `(n, 3)`.
+        accel_bias: m/s², `(n, 3)`.
+    """
+
+    times: Float[np.ndarray, " n"]
+    attitude: Float[np.ndarray, "n 3 3"]
+    position: Float[np.ndarray, "n 3"]
+    velocity: Float[np.ndarray, "n 3"]
+    gyro_bias: Float[np.ndarray, "n 3"]
+    accel_bias: Float[np.ndarray, "n 3"]
+
+    def moved(self, step: Float[np.ndarray, "n 15"]) -> "Chain":
+        """Return the chain after a step of the solver."""
+        return Chain(
+            self.times,
+            self.attitude @ rotation_matrices(step[:, _TURN]),
+            self.position + step[:, _SHIFT],
+            self.velocity + step[:, _SPEED],
+            self.gyro_bias + step[:, _GYRO],
+            self.accel_bias + step[:, _ACCEL],
+        )
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Mean rate and force between neighbouring knots.
+
+    Attributes:
+        rate: rad/s, `(n - 1, 3)`.
+        force: m/s², `(n - 1, 3)`; zero where nothing measured it.
+        rate_sigma: Of the change of attitude, rad/√s.
+        force_sigma: Of the change of velocity, m/s/√s.
+        has_force: Whether `force` was measured; otherwise the velocity is merely slow to change.
+    """
+
+    rate: Float[np.ndarray, "k 3"]
+    force: Float[np.ndarray, "k 3"]
+    rate_sigma: float
+    force_sigma: float
+    has_force: bool
+
+
+def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth: float) -> None:
+    """Adds what rates and forces say of neighbouring knots.
+
+    Args:
+        equations: Added to.
+        chain: Where to linearise.
+        motion: The measurements.
+        smooth: Standard deviation of a position against the mean of two velocities, m.
+    """
+    here, after = np.arange(len(chain.times) - 1), np.arange(1, len(chain.times))
+    span = np.diff(chain.times)[:, None]
+    turn = (motion.rate - chain.gyro_bias[here]) * span
+    before, later = chain.attitude[here], chain.attitude[after]
+    twist = rotation_vectors(invert_rotations(rotation_matrices(turn)) @ invert_rotations(before) @ later)
+    n = len(here)
+    first, second, residual = np.zeros((n, 9, KNOT_SIZE)), np.zeros((n, 9, KNOT_SIZE)), np.zeros((n, 9))
+    near = _EYE + 0.5 * cross_matrices(twist)
+    residual[:, :3] = twist
+    first[:, :3, _TURN] = -near @ invert_rotations(later) @ before
+    first[:, :3, _GYRO] = _EYE * span[:, :, None]
+    second[:, :3, _TURN] = near
+    residual[:, 3:6] = chain.velocity[after] - chain.velocity[here]
+    if motion.has_force:
+        half = rotation_matrices(0.5 * turn)
+        middle = before @ half
+        force = motion.force - chain.accel_bias[here]
+        residual[:, 3:6] -= (rotate_vectors(middle, force) - (0.0, 0.0, GRAVITY)) * span
+        first[:, 3:6, _TURN] = span[:, :, None] * (middle @ cross_matrices(force) @ invert_rotations(half))
+        first[:, 3:6, _GYRO] = -0.5 * span[:, :, None] ** 2 * (middle @ cross_matrices(force))
+        first[:, 3:6, _ACCEL] = span[:, :, None] * middle
+    first[:, 3:6, _SPEED], second[:, 3:6, _SPEED] = -_EYE, _EYE
+    residual[:, 6:] = chain.position[after] - chain.position[here]
+    residual[:, 6:] -= 0.5 * span * (chain.velocity[after] + chain.velocity[here])
+    first[:, 6:, _SHIFT], second[:, 6:, _SHIFT] = -_EYE, _EYE
+    first[:, 6:, _SPEED] = second[:, 6:, _SPEED] = -0.5 * span[:, :, None] * _EYE
+    root = np.sqrt(span)
+    scale = np.repeat(
+        np.hstack([motion.rate_sigma * root, motion.force_sigma * root, np.full_like(root, smooth)]), 3, 1
+    )
+    equations.add(residual / scale, here, first / scale[:, :, None], after, second / scale[:, :, None])
+
+
+def add_biases(equations: NormalEquations, chain: Chain, prior: tuple[float, float], walk: tuple[float, float]) -> None:
+    """Adds that biases of gyro (rad/s) and accelerometer (m/s²) start near zero and change slowly (per √s)."""
+    bias = np.hstack([chain.gyro_bias, chain.accel_bias])
+    unit = np.zeros((1, 6, KNOT_SIZE))
+    unit[:, :3, _GYRO], unit[:, 3:, _ACCEL] = _EYE, _EYE
+    start = np.repeat(prior, 3)
+    equations.add(bias[:1] / start, np.zeros(1, np.intp), unit / start[:, None])
+    scale = np.repeat(np.sqrt(np.diff(chain.times))[:, None] * np.asarray(walk), 3, axis=1)
+    weighted = unit / scale[:, :, None]
+    here = np.arange(len(bias) - 1)
+    equations.add(np.diff(bias, axis=0) / scale, here, -weighted, here + 1, weighted)
 
 
 @dataclass(frozen=True)
@@ -31,24 +242,24 @@ class Sightings:
     sigma: float
 
     def residual(self, chain: Chain) -> Float[np.ndarray, "m 3"]:
-        """Estimated less measured position of the point, m."""
+        """Return estimated less measured position of the point, m."""
         position, attitude, _ = self._between(chain)
         return position + attitude @ self.lever - self.position
 
     def _between(self, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         share, after = self.share[:, None], self.knot + 1
         position = (1 - share) * chain.position[self.knot] + share * chain.position[after]
-        turn = so3.log(so3.inverse(chain.attitude[self.knot]) @ chain.attitude[after])
-        return position, chain.attitude[self.knot] @ so3.exp(share * turn), share[:, :, None]
+        turn = rotation_vectors(invert_rotations(chain.attitude[self.knot]) @ chain.attitude[after])
+        return position, chain.attitude[self.knot] @ rotation_matrices(share * turn), share[:, :, None]
 
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:
         """Adds these terms; beyond `robust` standard deviations (Cauchy) a sighting counts ever less."""
         position, attitude, share = self._between(chain)
         residual = (position + attitude @ self.lever - self.position) / self.sigma
         weight = 1 / np.sqrt(1 + (np.linalg.norm(residual, axis=1) / robust) ** 2)
-        arm = -attitude @ so3.skew(self.lever[None])[0]
-        whole = np.zeros((len(residual), 3, SIZE))
-        whole[:, :, TURN], whole[:, :, PLACE] = arm, _EYE
+        arm = -attitude @ cross_matrices(self.lever[None])[0]
+        whole = np.zeros((len(residual), 3, KNOT_SIZE))
+        whole[:, :, _TURN], whole[:, :, _SHIFT] = arm, _EYE
         whole *= (weight / self.sigma)[:, None, None]
         equations.add(weight[:, None] * residual, self.knot, (1 - share) * whole, self.knot + 1, share * whole)
 
@@ -74,20 +285,20 @@ class Steps:
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:
         """Adds these terms; beyond `robust` standard deviations (Cauchy) a step counts ever less."""
         before, after = chain.attitude[self.first], chain.attitude[self.second]
-        back = so3.inverse(before)
-        twist = so3.log(so3.inverse(self.turn) @ back @ after)
-        way = so3.apply(back, chain.position[self.second] - chain.position[self.first])
-        near = _EYE + 0.5 * so3.skew(twist)
+        back = invert_rotations(before)
+        twist = rotation_vectors(invert_rotations(self.turn) @ back @ after)
+        way = rotate_vectors(back, chain.position[self.second] - chain.position[self.first])
+        near = _EYE + 0.5 * cross_matrices(twist)
         n = len(self.first)
         residual = np.zeros((n, 6))
-        first, second = np.zeros((n, 6, SIZE)), np.zeros((n, 6, SIZE))
-        residual[:, :3] = so3.apply(self.turn_root, twist)
-        residual[:, 3:] = so3.apply(self.shift_root, way - self.shift)
-        first[:, :3, TURN] = -self.turn_root @ near @ so3.inverse(after) @ before
-        second[:, :3, TURN] = self.turn_root @ near
-        first[:, 3:, TURN] = self.shift_root @ so3.skew(way)
-        first[:, 3:, PLACE] = -self.shift_root @ back
-        second[:, 3:, PLACE] = self.shift_root @ back
+        first, second = np.zeros((n, 6, KNOT_SIZE)), np.zeros((n, 6, KNOT_SIZE))
+        residual[:, :3] = rotate_vectors(self.turn_root, twist)
+        residual[:, 3:] = rotate_vectors(self.shift_root, way - self.shift)
+        first[:, :3, _TURN] = -self.turn_root @ near @ invert_rotations(after) @ before
+        second[:, :3, _TURN] = self.turn_root @ near
+        first[:, 3:, _TURN] = self.shift_root @ cross_matrices(way)
+        first[:, 3:, _SHIFT] = -self.shift_root @ back
+        second[:, 3:, _SHIFT] = self.shift_root @ back
         for half in (slice(0, 3), slice(3, 6)):
             weight = 1 / np.sqrt(1 + (np.linalg.norm(residual[:, half], axis=1) / robust) ** 2)
             residual[:, half] *= weight[:, None]

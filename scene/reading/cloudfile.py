@@ -9,21 +9,11 @@ import numpy as np
 from scene.cli import Stage
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import RecordingError
-from scene.reading import e57, frame, las, parquet, pcd, ply, table
-from scene.reading.cause import refusing
-from scene.reading.config import ReadingConfig
-from scene.reading.detect import CLOUDS, detect
+from scene.reading.formats import ReadingConfig, detect
+from scene.reading.source import CloudSource, choose_frame, refuse_damage
 from scene.resume import Partial
 
-_OPEN = {
-    "ply": ply.open_cloud,
-    "pcd": pcd.open_cloud,
-    "las": las.open_cloud,
-    "e57": e57.open_cloud,
-    "table": table.open_cloud,
-    "parquet": parquet.open_cloud,
-}
-_MOST_OUTSIDE = 0.5
+_MOST_OUTSIDE = 0.5  # share of the points that may lie too far from the first to be thinned
 
 
 def read_cloud(
@@ -36,11 +26,11 @@ def read_cloud(
     """Reads and thins a registered cloud.
 
     Args:
-        path: A file of one of the formats in `detect.CLOUDS`.
+        path: A file of any format of kind `cloud`.
         voxel: Thinning, m.
-        config: Overrides of what is detected.
+        config: What the user says instead of having it detected.
         stage: Counts the points.
-        partial: What an earlier build got done, and where this one keeps what it does.
+        partial: Partial results of an earlier build, and place for those of this one.
 
     Returns:
         The cloud, and what was detected.
@@ -49,17 +39,19 @@ def read_cloud(
         RecordingError: Unreadable, truncated, without coordinates, empty, or with no finite point.
     """
     config = config or ReadingConfig()
-    found = detect(path, config.format)
-    format = found.format
-    if format not in _OPEN:
+    detected = detect(path, config.format)
+    if detected.format.kind != "cloud":
         raise RecordingError(f"{path}: is no registered cloud")
     partial = partial or Partial(None)
     thinned, read, skip = VoxelMean(voxel), 0, 0
     if (known := partial.load("cloud")) is not None:
         thinned, (read, skip) = VoxelMean.restored(voxel, known), (int(n) for n in known["read"])
-    with refusing(path, f"a readable {CLOUDS[format]} cloud", RecordingError):
-        source = _OPEN[format](path)
-        placed = _frame(path, source.sample, source.unit, config)
+    with refuse_damage(path, f"a readable {detected.format.label} cloud", RecordingError):
+        source: CloudSource = detected.format.open(path)
+        try:
+            frame = choose_frame(source.sample, source.unit, config.unit, config.axes)
+        except ValueError as error:
+            raise RecordingError(f"{path}: {error}") from error
         if stage is not None:
             stage.total = source.count
             if skip:
@@ -67,7 +59,7 @@ def read_cloud(
         # Chunks that an earlier build had thinned are decoded again, which most formats cannot do without.
         for index, chunk in enumerate(itertools.islice(source.chunks(), skip, None), skip + 1):
             read += len(chunk)
-            thinned.add(placed.apply(chunk))
+            thinned.add(frame.apply(chunk))
             if stage is not None:
                 stage.advance(len(chunk))
             if partial.due():
@@ -78,15 +70,8 @@ def read_cloud(
         raise RecordingError(f"{path}: none of its {read} points is finite")
     if thinned.returns < (1 - _MOST_OUTSIDE) * thinned.finite:
         raise RecordingError(
-            f"{path}: most of its points lie further apart than any tunnel is long (unit {placed.unit}); "
+            f"{path}: most of its points lie further apart than any tunnel is long (unit {frame.unit}); "
             "is the unit mm? --unit says so"
         )
-    facts = {"kind": "registered cloud", "format": source.format, "format_by": found.by, **placed.facts}
+    facts = {"kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
     return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
-
-
-def _frame(path: Path, sample, declared: str | None, config: ReadingConfig) -> frame.Frame:
-    try:
-        return frame.choose(sample, declared, config.unit, config.axes)
-    except ValueError as error:
-        raise RecordingError(f"{path}: {error}") from error

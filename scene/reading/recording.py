@@ -1,4 +1,4 @@
-"""Any recording as a stream of timed scans: ROS1 and ROS2 bags, MCAP files, folders of scans."""
+"""Any recording as a stream of timed scans."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,11 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.errors import RecordingError
-from scene.reading.cause import cause
-from scene.reading.detect import RECORDINGS, detect
-from scene.reading.rosbag import RosBag
-from scene.reading.scan import Scan
-from scene.reading.scanfolder import ScanFolder
+from scene.reading.formats import detect
+from scene.reading.scans import Scan, ScanSource
+from scene.reading.source import cause, refuse_damage
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
 _MOST_OUT_OF_ORDER = 0.05
@@ -22,13 +20,13 @@ _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and w
 
 
 @dataclass(frozen=True)
-class Place:
-    """How far a recording has been read.
+class ReadPosition:
+    """A position in a recording, up to which it has been read.
 
     Attributes:
-        messages: Of the LiDAR, taken.
-        last: Time of the last scan handed out, s.
-        late: Messages left out because their time did not grow.
+        messages: Number of LiDAR messages read.
+        last: Time of the last scan yielded, s; `None` before the first.
+        late: Number of messages left out because their time did not grow.
     """
 
     messages: int = 0
@@ -36,17 +34,17 @@ class Place:
     late: int = 0
 
     def as_array(self) -> Float[np.ndarray, "3"]:
-        """All three as numbers."""
+        """Return the three attributes as numbers."""
         return np.array([self.messages, np.nan if self.last is None else self.last, self.late])
 
     @classmethod
-    def from_array(cls, values: Float[np.ndarray, "3"]) -> "Place":
-        """The opposite of `as_array`."""
+    def from_array(cls, values: Float[np.ndarray, "3"]) -> "ReadPosition":
+        """Return the position of which `as_array` made `values`."""
         last = float(values[1])
         return cls(int(values[0]), None if np.isnan(last) else last, int(values[2]))
 
 
-START = Place()
+START = ReadPosition()
 
 
 class Recording:
@@ -57,7 +55,7 @@ class Recording:
         topic: The LiDAR topic read; the folder's name for a folder of scans.
         scan_count: Scans in the recording.
         facts: What was detected, for the manifest; complete once a scan has been read.
-        place: How far the latest `scans()` has come.
+        position: Position up to which the latest `scans()` has read.
 
     Raises:
         RecordingError: Not a recording, truncated, or without a LiDAR topic.
@@ -65,23 +63,22 @@ class Recording:
 
     def __init__(self, path: Path, topic: str | None = None, format: str | None = None) -> None:
         self.path = path
-        found = detect(path, format)
-        if found.format not in RECORDINGS:
-            raise RecordingError(f"{path}: is no recording of scans, but {found.format}")
-        self._source: RosBag | ScanFolder = (
-            ScanFolder(path) if found.format == "scans" else RosBag(found.path, found.format, topic)
-        )
-        self._source.facts["format_by"] = found.by
-        self.place = START
+        detected = detect(path, format)
+        if detected.format.kind != "recording":
+            raise RecordingError(f"{path}: is no recording of scans, but {detected.format.name}")
+        with refuse_damage(path, f"a readable {detected.format.label}", RecordingError):
+            self._source: ScanSource = detected.format.open(detected.path, topic)
+        self._source.facts["format_by"] = detected.by
+        self.position = START
         self.topic, self.scan_count, self.facts = self._source.topic, self._source.scan_count, self._source.facts
 
     @property
     def reader(self) -> Any:
-        """The open bag, for what lies beside the LiDAR: `connections` and `messages(connections=…)`."""
+        """The bag's reader, for the IMU beside the LiDAR: `connections` and `messages(connections=…)`."""
         return self._source.reader
 
     def deserialize(self, raw: bytes, message_type: str) -> Any:
-        """A message of a standard type from `reader`, as an object, whatever the bag's serialisation.
+        """Return a message of a standard type from `reader` as an object, whatever the bag's serialisation.
 
         Raises:
             Exception: Whatever the library raises on damage.
@@ -96,16 +93,18 @@ class Recording:
     ) -> None:
         self._source.close()
 
-    def scans(self, after: Place = START) -> Iterator[Scan]:
-        """The scans in the order of the recording; one whose time does not grow is left out, and counted in `facts`.
+    def scans(self, after: ReadPosition = START) -> Iterator[Scan]:
+        """Yields the scans in the order of the recording.
+
+        A scan whose time does not grow is left out and counted in `facts`.
 
         Args:
-            after: Where to go on; the messages before it are skipped unread.
+            after: Position to go on from; the messages before it are not read.
 
         Raises:
             RecordingError: A message is damaged, or more than 5 % of the times do not grow; says which.
         """
-        self.place, last, late = after, after.last, after.late
+        self.position, last, late = after, after.last, after.late
         if late:
             self.facts["scans_out_of_order"] = late
         for index, scan in enumerate(self._source.scans(after.messages), after.messages):
@@ -124,11 +123,11 @@ class Recording:
                     f"{scan.stamp - last:.0f} s after the one before it"
                 )
             last = scan.stamp
-            self.place = Place(index + 1, last, late)
+            self.position = ReadPosition(index + 1, last, late)
             yield scan
 
     def peek(self) -> dict[str, Any]:
-        """`facts` with what only a scan can tell; reads the first one.
+        """Return `facts` with those that only a scan can tell; reads up to the first scan with a return.
 
         Raises:
             RecordingError: There is none, or it is damaged.
@@ -139,13 +138,12 @@ class Recording:
         raise RecordingError(f"{self.path}: {self.topic} holds no scan with a return in it")
 
     def up_at_start(self, duration: float) -> Float[np.ndarray, "3"] | None:
-        """Direction against gravity in the LiDAR's frame at the start, `(3,)` unit, or `None` without an IMU.
+        """Return the unit vector against gravity in the LiDAR's frame at the start; `None` without an IMU.
 
-        The IMU beside the LiDAR's topic is read (`/livox/imu` for `/livox/lidar`), which shares its axes; its unit does
-        not matter.
+        Reads the IMU beside the LiDAR's topic (`/livox/imu` for `/livox/lidar`), which shares its axes, in any unit.
 
         Args:
-            duration: How long to average, s.
+            duration: Time to average over, s.
 
         Raises:
             RecordingError: A message is damaged.

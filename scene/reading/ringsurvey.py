@@ -1,22 +1,78 @@
-"""An as-built survey of rings, in either layout that surveyors hand over, with the design axis where it comes along.
+"""As-built surveys of rings, from CSV or XLSX."""
 
-A ring survey has easting, northing and elevation, and names each point by `POINT` (`ring.point`) or by `RING NO.` and
-`POINT NO.`; `OFFSET`, where it is given, is how far the target stood off the wall. A table with `CHAINAGE` instead of
-rings is the design axis.
-"""
-
+import csv
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import openpyxl
 from jaxtyping import Float
 
 from scene.errors import RecordingError
-from scene.reading.cause import cause, refusing
-from scene.reading.columns import find_xyz, plain
-from scene.reading.frame import UNIT_NAMES, UNITS
-from scene.reading.sheets import SUFFIXES, Sheet, sheets
+from scene.reading.source import UNIT_NAMES, UNITS, cause, refuse_damage
+from scene.reading.tables import find_xyz, plain_name
+
+TABLE_SUFFIXES = (".csv", ".txt", ".xlsx")
+_MOST_CELLS = 64
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One table.
+
+    Attributes:
+        header: Cells of its first row, as text.
+        rows: Where each other row stands (`line 2`), and its cells; empty rows are left out.
+    """
+
+    header: tuple[str, ...]
+    rows: Iterator[tuple[str, tuple[Any, ...]]]
+
+
+@contextmanager
+def open_sheets(path: Path) -> Iterator[Iterator[Sheet]]:
+    """Return the tables of a file, each to be read before the next is asked for.
+
+    Raises:
+        Exception: Whatever the library raises on damage.
+    """
+    if path.suffix.lower() == ".xlsx":
+        with path.open("rb") as file:
+            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
+            yield (_xlsx_sheet(sheet) for sheet in book.worksheets)
+    else:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            yield iter([_csv_sheet(file)])
+
+
+def _csv_sheet(file: Any) -> Sheet:
+    first = file.readline(1 << 16)
+    delimiter = max(",;\t", key=first.count)
+    header = tuple(cell.strip() for cell in next(csv.reader([first], delimiter=delimiter), []))
+    reader = csv.reader(file, delimiter=delimiter)
+
+    def rows() -> Iterator[tuple[str, tuple[Any, ...]]]:
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                yield f"line {reader.line_num + 1}", tuple(row)
+
+    return Sheet(header, rows())
+
+
+def _xlsx_sheet(sheet: Any) -> Sheet:
+    cells = sheet.iter_rows(values_only=True, max_col=_MOST_CELLS)
+    header = tuple("" if cell is None else str(cell).strip() for cell in next(cells, ()))
+
+    def rows() -> Iterator[tuple[str, tuple[Any, ...]]]:
+        for number, row in enumerate(cells, 2):
+            if any(cell is not None for cell in row):
+                yield f"sheet {sheet.title!r} row {number}", row
+
+    return Sheet(header, rows())
+
 
 NEEDED = "EASTING, NORTHING, ELEVATION with POINT (ring.point), or with RING NO. and POINT NO."
 _MIN_RINGS = 4
@@ -45,7 +101,7 @@ class RingSurvey:
 
 
 @dataclass(frozen=True)
-class _Columns:
+class _RingColumns:
     """Where a ring table keeps what."""
 
     xyz: list[int]
@@ -55,18 +111,18 @@ class _Columns:
     offset: int | None
 
 
-def is_survey(path: Path) -> bool:
-    """Whether a file's header is that of a ring survey; a file that cannot be read is none."""
-    if path.suffix.lower() not in SUFFIXES:
+def is_ring_survey(path: Path) -> bool:
+    """Return whether a file's header is that of a ring survey; false for a file that cannot be read."""
+    if path.suffix.lower() not in TABLE_SUFFIXES:
         return False
     try:
-        with sheets(path) as tables:
-            return any(_columns(sheet.header) is not None for sheet in tables)
+        with open_sheets(path) as tables:
+            return any(_find_ring_columns(sheet.header) is not None for sheet in tables)
     except Exception:  # not a table at all; another reader may know it, or will say what is wrong
         return False
 
 
-def read_survey(path: Path, unit: str | None = None) -> RingSurvey:
+def read_ring_survey(path: Path, unit: str | None = None) -> RingSurvey:
     """Reads a ring survey.
 
     Args:
@@ -80,12 +136,12 @@ def read_survey(path: Path, unit: str | None = None) -> RingSurvey:
         raise RecordingError(f"{path}: unit {unit!r} is none of {UNIT_NAMES}")
     rings: dict[str, list[tuple[float, ...]]] = {}
     columns, headers, design = None, [], None
-    with refusing(path, "a readable survey", RecordingError), sheets(path) as tables:
+    with refuse_damage(path, "a readable survey", RecordingError), open_sheets(path) as tables:
         for sheet in tables:
             headers.append(",".join(sheet.header))
-            if columns is None and (columns := _columns(sheet.header)) is not None:
+            if columns is None and (columns := _find_ring_columns(sheet.header)) is not None:
                 _read_rings(path, sheet, columns, rings)
-            elif design is None and (at := _design_columns(sheet.header)) is not None:
+            elif design is None and (at := _find_design_columns(sheet.header)) is not None:
                 design = _read_design(path, sheet, at)
     if columns is None:
         raise RecordingError(f"{path}: columns are {' | '.join(headers)[:_SHOWN]!r}; {NEEDED} are needed")
@@ -98,8 +154,8 @@ def read_survey(path: Path, unit: str | None = None) -> RingSurvey:
     return RingSurvey(path, list(rings), [r[:, :3] for r in rows], [r[:, 3] for r in rows], design, facts)
 
 
-def _columns(header: tuple[str, ...]) -> _Columns | None:
-    names = [plain(name)[0] for name in header]
+def _find_ring_columns(header: tuple[str, ...]) -> _RingColumns | None:
+    names = [plain_name(name)[0] for name in header]
     found = find_xyz(header)
     if found is None or "chainage" in names or "easting" not in names:
         return None
@@ -110,17 +166,17 @@ def _columns(header: tuple[str, ...]) -> _Columns | None:
     ring, point = at("ring no", "ring", "ring number"), at("point", "point no", "point number")
     if point is None:
         return None
-    return _Columns(*found, point, ring, at("offset", "target offset", "prism offset"))
+    return _RingColumns(*found, point, ring, at("offset", "target offset", "prism offset"))
 
 
-def _design_columns(header: tuple[str, ...]) -> list[int] | None:
-    names = [plain(name)[0] for name in header]
+def _find_design_columns(header: tuple[str, ...]) -> list[int] | None:
+    names = [plain_name(name)[0] for name in header]
     found = find_xyz(header)
     rings = any(name.startswith("ring") for name in names)
     return None if found is None or rings or "chainage" not in names else [names.index("chainage"), *found[0]]
 
 
-def _read_rings(path: Path, sheet: Sheet, columns: _Columns, rings: dict[str, list[tuple[float, ...]]]) -> None:
+def _read_rings(path: Path, sheet: Sheet, columns: _RingColumns, rings: dict[str, list[tuple[float, ...]]]) -> None:
     for where, row in sheet.rows:
         try:
             ring = _ring_name(row, columns)
@@ -133,7 +189,7 @@ def _read_rings(path: Path, sheet: Sheet, columns: _Columns, rings: dict[str, li
         rings.setdefault(ring, []).append(point)
 
 
-def _ring_name(row: tuple[Any, ...], columns: _Columns) -> str:
+def _ring_name(row: tuple[Any, ...], columns: _RingColumns) -> str:
     if columns.ring is not None:
         name = row[columns.ring]
         if name in (None, ""):

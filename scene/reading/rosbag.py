@@ -1,44 +1,109 @@
-"""ROS1 bags, ROS2 bags and MCAP files: the LiDAR topic of each as scans, one message at a time."""
+"""ROS1 bags, ROS2 bags and MCAP files: the scans of their LiDAR topic, one message at a time."""
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import Reader as Reader2
 from rosbags.typesys import Stores, get_typestore
 
 from scene.errors import RecordingError
-from scene.reading import livox
-from scene.reading.cause import cause, one_line, refusing
-from scene.reading.mcap import is_ros1, open_mcap
-from scene.reading.pointcloud2 import MESSAGE_TYPE, parse_pointcloud2
-from scene.reading.scan import Scan
+from scene.reading.scans import (
+    LIVOX_TYPES,
+    POINTCLOUD2_TYPE,
+    Scan,
+    ScanSource,
+    parse_custom_msg,
+    parse_custom_msg_cdr,
+    parse_pointcloud2,
+)  # fmt: skip
+from scene.reading.source import cause, one_line, refuse_damage
 
-_NAMES = {"bag": "ROS1 bag", "rosbag2": "ROS2 bag", "db3": "ROS2 bag", "mcap": "MCAP file"}
+_PROFILE_AT = 17  # byte after magic, opcode and length of the header record; its two strings take 8 bytes or more
+_ROS2_PROFILE = b"\x04\0\0\0ros2"
+_KNOWN_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
+
+
+def open_mcap(path: Path) -> Any:
+    """Opens a file with the library's reader; types are named as ROS2 names them.
+
+    Raises:
+        Exception: Whatever the library raises on damage.
+    """
+    reader: Any = Reader2.STORAGE_PLUGINS[".mcap"](_AnyProfile(path))  # type: ignore[arg-type]
+    reader.schemas = _Schemas()
+    reader.open()
+    return reader
+
+
+def is_ros1(connection: Any) -> bool:
+    """Return whether the messages of a connection are serialised as ROS1 does."""
+    return getattr(connection.ext, "serialization_format", "") == "ros1"
+
+
+class _AnyProfile:
+    """A path whose file says that its profile is ROS2."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    def open(self, mode: str) -> "_Ros2Header":
+        return _Ros2Header(self._path.open(mode))
+
+
+class _Ros2Header:
+    """A file with the first eight bytes of its header record replaced; nothing behind them is read by position."""
+
+    def __init__(self, file: IO[Any]) -> None:
+        self._file = file
+        self.seek, self.tell, self.close = file.seek, file.tell, file.close
+
+    def read(self, size: int = -1) -> bytes:
+        start = self._file.tell()
+        data = self._file.read(size)
+        if start >= _PROFILE_AT + len(_ROS2_PROFILE) or start + len(data) <= _PROFILE_AT:
+            return data
+        patched = bytearray(data)
+        for place, byte in enumerate(_ROS2_PROFILE, _PROFILE_AT - start):
+            if 0 <= place < len(data):
+                patched[place] = byte
+        return bytes(patched)
+
+
+class _Schemas(dict[int, Any]):
+    """Schemas by number; of those in a language that the library does not know, the name alone is kept."""
+
+    def __setitem__(self, key: int, schema: Any) -> None:
+        package, _, kind = schema.name.partition("/")
+        name = f"{package}/msg/{kind}" if kind and "/" not in kind else schema.name
+        known = schema.encoding in _KNOWN_SCHEMAS
+        super().__setitem__(
+            key, schema._replace(name=name) if known else schema._replace(name=name, encoding="", data="")
+        )
+
+
+_BAG_NAMES = {"bag": "ROS1 bag", "rosbag2": "ROS2 bag", "db3": "ROS2 bag", "mcap": "MCAP file"}
 # Where several topics carry clouds, the sensor's own comes before what other programs made of it.
 _SENSOR_WORDS = ("velodyne", "ouster", "os_cloud", "os1", "livox", "hesai", "pandar", "rslidar", "lidar", "points")
 _DERIVED_WORDS = ("map", "registered", "filtered", "ground", "cluster", "obstacle", "corrected", "global")
 
 
-class RosBag:
+class RosBag(ScanSource):
     """An open bag and its LiDAR topic.
 
-    Attributes:
-        reader: The library's reader, for what lies beside the LiDAR: `connections`, `messages(connections=…)`.
-        topic: The LiDAR topic.
-        scan_count: Its messages.
-        facts: What was detected; the convention of point times is known after the first scan.
-
     Raises:
-        RecordingError: Not such a bag, truncated, or without a LiDAR topic.
+        RecordingError: Not a bag of that format, truncated, or without a LiDAR topic.
     """
 
-    def __init__(self, path: Path, format: str, topic: str | None) -> None:
+    def __init__(self, format: str, path: Path, topic: str | None) -> None:
         self.path, self._ros1 = path, format == "bag"
-        name = _NAMES[format]
-        with refusing(path, f"a whole {name}; was it truncated or never closed?", RecordingError):
-            self.reader: Any = _opened(path, format)
+        name = _BAG_NAMES[format]
+        with refuse_damage(path, f"a whole {name}; was it truncated or never closed?", RecordingError):
+            self.reader = _open_reader(path, format)
         try:
             self._connections, others = self._choose(topic)
         except RecordingError:
@@ -48,7 +113,7 @@ class RosBag:
         self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
         self.topic, self._type = self._connections[0].topic, self._connections[0].msgtype
         self.scan_count = sum(connection.msgcount for connection in self._connections)
-        self.facts: dict[str, Any] = {"kind": name, "topic": self.topic, "message_type": self._type}
+        self.facts = {"kind": name, "topic": self.topic, "message_type": self._type}
         if others:
             self.facts["other_lidar_topics"] = others
 
@@ -57,13 +122,13 @@ class RosBag:
         self.reader.close()
 
     def deserialize(self, raw: bytes, message_type: str) -> Any:
-        """A message of a standard type as an object."""
+        """Return a message of a standard type as an object."""
         if self._ros1:
             return self._store.deserialize_ros1(raw, message_type)
         return self._store.deserialize_cdr(raw, message_type)
 
     def scans(self, skip: int = 0) -> Iterator[Scan]:
-        """The scans in the order of the bag; a header without a stamp takes the time of its message.
+        """Yields the scans in the order of the bag; a header without a stamp takes the time of its message.
 
         Args:
             skip: Messages at the start that are not parsed.
@@ -92,12 +157,12 @@ class RosBag:
             index += 1
 
     def _parse(self, raw: bytes, received: float) -> Scan:
-        if self._type in livox.MESSAGE_TYPES:
-            scan = livox.parse_custom_msg(raw) if self._ros1 else livox.parse_custom_msg_cdr(raw)
+        if self._type in LIVOX_TYPES:
+            scan = parse_custom_msg(raw) if self._ros1 else parse_custom_msg_cdr(raw)
             convention = "`offset_time`, ns after the stamp (its start)"
         else:
             try:
-                message = self.deserialize(raw, MESSAGE_TYPE)
+                message = self.deserialize(raw, POINTCLOUD2_TYPE)
             except Exception as error:
                 raise ValueError(f"not a whole PointCloud2: {cause(error)}") from error
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
@@ -107,8 +172,8 @@ class RosBag:
         return scan
 
     def _choose(self, topic: str | None) -> tuple[list[Any], list[str]]:
-        """The LiDAR's connections (one for each publisher), and the other topics that could have been it."""
-        lidars = [c for c in self.reader.connections if c.msgtype in (*livox.MESSAGE_TYPES, MESSAGE_TYPE)]
+        """Return the LiDAR's connections (one for each publisher), and the other topics that could have been it."""
+        lidars = [c for c in self.reader.connections if c.msgtype in (*LIVOX_TYPES, POINTCLOUD2_TYPE)]
         chosen = [c for c in lidars if topic in (None, c.topic)]
         if not chosen:
             held = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in self.reader.connections)) or "nothing"
@@ -123,14 +188,14 @@ def _likelihood(connection: Any) -> tuple[bool, bool, bool, int]:
     name = connection.topic.lower()
     return (
         not any(word in name for word in _DERIVED_WORDS),
-        connection.msgtype in livox.MESSAGE_TYPES,
+        connection.msgtype in LIVOX_TYPES,
         any(word in name for word in _SENSOR_WORDS),
         connection.msgcount,
     )
 
 
-def _opened(path: Path, format: str) -> Any:
-    """The library's reader of a folder, or of one storage file whatever its name ends in."""
+def _open_reader(path: Path, format: str) -> Any:
+    """Return the library's reader of a folder, or of one storage file whatever its name ends in."""
     if format == "mcap":
         return open_mcap(path)
     reader: Any

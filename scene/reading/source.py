@@ -1,10 +1,47 @@
-"""What every reader of registered clouds hands back."""
+"""What all readers share: damaged files, numbers in text, units and axes, and the cloud that a reader returns."""
 
+import re
+import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+
+from scene.errors import SubterraError
+
+_LONGEST_CAUSE = 200
+
+
+def one_line(text: str) -> str:
+    """Return the text on one line, cut to 200 characters."""
+    text = " ".join(text.split()).rstrip(".")
+    return text if len(text) <= _LONGEST_CAUSE else text[:_LONGEST_CAUSE] + "…"
+
+
+def cause(error: BaseException) -> str:
+    """Return an error's text on one line; its type where it has none."""
+    return one_line(str(error)) or type(error).__name__
+
+
+@contextmanager
+def refuse_damage(path: Path, what: str, kind: type[SubterraError]) -> Iterator[None]:
+    """Turns whatever the block raises into one sentence about `path`.
+
+    Args:
+        path: The file at fault.
+        what: What the file is not, such as `a readable PLY cloud`.
+        kind: Raised in its place; errors of this project pass as they are.
+    """
+    try:
+        yield
+    except (KeyboardInterrupt, SystemExit, GeneratorExit, SubterraError):
+        raise
+    except BaseException as error:  # libraries raise anything on damage; a panic in Rust is no `Exception`
+        raise kind(f"{path}: not {what} ({cause(error)})") from error
+
 
 BATCH = 500_000  # points of a chunk: 12 MB of coordinates
 
@@ -28,8 +65,8 @@ class CloudSource:
     count: int | None = None
 
 
-def stacked(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """x, y and z of structured records as float64.
+def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
+    """Return x, y and z of structured records as float64.
 
     Raises:
         ValueError: A coordinate is missing.
@@ -41,11 +78,175 @@ def stacked(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
         return np.stack([records[name] for name in "xyz"], axis=1).astype(np.float64)
 
 
-def from_records(format: str, records: np.ndarray) -> CloudSource:
-    """A source over records in memory or mapped from the file."""
+def source_from_records(format: str, records: np.ndarray) -> CloudSource:
+    """Return a source over records in memory or mapped from the file."""
 
     def chunks() -> Iterator[np.ndarray]:
         for start in range(0, len(records), BATCH):
-            yield stacked(records[start : start + BATCH])
+            yield stack_xyz(records[start : start + BATCH])
 
-    return CloudSource(format, chunks, stacked(records[:: max(len(records) // 2000, 1)]), count=len(records))
+    return CloudSource(format, chunks, stack_xyz(records[:: max(len(records) // 2000, 1)]), count=len(records))
+
+
+_TEXT_BLOCK = 1 << 22  # bytes
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Where numbers stand in a text file.
+
+    Attributes:
+        path: The file.
+        columns: Which to read, in this order.
+        delimiter: Between them; `None` for any white space.
+        start: Byte of the first line of numbers.
+        line: Its number, from 1, for messages.
+        count: Lines to read; all where `None`.
+        decimal_comma: Whether `1,5` means one and a half.
+    """
+
+    path: Path
+    columns: tuple[int, ...]
+    delimiter: str | None = None
+    start: int = 0
+    line: int = 1
+    count: int | None = None
+    decimal_comma: bool = False
+
+    def rows(self) -> Iterator[Float[np.ndarray, "n k"]]:
+        """Return the columns as numbers, block by block.
+
+        Raises:
+            ValueError: A line does not hold them, or there are fewer lines than promised; says which.
+        """
+        line, left = self.line, self.count
+        with self.path.open("rb") as file:
+            file.seek(self.start)
+            rest = b""
+            while block := file.read(_TEXT_BLOCK):
+                whole, _, rest = (rest + block).rpartition(b"\n")
+                breaks = whole.count(b"\n") + 1 if whole else 0
+                if len(rest) > _TEXT_BLOCK:
+                    raise ValueError(f"line {line + breaks} does not end")
+                if whole.strip():
+                    rows = self.parse(whole, line, left)
+                    left = None if left is None else left - len(rows)
+                    yield rows
+                line += breaks
+                if left == 0:
+                    return
+            if rest.strip():
+                rows = self.parse(rest, line, left)
+                left = None if left is None else left - len(rows)
+                yield rows
+        if left:
+            raise ValueError(f"it ends after {(self.count or 0) - left} of {self.count} points")
+
+    def parse(self, block: bytes, first: int, limit: int | None = None) -> Float[np.ndarray, "n k"]:
+        """Return the columns of a block of whole lines.
+
+        Args:
+            block: The lines.
+            first: Number of the first one, for messages.
+            limit: Largest number of rows.
+
+        Raises:
+            ValueError: A line does not hold them; says which.
+        """
+        lines = block.decode("utf-8", "replace").splitlines()
+        if self.decimal_comma:
+            lines = [line.replace(",", ".") for line in lines]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a block of comments alone holds no data, and that is no fault
+                rows = np.loadtxt(
+                    lines, delimiter=self.delimiter, usecols=self.columns, ndmin=2, comments="#", max_rows=limit
+                )
+        except ValueError as error:
+            raise ValueError(self._first_bad(lines, first) or str(error)) from error
+        return rows.reshape(-1, len(self.columns))
+
+    def _first_bad(self, lines: list[str], first: int) -> str | None:
+        """Return the line that is at fault: the one-line parser is asked again, so that it agrees with itself."""
+        for index, line in enumerate(lines):
+            try:
+                if line.strip():
+                    np.loadtxt([line], delimiter=self.delimiter, usecols=self.columns, ndmin=2, comments="#")
+            except ValueError:
+                shown = line if len(line) <= 60 else line[:60] + "…"
+                return f"line {first + index} has no numbers in columns {[c + 1 for c in self.columns]}: {shown!r}"
+        return None
+
+
+# Metres of each. Source: NIST SP 811, B.6: the international foot, and the US survey foot of 1200/3937 m.
+UNITS = {"m": 1.0, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200 / 3937}
+UNIT_NAMES = "m, mm, ft or us-ft"
+_AXES = re.compile(r"(-?[xyz])(-?[xyz])(-?[xyz])")
+# The least extent of a tunnel's box is a height: at most some 100 m in m, at least some 1000 in mm.
+_MM_FROM = 500.0
+_LYING = 3.0  # a tunnel longer along "up" than this many times both other extents is not z up
+_LYING_LENGTH = 30.0  # m
+_Y_UP = "x-zy"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How stored coordinates become metres with z up.
+
+    Attributes:
+        unit: A key of `UNITS`.
+        axes: Which stored axes point along x, y and z.
+        facts: Both, and how each was found, for people and the manifest.
+    """
+
+    unit: str
+    axes: str
+    facts: dict[str, str]
+
+    def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Return stored coordinates in m, z up."""
+        order, signs = _parse_axes(self.axes)
+        return points[:, order] * (signs * UNITS[self.unit])
+
+
+def choose_frame(sample: np.ndarray, declared: str | None, unit: str | None, axes: str | None) -> Frame:
+    """Return the frame of a cloud; flags come before declarations, declarations before detection.
+
+    Args:
+        sample: Points from all over the cloud, as stored; few or none where the unit is declared, `(k, 3)`.
+        declared: Unit the file itself gives; words other than a key of `UNITS` are refused.
+        unit: Unit by flag.
+        axes: Axes by flag.
+
+    Raises:
+        ValueError: A flag is no unit, or no order of axes; the file declares another unit.
+    """
+    if unit is not None and unit not in UNITS:
+        raise ValueError(f"unit {unit!r} is none of {UNIT_NAMES}")
+    if unit is None and declared not in (None, *UNITS):
+        raise ValueError(f"its coordinates are in {declared}, not in {UNIT_NAMES}; --unit overrides what it says")
+    if axes is not None:
+        _parse_axes(axes)
+    finite = sample[np.isfinite(sample).all(axis=1)]
+    extent = np.zeros(3)
+    if len(finite):
+        low, high = np.percentile(finite, [1, 99], axis=0) if len(finite) > 2 else (finite.min(0), finite.max(0))
+        extent = high - low
+    detected = "mm" if extent.min() > _MM_FROM else "m"
+    found = unit or declared or detected
+    how = "by flag" if unit else "declared" if declared else f"detected: least extent {extent.min():.4g}"
+    metres = extent * UNITS[found]
+    lying = metres[2] > max(_LYING * metres[:2].max(), _LYING_LENGTH)
+    order = axes or (_Y_UP if lying else "xyz")
+    why = "by flag" if axes else "detected: longest along z, so y is taken as up" if lying else "by default, z up"
+    if np.linalg.det(np.eye(3)[_parse_axes(order)[0]] * _parse_axes(order)[1][:, None]) < 0:
+        why += ", mirrored"
+    return Frame(found, order, {"unit": f"{found} ({how})", "axes": f"{order} ({why})"})
+
+
+def _parse_axes(axes: str) -> tuple[list[int], np.ndarray]:
+    match = _AXES.fullmatch(axes)
+    letters = [part[-1] for part in match.groups()] if match else []
+    if match is None or len(set(letters)) != 3:
+        raise ValueError(f"axes {axes!r} are not x, y and z in some order, each with or without a minus (xyz, -yxz, …)")
+    return ["xyz".index(letter) for letter in letters], np.array([-1.0 if p[0] == "-" else 1.0 for p in match.groups()])

@@ -6,7 +6,7 @@ import tyro
 from rich.console import Console
 
 from scene.arguments import parse
-from scene.survey.config import SurveyConfig, check
+from scene.survey.config import SurveyConfig, check_survey
 from scene.survey.simulate import simulate
 
 
@@ -14,7 +14,7 @@ def main(args: list[str] | None = None) -> int:
     """Run the command; return its exit status, 2 for what the user can put right."""
     config = parse(lambda words: tyro.cli(SurveyConfig, prog="python -m scene.survey", args=words), args)
     try:
-        check(config)
+        check_survey(config)
         print(simulate(config, Console(stderr=True)))
     except (ValueError, OSError) as error:
         told = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.strerror else error

@@ -5,16 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scene.survey import plan, shape
-from scene.survey.alignment import Alignment, Elements, lay_out
+from scene.survey.alignment import Alignment, Elements, draw_grade, draw_railway, draw_s_bend, lay_out, metro_elements
 from scene.survey.config import TruthName
-from scene.survey.field import draw_field
 from scene.survey.furniture import Furniture, draw_furniture
-from scene.survey.mesh import Mesh, join
-from scene.survey.section import Section, Trend
-from scene.survey.shape import Shape
-from scene.survey.solids import nail_mesh, track_mesh
-from scene.survey.surface import surface_mesh
+from scene.survey.mesh import Mesh, join_meshes, nail_mesh, surface_mesh, track_mesh
+from scene.survey.section import Section, Shape, Trend, arch, circle, d_shape, draw_field, ellipse, horseshoe
 
 _IRREGULAR_SIGMA = 0.13  # m, standard deviation of the walls
 _CROSSFALL = 0.02  # of the irregular bore's floor
@@ -30,25 +25,25 @@ class Bore:
     furniture: Furniture
 
     def mesh(self) -> Mesh:
-        """Every surface that a ray can meet."""
+        """Return every surface that a ray can meet."""
         parts = (self.alignment, self.section, self.furniture)
-        mesh = join([surface_mesh(*parts), track_mesh(*parts), nail_mesh(*parts)])
+        mesh = join_meshes([surface_mesh(*parts), track_mesh(*parts), nail_mesh(*parts)])
         # To the micrometre, so that the last bits of a matrix product do not decide about the bytes of a survey.
         return replace(mesh, vertices=np.round(mesh.vertices, 6))
 
 
-def _steady(length: float) -> Trend:
+def _constant_width(length: float) -> Trend:
     return Trend()
 
 
-def _widened(length: float) -> Trend:
-    """1 m wider over the middle third, by ramps of an eighth of the length, at most 8 m."""
+def _wider_middle(length: float) -> Trend:
+    """1 m wider over the middle third, with ramps of an eighth of the length, at most 8 m."""
     ramp, third = min(8.0, length / 8.0), length / 3.0
     return Trend((third - 0.5 * ramp, third + 0.5 * ramp, 2 * third - 0.5 * ramp, 2 * third + 0.5 * ramp), (0, 1, 1, 0))
 
 
-def _flared(length: float) -> Trend:
-    """A portal 3 m wider at the last mouth, opening with the square of the distance over 6 m."""
+def _flared_end(length: float) -> Trend:
+    """Return a portal 3 m wider at the last mouth, opening with the square of the distance over 6 m."""
     share = np.linspace(0.0, 1.0, 7)
     return Trend(tuple(length - 6.0 + 6.0 * share), tuple(3.0 * share**2))
 
@@ -56,27 +51,27 @@ def _flared(length: float) -> Trend:
 @dataclass(frozen=True)
 class _Class:
     section_type: str
-    shape: Callable[[], Shape] = shape.d_shape
-    elements: Callable[[np.random.Generator, float], Elements] = plan.draw_railway
-    widening: Callable[[float], Trend] = _steady
+    shape: Callable[[], Shape] = d_shape
+    elements: Callable[[np.random.Generator, float], Elements] = draw_railway
+    widening: Callable[[float], Trend] = _constant_width
     rough: bool = False
 
 
 _CLASSES: dict[TruthName, _Class] = {
     "paper": _Class("D"),
-    "metro": _Class("D", elements=plan.metro),
-    "ellipse": _Class("ellipse", shape.ellipse),
-    "widening": _Class("D, widening", widening=_widened),
-    "horseshoe": _Class("horseshoe", shape.horseshoe),
-    "s-bend": _Class("D", elements=plan.draw_s_bend),
-    "grade": _Class("D", elements=plan.draw_grade),
-    "irregular": _Class("irregular", shape.arch, widening=_flared, rough=True),
-    "circle": _Class("circle", shape.circle),
+    "metro": _Class("D", elements=metro_elements),
+    "ellipse": _Class("ellipse", ellipse),
+    "widening": _Class("D, widening", widening=_wider_middle),
+    "horseshoe": _Class("horseshoe", horseshoe),
+    "s-bend": _Class("D", elements=draw_s_bend),
+    "grade": _Class("D", elements=draw_grade),
+    "irregular": _Class("irregular", arch, widening=_flared_end, rough=True),
+    "circle": _Class("circle", circle),
 }
 
 
 def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correlation: float) -> Section:
-    """Width and height vary by 5 cm (1 σ) over 8 to 15 m, the surface by 1 cm over 1 to 2 m, or as `irregular`."""
+    """Draws width and height (1 σ of 5 cm over 8 to 15 m) and roughness (1 cm over 1 to 2 m, or irregular)."""
     return Section(
         kind.shape(),
         width_field=draw_field(rng, 0.05, rng.uniform(8.0, 15.0)),

@@ -1,8 +1,4 @@
-"""The walk: a person carries the LiDAR through the bore.
-
-The Avia looks ahead, and meets the crown only some 6 m in front of itself. The walk therefore starts 10 m before the
-first mouth, outside, so that the section is seen whole from station 0 on; it ends 2 m before the second mouth.
-"""
+"""The walk, and what IMUs and total station measure along it."""
 
 from dataclasses import dataclass
 
@@ -11,7 +7,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.survey.bore import Bore
-from scene.survey.mount import Mount
+from scene.survey.config import SensorErrors
+from scene.survey.rack import PRISM, Mount
+from scene.survey.section import draw_field
 
 START, STOP = -10.0, -2.0  # m: from the first mouth; from the second
 CARRY_HEIGHT = 1.6  # m above the floor
@@ -33,12 +31,12 @@ class Sway:
     phase: Float[np.ndarray, "k"]
 
     def __call__(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Value at `time`, s."""
+        """Return the value at `time`, s."""
         return np.cos(np.outer(time, self.rate) + self.phase) @ self.amplitude
 
 
 def _draw_sway(rng: np.random.Generator, slow: float, stride: float) -> Sway:
-    """Slow sway of 0.04 to 0.4 Hz with standard deviation `slow`, and the beat of the steps with amplitude `stride`."""
+    """Draws slow sway of 0.04 to 0.4 Hz (standard deviation `slow`) and the beat of steps (amplitude `stride`)."""
     rate = 2.0 * np.pi * np.concatenate([rng.uniform(0.04, 0.4, 6), rng.uniform(1.7, 1.9, 1)])
     amplitude = np.concatenate([np.full(6, slow * np.sqrt(2.0 / 6.0)), [stride]])
     return Sway(amplitude, rate, rng.uniform(0.0, 2.0 * np.pi, 7))
@@ -80,11 +78,11 @@ class Walk:
     roll: Sway
 
     def station(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Station of the carrier, m."""
+        """Return the station of the carrier, m."""
         return START + self.speed * time + self.ahead(time)
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
-        """Exact poses at `time`, s."""
+        """Return the exact poses at `time`, s."""
         station = self.station(time)
         frames = self.bore.alignment.frames(station)
         above = CARRY_HEIGHT - 0.5 * self.bore.section.height(station) + self.above(time)
@@ -106,7 +104,7 @@ class Carried:
     mount: Mount
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
-        """Exact poses at `time`, s."""
+        """Return the exact poses at `time`, s."""
         rack = self.walk.poses(time)
         attitude = Rotation.from_quat(rack.quaternion)
         quaternion = (attitude * Rotation.from_matrix(self.mount.rotation.T)).as_quat()
@@ -116,7 +114,7 @@ class Carried:
         return Poses(rack.position + attitude.apply(self.mount.origin), quaternion)
 
     def poses_between(self, begin: float, time: Float[np.ndarray, "n"]) -> Poses:
-        """Poses at many sorted `time`, s, not before `begin`, by a table of exact poses; quick."""
+        """Return poses at many sorted `time`, s, not before `begin`, from a table of exact poses; quick."""
         knots = begin + _TABLE * np.arange(int(np.ceil((time[-1] - begin) / _TABLE)) + 2)
         exact = self.poses(knots)
         place = (time - begin) / _TABLE
@@ -147,7 +145,93 @@ def draw_walk(rng: np.random.Generator, bore: Bore, speed: float, period: float)
 
 
 def rotate(quaternion: Float[np.ndarray, "n 4"], vector: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Vectors turned by unit quaternions x, y, z, w."""
+    """Turns vectors by unit quaternions x, y, z, w."""
     axis, w = quaternion[:, :3], quaternion[:, 3:]
     twice = 2.0 * np.cross(axis, vector)
     return vector + w * twice + np.cross(axis, twice)
+
+
+GRAVITY = 9.80665  # m/s²
+PRISM_RATE = 3.0  # Hz
+ACCEL_BIAS, GYRO_BIAS = 0.02, 0.003  # m/s², rad/s; standard deviation of the constant part in each axis
+# GEODE's γ figures [geode.md], used for every IMU here. As standard deviations of one sample they agree with the
+# MTi-30's data sheet (0.03 °/s/√Hz, 60 µg/√Hz at 100 Hz); as densities they would be ten times worse than it.
+ACCEL_SIGMA, ACCEL_WALK = 5.574e-3, 1.208e-4  # m/s², m/s²/√s
+GYRO_SIGMA, GYRO_WALK = 5.144e-3, 1.088e-4  # rad/s, rad/s/√s
+_H = 1e-3  # s, half-step of the central differences
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Samples of one IMU.
+
+    Attributes:
+        time: s since the start.
+        accel: Specific force, m/s²; +9.8 upwards at rest.
+        gyro: rad/s.
+        quaternion: Orientation x, y, z, w, IMU to a level frame of unknown heading.
+    """
+
+    time: Float[np.ndarray, "n"]
+    accel: Float[np.ndarray, "n 3"]
+    gyro: Float[np.ndarray, "n 3"]
+    quaternion: Float[np.ndarray, "n 4"]
+
+
+def measure_inertial(
+    rng: np.random.Generator, lidar: Carried, rate: float, mount: Mount, errors: SensorErrors
+) -> Inertial:
+    """Simulate an IMU.
+
+    With `imu_noise`, roll and pitch of its orientation are off by 0.2° (1 σ), slowly changing; its heading is
+    magnetic, so it has an offset of up to 15° and wanders by 1°.
+
+    Args:
+        rng: Source of randomness.
+        lidar: The LiDAR's motion.
+        rate: Samples per second, Hz.
+        mount: Of the IMU against the LiDAR.
+        errors: `imu_noise` and `imu_bias`.
+    """
+    time = np.arange(round(lidar.walk.duration * rate)) / rate
+    turn = Rotation.from_matrix(mount.rotation.T)
+
+    def state(at: np.ndarray) -> tuple[np.ndarray, Rotation]:
+        poses = lidar.poses(at)
+        attitude = Rotation.from_quat(poses.quaternion)
+        return poses.position + attitude.apply(mount.origin), attitude * turn
+
+    (before, r_before), (here, r_here), (after, r_after) = (state(time + k * _H) for k in (-1.0, 0.0, 1.0))
+    force = (after - 2.0 * here + before) / _H**2 + (0.0, 0.0, GRAVITY)
+    accel = r_here.inv().apply(force)
+    gyro = (r_before.inv() * r_after).as_rotvec() / (2.0 * _H)
+
+    n, noise, bias = len(time), float(errors.imu_noise), float(errors.imu_bias)
+    walks = rng.standard_normal((2, n, 3)).cumsum(axis=1) / np.sqrt(rate)
+    accel += noise * ACCEL_SIGMA * rng.standard_normal((n, 3))
+    accel += bias * (ACCEL_WALK * walks[0] + rng.normal(0.0, ACCEL_BIAS, 3))
+    gyro += noise * GYRO_SIGMA * rng.standard_normal((n, 3))
+    gyro += bias * (GYRO_WALK * walks[1] + rng.normal(0.0, GYRO_BIAS, 3))
+    degree = np.pi / 180.0
+    tilt = np.stack([draw_field(rng, s * degree, 20.0).along(time) for s in (0.2, 0.2, 1.0)], axis=-1)
+    tilt[:, 2] += rng.uniform(-15.0, 15.0) * degree
+    return Inertial(time, accel, gyro, (Rotation.from_rotvec(noise * tilt) * r_here).as_quat())
+
+
+def measure_prism(
+    rng: np.random.Generator, walk: Walk, sigma: float
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Return times, s, and positions, m, of the prism as a tracking total station reports them.
+
+    About 3 Hz, not quite evenly, with noise of `sigma`, m, in each axis; one row in forty has changed places with the
+    next.
+    """
+    n = int(walk.duration * PRISM_RATE)
+    time = (np.arange(n) + rng.uniform(0.35, 0.65, n)) / PRISM_RATE
+    poses = walk.poses(time)
+    position = poses.position + Rotation.from_quat(poses.quaternion).apply(PRISM.origin)
+    position += sigma * rng.standard_normal((n, 3))
+    order = np.arange(n)
+    for i in rng.choice(n - 1, max(2, n // 40), replace=False):
+        order[[i, i + 1]] = order[[i + 1, i]]
+    return time[order], position[order]

@@ -72,7 +72,7 @@ class SurveyConfig:
     errors: SensorErrors = field(default_factory=SensorErrors)
 
 
-def check(config: SurveyConfig) -> None:
+def check_survey(config: SurveyConfig) -> None:
     """Refuse what cannot be simulated.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What all LiDARs of the rack have in common: when and where they look, and what one sweep of theirs holds."""
+"""The LiDARs of the rack."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -58,3 +58,101 @@ class Sweep:
     reflectivity: UInt8[np.ndarray, "n"]
     second: Bool[np.ndarray, "n"]
     placed: Float[np.ndarray, "n 3"]
+
+
+AVIA_POINT_RATE = 240_000  # points/s [geode.md]
+AVIA_LINES = 6
+_AVIA_HALF_FOV = np.deg2rad([35.2, 38.6])  # half of 70.4° across by 77.2° upright [geode.md]
+_AVIA_LINE_SPACING = np.deg2rad(0.25)  # upright, between neighbouring lines; an assumption
+_AVIA_PRISM_RATE = (7294.0 / 60.0, -4664.0 / 60.0)  # turns/s; the speeds reported for Livox's two-prism Mid-40
+_AVIA_RANGE_MIN, _AVIA_RANGE_MAX = 1.0, 190.0  # m
+# The maker's range of 190 m holds for a target of 10 % met squarely.
+_AVIA_WEAKEST_ECHO = 0.10 / 190.0**2
+_AVIA_DIVERGENCE = 0.5 * np.deg2rad(np.sqrt(0.03 * 0.28))  # rad; a circle for the maker's 0.03° across by 0.28° upright
+
+
+def avia_point_times(point_rate: int) -> Int[np.ndarray, "n"]:
+    """Return offsets of the points of one message, ns: 0 to 99.996 ms at the full rate."""
+    return (np.arange(round(point_rate * SCAN_PERIOD)) * 1_000_000_000) // point_rate
+
+
+def avia_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors in the LiDAR frame.
+
+    Args:
+        time: Time of each point, s. Points come in whole turns of the six lines.
+        phase: Angles of the two prisms at time 0, rad.
+    """
+    first, second = (2.0 * np.pi * rate * time + p for rate, p in zip(_AVIA_PRISM_RATE, phase, strict=True))
+    line = np.arange(len(time)) % AVIA_LINES - 0.5 * (AVIA_LINES - 1)
+    reach = _AVIA_HALF_FOV[1] - 0.5 * (AVIA_LINES - 1) * _AVIA_LINE_SPACING
+    azimuth = _AVIA_HALF_FOV[0] * 0.5 * (np.cos(first) + np.cos(second))
+    elevation = reach * 0.5 * (np.sin(first) + np.sin(second)) + _AVIA_LINE_SPACING * line
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def avia(point_rate: int = AVIA_POINT_RATE) -> Lidar:
+    """Return the Avia, thinned to `point_rate` points per second; stamped at the start of a sweep."""
+    offset = avia_point_times(point_rate)
+    line = np.arange(len(offset)) % AVIA_LINES
+    return Lidar(
+        "avia", offset, 0, line, avia_directions, _AVIA_RANGE_MIN, _AVIA_RANGE_MAX, _AVIA_WEAKEST_ECHO, _AVIA_DIVERGENCE
+    )
+
+
+VLP16_RINGS = 16
+VLP16_FIRING, VLP16_LASER = 55.296e-6, 2.304e-6  # s: from firing to firing; from laser to laser
+_PACKET, _PACKETS = 24, 75  # firings a packet; packets a sweep: the remaining 0.5 ms of a turn are left out
+# Elevations of the lasers in the order in which they fire, in degrees.
+_FIRED = np.array([-15, 1, -13, 3, -11, 5, -9, 7, -7, 9, -5, 11, -3, 13, -1, 15])
+_RING = np.argsort(np.argsort(_FIRED))  # rings count upwards
+
+
+def vlp16_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors in the LiDAR frame.
+
+    Args:
+        time: Time of each beam, s, in whole firings.
+        phase: Azimuth at time 0 in its first entry, rad.
+    """
+    azimuth = phase[0] - 2.0 * np.pi * time / SCAN_PERIOD
+    elevation = np.deg2rad(_FIRED)[np.arange(len(time)) % VLP16_RINGS]
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+def vlp16() -> Lidar:
+    """Return the VLP-16; a sweep is stamped, as its driver does, at the first firing of its last packet."""
+    firing = np.arange(_PACKET * _PACKETS)[:, None]
+    offset = np.rint(1e9 * (firing * VLP16_FIRING + np.arange(VLP16_RINGS) * VLP16_LASER)).astype(np.int64).ravel()
+    stamp = round(1e9 * VLP16_FIRING * _PACKET * (_PACKETS - 1))
+    line = np.tile(_RING, len(firing))
+    # 100 m on a target of 50 %; 0.4 m and 3 mrad of full divergence are assumptions near the manual's.
+    return Lidar("vlp16", offset, stamp, line, vlp16_directions, 0.4, 100.0, 0.5 / 100.0**2, 1.5e-3)
+
+
+OS1_RINGS, OS1_COLUMNS = 64, 1024
+_OS1_ELEVATION = np.deg2rad(np.linspace(22.5, -22.5, OS1_RINGS))  # ring 0 looks up
+_OS1_AZIMUTH = np.deg2rad(np.tile([4.22, 1.41, -1.41, -4.22], OS1_RINGS // 4))
+
+
+def os1_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors in the LiDAR frame.
+
+    Args:
+        time: Time of each beam, s, in whole columns.
+        phase: Not used: a sweep begins backwards, where the encoder starts.
+    """
+    ring = np.arange(len(time)) % OS1_RINGS
+    azimuth = np.pi - 2.0 * np.pi * time / SCAN_PERIOD + _OS1_AZIMUTH[ring]
+    level = np.cos(_OS1_ELEVATION)[ring]
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(_OS1_ELEVATION)[ring]], axis=-1)
+
+
+def os1() -> Lidar:
+    """Return the OS1-64, stamped at the start of a sweep; all beams of a column fire at once."""
+    column = (np.arange(OS1_COLUMNS) * round(SCAN_PERIOD * 1e9)) // OS1_COLUMNS
+    line = np.tile(np.arange(OS1_RINGS), OS1_COLUMNS)
+    # The manual's 45 m hold for a target of 10 %.
+    return Lidar("os1", column.repeat(OS1_RINGS), 0, line, os1_directions, 0.5, 120.0, 0.1 / 45.0**2, 1.6e-3)

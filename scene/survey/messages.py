@@ -1,18 +1,18 @@
-"""ROS1 messages of a Livox LiDAR and of IMUs, serialised by the message or by the thousand, never point by point."""
+"""ROS1 messages."""
 
 import struct
 
 import numpy as np
 from jaxtyping import Float
 
-from scene.survey.lidar import Lidar, Sweep
+from scene.survey.lidar import OS1_COLUMNS, OS1_RINGS, Lidar, Sweep
 
 EPOCH = 1_700_000_000  # s: stamp of the first point, the same for every survey
 
 CUSTOM_TYPE, CUSTOM_MD5 = "livox_ros_driver/msg/CustomMsg", "e4d6829bdfe657cb6c21a746c86b21a6"
 IMU_TYPE, IMU_MD5 = "sensor_msgs/msg/Imu", "6a62c6daae103f4ff57a132d6f95cec2"
-RULE = "=" * 80
-HEADER = f"""{RULE}
+_RULE = "=" * 80
+_HEADER_TEXT = f"""{_RULE}
 MSG: std_msgs/Header
 uint32 seq
 time stamp
@@ -25,8 +25,8 @@ uint8 lidar_id
 uint8[3] rsvd
 CustomPoint[] points
 
-{HEADER}
-{RULE}
+{_HEADER_TEXT}
+{_RULE}
 MSG: livox_ros_driver/CustomPoint
 uint32 offset_time
 float32 x
@@ -44,15 +44,15 @@ float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance
 
-{HEADER}
-{RULE}
+{_HEADER_TEXT}
+{_RULE}
 MSG: geometry_msgs/Quaternion
 float64 x
 float64 y
 float64 z
 float64 w
 
-{RULE}
+{_RULE}
 MSG: geometry_msgs/Vector3
 float64 x
 float64 y
@@ -66,19 +66,19 @@ POINT = np.dtype([
 ])  # fmt: skip
 
 
-def stamp(nanoseconds: int) -> int:
-    """Time in ns since the Unix epoch of a time in ns since the start of the survey."""
+def unix_nanoseconds(nanoseconds: int) -> int:
+    """Return a time since the start of the survey, ns, as a time since the Unix epoch, ns."""
     return EPOCH * 1_000_000_000 + nanoseconds
 
 
-def header(seq: int, nanoseconds: int, frame: bytes) -> bytes:
-    """A `std_msgs/Header` stamped `nanoseconds` after the start of the survey."""
-    seconds, rest = divmod(stamp(nanoseconds), 1_000_000_000)
+def make_header(seq: int, nanoseconds: int, frame: bytes) -> bytes:
+    """Serialises a `std_msgs/Header` stamped `nanoseconds` after the start of the survey."""
+    seconds, rest = divmod(unix_nanoseconds(nanoseconds), 1_000_000_000)
     return struct.pack("<IIII", seq, seconds, rest, len(frame)) + frame
 
 
 def custom_message(sweep: Sweep, lidar: Lidar) -> bytes:
-    """A `livox_ros_driver/CustomMsg`; stamp and timebase are the time of the first point.
+    """Serialises a `livox_ros_driver/CustomMsg`; stamp and timebase are the time of the first point.
 
     A pulse without return keeps its time and line and lies at (0, 0, 0).
     """
@@ -87,8 +87,8 @@ def custom_message(sweep: Sweep, lidar: Lidar) -> bytes:
     points["x"], points["y"], points["z"] = sweep.points.T
     points["reflectivity"] = sweep.reflectivity
     points["tag"] = np.where(sweep.second, 0x10, 0)
-    head = header(sweep.number, sweep.begin, b"livox_frame")
-    head += struct.pack("<QIB3xI", stamp(sweep.begin), len(points), 1, len(points))
+    head = make_header(sweep.number, sweep.begin, b"livox_frame")
+    head += struct.pack("<QIB3xI", unix_nanoseconds(sweep.begin), len(points), 1, len(points))
     return head + points.tobytes()
 
 
@@ -99,7 +99,7 @@ def imu_messages(
     gyro: Float[np.ndarray, "n 3"],
     accel: Float[np.ndarray, "n 3"],
 ) -> list[bytes]:
-    """`sensor_msgs/Imu` messages.
+    """Serialises `sensor_msgs/Imu` messages.
 
     Args:
         frame: Frame id.
@@ -115,10 +115,93 @@ def imu_messages(
     ])  # fmt: skip
     rows = np.zeros(len(nanoseconds), layout)
     rows["seq"], rows["size"], rows["frame"] = np.arange(len(rows)), len(frame), frame.encode()
-    rows["sec"], rows["nsec"] = np.divmod(stamp(0) + nanoseconds.astype(np.int64), 1_000_000_000)
+    rows["sec"], rows["nsec"] = np.divmod(unix_nanoseconds(0) + nanoseconds.astype(np.int64), 1_000_000_000)
     if quaternion is None:
         rows["quaternion_cov"][:, 0] = -1.0
     else:
         rows["quaternion"] = quaternion
     rows["gyro"], rows["accel"] = gyro, accel
     return [row.tobytes() for row in rows]
+
+
+CLOUD_TYPE, CLOUD_MD5 = "sensor_msgs/msg/PointCloud2", "1158d486dd51d683ce2f1be655c3c181"
+CLOUD_DEFINITION = f"""std_msgs/Header header
+uint32 height
+uint32 width
+sensor_msgs/PointField[] fields
+bool is_bigendian
+uint32 point_step
+uint32 row_step
+uint8[] data
+bool is_dense
+
+{_HEADER_TEXT}
+{_RULE}
+MSG: sensor_msgs/PointField
+uint8 INT8=1
+uint8 UINT8=2
+uint8 INT16=3
+uint8 UINT16=4
+uint8 INT32=5
+uint8 UINT32=6
+uint8 FLOAT32=7
+uint8 FLOAT64=8
+string name
+uint32 offset
+uint8 datatype
+uint32 count
+"""
+_CODES = {"u1": 2, "u2": 4, "u4": 6, "f4": 7}
+# velodyne_pointcloud's PointXYZIRT, packed: 22 bytes.
+VELODYNE_POINT = np.dtype([
+    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4"),
+])  # fmt: skip
+# ouster_ros's Point of the ROS1 driver, aligned to 16 bytes: 48 bytes.
+OUSTER_POINT = np.dtype({
+    "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
+    "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "u1", "<u2", "<u4"],
+    "offsets": [0, 4, 8, 16, 20, 24, 26, 28, 32],
+    "itemsize": 48,
+})  # fmt: skip
+_SIGNAL = 1e4  # photons of an echo of 1 % at 1 m; only ratios of it mean anything
+
+
+def _message(seq: int, stamp: int, frame: bytes, rows: int, points: np.ndarray, dense: bool) -> bytes:
+    """Return a PointCloud2 of `rows` rows, stamped `stamp` ns after the start of the survey."""
+    layout, width = points.dtype, len(points) // rows
+    fields = dict(layout.fields or {})
+    out = make_header(seq, stamp, frame) + struct.pack("<III", rows, width, len(fields))
+    for name, (kind, offset, *_) in fields.items():
+        out += struct.pack("<I", len(name)) + name.encode() + struct.pack("<IBI", offset, _CODES[kind.str[1:]], 1)
+    out += struct.pack("<?III", False, layout.itemsize, layout.itemsize * width, layout.itemsize * len(points))
+    return out + points.tobytes() + struct.pack("<?", dense)
+
+
+def velodyne_message(sweep: Sweep, lidar: Lidar) -> bytes:
+    """Serialises a VLP-16's sweep: one row of returns; `time` counts from a stamp at the sweep's end, s."""
+    seen = sweep.valid
+    points = np.zeros(int(seen.sum()), VELODYNE_POINT)
+    points["x"], points["y"], points["z"] = sweep.points[seen].T
+    # Velodyne's scale ends at 100 for diffuse surfaces.
+    points["intensity"] = np.rint(sweep.reflectivity[seen] / 1.5)
+    points["ring"] = lidar.line[seen]
+    points["time"] = 1e-9 * (sweep.offset - lidar.stamp)[seen]
+    return _message(sweep.number, sweep.begin + lidar.stamp, b"velodyne", 1, points, dense=True)
+
+
+def ouster_message(sweep: Sweep, lidar: Lidar) -> bytes:
+    """Serialises an OS1's sweep: a row for each ring, a column for each firing, `t` in ns after its start.
+
+    A beam without return keeps its time and ring and lies at (0, 0, 0).
+    """
+    row_by_row = np.arange(len(sweep.points)).reshape(OS1_COLUMNS, OS1_RINGS).T.ravel()
+    local, reflectivity = sweep.points[row_by_row], sweep.reflectivity[row_by_row] / 1.5
+    distance = np.linalg.norm(local.astype(np.float64), axis=1)
+    # Filled in place: a copy of these records would leave what it likes in their padding.
+    points = np.zeros(len(local), OUSTER_POINT)
+    points["x"], points["y"], points["z"] = local.T
+    points["t"], points["ring"] = sweep.offset[row_by_row], lidar.line[row_by_row]
+    points["range"] = np.rint(1e3 * distance)
+    points["reflectivity"] = np.rint(reflectivity)
+    points["intensity"] = np.rint(_SIGNAL * reflectivity / np.where(distance > 0.0, distance, 1.0) ** 2)
+    return _message(sweep.number, sweep.begin + lidar.stamp, b"os_sensor", OS1_RINGS, points, dense=False)

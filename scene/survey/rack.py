@@ -1,10 +1,4 @@
-"""One rack with three LiDARs, their IMUs and a prism, after GEODE's devices α, β and γ.
-
-All three devices of GEODE's tunnelling runs hang on one rack, and its scripts place each LiDAR against a common target:
-β and γ against the total station's prism, α and γ against the GNSS antenna. That is where the mounts come from.
-
-Source: PengYu-Team/GEODE_dataset, evaluation scripts and calibration files [geode.md].
-"""
+"""The rack."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,7 +8,32 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.survey.config import LidarName
-from scene.survey.mount import Mount
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How one instrument sits against another: p_instrument = rotation @ p_other + shift.
+
+    Attributes:
+        rotation: `(3, 3)`.
+        shift: m, `(3,)`.
+    """
+
+    rotation: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+    @property
+    def origin(self) -> Float[np.ndarray, "3"]:
+        """The instrument's origin in the other's coordinates, m."""
+        return -self.rotation.T @ self.shift
+
+    def after(self, first: "Mount") -> "Mount":
+        """Return the mount that applies `first`, then this one."""
+        return Mount(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
+
+    def inverse(self) -> "Mount":
+        """Return the mount from the instrument's coordinates to the other's."""
+        return Mount(self.rotation.T, self.origin)
 
 
 def _target(shift: list[float], wxyz: list[float]) -> Mount:
@@ -22,7 +41,7 @@ def _target(shift: list[float], wxyz: list[float]) -> Mount:
 
 
 def _printed(rotation: list[list[float]], shift: list[float]) -> Mount:
-    """A mount whose printed digits are made orthonormal."""
+    """Return a mount whose printed digits are made orthonormal."""
     u, _, vt = np.linalg.svd(np.array(rotation))
     return Mount(u @ vt, np.array(shift))
 
@@ -90,13 +109,13 @@ IMUS: dict[LidarName, tuple[Imu, ...]] = {
 
 
 def prism_from(name: LidarName) -> Float[np.ndarray, "3"]:
-    """The prism in the coordinates of a LiDAR, m."""
+    """Return the prism in the coordinates of a LiDAR, m."""
     mount = LIDARS[name]
     return mount.rotation @ PRISM.origin + mount.shift
 
 
 def calibration(name: LidarName) -> dict[str, Any]:
-    """Content of a calibration file of one device, per docs/formats.md."""
+    """Return the content of a calibration file of one device, per docs/formats.md."""
     return {
         "prism": np.round(prism_from(name), 9).tolist(),
         "imu": {

@@ -1,13 +1,195 @@
-"""The true section by station: an outline of varying size, with roughness along its normals, on a straight floor."""
+"""The true section."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.interpolate import PchipInterpolator
 
-from scene.survey.field import Field
-from scene.survey.shape import Shape
+from scene.survey.furniture import POCKET_WIDTH, SLEEPER_RISE
+
+
+@dataclass(frozen=True)
+class Field:
+    """Zero-mean, nearly Gaussian random function with the correlation exp(-(d / c)²).
+
+    It is defined everywhere, has all derivatives and needs no grid.
+
+    Attributes:
+        frequency: Angular frequencies, rad per unit of the argument.
+        phase: Phases, rad.
+        amplitude: Amplitude of each cosine; the standard deviation times sqrt(2 / k).
+
+    Source: Rahimi and Recht 2007, random Fourier features of the squared-exponential kernel.
+    """
+
+    frequency: Float[np.ndarray, "k d"]
+    phase: Float[np.ndarray, "k"]
+    amplitude: float
+
+    def along(self, x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return values of a field of one argument."""
+        return self.amplitude * np.cos(np.outer(x, self.frequency[:, 0]) + self.phase).sum(axis=1)
+
+    def over(self, x: Float[np.ndarray, "n"], y: Float[np.ndarray, "m"]) -> Float[np.ndarray, "n m"]:
+        """Return values of a field of two arguments on the grid of `x` and `y`."""
+        a = np.outer(x, self.frequency[:, 0]) + self.phase
+        b = np.outer(y, self.frequency[:, 1])
+        return self.amplitude * (np.cos(a) @ np.cos(b).T - np.sin(a) @ np.sin(b).T)
+
+
+def draw_field(rng: np.random.Generator, sigma: float, correlation: float, dims: int = 1, terms: int = 96) -> Field:
+    """Draw a field.
+
+    Args:
+        rng: Source of randomness.
+        sigma: Standard deviation of the values.
+        correlation: Correlation length c, where the correlation has fallen to 1/e, in the unit of the argument.
+        dims: Number of arguments.
+        terms: Number of cosines.
+    """
+    frequency = rng.normal(0.0, np.sqrt(2.0) / correlation, size=(terms, dims))
+    return Field(frequency, rng.uniform(0.0, 2.0 * np.pi, terms), sigma * np.sqrt(2.0 / terms))
+
+
+CELL = 0.10  # m, largest cell of the surface grid
+_OUTLINE_STEP = 1e-3  # m between the points of an outline before it is sampled
+_HALF_POCKET = 0.5 * POCKET_WIDTH * np.array([-1.0, 0.0, 1.0])  # m: first edge, middle, last edge of a pocket
+# Middles of the rows of pockets: on the wall in m above the floor (the first 0.70 m above the sleepers), on the crown
+# as a share of the height, which in the paper's D is 35° and 70° above the springing.
+_WALL_ROWS = (SLEEPER_RISE + 0.70, 2.20)
+_CROWN_ROWS = ((3.535 + 2.825 * np.sin(np.deg2rad([35.0, 70.0]))) / 6.36).tolist()
+
+
+def refine_breaks(breaks: Float[np.ndarray, "b"], cell: float) -> Float[np.ndarray, "n"]:
+    """Return the sorted, distinct `breaks` with equal cells no larger than `cell` between neighbours."""
+    breaks = np.unique(np.round(breaks, 9))
+    counts = np.ceil(np.diff(breaks) / cell - 1e-9).astype(int)
+    parts = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(breaks, breaks[1:], counts, strict=False)]
+    return np.concatenate([*parts, breaks[-1:]])
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One outline at its nominal size; other sizes stretch it across and upright.
+
+    Attributes:
+        width, height: Nominal largest width, and height from floor to crown, m.
+        nodes: Along `lateral`, and above the floor, m.
+        normal: Outward normals; horizontal at the feet, so that roughness does not lift them off the floor.
+        girth: Distance of the nodes from the left foot along the outline, m.
+        rows: Nodes at the first edge, the middle and the last edge of each row of pockets, the left side first.
+    """
+
+    width: float
+    height: float
+    nodes: Float[np.ndarray, "m 2"]
+    normal: Float[np.ndarray, "m 2"]
+    girth: Float[np.ndarray, "m"]
+    rows: Int[np.ndarray, "k 3"]
+
+    @property
+    def top(self) -> int:
+        """The node at the crown, on the axis."""
+        return len(self.nodes) // 2
+
+    def scaled(self, width: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
+        """Return nodes of sections of these sizes, above the floor, m."""
+        return self.nodes * np.stack([width / self.width, height / self.height], axis=-1)[:, None]
+
+
+@dataclass(frozen=True)
+class DShape(Shape):
+    """A D whose crown stays a semicircle: of other sizes the walls move, and stretch above `fixed` to the springing.
+
+    Attributes:
+        fixed: Nodes up to this height above the floor keep it, m.
+        spring: Nominal height of the springing above the floor, m.
+    """
+
+    fixed: float = 2.6
+    spring: float = 3.535
+
+    def scaled(self, width: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
+        """Return nodes of sections of these sizes, above the floor, m."""
+        radius = 0.5 * width[:, None]
+        spring = height[:, None] - radius
+        y, z = self.nodes.T
+        stretch = (spring - self.fixed) / (self.spring - self.fixed)
+        wall = np.where(z > self.fixed, self.fixed + (z - self.fixed) * stretch, z)
+        ratio = radius / (0.5 * self.width)
+        return np.stack([y * ratio, np.where(z > self.spring, spring + (z - self.spring) * ratio, wall)], axis=-1)
+
+
+def _arc(centre: tuple[float, float], radius: float, begin: float, end: float) -> Float[np.ndarray, "n 2"]:
+    angle = np.linspace(begin, end, int(np.ceil(radius * abs(end - begin) / _OUTLINE_STEP)) + 1)
+    return np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _sample_half(half: Float[np.ndarray, "n 2"], breaks: tuple[float, ...] = ()) -> dict[str, object]:
+    """Fields of the shape whose left half, from foot to crown, is the dense outline `half`.
+
+    Args:
+        half: Along `lateral`, and above the floor, m.
+        breaks: Heights above the floor where a node must lie, m.
+    """
+    half = half[np.concatenate([[True], np.linalg.norm(np.diff(half, axis=0), axis=1) > 1e-9])]
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(half, axis=0), axis=1))])
+    height = half[-1, 1]
+    middles = np.interp([*_WALL_ROWS, *(share * height for share in _CROWN_ROWS)], half[:, 1], along)
+    edges = np.add.outer(middles, _HALF_POCKET)
+    girth = refine_breaks(np.concatenate([[0.0, along[-1]], edges.ravel(), np.interp(breaks, half[:, 1], along)]), CELL)
+    left = np.stack([np.interp(girth, along, v) for v in half.T], axis=-1)
+    slope = np.gradient(half, along, axis=0)
+    normal = np.stack([np.interp(girth, along, slope[:, 1]), -np.interp(girth, along, slope[:, 0])], axis=-1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    left[-1, 0], normal[0], normal[-1] = 0.0, (1.0, 0.0), (0.0, 1.0)
+
+    rows = np.array([[int(np.argmin(abs(girth - e))) for e in row] for row in edges])
+    total = 2 * len(girth) - 1
+    mirror = (-1.0, 1.0)
+    return {
+        "width": 2.0 * float(half[:, 0].max()),
+        "height": float(height),
+        "nodes": np.concatenate([left, left[-2::-1] * mirror]),
+        "normal": np.concatenate([normal, normal[-2::-1] * mirror]),
+        "girth": np.concatenate([girth, 2.0 * along[-1] - girth[-2::-1]]),
+        "rows": np.concatenate([rows, total - 1 - rows[:, ::-1]]),
+    }
+
+
+def _d_half() -> Float[np.ndarray, "n 2"]:
+    wall = np.stack([np.full(3536, 2.825), np.linspace(0.0, 3.535, 3536)], axis=-1)
+    return np.concatenate([wall, _arc((0.0, 3.535), 2.825, 0.0, 0.5 * np.pi)])
+
+
+def d_shape() -> DShape:
+    """Return the paper's D, 5.65 m by 6.36 m: flat floor, vertical walls, semicircular crown."""
+    return DShape(**_sample_half(_d_half(), (2.6, 3.535)))  # type: ignore[arg-type]
+
+
+def arch() -> Shape:
+    """Return the same D, whose crown becomes elliptical where the width changes."""
+    return Shape(**_sample_half(_d_half()))  # type: ignore[arg-type]
+
+
+def ellipse() -> Shape:
+    """Return an upright ellipse with half-axes of 2.8 and 3.3 m, filled flat 0.6 m above its lowest point."""
+    begin = np.arcsin(0.6 / 3.3 - 1.0)
+    angle = np.linspace(begin, 0.5 * np.pi, 8001)
+    return Shape(**_sample_half(np.stack([2.8 * np.cos(angle), 2.7 + 3.3 * np.sin(angle)], axis=-1)))  # type: ignore[arg-type]
+
+
+def horseshoe() -> Shape:
+    """Return a semicircular crown of 2.9 m on walls that draw in, along arcs of 6 m, to 4.19 m at the floor."""
+    wall = _arc((2.9 - 6.0, 3.0), 6.0, -np.arcsin(3.0 / 6.0), 0.0)
+    return Shape(**_sample_half(np.concatenate([wall, _arc((0.0, 3.0), 2.9, 0.0, 0.5 * np.pi)])))  # type: ignore[arg-type]
+
+
+def circle() -> Shape:
+    """Return a shield bore of 2.898 m radius, as the real metro's rings, its invert filled flat to a depth of 0.9 m."""
+    radius, fill = 2.898, 0.9
+    return Shape(**_sample_half(_arc((0.0, radius - fill), radius, np.arcsin(fill / radius - 1.0), 0.5 * np.pi)))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -23,7 +205,7 @@ class Trend:
     value: tuple[float, ...] = (0.0, 0.0)
 
     def __call__(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Values at `station`, m."""
+        """Return values at `station`, m."""
         return PchipInterpolator(self.station, self.value)(np.clip(station, self.station[0], self.station[-1]))
 
 
@@ -63,11 +245,11 @@ class Section:
     crossfall: float = 0.0
 
     def width(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Largest width between the smooth walls, m."""
+        """Return the largest width between the smooth walls, m."""
         return self.shape.width + self.width_field.along(station) + self.widening(station)
 
     def height(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Height from the floor to the smooth crown on the axis, m."""
+        """Return the height from the floor to the smooth crown on the axis, m."""
         return self.shape.height + self.height_field.along(station)
 
     def _on_floor(self, nodes: Float[np.ndarray, "n m 2"], height: Float[np.ndarray, "n"]) -> None:
@@ -75,7 +257,7 @@ class Section:
             nodes[:, foot, 1] = self.crossfall * nodes[:, foot, 0] - 0.5 * height
 
     def smooth(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
-        """Nodes of the smooth section about the centreline, m along `lateral` and `up`."""
+        """Return nodes of the smooth section about the centreline, m along `lateral` and `up`."""
         height = self.height(station)
         nodes = self.shape.scaled(self.width(station), height)
         nodes[..., 1] -= 0.5 * height[:, None]
@@ -83,14 +265,14 @@ class Section:
         return nodes
 
     def rough(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
-        """Nodes of the actual lining, without pockets, about the centreline, m."""
+        """Return nodes of the actual lining, without pockets, about the centreline, m."""
         nodes = self.smooth(station)
         nodes += self.roughness.over(station, self.shape.girth)[..., None] * self.shape.normal
         self._on_floor(nodes, self.height(station))
         return nodes
 
     def measure(self, station: Float[np.ndarray, "n"]) -> Measures:
-        """Sizes of the actual lining at `station`, m."""
+        """Measures the actual lining at `station`, m."""
         nodes, top = self.rough(station), self.shape.top
         width, across = np.empty(len(station)), np.empty(len(station))
         for i, (y, z) in enumerate(np.moveaxis(nodes, -1, 1)):

@@ -1,22 +1,135 @@
-"""One survey from beginning to end: draw the bore, walk through it, write what was seen."""
+"""One survey from beginning to end."""
 
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
+from rosbags.rosbag1 import Writer
 
-from scene.survey import imu, rack, write
 from scene.survey.bore import draw_bore
-from scene.survey.carrier import Carried, Walk, draw_walk
+from scene.survey.carrier import GRAVITY, Carried, Walk, draw_walk, measure_inertial, measure_prism
 from scene.survey.cast import Caster
 from scene.survey.config import LidarName, SurveyConfig
-from scene.survey.lidar import SCAN_PERIOD
+from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
-from scene.survey.profiles import write_profiles
-from scene.survey.record import device, inertial, record
-from scene.survey.sweeps import n_sweeps, sweeps
-from scene.survey.truth import describe
+from scene.survey.messages import (
+    CLOUD_DEFINITION,
+    CLOUD_MD5,
+    CLOUD_TYPE,
+    CUSTOM_DEFINITION,
+    CUSTOM_MD5,
+    CUSTOM_TYPE,
+    IMU_DEFINITION,
+    IMU_MD5,
+    IMU_TYPE,
+    custom_message,
+    imu_messages,
+    ouster_message,
+    unix_nanoseconds,
+    velodyne_message,
+)
+from scene.survey.rack import IMUS, LIDARS, calibration
+from scene.survey.sweeps import n_sweeps, sweeps, write_profiles
+from scene.survey.write import CloudWriter, describe_truth, replace_file, write_json, write_mesh, write_tum, write_yaml
+
+Message = tuple[int, str, bytes]  # time in ns since the start of the survey, topic, bytes
+
+
+@dataclass(frozen=True)
+class Device:
+    """One LiDAR of the rack and how its driver publishes it.
+
+    Attributes:
+        lidar: The model.
+        suffix: Of the names of its files.
+        topic: Of its sweeps.
+        kind: Type, definition and MD5 sum of its messages.
+        encode: A sweep as one of them.
+    """
+
+    lidar: Lidar
+    suffix: str
+    topic: str
+    kind: tuple[str, str, str]
+    encode: Callable[[Sweep, Lidar], bytes]
+
+
+_LIVOX = (CUSTOM_TYPE, CUSTOM_DEFINITION, CUSTOM_MD5)
+_CLOUD = (CLOUD_TYPE, CLOUD_DEFINITION, CLOUD_MD5)
+
+
+def make_device(name: LidarName, config: SurveyConfig) -> Device:
+    """Return the device called `name`."""
+    if name == "avia":
+        return Device(avia(config.point_rate), "", "/livox/lidar", _LIVOX, custom_message)
+    if name == "vlp16":
+        return Device(vlp16(), "_vlp16", "/velodyne_points", _CLOUD, velodyne_message)
+    return Device(os1(), "_os1", "/ouster/points", _CLOUD, ouster_message)
+
+
+def draw_imu_messages(
+    seeds: list[np.random.SeedSequence], name: LidarName, carried: Carried, config: SurveyConfig
+) -> list[Message]:
+    """Draws the messages of all IMUs of a device, in order of time.
+
+    Args:
+        seeds: One for each IMU.
+        name: Of the device.
+        carried: Motion of its LiDAR.
+        config: Of the survey.
+    """
+    out = []
+    for seed, one in zip(seeds, IMUS[name], strict=True):
+        sample = measure_inertial(np.random.default_rng(seed), carried, one.rate, one.mount, config.errors)
+        at = np.rint(sample.time * 1e9).astype(np.int64)
+        accel = sample.accel / (GRAVITY if one.in_g else 1.0)
+        raw = imu_messages(one.frame, at, sample.quaternion if one.orientation else None, sample.gyro, accel)
+        out += [(int(t), one.topic, m) for t, m in zip(at, raw, strict=True)]
+    return sorted(out, key=lambda m: m[:2])
+
+
+def write_recording(
+    path: Path, device: Device, sweeps: Iterable[Sweep], inertial: list[Message], cloud: CloudWriter | None
+) -> int:
+    """Write the bag, and the cloud if asked; return the number of returns.
+
+    A message is recorded when it is complete: a sweep one period after its first point.
+
+    Args:
+        path: Bag to write.
+        device: What it holds.
+        sweeps: In order of time.
+        inertial: Messages of the IMUs, in order of time.
+        cloud: Where to put the placed returns too.
+    """
+    returns, waiting = 0, iter([*inertial, (2**62, "", b"")])
+    kinds = {topic: (IMU_TYPE, IMU_DEFINITION, IMU_MD5) for _, topic, _ in inertial}
+    kinds[device.topic] = device.kind
+    with ExitStack() as stack:
+        bag = stack.enter_context(Writer(stack.enter_context(replace_file(path))))
+        topics = {
+            name: bag.add_connection(name, kind, msgdef=text, md5sum=md5)
+            for name, (kind, text, md5) in sorted(kinds.items())
+        }
+        at, topic, raw = next(waiting)
+        for sweep in sweeps:
+            end = sweep.begin + round(SCAN_PERIOD * 1e9)
+            while at < end:
+                bag.write(topics[topic], unix_nanoseconds(at), raw)
+                at, topic, raw = next(waiting)
+            bag.write(topics[device.topic], unix_nanoseconds(end), device.encode(sweep, device.lidar))
+            returns += int(sweep.valid.sum())
+            if cloud:
+                cloud.add(sweep.placed[sweep.valid], sweep.reflectivity[sweep.valid])
+        while topic:
+            bag.write(topics[topic], unix_nanoseconds(at), raw)
+            at, topic, raw = next(waiting)
+    return returns
+
 
 TRUTH_RATE = 200.0  # Hz, rows of groundtruth.tum
 _BEHIND = {"avia": 20.0}  # m of bore that a LiDAR sees behind itself, where it is not its whole range
@@ -30,30 +143,30 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     walk = draw_walk(np.random.default_rng(of_walk), bore, config.speed, SCAN_PERIOD)
     config.out.mkdir(parents=True, exist_ok=True)
 
-    write.write_mesh(config.out / "truth.ply", mesh)
-    write.write_json(config.out / "truth.json", describe(bore, config))
-    prism = imu.measure_prism(np.random.default_rng(of_prism), walk, config.errors.prism_noise)
-    write.write_tum(config.out / "prism.tum", *prism, None)
+    write_mesh(config.out / "truth.ply", mesh)
+    write_json(config.out / "truth.json", describe_truth(bore, config))
+    prism = measure_prism(np.random.default_rng(of_prism), walk, config.errors.prism_noise)
+    write_tum(config.out / "prism.tum", *prism, None)
     told = [f"{config.out}: {config.length:g} m"]
     if config.profiles:
         told.append(f"{write_profiles(config, bore, Caster(mesh), of_profiles)} points in profiles")
     # A sensor's noise does not depend on which others are on the rack.
-    seeds = dict(zip(rack.LIDARS, of_sensors.spawn(len(rack.LIDARS)), strict=True))
+    seeds = dict(zip(LIDARS, of_sensors.spawn(len(LIDARS)), strict=True))
     for name in config.sensors:
-        told.append(_survey(config, name, walk, mesh, seeds[name], console))
+        told.append(_simulate_device(config, name, walk, mesh, seeds[name], console))
     return ", ".join(told)
 
 
-def _survey(
+def _simulate_device(
     config: SurveyConfig, name: LidarName, walk: Walk, mesh: Mesh, seed: np.random.SeedSequence, console: Console
 ) -> str:
     """Write recording, ground truth and calibration of one device."""
-    of_lidar, *of_imus = seed.spawn(1 + len(rack.IMUS[name]))
-    one, carried = device(name, config), Carried(walk, rack.LIDARS[name])
+    of_lidar, *of_imus = seed.spawn(1 + len(IMUS[name]))
+    one, carried = make_device(name, config), Carried(walk, LIDARS[name])
     time = np.arange(round(walk.duration * TRUTH_RATE) + 1) / TRUTH_RATE
     poses = carried.poses(time)
-    write.write_tum(config.out / f"groundtruth{one.suffix}.tum", time, poses.position, poses.quaternion)
-    write.write_yaml(config.out / f"calibration{one.suffix}.yaml", rack.calibration(name))
+    write_tum(config.out / f"groundtruth{one.suffix}.tum", time, poses.position, poses.quaternion)
+    write_yaml(config.out / f"calibration{one.suffix}.yaml", calibration(name))
 
     every = 1 if name == "avia" else config.scan_every
     caster = Caster(mesh, _BEHIND.get(name, one.lidar.range_max))
@@ -62,10 +175,10 @@ def _survey(
     with ExitStack() as stack:
         cloud = None
         if config.cloud and name == config.sensors[0]:
-            paths = (stack.enter_context(write.replacing(config.out / f"cloud.{kind}")) for kind in ("ply", "pcd"))
-            cloud = stack.enter_context(write.CloudWriter(*paths))
+            paths = (stack.enter_context(replace_file(config.out / f"cloud.{kind}")) for kind in ("ply", "pcd"))
+            cloud = stack.enter_context(CloudWriter(*paths))
         progress = stack.enter_context(Progress(console=console, transient=True))
         tracked = progress.track(seen, total=count, description=f"survey, {name}")
         bag = config.out / f"survey{one.suffix}.bag"
-        returns = record(bag, one, tracked, inertial(of_imus, name, carried, config), cloud)
+        returns = write_recording(bag, one, tracked, draw_imu_messages(of_imus, name, carried, config), cloud)
     return f"{name}: {count} scans, {returns} returns"

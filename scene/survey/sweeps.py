@@ -1,28 +1,29 @@
-"""The sweeps of one LiDAR along the walk."""
+"""The sweeps of a LiDAR along the walk, and the turns of a profile scanner."""
 
 from collections.abc import Iterator
 
 import numpy as np
 
-from scene.survey import echo
-from scene.survey.carrier import Carried, rotate
-from scene.survey.cast import Caster
-from scene.survey.config import SensorErrors
+from scene.survey.bore import Bore
+from scene.survey.carrier import CARRY_HEIGHT, Carried, rotate
+from scene.survey.cast import Caster, Hits, draw_reflectivity, draw_returns, mix_pixels, noise_sigma
+from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
+from scene.survey.write import CloudWriter, replace_file
 
 _RAYS_AT_ONCE = 240_000  # large enough for numpy, small enough for the memory
 _SECOND_RETURN = 0.02  # share of returns marked as second ones
 
 
 def n_sweeps(carried: Carried, every: int) -> int:
-    """How many sweeps `sweeps` yields."""
+    """Return the number of sweeps that `sweeps` yields."""
     return len(range(0, round(carried.walk.duration / SCAN_PERIOD), every))
 
 
 def sweeps(
     rng: np.random.Generator, lidar: Lidar, carried: Carried, caster: Caster, errors: SensorErrors, every: int = 1
 ) -> Iterator[Sweep]:
-    """Sweeps in order of time; every point is cast from the pose at its own time.
+    """Yields sweeps in order of time; every point is cast from the pose at its own time.
 
     Args:
         rng: Source of randomness.
@@ -39,10 +40,10 @@ def sweeps(
     at_once = max(1, _RAYS_AT_ONCE // len(offset)) if every == 1 else 1
     for first in range(0, len(numbers), at_once):
         batch = numbers[first : first + at_once]
-        yield from _cast(rng, lidar, carried, caster, errors, phase, offset, batch)
+        yield from _cast_sweeps(rng, lidar, carried, caster, errors, phase, offset, batch)
 
 
-def _cast(
+def _cast_sweeps(
     rng: np.random.Generator,
     lidar: Lidar,
     carried: Carried,
@@ -59,15 +60,15 @@ def _cast(
     caster.load(float(carried.walk.station(begin[:1])[0]), poses.position[0])
     hits = caster.cast_loaded(poses.position, heading)
 
-    valid = echo.returned(rng, lidar, errors, hits)
+    valid = draw_returns(rng, lidar, errors, hits)
     distance = hits.distance
     if errors.mixed_pixels > 0.0:
-        distance = echo.mixed(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
-    sigma = echo.noise_sigma(errors, distance, hits.cosine)
+        distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
+    sigma = noise_sigma(errors, distance, hits.cosine)
     # Rounded once, here: the cloud and the bag then hold the same point.
     seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)
     points = (seen[:, None] * ray).astype(np.float32)
-    reflectivity = np.where(valid, echo.reflectivity(rng, hits.cosine, hits.part), 0).astype(np.uint8)
+    reflectivity = np.where(valid, draw_reflectivity(rng, hits.cosine, hits.part), 0).astype(np.uint8)
     second = valid & (rng.random(len(ray), np.float32) < _SECOND_RETURN)
     placed = poses.position + seen[:, None] * heading
     for k, number in enumerate(numbers):
@@ -82,3 +83,55 @@ def _cast(
             second[of],
             placed[of],
         )
+
+
+_POINTS = 3600  # in one turn
+_THICK = 0.01  # m, half the thickness of a profile: the carrier creeps on while the mirror turns
+_HELD_OUT = (0.25, 0.5, 0.75)  # places of the held-out profiles between two others, as shares of their spacing
+_AT_ONCE = 40  # profiles cast together
+_SCANNER = Lidar(
+    "profile scanner", np.zeros(1, np.int64), 0, np.zeros(1, np.int64), lambda t, p: np.zeros((len(t), 3)),
+    range_min=0.3, range_max=80.0, weakest_echo=0.1 / 80.0**2, divergence=1e-3,
+)  # fmt: skip
+
+
+def profile_stations(length: float, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stations, m, of the profiles, at least 2 `_THICK` inside the mouths, and of those held out."""
+    given = np.arange(2.0 * _THICK, length - 2.0 * _THICK + 1e-9, spacing)
+    return given, np.add.outer(given[:-1], spacing * np.array(_HELD_OUT)).ravel()
+
+
+def write_profiles(config: SurveyConfig, bore: Bore, caster: Caster, seed: np.random.SeedSequence) -> int:
+    """Write `cloud.ply` and `held_out.ply`; return the number of points of the first."""
+    counts = []
+    stations = profile_stations(config.length, config.profiles)
+    for name, at, one in zip(("cloud.ply", "held_out.ply"), stations, seed.spawn(2), strict=True):
+        rng, count = np.random.default_rng(one), 0
+        with replace_file(config.out / name) as part, CloudWriter(part) as cloud:
+            for first in range(0, len(at), _AT_ONCE):
+                placed, brightness = _cast_turns(rng, config, bore, caster, at[first : first + _AT_ONCE])
+                cloud.add(placed, brightness)
+                count += len(placed)
+        counts.append(count)
+    return counts[0]
+
+
+def _cast_turns(
+    rng: np.random.Generator, config: SurveyConfig, bore: Bore, caster: Caster, stations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points, m, and reflectivities of one turn at each station."""
+    turn = np.linspace(0.0, 2.0 * np.pi, _POINTS, endpoint=False)
+    at = np.repeat(stations, _POINTS) + rng.uniform(-_THICK, _THICK, _POINTS * len(stations))
+    angle = np.tile(turn, len(stations)) + np.repeat(rng.uniform(0.0, 2.0 * np.pi, len(stations)), _POINTS)
+    frames = bore.alignment.frames(at)
+    origin = frames.point(np.zeros_like(at), CARRY_HEIGHT - 0.5 * bore.section.height(at))
+    heading = np.cos(angle)[:, None] * frames.lateral + np.sin(angle)[:, None] * frames.up
+    caster.load(float(stations[0]), origin[0])
+    hits: Hits = caster.cast_loaded(origin, heading)
+    valid = draw_returns(rng, _SCANNER, config.errors, hits)
+    distance = hits.distance
+    if config.errors.mixed_pixels > 0.0:
+        distance = mix_pixels(rng, _SCANNER, config.errors.mixed_pixels, caster, origin, heading, hits)
+    distance = distance + noise_sigma(config.errors, distance, hits.cosine) * rng.standard_normal(len(distance))
+    bright = draw_reflectivity(rng, hits.cosine, hits.part)
+    return (origin + np.where(valid, distance, 0.0)[:, None] * heading)[valid], bright[valid]

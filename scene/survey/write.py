@@ -1,8 +1,9 @@
-"""Files of a survey, each written under a temporary name and renamed."""
+"""Files of a survey."""
 
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -11,6 +12,27 @@ import numpy as np
 import yaml
 from jaxtyping import Float, Shaped
 
+from scene.survey.bore import Bore
+from scene.survey.config import SurveyConfig
+from scene.survey.furniture import (
+    GAUGE,
+    N_ROWS,
+    NAIL_DEPTH,
+    NAIL_DIAMETER,
+    PAD,
+    POCKET_LENGTH,
+    POCKET_OFFSET,
+    RAIL_AXIS,
+    RAIL_HEIGHT,
+    RAIL_TOP,
+    RING_WIDTH,
+    SLEEPER_BOTTOM,
+    SLEEPER_HEIGHT,
+    SLEEPER_LENGTH,
+    SLEEPER_RISE,
+    SLEEPER_SPACING,
+    SLEEPER_TOP,
+)
 from scene.survey.mesh import Mesh
 from scene.survey.messages import EPOCH
 
@@ -18,7 +40,7 @@ CLOUD_POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", 
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replace_file(path: Path) -> Iterator[Path]:
     """Give a temporary name beside `path`, and rename to `path` if all went well; otherwise leave nothing behind."""
     part = path.with_name(f".{path.name}.part")
     part.unlink(missing_ok=True)
@@ -31,13 +53,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Write JSON on one line."""
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text(json.dumps(content, allow_nan=False) + "\n")
 
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
     """Write YAML, lists of numbers on one line."""
-    with replacing(path) as part:
+    with replace_file(path) as part:
         part.write_text(yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120))
 
 
@@ -56,7 +78,7 @@ def write_tum(
         quaternion: x, y, z, w, or None.
     """
     turns = np.zeros((len(time), 4)) if quaternion is None else quaternion
-    with replacing(path) as part, part.open("w") as file:
+    with replace_file(path) as part, part.open("w") as file:
         for t, p, q in zip(time, position, turns, strict=True):
             # Seconds and fraction apart: together they would exceed what a float64 resolves.
             whole, micro = divmod(round(t * 1e6), 1_000_000)
@@ -73,7 +95,7 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
         f"element vertex {len(mesh.vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nproperty uchar part\nend_header\n"
     )
-    with replacing(path) as part, part.open("wb") as file:
+    with replace_file(path) as part, part.open("wb") as file:
         file.write(header.encode())
         file.write(mesh.vertices.astype("<f8").tobytes())
         file.write(faces.tobytes())
@@ -131,3 +153,99 @@ def _pcd_header(count: int) -> bytes:
         f"# .PCD v0.7 - simulated {pad}\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 8 8 8 4\nTYPE F F F F\n"
         f"COUNT 1 1 1 1\nWIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA binary\n"
     ).encode()
+
+
+TRUTH_STEP = 0.25  # m between the stations of the truth
+_DEFINITIONS = {
+    "frame": "survey frame, z up; sections lie in the plane of lateral (left, horizontal) and up = tangent x lateral",
+    "position": "middle of the smooth section: half its width, half its height; station is arc length along it",
+    "width": "largest horizontal distance between the walls in the section, roughness included, pockets excluded",
+    "height": "floor to crown on the axis, roughness included; width_smooth and height_smooth leave roughness out",
+    "middle": "of the actual section, along lateral and up from position: half way between the walls where the width "
+    "is largest, half way from floor to crown",
+    "floor": "ballast surface, straight across, half of height_smooth below position; crossfall: its rise to the left",
+    "angle": "rad about position, from lateral towards up",
+    "pockets.depth": "along the normal of the smooth section at the pocket's middle",
+    "rails.gauge": "between the inner faces of the heads 14 to 16 mm below rail top; rails upright, not inclined",
+}
+
+
+def _rounded(values: np.ndarray, digits: int = 6) -> list[Any]:
+    return np.round(np.asarray(values, float), digits).tolist()
+
+
+def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
+    """Return the content of `truth.json`, per docs/formats.md."""
+    alignment, section, furniture = bore.alignment, bore.section, bore.furniture
+    station = np.arange(0.0, alignment.length + 1e-9, TRUTH_STEP)
+    frames = alignment.frames(station)
+    actual = section.measure(station)
+    return {
+        "schema": "subterra.truth/1",
+        "provenance": "simulated",
+        "section_type": bore.section_type,
+        "seed": config.seed,
+        "config": {k: v for k, v in asdict(config).items() if k != "out"},
+        "definitions": _DEFINITIONS,
+        "length": alignment.length,
+        "station": _rounded(station),
+        "position": _rounded(frames.position),
+        "tangent": _rounded(frames.tangent, 9),
+        "width": _rounded(actual.width),
+        "height": _rounded(actual.height),
+        "width_smooth": _rounded(section.width(station)),
+        "height_smooth": _rounded(section.height(station)),
+        "middle": _rounded(actual.middle),
+        "crossfall": section.crossfall,
+        "rings": {"width": RING_WIDTH, "station": _rounded(furniture.joints)},
+        "pockets": _describe_pockets(bore),
+        "nails": {"diameter": NAIL_DIAMETER, "depth": NAIL_DEPTH, "count": int(furniture.nails.sum())},
+        "sleepers": _describe_sleepers(bore),
+        "rails": _describe_rails(bore, station),
+    }
+
+
+def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
+    """Every pocket by growing ring, row and station; `open` is false where it is mortared flush."""
+    section, furniture = bore.section, bore.furniture
+    out = []
+    for side, offset in enumerate((-POCKET_OFFSET, POCKET_OFFSET)):
+        station = furniture.joints + offset
+        frames, smooth = bore.alignment.frames(station), section.smooth(station)
+        half = 0.5 * section.height(station)
+        for j in np.flatnonzero(furniture.pocketed):
+            for r, (first, middle, last) in enumerate(section.shape.rows):
+                (y, z), normal = smooth[j, middle], section.shape.normal[middle]
+                centre = frames.position[j] + y * frames.lateral[j] + z * frames.up[j]
+                out.append({
+                    "ring": int(j), "row": r, "side": "left" if 2 * r < N_ROWS else "right",
+                    "station": round(float(station[j]), 6), "angle": round(float(np.arctan2(z, y)), 6),
+                    "above_floor": round(float(z + half[j]), 6), "position": _rounded(centre),
+                    "outward": _rounded(normal[0] * frames.lateral[j] + normal[1] * frames.up[j], 9),
+                    "length": POCKET_LENGTH, "depth": round(float(furniture.depth[j, r, side]), 6),
+                    "width": round(float(np.linalg.norm(smooth[j, last] - smooth[j, first])), 6),
+                    "open": not bool(furniture.filled[j, r, side]), "nail": bool(furniture.nails[j, r]),
+                })  # fmt: skip
+    return sorted(out, key=lambda p: (p["ring"], p["row"], p["station"]))
+
+
+def _describe_sleepers(bore: Bore) -> dict[str, Any]:
+    station = bore.furniture.sleepers
+    top = SLEEPER_RISE - 0.5 * bore.section.height(station)
+    return {
+        "station": _rounded(station),
+        "position": _rounded(bore.alignment.frames(station).point(np.zeros_like(top), top)),
+        "spacing": SLEEPER_SPACING, "length": SLEEPER_LENGTH, "top_width": SLEEPER_TOP,
+        "bottom_width": SLEEPER_BOTTOM, "height": SLEEPER_HEIGHT, "top_above_floor": SLEEPER_RISE,
+    }  # fmt: skip
+
+
+def _describe_rails(bore: Bore, station: np.ndarray) -> dict[str, Any]:
+    frames = bore.alignment.frames(station)
+    top = RAIL_TOP - 0.5 * bore.section.height(station)
+    return {
+        "profile": "CHN60", "gauge": GAUGE, "height": RAIL_HEIGHT, "pad": PAD[2],
+        "axis_offset": RAIL_AXIS, "top_above_floor": RAIL_TOP, "inclination": 0.0,
+        "left": _rounded(frames.point(np.full_like(top, RAIL_AXIS), top)),
+        "right": _rounded(frames.point(np.full_like(top, -RAIL_AXIS), top)),
+    }  # fmt: skip

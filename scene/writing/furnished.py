@@ -7,12 +7,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.bore import POCKET, Bore
-from scene.writing.furniture import furnish
-from scene.writing.panels import Opening
-from scene.writing.place import FurnitureConfig, Piece, Place
-from scene.writing.recess import recess_boxes
+from scene.writing.furniture import FurnitureConfig, Piece, TunnelSpace, place_furniture
 from scene.writing.track import Track
-from scene.writing.unrolled import unroll
+from scene.writing.unrolled import recess_boxes, unroll_section
+from scene.writing.walls import Opening
 
 _DOOR = (1.2, 0.08, 2.0)  # length, thickness, height, m
 _FRAME = 0.15  # of wall left between a niche and the next pocket, m
@@ -39,24 +37,24 @@ class Furnished:
 
 
 def furnish_bore(bore: Bore, track: Track, config: FurnitureConfig) -> Furnished:
-    """Niches and furniture by standard, as far as the bore has room for them."""
-    openings = _openings(bore, track, config) if config.passage else []
-    niche = _niches(bore, openings, config.passage_size[2])
+    """Adds niches and furniture by standard, as far as the bore has room for them."""
+    openings = _niche_openings(bore, track, config) if config.passage else []
+    niche = _niche_pockets(bore, openings, config.passage_size[2])
     spans = [(float(row["station"] - row["length"] / 2), float(row["station"] + row["length"] / 2)) for row in niche]
     keep = np.ones(len(bore.pocket), bool)
     for row in niche:
         keep &= ~_overlaps(bore, row)
     with_niches = replace(bore, pocket=np.concatenate([bore.pocket[keep], niche]))
     number = np.arange(keep.sum(), len(with_niches.pocket))
-    corners = [_flush(box) for box in recess_boxes(with_niches, number)]
-    pieces = furnish(Place(bore, track, config, spans)) + [_door(corner) for corner in corners]
+    corners = [_cut_flush(box) for box in recess_boxes(with_niches, number)]
+    pieces = place_furniture(TunnelSpace(bore, track, config, spans)) + [_niche_door(corner) for corner in corners]
     return Furnished(with_niches, pieces, openings, spans, corners)
 
 
 def planar_segments(
     pieces: list[Piece], bore: Bore, elevation: Float[np.ndarray, " n"], height: float
 ) -> Float[np.ndarray, "f 4"]:
-    """Outlines of the pieces where a surface `height` m above the track cuts them.
+    """Return outlines of the pieces where a surface `height` m above the track cuts them.
 
     Returns:
         Segments `x0, y0, x1, y1`, m; those of one piece follow one another and close.
@@ -80,7 +78,7 @@ def planar_segments(
     return np.concatenate(found) if found else np.empty((0, 4))
 
 
-def _openings(bore: Bore, track: Track, config: FurnitureConfig) -> list[Opening]:
+def _niche_openings(bore: Bore, track: Track, config: FurnitureConfig) -> list[Opening]:
     """Niches on the grid of the bore, above the walkway (the sleepers, where there is none), on the left."""
     length, height, _ = config.passage_size
     step, found = bore.station[1], []
@@ -96,8 +94,8 @@ def _openings(bore: Bore, track: Track, config: FurnitureConfig) -> list[Opening
     return found
 
 
-def _niches(bore: Bore, openings: list[Opening], depth: float) -> np.ndarray:
-    plane, rows = unroll(bore), []
+def _niche_pockets(bore: Bore, openings: list[Opening], depth: float) -> np.ndarray:
+    plane, rows = unroll_section(bore), []
     for opening in openings:
         first, last = bore.station[list(opening.rows)]
         low, high = np.sort(plane.to_around(bore.angle[list(opening.columns)]))
@@ -107,16 +105,16 @@ def _niches(bore: Bore, openings: list[Opening], depth: float) -> np.ndarray:
 
 
 def _overlaps(bore: Bore, niche: np.void) -> np.ndarray:
-    """Which pockets a niche takes away."""
-    plane, pocket = unroll(bore), bore.pocket
+    """True for the pockets that a niche takes away."""
+    plane, pocket = unroll_section(bore), bore.pocket
     across = np.abs(plane.to_around(pocket["angle"]) - plane.to_around(niche["angle"]))
     across = np.minimum(across, plane.girth - across)
     beside = np.abs(pocket["station"] - niche["station"]) < (pocket["length"] + niche["length"]) / 2 + _FRAME
     return beside & (across < (pocket["width"] + niche["width"]) / 2 + _FRAME)
 
 
-def _door(corners: Float[np.ndarray, "8 3"]) -> Piece:
-    """The door at the back of a niche."""
+def _niche_door(corners: Float[np.ndarray, "8 3"]) -> Piece:
+    """Return the door at the back of a niche."""
     grid = corners.reshape(2, 2, 2, 3)
     x, z = grid[1, 0, 1] - grid[0, 0, 1], grid[0, 1, 1] - grid[0, 0, 1]
     half = np.array([min(_DOOR[0], np.linalg.norm(x)), _DOOR[1], min(_DOOR[2], np.linalg.norm(z))]) / 2
@@ -129,8 +127,8 @@ def _door(corners: Float[np.ndarray, "8 3"]) -> Piece:
     )
 
 
-def _flush(box: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "8 3"]:
-    """A niche's box without the part that reaches into the bore, so that its front lies in the wall."""
+def _cut_flush(box: Float[np.ndarray, "8 3"]) -> Float[np.ndarray, "8 3"]:
+    """Return a niche's box without the part that reaches into the bore, so that its front lies in the wall."""
     grid = box.reshape(4, 2, 3)
     inward = grid[:, 0] - grid[:, 1]
     size = np.linalg.norm(inward, axis=1, keepdims=True)

@@ -1,18 +1,147 @@
-"""Lineside furniture by standard: what stands in a running tunnel beside the track, as boxes that fit the local bore.
-
-None of it is read from the survey; each kind can be left out, since each is a landmark along the axis.
-"""
+"""Lineside furniture by standard, as boxes that fit the local bore."""
 
 from collections import Counter
+from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
-from scene.writing.place import Piece, Place
+from scene.bore import Bore
+from scene.writing.markup import rotation_along
+from scene.writing.track import Track, wall_offset
+
+_ROBOT_HEIGHT = 1.0
 
 
-def furnish(place: Place) -> list[Piece]:
-    """Everything the configuration asks for and the bore has room for."""
+@dataclass(frozen=True)
+class FurnitureConfig:
+    """Which furniture, and its sizes, m; heights are above the top of the sleepers.
+
+    Sources: widths of walkways 0.8 m (low) to 1.0 m: metro walkway descriptions; cross-passages 244 m apart: NFPA 130.
+    Bracket pitch and tiers, the third rail's offset, plate pitch and all other sizes are engineering defaults.
+
+    Attributes:
+        walkway: Whether there is a low walkway, on the left.
+        walkway_width: It is less where it would come nearer than 5 cm to the sleepers' ends, none below 0.5 m.
+        walkway_height: Of its top.
+        handrail: Whether a handrail on posts runs along the walkway's wall.
+        handrail_height: Above the walkway.
+        post_spacing: Of the handrail's posts.
+        post_size: Side of a post's square section.
+        cables: Whether cables on brackets run along the right wall.
+        bracket_spacing: Of the brackets.
+        bracket_length: Out of the wall.
+        tiers: Heights of the brackets' arms.
+        cable_diameter: Of each tier's bundle.
+        third_rail: Whether there is a third rail, on the right.
+        third_rail_offset: From the running rail, middle to middle.
+        plates: Whether there are hectometre plates on the left wall.
+        plate_spacing: Of the plates.
+        passage: Whether there are doors of cross-passages, in niches of the left wall.
+        passage_spacing: Of the doors, the first half of that from the start.
+        passage_size: Length, height and depth of a niche.
+        lamps: Whether there are lamps at the crown.
+        lamp_spacing: Of the lamps.
+        gauge: Half the width about the axis that nothing may enter up to a robot's height.
+    """
+
+    walkway: bool = True
+    walkway_width: float = 0.8
+    walkway_height: float = 0.30
+    handrail: bool = True
+    handrail_height: float = 1.0
+    post_spacing: float = 2.0
+    post_size: float = 0.05
+    cables: bool = True
+    bracket_spacing: float = 1.0
+    bracket_length: float = 0.25
+    tiers: tuple[float, ...] = (0.55, 0.90, 1.25, 1.60)
+    cable_diameter: float = 0.06
+    third_rail: bool = True
+    third_rail_offset: float = 0.7
+    plates: bool = True
+    plate_spacing: float = 100.0
+    passage: bool = True
+    passage_spacing: float = 244.0
+    passage_size: tuple[float, float, float] = (2.0, 2.1, 0.5)
+    lamps: bool = True
+    lamp_spacing: float = 12.0
+    gauge: float = 0.9
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One box of furniture.
+
+    Attributes:
+        kind: What it is part of.
+        material: Of the scene.
+        centre: m, `(3,)`.
+        rotation: X along the bore, y to the left, z upwards.
+        half: Half its sizes, m, `(3,)`.
+        low: Whether it stands where a robot could run into it.
+    """
+
+    kind: str
+    material: str
+    centre: Float[np.ndarray, "3"]
+    rotation: Rotation
+    half: Float[np.ndarray, "3"]
+    low: bool
+
+    def corners(self) -> Float[np.ndarray, "8 3"]:
+        """Return the corners, m; the last bit of a corner's number tells lower from upper."""
+        signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        return self.centre + self.rotation.apply(signs * self.half)
+
+
+@dataclass(frozen=True, eq=False)
+class TunnelSpace:
+    """Where furniture may stand.
+
+    Attributes:
+        bore: The bore.
+        track: Its track.
+        config: What to place.
+        keep_out: First and last station of each niche of the left wall, m.
+    """
+
+    bore: Bore
+    track: Track
+    config: FurnitureConfig
+    keep_out: list[tuple[float, float]] = field(default_factory=list)
+
+    def wall(self, start: float, end: float, height: float, side: int) -> tuple[float, float]:
+        """Return nearest and furthest distance of the wall from the axis at a height over the sleepers, m."""
+        offset = self._offset(height, side)
+        step = self.bore.station[1]
+        near = offset[int(start / step) : int(np.ceil(end / step)) + 1]
+        return float(near.min()), float(near.max())
+
+    @lru_cache(maxsize=64)  # noqa: B019 a place lives as long as it is furnished
+    def _offset(self, height: float, side: int) -> Float[np.ndarray, " n"]:
+        return wall_offset(self.bore, self.track.elevation + height - self.bore.position[:, 2], side)
+
+    def barred(self, start: float, end: float) -> bool:
+        """Return whether a niche of the left wall lies in a stretch."""
+        return any(start < last + 0.1 and first - 0.1 < end for first, last in self.keep_out)
+
+    def box(
+        self, kind: str, material: str, span: tuple[float, float], across: tuple[float, float], up: tuple[float, float]
+    ) -> Piece:
+        """Return a box between two stations, two distances left of the axis and two heights over the sleepers, m."""
+        line = (self.bore.position[:, 0], self.bore.position[:, 1], self.track.elevation)
+        foot = np.column_stack([np.interp(span, self.bore.station, values) for values in line])
+        rotation = rotation_along(foot[0], foot[1])
+        middle = foot.mean(axis=0) + rotation.apply([0, sum(across) / 2, sum(up) / 2])
+        half = np.array([np.linalg.norm(foot[1] - foot[0]), across[1] - across[0], up[1] - up[0]]) / 2
+        return Piece(kind, material, middle, rotation, half, low=up[0] < _ROBOT_HEIGHT)
+
+
+def place_furniture(place: TunnelSpace) -> list[Piece]:
+    """Places everything that the configuration asks for and the bore has room for."""
     config = place.config
     pieces: list[Piece] = []
     if config.walkway:
@@ -28,21 +157,21 @@ def furnish(place: Place) -> list[Piece]:
     return pieces
 
 
-def counts(pieces: list[Piece]) -> dict[str, int]:
-    """How many boxes of each kind there are."""
+def count_pieces(pieces: list[Piece]) -> dict[str, int]:
+    """Counts the boxes of each kind."""
     return dict(sorted(Counter(piece.kind for piece in pieces).items()))
 
 
-def _stations(place: Place, spacing: float, margin: float = 0.3) -> Float[np.ndarray, " k"]:
+def _stations(place: TunnelSpace, spacing: float, margin: float = 0.3) -> Float[np.ndarray, " k"]:
     return np.arange(spacing / 2, place.bore.length - margin, spacing)
 
 
-def _stretches(place: Place, spacing: float) -> list[tuple[float, float]]:
+def _stretches(place: TunnelSpace, spacing: float) -> list[tuple[float, float]]:
     edge = np.append(np.arange(0.0, place.bore.length - spacing / 2, spacing), place.bore.length)
     return list(zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True))
 
 
-def _walkway(place: Place) -> list[Piece]:
+def _walkway(place: TunnelSpace) -> list[Piece]:
     config, pieces = place.config, []
     least = max(config.gauge, place.track.config.sleeper_length / 2 + 0.05)
     foot, top = -place.track.config.protrusion, config.walkway_height
@@ -64,7 +193,7 @@ def _walkway(place: Place) -> list[Piece]:
     return pieces
 
 
-def _cables(place: Place) -> list[Piece]:
+def _cables(place: TunnelSpace) -> list[Piece]:
     config, pieces = place.config, []
     low, high = min(config.tiers) - 0.1, max(config.tiers) + 0.15
     for station in _stations(place, config.bracket_spacing):
@@ -88,7 +217,7 @@ def _cables(place: Place) -> list[Piece]:
     return pieces
 
 
-def _third_rail(place: Place) -> list[Piece]:
+def _third_rail(place: TunnelSpace) -> list[Piece]:
     config, laid, pieces = place.config, place.track.config, []
     middle = -(laid.rail_offset + config.third_rail_offset)
     top = laid.pad_thickness + laid.rail.height + 0.076
@@ -108,7 +237,7 @@ def _third_rail(place: Place) -> list[Piece]:
     return pieces
 
 
-def _plates(place: Place) -> list[Piece]:
+def _plates(place: TunnelSpace) -> list[Piece]:
     pieces = []
     for station in np.arange(place.config.plate_spacing, place.bore.length - 0.5, place.config.plate_spacing):
         if place.barred(station - 0.3, station + 0.3):
@@ -119,7 +248,7 @@ def _plates(place: Place) -> list[Piece]:
     return pieces
 
 
-def _lamps(place: Place) -> list[Piece]:
+def _lamps(place: TunnelSpace) -> list[Piece]:
     pieces, bore = [], place.bore
     crown = np.array([np.interp(np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
     ceiling = bore.position[:, 2] + crown * bore.up[:, 2] - place.track.elevation

@@ -18,35 +18,35 @@ LOW_WALL = 8  # lining and furniture at robots' height alone, a few panels, so t
 _DIGITS = 5
 
 
-def child(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
-    """A new element below `parent`."""
+def add_element(parent: ET.Element, tag: str, **attributes: str) -> ET.Element:
+    """Adds an element below `parent` and returns it."""
     return ET.SubElement(parent, tag, attributes)
 
 
-def numbers(values: ArrayLike) -> str:
-    """Numbers as MJCF writes them, six digits."""
+def format_numbers(values: ArrayLike) -> str:
+    """Formats numbers for MJCF, six digits."""
     return " ".join(f"{value:.6g}" for value in np.ravel(values))
 
 
-def quaternion(rotation: Rotation) -> str:
-    """A rotation as MJCF writes it, real part first."""
-    return numbers(rotation.as_quat()[[3, 0, 1, 2]])
+def format_quaternion(rotation: Rotation) -> str:
+    """Formats a rotation for MJCF, real part first."""
+    return format_numbers(rotation.as_quat()[[3, 0, 1, 2]])
 
 
-def along(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Rotation:
-    """X from start to end, y horizontal to the left."""
+def rotation_along(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Rotation:
+    """Return the rotation with x from start to end and y horizontal to the left."""
     x = (end - start) / np.linalg.norm(end - start)
     y = np.array([-x[1], x[0], 0.0])
     y /= np.linalg.norm(y)
-    return Rotation.from_matrix(np.stack([x, y, cross(x, y)], axis=1))
+    return Rotation.from_matrix(np.stack([x, y, cross_product(x, y)], axis=1))
 
 
-def cross(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """The vector product; NumPy's takes ten times as long for a single pair, and there are ten thousands of boxes."""
+def cross_product(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """Return the vector product of a single pair, ten times as fast as NumPy's."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def box(
+def add_box(
     world: ET.Element,
     name: str,
     half: ArrayLike,
@@ -55,14 +55,14 @@ def box(
     bits: int,
     **attributes: str,
 ) -> None:
-    """A fixed box that bodies touch whose affinity has one of `bits`; half sizes and centre in m."""
-    child(
-        world, "geom", name=name, type="box", size=numbers(half), pos=numbers(centre), quat=quaternion(rotation),
-        contype=str(bits), conaffinity="0", **attributes,
+    """Adds a fixed box that bodies touch whose affinity has one of `bits`; half sizes and centre in m."""
+    add_element(
+        world, "geom", name=name, type="box", size=format_numbers(half), pos=format_numbers(centre),
+        quat=format_quaternion(rotation), contype=str(bits), conaffinity="0", **attributes,
     )  # fmt: skip
 
 
-def mesh_geom(
+def add_mesh(
     asset: ET.Element,
     world: ET.Element,
     folder: Path,
@@ -73,7 +73,7 @@ def mesh_geom(
     coordinates: tuple[Float[np.ndarray, "t 2"], np.ndarray] | None = None,
     reuse: bool = False,
 ) -> None:
-    """A mesh for looks and rays, stored about its own whole-metre origin so that few digits suffice.
+    """Adds a mesh for looks and rays, stored about its own whole-metre origin so that few digits suffice.
 
     Args:
         asset: Where the mesh is declared.
@@ -89,15 +89,15 @@ def mesh_geom(
     origin = np.floor(mesh.vertices.mean(axis=0))
     path = folder / f"{name}.obj"
     if not (reuse and path.exists()):
-        path.write_text(_obj(mesh.vertices - origin, mesh.faces, coordinates))
-    child(asset, "mesh", name=name, file=path.name, inertia="shell")
-    child(
-        world, "geom", name=name, type="mesh", mesh=name, pos=numbers(origin), material=material, group=group,
+        path.write_text(_obj_text(mesh.vertices - origin, mesh.faces, coordinates))
+    add_element(asset, "mesh", name=name, file=path.name, inertia="shell")
+    add_element(
+        world, "geom", name=name, type="mesh", mesh=name, pos=format_numbers(origin), material=material, group=group,
         contype="0", conaffinity="0",
     )  # fmt: skip
 
 
-def _obj(vertices: np.ndarray, faces: np.ndarray, coordinates: tuple[np.ndarray, np.ndarray] | None) -> str:
+def _obj_text(vertices: np.ndarray, faces: np.ndarray, coordinates: tuple[np.ndarray, np.ndarray] | None) -> str:
     lines = [f"v {x:.{_DIGITS}f} {y:.{_DIGITS}f} {z:.{_DIGITS}f}" for x, y, z in vertices.tolist()]
     if coordinates is None:
         return "\n".join(lines + [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]) + "\n"

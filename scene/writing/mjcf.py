@@ -11,14 +11,12 @@ from xml.etree import ElementTree as ET
 import trimesh
 
 from scene.bore import Bore
-from scene.writing import dressing
+from scene.writing.dressing import add_cameras, add_lights, add_materials, add_scout, make_root
 from scene.writing.furnished import Furnished
-from scene.writing.markup import LOW_WALL, SOLID, box, child, mesh_geom
-from scene.writing.mesh import chunks
-from scene.writing.place import FurnitureConfig
+from scene.writing.furniture import FurnitureConfig
+from scene.writing.markup import LOW_WALL, SOLID, add_box, add_element, add_mesh
+from scene.writing.mesh import has_rings, split_lining, split_skin
 from scene.writing.planar import Walls
-from scene.writing.scout import add_scout
-from scene.writing.skin import has_rings, skins
 from scene.writing.track import Track
 from scene.writing.trackgeoms import add_nails, add_slabs, add_track
 from scene.writing.walls import add_low_panels, add_niche, add_patches
@@ -72,9 +70,9 @@ def write_scene(
     """
     meshes = folder / "meshes"
     meshes.mkdir(exist_ok=True)
-    root = dressing.header(name)
-    asset, world = child(root, "asset"), child(root, "worldbody")
-    dressing.materials(asset, meshes, rings=has_rings(bore), reuse=furnished is not None)
+    root = make_root(name)
+    asset, world = add_element(root, "asset"), add_element(root, "worldbody")
+    add_materials(asset, meshes, rings=has_rings(bore), reuse=furnished is not None)
     count = {"sleepers": len(track.sleeper_station), "rails": 0, "pads": 0, "fasteners": 0}
     count["lining_chunks"] = _add_lining(asset, world, meshes, bore, lining, track, config, furnished)
     openings = furnished.openings if furnished else []
@@ -87,8 +85,8 @@ def write_scene(
     count["nails"] = add_nails(asset, world, meshes, bore, config.chunk_length)
     if furnished:
         _add_furniture(world, furnished)
-    count["lights"] = dressing.lights(world, bore, track, config.furniture.lamp_spacing)
-    dressing.cameras(world, bore, track)
+    count["lights"] = add_lights(world, bore, track, config.furniture.lamp_spacing)
+    add_cameras(world, bore, track)
     add_scout(world, bore, track, config.robot_radius, config.lidar_height)
     ET.indent(root)
     path = folder / ("scene_furnished.xml" if furnished else "scene.xml")
@@ -106,15 +104,15 @@ def _add_lining(
     config: SceneConfig,
     furnished: Furnished | None,
 ) -> int:
-    parts = chunks(lining, bore, config.chunk_length)
+    parts = split_lining(lining, bore, config.chunk_length)
     for k, chunk in enumerate(parts):
         first, last = k * config.chunk_length, (k + 1) * config.chunk_length
         own = furnished is not None and any(
             a - _NEAR_NICHE < last and first < b + _NEAR_NICHE for a, b in furnished.niches
         )
-        for part, (mesh, coordinates) in skins(chunk, bore, track.bed).items():
+        for part, (mesh, coordinates) in split_skin(chunk, bore, track.bed).items():
             name = f"{part}_{k:03d}{'_niche' if own else ''}"
-            mesh_geom(
+            add_mesh(
                 asset,
                 world,
                 meshes,
@@ -132,6 +130,6 @@ def _add_furniture(world: ET.Element, furnished: Furnished) -> None:
     for k, piece in enumerate(furnished.pieces):
         bits = SOLID | LOW_WALL if piece.low else SOLID
         name = f"{piece.kind}_{k:05d}"
-        box(world, name, piece.half, piece.centre, piece.rotation, bits, group="1", material=piece.material)
+        add_box(world, name, piece.half, piece.centre, piece.rotation, bits, group="1", material=piece.material)
     for k, corners in enumerate(furnished.niche_corners):
         add_niche(world, f"niche_{k:02d}", corners)

@@ -7,10 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import Manifold, Mesh64
 
-from scene.axis import Axis, with_frames
-from scene.bore import Bore
+from scene.bore import Axis, Bore, make_axis
 from scene.errors import FitError
-from scene.writing.skin import has_rings
+from scene.writing.mesh import has_rings
 
 SCHEMA = "subterra.tunnel/1"
 _SAME_JOINT = 0.4  # m: less than a ring is wide
@@ -35,7 +34,7 @@ class Walls:
 
 
 def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], height: float) -> Walls:
-    """The walls where a surface `height` above the track meets the solid.
+    """Cuts the solid by a surface `height` above the track.
 
     The solid is levelled first (each vertex lowered by the track's elevation at its station), so that the cut follows
     the grade.
@@ -59,7 +58,7 @@ def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], h
     if not polygons:
         raise FitError(f"no wall {height:g} m above the track: the bore is not that high there")
     outline = max(polygons, key=_area)
-    plan = flat(axis)
+    plan = flatten_axis(axis)
     along, across, _ = plan.local(np.column_stack([outline, np.zeros(len(outline))]))
     left, right = across > 0, across <= 0
     if left.sum() < 2 or right.sum() < 2:
@@ -78,17 +77,17 @@ def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], h
     )
 
 
-def flat(axis: Axis) -> Axis:
-    """The axis in plan, at its own stations."""
+def flatten_axis(axis: Axis) -> Axis:
+    """Return the axis in plan, at its own stations."""
     tangent = axis.tangent * [1.0, 1.0, 0.0]
-    return with_frames(
+    return make_axis(
         axis.station, axis.position * [1.0, 1.0, 0.0], tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
     )
 
 
 def half_widths(walls: Walls, bore: Bore) -> Float[np.ndarray, " n"]:
-    """Half the distance of the walls at each station, m."""
-    plan = flat(bore.axis)
+    """Return half the distance of the walls at each station, m."""
+    plan = flatten_axis(bore.axis)
 
     def across(wall: np.ndarray, station: np.ndarray) -> np.ndarray:
         return np.interp(bore.station, station, plan.local(np.column_stack([wall, np.zeros(len(wall))]))[1])
@@ -97,7 +96,7 @@ def half_widths(walls: Walls, bore: Bore) -> Float[np.ndarray, " n"]:
 
 
 def ring_pitch(bore: Bore) -> float:
-    """Distance from ring joint to ring joint, m; 0 where there are none.
+    """Return the distance from ring joint to ring joint, m; 0 where there are none.
 
     A ring survey may have only some of its rings; the joints are then those that the laid nails bridge.
     """
@@ -108,7 +107,7 @@ def ring_pitch(bore: Bore) -> float:
     return float(np.median(np.diff(joints))) if len(joints) > 1 else 0.0
 
 
-def save(
+def save_tunnel(
     path: Path,
     name: str,
     provenance: str,
@@ -122,7 +121,7 @@ def save(
 
     `furniture` holds, by variant, segments beside the walls; none where a variant is not named.
     """
-    plan = flat(bore.axis)
+    plan = flatten_axis(bore.axis)
     fields: dict[str, np.ndarray] = {
         "schema": np.array(SCHEMA),
         "name": np.array(name),

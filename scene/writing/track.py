@@ -91,7 +91,7 @@ class Track:
     raised: bool
 
 
-def lay(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None) -> Track:
+def lay_track(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None) -> Track:
     """Lays the track on the flat floor, or on a bed just wide enough where the bore is round.
 
     Args:
@@ -153,7 +153,7 @@ def _lowest_chord(bore: Bore, half_width: float) -> np.ndarray:
 
 
 def wall_offset(bore: Bore, level: Float[np.ndarray, " n"], side: int) -> Float[np.ndarray, " n"]:
-    """From the axis to the wall, m, `level` m above the axis at each station, to the left for `side` 1, else the right.
+    """Return the distance from the axis to the wall, m, `level` m above the axis at each station.
 
     0 where the bore is not that high.
     """
@@ -166,7 +166,7 @@ def wall_offset(bore: Bore, level: Float[np.ndarray, " n"], side: int) -> Float[
 
 
 def _clearance(bore: Bore, elevation: np.ndarray, station: np.ndarray) -> np.ndarray:
-    """From the axis to the nearer wall at the height of the track, at each station, m."""
+    """Distance from the axis to the nearer wall at the height of the track, at each station, m."""
     level = elevation - bore.position[:, 2]
     nearer = np.minimum(wall_offset(bore, level, 1), wall_offset(bore, level, -1))
     return nearer[np.clip(np.rint(station / bore.station[1]).astype(int), 0, len(bore.station) - 1)]

@@ -1,4 +1,4 @@
-"""The track and what carries it as geoms: bed, deck, sleepers, rails, fastenings, nails."""
+"""The track as meshes and geoms: bed, deck, sleepers, rails, fastenings, nails."""
 
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -8,11 +8,120 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from scene.axis import Axis
-from scene.bore import Bore
-from scene.writing import trackmesh
-from scene.writing.markup import DECK, GROUND, SOLID, along, box, child, mesh_geom, numbers, quaternion
-from scene.writing.track import Track
+from scene.bore import Axis, Bore
+from scene.writing.markup import (
+    DECK,
+    GROUND,
+    SOLID,
+    add_box,
+    add_element,
+    add_mesh,
+    format_numbers,
+    format_quaternion,
+    rotation_along,
+)
+from scene.writing.track import RailProfile, Track, TrackConfig
+from scene.writing.unrolled import wall_points
+
+# Engineering defaults, not sourced: plan size of a pad; cast shoulder; a clip of 20 mm bar, e-shaped from above, from
+# its leg in the shoulder to its toe on the rail's foot, as x along the rail, y away from the foot's edge, z above it.
+_PAD = (0.18, 0.15)
+_SHOULDER, _SHOULDER_AT = (0.07, 0.055, 0.045), 0.045
+_CLIP_BAR = 0.020
+_CLIP = 0.001 * np.array(
+    [
+        (-50, 45, 12),
+        (35, 45, 12),
+        (58, 36, 16),
+        (62, 15, 24),
+        (45, -4, 30),
+        (10, -14, 26),
+        (-12, -16, 14),
+        (-38, -14, 10),
+    ]
+)
+_BAR_SIDES = 6
+_BOLT_SIDES = 6
+
+
+def sleeper_mesh(config: TrackConfig) -> trimesh.Trimesh:
+    """Return a monoblock sleeper about the middle of its top, long axis along y, m; convex."""
+    y, z = config.sleeper_length / 2, config.sleeper_height
+    top, bottom = config.sleeper_top / 2, config.sleeper_bottom / 2
+    corners = [(x, s * y, 0.0) for x in (-top, top) for s in (-1, 1)]
+    corners += [(x, s * y, -z) for x in (-bottom, bottom) for s in (-1, 1)]
+    return trimesh.convex.convex_hull(np.array(corners))
+
+
+def rail_boxes(profile: RailProfile) -> list[tuple[float, float, float]]:
+    """Return foot, web and head of a rail as width, lower and upper edge above its foot, m."""
+    neck = profile.height - profile.head_height
+    return [
+        (profile.foot_width, 0.0, profile.foot_height),
+        (profile.web_width, profile.foot_height, neck),
+        (profile.head_width, neck, profile.height),
+    ]
+
+
+def fastening_mesh(config: TrackConfig) -> trimesh.Trimesh:
+    """Return the pads, shoulders and clips of one sleeper, about the middle of its top, m."""
+    parts = []
+    for side in (1, -1):
+        pad = trimesh.creation.box((*_PAD, config.pad_thickness))
+        parts.append(pad.apply_translation((0, side * config.rail_offset, config.pad_thickness / 2)))
+        for edge in (1, -1):
+            foot = side * config.rail_offset + edge * config.rail.foot_width / 2
+            shoulder = trimesh.creation.box(_SHOULDER)
+            parts.append(shoulder.apply_translation((0, foot + edge * _SHOULDER_AT, _SHOULDER[2] / 2)))
+            path = _CLIP * [edge, edge, 1.0] + [0.0, foot, config.pad_thickness + config.rail.foot_height]
+            parts.append(_bent_bar(path, _CLIP_BAR / 2))
+    return _merge_meshes(parts)
+
+
+def _bent_bar(path: Float[np.ndarray, "k 3"], radius: float) -> trimesh.Trimesh:
+    """Return a round bar bent along a path, closed at both ends, m."""
+    along = np.gradient(path, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    aside = np.cross(along, [0.0, 0.0, 1.0])
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    turn = np.arange(_BAR_SIDES) * 2 * np.pi / _BAR_SIDES
+    ring = np.cos(turn)[:, None] * aside[:, None] + np.sin(turn)[:, None] * np.cross(aside, along)[:, None]
+    vertex = np.concatenate([(path[:, None] + radius * ring).reshape(-1, 3), path[[0, -1]]])
+    corner = np.arange(len(path) * _BAR_SIDES).reshape(len(path), _BAR_SIDES)
+    after = np.roll(corner, -1, axis=1)
+    a, b, c, d = (part.ravel() for part in (corner[:-1], after[:-1], corner[1:], after[1:]))
+    first, last = np.full(_BAR_SIDES, len(vertex) - 2), np.full(_BAR_SIDES, len(vertex) - 1)
+    ends = [(first, after[0], corner[0]), (last, corner[-1], after[-1])]
+    faces = np.concatenate([np.column_stack(part) for part in [(a, b, c), (b, d, c), *ends]])
+    bar = trimesh.Trimesh(vertex, faces, process=False)
+    if bar.volume < 0:
+        bar.invert()
+    return bar
+
+
+def nail_mesh(bore: Bore, start: float, end: float) -> trimesh.Trimesh | None:
+    """Return the bolts between two stations, m, as prisms behind the wall, for looks; `None` without any."""
+    chosen = bore.nail[(bore.nail["station"] >= start) & (bore.nail["station"] < end)]
+    if not len(chosen):
+        return None
+    at = bore.axis.at(chosen["station"])
+    wall, parts = wall_points(bore, chosen["station"], chosen["angle"]), []
+    for k, nail in enumerate(chosen):
+        outward = np.cos(nail["angle"]) * at.lateral[k] + np.sin(nail["angle"]) * at.up[k]
+        frame = np.eye(4)
+        frame[:3, 2], frame[:3, 0] = at.tangent[k], outward
+        frame[:3, 1] = np.cross(frame[:3, 2], frame[:3, 0])
+        frame[:3, 3] = wall[k] + nail["depth"] * outward
+        bolt = trimesh.creation.cylinder(nail["diameter"] / 2, nail["length"], sections=_BOLT_SIDES)
+        parts.append(bolt.apply_transform(frame))
+    return _merge_meshes(parts)
+
+
+def _merge_meshes(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
+    return trimesh.Trimesh(np.concatenate([p.vertices for p in parts]), np.concatenate(faces), process=False)
+
 
 _SLAB_THICKNESS = 0.20
 _SLAB_LENGTH = 4.0
@@ -20,7 +129,7 @@ _RAIL_LENGTH = 3.0
 
 
 def add_slabs(world: ET.Element, bore: Bore, track: Track) -> None:
-    """The bed (seen only where it is a slab above the lining) and the deck, in straight pieces along the grade."""
+    """Adds the bed (visible where it is a slab) and the deck, in straight pieces along the grade."""
     axis = bore.axis
     station = np.linspace(0.0, bore.length, max(int(np.ceil(bore.length / _SLAB_LENGTH)), 1) + 1)
     at = axis.at(station)
@@ -30,29 +139,34 @@ def add_slabs(world: ET.Element, bore: Bore, track: Track) -> None:
         top[:, 2] = np.interp(station, bore.station, level)
         seen = {"group": "0", "material": "ballast"} if name == "bed" and track.raised else {"group": "3"}
         for k in range(len(station) - 1):
-            rotation = along(top[k], top[k + 1])
+            rotation = rotation_along(top[k], top[k + 1])
             middle = (top[k] + top[k + 1]) / 2 - rotation.apply([0, 0, _SLAB_THICKNESS / 2])
             half_size = np.array([np.linalg.norm(top[k + 1] - top[k]) / 2 + 0.02, half, _SLAB_THICKNESS / 2])
-            box(world, f"{name}_{k:03d}", half_size, middle, rotation, bits, **seen)
+            add_box(world, f"{name}_{k:03d}", half_size, middle, rotation, bits, **seen)
 
 
 def add_track(asset: ET.Element, world: ET.Element, meshes: Path, axis: Axis, track: Track) -> None:
-    """Sleepers, with what fastens the rails to them, and rails."""
-    for name, mesh in (("sleeper", trackmesh.sleeper(track.config)), ("fastening", trackmesh.fastening(track.config))):
+    """Adds sleepers, their fastenings, and rails."""
+    for name, mesh in (("sleeper", sleeper_mesh(track.config)), ("fastening", fastening_mesh(track.config))):
         text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=5, header=None)
         (meshes / f"{name}.obj").write_text(text)
-        child(asset, "mesh", name=name, file=f"{name}.obj", **({} if name == "sleeper" else {"inertia": "shell"}))
+        add_element(asset, "mesh", name=name, file=f"{name}.obj", **({} if name == "sleeper" else {"inertia": "shell"}))
     at = axis.at(track.sleeper_station)
     for k, z in enumerate(np.interp(track.sleeper_station, axis.station, track.elevation)):
         frame = Rotation.from_matrix(
             np.stack([at.tangent[k], at.lateral[k], np.cross(at.tangent[k], at.lateral[k])], axis=1)
         )
-        place = {"pos": numbers([*at.position[k, :2], z]), "quat": quaternion(frame), "conaffinity": "0", "group": "1"}
-        child(
+        place = {
+            "pos": format_numbers([*at.position[k, :2], z]),
+            "quat": format_quaternion(frame),
+            "conaffinity": "0",
+            "group": "1",
+        }
+        add_element(
             world, "geom", name=f"sleeper_{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
             contype=str(SOLID | GROUND), **place,
         )  # fmt: skip
-        child(
+        add_element(
             world, "geom", name=f"fastening_{k:04d}", type="mesh", mesh="fastening", material="bolt", contype="0",
             **place,
         )  # fmt: skip
@@ -60,22 +174,22 @@ def add_track(asset: ET.Element, world: ET.Element, meshes: Path, axis: Axis, tr
 
 
 def add_nails(asset: ET.Element, world: ET.Element, meshes: Path, bore: Bore, chunk: float) -> int:
-    """The bolts that bridge pockets, for looks; returns how many there are."""
+    """Adds the bolts that bridge pockets, for looks; returns how many there are."""
     edges = chunk_edges(bore.length, chunk)
     for k in range(len(edges) - 1):
-        merged = trackmesh.nails(bore, edges[k], edges[k + 1])
+        merged = nail_mesh(bore, edges[k], edges[k + 1])
         if merged is not None:
-            mesh_geom(asset, world, meshes, f"nails_{k:03d}", merged, "bolt", group="1")
+            add_mesh(asset, world, meshes, f"nails_{k:03d}", merged, "bolt", group="1")
     return len(bore.nail)
 
 
 def chunk_edges(length: float, chunk: float) -> Float[np.ndarray, " k"]:
-    """Stations from 0 to the length, `chunk` m apart, the last a little beyond."""
+    """Return stations from 0 to the length, `chunk` m apart, the last a little beyond."""
     return np.append(np.arange(0.0, length - 1e-6, chunk), length + 1e-6)
 
 
 def _add_rails(world: ET.Element, axis: Axis, track: Track) -> None:
-    """Rails as boxes, foot, web and head, over stretches short enough for the curve."""
+    """Adds rails as boxes (foot, web, head) over stretches short enough for the curve."""
     config = track.config
     station = np.linspace(0.0, axis.length, max(int(np.ceil(axis.length / _RAIL_LENGTH)), 1) + 1)
     at = axis.at(station)
@@ -84,13 +198,11 @@ def _add_rails(world: ET.Element, axis: Axis, track: Track) -> None:
         foot = at.position + side * config.rail_offset * at.lateral
         foot[:, 2] = base
         for k in range(len(station) - 1):
-            rotation = along(foot[k], foot[k + 1])
+            rotation = rotation_along(foot[k], foot[k + 1])
             half = float(np.linalg.norm(foot[k + 1] - foot[k])) / 2
-            for part, (width, low, high) in zip(
-                ("foot", "web", "head"), trackmesh.rail_boxes(config.rail), strict=True
-            ):
+            for part, (width, low, high) in zip(("foot", "web", "head"), rail_boxes(config.rail), strict=True):
                 middle = (foot[k] + foot[k + 1]) / 2 + rotation.apply([0, 0, (low + high) / 2])
                 material = "rail_head" if part == "head" else "steel"
                 size = (half, width / 2, (high - low) / 2)
                 name_part = f"rail_{name}_{k:03d}_{part}"
-                box(world, name_part, size, middle, rotation, SOLID | GROUND, group="1", material=material)
+                add_box(world, name_part, size, middle, rotation, SOLID | GROUND, group="1", material=material)

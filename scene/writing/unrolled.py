@@ -1,9 +1,4 @@
-"""The wall rolled out flat: points a grid apart that keep clear of recesses, and their Delaunay triangles.
-
-In the plane of arc length around the section and station along the axis a recess is a rectangle. Because no other point
-comes near its rim, Delaunay's triangulation holds the rim's edges, so that recesses need no Boolean operation, which
-would leave slivers.
-"""
+"""The wall rolled out flat, with its recesses, as triangles."""
 
 from dataclasses import dataclass
 
@@ -12,6 +7,61 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import Delaunay
 
 from scene.bore import Bore
+
+_LID_OVERLAP = 0.05  # how far a box reaches into the air, so that a union leaves no film
+
+
+def wall_points(
+    bore: Bore, station: Float[np.ndarray, " k"], angle: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k 3"]:
+    """Return points of the smooth wall, bilinear between the sections' points, m."""
+    n, m = bore.radius.shape
+    row = np.clip(station / (bore.station[1] - bore.station[0]), 0, n - 1)
+    column = (angle - bore.angle[0]) / (2 * np.pi) * m
+    r, c = np.minimum(row.astype(int), n - 2), np.floor(column).astype(int)
+    along, across = (row - r)[:, None], (column - c)[:, None]
+    c, d = c % m, (c + 1) % m
+    near = _point(bore, r, c) * (1 - across) + _point(bore, r, d) * across
+    far = _point(bore, r + 1, c) * (1 - across) + _point(bore, r + 1, d) * across
+    return near * (1 - along) + far * along
+
+
+def _point(bore: Bore, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    radius, angle = bore.radius[row, column, None], bore.angle[column, None]
+    return bore.position[row] + radius * (np.cos(angle) * bore.lateral[row] + np.sin(angle) * bore.up[row])
+
+
+def wall_normals(bore: Bore, pocket: Int[np.ndarray, " r"]) -> Float[np.ndarray, "r 3"]:
+    """Return outward unit normals of the wall at some pockets, over an arc of about 5°."""
+    m = len(bore.angle)
+    row = np.rint(bore.pocket["station"][pocket] / (bore.station[1] - bore.station[0])).astype(int)
+    row = np.clip(row, 0, len(bore.station) - 1)
+    turn = (bore.pocket["angle"][pocket] - bore.angle[0]) / (2 * np.pi) * m
+    column, reach = np.rint(turn).astype(int), max(1, m // 144)
+    normal = np.cross(
+        _point(bore, row, (column + reach) % m) - _point(bore, row, (column - reach) % m), bore.tangent[row]
+    )
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
+def recess_boxes(bore: Bore, pocket: Int[np.ndarray, " r"]) -> list[Float[np.ndarray, "8 3"]]:
+    """Return corners of some pockets as boxes square to the wall they are sunk into, m."""
+    rows = bore.pocket[pocket]
+    centre, outward = wall_points(bore, rows["station"], rows["angle"]), wall_normals(bore, pocket)
+    around = np.cross(outward, bore.axis.at(rows["station"]).tangent)
+    along = np.cross(around, outward)
+    return [
+        np.array(
+            [
+                centre[k] + i * rows["length"][k] / 2 * along[k] + j * rows["width"][k] / 2 * around[k] + d * outward[k]
+                for i in (-1, 1)
+                for j in (-1, 1)
+                for d in (-_LID_OVERLAP, float(rows["depth"][k]))
+            ]
+        )
+        for k in range(len(rows))
+    ]
+
 
 ALONG, AROUND = 0.18, 0.2  # of the grid, m
 _BAND = 0.6 * AROUND  # no grid point is this near a rim or a corner of the section, m
@@ -37,11 +87,11 @@ class Unrolled:
         return float(self.around[-1])
 
     def to_angle(self, around: np.ndarray) -> np.ndarray:
-        """Angle at an arc length, rad."""
+        """Return the angle at an arc length, rad."""
         return np.interp(around, self.around, self.angle)
 
     def to_around(self, angle: np.ndarray) -> np.ndarray:
-        """Arc length at any angle, m, in one turn from the seam."""
+        """Return the arc length at any angle, m, in one turn from the seam."""
         turn = (np.asarray(angle) - self.angle[0]) % (2 * np.pi)
         return np.interp(turn + self.angle[0], self.angle, self.around)
 
@@ -65,8 +115,8 @@ class Sheet:
     faces: Int[np.ndarray, "f 3"]
 
 
-def unroll(bore: Bore) -> Unrolled:
-    """The mean section's arc length, its seam in the widest gap between recesses, at the floor where there are none."""
+def unroll_section(bore: Bore) -> Unrolled:
+    """Return the mean section's arc length; the seam is in the widest gap between recesses, else at the floor."""
     taken = np.sort(bore.pocket["angle"] % (2 * np.pi))
     gap = np.diff(np.append(taken, taken[0] + 2 * np.pi)) if len(taken) else np.empty(0)
     seam = taken[np.argmax(gap)] + gap.max() / 2 if len(taken) else 1.5 * np.pi
@@ -81,8 +131,8 @@ def unroll(bore: Bore) -> Unrolled:
     return Unrolled(around, angle)
 
 
-def corners(bore: Bore) -> Float[np.ndarray, " c"]:
-    """Angles at which the mean section has a corner, rad: where floor and wall of a horseshoe meet, say."""
+def section_corners(bore: Bore) -> Float[np.ndarray, " c"]:
+    """Return the angles at which the mean section has a corner, rad, such as a horseshoe's feet."""
     radius = bore.radius.mean(axis=0)
     outline = radius[:, None] * np.column_stack([np.cos(bore.angle), np.sin(bore.angle)])
     edge = np.roll(outline, -2, axis=0) - outline
@@ -95,7 +145,7 @@ def corners(bore: Bore) -> Float[np.ndarray, " c"]:
 def triangulate(
     plane: Unrolled, length: float, fold: Float[np.ndarray, " c"], boxes: Float[np.ndarray, "r 4"]
 ) -> Sheet:
-    """Triangles over one turn and the whole length.
+    """Triangulates one turn over the whole length.
 
     Args:
         plane: The section's arc length.
@@ -120,7 +170,7 @@ def triangulate(
 
 
 def _grid(girth: float, length: float, fold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of points in order of station, every second one half a step aside, and a point of each row on every fold."""
+    """Points in rows by station, every second row half a step aside, with a point of each row on every fold."""
     columns, rows = max(round(girth / AROUND), 8), max(round(length / ALONG), 2)
     step = girth / columns
     station = np.linspace(0.0, length, rows + 1)
@@ -143,7 +193,7 @@ def _rim(box: Float[np.ndarray, "4"]) -> Float[np.ndarray, "k 2"]:
 
 
 def _delaunay(u: np.ndarray, s: np.ndarray, girth: float) -> Int[np.ndarray, "f 3"]:
-    """Delaunay's triangles of points on a cylinder: of the plane with a strip repeated at either side."""
+    """Delaunay's triangles of points on a cylinder, from the plane with a strip repeated at either side."""
     low, high = np.flatnonzero(u < _PAD), np.flatnonzero(u > girth - _PAD)
     source = np.concatenate([np.arange(len(u)), low, high])
     shift = np.concatenate([np.zeros(len(u)), np.full(len(low), girth), np.full(len(high), -girth)])

@@ -10,9 +10,9 @@ import trimesh
 
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
 from benchmarks.rays.agreement import Agreement
-from scene.writing.geometry import write_geometry
+from scene.output import write_geometry
 from scene.writing.mjcf import SceneConfig
-from scene.writing.track import TrackConfig, lay
+from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.surface import read_mesh, read_scene
 from tests.scene.conftest import arc_bore
@@ -26,7 +26,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rays") / "scene"
     folder.mkdir()
     bore = arc_bore()
-    write_geometry(folder, "arc", "simulated", bore, lay(bore, TrackConfig()), SceneConfig())
+    write_geometry(folder, "arc", "simulated", bore, lay_track(bore, TrackConfig()), SceneConfig())
     return folder
 
 

@@ -3,23 +3,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scene.axis import through
-from scene.bore import POCKET, STATION_STEP, Bore
-from scene.fitting import assemble, profile
+from scene.bore import POCKET, STATION_STEP, Bore, axis_through
+from scene.fitting.assemble import measure_extents
+from scene.fitting.profile import N_ANGLES, section_angles
 
 
 def arc_bore(length: float = 24.0, radius: float = 60.0, grade: float = 0.01, half_width: float = 2.8) -> Bore:
     """A D-section with exact corners on an arc, with a pair of pockets on each wall every 3 m at LiDAR height."""
     turn = np.linspace(0, length / radius, 40)
     points = np.stack([radius * np.sin(turn), radius * (1 - np.cos(turn)), grade * radius * turn + 3.2], axis=1)
-    axis = through(points, STATION_STEP)
-    angle = profile.angles() + np.pi / profile.N_ANGLES
+    axis = axis_through(points, STATION_STEP)
+    angle = section_angles() + np.pi / N_ANGLES
     with np.errstate(divide="ignore"):
         wall = np.where(np.sin(angle) > 0, half_width, half_width / np.abs(np.cos(angle)))
         floor = np.where(np.sin(angle) < 0, 3.2 / np.abs(np.sin(angle)), np.inf)
     section = np.minimum(wall, floor)
     n = len(axis.station)
-    width, height = assemble.measured_extents(angle, section[None])
+    width, height = measure_extents(angle, section[None])
     bore = Bore(
         axis.station, axis.position, axis.tangent, axis.lateral, axis.up, np.repeat(width, n), np.repeat(height, n),
         angle, np.repeat(section[None], n, axis=0), np.zeros(n), np.ones(n), np.zeros(n, bool), np.empty(0),

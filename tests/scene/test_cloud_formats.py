@@ -3,9 +3,9 @@ import pytest
 
 from scene.errors import RecordingError
 from scene.reading.cloudfile import read_cloud
-from scene.reading.columns import find_xyz, plain
-from scene.reading.config import ReadingConfig
-from scene.reading.frame import choose
+from scene.reading.formats import ReadingConfig
+from scene.reading.source import choose_frame
+from scene.reading.tables import find_xyz, plain_name
 from tests.scene.files import CLOUDS, write_e57, write_parquet, write_text, write_xlsx
 
 # No two coordinates nearer than the formats round, so that points can be put in order.
@@ -67,10 +67,10 @@ def test_columns_are_found_by_name_in_any_order(tmp_path):
 
 
 def test_names_give_their_unit():
-    assert plain("EASTING (M.)") == ("easting", "m")
-    assert plain("//X [mm]") == ("x", "mm")
-    assert plain("z_mm") == ("z", "mm")
-    assert plain("m") == ("m", None)
+    assert plain_name("EASTING (M.)") == ("easting", "m")
+    assert plain_name("//X [mm]") == ("x", "mm")
+    assert plain_name("z_mm") == ("z", "mm")
+    assert plain_name("m") == ("m", None)
     assert find_xyz(["t", "x (mm)", "y (mm)", "z (mm)"]) == ([1, 2, 3], "mm")
     with pytest.raises(ValueError, match="differ in unit"):
         find_xyz(["x (mm)", "y (m)", "z (mm)"])
@@ -90,23 +90,23 @@ def test_a_flag_comes_before_a_declaration_and_a_declaration_before_detection(tm
 
 
 def test_axes_are_taken_in_the_order_that_the_flag_gives():
-    frame = choose(NONE, None, "m", "-yxz")
+    frame = choose_frame(NONE, None, "m", "-yxz")
     np.testing.assert_array_equal(frame.apply(np.array([[1.0, 2, 3]])), [[-2, 1, 3]])
     assert "mirrored" not in frame.facts["axes"]
-    assert "mirrored" in choose(NONE, None, "m", "xzy").facts["axes"]
+    assert "mirrored" in choose_frame(NONE, None, "m", "xzy").facts["axes"]
 
 
 def test_a_cloud_that_lies_along_z_is_turned_and_says_so():
     along_z = POINTS[:, [1, 2, 0]]
-    frame = choose(along_z, None, None, None)
+    frame = choose_frame(along_z, None, None, None)
     assert "y is taken as up" in frame.facts["axes"]
     np.testing.assert_allclose(frame.apply(along_z), np.column_stack([POINTS[:, 1], -POINTS[:, 0], POINTS[:, 2]]))
-    assert choose(along_z, None, None, "xyz").facts["axes"] == "xyz (by flag)"
+    assert choose_frame(along_z, None, None, "xyz").facts["axes"] == "xyz (by flag)"
 
 
 def test_a_long_climbing_tunnel_in_metres_is_not_taken_for_millimetres():
     climb = np.random.default_rng(0).uniform(0, 1, (500, 1)) * [5000, 3000, 150] + POINTS
-    assert choose(climb, None, None, None).unit == "m"
+    assert choose_frame(climb, None, None, None).unit == "m"
 
 
 @pytest.mark.parametrize(

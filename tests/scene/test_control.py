@@ -3,7 +3,7 @@ import pytest
 
 from scene.errors import RecordingError
 from scene.poses.calibration import PRESETS, find_calibration
-from scene.poses.control import load_control
+from scene.poses.trajectory import load_control
 from tests.scene.test_trajectory import write
 
 

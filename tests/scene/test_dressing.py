@@ -4,15 +4,19 @@ import mujoco
 import numpy as np
 import pytest
 
-from scene.writing import dressing, mesh, mjcf, planar, skin, texture, track
+from scene.writing import mjcf
+from scene.writing.dressing import LIT, ballast_picture, concrete_picture, write_png
+from scene.writing.mesh import as_trimesh, build_solid, has_rings, open_lining, split_skin
+from scene.writing.planar import cut_walls
+from scene.writing.track import TrackConfig, lay_track
 
 
 @pytest.fixture(scope="module")
 def written(bore, tmp_path_factory):
     folder = tmp_path_factory.mktemp("dressing")
-    laid, solid = track.lay(bore, track.TrackConfig()), mesh.build_solid(bore, pockets=True)
-    lining = mesh.open_lining(mesh.as_trimesh(solid), bore)
-    walls = planar.cut_walls(solid, bore, laid.elevation, 0.7)
+    laid, solid = lay_track(bore, TrackConfig()), build_solid(bore, pockets=True)
+    lining = open_lining(as_trimesh(solid), bore)
+    walls = cut_walls(solid, bore, laid.elevation, 0.7)
     mjcf.write_scene(folder, "x", bore, lining, walls, laid, mjcf.SceneConfig())
     return laid, lining, mujoco.MjModel.from_xml_path(str(folder / "scene.xml"))
 
@@ -21,19 +25,19 @@ def test_a_picture_is_read_back_as_it_was_written(tmp_path):
     from PIL import Image
 
     picture = np.random.default_rng(0).integers(0, 256, (7, 5, 3), dtype=np.uint8)
-    texture.write_png(tmp_path / "a.png", picture)
+    write_png(tmp_path / "a.png", picture)
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), picture)
 
 
 def test_joints_are_dark_lines_where_there_are_rings_and_only_there():
-    with_rings, without = (texture.concrete(rings, 128, 512).astype(float).mean(axis=(1, 2)) for rings in (True, False))
+    with_rings, without = (concrete_picture(rings, 128, 512).astype(float).mean(axis=(1, 2)) for rings in (True, False))
     assert np.argsort(with_rings)[:2].tolist() in ([0, 64], [64, 0], [0, 127], [0, 1])
     assert with_rings.min() < with_rings.mean() - 20
     assert without.min() > without.mean() - 15
 
 
 def test_pictures_repeat_at_their_edges():
-    for picture in (texture.concrete(False, 128, 512), texture.ballast(128)):
+    for picture in (concrete_picture(False, 128, 512), ballast_picture(128)):
         grey = picture.astype(float).mean(axis=2)
         inside = np.abs(np.diff(grey, axis=0)).mean()
         assert np.abs(grey[0] - grey[-1]).mean() < 2 * inside
@@ -42,7 +46,7 @@ def test_pictures_repeat_at_their_edges():
 def test_no_more_lamps_are_on_than_are_drawn(written):
     model = written[2]
     assert model.nlight == 2
-    assert 0 < model.light_active.sum() <= dressing.LIT
+    assert 0 < model.light_active.sum() <= LIT
 
 
 def test_the_cameras_stand_inside_the_bore(bore, written):
@@ -57,7 +61,7 @@ def test_the_cameras_stand_inside_the_bore(bore, written):
 
 def test_skins_hold_every_face_once_and_the_floor_is_the_floor(bore, written):
     laid, lining, _ = written
-    parts = skin.skins(lining, bore, laid.bed)
+    parts = split_skin(lining, bore, laid.bed)
     assert set(parts) == {"lining", "recess", "floor"}
     assert sum(len(part.faces) for part, _ in parts.values()) == len(lining.faces)
     floor = parts["floor"][0]
@@ -67,7 +71,7 @@ def test_skins_hold_every_face_once_and_the_floor_is_the_floor(bore, written):
 
 def test_texture_coordinates_run_once_around_without_a_jump_inside_a_face(bore, written):
     laid, lining, _ = written
-    texture_at, corner = skin.skins(lining, bore, laid.bed)["lining"][1]
+    texture_at, corner = split_skin(lining, bore, laid.bed)["lining"][1]
     assert np.ptp(texture_at[corner], axis=1).max() < 0.3
     assert np.ptp(texture_at[corner][..., 0]) == pytest.approx(1.0, abs=0.05)
 
@@ -75,6 +79,6 @@ def test_texture_coordinates_run_once_around_without_a_jump_inside_a_face(bore, 
 def test_stations_of_surveyed_rings_are_no_joints(bore):
     from dataclasses import replace
 
-    assert skin.has_rings(replace(bore, ring_station=np.arange(1.0, 20.0, 1.5)))
-    assert not skin.has_rings(replace(bore, ring_station=np.arange(1.0, 24.0, 5.0)))
-    assert not skin.has_rings(replace(bore, ring_station=np.empty(0)))
+    assert has_rings(replace(bore, ring_station=np.arange(1.0, 20.0, 1.5)))
+    assert not has_rings(replace(bore, ring_station=np.arange(1.0, 24.0, 5.0)))
+    assert not has_rings(replace(bore, ring_station=np.empty(0)))

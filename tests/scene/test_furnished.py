@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from scene.writing import geometry, track
+from scene.output import write_geometry
 from scene.writing.furnished import furnish_bore, planar_segments
-from scene.writing.furniture import counts
+from scene.writing.furniture import FurnitureConfig, count_pieces
 from scene.writing.mjcf import SceneConfig
-from scene.writing.place import FurnitureConfig
+from scene.writing.track import TrackConfig, lay_track
 from tests.scene.conftest import arc_bore
 
 WITH_DOOR = FurnitureConfig(passage_spacing=20.0, plate_spacing=6.0)
@@ -24,14 +24,14 @@ def level():
 
 @pytest.fixture(scope="module")
 def laid(level):
-    return track.lay(level, track.TrackConfig())
+    return lay_track(level, TrackConfig())
 
 
 @pytest.fixture(scope="module")
 def written(level, laid, tmp_path_factory):
     folder = tmp_path_factory.mktemp("furnished")
     config = SceneConfig(furniture=WITH_DOOR)
-    return folder, *geometry.write_geometry(folder, "x", "simulated", level, laid, config)
+    return folder, *write_geometry(folder, "x", "simulated", level, laid, config)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +72,7 @@ def test_every_kind_can_be_left_out(level, laid):
     assert not nothing.niches
     assert not len(planar_segments(nothing.pieces, level, laid.elevation, 0.7))
     only_cables = furnish_bore(level, laid, replace(none, cables=True))
-    assert set(counts(only_cables.pieces)) == {"bracket", "bracket_arm", "cable"}
+    assert set(count_pieces(only_cables.pieces)) == {"bracket", "bracket_arm", "cable"}
 
 
 def test_nothing_enters_the_robots_gauge(level, laid):
@@ -86,8 +86,8 @@ def test_nothing_enters_the_robots_gauge(level, laid):
 
 def test_walkway_and_third_rail_are_left_out_where_the_bore_is_too_narrow():
     narrow = arc_bore(half_width=1.7, radius=300.0)
-    laid = track.lay(narrow, track.TrackConfig(shoulder=0.2))
-    kinds = counts(furnish_bore(narrow, laid, FurnitureConfig()).pieces)
+    laid = lay_track(narrow, TrackConfig(shoulder=0.2))
+    kinds = count_pieces(furnish_bore(narrow, laid, FurnitureConfig()).pieces)
     assert "walkway" not in kinds
     assert "handrail_post" not in kinds
     assert "bracket" in kinds

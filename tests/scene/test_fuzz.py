@@ -14,14 +14,13 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from scene.errors import FitError, RecordingError
-from scene.fitting import rings
+from scene.fitting.rings import fit_rings
 from scene.poses.calibration import load_calibration
-from scene.poses.control import load_control
 from scene.poses.imu import read_inertial
-from scene.poses.trajectory import load_tum
+from scene.poses.trajectory import load_control, load_tum
 from scene.reading.cloudfile import read_cloud
 from scene.reading.recording import Recording
-from scene.reading.ringsurvey import read_survey
+from scene.reading.ringsurvey import read_ring_survey
 from tests.scene.bags import write_bag, write_imu_bag
 from tests.scene.files import CLOUDS, RING_HEADER, ring_rows, write_las, write_xlsx
 from tests.scene.messages import LIVOX2, OUSTER, POINTCLOUD2, livox_cdr, pointcloud2, write_bag1, write_bag2, write_mcap
@@ -106,7 +105,7 @@ def read_recording(path: Path) -> None:
 
 
 def read_rings(path: Path) -> None:
-    fit = rings.fit_rings(read_survey(path))
+    fit = fit_rings(read_ring_survey(path))
     assert np.isfinite(fit.radius).all()
     assert np.isfinite(fit.centre).all()
 

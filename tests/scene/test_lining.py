@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from scene.bore import Bore, load
+from scene.bore import Bore, load_bore
 from scene.cloud import Cloud
-from scene.fitting import assemble, lining
+from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
-from scene.fitting.lining import LiningConfig
+from scene.fitting.lining import LiningConfig, add_lining
 from scene.fitting.section import fit_sections
 from tests.scene.shapes import swept
 from tests.scene.test_irregular_walls import Irregular
@@ -44,7 +44,7 @@ def built(points: np.ndarray, config: LiningConfig | None = None) -> tuple[Bore,
     cloud = thin(points)
     axis = fit_centreline(cloud.points, CentrelineConfig(), cloud.origin)
     sections = fit_sections(cloud, axis)
-    return *lining.add_features(assemble.from_sections(axis, sections), sections, cloud, config), cloud
+    return *add_lining(bore_from_sections(axis, sections), sections, cloud, config), cloud
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_a_wall_seen_too_thinly_gets_the_standard_lining_marked_so(tmp_path):
     assert (bore.pocket["depth"] == 0.13).all()
     np.testing.assert_allclose(np.diff(bore.ring_station), 1.5)
     bore.save(tmp_path / "bore.npz")
-    np.testing.assert_array_equal(load(tmp_path / "bore.npz").nail, bore.nail)
+    np.testing.assert_array_equal(load_bore(tmp_path / "bore.npz").nail, bore.nail)
 
 
 def test_the_standard_lining_can_be_left_out_and_chosen():

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scene.cli import progress_bar
 from scene.errors import RecordingError
 from scene.reconstruct import ReconstructConfig, reconstruct
 from tests.scene.bags import write_bag, write_tum
@@ -32,7 +33,6 @@ def control_rows(start: float) -> np.ndarray:
 
 
 def test_control_of_another_day_is_refused_before_any_odometry(bag, tmp_path):
-    from scene.cli import progress_bar
 
     control = write_tum(tmp_path / "prism.tum", control_rows(0.0))
     with pytest.raises(RecordingError, match=r"prism\.tum: control runs from 0\.00 to 11\.70 s, but .*a\.bag from 100"):
@@ -40,7 +40,6 @@ def test_control_of_another_day_is_refused_before_any_odometry(bag, tmp_path):
 
 
 def test_control_and_a_trajectory_together_are_refused(bag, tmp_path):
-    from scene.cli import progress_bar
 
     control = write_tum(tmp_path / "prism.tum", control_rows(100.0))
     with pytest.raises(RecordingError, match=r"prism\.tum: control is for a recording without a trajectory"):

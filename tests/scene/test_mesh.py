@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from scene.writing import mesh
+from scene.writing.mesh import as_trimesh, build_solid, open_lining, split_lining
 
 
 @pytest.fixture(scope="module")
 def solid(bore):
-    return mesh.as_trimesh(mesh.build_solid(bore, pockets=True))
+    return as_trimesh(build_solid(bore, pockets=True))
 
 
 def test_the_solid_is_watertight_and_wound_outwards(solid):
@@ -15,7 +15,7 @@ def test_the_solid_is_watertight_and_wound_outwards(solid):
 
 
 def test_its_volume_is_the_area_of_the_section_times_the_length_and_the_pockets(bore, solid):
-    smooth = mesh.as_trimesh(mesh.build_solid(bore, pockets=False))
+    smooth = as_trimesh(build_solid(bore, pockets=False))
     x, y = bore.radius[0] * np.cos(bore.angle), bore.radius[0] * np.sin(bore.angle)
     area = 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
     assert smooth.volume == pytest.approx(area * bore.length, rel=2e-3)
@@ -24,7 +24,7 @@ def test_its_volume_is_the_area_of_the_section_times_the_length_and_the_pockets(
 
 
 def test_the_lining_is_open_at_both_mouths_and_faces_the_axis(bore, solid):
-    lining = mesh.open_lining(solid, bore)
+    lining = open_lining(solid, bore)
     for end in (0, -1):
         flush = np.abs((lining.triangles_center - bore.position[end]) @ bore.tangent[end]) < 1e-3
         assert not flush.any()
@@ -48,8 +48,8 @@ def test_a_ray_into_a_pocket_goes_13_cm_further(bore, solid):
 
 
 def test_chunks_hold_every_face_once(bore, solid):
-    lining = mesh.open_lining(solid, bore)
-    parts = mesh.chunks(lining, bore, 5.0)
+    lining = open_lining(solid, bore)
+    parts = split_lining(lining, bore, 5.0)
     assert len(parts) > 3
     assert sum(len(part.faces) for part in parts) == len(lining.faces)
     assert sum(part.area for part in parts) == pytest.approx(lining.area)

@@ -7,7 +7,7 @@ import pytest
 
 from scene.bore import Bore
 from scene.errors import FitError
-from scene.fitting import assemble
+from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from tests.scene.shapes import PLACE, Box, Tube, cavity, placed
@@ -27,7 +27,7 @@ JUNCTIONS = {
 def fitted(points: np.ndarray) -> Bore:
     cloud = thin(points)
     axis = fit_centreline(cloud.points, CentrelineConfig(), cloud.origin)
-    return assemble.from_sections(axis, fit_sections(cloud, axis))
+    return bore_from_sections(axis, fit_sections(cloud, axis))
 
 
 @pytest.mark.parametrize("name", JUNCTIONS)

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from scene.bore import Bore
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError
-from scene.fitting import assemble
+from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from tests.scene.clouds import KnownBore, curved_d_bore
@@ -22,7 +22,7 @@ def thin(points: np.ndarray) -> Cloud:
 def rebuilt(points: np.ndarray) -> tuple[Bore, Cloud]:
     cloud = thin(points)
     axis = fit_centreline(cloud.points, CentrelineConfig())
-    return assemble.from_sections(axis, fit_sections(cloud, axis)), cloud
+    return bore_from_sections(axis, fit_sections(cloud, axis)), cloud
 
 
 def offsets(bore: Bore, cloud: Cloud, known: KnownBore) -> tuple[np.ndarray, np.ndarray]:

@@ -18,15 +18,13 @@ from scene.cli import progress_bar
 from scene.cloud import VoxelMean
 from scene.errors import OutputError
 from scene.files import replace_folder
-from scene.inputs import input_record, key_of
-from scene.poses.odometry import estimate_odometry
-from scene.poses.odometrylog import OdometryLog
-from scene.poses.registration import register
+from scene.poses.odometry import OdometryLog, estimate_odometry
+from scene.poses.registration import register_scans
 from scene.poses.trajectory import Trajectory
 from scene.reading.cloudfile import read_cloud
-from scene.reading.config import ReadingConfig
+from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
-from scene.resume import Partial, beside
+from scene.resume import Partial, input_record, partial_folder, resume_key
 from tests.scene.bags import write_bag
 from tests.scene.clouds import curved_d_bore
 
@@ -97,12 +95,12 @@ def test_a_registration_that_is_killed_ends_on_the_same_bits(bag, tmp_path, caps
     with Recording(bag) as recording:
         poses = estimate_odometry(recording, None, stage(), OdometryLog(Partial(None), "o")).trajectory
         poses = Trajectory(times, *poses.at(times), "poses")
-        whole, uncovered = register(recording, poses, 0.02, stage())
+        whole, uncovered = register_scans(recording, poses, 0.02, stage())
         kept = partial(tmp_path / "kept")
         with pytest.raises(Killed):
-            register(recording, poses, 0.02, stage(45), partial=kept)
+            register_scans(recording, poses, 0.02, stage(45), partial=kept)
         kept.close()
-        again, uncovered_again = register(recording, poses, 0.02, stage(), partial=partial(tmp_path / "kept"))
+        again, uncovered_again = register_scans(recording, poses, 0.02, stage(), partial=partial(tmp_path / "kept"))
     assert "Resumed at 72 % of scans" in capsys.readouterr().out
     assert (again.returns, uncovered_again) == (whole.returns, uncovered)
     assert uncovered == 3
@@ -158,9 +156,9 @@ def test_the_key_follows_inputs_and_settings(tmp_path):
     (tmp_path / "a").write_bytes(b"1")
     (tmp_path / "b").write_bytes(b"1")
     one = input_record([tmp_path / "a"])
-    keys = {key_of(record, value) for record in (one, input_record([tmp_path / "b"])) for value in (0.04, 0.05)}
+    keys = {resume_key(record, value) for record in (one, input_record([tmp_path / "b"])) for value in (0.04, 0.05)}
     assert len(keys) == 4
-    assert key_of(one, 0.04) in keys
+    assert resume_key(one, 0.04) in keys
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
@@ -250,7 +248,7 @@ def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(cl
     build.send_signal(signal.SIGKILL)
     assert build.wait() == -signal.SIGKILL
     assert (out / "scene.xml").read_text() == "mine"
-    assert beside(out).exists()
+    assert partial_folder(out).exists()
 
     full = start(cloud_file, "--out", out, limit=100_000)  # bytes a file
     said, error = full.communicate(timeout=120)
@@ -268,7 +266,7 @@ def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(cl
 def test_a_build_that_is_killed_in_its_odometry_goes_on_and_leaves_nothing_behind(bag, tmp_path):
     out = tmp_path / "scene"
     build = start(bag, "--out", out, "--keep-every", "0")
-    while build.poll() is None and not list(beside(out).glob("odometry-first-*.npz")):
+    while build.poll() is None and not list(partial_folder(out).glob("odometry-first-*.npz")):
         time.sleep(0.005)
     os.kill(build.pid, signal.SIGKILL)
     build.communicate()
@@ -276,4 +274,4 @@ def test_a_build_that_is_killed_in_its_odometry_goes_on_and_leaves_nothing_behin
     said, _ = again.communicate(timeout=120)
     assert "of LiDAR odometry, first pass" in said
     assert again.returncode in (0, 2)  # a walk of 6 m may or may not pass for a tunnel
-    assert not beside(out).exists()
+    assert not partial_folder(out).exists()

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from scene.errors import FitError, RecordingError
-from scene.fitting import rings
-from scene.reading.detect import detect
-from scene.reading.ringsurvey import read_survey
+from scene.fitting.rings import compare_with_design, fit_rings
+from scene.reading.formats import detect
+from scene.reading.ringsurvey import read_ring_survey
 from tests.scene.files import RING_HEADER, ring_rows, write_xlsx
 from tests.shared import SHARED
 
@@ -12,18 +12,18 @@ WATER = SHARED / "data" / "water_tunnel_asbuilt"
 
 
 def fitted(path, **options):
-    return rings.fit_rings(read_survey(path, **options))
+    return fit_rings(read_ring_survey(path, **options))
 
 
 def test_a_workbook_with_rings_and_design_axis_is_found_and_read(tmp_path):
     design = [(k, 9000 + 0.5 * k, 990 + 0.5 * k, 500.1, 9.8) for k in range(200)]
     path = write_xlsx(tmp_path / "s.xlsx", ring_rows(offset=0.04), design)
     found = detect(tmp_path)
-    assert (found.path, found.format) == (path, "rings")
-    survey = read_survey(path)
-    fit = rings.fit_rings(survey)
+    assert (found.path, found.format.name) == (path, "rings")
+    survey = read_ring_survey(path)
+    fit = fit_rings(survey)
     np.testing.assert_allclose(fit.radius, 1.7, atol=1e-6)  # targets stood 4 cm inside the wall
-    where = rings.against_design(fit, survey.design)
+    where = compare_with_design(fit, survey.design)
     assert where["chainage_first"] == pytest.approx(9010.0, abs=1e-3)
     assert where["right_of_design_mean"] == pytest.approx(0.1, abs=1e-3)
     assert where["above_design_mean"] == pytest.approx(0.2, abs=1e-3)
@@ -54,7 +54,7 @@ def test_a_bad_row_of_a_workbook_is_named_by_sheet_and_row(tmp_path):
     for value in ("n/a", None, float("nan")):
         path = write_xlsx(tmp_path / "s.xlsx", [*rows[:5], changed(rows[5], n=value), *rows[6:]])
         with pytest.raises(RecordingError, match=r"s\.xlsx: sheet 'Survey' row 7 is not a ring point"):
-            read_survey(path)
+            read_ring_survey(path)
 
 
 @pytest.mark.parametrize(
@@ -73,11 +73,11 @@ def test_a_gap_a_turn_or_a_repeated_ring_is_named(tmp_path, edit, cause):
 
 @pytest.mark.skipif(not WATER.is_dir(), reason="the water tunnel's survey is not here")
 def test_the_real_water_tunnel_has_its_published_diameter_and_lies_on_its_design_axis():
-    survey = read_survey(detect(WATER).path)
-    fit = rings.fit_rings(survey)
+    survey = read_ring_survey(detect(WATER).path)
+    fit = fit_rings(survey)
     assert len(fit.names) == 46
     assert 2 * fit.radius.mean() == pytest.approx(3.396, abs=0.015)
     assert fit.radius.std() < 0.003, "rings measured with and without a target must agree"
-    where = rings.against_design(fit, survey.design)
+    where = compare_with_design(fit, survey.design)
     assert where["chainage_last"] - where["chainage_first"] == pytest.approx(211.05, abs=0.1)
     assert abs(where["above_design_mean"]) < 0.02

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from scene.errors import FitError, RecordingError
-from scene.fitting import rings
-from scene.reading.detect import detect
-from scene.reading.ringsurvey import read_survey
+from scene.fitting.rings import bore_from_rings, fit_rings
+from scene.reading.formats import detect
+from scene.reading.ringsurvey import read_ring_survey
 from tests.shared import METRO, needs_metro
 
 COLUMNS = ("POINT", "EASTING", "NORTHING", "ELEVATION")
@@ -23,10 +23,10 @@ def survey_text(radius: float = 2.9, count: int = 12, per_ring: int = 8) -> str:
 
 def test_circles_are_recovered(tmp_path):
     (tmp_path / "s.csv").write_text(survey_text())
-    fit = rings.fit_rings(read_survey(detect(tmp_path).path))
+    fit = fit_rings(read_ring_survey(detect(tmp_path).path))
     np.testing.assert_allclose(fit.radius, 2.9, atol=2e-4)
     np.testing.assert_allclose(fit.centre, [[1000 + 1.5 * k, 500, 10] for k in range(12)], atol=2e-4)
-    bore = rings.bore_from_rings(fit, np.array([1000.0, 500, 10]))
+    bore = bore_from_rings(fit, np.array([1000.0, 500, 10]))
     assert bore.length == pytest.approx(16.5, abs=1e-3)
     np.testing.assert_allclose(bore.ring_station, 1.5 * np.arange(12), atol=1e-3)
 
@@ -34,13 +34,13 @@ def test_circles_are_recovered(tmp_path):
 def test_one_gross_outlier_does_not_move_a_ring(tmp_path):
     text = survey_text().replace("3.1,1004.5000,502.9000", "3.1,1004.5000,503.3000")
     (tmp_path / "s.csv").write_text(text)
-    fit = rings.fit_rings(read_survey(tmp_path / "s.csv"))
+    fit = fit_rings(read_ring_survey(tmp_path / "s.csv"))
     assert np.linalg.norm(fit.centre[3] - [1004.5, 500, 10]) < 0.02
 
 
 def test_point_ten_of_a_ring_is_not_point_one(tmp_path):
     (tmp_path / "s.csv").write_text(survey_text(per_ring=10))
-    survey = read_survey(tmp_path / "s.csv")
+    survey = read_ring_survey(tmp_path / "s.csv")
     assert len(survey.names) == 12
     assert all(len(points) == 10 for points in survey.points)
 
@@ -60,7 +60,7 @@ def test_point_ten_of_a_ring_is_not_point_one(tmp_path):
 def test_a_bad_survey_is_refused_by_name_and_cause(tmp_path, text, error, cause):
     (tmp_path / "s.csv").write_text(text)
     with pytest.raises(error, match=rf"s\.csv: .*{cause}"):
-        rings.fit_rings(read_survey(tmp_path / "s.csv"))
+        fit_rings(read_ring_survey(tmp_path / "s.csv"))
 
 
 def test_a_folder_without_a_survey_is_refused(tmp_path):
@@ -71,10 +71,10 @@ def test_a_folder_without_a_survey_is_refused(tmp_path):
 @needs_metro
 def test_the_real_metro_has_its_published_length_radius_and_centres():
     """Against the best-fit circles that the survey's author published."""
-    fit = rings.fit_rings(read_survey(detect(METRO).path))
+    fit = fit_rings(read_ring_survey(detect(METRO).path))
     reference = np.genfromtxt(METRO / "export_best_fit_result.csv", delimiter=",", skip_header=1)
     assert len(fit.names) == 217
     assert fit.radius.mean() == pytest.approx(2.898, abs=0.005)
     assert np.sqrt(np.mean(np.sum((fit.centre - reference[:, 1:4]) ** 2, axis=1))) < 0.02
-    bore = rings.bore_from_rings(fit, np.floor(np.median(fit.centre, axis=0)))
+    bore = bore_from_rings(fit, np.floor(np.median(fit.centre, axis=0)))
     assert bore.length == pytest.approx(1283.7, rel=0.002)

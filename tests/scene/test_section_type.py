@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scene.bore import load
+from scene.bore import load_bore
 from tests.scene.clouds import curved_d_bore
 from tests.scene.shapes import swept
 from tests.scene.test_reconstruction import rebuilt
@@ -47,7 +47,7 @@ def test_curvature_grade_and_types_are_in_the_bore_file(tmp_path):
         np.testing.assert_allclose(sign * data["curvature"][inner], 1 / 150, rtol=0.1)
         np.testing.assert_allclose(sign * data["grade"], 0.01, atol=0.003)
         assert (data["section_type"] == "d").all()
-    again = load(tmp_path / "bore.npz")
+    again = load_bore(tmp_path / "bore.npz")
     np.testing.assert_array_equal(again.confidence, bore.confidence)
     np.testing.assert_array_equal(again.stretch, bore.stretch)
 

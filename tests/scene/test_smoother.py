@@ -3,13 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.errors import FitError
-from scene.poses import chain as chains
-from scene.poses import rotation as so3
-from scene.poses.chain import Chain, Motion
-from scene.poses.leastsquares import NormalEquations
-from scene.poses.problem import Noise, solve_with_heading
-from scene.poses.smoother import inertial_problem, odometry_problem
-from scene.poses.terms import Sightings, Steps
+from scene.poses.smoother import Noise, inertial_problem, odometry_problem, solve_with_heading
+from scene.poses.terms import KNOT_SIZE, Chain, Motion, NormalEquations, Sightings, Steps, add_motion, invert_rotations
 from tests.scene import walks
 
 DURATION = 24.0
@@ -78,7 +73,7 @@ def terms():
     rng = np.random.default_rng(2)
     ends = np.arange(3), np.arange(1, 4)
     chain = small_chain()
-    turn = so3.inverse(chain.attitude[:-1]) @ chain.attitude[1:]
+    turn = invert_rotations(chain.attitude[:-1]) @ chain.attitude[1:]
     unit = np.broadcast_to(np.eye(3), (3, 3, 3))
     motion = Motion(
         rng.standard_normal((3, 3)) * 0.1, rng.standard_normal((3, 3)) + np.array([0, 0, 9.8]), 1.0, 1.0, True
@@ -86,7 +81,7 @@ def terms():
     seen = Sightings(np.array([0, 1, 2]), np.array([0.0, 0.5, 0.9]), chain.position[:3], walks.LEVER, 1.0)
     steps = Steps(*ends, turn, rng.standard_normal((3, 3)), unit, unit)
     return {
-        "motion": lambda sink, at: chains.add_motion(sink, at, motion, 1.0),
+        "motion": lambda sink, at: add_motion(sink, at, motion, 1.0),
         "sightings": lambda sink, at: seen.add_to(sink, at, 1e9),
         "steps": lambda sink, at: steps.add_to(sink, at, 1e9),
     }
@@ -97,10 +92,10 @@ def test_written_out_derivatives_agree_with_finite_differences(name):
     add, chain, h = terms()[name], small_chain(), 1e-6
     here, moved = Recorder(), Recorder()
     add(here, chain)
-    for unknown in range(chains.SIZE):
+    for unknown in range(KNOT_SIZE):
         for which, jacobian in zip((here.first, here.second), here.jacobians, strict=True):
             for term, knot in enumerate(which):
-                step = np.zeros((4, chains.SIZE))
+                step = np.zeros((4, KNOT_SIZE))
                 step[knot, unknown] = h
                 add(moved, chain.moved(step))
                 slope = (moved.residual[term] - here.residual[term]) / h

@@ -5,15 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scene.survey import echo
 from scene.survey.__main__ import main
-from scene.survey.cast import Caster, Hits
+from scene.survey.cast import PULSE, Caster, Hits, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors
-from scene.survey.lidar import Lidar
+from scene.survey.lidar import Lidar, os1, vlp16
 from scene.survey.mesh import Mesh, Part
-from scene.survey.os1 import os1
 from scene.survey.rack import IMUS
-from scene.survey.vlp16 import vlp16
 
 NEAR, FAR = 5.0, 5.3  # m: two walls across the x axis, with an edge at y = 0
 
@@ -43,7 +40,7 @@ def mix(share: float, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reported and true distances along x of beams at `y`, m."""
     caster, lidar = two_walls(), os1()
     origin, ray, seen = looked(caster, y)
-    distance = echo.mixed(np.random.default_rng(3), lidar, share, caster, origin, ray, seen)
+    distance = mix_pixels(np.random.default_rng(3), lidar, share, caster, origin, ray, seen)
     return distance * ray[:, 0], seen.distance * ray[:, 0]
 
 
@@ -74,22 +71,22 @@ def test_surfaces_further_apart_than_a_pulse_do_not_mix() -> None:
     back = origin + np.array([0.0, -20.0, 0.0])
     ray = np.array([NEAR, 20.0 + 1e-6, 0.0]) / np.hypot(NEAR, 20.0) + 0 * ray
     seen = caster.cast_loaded(back, ray)
-    reported = echo.mixed(np.random.default_rng(0), os1(), 1.0, caster, back, ray, seen)
+    reported = mix_pixels(np.random.default_rng(0), os1(), 1.0, caster, back, ray, seen)
     np.testing.assert_array_equal(reported, seen.distance)
-    assert (FAR - NEAR) / NEAR * np.hypot(NEAR, 20.0) > echo.PULSE
+    assert (FAR - NEAR) / NEAR * np.hypot(NEAR, 20.0) > PULSE
 
 
 def test_range_noise_grows_with_range_and_incidence() -> None:
     def sigma(distance: float, cosine: float) -> float:
         one = [np.array([v], np.float32) for v in (distance, cosine)]
-        return float(echo.noise_sigma(SensorErrors(), *one)[0])
+        return float(noise_sigma(SensorErrors(), *one)[0])
 
     assert sigma(0.0, 1.0) == pytest.approx(0.019)
     assert sigma(50.0, 1.0) == pytest.approx(np.hypot(0.019, 0.005))
     assert sigma(0.0, np.sqrt(0.5)) == pytest.approx(np.hypot(0.019, 0.002))
     # The tangent stops at 10.
     assert sigma(0.0, 0.01) == sigma(0.0, 0.05) == pytest.approx(np.hypot(0.019, 0.02))
-    assert echo.noise_sigma(SensorErrors(), np.full(1, np.inf, np.float32), np.zeros(1, np.float32))[0] < 0.03
+    assert noise_sigma(SensorErrors(), np.full(1, np.inf, np.float32), np.zeros(1, np.float32))[0] < 0.03
 
 
 @pytest.mark.parametrize("lidar", [vlp16(), os1()], ids=lambda lidar: lidar.name)
@@ -97,7 +94,7 @@ def test_echoes_too_weak_are_lost_and_can_be_kept(lidar: Lidar) -> None:
     rng, n = np.random.default_rng(0), 4000
 
     def share(errors: SensorErrors, distance: float, cosine: float) -> float:
-        return echo.returned(rng, lidar, errors, hits(distance, cosine, n)).mean()
+        return draw_returns(rng, lidar, errors, hits(distance, cosine, n)).mean()
 
     given = SensorErrors()
     assert share(given, 5.0, 0.8) > 0.99

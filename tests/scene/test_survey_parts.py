@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene.survey import avia, echo
 from scene.survey.__main__ import main
-from scene.survey.alignment import lay_out
+from scene.survey.alignment import draw_railway, lay_out
 from scene.survey.bore import draw_bore
-from scene.survey.cast import Hits
+from scene.survey.cast import Hits, draw_returns
 from scene.survey.config import SensorErrors
-from scene.survey.field import draw_field
+from scene.survey.lidar import AVIA_POINT_RATE, avia, avia_directions, avia_point_times
 from scene.survey.mesh import Part
-from scene.survey.plan import draw_railway
+from scene.survey.section import draw_field
 
 SURVEY = Path(__file__).parents[2] / "scene" / "survey"
 
@@ -61,8 +60,8 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path, capsys: pytest
 
 
 def rosette(begin: float, duration: float) -> np.ndarray:
-    time = begin + np.arange(round(duration * avia.POINT_RATE)) / avia.POINT_RATE
-    return avia.directions(time, np.array([0.3, 1.1]))
+    time = begin + np.arange(round(duration * AVIA_POINT_RATE)) / AVIA_POINT_RATE
+    return avia_directions(time, np.array([0.3, 1.1]))
 
 
 def angles(ray: np.ndarray) -> np.ndarray:
@@ -86,7 +85,7 @@ def test_the_pattern_does_not_repeat() -> None:
 
 
 def test_points_are_timed_within_their_message() -> None:
-    offset = avia.point_times(240_000)
+    offset = avia_point_times(240_000)
     assert (len(offset), offset[0], offset[-1]) == (24_000, 0, 99_995_833)
     assert (np.diff(offset) >= 0).all()
 
@@ -97,7 +96,7 @@ def test_far_and_grazing_pulses_are_lost() -> None:
     def share(distance: float, cosine: float) -> float:
         full = [np.full(4000, v, np.float32) for v in (distance, cosine)]
         hits = Hits(*full, np.full(4000, Part.LINING, np.uint8), np.zeros((4000, 3), np.float32))
-        return echo.returned(rng, avia.avia(), SensorErrors(), hits).mean()
+        return draw_returns(rng, avia(), SensorErrors(), hits).mean()
 
     assert share(5.0, 0.5) > 0.99
     assert share(40.0, 2.8 / 40.0) > 0.9

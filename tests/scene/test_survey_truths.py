@@ -10,12 +10,11 @@ import trimesh
 from plyfile import PlyData
 
 from scene.survey.__main__ import main
-from scene.survey.alignment import lay_out
+from scene.survey.alignment import draw_s_bend, lay_out, metro_elements
 from scene.survey.bore import draw_bore
 from scene.survey.config import TruthName
 from scene.survey.furniture import draw_furniture
 from scene.survey.mesh import Part
-from scene.survey.plan import draw_s_bend, metro
 from tests.scene.surveyed import Cast, frames, load_cast
 from tests.shared import METRO, needs_metro
 
@@ -181,7 +180,7 @@ def test_the_metro_alignment_follows_the_real_ring_centres() -> None:
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1))]) - 820.0
     window = (station >= 0.0) & (station <= 351.0)
     rng = np.random.default_rng(0)
-    curve = lay_out(rng, 351.0, metro(rng, 351.0)).frames(station[window]).position
+    curve = lay_out(rng, 351.0, metro_elements(rng, 351.0)).frames(station[window]).position
     centres = centres[window]
     # The frame's heading and origin are drawn: the best rigid motion in plan, and a shift in height.
     plan, real = (p[:, 0] + 1j * p[:, 1] - (p[:, 0] + 1j * p[:, 1]).mean() for p in (curve, centres))

@@ -6,22 +6,26 @@ import pytest
 
 from scene.bore import NAIL
 from scene.errors import FitError
-from scene.writing import mesh, mjcf, planar, track, trackmesh
+from scene.writing import mjcf
+from scene.writing.mesh import as_trimesh, build_solid, open_lining
+from scene.writing.planar import cut_walls
+from scene.writing.track import TrackConfig, lay_track
+from scene.writing.trackgeoms import fastening_mesh, nail_mesh
 from tests.scene.conftest import arc_bore
 
 
 def test_sleepers_stand_every_60_cm_from_end_to_end():
-    assert len(track.lay(arc_bore(length=60.0), track.TrackConfig()).sleeper_station) == 101
+    assert len(lay_track(arc_bore(length=60.0), TrackConfig()).sleeper_station) == 101
 
 
 @pytest.fixture(scope="module")
 def written(bore, tmp_path_factory):
     """The scene of the bore: its track, its counts and its file."""
     folder = tmp_path_factory.mktemp("track")
-    laid = track.lay(bore, track.TrackConfig())
-    solid = mesh.build_solid(bore, pockets=False)
-    walls = planar.cut_walls(solid, bore, laid.elevation, 0.7)
-    lining = mesh.open_lining(mesh.as_trimesh(solid), bore)
+    laid = lay_track(bore, TrackConfig())
+    solid = build_solid(bore, pockets=False)
+    walls = cut_walls(solid, bore, laid.elevation, 0.7)
+    lining = open_lining(as_trimesh(solid), bore)
     return laid, mjcf.write_scene(folder, "x", bore, lining, walls, laid, mjcf.SceneConfig()), folder / "scene.xml"
 
 
@@ -40,7 +44,7 @@ def test_the_gauge_is_between_the_inner_faces_of_the_heads(bore, written):
 
 
 def test_the_bed_is_the_flat_floor_and_sleepers_stand_out_of_it(bore):
-    laid = track.lay(bore, track.TrackConfig())
+    laid = lay_track(bore, TrackConfig())
     floor = bore.position[:, 2] - 3.2 * bore.up[:, 2]
     np.testing.assert_allclose(laid.bed, floor, atol=0.02)
     np.testing.assert_allclose(laid.elevation - laid.bed, 0.06)
@@ -51,7 +55,7 @@ def test_the_bed_is_the_flat_floor_and_sleepers_stand_out_of_it(bore):
 def test_in_a_round_bore_the_track_lies_on_a_slab_just_wide_enough(bore):
     n = len(bore.station)
     round_bore = replace(bore, radius=np.full((n, 360), 2.9), width=np.full(n, 5.8), height=np.full(n, 5.8))
-    laid = track.lay(round_bore, track.TrackConfig())
+    laid = lay_track(round_bore, TrackConfig())
     assert laid.raised
     np.testing.assert_allclose(bore.position[:, 2] - laid.bed, np.sqrt(2.9**2 - 1.6**2), atol=0.03)
 
@@ -59,12 +63,12 @@ def test_in_a_round_bore_the_track_lies_on_a_slab_just_wide_enough(bore):
 def test_a_bore_too_low_for_a_track_gets_none(bore):
     n = len(bore.station)
     pipe = replace(bore, radius=np.full((n, 360), 1.2), width=np.full(n, 2.4), height=np.full(n, 2.4))
-    assert not len(track.lay(pipe, track.TrackConfig()).sleeper_station)
+    assert not len(lay_track(pipe, TrackConfig()).sleeper_station)
 
 
 def test_a_sleeper_too_near_the_wall_is_an_error_with_its_place():
     with pytest.raises(FitError, match=r"the sleeper at .* m comes within"):
-        track.lay(arc_bore(half_width=1.3), track.TrackConfig(shoulder=0.0))
+        lay_track(arc_bore(half_width=1.3), TrackConfig(shoulder=0.0))
 
 
 def test_the_scene_file_names_every_sleeper_and_both_rails(written):
@@ -75,8 +79,8 @@ def test_the_scene_file_names_every_sleeper_and_both_rails(written):
 
 
 def test_each_sleeper_has_two_pads_and_four_clips_on_the_rails_feet():
-    config = track.TrackConfig()
-    parts = trackmesh.fastening(config).split(only_watertight=True)
+    config = TrackConfig()
+    parts = fastening_mesh(config).split(only_watertight=True)
     pads = [part for part in parts if np.ptp(part.bounds[:, 2]) == pytest.approx(config.pad_thickness)]
     clips = [part for part in parts if len(part.vertices) > 8]
     assert (len(pads), len(clips), len(parts)) == (2, 4, 10)
@@ -88,14 +92,14 @@ def test_each_sleeper_has_two_pads_and_four_clips_on_the_rails_feet():
 
 
 def test_nails_bridge_the_joint_behind_the_wall(bore, tmp_path):
-    assert trackmesh.nails(bore, 0.0, bore.length) is None
+    assert nail_mesh(bore, 0.0, bore.length) is None
     rows = [(4.5, 0.4, 0.30, 0.028, 0.06, 1.0, False), (7.5, 2.0, 0.30, 0.028, 0.06, 1.0, True)]
     nailed = replace(bore, nail=np.array(rows, NAIL))
-    mesh_of_nails = trackmesh.nails(nailed, 0.0, bore.length)
+    mesh_of_nails = nail_mesh(nailed, 0.0, bore.length)
     assert mesh_of_nails.is_volume
     station, lateral, up = nailed.axis.local(mesh_of_nails.vertices)
     first = np.abs(station - 4.5) < 1
     assert np.ptp(station[first]) == pytest.approx(0.30, abs=0.02)  # on its arc
     depth = np.hypot(lateral, up)[first].mean() - np.interp(0.4, bore.angle, bore.radius[0])
     assert depth == pytest.approx(0.06, abs=0.01)
-    assert trackmesh.nails(nailed, 5.0, 7.0) is None
+    assert nail_mesh(nailed, 5.0, 7.0) is None

@@ -8,8 +8,8 @@ import pytest
 
 from scene.errors import RecordingError
 from scene.reading.cloudfile import read_cloud
-from scene.reading.columns import plain
-from scene.reading.config import ReadingConfig
+from scene.reading.formats import ReadingConfig
+from scene.reading.tables import plain_name
 from tests.scene.files import write_las, write_text
 
 POINTS = np.random.default_rng(0).uniform(0, 1, (500, 3)) * [90.0, 20.0, 15.0]
@@ -87,7 +87,7 @@ def test_other_units_are_refused_by_name_unless_a_flag_overrides(tmp_path, name)
      ("Z (usft)", "z", "us-ft"), ("x_m", "x", "m"), ("foot", "foot", None)],
 )  # fmt: skip
 def test_headers_in_feet_are_understood(text, base, unit):
-    assert plain(text) == (base, unit)
+    assert plain_name(text) == (base, unit)
 
 
 def test_a_table_whose_header_says_feet_is_read_in_feet(tmp_path):

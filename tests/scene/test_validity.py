@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from scene.bore import POCKET, Bore
 from scene.errors import FitError
-from scene.writing import mesh
+from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from tests.scene.conftest import arc_bore
 
 
@@ -39,8 +39,8 @@ BORES = {
 @pytest.fixture(scope="module", params=BORES)
 def case(request):
     bore = BORES[request.param]()
-    solid = mesh.as_trimesh(mesh.build_solid(bore, pockets=True))
-    return bore, solid, mesh.open_lining(solid, bore)
+    solid = as_trimesh(build_solid(bore, pockets=True))
+    return bore, solid, open_lining(solid, bore)
 
 
 def section_volume(bore: Bore) -> float:
@@ -107,4 +107,4 @@ def test_the_lining_faces_the_axis(case):
 def test_sections_that_fold_into_each_other_are_an_error_with_their_place():
     bore = arc_bore(length=24.0, radius=60.0)
     with pytest.raises(FitError, match=r"fold into each other at \d"):
-        mesh.build_solid(replace(bore, radius=bore.radius * 25), pockets=False)
+        build_solid(replace(bore, radius=bore.radius * 25), pockets=False)

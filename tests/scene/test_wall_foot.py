@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from shapely import LineString, points
 
-from scene.fitting import assemble, unroll
+from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
+from scene.fitting.unroll import median_smooth
 from tests.scene.shapes import PLACE, outline, swept
 from tests.scene.test_reconstruction import thin
 
@@ -25,7 +26,7 @@ def test_the_corner_of_wall_and_floor_is_not_cut_off(kind):
     section = outline(kind)
     cloud = thin(with_rails(swept(kind, 24.0, yaw=0.0), section[:, 1].min()))
     axis = fit_centreline(cloud.points, CentrelineConfig())
-    bore = assemble.from_sections(axis, fit_sections(cloud, axis))
+    bore = bore_from_sections(axis, fit_sections(cloud, axis))
     surface = bore.surface()[8:-8] + cloud.origin - PLACE
     wall = np.stack([surface[..., 1], surface[..., 2] - 0.01 * surface[..., 0]], axis=-1).reshape(-1, 2)
     true = LineString(section[np.argsort(np.arctan2(*section.T[::-1]))])
@@ -39,4 +40,4 @@ def test_the_corner_of_wall_and_floor_is_not_cut_off(kind):
 
 def test_a_window_of_one_column_smooths_along_alone():
     field = np.tile([[1.0], [1.0], [9.0], [1.0], [1.0]], (1, 4)) + np.arange(4)
-    np.testing.assert_array_equal(unroll.median_smooth(field, (3, 1)), np.ones((5, 4)) + np.arange(4))
+    np.testing.assert_array_equal(median_smooth(field, (3, 1)), np.ones((5, 4)) + np.arange(4))

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene.writing import mesh, mjcf, planar, track
+from scene.writing import mjcf
+from scene.writing.mesh import as_trimesh, build_solid, open_lining
+from scene.writing.planar import cut_walls
+from scene.writing.track import TrackConfig, lay_track
 from tests.scene.conftest import arc_bore
 from tests.scene.test_validity import irregular
 
@@ -46,10 +49,10 @@ class Probe:
 def built(request, tmp_path_factory):
     bore = request.param
     folder = tmp_path_factory.mktemp("walls")
-    laid = track.lay(replace(bore, radius=arc_bore().radius[:1].repeat(len(bore.station), axis=0)), track.TrackConfig())
-    solid = mesh.build_solid(bore, pockets=True)
-    walls = planar.cut_walls(mesh.build_solid(bore, pockets=False), bore, laid.elevation, 0.7)
-    lining = mesh.open_lining(mesh.as_trimesh(solid), bore)
+    laid = lay_track(replace(bore, radius=arc_bore().radius[:1].repeat(len(bore.station), axis=0)), TrackConfig())
+    solid = build_solid(bore, pockets=True)
+    walls = cut_walls(build_solid(bore, pockets=False), bore, laid.elevation, 0.7)
+    lining = open_lining(as_trimesh(solid), bore)
     mjcf.write_scene(folder, "x", bore, lining, walls, laid, mjcf.SceneConfig())
     return bore, lining, Probe(folder / "scene.xml")
 

@@ -5,10 +5,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scene.poses.control import Control
 from scene.poses.imu import GRAVITY, Inertial
 from scene.poses.odometry import Odometry
-from scene.poses.trajectory import Trajectory
+from scene.poses.trajectory import Control, Trajectory
 
 LEVER = np.array([0.1, -0.3, 0.35])
 

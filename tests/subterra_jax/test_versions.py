@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from scene import bore
+from scene.bore import load_bore
 from scene.errors import RecordingError as SceneError
 from subterra_jax import policies
 from subterra_jax.lidar3d.surface import read_axis
@@ -83,7 +83,7 @@ def test_a_bore_of_another_version_says_what_to_do(tmp_path):
     with pytest.raises(st.TunnelError, match=r"written by an older .* `python -m scene\.build`"):
         read_axis(tmp_path / "bore.npz")
     with pytest.raises(SceneError, match=r"another version of Subterra wrote it; .* `python -m scene\.build`"):
-        bore.load(tmp_path / "bore.npz")
+        load_bore(tmp_path / "bore.npz")
 
 
 def test_an_archive_that_was_cut_short_is_no_bore_and_no_tunnel(tmp_path):
@@ -94,7 +94,7 @@ def test_an_archive_that_was_cut_short_is_no_bore_and_no_tunnel(tmp_path):
     with pytest.raises(st.TunnelError, match="not a bore file"):
         read_axis(cut)
     with pytest.raises(SceneError, match="not a bore file"):
-        bore.load(cut)
+        load_bore(cut)
 
 
 @pytest.mark.parametrize(("number", "says"), [(0, "older .* `python -m train.release`"), (2, "newer .* --upgrade")])

@@ -13,10 +13,10 @@ from benchmarks.slam import libraries, reading
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.errors import SlamError
 from benchmarks.slam.recordset import SetConfig, planned
+from scene.output import write_geometry
 from scene.poses.trajectory import load_tum
-from scene.writing.geometry import write_geometry
 from scene.writing.mjcf import SceneConfig
-from scene.writing.track import TrackConfig, lay
+from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.lidar3d.surface import read_scene
 from subterra_jax.recorder.sensing import CLOUD_SIGMA
 from tests.benchmarks.slam.tracks import EPOCH, line, write_axis, write_tum
@@ -71,7 +71,7 @@ def made(tmp_path_factory) -> Path:
     scene = folder / "scene"
     scene.mkdir()
     bore = arc_bore()
-    write_geometry(scene, "arc", "simulated", bore, lay(bore, TrackConfig()), SceneConfig())
+    write_geometry(scene, "arc", "simulated", bore, lay_track(bore, TrackConfig()), SceneConfig())
     wanted = ("--tasks", "TraverseShort", "--episodes", "1", "--steps", "30", "--columns", "120", "--beams", "180")
     assert command(["record", "--scene", str(scene), "--out", str(folder / "set"), *wanted]) == 0
     for name in ("wheel-odometry", "kiss-icp", "kiss-icp-planar"):

@@ -1,0 +1,235 @@
+"""The table of input formats: its rows, rows of a user's own, and the search for the format of an input."""
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from scene.errors import RecordingError
+from scene.reading.las_e57 import open_e57, open_las
+from scene.reading.ply_pcd import open_pcd, open_ply
+from scene.reading.ringsurvey import is_ring_survey, read_ring_survey
+from scene.reading.rosbag import RosBag
+from scene.reading.scanfolder import open_folder, scan_files
+from scene.reading.source import cause
+from scene.reading.tables import open_parquet, open_table
+
+Kind = Literal["recording", "cloud", "rings"]
+_SHOWN_FACTS = ("format", "topic", "message_type", "times", "point_times", "unit", "axes")
+# Flags without the path of the nested configs before them: `--unit mm`, not `--reconstruct.reading.unit mm`.
+_FLAG = tyro.conf.arg(prefix_name=False)
+
+
+@dataclass(frozen=True)
+class ReadingConfig:
+    """What a user says about an input instead of having it detected.
+
+    Attributes:
+        topic: LiDAR topic of a bag; found by its type where not given.
+        format: Of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.
+        unit: Of a registered cloud's or a ring survey's coordinates: m, mm, ft or us-ft.
+        axes: Of a registered cloud: which of its axes point east, north and up, such as xyz, xzy or -yxz.
+    """
+
+    topic: Annotated[str | None, _FLAG] = None
+    format: Annotated[str | None, _FLAG] = None
+    unit: Annotated[str | None, _FLAG] = None
+    axes: Annotated[str | None, _FLAG] = None
+
+
+@dataclass(frozen=True)
+class Format:
+    """One row of the table.
+
+    Attributes:
+        name: Word for `--format`.
+        label: Name for people.
+        kind: `recording`, `cloud` or `rings`.
+        open: Opens a file: a recording as `(path, topic) -> ScanSource`, a cloud as `path -> CloudSource`, rings as
+            `(path, unit) -> RingSurvey`.
+        suffixes: Endings of file names, lower case.
+        magic: First bytes of a file, at most 64; any of them.
+    """
+
+    name: str
+    label: str
+    kind: Kind
+    open: Callable[..., Any]
+    suffixes: tuple[str, ...] = ()
+    magic: tuple[bytes, ...] = ()
+
+
+_TABLE = (
+    Format("bag", "ROS1 bag", "recording", partial(RosBag, "bag"), (".bag",), (b"#ROSBAG",)),
+    Format("rosbag2", "ROS2 bag", "recording", partial(RosBag, "rosbag2")),
+    Format("mcap", "MCAP file", "recording", partial(RosBag, "mcap"), (".mcap",), (b"\x89MCAP0\r\n",)),
+    Format("db3", "ROS2 bag", "recording", partial(RosBag, "db3"), (".db3",), (b"SQLite format 3\x00",)),
+    Format("scans", "folder of scans", "recording", open_folder),
+    Format("ply", "PLY", "cloud", open_ply, (".ply",), (b"ply\n", b"ply\r")),
+    Format("pcd", "PCD", "cloud", open_pcd, (".pcd",), (b"# .PCD", b"VERSION ")),
+    Format("las", "LAS", "cloud", open_las, (".las", ".laz"), (b"LASF",)),
+    Format("e57", "E57", "cloud", open_e57, (".e57",), (b"ASTM-E57",)),
+    Format("table", "table", "cloud", open_table, (".xyz", ".csv", ".txt", ".asc", ".pts")),
+    Format("parquet", "Parquet", "cloud", open_parquet, (".parquet",), (b"PAR1",)),
+    Format("rings", "ring survey", "rings", read_ring_survey, (".xlsx",)),
+)
+_own: dict[str, Format] = {}
+
+
+@dataclass(frozen=True)
+class Detected:
+    """An input and its format.
+
+    Attributes:
+        path: The file or folder to open; inside the input where that is a folder with one file.
+        format: Row of the table.
+        by: How it was found: `content`, `name` or `flag`.
+    """
+
+    path: Path
+    format: Format
+    by: str
+
+
+def register_reader(
+    name: str,
+    open: Callable[..., Any],
+    *,
+    kind: Kind = "recording",
+    label: str = "",
+    suffixes: tuple[str, ...] = (),
+    magic: tuple[bytes, ...] = (),
+) -> None:
+    """Adds a row to the table of formats; it is tried before those of this package.
+
+    A row of the same name that was added before is replaced.
+
+    Args:
+        name: Word for `--format`.
+        open: Opens a file; see `Format`.
+        kind: `recording` or `cloud`.
+        label: Name for people; `name` where not given.
+        suffixes: Endings of file names, lower case, such as `.zip`.
+        magic: First bytes of a file, at most 64; any of them.
+
+    Raises:
+        ValueError: The name belongs to a format of this package, or the kind is neither of the two.
+    """
+    if name in {row.name for row in _TABLE}:
+        raise ValueError(f"format {name!r} is one of this package; choose another name")
+    if kind not in ("recording", "cloud"):
+        raise ValueError(f"kind must be recording or cloud, got {kind!r}")
+    _own[name] = Format(name, label or name, kind, open, suffixes, magic)
+
+
+def load_readers(source: str) -> None:
+    """Runs a user's module, which calls `register_reader`.
+
+    Args:
+        source: Path of a `.py` file, or name of a module that can be imported.
+
+    Raises:
+        RecordingError: There is no such file or module, or it fails.
+    """
+    path = Path(source)
+    try:
+        if path.suffix != ".py":
+            importlib.import_module(source)
+            return
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[path.stem] = module  # dataclasses and tracebacks of the module look it up
+        spec.loader.exec_module(module)
+    except Exception as error:  # a user's code raises anything
+        raise RecordingError(f"{source}: cannot be loaded as a reader ({cause(error)})") from error
+
+
+def own_readers() -> list[str]:
+    """Return names and source hashes of the rows that users added; partial results depend on them."""
+    result = []
+    for name, row in sorted(_own.items()):
+        try:
+            source = inspect.getsource(inspect.getmodule(row.open) or row.open)
+        except (OSError, TypeError):  # typed into a session: there is no file
+            source = repr(row.open)
+        result.append(f"{name} {hashlib.sha256(source.encode()).hexdigest()}")
+    return result
+
+
+def detect(path: Path, name: str | None = None) -> Detected:
+    """Finds the format of an input by its first bytes, then by its name.
+
+    Args:
+        path: A file or folder that exists.
+        name: A format's name; nothing is detected then.
+
+    Raises:
+        RecordingError: Of no known kind, or `name` is no format.
+    """
+    rows = {row.name: row for row in (*_own.values(), *_TABLE)}
+    if name is not None:
+        if name not in rows:
+            raise RecordingError(f"{path}: format {name!r} is none of {', '.join(rows)}")
+        return Detected(path, rows[name], "flag")
+    detected = _detect_in_folder(path, rows) if path.is_dir() else _detect_file(path, rows)
+    if detected is None:
+        own = "".join(f", {row.label}" for row in _own.values())
+        raise RecordingError(
+            f"{path}: of no known kind; a ROS bag or MCAP, a folder of timed scans, a cloud (PLY, PCD, LAS, LAZ, E57, "
+            f"XYZ, CSV, Parquet) or a ring survey (CSV, XLSX){own} is needed"
+        )
+    return detected
+
+
+def describe(facts: dict[str, Any]) -> str:
+    """Return what was detected of a recording, a cloud or a survey, in one line for people."""
+    parts = [f"{facts['kind']}"]
+    parts += [f"{key.replace('_', ' ')} {facts[key]}" for key in _SHOWN_FACTS if key in facts]
+    if others := facts.get("other_lidar_topics"):
+        parts.append(f"not read: {' '.join(others)} (--topic chooses)")
+    return "; ".join(parts)
+
+
+def _detect_file(path: Path, rows: dict[str, Format]) -> Detected | None:
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+    for row in rows.values():
+        if row.magic and head.startswith(row.magic):
+            return Detected(path, row, "content")
+    suffix = path.suffix.lower()
+    own = next((row for row in _own.values() if suffix in row.suffixes), None)
+    if own is None and is_ring_survey(path):
+        return Detected(path, rows["rings"], "content")
+    row_by_name = own or next((row for row in _TABLE if suffix in row.suffixes), None)
+    return None if row_by_name is None else Detected(path, row_by_name, "name")
+
+
+def _detect_in_folder(path: Path, rows: dict[str, Format]) -> Detected | None:
+    if (path / "metadata.yaml").is_file():
+        return Detected(path, rows["rosbag2"], "content")
+    files = sorted(path.iterdir())
+    bags = [file for file in files if file.suffix in (".mcap", ".db3", ".bag")]
+    if len(bags) == 1:
+        return _detect_file(bags[0], rows)
+    if len(bags) > 1:
+        raise RecordingError(f"{path}: holds {len(bags)} bags and no metadata.yaml; name one of them")
+    surveys = [file for file in files if file.is_file() and is_ring_survey(file)]
+    if len(surveys) == 1:
+        return Detected(surveys[0], rows["rings"], "content")
+    if surveys:
+        names = ", ".join(file.name for file in surveys)
+        raise RecordingError(f"{path}: holds {len(surveys)} ring surveys ({names}); name one")
+    return Detected(path, rows["scans"], "content") if scan_files(path) else None

@@ -1,0 +1,169 @@
+"""Clouds as tables: text (XYZ, CSV, TXT, ASC, PTS) and Parquet, with x, y, z found by the names of the columns."""
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from scene.reading.source import BATCH, CloudSource, Lines
+
+_XYZ_NAMES = (
+    ("x", "easting", "east", "e"),
+    ("y", "northing", "north", "n"),
+    ("z", "elevation", "elev", "height", "altitude", "h"),
+)
+_COLUMN_UNIT = re.compile(
+    r"[\s_]*[(\[]?\s*\b(mm|millimet(?:er|re)s?|m|met(?:er|re)s?|us[ -]?ft|ft|feet|foot)\b\.?\s*[)\]]?$", re.IGNORECASE
+)
+_UNIT_STARTS = (("mm", "mm"), ("milli", "mm"), ("m", "m"), ("us", "us-ft"), ("f", "ft"))
+
+
+def plain_name(name: str) -> tuple[str, str | None]:
+    """Return a column's name in lower case without its unit, and the unit, a key of `frame.UNITS`, where it gives one.
+
+    `EASTING (M.)` is `easting` in m; a name that is a unit alone is left as it is.
+    """
+    text = name.strip().lstrip("/#").strip().strip('"')
+    bracketed = re.search(r"[(\[]([^)\]]*)[)\]]", text)
+    found = _COLUMN_UNIT.search(" " + (bracketed.group(1) if bracketed else text.replace("_", " ")))
+    base = re.sub(r"[(\[][^)\]]*[)\]]", "", text).strip() if bracketed else text
+    unit = None
+    if found and (bracketed or " " in text.replace("_", " ")):
+        unit = next(unit for start, unit in _UNIT_STARTS if found.group(1).lower().startswith(start))
+        base = base if bracketed else _COLUMN_UNIT.sub("", " " + base.replace("_", " "))
+    return base.strip(" _.").lower(), unit
+
+
+def find_xyz(names: Sequence[str]) -> tuple[list[int], str | None] | None:
+    """Finds the columns of x, y and z, and their declared unit; `None` where one is missing.
+
+    Raises:
+        ValueError: The three columns declare different units.
+    """
+    known = [plain_name(name) for name in names]
+    bare = [name for name, _ in known]
+    at = []
+    for wanted in _XYZ_NAMES:
+        index = next((bare.index(name) for name in wanted if name in bare), None)
+        if index is None:
+            return None
+        at.append(index)
+    units = {known[index][1] for index in at} - {None}
+    if len(units) > 1:
+        raise ValueError(f"its columns {', '.join(names[i] for i in at)} differ in unit")
+    return at, next(iter(units), None)
+
+
+_HEAD_BYTES = 1 << 16
+_PROBES = 16
+_DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
+
+
+def open_table(path: Path) -> CloudSource:
+    """Return the points of a text table: columns by the names of its header, or the first three.
+
+    Raises:
+        ValueError: No text, or no line with three numbers near its start.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    if b"\0" in head:
+        raise ValueError("it is binary, not text")
+    lines = head.decode("utf-8-sig", "replace").splitlines()
+    delimiter, name = _find_delimiter(lines)
+    comma = delimiter == ";" and any("," in line for line in lines) and not any("." in line for line in lines[1:])
+    skip, columns, unit = _find_columns(lines, delimiter, comma)
+    start = sum(len(line) for line in head.splitlines(keepends=True)[:skip])
+    text = Lines(path, tuple(columns), delimiter, start, skip + 1, None, comma)
+    return CloudSource(f"text, {name} between columns", text.rows, _sample_lines(text), unit)
+
+
+def _find_delimiter(lines: list[str]) -> tuple[str | None, str]:
+    """Delimiter of most lines; white space where there is no other."""
+    body = [line for line in lines[:200] if line.strip()]
+    for mark, name in _DELIMITERS:
+        if body and sum(line.count(mark) >= 2 for line in body) > len(body) / 2:
+            return mark, name
+    return None, "white space"
+
+
+def _find_columns(lines: list[str], delimiter: str | None, comma: bool) -> tuple[int, list[int], str | None]:
+    """Number of lines before the numbers, columns of x, y and z, and the unit that a header declares."""
+    found, unit = None, None
+    for index, line in enumerate(lines):
+        words = [word.strip() for word in line.split(delimiter)]
+        if _numeric(words[:3], comma) or (found and _numeric([words[i] for i in found if i < len(words)], comma)):
+            return index, found or [0, 1, 2], unit
+        named = find_xyz(words) if len(words) >= 3 else None
+        if named is not None:
+            found, unit = named
+        elif index and not line.startswith(("#", "/")) and line.strip() and found:
+            return index, found, unit  # the reader will name this line
+        elif len(words) > 3 and found is None and not line.startswith(("#", "/")) and not _numeric(words, comma):
+            raise ValueError(f"line {index + 1} has no columns x, y, z: {line[:60]!r}")
+    raise ValueError("no line near its start holds three numbers")
+
+
+def _numeric(words: list[str], comma: bool) -> bool:
+    try:
+        return len(words) >= 3 and bool([float(word.replace(",", ".") if comma else word) for word in words[:3]])
+    except ValueError:
+        return False
+
+
+def _sample_lines(text: Lines) -> np.ndarray:
+    """Points from places spread over the whole file; lines that do not parse are left out here."""
+    size, points = text.path.stat().st_size, [np.empty((0, 3))]
+    with text.path.open("rb") as file:
+        for start in np.linspace(text.start, max(size - 4096, text.start), _PROBES).astype(int):
+            file.seek(start)
+            lines = file.read(4096).split(b"\n")
+            # The first line of a block in the middle of the file is cut, and so is the last.
+            whole = lines[0 if start == text.start else 1 : -1]
+            try:
+                points.append(text.parse(b"\n".join(whole), 1))
+            except ValueError:
+                continue
+    return np.concatenate(points)
+
+
+def open_parquet(path: Path) -> CloudSource:
+    """Return the columns x, y, z (or easting, northing, elevation) of a Parquet file.
+
+    Raises:
+        ValueError: Damaged, without such columns, or with columns that hold no numbers.
+    """
+    with pq.ParquetFile(path) as file:
+        names, rows = file.schema_arrow.names, file.metadata.num_rows
+        found = find_xyz(names)
+        if found is None:
+            raise ValueError(f"no columns x, y, z among {', '.join(names)}")
+        columns = [names[index] for index in found[0]]
+        for name in columns:
+            kind = file.schema_arrow.field(name).type
+            if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
+                raise ValueError(f"column {name} holds {kind}, not numbers")
+        declared = found[1] or _field_unit(file.schema_arrow.field(columns[0]))
+        groups = sorted({0, file.num_row_groups // 2, file.num_row_groups - 1}) if file.num_row_groups else []
+        sample = [next(_read_batches(file, columns, [group]), np.empty((0, 3)))[::100] for group in groups]
+
+    def chunks() -> Iterator[np.ndarray]:
+        with pq.ParquetFile(path) as file:
+            yield from _read_batches(file, columns, list(range(file.num_row_groups)))
+
+    return CloudSource("Parquet", chunks, np.concatenate([np.empty((0, 3)), *sample]), declared, rows)
+
+
+def _read_batches(file: pq.ParquetFile, columns: list[str], groups: list[int]) -> Iterator[np.ndarray]:
+    for batch in file.iter_batches(BATCH, columns=columns, row_groups=groups):
+        arrays = [batch.column(name).cast(pa.float64()).to_numpy(zero_copy_only=False) for name in columns]
+        yield np.stack(arrays, axis=1)
+
+
+def _field_unit(field: pa.Field) -> str | None:
+    """Unit from the column's own metadata, key `unit`."""
+    said = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+    return said if said in ("m", "mm") else None
