@@ -18,21 +18,13 @@ _BEND_OVER = 10.0  # m
 
 @dataclass(frozen=True)
 class Axis:
-    """A centreline sampled at uniform stations.
+    """A centreline sampled at uniform stations."""
 
-    Attributes:
-        station: Arc length, m, `(n,)`.
-        position: m, `(n, 3)`.
-        tangent: Unit vectors of growing station, `(n, 3)`.
-        lateral: Unit vectors, horizontal, to the left, `(n, 3)`.
-        up: Unit vectors, `tangent × lateral`, `(n, 3)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    tangent: Float[np.ndarray, "n 3"]
-    lateral: Float[np.ndarray, "n 3"]
-    up: Float[np.ndarray, "n 3"]
+    station: Float[np.ndarray, " n"]  # Arc length, m
+    position: Float[np.ndarray, "n 3"]  # m
+    tangent: Float[np.ndarray, "n 3"]  # Unit vectors of growing station
+    lateral: Float[np.ndarray, "n 3"]  # Unit vectors, horizontal, to the left
+    up: Float[np.ndarray, "n 3"]  # Unit vectors, `tangent × lateral`
 
     @property
     def length(self) -> float:
@@ -150,44 +142,27 @@ STRETCH = np.dtype(
 
 @dataclass(frozen=True)
 class Bore:
-    """The arrays of `bore.npz`; docs/formats.md says what each means.
+    """The arrays of `bore.npz`; docs/formats.md says what each means."""
 
-    Attributes:
-        station: m, from 0, uniform, `(n,)`.
-        position: Centreline, m, `(n, 3)`.
-        tangent: Unit vectors, `(n, 3)`.
-        lateral: Unit vectors to the left, `(n, 3)`.
-        up: Unit vectors, `(n, 3)`.
-        width: Largest inner width, m, `(n,)`.
-        height: Floor to crown on the axis, m, `(n,)`.
-        angle: From `lateral` towards `up`, rad, `(m,)`.
-        radius: Smooth section about the centreline, m, `(n, m)`.
-        residual_rms: Of the section's inliers, m, `(n,)`.
-        coverage: Share of the section's angles seen, `(n,)`.
-        filled: Section interpolated, `(n,)`.
-        ring_station: Ring joints, m, `(r,)`.
-        pocket: Recesses of the lining, `(p,)` of `POCKET`.
-        confidence: Probability that the wall is within 5 cm of the true one, mean over the angles, `(n,)`.
-        stretch: Stretches of one type of section, `(t,)` of `STRETCH`.
-        nail: Bolts that bridge two pockets across a joint, `(b,)` of `NAIL`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    tangent: Float[np.ndarray, "n 3"]
-    lateral: Float[np.ndarray, "n 3"]
-    up: Float[np.ndarray, "n 3"]
-    width: Float[np.ndarray, " n"]
-    height: Float[np.ndarray, " n"]
-    angle: Float[np.ndarray, " m"]
-    radius: Float[np.ndarray, "n m"]
-    residual_rms: Float[np.ndarray, " n"]
-    coverage: Float[np.ndarray, " n"]
-    filled: Bool[np.ndarray, " n"]
-    ring_station: Float[np.ndarray, " r"]
-    pocket: Shaped[np.ndarray, " p"]
+    station: Float[np.ndarray, " n"]  # m, from 0, uniform
+    position: Float[np.ndarray, "n 3"]  # Centreline, m
+    tangent: Float[np.ndarray, "n 3"]  # Unit vectors
+    lateral: Float[np.ndarray, "n 3"]  # Unit vectors to the left
+    up: Float[np.ndarray, "n 3"]  # Unit vectors
+    width: Float[np.ndarray, " n"]  # Largest inner width, m
+    height: Float[np.ndarray, " n"]  # Floor to crown on the axis, m
+    angle: Float[np.ndarray, " m"]  # From `lateral` towards `up`, rad
+    radius: Float[np.ndarray, "n m"]  # Smooth section about the centreline, m
+    residual_rms: Float[np.ndarray, " n"]  # RMS distance of the section's inliers, m
+    coverage: Float[np.ndarray, " n"]  # Share of the section's angles seen
+    filled: Bool[np.ndarray, " n"]  # Section interpolated
+    ring_station: Float[np.ndarray, " r"]  # Ring joints, m
+    pocket: Shaped[np.ndarray, " p"]  # Recesses of the lining, `(p,)` of `POCKET`
+    # Probability that the wall is within 5 cm of the true one, mean over the angles
     confidence: Float[np.ndarray, " n"]
+    # Stretches of one type of section, `(t,)` of `STRETCH`
     stretch: Shaped[np.ndarray, " t"] = field(default_factory=lambda: np.empty(0, STRETCH))
+    # Bolts that bridge two pockets across a joint, `(b,)` of `NAIL`
     nail: Shaped[np.ndarray, " b"] = field(default_factory=lambda: np.empty(0, NAIL))
 
     @property

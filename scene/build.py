@@ -18,6 +18,7 @@ from scene.errors import FitError, RecordingError, SubterraError
 from scene.files import replace_folder, require_output_folder
 from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
+from scene.reading.formats import load_readers
 from scene.reconstruct import Reconstruction, reconstruct
 from scene.resume import Partial, partial_folder
 
@@ -72,6 +73,7 @@ def build(
     control: Path | None = None,
     calibration: str | None = None,
     partial: Partial | None = None,
+    reader: str | None = None,
 ) -> Reconstruction:
     """Reconstructs the tunnel in `source` and writes its scene folder whole, or not at all.
 
@@ -82,7 +84,8 @@ def build(
         config: Defaults where not given.
         control: Positions for a bag, TUM.
         calibration: See `scene.poses.calibration.find_calibration`.
-        partial: Where partial results are kept; beside `out` where not given.
+        partial: Place for partial results; beside `out` where not given.
+        reader: File or module that registers a reader of the user's own.
 
     Raises:
         SubterraError: The input or a setting is at fault, or the output cannot be written.
@@ -92,6 +95,8 @@ def build(
     check_settings(config)
     check_number("keep-every", 0.0 if partial is None else partial.every)
     mounts = find_calibration(calibration)
+    if reader is not None:
+        load_readers(reader)
     started = time.monotonic()
     partial = partial or Partial(partial_folder(out))
     try:
@@ -122,6 +127,7 @@ def command(
     trajectory: Path | None = None,
     control: Path | None = None,
     calibration: str | None = None,
+    reader: str | None = None,
     fresh: bool = False,
     keep_every: float = 5.0,
     config: Annotated[BuildConfig, tyro.conf.arg(name="")] = _DEFAULT,
@@ -138,13 +144,13 @@ def command(
         control: Positions of a prism in TUM form (quaternion zero, any order) that fix odometry's length.
         calibration: Where prism and IMU sit: geode-gamma, geode-beta, …, a YAML file, or the prism's lever arm x,y,z
             in the LiDAR's axes, m.
+        reader: A Python file or module of your own that registers a reader of another format.
         fresh: Start over, whatever a killed build got done.
         keep_every: Least time between two partial results, s.
         config: Settings.
     """
-    return partial(
-        build, source, out, trajectory, config, control, calibration, Partial(partial_folder(out), fresh, keep_every)
-    )
+    results = Partial(partial_folder(out), fresh, keep_every)
+    return partial(build, source, out, trajectory, config, control, calibration, results, reader)
 
 
 def main() -> None:

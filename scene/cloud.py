@@ -13,21 +13,13 @@ _MERGE_AT = 8_000_000
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points in the tunnel frame.
+    """Points in the tunnel frame."""
 
-    Attributes:
-        points: m, less `origin`, `(n, 3)` float32.
-        weights: Returns that each point stands for, `(n,)`.
-        origin: Whole-metre offset of the tunnel frame in the input's frame, m, `(3,)`.
-        returns: Returns read in all.
-        voxel: Edge length of the voxels, m.
-    """
-
-    points: Float[np.ndarray, "n 3"]
-    weights: Float[np.ndarray, " n"]
-    origin: Float[np.ndarray, "3"]
-    returns: int
-    voxel: float
+    points: Float[np.ndarray, "n 3"]  # m, less `origin`, `(n, 3)` float32
+    weights: Float[np.ndarray, " n"]  # Returns that each point stands for
+    origin: Float[np.ndarray, "3"]  # Whole-metre offset of the tunnel frame in the input's frame, m
+    returns: int  # Returns read in all
+    voxel: float  # Edge length of the voxels, m
 
 
 def thin_cloud(cloud: Cloud, voxel: float) -> Float[np.ndarray, "k 3"]:

@@ -35,10 +35,10 @@ def write_geometry(
     Args:
         folder: Where to.
         name: Of the tunnel.
-        provenance: What kind of recording the bore comes from.
+        provenance: Kind of recording that the bore comes from.
         bore: The bore.
         track: Its track.
-        config: How the scene is cut and dressed.
+        config: Cutting and dressing of the scene.
 
     Returns:
         How many of each asset there are, and where the furniture comes from.
@@ -131,11 +131,11 @@ class BuildConfig:
     """Everything a build depends on beside its input.
 
     Attributes:
-        name: Of the tunnel; the output folder's where not given.
-        provenance: What kind of recording this is: say `simulated` for a simulated survey.
-        reconstruct: How the input becomes a bore.
-        track: How the track is laid.
-        scene: How the scene is cut and dressed.
+        name: Name of the tunnel; that of the output folder where not given.
+        provenance: Kind of recording, such as `simulated` for a simulated survey.
+        reconstruct: Steps from the input to a bore.
+        track: Standard by which the track is laid.
+        scene: Cutting and dressing of the scene.
     """
 
     name: str = ""

@@ -31,19 +31,12 @@ from scene.resume import Partial, input_record, resume_key, total_bytes
 
 @dataclass(frozen=True)
 class Registered:
-    """A cloud and where it comes from.
+    """A cloud and where it comes from."""
 
-    Attributes:
-        cloud: Thinned.
-        record: Name, size and hash of each input.
-        facts: For the manifest.
-        located: Where the LiDAR was, for a recording.
-    """
-
-    cloud: Cloud
-    record: list[dict[str, Any]]
-    facts: dict[str, Any]
-    located: Located | None = None
+    cloud: Cloud  # Thinned
+    record: list[dict[str, Any]]  # Name, size and hash of each input
+    facts: dict[str, Any]  # For the manifest
+    located: Located | None = None  # Poses of the LiDAR, for a recording
 
 
 def hash_inputs(paths: list[Path], progress: Stages) -> list[dict[str, Any]]:
@@ -67,9 +60,9 @@ def register_recording(
         known: Of its poses.
         calibration: Where prism and IMU sit against the LiDAR.
         voxel: Thinning of the cloud, m.
-        reading: What is said about the recording instead of detected.
+        reading: What the user says instead of having it detected.
         progress: Where the stages show how far they are.
-        partial: What an earlier build got done, and where this one keeps what it does.
+        partial: Partial results of an earlier build, and place for those of this one.
 
     Raises:
         RecordingError: Damaged, or the poses belong to another recording.
@@ -111,13 +104,13 @@ def load_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stage
 
 @dataclass(frozen=True)
 class ReconstructConfig:
-    """How an input becomes a bore.
+    """Settings of the steps from an input to a bore.
 
     Attributes:
         voxel: Thinning of the cloud, m.
-        reading: What is said about the input instead of detected.
-        centreline: How the axis is found.
-        lining: What stands where the survey can show no lining.
+        reading: What the user says instead of having it detected.
+        centreline: Search for the axis.
+        lining: Lining by standard, where the survey can show none.
     """
 
     voxel: float = 0.04
@@ -128,27 +121,16 @@ class ReconstructConfig:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A bore and what there is to say about it.
+    """A bore and what there is to say about it."""
 
-    Attributes:
-        bore: In the tunnel frame.
-        origin: Of the tunnel frame in the input's frame, whole metres, `(3,)`.
-        inputs: Name, size and hash of each.
-        facts: For the manifest.
-        provenance: Of lining features, for the manifest.
-        odometry: The estimated poses, where there was no trajectory to be given.
-        cloud: The registered cloud, where there was one.
-        seen: What of a track it shows.
-    """
-
-    bore: Bore
-    origin: np.ndarray
-    inputs: list[dict[str, Any]]
-    facts: dict[str, Any]
-    provenance: dict[str, str]
-    odometry: Trajectory | None = None
-    cloud: Cloud | None = None
-    seen: SeenTrack = field(default_factory=lambda: SeenTrack(None, None))
+    bore: Bore  # Bore in the tunnel frame
+    origin: np.ndarray  # Origin of the tunnel frame in the input's, whole metres
+    inputs: list[dict[str, Any]]  # Name, size and hash of each
+    facts: dict[str, Any]  # For the manifest
+    provenance: dict[str, str]  # Provenance of lining features, for the manifest
+    odometry: Trajectory | None = None  # The estimated poses, where there was no trajectory to be given
+    cloud: Cloud | None = None  # The registered cloud, where there was one
+    seen: SeenTrack = field(default_factory=lambda: SeenTrack(None, None))  # Track that the cloud shows
 
 
 def reconstruct(
@@ -169,7 +151,7 @@ def reconstruct(
         progress: Where the stages show how far they are.
         control: Positions in TUM form, for a recording without a trajectory.
         calibration: Where prism and IMU sit against the LiDAR.
-        partial: What an earlier build got done, and where this one keeps what it does; nothing is kept without it.
+        partial: Partial results of an earlier build, and place for those of this one; none are kept without it.
 
     Raises:
         RecordingError: Unreadable, or of no known kind.

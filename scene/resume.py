@@ -90,7 +90,7 @@ class Partial:
 
     Attributes:
         folder: Where they lie; `None` keeps nothing.
-        fresh: Whether to start over whatever lies there.
+        fresh: Start over, whatever lies there.
         every: Least time between two writings of a growing result, s; more where writing takes long. 0 writes at every
             occasion, whatever it costs.
     """
@@ -125,7 +125,7 @@ class Partial:
 
     @property
     def keeps(self) -> bool:
-        """Whether what is saved is written at all."""
+        """True where saved results are written at all."""
         return self._open
 
     def due(self) -> bool:

@@ -28,21 +28,13 @@ _N_PARAMETERS = {"circle": 3, "d": 3, "horseshoe": 4}
 
 @dataclass(frozen=True)
 class TypeFit:
-    """One type fitted to one section.
+    """One type fitted to one section."""
 
-    Attributes:
-        type: `circle`, `d`, `horseshoe` or `free`.
-        crown_radius: m; NaN where free.
-        wall_radius: m; infinite for a D, NaN where free.
-        rms: Of the best nine tenths of the directions, m; 0 where free.
-        cost: Akaike's criterion; the least is the best.
-    """
-
-    type: str
-    crown_radius: float
-    wall_radius: float
-    rms: float
-    cost: float
+    type: str  # `circle`, `d`, `horseshoe` or `free`
+    crown_radius: float  # m; NaN where free
+    wall_radius: float  # m; infinite for a D, NaN where free
+    rms: float  # RMS of the best nine tenths of the directions, m; 0 where free
+    cost: float  # Akaike's criterion; the least is the best
 
 
 def find_stretches(bore: Bore, flat_floor: bool, sigma: float) -> Shaped[np.ndarray, " t"]:
@@ -50,7 +42,7 @@ def find_stretches(bore: Bore, flat_floor: bool, sigma: float) -> Shaped[np.ndar
 
     Args:
         bore: The bore; its own `stretch` is not read.
-        flat_floor: Whether it stands on a floor; without, only a circle or a free profile comes into question.
+        flat_floor: The bore stands on a floor; without one, only a circle or a free profile is tried.
         sigma: Standard deviation of its walls, m.
     """
     count = max(round(bore.length / _WINDOW), 1)

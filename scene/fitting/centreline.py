@@ -116,7 +116,7 @@ _DOWN, _TRACK = -0.8, 0.5  # directions in which sleepers and rails may hide the
 
 @dataclass(frozen=True)
 class CentrelineConfig:
-    """How the axis is found.
+    """Settings of the search for the axis.
 
     Attributes:
         min_length: A cloud shorter than this is refused, m.

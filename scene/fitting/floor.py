@@ -75,17 +75,11 @@ _NEWTON, _CONVERGED = 6, 0.01
 
 @dataclass(frozen=True)
 class Floors:
-    """Floor lines of sections.
+    """Floor lines of sections."""
 
-    Attributes:
-        station: m, `(k,)`.
-        height: On the axis, m, `(k,)`.
-        slope: Rise for each metre to the left, `(k,)`.
-    """
-
-    station: Float[np.ndarray, " k"]
-    height: Float[np.ndarray, " k"]
-    slope: Float[np.ndarray, " k"]
+    station: Float[np.ndarray, " k"]  # m
+    height: Float[np.ndarray, " k"]  # On the axis, m
+    slope: Float[np.ndarray, " k"]  # Rise for each metre to the left
 
     def radius(self, grid: Grid) -> Float[np.ndarray, "rows cols"]:
         """Return the distance from the axis to the floor in each direction, m; `inf` where it is not met."""
@@ -127,7 +121,7 @@ def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarr
         wall: Its distance from the axis, m, `(rows, cols)`.
         grid: Its cells.
         floors: Where the foot is.
-        seen: The same without smoothing around, which would round the corner off, m, `(rows, cols)`.
+        seen: The wall without smoothing around, which would round the corner off, m, `(rows, cols)`.
     """
     lateral, upward = seen * np.cos(grid.angle), seen * np.sin(grid.angle)
     height = np.interp(grid.station, floors.station, floors.height)[:, None]

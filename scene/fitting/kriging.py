@@ -21,19 +21,12 @@ _UNEVEN = 1.3  # times the median deviation of the windows: more is another wall
 
 @dataclass(frozen=True)
 class Correlation:
-    """How alike the wall is at two stations.
+    """Correlation of the wall at two stations."""
 
-    Attributes:
-        family: One of `exponential`, `matern 3/2`, `matern 5/2`, `gaussian`.
-        length: Its length, m.
-        nugget: Variance of the noise, as a share of that of the wall.
-        sigma: Standard deviation of the wall about its trend, m.
-    """
-
-    family: str
-    length: float
-    nugget: float
-    sigma: float
+    family: str  # One of `exponential`, `matern 3/2`, `matern 5/2`, `gaussian`
+    length: float  # Its length, m
+    nugget: float  # Variance of the noise, as a share of that of the wall
+    sigma: float  # Standard deviation of the wall about its trend, m
 
     def __call__(self, distance: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
         """Return the correlation at a distance, m, without the noise."""
@@ -175,17 +168,11 @@ _BRIDGED = 4  # columns without a return that a profile is drawn straight across
 
 @dataclass(frozen=True)
 class Kriged:
-    """The wall on a fine grid.
+    """The wall on a fine grid."""
 
-    Attributes:
-        wall: m, `(rows, cols)`.
-        sigma: Its standard deviation, m, `(rows, cols)`.
-        correlation: What it rests on.
-    """
-
-    wall: Float[np.ndarray, "rows cols"]
-    sigma: Float[np.ndarray, "rows cols"]
-    correlation: Correlation
+    wall: Float[np.ndarray, "rows cols"]  # m
+    sigma: Float[np.ndarray, "rows cols"]  # Its standard deviation, m
+    correlation: Correlation  # Correlation that it rests on
 
 
 def krige_profiles(

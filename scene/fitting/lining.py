@@ -26,19 +26,12 @@ _RADIUS = 0.0135  # m
 
 @dataclass(frozen=True)
 class SeenNails:
-    """What the cloud says of each pair.
+    """Nails that the cloud shows in each pair of pockets."""
 
-    Attributes:
-        present: A nail was seen, `(b,)`.
-        absent: The backs were seen and no nail in front of them, `(b,)`.
-        confidence: Probability that what was counted is no chance, `(b,)`.
-        depth: Of the nails' axes behind the wall, m, median over all.
-    """
-
-    present: Bool[np.ndarray, " b"]
-    absent: Bool[np.ndarray, " b"]
-    confidence: Float[np.ndarray, " b"]
-    depth: float
+    present: Bool[np.ndarray, " b"]  # A nail was seen
+    absent: Bool[np.ndarray, " b"]  # The backs were seen and no nail in front of them
+    confidence: Float[np.ndarray, " b"]  # Probability that what was counted is no chance
+    depth: float  # Median depth of the nails' axes behind the wall, m
 
 
 def pair_pockets(bore: Bore) -> Int[np.ndarray, "b 2"]:
@@ -137,7 +130,7 @@ class LiningConfig:
     """The lining that stands where the survey can show none.
 
     Attributes:
-        by_standard: Whether such a lining is put in at all. It is not where the survey could have shown one and did
+        by_standard: Put such a lining in. It is left out where the survey could have shown one and did
             not, nor where the walls are no even section.
         ring_width: m. Source: 1.5 m, Guangzhou line 21; 1.2–1.5 m in use.
         pockets_per_ring: On each side of a joint, spread evenly over the crown between the lowest two. An assumption:
@@ -172,7 +165,7 @@ def add_lining(
 
     Args:
         bore: Smooth.
-        sections: What it was made of.
+        sections: Sections that the bore was made of.
         cloud: In which nails are looked for; without it they are by standard.
         config: See `LiningConfig`.
     """
@@ -192,7 +185,7 @@ def add_standard_lining(bore: Bore, config: LiningConfig, flat_floor: bool) -> t
     Args:
         bore: Smooth.
         config: See `LiningConfig`.
-        flat_floor: Whether the lowest part of the section is a floor, which has no pockets.
+        flat_floor: The lowest part of the section is a floor, which has no pockets.
     """
     rings = {"rings": MEASURED} if len(bore.ring_station) else {"rings": STANDARD}
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)

@@ -14,17 +14,11 @@ _LONG_CHORD = 0.97
 
 @dataclass(frozen=True)
 class Extents:
-    """What a section measures, about the point it is drawn from.
+    """Sizes of a section, about the point it is drawn from."""
 
-    Attributes:
-        width: Largest inner width, m.
-        height: Floor to crown on the axis, m.
-        middle: Lateral and upward offset of mid-width and mid-height, m.
-    """
-
-    width: float
-    height: float
-    middle: tuple[float, float]
+    width: float  # Largest inner width, m
+    height: float  # Floor to crown on the axis, m
+    middle: tuple[float, float]  # Lateral and upward offset of mid-width and mid-height, m
 
 
 def section_angles(count: int = N_ANGLES) -> Float[np.ndarray, " m"]:

@@ -23,21 +23,13 @@ _LONGEST_GAP = 50.0  # m; across more, nobody knows how the tunnel runs
 
 @dataclass(frozen=True)
 class RingFit:
-    """The circle of each ring.
+    """The circle of each ring."""
 
-    Attributes:
-        names: Ring numbers.
-        centre: m, `(r, 3)`.
-        radius: m, `(r,)`.
-        rms: Distance of the points from the circle, m, `(r,)`.
-        seen: Share of the circumference within 22.5° of a point, `(r,)`.
-    """
-
-    names: list[str]
-    centre: Float[np.ndarray, "r 3"]
-    radius: Float[np.ndarray, " r"]
-    rms: Float[np.ndarray, " r"]
-    seen: Float[np.ndarray, " r"]
+    names: list[str]  # Ring numbers
+    centre: Float[np.ndarray, "r 3"]  # m
+    radius: Float[np.ndarray, " r"]  # m
+    rms: Float[np.ndarray, " r"]  # Distance of the points from the circle, m
+    seen: Float[np.ndarray, " r"]  # Share of the circumference within 22.5° of a point
 
 
 def fit_rings(survey: RingSurvey) -> RingFit:

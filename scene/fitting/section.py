@@ -9,19 +9,11 @@ from scipy.ndimage import uniform_filter1d
 from scene.bore import Axis
 from scene.cloud import Cloud
 from scene.errors import FitError
+from scene.fitting import unroll
 from scene.fitting.floor import Floors, clip_to_floor, extend_to_floor, find_floors, is_floor
 from scene.fitting.kriging import krige_profiles
 from scene.fitting.profile import N_ANGLES
-from scene.fitting.unroll import (
-    Grid,
-    cell_means,
-    cell_medians,
-    estimate_sigma,
-    fill_nearest,
-    median_smooth,
-    resample,
-    smooth_cells,
-)
+from scene.fitting.unroll import Grid
 
 DENSE_STEP = 0.25  # m; where nearly every row of this length was seen, the survey is no row of profiles
 OVERRUN = 3.0  # m beyond the axis that are looked at
@@ -67,7 +59,7 @@ def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
     Args:
         station: Growing inwards, m.
         end: Where the first returns are, m.
-        behind: How far inside to look, m.
+        behind: Distance to look inside, m.
     """
     step = _TRIM_STEP
     total = np.histogram(station, np.arange(end - 0.5, end + 2 * behind, step))[0]
@@ -112,35 +104,20 @@ _HOLLOW, _MIN_HOLLOW = 0.5, 0.7  # m from the wall, share of the points
 
 @dataclass(frozen=True)
 class Sections:
-    """The wall on a fine grid, and what was measured of it.
+    """The wall on a fine grid, and what was measured of it."""
 
-    Attributes:
-        grid: Station and angle cells.
-        radius: Smooth wall, m, `(rows, cols)`.
-        residual: Mean outward distance of each cell's returns from it, m, `(rows, cols)`.
-        weight: Returns in each cell, `(rows, cols)`.
-        support: Points of the thinned cloud on the wall, `(rows, cols)`.
-        deepest: Furthest return behind the wall, m, `(rows, cols)`; 0 where there is none.
-        spread: Inlier distance rms of each row, m, `(rows,)`.
-        inlier: Cells that the wall was fitted to, `(rows, cols)`.
-        sigma: Standard deviation of the wall's radius, m, `(rows, cols)`.
-        flat_floor: Whether the section stands on a flat floor.
-        voxel: Thinning of the cloud it was fitted to, m.
-        spacing: Between the survey's profiles, about, m; 0 where it is a dense cloud.
-    """
-
-    grid: Grid
-    radius: Float[np.ndarray, "rows cols"]
-    residual: Float[np.ndarray, "rows cols"]
-    weight: Float[np.ndarray, "rows cols"]
-    support: Float[np.ndarray, "rows cols"]
-    deepest: Float[np.ndarray, "rows cols"]
-    spread: Float[np.ndarray, " rows"]
-    inlier: Bool[np.ndarray, "rows cols"]
-    sigma: Float[np.ndarray, "rows cols"]
-    flat_floor: bool
-    voxel: float
-    spacing: float
+    grid: Grid  # Station and angle cells
+    radius: Float[np.ndarray, "rows cols"]  # Smooth wall, m
+    residual: Float[np.ndarray, "rows cols"]  # Mean outward distance of each cell's returns from it, m
+    weight: Float[np.ndarray, "rows cols"]  # Returns in each cell
+    support: Float[np.ndarray, "rows cols"]  # Points of the thinned cloud on the wall
+    deepest: Float[np.ndarray, "rows cols"]  # Furthest return behind the wall, m; 0 where there is none
+    spread: Float[np.ndarray, " rows"]  # Inlier distance rms of each row, m
+    inlier: Bool[np.ndarray, "rows cols"]  # Cells that the wall was fitted to
+    sigma: Float[np.ndarray, "rows cols"]  # Standard deviation of the wall's radius, m
+    flat_floor: bool  # True where the section stands on a flat floor
+    voxel: float  # Thinning of the cloud it was fitted to, m
+    spacing: float  # Between the survey's profiles, about, m; 0 where it is a dense cloud
 
 
 @dataclass(frozen=True)
@@ -178,20 +155,22 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
         wall = kriged.wall if floors is None else _stand_wall(kriged.wall, fine, floors)
         return _measure_wall(points, wall, kriged.sigma, fine, floors is not None, cloud.voxel, step)
     wall, seen = _follow_wall(points, wall, fine, floors)
-    return _measure_wall(points, wall, estimate_sigma(wall, seen, fine), fine, floors is not None, cloud.voxel, 0.0)
+    return _measure_wall(
+        points, wall, unroll.estimate_sigma(wall, seen, fine), fine, floors is not None, cloud.voxel, 0.0
+    )
 
 
 def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None) -> np.ndarray:
-    wall = cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
+    wall = unroll.cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
-    along = median_smooth(fill_nearest(wall), (window[0], 1))
-    wall = median_smooth(fill_nearest(wall), window)
+    along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
+    wall = unroll.median_smooth(unroll.fill_nearest(wall), window)
     if floors is None:
-        return resample(wall, coarse, fine)
+        return unroll.resample(wall, coarse, fine)
     # Clipped on the fine grid alone: interpolation between a wall and a floor would cut their corner off.
-    return clip_to_floor(resample(extend_to_floor(wall, coarse, floors, along), coarse, fine), fine, floors)
+    return clip_to_floor(unroll.resample(extend_to_floor(wall, coarse, floors, along), coarse, fine), fine, floors)
 
 
 def _stand_wall(wall: np.ndarray, grid: Grid, floors: Floors) -> np.ndarray:
@@ -212,10 +191,10 @@ def _follow_wall(
     """Return the wall at the half-metre scale, and the cells that it was fitted to."""
     cell = fine.cell(points.station, points.angle)
     outward = points.radius - first.ravel()[np.maximum(cell, 0)]
-    residual, weight = cell_means(fine, cell, outward, points.weight)
+    residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     weight = np.where(inlier, np.minimum(weight, 50.0), 0.0)
-    correction, support = smooth_cells(residual, weight, (_SIGMA[0] / fine.step, _SIGMA[1]))
+    correction, support = unroll.smooth_cells(residual, weight, (_SIGMA[0] / fine.step, _SIGMA[1]))
     correction *= np.clip(support / _SEEN_WEIGHT, 0.0, 1.0)
     if floors is not None:
         correction[is_floor(first, fine, floors)] = 0.0
@@ -228,7 +207,7 @@ def _measure_wall(
     """Measures what the points show of the wall that was fitted to them."""
     cell = fine.cell(points.station, points.angle)
     outward = points.radius - wall.ravel()[np.maximum(cell, 0)]
-    residual, weight = cell_means(fine, cell, outward, points.weight)
+    residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
     on_wall = (np.abs(outward) < _ON_WALL) & (cell >= 0)
     behind = (outward > _ON_WALL) & (outward < _DEEPEST) & (cell >= 0)
     support = np.bincount(cell[on_wall], minlength=wall.size).reshape(wall.shape).astype(float)

@@ -22,17 +22,11 @@ _MIN_RETURNS = 10  # returns a metre
 
 @dataclass(frozen=True)
 class SeenRails:
-    """Both rails.
+    """Both rails."""
 
-    Attributes:
-        gauge: Between the inner faces of the heads, 12 to 45 mm below their tops, m.
-        centre: Of the track to the left of the axis, m.
-        top: Above the bed, m.
-    """
-
-    gauge: float
-    centre: float
-    top: float
+    gauge: float  # Between the inner faces of the heads, 12 to 45 mm below their tops, m
+    centre: float  # Distance of the track to the left of the axis, m
+    top: float  # Above the bed, m
 
 
 def find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:
@@ -118,22 +112,16 @@ _SPACINGS = (0.45, 0.80)  # in use, m
 
 @dataclass(frozen=True)
 class SeenSleepers:
-    """Sleepers of a bore.
+    """Sleepers of a bore."""
 
-    Attributes:
-        station: m, `(k,)`.
-        measured: Seen; the others stand where the spacing asks for one, `(k,)`.
-        protrusion: Of their tops out of the bed, median, m.
-    """
-
-    station: Float[np.ndarray, " k"]
-    measured: Bool[np.ndarray, " k"]
-    protrusion: float
+    station: Float[np.ndarray, " k"]  # m
+    measured: Bool[np.ndarray, " k"]  # Seen; the others stand where the spacing asks for one
+    protrusion: float  # Median height of their tops above the bed, m
 
 
 @dataclass(frozen=True)
 class SeenTrack:
-    """What of a track the cloud shows; `None` for what it does not."""
+    """Track that the cloud shows; `None` for what it does not."""
 
     sleepers: SeenSleepers | None
     rails: SeenRails | None

@@ -13,19 +13,12 @@ _RADIUS_BITS = 20
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells over station and angle; the angle closes on itself.
+    """Cells over station and angle; the angle closes on itself."""
 
-    Attributes:
-        start: Station of the first cell's near edge, m.
-        step: Length of a cell, m.
-        rows: Cells along the station.
-        columns: Cells around.
-    """
-
-    start: float
-    step: float
-    rows: int
-    columns: int
+    start: float  # Station of the first cell's near edge, m
+    step: float  # Length of a cell, m
+    rows: int  # Cells along the station
+    columns: int  # Cells around
 
     @classmethod
     def over(cls, start: float, end: float, step: float, columns: int) -> "Grid":

@@ -1,4 +1,4 @@
-"""How the instruments of a carrier sit against its LiDAR: published presets, a YAML file, or a lever arm."""
+"""Mounts of a carrier's instruments against its LiDAR: published presets, a YAML file, or a lever arm."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,15 +17,10 @@ _ORTHONORMAL = 1e-3  # published matrices are rounded to 6 digits
 
 @dataclass(frozen=True)
 class Mount:
-    """A rigid transform that maps LiDAR coordinates to the instrument's: `p_instrument = rotation @ p_lidar + shift`.
+    """Transform from LiDAR coordinates to an instrument's: `p_instrument = rotation @ p_lidar + shift`."""
 
-    Attributes:
-        rotation: `(3, 3)`.
-        shift: m, `(3,)`.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]  # `(3, 3)`
+    shift: Float[np.ndarray, "3"]  # m
 
     @property
     def origin(self) -> Float[np.ndarray, "3"]:
@@ -35,17 +30,11 @@ class Mount:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where prism and IMU are, seen from the LiDAR.
+    """Where prism and IMU are, seen from the LiDAR."""
 
-    Attributes:
-        name: Preset, file or lever arm, for the manifest.
-        prism: In LiDAR coordinates, m, `(3,)`.
-        imu: Maps LiDAR coordinates to the IMU's, by topic of the IMU.
-    """
-
-    name: str
-    prism: Float[np.ndarray, "3"]
-    imu: dict[str, Mount]
+    name: str  # Preset, file or lever arm, for the manifest
+    prism: Float[np.ndarray, "3"]  # Position of the prism in LiDAR coordinates, m
+    imu: dict[str, Mount]  # Maps LiDAR coordinates to the IMU's, by topic of the IMU
 
 
 def _orthonormal_mount(rotation: list[list[float]], shift: list[float]) -> Mount:

@@ -23,19 +23,13 @@ _MIN_SAMPLES = 50
 
 @dataclass(frozen=True)
 class Inertial:
-    """One IMU's samples over a recording.
+    """One IMU's samples over a recording."""
 
-    Attributes:
-        times: s, growing, `(n,)`.
-        rate: Angular rate in the IMU's axes, rad/s, `(n, 3)`.
-        force: Specific force in the IMU's axes, m/s², `(n, 3)`; at rest it points up and measures one g.
-        topic: Where it was read.
-    """
-
-    times: Float[np.ndarray, " n"]
-    rate: Float[np.ndarray, "n 3"]
+    times: Float[np.ndarray, " n"]  # s, growing
+    rate: Float[np.ndarray, "n 3"]  # Angular rate in the IMU's axes, rad/s
+    # Specific force in the IMU's axes, m/s²; at rest it points up and measures one g
     force: Float[np.ndarray, "n 3"]
-    topic: str
+    topic: str  # Topic of the samples
 
 
 def imu_topics(recording: Recording) -> list[str]:

@@ -22,19 +22,14 @@ from scene.resume import Partial
 
 @dataclass(frozen=True)
 class Located:
-    """Where the LiDAR was, and what the manifest says of it.
+    """Where the LiDAR was, and what the manifest says of it."""
 
-    Attributes:
-        trajectory: Poses of the LiDAR; in the control's frame where there was one, else level from the first sweep.
-        estimated: Whether the poses were found here, so that they are worth writing down.
-        most_uncovered: Share of the scans that may lie outside the trajectory's time.
-        facts: `poses`, `length_fixed_by`, `length_uncertainty` (m, 95 %, or `None` where nobody can say) and figures.
-    """
-
+    # Poses of the LiDAR; in the control's frame where there was one, else level from the first sweep
     trajectory: Trajectory
+    # `poses`, `length_fixed_by`, `length_uncertainty` (m, 95 %, or `None` where nobody can say) and figures
     facts: dict[str, Any]
-    estimated: bool = True
-    most_uncovered: float = 0.05
+    estimated: bool = True  # True where the poses were estimated here and are written to the scene
+    most_uncovered: float = 0.05  # Share of the scans that may lie outside the trajectory's time
 
 
 def run_odometry(

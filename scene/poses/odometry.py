@@ -27,19 +27,12 @@ _KNOTS = 11  # poses that a sweep is unwound with
 
 @dataclass(frozen=True)
 class Guide:
-    """What is known of the motion before the LiDAR is asked.
+    """Motion that is known before the LiDAR is asked."""
 
-    Attributes:
-        trajectory: Attitudes of the LiDAR, and its positions where `moves`, in any fixed frame.
-        moves: Whether the positions mean anything.
-        turn_sigma: Standard deviation of the turn from one sweep to the next, rad.
-        shift_sigma: Of the shift from one sweep to the next, m.
-    """
-
-    trajectory: Trajectory
-    moves: bool
-    turn_sigma: float
-    shift_sigma: float
+    trajectory: Trajectory  # Attitudes of the LiDAR, and its positions where `moves`, in any fixed frame
+    moves: bool  # True where the positions mean anything
+    turn_sigma: float  # Standard deviation of the turn from one sweep to the next, rad
+    shift_sigma: float  # Standard deviation of the shift from one sweep to the next, m
 
 
 class Tracker:
@@ -154,23 +147,15 @@ def _blend_poses(
 
 @dataclass
 class TrackedSweeps:
-    """Sweeps in the order of time.
+    """Sweeps in the order of time."""
 
-    Attributes:
-        times: Middle of each, s.
-        poses: `(4, 4)` each.
-        weakest: See `Odometry`.
-        thinned: Points of each as they went into the map, m, `(k, 3)`; only of those that were read back.
-        place: How far the recording has been read.
-        done: Whether that was all of it.
-    """
-
-    times: list[float] = field(default_factory=list)
-    poses: list[np.ndarray] = field(default_factory=list)
-    weakest: list[np.ndarray] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)  # Middle of each, s
+    poses: list[np.ndarray] = field(default_factory=list)  # `(4, 4)` each
+    weakest: list[np.ndarray] = field(default_factory=list)  # See `Odometry`
+    # Points of each as they went into the map, m; only of those that were read back
     thinned: list[np.ndarray] = field(default_factory=list)
-    place: ReadPosition = START
-    done: bool = False
+    place: ReadPosition = START  # Position up to which the recording has been read
+    done: bool = False  # True where the whole recording has been read
 
 
 class OdometryLog:
@@ -236,15 +221,10 @@ class OdometryLog:
 
 @dataclass(frozen=True)
 class Odometry:
-    """Poses of the LiDAR in the middle of each sweep, in the frame of the first of them.
+    """Poses of the LiDAR in the middle of each sweep, in the frame of the first of them."""
 
-    Attributes:
-        trajectory: The poses.
-        weakest: Unit direction in each sweep that its walls say least about: the bore's axis, `(n, 3)`.
-    """
-
-    trajectory: Trajectory
-    weakest: Float[np.ndarray, "n 3"]
+    trajectory: Trajectory  # The poses
+    weakest: Float[np.ndarray, "n 3"]  # Unit direction in each sweep that its walls say least about: the bore's axis
 
 
 def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog) -> Odometry:
@@ -254,7 +234,7 @@ def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, l
         recording: The recording; each scan is read once.
         guide: See `Guide`; without one, each sweep is expected to go on as the last did.
         stage: Counts the scans.
-        log: What an earlier build tracked, and where this one keeps what it does.
+        log: Sweeps that an earlier build tracked, and place for those of this one.
 
     Raises:
         FitError: Fewer than two usable scans.

@@ -50,7 +50,7 @@ def register_scans(
         voxel: Thinning, m.
         stage: Counts the scans.
         most_uncovered: Share of the scans that may lack a pose; those are left out.
-        partial: What an earlier build got done, and where this one keeps what it does.
+        partial: Partial results of an earlier build, and place for those of this one.
 
     Raises:
         RecordingError: The trajectory misses a larger share of the scans.
@@ -89,7 +89,7 @@ def register_scans(
 
 @dataclass
 class _Registration:
-    """How far a registration is, between two batches."""
+    """State of a registration between two batches."""
 
     thinned: VoxelMean
     place: ReadPosition = START

@@ -8,22 +8,11 @@ from scipy.interpolate import make_smoothing_spline
 from scipy.ndimage import gaussian_filter1d
 
 from scene.errors import FitError
+from scene.poses import terms
 from scene.poses.calibration import Mount
 from scene.poses.imu import Inertial
 from scene.poses.odometry import Odometry
-from scene.poses.terms import (
-    KNOT_SIZE,
-    Chain,
-    Motion,
-    NormalEquations,
-    Sightings,
-    Steps,
-    add_biases,
-    add_motion,
-    invert_rotations,
-    rotate_vectors,
-    rotation_matrices,
-)
+from scene.poses.terms import Chain, Motion, Sightings, Steps
 from scene.poses.trajectory import Control
 
 _YAWS = np.deg2rad(np.arange(0, 360, 45))
@@ -38,7 +27,7 @@ _SMOOTH, SMOOTH_BETWEEN_SWEEPS = 2e-4, 5e-3
 
 @dataclass(frozen=True)
 class Noise:
-    """What the instruments are trusted to.
+    """Standard deviations that the instruments are trusted to.
 
     Attributes:
         control: Standard deviation of a control position in each axis, m.
@@ -58,20 +47,13 @@ class Noise:
 
 @dataclass(frozen=True)
 class Problem:
-    """Everything that was measured, on one chain of knots.
+    """Everything that was measured, on one chain of knots."""
 
-    Attributes:
-        motion: Rates and forces between knots.
-        sightings: Of the prism.
-        steps: Of the odometry, where it ran.
-        noise: See `Noise`.
-        inertial: Whether the rates come from an instrument, which has biases; otherwise the motion is merely smooth.
-    """
-
-    motion: Motion
-    sightings: Sightings
-    steps: Steps | None
-    noise: Noise
+    motion: Motion  # Rates and forces between knots
+    sightings: Sightings  # Sightings of the prism
+    steps: Steps | None  # Steps of the odometry, where it ran
+    noise: Noise  # See `Noise`
+    # True where the rates come from an instrument, which has biases; otherwise the motion is only smooth
     inertial: bool = True
 
     def solve(self, chain: Chain, iterations: int = _ITERATIONS) -> tuple[Chain, float]:
@@ -92,16 +74,16 @@ class Problem:
                 break
         return best, cost
 
-    def _equations(self, chain: Chain) -> NormalEquations:
+    def _equations(self, chain: Chain) -> terms.NormalEquations:
         reach = 1 if self.steps is None else int((self.steps.second - self.steps.first).max())
-        equations = NormalEquations(len(chain.times), KNOT_SIZE, reach)
+        equations = terms.NormalEquations(len(chain.times), terms.KNOT_SIZE, reach)
         noise = self.noise
         if self.inertial:
-            add_motion(equations, chain, self.motion, _SMOOTH)
-            add_biases(equations, chain, _BIAS, (noise.gyro_walk, noise.accel_walk))
+            terms.add_motion(equations, chain, self.motion, _SMOOTH)
+            terms.add_biases(equations, chain, _BIAS, (noise.gyro_walk, noise.accel_walk))
         else:
-            add_motion(equations, chain, self.motion, SMOOTH_BETWEEN_SWEEPS)
-            add_biases(equations, chain, _NO_BIAS, _NO_BIAS)
+            terms.add_motion(equations, chain, self.motion, SMOOTH_BETWEEN_SWEEPS)
+            terms.add_biases(equations, chain, _NO_BIAS, _NO_BIAS)
         self.sightings.add_to(equations, chain, noise.robust)
         if self.steps is not None:
             self.steps.add_to(equations, chain, noise.robust)
@@ -171,7 +153,7 @@ def level_attitudes(
     # The smallest turn from `up` to the vertical.
     axis = np.cross(up, [0.0, 0.0, 1.0])
     size = np.linalg.norm(axis, axis=1, keepdims=True)
-    level = rotation_matrices(axis / np.maximum(size, 1e-9) * np.arctan2(size[:, 0], up[:, 2])[:, None])
+    level = terms.rotation_matrices(axis / np.maximum(size, 1e-9) * np.arctan2(size[:, 0], up[:, 2])[:, None])
     return _rotations_about_z(heading) @ level
 
 
@@ -184,7 +166,7 @@ def turn_along_track(
         times: Evenly spaced, s.
         attitude: Whose heading drifts slowly.
         velocity: In the fixed frame, m/s; weighs by its size.
-        yaw: How the body is mounted.
+        yaw: Angle of the x axis left of the motion, rad.
     """
     step = float(np.median(np.diff(times)))
     facing = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
@@ -197,7 +179,7 @@ def turn_along_track(
 
 
 def _rotations_about_z(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3 3"]:
-    return rotation_matrices(angle[:, None] * np.array([0.0, 0.0, 1.0]))
+    return terms.rotation_matrices(angle[:, None] * np.array([0.0, 0.0, 1.0]))
 
 
 def inertial_problem(
@@ -244,8 +226,8 @@ def odometry_problem(
     if len(shared) < 3:
         raise FitError(f"{control.path}: only {len(shared)} sweeps lie within the control's time")
     times, turns = poses.times[shared], poses.rotations[shared].as_matrix()
-    back = invert_rotations(turns[:-1])
-    shift = rotate_vectors(back, np.diff(poses.positions[shared], axis=0))
+    back = terms.invert_rotations(turns[:-1])
+    shift = terms.rotate_vectors(back, np.diff(poses.positions[shared], axis=0))
     along = odometry.weakest[shared[1:], :, None] * odometry.weakest[shared[1:], None, :]
     n = np.arange(len(times) - 1)
     turn_root = np.broadcast_to(np.eye(3) / _STEP_TURN, along.shape)
@@ -267,7 +249,7 @@ def imu_steps(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
     places, turns = poses.at(chain.times[knots])
     attitude = turns.as_matrix() @ mount.rotation.T
     places = places + turns.apply(mount.origin)
-    back = invert_rotations(attitude[:-1])
+    back = terms.invert_rotations(attitude[:-1])
     nearest = np.clip(np.searchsorted(poses.times, chain.times[knots[1:]]), 0, len(poses.times) - 1)
     weakest = odometry.weakest[nearest] @ mount.rotation.T
     along = weakest[:, :, None] * weakest[:, None, :]
@@ -275,7 +257,7 @@ def imu_steps(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
         knots[:-1],
         knots[1:],
         back @ attitude[1:],
-        rotate_vectors(back, np.diff(places, axis=0)),
+        terms.rotate_vectors(back, np.diff(places, axis=0)),
         np.broadcast_to(np.eye(3) / _IMU_STEP_TURN, along.shape),
         (np.eye(3) - along) / _IMU_STEP_ACROSS + along / _IMU_STEP_ALONG,
     )

@@ -119,23 +119,14 @@ _EYE = np.eye(3)
 
 @dataclass(frozen=True)
 class Chain:
-    """Knots in time, and the state of the body at each.
+    """Knots in time, and the state of the body at each."""
 
-    Attributes:
-        times: s, `(n,)`.
-        attitude: Body to fixed frame, `(n, 3, 3)`.
-        position: Of the body's origin, m, `(n, 3)`.
-        velocity: m/s, `(n, 3)`.
-        gyro_bias: rad/s, `(n, 3)`.
-        accel_bias: m/s², `(n, 3)`.
-    """
-
-    times: Float[np.ndarray, " n"]
-    attitude: Float[np.ndarray, "n 3 3"]
-    position: Float[np.ndarray, "n 3"]
-    velocity: Float[np.ndarray, "n 3"]
-    gyro_bias: Float[np.ndarray, "n 3"]
-    accel_bias: Float[np.ndarray, "n 3"]
+    times: Float[np.ndarray, " n"]  # s
+    attitude: Float[np.ndarray, "n 3 3"]  # Body to fixed frame
+    position: Float[np.ndarray, "n 3"]  # Position of the body's origin, m
+    velocity: Float[np.ndarray, "n 3"]  # m/s
+    gyro_bias: Float[np.ndarray, "n 3"]  # rad/s
+    accel_bias: Float[np.ndarray, "n 3"]  # m/s²
 
     def moved(self, step: Float[np.ndarray, "n 15"]) -> "Chain":
         """Return the chain after a step of the solver."""
@@ -151,21 +142,13 @@ class Chain:
 
 @dataclass(frozen=True)
 class Motion:
-    """Mean rate and force between neighbouring knots.
+    """Mean rate and force between neighbouring knots."""
 
-    Attributes:
-        rate: rad/s, `(n - 1, 3)`.
-        force: m/s², `(n - 1, 3)`; zero where nothing measured it.
-        rate_sigma: Of the change of attitude, rad/√s.
-        force_sigma: Of the change of velocity, m/s/√s.
-        has_force: Whether `force` was measured; otherwise the velocity is merely slow to change.
-    """
-
-    rate: Float[np.ndarray, "k 3"]
-    force: Float[np.ndarray, "k 3"]
-    rate_sigma: float
-    force_sigma: float
-    has_force: bool
+    rate: Float[np.ndarray, "k 3"]  # rad/s
+    force: Float[np.ndarray, "k 3"]  # m/s²; zero where nothing measured it
+    rate_sigma: float  # Standard deviation of the change of attitude, rad/√s
+    force_sigma: float  # Standard deviation of the change of velocity, m/s/√s
+    has_force: bool  # True where `force` was measured; otherwise the velocity changes slowly
 
 
 def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth: float) -> None:
@@ -225,21 +208,13 @@ def add_biases(equations: NormalEquations, chain: Chain, prior: tuple[float, flo
 
 @dataclass(frozen=True)
 class Sightings:
-    """Positions of a point fixed to the body.
+    """Positions of a point fixed to the body."""
 
-    Attributes:
-        knot: Knot before each, `(m,)`.
-        share: Way from that knot to the next, 0 to 1, `(m,)`.
-        position: m, `(m, 3)`.
-        lever: Of the point in the body, m, `(3,)`.
-        sigma: Standard deviation in each axis, m.
-    """
-
-    knot: Int[np.ndarray, " m"]
-    share: Float[np.ndarray, " m"]
-    position: Float[np.ndarray, "m 3"]
-    lever: Float[np.ndarray, "3"]
-    sigma: float
+    knot: Int[np.ndarray, " m"]  # Knot before each
+    share: Float[np.ndarray, " m"]  # Way from that knot to the next, 0 to 1
+    position: Float[np.ndarray, "m 3"]  # m
+    lever: Float[np.ndarray, "3"]  # Position of the point in the body, m
+    sigma: float  # Standard deviation in each axis, m
 
     def residual(self, chain: Chain) -> Float[np.ndarray, "m 3"]:
         """Return estimated less measured position of the point, m."""
@@ -266,20 +241,13 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Steps:
-    """Relative poses between knots, from LiDAR odometry.
+    """Relative poses between knots, from LiDAR odometry."""
 
-    Attributes:
-        first, second: Knots joined, `(m,)`.
-        turn: Attitude of the second in the first, `(m, 3, 3)`.
-        shift: Position of the second in the first, m, `(m, 3)`.
-        turn_root, shift_root: Square roots of the information matrices, `(m, 3, 3)`, 1/rad and 1/m.
-    """
-
-    first: Int[np.ndarray, " m"]
+    first: Int[np.ndarray, " m"]  # Knots joined
     second: Int[np.ndarray, " m"]
-    turn: Float[np.ndarray, "m 3 3"]
-    shift: Float[np.ndarray, "m 3"]
-    turn_root: Float[np.ndarray, "m 3 3"]
+    turn: Float[np.ndarray, "m 3 3"]  # Attitude of the second in the first
+    shift: Float[np.ndarray, "m 3"]  # Position of the second in the first, m
+    turn_root: Float[np.ndarray, "m 3 3"]  # Square roots of the information matrices, `(m, 3, 3)`, 1/rad and 1/m
     shift_root: Float[np.ndarray, "m 3 3"]
 
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:

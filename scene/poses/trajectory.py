@@ -17,19 +17,12 @@ _QUATERNION_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Sensor poses in a fixed frame.
+    """Sensor poses in a fixed frame."""
 
-    Attributes:
-        times: s, growing, `(n,)`.
-        positions: m, `(n, 3)`.
-        rotations: Sensor to fixed frame, `n` of them.
-        source: Where the poses come from, for messages.
-    """
-
-    times: Float[np.ndarray, " n"]
-    positions: Float[np.ndarray, "n 3"]
-    rotations: Rotation
-    source: str
+    times: Float[np.ndarray, " n"]  # s, growing
+    positions: Float[np.ndarray, "n 3"]  # m
+    rotations: Rotation  # Sensor to fixed frame, `n` of them
+    source: str  # Origin of the poses, for messages
 
     @property
     def path(self) -> Path:
@@ -104,19 +97,12 @@ MIN_CONTROL_SHARE = 0.5  # of the recording's time
 
 @dataclass(frozen=True)
 class Control:
-    """Positions of one point of the carrier in a surveyed frame.
+    """Positions of one point of the carrier in a surveyed frame."""
 
-    Attributes:
-        times: s, growing, `(n,)`.
-        positions: m, `(n, 3)`.
-        path: The file.
-        dropped: Rows left out because their time was repeated.
-    """
-
-    times: Float[np.ndarray, " n"]
-    positions: Float[np.ndarray, "n 3"]
-    path: Path
-    dropped: int
+    times: Float[np.ndarray, " n"]  # s, growing
+    positions: Float[np.ndarray, "n 3"]  # m
+    path: Path  # The file
+    dropped: int  # Rows left out because their time was repeated
 
     def require_overlap(self, start: float, end: float, recording: Path) -> None:
         """Refuses control that misses much of the recording.

@@ -86,17 +86,11 @@ _own: dict[str, Format] = {}
 
 @dataclass(frozen=True)
 class Detected:
-    """An input and its format.
+    """An input and its format."""
 
-    Attributes:
-        path: The file or folder to open; inside the input where that is a folder with one file.
-        format: Row of the table.
-        by: How it was found: `content`, `name` or `flag`.
-    """
-
-    path: Path
-    format: Format
-    by: str
+    path: Path  # The file or folder to open; inside the input where that is a folder with one file
+    format: Format  # Row of the table
+    by: str  # Way it was found: `content`, `name` or `flag`
 
 
 def register_reader(

@@ -21,17 +21,11 @@ _LONGEST_PAUSE = 3600.0  # s; a stamp further from the last one is damage, and w
 
 @dataclass(frozen=True)
 class ReadPosition:
-    """A position in a recording, up to which it has been read.
+    """A position in a recording, up to which it has been read."""
 
-    Attributes:
-        messages: Number of LiDAR messages read.
-        last: Time of the last scan yielded, s; `None` before the first.
-        late: Number of messages left out because their time did not grow.
-    """
-
-    messages: int = 0
-    last: float | None = None
-    late: int = 0
+    messages: int = 0  # Number of LiDAR messages read
+    last: float | None = None  # Time of the last scan yielded, s; `None` before the first
+    late: int = 0  # Number of messages left out because their time did not grow
 
     def as_array(self) -> Float[np.ndarray, "3"]:
         """Return the three attributes as numbers."""
@@ -54,7 +48,7 @@ class Recording:
         path: The recording.
         topic: The LiDAR topic read; the folder's name for a folder of scans.
         scan_count: Scans in the recording.
-        facts: What was detected, for the manifest; complete once a scan has been read.
+        facts: Detected facts, for the manifest; complete once a scan has been read.
         position: Position up to which the latest `scans()` has read.
 
     Raises:

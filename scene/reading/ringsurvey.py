@@ -21,14 +21,10 @@ _MOST_CELLS = 64
 
 @dataclass(frozen=True)
 class Sheet:
-    """One table.
+    """One table."""
 
-    Attributes:
-        header: Cells of its first row, as text.
-        rows: Where each other row stands (`line 2`), and its cells; empty rows are left out.
-    """
-
-    header: tuple[str, ...]
+    header: tuple[str, ...]  # Cells of its first row, as text
+    # Place of each other row (`line 2`), and its cells; empty rows are left out
     rows: Iterator[tuple[str, tuple[Any, ...]]]
 
 
@@ -81,23 +77,15 @@ _SHOWN = 100  # characters of a wrong header
 
 @dataclass(frozen=True)
 class RingSurvey:
-    """Points of each ring, in the order of the file.
+    """Points of each ring, in the order of the file."""
 
-    Attributes:
-        path: The file.
-        names: Ring numbers as written.
-        points: Easting, northing, elevation of each ring's points, m, `(k, 3)` each.
-        offsets: How far each point lies inside the wall, m, `(k,)` each.
-        design: Chainage, easting, northing, elevation of the design axis, m, `(d, 4)`; `None` where there is none.
-        facts: What was detected, for people and the manifest.
-    """
-
-    path: Path
-    names: list[str]
-    points: list[Float[np.ndarray, "k 3"]]
-    offsets: list[Float[np.ndarray, " k"]]
+    path: Path  # The file
+    names: list[str]  # Ring numbers as written
+    points: list[Float[np.ndarray, "k 3"]]  # Easting, northing, elevation of each ring's points, m each
+    offsets: list[Float[np.ndarray, " k"]]  # Distance of each point inside the wall, m
+    # Chainage, easting, northing, elevation of the design axis, m; `None` where there is none
     design: Float[np.ndarray, "d 4"] | None
-    facts: dict[str, str]
+    facts: dict[str, str]  # Detected facts, for people and the manifest
 
 
 @dataclass(frozen=True)

@@ -23,17 +23,11 @@ from scene.reading.source import cause, stack_xyz
 
 @dataclass(frozen=True)
 class Scan:
-    """A sweep in the sensor frame.
+    """A sweep in the sensor frame."""
 
-    Attributes:
-        stamp: Time of the sweep, s.
-        points: Returns at their own time, m, `(n, 3)`.
-        times: Time of each return after `stamp`, s, `(n,)`.
-    """
-
-    stamp: float
-    points: Float[np.ndarray, "n 3"]
-    times: Float[np.ndarray, " n"]
+    stamp: float  # Time of the sweep, s
+    points: Float[np.ndarray, "n 3"]  # Returns at their own time, m
+    times: Float[np.ndarray, " n"]  # Time of each return after `stamp`, s
 
 
 class _NoTopics:
@@ -53,7 +47,7 @@ class ScanSource:
         path: The recording, for messages.
         topic: The LiDAR topic; the file's or folder's name where there are no topics.
         scan_count: Number of scans.
-        facts: What was detected, for people and the manifest. `kind` is needed; `point_times` is known after a scan.
+        facts: Detected facts, for people and the manifest. `kind` is needed; `point_times` is known after a scan.
         reader: A bag's reader, for the IMU beside the LiDAR: `connections` and `messages(connections=…)`.
     """
 

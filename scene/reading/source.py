@@ -32,7 +32,7 @@ def refuse_damage(path: Path, what: str, kind: type[SubterraError]) -> Iterator[
 
     Args:
         path: The file at fault.
-        what: What the file is not, such as `a readable PLY cloud`.
+        what: Description that the file does not meet, such as `a readable PLY cloud`.
         kind: Raised in its place; errors of this project pass as they are.
     """
     try:
@@ -48,21 +48,15 @@ BATCH = 500_000  # points of a chunk: 12 MB of coordinates
 
 @dataclass(frozen=True)
 class CloudSource:
-    """A cloud that has been opened but not read.
+    """A cloud that has been opened but not read."""
 
-    Attributes:
-        format: With its version, for the manifest.
-        chunks: Starts reading: x, y, z as stored, `(n, 3)` float64 each, of bounded size.
-        sample: Points from all over the file, or corners of its box, by which a unit can be told, `(k, 3)`.
-        unit: `m`, `mm` or a kind of foot, where the format or a header says so.
-        count: Points in all, where the file knows.
-    """
-
-    format: str
+    format: str  # With its version, for the manifest
+    # Starts reading: x, y, z as stored, `(n, 3)` float64 each, of bounded size
     chunks: Callable[[], Iterator[Float[np.ndarray, "n 3"]]]
+    # Points from all over the file, or corners of its box, by which a unit can be told
     sample: Float[np.ndarray, "k 3"]
-    unit: str | None = None
-    count: int | None = None
+    unit: str | None = None  # `m`, `mm` or a kind of foot, where the format or a header says so
+    count: int | None = None  # Points in all, where the file knows
 
 
 def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
@@ -93,25 +87,15 @@ _TEXT_BLOCK = 1 << 22  # bytes
 
 @dataclass(frozen=True)
 class Lines:
-    """Where numbers stand in a text file.
+    """Where numbers stand in a text file."""
 
-    Attributes:
-        path: The file.
-        columns: Which to read, in this order.
-        delimiter: Between them; `None` for any white space.
-        start: Byte of the first line of numbers.
-        line: Its number, from 1, for messages.
-        count: Lines to read; all where `None`.
-        decimal_comma: Whether `1,5` means one and a half.
-    """
-
-    path: Path
-    columns: tuple[int, ...]
-    delimiter: str | None = None
-    start: int = 0
-    line: int = 1
-    count: int | None = None
-    decimal_comma: bool = False
+    path: Path  # The file
+    columns: tuple[int, ...]  # Columns to read, in this order
+    delimiter: str | None = None  # Between them; `None` for any white space
+    start: int = 0  # Byte of the first line of numbers
+    line: int = 1  # Its number, from 1, for messages
+    count: int | None = None  # Lines to read; all where `None`
+    decimal_comma: bool = False  # True where `1,5` means one and a half
 
     def rows(self) -> Iterator[Float[np.ndarray, "n k"]]:
         """Return the columns as numbers, block by block.
@@ -191,17 +175,11 @@ _Y_UP = "x-zy"
 
 @dataclass(frozen=True)
 class Frame:
-    """How stored coordinates become metres with z up.
+    """Conversion of stored coordinates to metres with z up."""
 
-    Attributes:
-        unit: A key of `UNITS`.
-        axes: Which stored axes point along x, y and z.
-        facts: Both, and how each was found, for people and the manifest.
-    """
-
-    unit: str
-    axes: str
-    facts: dict[str, str]
+    unit: str  # A key of `UNITS`
+    axes: str  # Stored axes that point along x, y and z
+    facts: dict[str, str]  # Both, and how each was found, for people and the manifest
 
     def apply(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Return stored coordinates in m, z up."""

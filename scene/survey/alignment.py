@@ -12,19 +12,12 @@ MARGIN = 30.0  # m of alignment beyond either mouth, where the carrier starts
 
 @dataclass(frozen=True)
 class Frames:
-    """Right-handed frames on the centreline.
+    """Right-handed frames on the centreline."""
 
-    Attributes:
-        position: Points of the centreline in the survey frame, m.
-        tangent: Unit vectors of growing station.
-        lateral: Unit vectors to the left, horizontal.
-        up: Unit vectors; sections lie in the plane of `lateral` and `up`.
-    """
-
-    position: Float[np.ndarray, "n 3"]
-    tangent: Float[np.ndarray, "n 3"]
-    lateral: Float[np.ndarray, "n 3"]
-    up: Float[np.ndarray, "n 3"]
+    position: Float[np.ndarray, "n 3"]  # Points of the centreline in the survey frame, m
+    tangent: Float[np.ndarray, "n 3"]  # Unit vectors of growing station
+    lateral: Float[np.ndarray, "n 3"]  # Unit vectors to the left, horizontal
+    up: Float[np.ndarray, "n 3"]  # Unit vectors; sections lie in the plane of `lateral` and `up`
 
     def point(self, y: Float[np.ndarray, "n *m"], z: Float[np.ndarray, "n *m"]) -> Float[np.ndarray, "n *m 3"]:
         """Return points at `y` along `lateral` and `z` along `up` of each frame, m."""
@@ -39,19 +32,12 @@ class Frames:
 
 @dataclass(frozen=True)
 class Alignment:
-    """A centreline by arc length.
+    """A centreline by arc length."""
 
-    Attributes:
-        length: Length between the mouths, m. Stations from `-MARGIN` to `length + MARGIN` are defined.
-        curve: Station to position, m.
-        heading: Station to heading from the survey x axis, rad.
-        slope: Station to angle above the horizontal, rad.
-    """
-
-    length: float
-    curve: CubicHermiteSpline
-    heading: CubicHermiteSpline
-    slope: CubicHermiteSpline
+    length: float  # Length between the mouths, m. Stations from `-MARGIN` to `length + MARGIN` are defined
+    curve: CubicHermiteSpline  # Station to position, m
+    heading: CubicHermiteSpline  # Station to heading from the survey x axis, rad
+    slope: CubicHermiteSpline  # Station to angle above the horizontal, rad
 
     def frames(self, station: Float[np.ndarray, "n"]) -> Frames:
         """Return the frames at `station`, m."""
@@ -67,19 +53,12 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Elements:
-    """What a centreline is made of: piecewise linear curvature in plan and grade in profile, constant beyond the ends.
+    """Piecewise linear curvature in plan and grade in profile, constant beyond the ends."""
 
-    Attributes:
-        plan: Stations of the knots of the curvature, m.
-        curvature: There, 1/m; positive turns left.
-        profile: Stations of the knots of the grade, m.
-        grade: There, rise over run.
-    """
-
-    plan: Float[np.ndarray, "p"]
-    curvature: Float[np.ndarray, "p"]
-    profile: Float[np.ndarray, "q"]
-    grade: Float[np.ndarray, "q"]
+    plan: Float[np.ndarray, "p"]  # Stations of the knots of the curvature, m
+    curvature: Float[np.ndarray, "p"]  # Curvature at these knots, 1/m; positive turns left
+    profile: Float[np.ndarray, "q"]  # Stations of the knots of the grade, m
+    grade: Float[np.ndarray, "q"]  # Grade at these knots, rise over run
 
 
 def lay_out(rng: np.random.Generator, length: float, elements: Elements) -> Alignment:

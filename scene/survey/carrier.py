@@ -18,17 +18,11 @@ _TABLE = 1e-3  # s, spacing of the pose table; linear in between, good to 0.01 m
 
 @dataclass(frozen=True)
 class Sway:
-    """A sum of sinusoids.
+    """A sum of sinusoids."""
 
-    Attributes:
-        amplitude: One for each sinusoid, in the unit of the sway.
-        rate: rad/s.
-        phase: rad.
-    """
-
-    amplitude: Float[np.ndarray, "k"]
-    rate: Float[np.ndarray, "k"]
-    phase: Float[np.ndarray, "k"]
+    amplitude: Float[np.ndarray, "k"]  # One for each sinusoid, in the unit of the sway
+    rate: Float[np.ndarray, "k"]  # rad/s
+    phase: Float[np.ndarray, "k"]  # rad
 
     def __call__(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the value at `time`, s."""
@@ -44,36 +38,23 @@ def _draw_sway(rng: np.random.Generator, slow: float, stride: float) -> Sway:
 
 @dataclass(frozen=True)
 class Poses:
-    """LiDAR poses in the survey frame.
+    """LiDAR poses in the survey frame."""
 
-    Attributes:
-        position: m.
-        quaternion: x, y, z, w; takes LiDAR vectors to the survey frame.
-    """
-
-    position: Float[np.ndarray, "n 3"]
-    quaternion: Float[np.ndarray, "n 4"]
+    position: Float[np.ndarray, "n 3"]  # m
+    quaternion: Float[np.ndarray, "n 4"]  # x, y, z, w; takes LiDAR vectors to the survey frame
 
 
 @dataclass(frozen=True)
 class Walk:
-    """The carried LiDAR's motion.
+    """The carried LiDAR's motion."""
 
-    Attributes:
-        bore: The bore walked through.
-        speed: Mean speed, m/s.
-        duration: Length of the survey, s.
-        ahead, across, above: Sway of the position, m.
-        yaw, pitch, roll: Sway of the attitude against the centreline's frame, rad.
-    """
-
-    bore: Bore
-    speed: float
-    duration: float
-    ahead: Sway
+    bore: Bore  # The bore walked through
+    speed: float  # Mean speed, m/s
+    duration: float  # Length of the survey, s
+    ahead: Sway  # Sway of the position, m
     across: Sway
     above: Sway
-    yaw: Sway
+    yaw: Sway  # Sway of the attitude against the centreline's frame, rad
     pitch: Sway
     roll: Sway
 
@@ -93,15 +74,10 @@ class Walk:
 
 @dataclass(frozen=True)
 class Carried:
-    """An instrument on the walk.
+    """An instrument on the walk."""
 
-    Attributes:
-        walk: Motion of the rack, which is that of the Avia's frame.
-        mount: Of the instrument against the Avia.
-    """
-
-    walk: Walk
-    mount: Mount
+    walk: Walk  # Motion of the rack, which is that of the Avia's frame
+    mount: Mount  # Mount of the instrument against the Avia
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
         """Return the exact poses at `time`, s."""
@@ -163,19 +139,12 @@ _H = 1e-3  # s, half-step of the central differences
 
 @dataclass(frozen=True)
 class Inertial:
-    """Samples of one IMU.
+    """Samples of one IMU."""
 
-    Attributes:
-        time: s since the start.
-        accel: Specific force, m/s²; +9.8 upwards at rest.
-        gyro: rad/s.
-        quaternion: Orientation x, y, z, w, IMU to a level frame of unknown heading.
-    """
-
-    time: Float[np.ndarray, "n"]
-    accel: Float[np.ndarray, "n 3"]
-    gyro: Float[np.ndarray, "n 3"]
-    quaternion: Float[np.ndarray, "n 4"]
+    time: Float[np.ndarray, "n"]  # s since the start
+    accel: Float[np.ndarray, "n 3"]  # Specific force, m/s²; +9.8 upwards at rest
+    gyro: Float[np.ndarray, "n 3"]  # rad/s
+    quaternion: Float[np.ndarray, "n 4"]  # Orientation x, y, z, w, IMU to a level frame of unknown heading
 
 
 def measure_inertial(

@@ -17,19 +17,12 @@ _REACH = 190.0  # m loaded ahead of it, and behind it for LiDARs that look back;
 
 @dataclass(frozen=True)
 class Hits:
-    """The first surface on each ray.
+    """The first surface on each ray."""
 
-    Attributes:
-        distance: m, infinite where nothing is hit.
-        cosine: Of the incidence angle; negative where the surface is hit from behind.
-        part: `Part` that is hit; meaningless where nothing is.
-        normal: Unit normals, towards the air.
-    """
-
-    distance: Float32[np.ndarray, "n"]
-    cosine: Float32[np.ndarray, "n"]
-    part: UInt8[np.ndarray, "n"]
-    normal: Float32[np.ndarray, "n 3"]
+    distance: Float32[np.ndarray, "n"]  # m, infinite where nothing is hit
+    cosine: Float32[np.ndarray, "n"]  # Cosine of incidence; negative on a surface hit from behind
+    part: UInt8[np.ndarray, "n"]  # `Part` that is hit; meaningless where nothing is
+    normal: Float32[np.ndarray, "n 3"]  # Unit normals, towards the air
 
 
 class Caster:
@@ -44,7 +37,7 @@ class Caster:
 
         Args:
             mesh: True surfaces.
-            behind: What is kept behind the carrier, m.
+            behind: Length of the mesh kept behind the carrier, m.
         """
         self._mesh = mesh
         self._behind = behind
@@ -104,7 +97,7 @@ def draw_returns(rng: np.random.Generator, lidar: Lidar, errors: SensorErrors, h
         rng: Source of randomness.
         lidar: Its ranges and its weakest echo.
         errors: `weak_echoes` and `lost`.
-        hits: What the pulses meet.
+        hits: First surface on each pulse.
     """
     distance, cosine = hits.distance, hits.cosine
     seen = (distance >= lidar.range_min) & (distance <= lidar.range_max) & (cosine > 0.0)
@@ -148,7 +141,7 @@ def mix_pixels(
         caster: Of the true mesh, loaded about the carrier.
         origin: Of the rays, survey frame, m.
         heading: Unit vectors, survey frame.
-        hits: What the middles of the beams meet.
+        hits: First surface on the middle of each beam.
     """
     chosen = np.flatnonzero((rng.random(len(heading), np.float32) < share) & np.isfinite(hits.distance))
     ray, near, normal = heading[chosen], hits.distance[chosen], hits.normal[chosen]

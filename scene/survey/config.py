@@ -1,4 +1,4 @@
-"""What one simulated survey is asked to be."""
+"""Settings of one simulated survey."""
 
 import math
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ METRO_LENGTH = 351.0  # m of the real alignment that are at hand
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """How the instruments err. Zero, or the flag's `no-` form, switches a part off."""
+    """Errors of the instruments. Zero, or the flag's `no-` form, switches a part off."""
 
     range_noise: float = 0.019
     """Standard deviation of a range met squarely and near, m."""
@@ -50,7 +50,7 @@ class SurveyConfig:
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder to write to; made if missing."""
     truth: TruthName = "paper"
-    """Which bore: the paper's D-section; the same on a real metro's alignment; or one outside that class."""
+    """Kind of bore: the paper's D-section; the same on a real metro's alignment; or one outside that class."""
     length: float = 60.0
     """Length of the bore along its centreline, m."""
     seed: int = 0

@@ -1,4 +1,4 @@
-"""What is built into the bore: rings, bolt pockets, nails, sleepers, rails. Sizes and where they stand."""
+"""Sizes and places of what is built into the bore: rings, bolt pockets, nails, sleepers, rails."""
 
 from dataclasses import dataclass
 
@@ -55,23 +55,14 @@ N_ROWS = 8  # longitudinal rows of pockets: four on the left side from the floor
 
 @dataclass(frozen=True)
 class Furniture:
-    """Where the furniture of one bore stands.
+    """Where the furniture of one bore stands."""
 
-    Attributes:
-        joints: Stations of the ring joints, m `(r,)`; empty where the bore has no rings.
-        pocketed: Which joints have pockets: those far enough from the mouths `(r,)`.
-        filled: Pockets mortared flush, by joint, row and side of the joint (before, after) `(r, k, 2)`.
-        depth: Depth of each pocket, m `(r, k, 2)`.
-        nails: Whether a nail bridges the pair; false wherever a pocket is filled `(r, k)`.
-        sleepers: Stations of the sleepers' middles, m `(t,)`.
-    """
-
-    joints: np.ndarray
-    pocketed: np.ndarray
-    filled: np.ndarray
-    depth: np.ndarray
-    nails: np.ndarray
-    sleepers: np.ndarray
+    joints: np.ndarray  # Stations of the ring joints, m `(r,)`; empty where the bore has no rings
+    pocketed: np.ndarray  # Joints with pockets: those far enough from the mouths
+    filled: np.ndarray  # Pockets mortared flush, by joint, row and side of the joint (before, after)
+    depth: np.ndarray  # Depth of each pocket, m
+    nails: np.ndarray  # Pairs that a nail bridges; false where a pocket is filled
+    sleepers: np.ndarray  # Stations of the sleepers' middles, m
 
 
 def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True) -> Furniture:

@@ -7,30 +7,14 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from scene.survey import furniture as fur
 from scene.survey.alignment import Alignment
-from scene.survey.furniture import (
-    CLIP,
-    CLIP_INNER,
-    NAIL_DEPTH,
-    NAIL_DIAMETER,
-    PAD,
-    POCKET_LENGTH,
-    POCKET_OFFSET,
-    RAIL_AXIS,
-    RAIL_HALF,
-    RAIL_HEIGHT,
-    SLEEPER_BOTTOM,
-    SLEEPER_HEIGHT,
-    SLEEPER_LENGTH,
-    SLEEPER_RISE,
-    SLEEPER_TOP,
-    Furniture,
-)
+from scene.survey.furniture import Furniture
 from scene.survey.section import CELL, Section, refine_breaks
 
 
 class Part(IntEnum):
-    """What a triangle belongs to; the values stand in `truth.ply` as `part`."""
+    """Part of the bore that a triangle belongs to; the values stand in `truth.ply` as `part`."""
 
     LINING = 0
     JOINT = 1
@@ -44,19 +28,12 @@ class Part(IntEnum):
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles with normals towards the air.
+    """Triangles with normals towards the air."""
 
-    Attributes:
-        vertices: Survey frame, m.
-        faces: Vertices of each triangle, anticlockwise seen from the air.
-        part: `Part` of each triangle.
-        station: Station of each triangle, good to about a metre, m.
-    """
-
-    vertices: Float[np.ndarray, "v 3"]
-    faces: Int[np.ndarray, "f 3"]
-    part: UInt8[np.ndarray, "f"]
-    station: Float[np.ndarray, "f"]
+    vertices: Float[np.ndarray, "v 3"]  # Survey frame, m
+    faces: Int[np.ndarray, "f 3"]  # Vertices of each triangle, anticlockwise seen from the air
+    part: UInt8[np.ndarray, "f"]  # `Part` of each triangle
+    station: Float[np.ndarray, "f"]  # Station of each triangle, good to about a metre, m
 
 
 def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
@@ -106,17 +83,17 @@ def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> 
         return _copy_shape(shape, _BOX, frames.point(np.full_like(s, across), floor + above), frames.matrix, part, s)
 
     # Down to just under the floor only: from outside the mouth, one would see the buried part beneath it.
-    tall = SLEEPER_RISE + _BURIED + 0.5 * SLEEPER_LENGTH * abs(section.crossfall)
-    low = SLEEPER_TOP + (SLEEPER_BOTTOM - SLEEPER_TOP) * tall / SLEEPER_HEIGHT
-    sleeper = 0.5 * _CORNERS * (1.0, SLEEPER_LENGTH, tall)
-    sleeper[:, 0] *= np.where(sleeper[:, 2] > 0, SLEEPER_TOP, low)
-    meshes = [boxes(sleeper, 0.0, SLEEPER_RISE - 0.5 * tall, Part.SLEEPER)]
-    for rail in (RAIL_AXIS, -RAIL_AXIS):
-        meshes.append(boxes(0.5 * _CORNERS * PAD, rail, SLEEPER_RISE + 0.5 * PAD[2], Part.FASTENING))
+    tall = fur.SLEEPER_RISE + _BURIED + 0.5 * fur.SLEEPER_LENGTH * abs(section.crossfall)
+    low = fur.SLEEPER_TOP + (fur.SLEEPER_BOTTOM - fur.SLEEPER_TOP) * tall / fur.SLEEPER_HEIGHT
+    sleeper = 0.5 * _CORNERS * (1.0, fur.SLEEPER_LENGTH, tall)
+    sleeper[:, 0] *= np.where(sleeper[:, 2] > 0, fur.SLEEPER_TOP, low)
+    meshes = [boxes(sleeper, 0.0, fur.SLEEPER_RISE - 0.5 * tall, Part.SLEEPER)]
+    for rail in (fur.RAIL_AXIS, -fur.RAIL_AXIS):
+        meshes.append(boxes(0.5 * _CORNERS * fur.PAD, rail, fur.SLEEPER_RISE + 0.5 * fur.PAD[2], Part.FASTENING))
         for side in (-1, 1):
-            across = rail + side * (CLIP_INNER + 0.5 * CLIP[1])
-            above = SLEEPER_RISE + 0.5 * CLIP[2]
-            meshes.append(boxes(0.5 * _CORNERS * CLIP, across, above, Part.FASTENING))
+            across = rail + side * (fur.CLIP_INNER + 0.5 * fur.CLIP[1])
+            above = fur.SLEEPER_RISE + 0.5 * fur.CLIP[2]
+            meshes.append(boxes(0.5 * _CORNERS * fur.CLIP, across, above, Part.FASTENING))
         meshes.append(_rail_mesh(alignment, section, rail))
     return join_meshes(meshes)
 
@@ -124,11 +101,11 @@ def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> 
 def _rail_mesh(alignment: Alignment, section: Section, across: float) -> Mesh:
     """One rail from mouth to mouth, `across` to the left of the axis."""
     stations = np.linspace(0.0, alignment.length, int(np.ceil(alignment.length / _RAIL_STEP)) + 1)
-    half = RAIL_HALF
+    half = fur.RAIL_HALF
     # Half at negative `lateral` upwards, the middle of the head, the other half downwards: normals come out outwards.
-    outline = np.concatenate([half * (-1, 1), [(0.0, RAIL_HEIGHT)], half[::-1]])
+    outline = np.concatenate([half * (-1, 1), [(0.0, fur.RAIL_HEIGHT)], half[::-1]])
     k, n = len(outline), len(stations)
-    base = SLEEPER_RISE + PAD[2] - 0.5 * section.height(stations)[:, None]
+    base = fur.SLEEPER_RISE + fur.PAD[2] - 0.5 * section.height(stations)[:, None]
     y, z = np.broadcast_to(outline[:, 0] + across, (n, k)), outline[:, 1] + base
     vertices = alignment.frames(stations).point(y, z).reshape(-1, 3)
 
@@ -151,10 +128,10 @@ def nail_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> M
     station = furniture.joints[joint]
     node = section.shape.rows[row, 1]
     ends = []
-    for offset in (-POCKET_OFFSET, POCKET_OFFSET):
+    for offset in (-fur.POCKET_OFFSET, fur.POCKET_OFFSET):
         frames = alignment.frames(station + offset)
         at = np.arange(len(node))
-        yz = section.rough(station + offset)[at, node] + NAIL_DEPTH * section.shape.normal[node]
+        yz = section.rough(station + offset)[at, node] + fur.NAIL_DEPTH * section.shape.normal[node]
         ends.append(frames.point(yz[:, 0], yz[:, 1]))
     along = ends[1] - ends[0]
     half = 0.5 * np.linalg.norm(along, axis=1)
@@ -166,7 +143,7 @@ def nail_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> M
 
     n = _NAIL_SIDES
     turn = 2.0 * np.pi * np.arange(n) / n
-    circle = 0.5 * NAIL_DIAMETER * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    circle = 0.5 * fur.NAIL_DIAMETER * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
     rings = [np.column_stack([np.full(n, side), circle]) for side in (-1.0, 1.0)]
     ring = np.arange(n)
     ahead = np.roll(ring, -1)
@@ -184,8 +161,8 @@ _FLOOR_CELL = 0.3  # m across the floor
 
 def station_rows(furniture: Furniture, length: float) -> Float[np.ndarray, "n"]:
     """Return the stations of the surface grid: mouths, joints, edges and middles of pockets, and cells between."""
-    half = 0.5 * POCKET_LENGTH
-    offsets = np.array([0.0, _JOINT_HALF, *(POCKET_OFFSET + half * np.array([-1, 0, 1]))])
+    half = 0.5 * fur.POCKET_LENGTH
+    offsets = np.array([0.0, _JOINT_HALF, *(fur.POCKET_OFFSET + half * np.array([-1, 0, 1]))])
     near = (furniture.joints[furniture.pocketed, None] + np.concatenate([-offsets, offsets])).ravel()
     bare = (furniture.joints[~furniture.pocketed, None] + _JOINT_HALF * np.array([-1, 0, 1])).ravel()
     breaks = np.concatenate([[0.0, length], near, bare])
@@ -219,8 +196,8 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
     keep = np.ones(quads.shape[:2], bool)
     pockets = []
     for j, r, side in np.argwhere(furniture.pocketed[:, None, None] & ~furniture.filled):
-        centre = furniture.joints[j] + (2 * side - 1) * POCKET_OFFSET
-        i0, ic, i1 = np.searchsorted(rows, centre + 0.5 * POCKET_LENGTH * np.array([-1, 0, 1]) - 1e-6)
+        centre = furniture.joints[j] + (2 * side - 1) * fur.POCKET_OFFSET
+        i0, ic, i1 = np.searchsorted(rows, centre + 0.5 * fur.POCKET_LENGTH * np.array([-1, 0, 1]) - 1e-6)
         j0, jc, j1 = shape.rows[r]
         keep[i0:i1, j0:j1] = False
         out = shape.normal[jc, 0] * frames.lateral[ic] + shape.normal[jc, 1] * frames.up[ic]

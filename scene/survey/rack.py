@@ -12,15 +12,10 @@ from scene.survey.config import LidarName
 
 @dataclass(frozen=True)
 class Mount:
-    """How one instrument sits against another: p_instrument = rotation @ p_other + shift.
+    """Transform between two instruments: p_instrument = rotation @ p_other + shift."""
 
-    Attributes:
-        rotation: `(3, 3)`.
-        shift: m, `(3,)`.
-    """
-
-    rotation: Float[np.ndarray, "3 3"]
-    shift: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]  # `(3, 3)`
+    shift: Float[np.ndarray, "3"]  # m
 
     @property
     def origin(self) -> Float[np.ndarray, "3"]:
@@ -62,23 +57,14 @@ LIDARS: dict[LidarName, Mount] = {
 
 @dataclass(frozen=True)
 class Imu:
-    """An IMU of one device.
+    """An IMU of one device."""
 
-    Attributes:
-        topic: Where it is published.
-        frame: Its frame id.
-        rate: Samples per second, Hz.
-        mount: Against the device's LiDAR.
-        in_g: Whether its accelerations are published in g.
-        orientation: Whether it estimates one.
-    """
-
-    topic: str
-    frame: str
-    rate: float
-    mount: Mount
-    in_g: bool = False
-    orientation: bool = False
+    topic: str  # Topic of its messages
+    frame: str  # Its frame id
+    rate: float  # Samples per second, Hz
+    mount: Mount  # Against the device's LiDAR
+    in_g: bool = False  # True where accelerations are published in g
+    orientation: bool = False  # True where it estimates its orientation
 
 
 def _mti(rotation: list[list[float]], shift: list[float]) -> Imu:

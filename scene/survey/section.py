@@ -15,17 +15,12 @@ class Field:
 
     It is defined everywhere, has all derivatives and needs no grid.
 
-    Attributes:
-        frequency: Angular frequencies, rad per unit of the argument.
-        phase: Phases, rad.
-        amplitude: Amplitude of each cosine; the standard deviation times sqrt(2 / k).
-
     Source: Rahimi and Recht 2007, random Fourier features of the squared-exponential kernel.
     """
 
-    frequency: Float[np.ndarray, "k d"]
-    phase: Float[np.ndarray, "k"]
-    amplitude: float
+    frequency: Float[np.ndarray, "k d"]  # Angular frequencies, rad per unit of the argument
+    phase: Float[np.ndarray, "k"]  # Phases, rad
+    amplitude: float  # Amplitude of each cosine; the standard deviation times sqrt(2 / k)
 
     def along(self, x: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return values of a field of one argument."""
@@ -71,21 +66,15 @@ def refine_breaks(breaks: Float[np.ndarray, "b"], cell: float) -> Float[np.ndarr
 
 @dataclass(frozen=True)
 class Shape:
-    """One outline at its nominal size; other sizes stretch it across and upright.
+    """One outline at its nominal size; other sizes stretch it across and upright."""
 
-    Attributes:
-        width, height: Nominal largest width, and height from floor to crown, m.
-        nodes: Along `lateral`, and above the floor, m.
-        normal: Outward normals; horizontal at the feet, so that roughness does not lift them off the floor.
-        girth: Distance of the nodes from the left foot along the outline, m.
-        rows: Nodes at the first edge, the middle and the last edge of each row of pockets, the left side first.
-    """
-
-    width: float
+    width: float  # Nominal largest width, and height from floor to crown, m
     height: float
-    nodes: Float[np.ndarray, "m 2"]
+    nodes: Float[np.ndarray, "m 2"]  # Along `lateral`, and above the floor, m
+    # Outward normals; horizontal at the feet, so that roughness does not lift them off the floor
     normal: Float[np.ndarray, "m 2"]
-    girth: Float[np.ndarray, "m"]
+    girth: Float[np.ndarray, "m"]  # Distance of the nodes from the left foot along the outline, m
+    # Nodes at the first edge, the middle and the last edge of each row of pockets, the left side first
     rows: Int[np.ndarray, "k 3"]
 
     @property
@@ -100,15 +89,10 @@ class Shape:
 
 @dataclass(frozen=True)
 class DShape(Shape):
-    """A D whose crown stays a semicircle: of other sizes the walls move, and stretch above `fixed` to the springing.
+    """A D whose crown stays a semicircle: of other sizes the walls move, and stretch above `fixed` to the springing."""
 
-    Attributes:
-        fixed: Nodes up to this height above the floor keep it, m.
-        spring: Nominal height of the springing above the floor, m.
-    """
-
-    fixed: float = 2.6
-    spring: float = 3.535
+    fixed: float = 2.6  # Nodes up to this height above the floor keep it, m
+    spring: float = 3.535  # Nominal height of the springing above the floor, m
 
     def scaled(self, width: Float[np.ndarray, "n"], height: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n m 2"]:
         """Return nodes of sections of these sizes, above the floor, m."""
@@ -194,15 +178,10 @@ def circle() -> Shape:
 
 @dataclass(frozen=True)
 class Trend:
-    """A smooth function of station through knots, constant beyond them.
+    """A smooth function of station through knots, constant beyond them."""
 
-    Attributes:
-        station: Knots, m.
-        value: There, m.
-    """
-
-    station: tuple[float, ...] = (0.0, 1.0)
-    value: tuple[float, ...] = (0.0, 0.0)
+    station: tuple[float, ...] = (0.0, 1.0)  # Knots, m
+    value: tuple[float, ...] = (0.0, 0.0)  # Value at each knot, m
 
     def __call__(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return values at `station`, m."""
@@ -211,37 +190,25 @@ class Trend:
 
 @dataclass(frozen=True)
 class Measures:
-    """Sizes of the actual sections, pockets excepted.
+    """Sizes of the actual sections, pockets excepted."""
 
-    Attributes:
-        width: Largest horizontal distance between the walls, m.
-        height: Floor to crown on the axis, m.
-        middle: Middle of the width (where it is largest) and of the height, along `lateral` and `up` from the
-            centreline, m. Not zero where walls and crown are rough.
-    """
-
-    width: Float[np.ndarray, "n"]
-    height: Float[np.ndarray, "n"]
+    width: Float[np.ndarray, "n"]  # Largest horizontal distance between the walls, m
+    height: Float[np.ndarray, "n"]  # Floor to crown on the axis, m
+    # Middle of the width (where it is largest) and of the height, along `lateral` and `up` from the centreline, m. Not
+    # zero where walls and crown are rough
     middle: Float[np.ndarray, "n 2"]
 
 
 @dataclass(frozen=True)
 class Section:
-    """Section by station, on the nodes of a shape.
+    """Section by station, on the nodes of a shape."""
 
-    Attributes:
-        shape: The outline.
-        width_field, height_field: Slow deviations from its width and height, m.
-        roughness: Deviation along the outward normal by station and girth, m.
-        widening: Further width by station, m.
-        crossfall: Rise of the floor towards the left, m/m; on the axis it lies half the height below the centreline.
-    """
-
-    shape: Shape
-    width_field: Field
+    shape: Shape  # The outline
+    width_field: Field  # Slow deviations from its width and height, m
     height_field: Field
-    roughness: Field
-    widening: Trend = field(default_factory=Trend)
+    roughness: Field  # Deviation along the outward normal by station and girth, m
+    widening: Trend = field(default_factory=Trend)  # Further width by station, m
+    # Rise of the floor towards the left, m/m; on the axis it lies half the height below the centreline
     crossfall: float = 0.0
 
     def width(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

@@ -10,28 +10,13 @@ from rich.console import Console
 from rich.progress import Progress
 from rosbags.rosbag1 import Writer
 
+from scene.survey import messages
 from scene.survey.bore import draw_bore
 from scene.survey.carrier import GRAVITY, Carried, Walk, draw_walk, measure_inertial, measure_prism
 from scene.survey.cast import Caster
 from scene.survey.config import LidarName, SurveyConfig
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
-from scene.survey.messages import (
-    CLOUD_DEFINITION,
-    CLOUD_MD5,
-    CLOUD_TYPE,
-    CUSTOM_DEFINITION,
-    CUSTOM_MD5,
-    CUSTOM_TYPE,
-    IMU_DEFINITION,
-    IMU_MD5,
-    IMU_TYPE,
-    custom_message,
-    imu_messages,
-    ouster_message,
-    unix_nanoseconds,
-    velodyne_message,
-)
 from scene.survey.rack import IMUS, LIDARS, calibration
 from scene.survey.sweeps import n_sweeps, sweeps, write_profiles
 from scene.survey.write import CloudWriter, describe_truth, replace_file, write_json, write_mesh, write_tum, write_yaml
@@ -41,34 +26,26 @@ Message = tuple[int, str, bytes]  # time in ns since the start of the survey, to
 
 @dataclass(frozen=True)
 class Device:
-    """One LiDAR of the rack and how its driver publishes it.
+    """One LiDAR of the rack and how its driver publishes it."""
 
-    Attributes:
-        lidar: The model.
-        suffix: Of the names of its files.
-        topic: Of its sweeps.
-        kind: Type, definition and MD5 sum of its messages.
-        encode: A sweep as one of them.
-    """
-
-    lidar: Lidar
-    suffix: str
-    topic: str
-    kind: tuple[str, str, str]
-    encode: Callable[[Sweep, Lidar], bytes]
+    lidar: Lidar  # The model
+    suffix: str  # Ending of the names of its files
+    topic: str  # Topic of its sweeps
+    kind: tuple[str, str, str]  # Type, definition and MD5 sum of its messages
+    encode: Callable[[Sweep, Lidar], bytes]  # A sweep as one of them
 
 
-_LIVOX = (CUSTOM_TYPE, CUSTOM_DEFINITION, CUSTOM_MD5)
-_CLOUD = (CLOUD_TYPE, CLOUD_DEFINITION, CLOUD_MD5)
+_LIVOX = (messages.CUSTOM_TYPE, messages.CUSTOM_DEFINITION, messages.CUSTOM_MD5)
+_CLOUD = (messages.CLOUD_TYPE, messages.CLOUD_DEFINITION, messages.CLOUD_MD5)
 
 
 def make_device(name: LidarName, config: SurveyConfig) -> Device:
     """Return the device called `name`."""
     if name == "avia":
-        return Device(avia(config.point_rate), "", "/livox/lidar", _LIVOX, custom_message)
+        return Device(avia(config.point_rate), "", "/livox/lidar", _LIVOX, messages.custom_message)
     if name == "vlp16":
-        return Device(vlp16(), "_vlp16", "/velodyne_points", _CLOUD, velodyne_message)
-    return Device(os1(), "_os1", "/ouster/points", _CLOUD, ouster_message)
+        return Device(vlp16(), "_vlp16", "/velodyne_points", _CLOUD, messages.velodyne_message)
+    return Device(os1(), "_os1", "/ouster/points", _CLOUD, messages.ouster_message)
 
 
 def draw_imu_messages(
@@ -87,7 +64,7 @@ def draw_imu_messages(
         sample = measure_inertial(np.random.default_rng(seed), carried, one.rate, one.mount, config.errors)
         at = np.rint(sample.time * 1e9).astype(np.int64)
         accel = sample.accel / (GRAVITY if one.in_g else 1.0)
-        raw = imu_messages(one.frame, at, sample.quaternion if one.orientation else None, sample.gyro, accel)
+        raw = messages.imu_messages(one.frame, at, sample.quaternion if one.orientation else None, sample.gyro, accel)
         out += [(int(t), one.topic, m) for t, m in zip(at, raw, strict=True)]
     return sorted(out, key=lambda m: m[:2])
 
@@ -101,13 +78,13 @@ def write_recording(
 
     Args:
         path: Bag to write.
-        device: What it holds.
+        device: Device that is recorded.
         sweeps: In order of time.
         inertial: Messages of the IMUs, in order of time.
         cloud: Where to put the placed returns too.
     """
     returns, waiting = 0, iter([*inertial, (2**62, "", b"")])
-    kinds = {topic: (IMU_TYPE, IMU_DEFINITION, IMU_MD5) for _, topic, _ in inertial}
+    kinds = {topic: (messages.IMU_TYPE, messages.IMU_DEFINITION, messages.IMU_MD5) for _, topic, _ in inertial}
     kinds[device.topic] = device.kind
     with ExitStack() as stack:
         bag = stack.enter_context(Writer(stack.enter_context(replace_file(path))))
@@ -119,14 +96,14 @@ def write_recording(
         for sweep in sweeps:
             end = sweep.begin + round(SCAN_PERIOD * 1e9)
             while at < end:
-                bag.write(topics[topic], unix_nanoseconds(at), raw)
+                bag.write(topics[topic], messages.unix_nanoseconds(at), raw)
                 at, topic, raw = next(waiting)
-            bag.write(topics[device.topic], unix_nanoseconds(end), device.encode(sweep, device.lidar))
+            bag.write(topics[device.topic], messages.unix_nanoseconds(end), device.encode(sweep, device.lidar))
             returns += int(sweep.valid.sum())
             if cloud:
                 cloud.add(sweep.placed[sweep.valid], sweep.reflectivity[sweep.valid])
         while topic:
-            bag.write(topics[topic], unix_nanoseconds(at), raw)
+            bag.write(topics[topic], messages.unix_nanoseconds(at), raw)
             at, topic, raw = next(waiting)
     return returns
 

@@ -27,7 +27,7 @@ def sweeps(
 
     Args:
         rng: Source of randomness.
-        lidar: What looks.
+        lidar: Model of the LiDAR.
         carried: Its motion.
         caster: Of the true mesh.
         errors: Without `distortion`, all points of a sweep are measured at its stamp, and say so.

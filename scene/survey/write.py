@@ -12,27 +12,9 @@ import numpy as np
 import yaml
 from jaxtyping import Float, Shaped
 
+from scene.survey import furniture as fur
 from scene.survey.bore import Bore
 from scene.survey.config import SurveyConfig
-from scene.survey.furniture import (
-    GAUGE,
-    N_ROWS,
-    NAIL_DEPTH,
-    NAIL_DIAMETER,
-    PAD,
-    POCKET_LENGTH,
-    POCKET_OFFSET,
-    RAIL_AXIS,
-    RAIL_HEIGHT,
-    RAIL_TOP,
-    RING_WIDTH,
-    SLEEPER_BOTTOM,
-    SLEEPER_HEIGHT,
-    SLEEPER_LENGTH,
-    SLEEPER_RISE,
-    SLEEPER_SPACING,
-    SLEEPER_TOP,
-)
 from scene.survey.mesh import Mesh
 from scene.survey.messages import EPOCH
 
@@ -197,9 +179,9 @@ def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
         "height_smooth": _rounded(section.height(station)),
         "middle": _rounded(actual.middle),
         "crossfall": section.crossfall,
-        "rings": {"width": RING_WIDTH, "station": _rounded(furniture.joints)},
+        "rings": {"width": fur.RING_WIDTH, "station": _rounded(furniture.joints)},
         "pockets": _describe_pockets(bore),
-        "nails": {"diameter": NAIL_DIAMETER, "depth": NAIL_DEPTH, "count": int(furniture.nails.sum())},
+        "nails": {"diameter": fur.NAIL_DIAMETER, "depth": fur.NAIL_DEPTH, "count": int(furniture.nails.sum())},
         "sleepers": _describe_sleepers(bore),
         "rails": _describe_rails(bore, station),
     }
@@ -209,7 +191,7 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
     """Every pocket by growing ring, row and station; `open` is false where it is mortared flush."""
     section, furniture = bore.section, bore.furniture
     out = []
-    for side, offset in enumerate((-POCKET_OFFSET, POCKET_OFFSET)):
+    for side, offset in enumerate((-fur.POCKET_OFFSET, fur.POCKET_OFFSET)):
         station = furniture.joints + offset
         frames, smooth = bore.alignment.frames(station), section.smooth(station)
         half = 0.5 * section.height(station)
@@ -218,11 +200,11 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
                 (y, z), normal = smooth[j, middle], section.shape.normal[middle]
                 centre = frames.position[j] + y * frames.lateral[j] + z * frames.up[j]
                 out.append({
-                    "ring": int(j), "row": r, "side": "left" if 2 * r < N_ROWS else "right",
+                    "ring": int(j), "row": r, "side": "left" if 2 * r < fur.N_ROWS else "right",
                     "station": round(float(station[j]), 6), "angle": round(float(np.arctan2(z, y)), 6),
                     "above_floor": round(float(z + half[j]), 6), "position": _rounded(centre),
                     "outward": _rounded(normal[0] * frames.lateral[j] + normal[1] * frames.up[j], 9),
-                    "length": POCKET_LENGTH, "depth": round(float(furniture.depth[j, r, side]), 6),
+                    "length": fur.POCKET_LENGTH, "depth": round(float(furniture.depth[j, r, side]), 6),
                     "width": round(float(np.linalg.norm(smooth[j, last] - smooth[j, first])), 6),
                     "open": not bool(furniture.filled[j, r, side]), "nail": bool(furniture.nails[j, r]),
                 })  # fmt: skip
@@ -231,21 +213,21 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
 
 def _describe_sleepers(bore: Bore) -> dict[str, Any]:
     station = bore.furniture.sleepers
-    top = SLEEPER_RISE - 0.5 * bore.section.height(station)
+    top = fur.SLEEPER_RISE - 0.5 * bore.section.height(station)
     return {
         "station": _rounded(station),
         "position": _rounded(bore.alignment.frames(station).point(np.zeros_like(top), top)),
-        "spacing": SLEEPER_SPACING, "length": SLEEPER_LENGTH, "top_width": SLEEPER_TOP,
-        "bottom_width": SLEEPER_BOTTOM, "height": SLEEPER_HEIGHT, "top_above_floor": SLEEPER_RISE,
+        "spacing": fur.SLEEPER_SPACING, "length": fur.SLEEPER_LENGTH, "top_width": fur.SLEEPER_TOP,
+        "bottom_width": fur.SLEEPER_BOTTOM, "height": fur.SLEEPER_HEIGHT, "top_above_floor": fur.SLEEPER_RISE,
     }  # fmt: skip
 
 
 def _describe_rails(bore: Bore, station: np.ndarray) -> dict[str, Any]:
     frames = bore.alignment.frames(station)
-    top = RAIL_TOP - 0.5 * bore.section.height(station)
+    top = fur.RAIL_TOP - 0.5 * bore.section.height(station)
     return {
-        "profile": "CHN60", "gauge": GAUGE, "height": RAIL_HEIGHT, "pad": PAD[2],
-        "axis_offset": RAIL_AXIS, "top_above_floor": RAIL_TOP, "inclination": 0.0,
-        "left": _rounded(frames.point(np.full_like(top, RAIL_AXIS), top)),
-        "right": _rounded(frames.point(np.full_like(top, -RAIL_AXIS), top)),
+        "profile": "CHN60", "gauge": fur.GAUGE, "height": fur.RAIL_HEIGHT, "pad": fur.PAD[2],
+        "axis_offset": fur.RAIL_AXIS, "top_above_floor": fur.RAIL_TOP, "inclination": 0.0,
+        "left": _rounded(frames.point(np.full_like(top, fur.RAIL_AXIS), top)),
+        "right": _rounded(frames.point(np.full_like(top, -fur.RAIL_AXIS), top)),
     }  # fmt: skip

@@ -19,21 +19,13 @@ _EDGES = np.array([(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a 
 
 @dataclass(frozen=True)
 class Furnished:
-    """A bore and what stands in it.
+    """A bore and what stands in it."""
 
-    Attributes:
-        bore: With the niches among its pockets, in place of the pockets they take away.
-        pieces: The furniture.
-        openings: What the niches take out of the wall.
-        niches: First and last station of each niche, m.
-        niche_corners: Of the air of each niche, m.
-    """
-
-    bore: Bore
-    pieces: list[Piece]
-    openings: list[Opening]
-    niches: list[tuple[float, float]]
-    niche_corners: list[Float[np.ndarray, "8 3"]]
+    bore: Bore  # With the niches among its pockets, in place of the pockets they take away
+    pieces: list[Piece]  # The furniture
+    openings: list[Opening]  # Parts of the wall that niches take out
+    niches: list[tuple[float, float]]  # First and last station of each niche, m
+    niche_corners: list[Float[np.ndarray, "8 3"]]  # Corners of the air of each niche, m
 
 
 def furnish_bore(bore: Bore, track: Track, config: FurnitureConfig) -> Furnished:

@@ -17,32 +17,32 @@ _ROBOT_HEIGHT = 1.0
 
 @dataclass(frozen=True)
 class FurnitureConfig:
-    """Which furniture, and its sizes, m; heights are above the top of the sleepers.
+    """Kinds of furniture and their sizes, m; heights are above the top of the sleepers.
 
     Sources: widths of walkways 0.8 m (low) to 1.0 m: metro walkway descriptions; cross-passages 244 m apart: NFPA 130.
     Bracket pitch and tiers, the third rail's offset, plate pitch and all other sizes are engineering defaults.
 
     Attributes:
-        walkway: Whether there is a low walkway, on the left.
+        walkway: Low walkway, on the left.
         walkway_width: It is less where it would come nearer than 5 cm to the sleepers' ends, none below 0.5 m.
         walkway_height: Of its top.
-        handrail: Whether a handrail on posts runs along the walkway's wall.
+        handrail: Handrail on posts along the walkway's wall.
         handrail_height: Above the walkway.
         post_spacing: Of the handrail's posts.
         post_size: Side of a post's square section.
-        cables: Whether cables on brackets run along the right wall.
+        cables: Cables on brackets along the right wall.
         bracket_spacing: Of the brackets.
         bracket_length: Out of the wall.
         tiers: Heights of the brackets' arms.
         cable_diameter: Of each tier's bundle.
-        third_rail: Whether there is a third rail, on the right.
+        third_rail: Third rail, on the right.
         third_rail_offset: From the running rail, middle to middle.
-        plates: Whether there are hectometre plates on the left wall.
+        plates: Hectometre plates on the left wall.
         plate_spacing: Of the plates.
-        passage: Whether there are doors of cross-passages, in niches of the left wall.
+        passage: Doors of cross-passages, in niches of the left wall.
         passage_spacing: Of the doors, the first half of that from the start.
         passage_size: Length, height and depth of a niche.
-        lamps: Whether there are lamps at the crown.
+        lamps: Lamps at the crown.
         lamp_spacing: Of the lamps.
         gauge: Half the width about the axis that nothing may enter up to a robot's height.
     """
@@ -73,23 +73,14 @@ class FurnitureConfig:
 
 @dataclass(frozen=True)
 class Piece:
-    """One box of furniture.
+    """One box of furniture."""
 
-    Attributes:
-        kind: What it is part of.
-        material: Of the scene.
-        centre: m, `(3,)`.
-        rotation: X along the bore, y to the left, z upwards.
-        half: Half its sizes, m, `(3,)`.
-        low: Whether it stands where a robot could run into it.
-    """
-
-    kind: str
-    material: str
-    centre: Float[np.ndarray, "3"]
-    rotation: Rotation
-    half: Float[np.ndarray, "3"]
-    low: bool
+    kind: str  # Kind of furniture
+    material: str  # Material of the scene
+    centre: Float[np.ndarray, "3"]  # m
+    rotation: Rotation  # X along the bore, y to the left, z upwards
+    half: Float[np.ndarray, "3"]  # Half its sizes, m
+    low: bool  # True where a robot could run into it
 
     def corners(self) -> Float[np.ndarray, "8 3"]:
         """Return the corners, m; the last bit of a corner's number tells lower from upper."""
@@ -99,18 +90,12 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class TunnelSpace:
-    """Where furniture may stand.
+    """Where furniture may stand."""
 
-    Attributes:
-        bore: The bore.
-        track: Its track.
-        config: What to place.
-        keep_out: First and last station of each niche of the left wall, m.
-    """
-
-    bore: Bore
-    track: Track
-    config: FurnitureConfig
+    bore: Bore  # The bore
+    track: Track  # Its track
+    config: FurnitureConfig  # Furniture to place
+    # First and last station of each niche of the left wall, m
     keep_out: list[tuple[float, float]] = field(default_factory=list)
 
     def wall(self, start: float, end: float, height: float, side: int) -> tuple[float, float]:

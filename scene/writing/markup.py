@@ -84,7 +84,7 @@ def add_mesh(
         material: Of the geom.
         group: Of the geom.
         coordinates: Texture coordinates, and which of them each corner of each face has, `(f, 3)`.
-        reuse: Whether a file of that name that is there already is this mesh's.
+        reuse: Take a file of that name that is there already.
     """
     origin = np.floor(mesh.vertices.mean(axis=0))
     path = folder / f"{name}.obj"

@@ -7,17 +7,8 @@ from manifold3d import Manifold, Mesh64, OpType
 
 from scene.bore import Bore
 from scene.errors import FitError
-from scene.writing.unrolled import (
-    AROUND,
-    Sheet,
-    Unrolled,
-    recess_boxes,
-    section_corners,
-    triangulate,
-    unroll_section,
-    wall_normals,
-    wall_points,
-)
+from scene.writing import unrolled
+from scene.writing.unrolled import Sheet, Unrolled
 
 _MOUTH_TOLERANCE = 1e-4
 
@@ -27,23 +18,23 @@ def build_solid(bore: Bore, pockets: bool) -> Manifold:
 
     Args:
         bore: The bore.
-        pockets: Whether the recesses of the lining are part of the air.
+        pockets: Make the recesses of the lining part of the air.
 
     Raises:
         FitError: The sections fold into each other, so that no solid comes out.
     """
     _require_unfolded(bore)
-    plane = unroll_section(bore)
+    plane = unrolled.unroll_section(bore)
     boxes, apart = _pocket_rectangles(bore, plane) if pockets else (np.empty((0, 4)), np.zeros(len(bore.pocket), bool))
-    sheet = triangulate(
-        plane, bore.length, np.sort(plane.to_around(section_corners(bore))), boxes[apart] if pockets else boxes
+    sheet = unrolled.triangulate(
+        plane, bore.length, np.sort(plane.to_around(unrolled.section_corners(bore))), boxes[apart] if pockets else boxes
     )
     solid = Manifold(Mesh64(*_close_sheet(bore, plane, sheet, np.flatnonzero(apart))))
     if solid.is_empty():
         raise FitError(f"the sections do not make a solid ({solid.status().name})")
     crowded = np.flatnonzero(~apart) if pockets else np.empty(0, np.intp)
     if len(crowded):
-        recesses = [Manifold.hull_points(box) for box in recess_boxes(bore, crowded)]
+        recesses = [Manifold.hull_points(box) for box in unrolled.recess_boxes(bore, crowded)]
         solid = solid + Manifold.batch_boolean(recesses, OpType.Add)
     return max(solid.decompose(), key=lambda part: part.volume())
 
@@ -91,7 +82,7 @@ def _require_unfolded(bore: Bore) -> None:
 
 def _pocket_rectangles(bore: Bore, plane: Unrolled) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:
     """Each pocket's rectangle in the plane, and whether it is clear of other pockets, the seam and the mouths."""
-    pocket, clear = bore.pocket, 0.6 * AROUND
+    pocket, clear = bore.pocket, 0.6 * unrolled.AROUND
     u, half = plane.to_around(pocket["angle"]), pocket["width"] / 2
     box = np.column_stack([u - half, u + half, pocket["station"] - pocket["length"] / 2, pocket["station"]])
     box[:, 3] += pocket["length"] / 2
@@ -111,14 +102,14 @@ def _close_sheet(
     bore: Bore, plane: Unrolled, sheet: Sheet, pocket: Int[np.ndarray, " r"]
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     """Return the sheet rolled up, its recesses pushed outwards, both mouths closed."""
-    vertex = wall_points(bore, sheet.station, plane.to_angle(sheet.around))
+    vertex = unrolled.wall_points(bore, sheet.station, plane.to_angle(sheet.around))
     count, faces = len(vertex), sheet.faces
     rim = np.flatnonzero(sheet.rim)
     sunk = np.arange(count)
     sunk[rim] = count + np.arange(len(rim))
     push = np.zeros((count, 3))
     if len(pocket):
-        outward = wall_normals(bore, pocket) * bore.pocket["depth"][pocket, None]
+        outward = unrolled.wall_normals(bore, pocket) * bore.pocket["depth"][pocket, None]
         push = np.where(sheet.recess[:, None] >= 0, outward[sheet.recess], 0.0)
     vertex = np.concatenate([np.where(sheet.rim[:, None], vertex, vertex + push), vertex[rim] + push[rim]])
     owner = sheet.recess[faces]
@@ -177,7 +168,7 @@ def split_skin(
     angle = np.arctan2(up, lateral)
     height = chunk.vertices[:, 2] - np.interp(station, bore.station, bed)
     low = (np.abs(height[chunk.faces]) < _FLOOR_HEIGHT).all(axis=1) & (chunk.face_normals[:, 2] > _LEVEL)
-    depth = np.linalg.norm(chunk.vertices - wall_points(bore, station, angle), axis=1)
+    depth = np.linalg.norm(chunk.vertices - unrolled.wall_points(bore, station, angle), axis=1)
     sunk = (depth[chunk.faces] > _SUNK).any(axis=1) & ~low
     parts: dict[str, tuple[trimesh.Trimesh, Coordinates | None]] = {}
     for name, chosen in (("lining", ~low & ~sunk), ("recess", sunk), ("floor", low)):
@@ -199,7 +190,7 @@ def split_skin(
 
 def _wall_texture(bore: Bore, station: np.ndarray, angle: np.ndarray, corner: np.ndarray) -> Coordinates:
     """Texture coordinates: one picture a turn and two rings; faces across the seam go beyond one."""
-    plane = unroll_section(bore)
+    plane = unrolled.unroll_section(bore)
     u = plane.to_around(angle) / plane.girth
     v = _ring_number(bore, station) / 2
     wraps = np.ptp(u[corner], axis=1) > 0.5

@@ -27,7 +27,7 @@ _MATERIAL = {"lining": "concrete", "recess": "recess", "floor": "floor"}
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """How the scene is cut and dressed.
+    """Cutting and dressing of the scene.
 
     Attributes:
         chunk_length: Of one mesh of the lining, m.

@@ -18,19 +18,12 @@ _COLLINEAR = 0.001  # m; half of it would add half as many vertices to a smooth 
 
 @dataclass(frozen=True)
 class Walls:
-    """Both walls of one variant at LiDAR height, in the direction of growing station.
+    """Both walls of one variant at LiDAR height, in the direction of growing station."""
 
-    Attributes:
-        left: m, `(k, 2)`.
-        right: m, `(l, 2)`.
-        left_station: Of each vertex, not decreasing, m, `(k,)`.
-        right_station: The same, `(l,)`.
-    """
-
-    left: Float[np.ndarray, "k 2"]
-    right: Float[np.ndarray, "l 2"]
-    left_station: Float[np.ndarray, " k"]
-    right_station: Float[np.ndarray, " l"]
+    left: Float[np.ndarray, "k 2"]  # m
+    right: Float[np.ndarray, "l 2"]  # m
+    left_station: Float[np.ndarray, " k"]  # Station of each vertex, not decreasing, m
+    right_station: Float[np.ndarray, " l"]  # Station of each vertex, not decreasing, m
 
 
 def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], height: float) -> Walls:

@@ -41,7 +41,7 @@ class TrackConfig:
         sleeper_top: Width of the top; the bottom is `sleeper_bottom` wide.
         sleeper_bottom: Width of the bottom.
         sleeper_height: Of the whole sleeper; all but `protrusion` lies in the ballast.
-        protrusion: How far sleepers stand out of the bed.
+        protrusion: Height of the sleepers above the bed.
         pad_thickness: Between sleeper and rail foot.
         margin: Least distance from the end of a sleeper to the wall.
         shoulder: Bed left beside the sleepers where the bore is round.
@@ -70,25 +70,16 @@ class TrackConfig:
 
 @dataclass(frozen=True)
 class Track:
-    """The track of one bore.
+    """The track of one bore."""
 
-    Attributes:
-        config: By which it was laid.
-        bed: z of the ballast or slab at each station of the bore, m, `(n,)`.
-        elevation: z of the top of the sleepers, of the floor where there is no track, m, `(n,)`.
-        sleeper_station: m, `(k,)`; empty where the bore is too narrow for a track.
-        measured: Sleepers that the survey shows, `(k,)`; the others lie where the spacing asks for one.
-        clearance: From each sleeper's ends to the wall at its top, the smaller side, m, `(k,)`.
-        raised: Whether the bed is a slab above the floor of the bore (a round bore).
-    """
-
-    config: TrackConfig
-    bed: Float[np.ndarray, " n"]
-    elevation: Float[np.ndarray, " n"]
-    sleeper_station: Float[np.ndarray, " k"]
+    config: TrackConfig  # Standard by which it was laid
+    bed: Float[np.ndarray, " n"]  # z of the ballast or slab at each station of the bore, m
+    elevation: Float[np.ndarray, " n"]  # z of the top of the sleepers, of the floor where there is no track, m
+    sleeper_station: Float[np.ndarray, " k"]  # m; empty where the bore is too narrow for a track
+    # Sleepers that the survey shows; the others lie where the spacing asks for one
     measured: Bool[np.ndarray, " k"]
-    clearance: Float[np.ndarray, " k"]
-    raised: bool
+    clearance: Float[np.ndarray, " k"]  # From each sleeper's ends to the wall at its top, the smaller side, m
+    raised: bool  # True where the bed is a slab above the floor (a round bore)
 
 
 def lay_track(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None) -> Track:

@@ -9,17 +9,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.bore import Axis, Bore
-from scene.writing.markup import (
-    DECK,
-    GROUND,
-    SOLID,
-    add_box,
-    add_element,
-    add_mesh,
-    format_numbers,
-    format_quaternion,
-    rotation_along,
-)
+from scene.writing import markup
+from scene.writing.markup import DECK, GROUND, SOLID, add_box, add_element
 from scene.writing.track import RailProfile, Track, TrackConfig
 from scene.writing.unrolled import wall_points
 
@@ -139,7 +130,7 @@ def add_slabs(world: ET.Element, bore: Bore, track: Track) -> None:
         top[:, 2] = np.interp(station, bore.station, level)
         seen = {"group": "0", "material": "ballast"} if name == "bed" and track.raised else {"group": "3"}
         for k in range(len(station) - 1):
-            rotation = rotation_along(top[k], top[k + 1])
+            rotation = markup.rotation_along(top[k], top[k + 1])
             middle = (top[k] + top[k + 1]) / 2 - rotation.apply([0, 0, _SLAB_THICKNESS / 2])
             half_size = np.array([np.linalg.norm(top[k + 1] - top[k]) / 2 + 0.02, half, _SLAB_THICKNESS / 2])
             add_box(world, f"{name}_{k:03d}", half_size, middle, rotation, bits, **seen)
@@ -157,8 +148,8 @@ def add_track(asset: ET.Element, world: ET.Element, meshes: Path, axis: Axis, tr
             np.stack([at.tangent[k], at.lateral[k], np.cross(at.tangent[k], at.lateral[k])], axis=1)
         )
         place = {
-            "pos": format_numbers([*at.position[k, :2], z]),
-            "quat": format_quaternion(frame),
+            "pos": markup.format_numbers([*at.position[k, :2], z]),
+            "quat": markup.format_quaternion(frame),
             "conaffinity": "0",
             "group": "1",
         }
@@ -179,7 +170,7 @@ def add_nails(asset: ET.Element, world: ET.Element, meshes: Path, bore: Bore, ch
     for k in range(len(edges) - 1):
         merged = nail_mesh(bore, edges[k], edges[k + 1])
         if merged is not None:
-            add_mesh(asset, world, meshes, f"nails_{k:03d}", merged, "bolt", group="1")
+            markup.add_mesh(asset, world, meshes, f"nails_{k:03d}", merged, "bolt", group="1")
     return len(bore.nail)
 
 
@@ -198,7 +189,7 @@ def _add_rails(world: ET.Element, axis: Axis, track: Track) -> None:
         foot = at.position + side * config.rail_offset * at.lateral
         foot[:, 2] = base
         for k in range(len(station) - 1):
-            rotation = rotation_along(foot[k], foot[k + 1])
+            rotation = markup.rotation_along(foot[k], foot[k + 1])
             half = float(np.linalg.norm(foot[k + 1] - foot[k])) / 2
             for part, (width, low, high) in zip(("foot", "web", "head"), rail_boxes(config.rail), strict=True):
                 middle = (foot[k] + foot[k + 1]) / 2 + rotation.apply([0, 0, (low + high) / 2])

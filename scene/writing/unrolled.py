@@ -71,15 +71,10 @@ _PAD = 1.0  # beyond the seam, m
 
 @dataclass(frozen=True)
 class Unrolled:
-    """The section's arc length as a coordinate, cut open at a seam.
+    """The section's arc length as a coordinate, cut open at a seam."""
 
-    Attributes:
-        around: Arc length from the seam at each of `angle`, m, `(k,)`.
-        angle: rad, growing over one turn from the seam, `(k,)`.
-    """
-
-    around: Float[np.ndarray, " k"]
-    angle: Float[np.ndarray, " k"]
+    around: Float[np.ndarray, " k"]  # Arc length from the seam at each of `angle`, m
+    angle: Float[np.ndarray, " k"]  # rad, growing over one turn from the seam
 
     @property
     def girth(self) -> float:
@@ -98,21 +93,13 @@ class Unrolled:
 
 @dataclass(frozen=True)
 class Sheet:
-    """Triangles in the plane.
+    """Triangles in the plane."""
 
-    Attributes:
-        around: Of each point, m, `(p,)`.
-        station: Of each point, m, `(p,)`.
-        recess: Which recess a point belongs to, -1 for none, `(p,)`.
-        rim: Whether it lies on the recess's rim, `(p,)`.
-        faces: Counter-clockwise with `around` to the right and `station` upwards, `(f, 3)`.
-    """
-
-    around: Float[np.ndarray, " p"]
-    station: Float[np.ndarray, " p"]
-    recess: Int[np.ndarray, " p"]
-    rim: Bool[np.ndarray, " p"]
-    faces: Int[np.ndarray, "f 3"]
+    around: Float[np.ndarray, " p"]  # Arc length of each point, m
+    station: Float[np.ndarray, " p"]  # Station of each point, m
+    recess: Int[np.ndarray, " p"]  # Number of the recess that a point belongs to, -1 for none
+    rim: Bool[np.ndarray, " p"]  # Points on the rim of their recess
+    faces: Int[np.ndarray, "f 3"]  # Counter-clockwise with `around` to the right and `station` upwards
 
 
 def unroll_section(bore: Bore) -> Unrolled:

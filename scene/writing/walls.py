@@ -1,4 +1,7 @@
-"""What bodies collide with where the lining is."""
+"""The lining as boxes to collide with: flat patches all around, and a few panels at robots' height.
+
+MuJoCo collides a mesh as its convex hull, which of a bore is the bore filled up.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -24,19 +27,12 @@ _ON_BED = 0.03  # wall this little above the bed is floor, m
 
 @dataclass(frozen=True)
 class Panel:
-    """A box behind the wall.
+    """A box behind the wall."""
 
-    Attributes:
-        centre: m, `(3,)`.
-        rotation: X along the bore, y around it, z out of the air.
-        half: Half its sizes, m, `(3,)`.
-        height: Lowest and highest point above the bed, m.
-    """
-
-    centre: Float[np.ndarray, "3"]
-    rotation: Rotation
-    half: Float[np.ndarray, "3"]
-    height: tuple[float, float]
+    centre: Float[np.ndarray, "3"]  # m
+    rotation: Rotation  # X along the bore, y around it, z out of the air
+    half: Float[np.ndarray, "3"]  # Half its sizes, m
+    height: tuple[float, float]  # Lowest and highest point above the bed, m
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,126 @@
+"""A format that the package does not know, read by a module of the user's own."""
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene.errors import RecordingError
+from scene.reading import Scan, ScanSource, formats, make_scan, register_reader
+from scene.reading.formats import detect, load_readers, own_readers
+from scene.reading.recording import Recording
+from tests.scene.bags import write_tum
+from tests.scene.clouds import curved_d_bore
+
+ROOT = Path(__file__).parents[2]
+READER = Path(__file__).with_name("plyzip.py")
+START = 1317376510.25
+
+
+@pytest.fixture(autouse=True)
+def table(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The table of formats as it was, whatever a test adds."""
+    monkeypatch.setattr(formats, "_own", {})
+    monkeypatch.delitem(sys.modules, READER.stem, raising=False)
+
+
+def write_zip(path: Path, scans: list[np.ndarray]) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for k, points in reversed(list(enumerate(scans))):
+            archive.writestr(f"{START + 0.1 * k:.2f}.ply", trimesh.PointCloud(points).export(file_type="ply"))
+    return path
+
+
+def scans_of(count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(0)
+    return [rng.uniform(1, 9, (30, 3)).astype(np.float32) for _ in range(count)]
+
+
+def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(tmp_path):
+    points = scans_of(3)
+    load_readers(str(shutil.copy(READER, tmp_path)))
+    with Recording(write_zip(tmp_path / "walk.zip", points)) as recording:
+        scans = list(recording.scans())
+        facts = recording.peek()
+    assert [scan.stamp for scan in scans] == pytest.approx([START, START + 0.1, START + 0.2])
+    for scan, known in zip(scans, points, strict=True):
+        np.testing.assert_array_equal(scan.points, known)
+    assert facts["kind"] == "zip of PLY scans"
+    assert facts["format_by"] == "name"
+    assert "static" in facts["point_times"]
+
+
+def test_a_scene_is_built_from_it_by_one_option(tmp_path):
+    bore = curved_d_bore(length=30.0, per_metre=4000, offset=(0.0, 0.0, 0.0))
+    walk = write_zip(tmp_path / "walk.zip", np.array_split(bore.points.astype(np.float32), 10))
+    poses = np.column_stack([START + np.array([-1.0, 2.0]), np.zeros((2, 6)), np.ones(2)])
+    words = [walk, "--reader", READER, "--trajectory", write_tum(tmp_path / "poses.tum", poses)]
+    command = [sys.executable, "-m", "scene.build", *map(str, words), "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["detected"]["kind"] == "zip of PLY scans"
+    assert manifest["detected"]["scans"] == 10
+    assert manifest["bore"]["length"] == pytest.approx(30.0, abs=0.3)
+
+
+def test_a_damaged_scan_is_named(tmp_path):
+    load_readers(str(READER))
+    path = tmp_path / "walk.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("1.0.ply", "ply\nnonsense\n")
+    with Recording(path) as recording, pytest.raises(RecordingError, match=r"walk\.zip: scan 0 is not readable"):
+        list(recording.scans())
+    path.write_text("no archive")
+    with pytest.raises(RecordingError, match=r"walk\.zip: not a readable zip of PLY scans"):
+        Recording(path)
+
+
+def test_a_cloud_format_of_ones_own_is_found_by_its_first_bytes(tmp_path):
+    register_reader("mine", lambda path: None, kind="cloud", magic=(b"MINE",))
+    (tmp_path / "cloud.dat").write_bytes(b"MINE and more")
+    detected = detect(tmp_path / "cloud.dat")
+    assert (detected.format.name, detected.by) == ("mine", "content")
+
+
+def test_names_of_the_package_and_kinds_of_no_meaning_are_refused():
+    with pytest.raises(ValueError, match="'ply' is one of this package"):
+        register_reader("ply", lambda path: None)
+    with pytest.raises(ValueError, match="kind must be recording or cloud, got 'rings'"):
+        register_reader("mine", lambda path: None, kind="rings")
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"), [(None, "No such file"), ("1 / 0", "division by zero"), ("import nowhere_at_all", "nowhere")]
+)
+def test_a_reader_that_cannot_be_loaded_is_one_sentence(tmp_path, text, cause):
+    path = tmp_path / "broken.py"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(RecordingError, match=rf"broken\.py: cannot be loaded as a reader \(.*{cause}"):
+        load_readers(str(path))
+
+
+def test_partial_results_depend_on_the_readers_own_code(tmp_path):
+    first, second = (Path(shutil.copy(READER, tmp_path / f"{name}.py")) for name in ("one", "two"))
+    second.write_text(second.read_text() + "# changed\n")
+    keys = []
+    for path in (first, second):
+        load_readers(str(path))
+        keys.append(own_readers())
+    assert keys[0] != keys[1]
+
+
+def test_a_source_without_times_is_taken_as_static(tmp_path):
+    def read(index: int) -> tuple[Scan, str]:
+        return make_scan(float(index), np.ones((4, 3)), None)
+
+    source = ScanSource(tmp_path, 2, {"kind": "mine"}, read)
+    assert [scan.stamp for scan in source.scans(skip=1)] == [1.0]
+    assert "static" in source.facts["point_times"]
