@@ -24,8 +24,7 @@ from benchmarks.fidelity.derive import surface
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.truth import compare, load_truth
 from scene.arguments import parse
-from scene.survey.config import SurveyConfig, TruthName
-from scene.survey.config import check_survey
+from scene.survey.config import SurveyConfig, TruthName, check_survey
 from subterra_jax.outputs import require_folder
 
 

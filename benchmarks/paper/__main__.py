@@ -20,8 +20,7 @@ from benchmarks.paper.material import Material, read_truth
 from benchmarks.paper.sheet import Drawing
 from scene.arguments import parse
 from scene.files import require_output_folder
-from scene.survey.config import SurveyConfig
-from scene.survey.config import check_survey
+from scene.survey.config import SurveyConfig, check_survey
 
 OF_A_SURVEY: dict[int, Callable[[Material], Drawing]] = {1: bore_view.draw, 2: pipeline.draw, 3: occupancy.draw}
 LEARNING = 4
