@@ -2,7 +2,7 @@
 
 import importlib.util
 
-from subterra_jax import batch, procedural
+from subterra_jax import batch, procedural, tunnel
 from subterra_jax.batch import AutoReset, rollout
 from subterra_jax.env import TunnelEnv
 from subterra_jax.errors import SubterraError, TunnelError
@@ -12,7 +12,7 @@ from subterra_jax.tasks import TASKS, make
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
-from subterra_jax.tunnel.stack import stack
+from subterra_jax.tunnel.tunnel import stack
 from subterra_jax.versions import VERSION
 
 __version__ = VERSION
@@ -35,6 +35,7 @@ __all__ = [
     "randomize",
     "rollout",
     "stack",
+    "tunnel",
 ]
 
 if importlib.util.find_spec("gymnasium") is not None:

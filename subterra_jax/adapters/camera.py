@@ -12,8 +12,7 @@ from subterra_jax.env import TunnelEnv
 from subterra_jax.errors import SubterraError
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel.reading import tunnel_of
-from subterra_jax.tunnel.sources import load_tunnel
+from subterra_jax.tunnel.sources import load_tunnel, tunnel_of
 
 if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it once, when it is imported

@@ -13,7 +13,7 @@ from subterra_jax.drawing import top_down, wall_points
 from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnel.reading import tunnel_of
+from subterra_jax.tunnel.sources import tunnel_of
 
 VIEWS = ("top", "mujoco")
 

@@ -1,6 +1,6 @@
-"""Where the beams of common LiDARs look: unit vectors in the sensor's frame, x ahead, y to the left, z upwards.
+"""Beam directions of common LiDARs: unit vectors in the sensor's frame, x ahead, y to the left, z upwards.
 
-They feed `lidar3d.scan`. One frame or sweep is taken from one pose: the sensor's own motion during it is the caller's.
+They are the input of `lidar3d.scan`, which takes a sweep from one pose; motion during a sweep is left to the caller.
 """
 
 import numpy as np
@@ -11,20 +11,20 @@ _PRISMS = (7294.0 / 60.0, -4664.0 / 60.0)
 
 
 def planar(n_beams: int = 16) -> Float[np.ndarray, "n_beams 3"]:
-    """A planar LiDAR, as in `lidar.scan`: beam 0 straight ahead, the others counter-clockwise, evenly spaced."""
+    """Return the beams of `lidar.scan`: beam 0 straight ahead, the others counter-clockwise, evenly spaced."""
     bearing = np.arange(_at_least_one("n_beams", n_beams)) * (2.0 * np.pi / n_beams)
     return _unit(bearing, np.zeros(n_beams))
 
 
 def spinning(elevations: Float[np.ndarray, "n_rings"], n_columns: int) -> Float[np.ndarray, "n 3"]:
-    """A turning head: columns counter-clockwise from straight ahead, all rings of a column before the next.
+    """Return the beams of a turning head: columns counter-clockwise from straight ahead, ring by ring in a column.
 
     Args:
-        elevations: Of the rings, rad.
+        elevations: Elevations of the rings, rad.
         n_columns: Columns in a turn.
 
     Raises:
-        ValueError: There is no column, or an elevation is not below a right angle.
+        ValueError: `n_columns` is below 1, or an elevation is not below a right angle.
     """
     elevations = np.asarray(elevations, np.float64)
     if not np.all(np.abs(elevations) < np.pi / 2):
@@ -34,7 +34,7 @@ def spinning(elevations: Float[np.ndarray, "n_rings"], n_columns: int) -> Float[
 
 
 def vlp16(n_columns: int = 1800) -> Float[np.ndarray, "n 3"]:
-    """Velodyne VLP-16: 16 rings from -15° to 15°.
+    """Return the beams of a Velodyne VLP-16: 16 rings from -15° to 15°.
 
     Source: VLP-16 user manual; at 10 turns/s it fires 1,808 times in a turn.
     """
@@ -42,7 +42,7 @@ def vlp16(n_columns: int = 1800) -> Float[np.ndarray, "n 3"]:
 
 
 def os1(n_columns: int = 1024) -> Float[np.ndarray, "n 3"]:
-    """Ouster OS1-64: 64 rings evenly over 45°, the uppermost first.
+    """Return the beams of an Ouster OS1-64: 64 rings evenly over 45°, the uppermost first.
 
     Source: OS1 hardware user manual. Its four columns of beams with slightly different azimuths are left out.
     """
@@ -55,15 +55,15 @@ def rosette(
     duration: float = 0.1,
     half_fov: tuple[float, float] = (np.deg2rad(35.2), np.deg2rad(38.6)),
 ) -> Float[np.ndarray, "n_beams 3"]:
-    """A pattern that never repeats, as a Livox scans with two counter-rotating prisms.
+    """Return a pattern that never repeats, as of a Livox with two counter-rotating prisms.
 
-    The shape of the instrument's pattern, not a copy of it: Livox does not publish the angles.
+    The pattern has the shape of the instrument's but is no copy: Livox does not publish the angles.
 
     Args:
         n_beams: Beams.
         start: Time of the first beam, s; the next sweep begins at `start + duration`.
-        duration: Of the sweep, s.
-        half_fov: Half of the field of view across and upright, rad. The default is the Avia's 70.4° by 77.2°.
+        duration: Duration of the sweep, s.
+        half_fov: Half the field of view across and upright, rad. The default is the Avia's 70.4° by 77.2°.
     """
     time = start + np.arange(_at_least_one("n_beams", n_beams)) * (duration / n_beams)
     first, second = (2.0 * np.pi * rate * time for rate in _PRISMS)

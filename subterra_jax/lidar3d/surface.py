@@ -1,24 +1,24 @@
-"""What a LiDAR sees in a scene folder, as triangles in the tunnel frame: lining, bed, sleepers, rails, furniture."""
+"""Read the surfaces of a scene folder as triangles in the tunnel frame: lining, bed, sleepers, rails, furniture."""
 
 import dataclasses
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from subterra_jax.errors import TunnelError
-from subterra_jax.tunnel.reading import AGAIN
+from subterra_jax.tunnel.sources import AGAIN
 from subterra_jax.versions import other_schema
 
 if TYPE_CHECKING:
     import mujoco
 
 _BORE_SCHEMA = "subterra.bore/1"
-_SCENES = {"smooth": "scene.xml", "pockets": "scene.xml", "furnished": "scene_furnished.xml"}
-_LINING = ("lining", "recess", "floor")
-# Bolts and clips of a few centimetres, which would be half of all triangles.
+SCENES = {"smooth": "scene.xml", "pockets": "scene.xml", "furnished": "scene_furnished.xml"}
+LINING_KINDS = ("lining", "recess", "floor")  # first parts of the geoms' names
+# Bolts and clips of a few centimetres make up half of all triangles.
 SMALL = ("fastening", "nails")
 _LARGEST_SEEN_GROUP = 1
 _BOX_FACES = np.array([(0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5), (2, 3, 7), (2, 7, 6),
@@ -31,8 +31,8 @@ class Axis:
     """The centreline of a bore.
 
     Attributes:
-        station: Uniform, from 0, m, `(n,)`.
-        position: m, `(n, 3)`.
+        station: Uniform stations from 0, m, `(n,)`.
+        position: Positions, m, `(n, 3)`.
         tangent: Unit vectors of growing station, `(n, 3)`.
     """
 
@@ -49,8 +49,24 @@ class Triangles:
     faces: Int[np.ndarray, "f 3"]
 
 
+class ScenePart(NamedTuple):
+    """One geom of a scene.
+
+    Attributes:
+        kind: First part of its name.
+        material: Name of its material; empty if it has none.
+        colour: Red, green, blue, alpha of the material, 0 to 1; 0 if it has none.
+        triangles: Its surface in the tunnel frame.
+    """
+
+    kind: str
+    material: str
+    colour: Float[np.ndarray, "4"]
+    triangles: Triangles
+
+
 def joined(parts: list[Triangles]) -> Triangles:
-    """Several surfaces as one."""
+    """Join several surfaces into one."""
     before = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, before, strict=False)]
     return Triangles(
@@ -60,10 +76,10 @@ def joined(parts: list[Triangles]) -> Triangles:
 
 
 def read_axis(path: Path) -> Axis:
-    """The centreline in a `bore.npz`.
+    """Read the centreline of a `bore.npz`.
 
     Raises:
-        TunnelError: The file cannot be read, is of another schema, or lacks a field.
+        TunnelError: The file cannot be read, has another schema, or lacks a field.
     """
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -75,10 +91,10 @@ def read_axis(path: Path) -> Axis:
 
 
 def read_mesh(path: Path) -> Triangles:
-    """A mesh file.
+    """Read a mesh file.
 
     Raises:
-        TunnelError: There is none, it cannot be read, or it holds no triangle.
+        TunnelError: The file is missing, cannot be read, or holds no triangle.
     """
     import trimesh
 
@@ -94,25 +110,30 @@ def read_mesh(path: Path) -> Triangles:
 
 
 def read_scene(folder: Path, lining: str = "pockets", leave_out: tuple[str, ...] = SMALL) -> Triangles:
-    """All that is drawn in a scene.
+    """Read every visible surface of a scene.
 
     Args:
         folder: A scene folder.
         lining: `smooth`, `pockets`, or `furnished`, which brings the furniture along.
-        leave_out: Kinds of geom, by the first part of their names, that are not wanted.
+        leave_out: Kinds of geom to leave out, by the first part of their names.
 
     Raises:
-        TunnelError: No such lining, or a file of the folder is missing or spoiled.
+        TunnelError: The lining is unknown, or a file of the folder is missing or damaged.
     """
-    if lining not in _SCENES:
-        raise TunnelError(f"{folder}: there is no lining {lining!r}; a scene has {', '.join(_SCENES)}")
+    if lining not in SCENES:
+        raise TunnelError(f"{folder}: there is no lining {lining!r}; a scene has {', '.join(SCENES)}")
     smooth = lining == "smooth"
-    parts = _drawn(folder / _SCENES[lining], (*leave_out, *(_LINING if smooth else ())))
-    return joined([*parts, read_mesh(folder / "meshes" / "lining_smooth.ply")] if smooth else parts)
+    parts = scene_parts(folder / SCENES[lining], (*leave_out, *(LINING_KINDS if smooth else ())))
+    meshes = [part.triangles for part in parts]
+    return joined([*meshes, read_mesh(folder / "meshes" / "lining_smooth.ply")] if smooth else meshes)
 
 
-def _drawn(path: Path, leave_out: tuple[str, ...]) -> list[Triangles]:
-    """The meshes and boxes of a MuJoCo scene that a camera sees."""
+def scene_parts(path: Path, leave_out: tuple[str, ...] = ()) -> list[ScenePart]:
+    """Read the meshes and boxes of a MuJoCo scene that a camera sees.
+
+    Raises:
+        TunnelError: The file is missing, or MuJoCo refuses it.
+    """
     import mujoco
 
     if not path.is_file():
@@ -123,16 +144,18 @@ def _drawn(path: Path, leave_out: tuple[str, ...]) -> list[Triangles]:
         raise TunnelError(f"{path}: MuJoCo refuses the scene ({error})") from error
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    seen = np.flatnonzero(model.geom_group <= _LARGEST_SEEN_GROUP)
-    kinds = [model.geom(geom).name.split("_")[0] for geom in seen]
-    parts = (
-        geom_triangles(model, data, int(geom)) for geom, kind in zip(seen, kinds, strict=True) if kind not in leave_out
-    )
-    return [part for part in parts if len(part.faces)]
+    parts = []
+    for geom in np.flatnonzero(model.geom_group <= _LARGEST_SEEN_GROUP):
+        kind, material = model.geom(geom).name.split("_")[0], int(model.geom_matid[geom])
+        if kind in leave_out or not len((triangles := _geom_triangles(model, data, int(geom))).faces):
+            continue
+        name, colour = ("", np.zeros(4)) if material < 0 else (model.mat(material).name, model.mat(material).rgba)
+        parts.append(ScenePart(kind, name, colour.copy(), triangles))
+    return parts
 
 
-def geom_triangles(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> Triangles:
-    """One geom in the world; shapes other than meshes and boxes have no triangles here, and scenes have none."""
+def _geom_triangles(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -> Triangles:
+    """Return the triangles of a mesh or box in the world frame; none for other shapes, which scenes do not have."""
     import mujoco
 
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:

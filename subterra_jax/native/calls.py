@@ -1,12 +1,134 @@
-"""The kernels as functions of JAX, over many rows in one tunnel."""
+"""The kernels as functions of JAX: compiled by numba, kept on disk, registered with XLA as custom calls."""
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, no_type_check
 
 import jax
 import jax.numpy as jnp
+import jaxlib
+import llvmlite.binding
+import numba
+import numba.core.config
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numba import cfunc, njit, types
 
-from subterra_jax.native.handlers import CLEARANCE, SCAN
+from subterra_jax.native.frames import argument, capsule, floats, ints, result, run_on_all_threads, size, wants_work
+from subterra_jax.native.kernels import clearance_rows, scan_rows
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel
+
+config: Any = numba.core.config  # its attributes come from the environment
+
+
+@contextlib.contextmanager
+def code_cache() -> Iterator[bool]:
+    """Let numba keep machine code in a folder for this version; yields False if no folder can be written.
+
+    Numba numbers the files of one function in the order in which processes write them. Two processes that compile
+    different versions at the same time would take the same number, and a third would run the wrong one. So each
+    version of our sources, of the libraries and of the processor has its own folder.
+    """
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = base / "subterra" / "native" / _version()
+    before = config.CACHE_DIR
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
+    except OSError:
+        writable = False
+    if not writable:
+        yield False
+        return
+    config.CACHE_DIR = str(folder)
+    try:
+        yield True
+    finally:
+        config.CACHE_DIR = before
+
+
+def _version() -> str:
+    """Return a digest of all that the machine code depends on."""
+    sources = [file.read_bytes() for file in sorted(Path(__file__).parent.glob("*.py"))]
+    features = llvmlite.binding.get_host_cpu_features().flatten()
+    machine = f"{numba.__version__} {jaxlib.__version__} {llvmlite.binding.get_host_cpu_name()} {features}"
+    return hashlib.sha256(b"".join([*sources, machine.encode()])).hexdigest()[:32]
+
+
+SCAN, CLEARANCE = "subterra_scan", "subterra_clearance"
+# Machine code lives as long as the object that made it.
+_alive: list[Any] = []
+
+
+@njit
+@no_type_check
+def _scan(frame, begin, end):
+    """Take rows of a scan call: first, wanted, position, heading, box, wall, turn, limit, n_scan to ranges."""
+    wall = argument(frame, 5)
+    scan_rows(
+        begin,
+        end,
+        ints(argument(frame, 0)),
+        ints(argument(frame, 1)),
+        floats(argument(frame, 2)),
+        floats(argument(frame, 3)),
+        floats(argument(frame, 4)),
+        floats(wall),
+        size(wall, 2),
+        floats(argument(frame, 6)),
+        floats(argument(frame, 7))[0],
+        ints(argument(frame, 8))[0],
+        floats(result(frame, 0)),
+    )
+
+
+@njit
+@no_type_check
+def _clearance(frame, begin, end):
+    """Take rows of a clearance call: first, position, box, wall, reach, n_contact to distances."""
+    wall = argument(frame, 3)
+    clearance_rows(
+        begin,
+        end,
+        ints(argument(frame, 0)),
+        floats(argument(frame, 1)),
+        floats(argument(frame, 2)),
+        floats(wall),
+        size(wall, 2),
+        floats(argument(frame, 4))[0],
+        ints(argument(frame, 5))[0],
+        floats(result(frame, 0)),
+    )
+
+
+# Chunks of about 20 µs of work, which is the cost of waking a thread.
+_scan_all = run_on_all_threads(_scan, 32, "subterra_scan_helper")
+_clearance_all = run_on_all_threads(_clearance, 256, "subterra_clearance_helper")
+
+
+@no_type_check
+def _scan_handler(frame):
+    """Answer XLA's call of the scan."""
+    if wants_work(frame):
+        _scan_all(frame, size(result(frame, 0), 0))
+    return 0
+
+
+@no_type_check
+def _clearance_handler(frame):
+    """Answer XLA's call of the clearance."""
+    if wants_work(frame):
+        _clearance_all(frame, size(result(frame, 0), 0))
+    return 0
+
+
+with code_cache() as writable:
+    for _name, _handler in ((SCAN, _scan_handler), (CLEARANCE, _clearance_handler)):
+        _alive.append(cfunc(types.intp(types.intp), cache=writable)(_handler))
+        jax.ffi.register_ffi_target(_name, capsule(_alive[-1].address), platform="cpu")
 
 
 def scan(
@@ -18,19 +140,19 @@ def scan(
     range_max: Float[Array, ""],
     bearing: np.ndarray,
 ) -> Float[Array, "n n_beams"]:
-    """True ranges of many scans in one tunnel.
+    """Return the true ranges of many scans in one tunnel.
 
     Args:
         tunnel: The tunnel, one for all.
         position: Positions of the LiDAR, tunnel frame, m.
-        heading: Its headings, rad.
+        heading: Headings of the LiDAR, rad.
         first: First block of each window.
-        wanted: Which scans to take; the others cost nothing, and hold anything.
+        wanted: Scans to take; the others cost nothing and hold arbitrary numbers.
         range_max: Largest range, m.
         bearing: Of each beam from the heading, rad; if their number is even, the second half opposes the first.
 
     Returns:
-        As `lidar.scan`.
+        Ranges, m, as `lidar.scan`.
     """
     shape = jax.ShapeDtypeStruct((position.shape[0], len(bearing)), jnp.float32)
     return jax.ffi.ffi_call(SCAN, shape)(
@@ -47,7 +169,7 @@ def scan(
 
 
 def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
-    """Distances from many points in one tunnel to its nearest wall or furniture.
+    """Return the distances from many points in one tunnel to its nearest wall or furniture.
 
     Args:
         tunnel: The tunnel, one for all.
@@ -55,7 +177,7 @@ def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, "
         first: First block of each contact window.
 
     Returns:
-        Distances, m; exact up to `CONTACT_REACH`, and exactly that where the truth is beyond.
+        Distances, m; exact up to `CONTACT_REACH`, and exactly that where the true distance is larger.
     """
     shape = jax.ShapeDtypeStruct(position.shape[:1], jnp.float32)
     return jax.ffi.ffi_call(CLEARANCE, shape)(

@@ -1,6 +1,6 @@
-"""Sixteen numbers at a time: vector types for numba, so that a kernel says what is to be a SIMD instruction.
+"""Vector types of sixteen numbers for numba, with which a kernel states its SIMD instructions.
 
-LLVM splits the vectors into whatever registers the processor has. Operators and comparisons work between vectors and
+LLVM splits the vectors into the registers of the processor. Operators and comparisons work between vectors and
 between a vector and a number of its kind; comparisons of floats are false where one is NaN.
 """
 
@@ -19,7 +19,7 @@ _FLOAT, _INT, _BOOL = ir.FloatType(), ir.IntType(32), ir.IntType(1)
 
 
 class Lanes(types.Type):
-    """A vector of 16 elements; its values live in registers, never in an array of Python's."""
+    """Type of a vector of 16 elements, held in registers, never in a Python array."""
 
     def __init__(self, name: str, element: ir.Type, scalar: types.Type) -> None:
         super().__init__(name=f"lanes of {name}")
@@ -39,7 +39,7 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _widen(builder: ir.IRBuilder, kind: types.Type, value: ir.Value) -> ir.Value:
-    """A vector as it is; a number in every lane of one."""
+    """Return a vector unchanged, or a number repeated in every lane."""
     if isinstance(kind, Lanes):
         return value
     vector = ir.VectorType(value.type, N_LANES)
@@ -88,7 +88,7 @@ _define(operator.eq, (FLOATS, INTS), MASK, _comparison("=="))
 
 
 def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: list[ir.Value]) -> ir.Value:
-    """A call of one of LLVM's own functions."""
+    """Call one of LLVM's own functions."""
     function = builder.module.globals.get(name)
     if function is None:
         function = ir.Function(builder.module, ir.FunctionType(result, [arg.type for arg in args]), name)
@@ -97,7 +97,7 @@ def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: list[ir.Value
 
 @intrinsic
 def where(typing: Any, mask: Any, then: Any, otherwise: Any) -> Any:
-    """Lane by lane `then` where the mask is set, else `otherwise`; one of the two may be a number."""
+    """Select, lane by lane, `then` where the mask is set, else `otherwise`; one of the two may be a number."""
     kind = then if isinstance(then, Lanes) else otherwise
     sig = signature(kind, MASK, *(arg if arg is kind else kind.scalar for arg in (then, otherwise)))
 
@@ -109,7 +109,7 @@ def where(typing: Any, mask: Any, then: Any, otherwise: Any) -> Any:
 
 @intrinsic
 def magnitude(typing: Any, values: Any) -> Any:
-    """Absolute values."""
+    """Return absolute values."""
     return signature(FLOATS, FLOATS), lambda context, builder, sig, args: _call(
         builder, f"llvm.fabs.v{N_LANES}f32", FLOATS.vector, args
     )
@@ -117,7 +117,7 @@ def magnitude(typing: Any, values: Any) -> Any:
 
 @intrinsic
 def root(typing: Any, values: Any) -> Any:
-    """Square roots."""
+    """Return square roots."""
     return signature(FLOATS, FLOATS), lambda context, builder, sig, args: _call(
         builder, f"llvm.sqrt.v{N_LANES}f32", FLOATS.vector, args
     )
@@ -125,7 +125,7 @@ def root(typing: Any, values: Any) -> Any:
 
 @intrinsic
 def least(typing: Any, values: Any) -> Any:
-    """The least of 16 integers."""
+    """Return the least of 16 integers."""
     return signature(types.int32, INTS), lambda context, builder, sig, args: _call(
         builder, f"llvm.vector.reduce.smin.v{N_LANES}i32", _INT, args
     )
@@ -133,13 +133,13 @@ def least(typing: Any, values: Any) -> Any:
 
 @intrinsic
 def numbered(typing: Any) -> Any:
-    """The number of each lane, 0 to 15."""
+    """Return the number of each lane, 0 to 15."""
     return signature(INTS), lambda context, builder, sig, args: ir.Constant(INTS.vector, list(range(N_LANES)))
 
 
 @intrinsic
 def following(typing: Any, values: Any) -> Any:
-    """Each lane's follower's value; the last lane keeps its own."""
+    """Shift values one lane down; the last lane keeps its own."""
     order = ir.Constant(ir.VectorType(_INT, N_LANES), [*range(1, N_LANES), N_LANES - 1])
     return signature(values, values), lambda context, builder, sig, args: builder.shuffle_vector(
         args[0], args[0], order
@@ -148,7 +148,7 @@ def following(typing: Any, values: Any) -> Any:
 
 @intrinsic
 def bits(typing: Any, value: Any) -> Any:
-    """The bits of floats as integers; those of floats that are not negative sort like them."""
+    """Return the bits of floats as integers; for floats of at least 0 both sort alike."""
     result = INTS if value is FLOATS else types.int32
     return signature(result, value), lambda context, builder, sig, args: builder.bitcast(
         args[0], INTS.vector if value is FLOATS else _INT
@@ -157,19 +157,19 @@ def bits(typing: Any, value: Any) -> Any:
 
 @intrinsic
 def from_bits(typing: Any, value: Any) -> Any:
-    """The float that has the bits of an integer."""
+    """Return the float that has the bits of an integer."""
     return signature(types.float32, types.int32), lambda context, builder, sig, args: builder.bitcast(args[0], _FLOAT)
 
 
 def _address(context: Any, builder: Any, kind: Any, array: ir.Value, index: ir.Value) -> ir.Value:
-    """Where 16 elements of a flat contiguous array begin."""
+    """Return the address of 16 elements of a flat contiguous array."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), FLOATS.vector.as_pointer())
 
 
 @intrinsic
 def load(typing: Any, array: Any, index: Any) -> Any:
-    """16 consecutive elements of a flat contiguous float32 array; bounds are not checked."""
+    """Load 16 consecutive elements of a flat contiguous float32 array; bounds are not checked."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
         return builder.load(_address(context, builder, sig.args[0], args[0], args[1]), align=4)
@@ -179,7 +179,7 @@ def load(typing: Any, array: Any, index: Any) -> Any:
 
 @intrinsic
 def load_some(typing: Any, array: Any, index: Any, mask: Any) -> Any:
-    """As `load`, but lanes outside the mask are 0 and their memory is not touched."""
+    """Load as `load`, but lanes outside the mask are 0 and their memory is not read."""
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
         address = _address(context, builder, sig.args[0], args[0], args[1])

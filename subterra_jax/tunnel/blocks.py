@@ -1,7 +1,7 @@
-"""Wall polylines cut into short blocks, each in a thin box, so that a ray need only meet the few blocks near its hit.
+"""Cut walls into short blocks, each in a thin box, and list the blocks within reach of every place along the tunnel.
 
-Everything here runs once, on the host, in float64. Nothing is simplified: a block keeps every segment of its piece of
-wall, and its box encloses them.
+A ray is compared only with the blocks near its hit. Everything here runs once, on the host, in float64. Nothing is
+simplified: a block keeps every segment of its piece of wall, and its box encloses them.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from subterra_jax.tunnel.boxes import LIDAR_GAP as LIDAR_GAP
-from subterra_jax.tunnel.boxes import lidded, thin_boxes
+from subterra_jax.tunnel.boxes import distance_to_segment, lidded, thin_boxes
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
-# Where padding is, m, and half the thickness of its boxes: less than nothing, or a beam exactly towards them would
-# enter them and take them for the nearest.
+# Position of padding, m, and half the thickness of its boxes: negative, or a beam exactly towards them would enter them
+# and take them for the nearest.
 PADDING_CENTRE, PADDING_THICKNESS = 1e6, -1.0
 
 
@@ -59,7 +59,7 @@ class _Pieces:
 
 
 def _joined(parts: list[_Pieces]) -> _Pieces:
-    """Pieces of several polylines in order of station."""
+    """Join the pieces of several polylines in order of station."""
     shift = np.cumsum([0, *(len(part.vertex) for part in parts)])
     station = np.concatenate([part.station for part in parts])
     order = np.argsort(station, kind="stable")
@@ -73,7 +73,7 @@ def _joined(parts: list[_Pieces]) -> _Pieces:
 
 
 def _wall_pieces(plan: TunnelPlan, wall: Wall, inward: float, length: float, max_segments: int) -> _Pieces:
-    """One wall cut into pieces."""
+    """Cut one wall into pieces."""
     off_x, off_y = (wall.vertex[:, i] - np.interp(wall.station, plan.station, plan.centre[:, i]) for i in range(2))
     cuts = np.array(_cuts(wall.station, np.sqrt(off_x * off_x + off_y * off_y), length, max_segments))
     first, last = cuts[:-1], cuts[1:]
@@ -84,10 +84,10 @@ def _wall_pieces(plan: TunnelPlan, wall: Wall, inward: float, length: float, max
 def _cuts(
     station: Float[np.ndarray, " v"], clearance: Float[np.ndarray, " v"], length: float, max_segments: int
 ) -> list[int]:
-    """The vertices between which the blocks of one wall lie.
+    """Return the vertices between which the blocks of one wall lie.
 
-    A block ends at the innermost vertex of the last part of its allowed length: never in a recess, whose mouth would
-    then lie slanted in two thick boxes.
+    A block ends at the innermost vertex of the last part of its allowed length. It never ends in a recess, whose mouth
+    would then lie slanted in two thick boxes.
     """
     end = len(station) - 1
     furthest = np.searchsorted(station, station + length + 1e-9, side="right") - 1
@@ -104,7 +104,7 @@ def _cuts(
 
 
 def _furniture_pieces(plan: TunnelPlan, furniture: Float[np.ndarray, "f 4"], max_segments: int) -> _Pieces:
-    """Loose segments joined, where the next begins at the end of the last, into polylines of a few segments."""
+    """Join segments that begin where the one before ends into polylines of a few segments."""
     follows = np.all(np.abs(furniture[1:, :2] - furniture[:-1, 2:]) <= 1e-9, axis=1).tolist()
     begins, segments = [0], 1
     for i, joined in enumerate(follows, start=1):
@@ -130,7 +130,7 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
     Args:
         plan: The tunnel, for its centreline.
         lining: The walls and furniture to cut.
-        length: Wanted length of a block, m. A single longer wall segment stays whole.
+        length: Target length of a block, m. A single longer wall segment stays whole.
         max_segments: Most segments in one block.
     """
     parts = [
@@ -148,7 +148,7 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
 
 
 def padded(blocks: Blocks, count: int) -> Blocks:
-    """At least `count` blocks: the missing ones are points too far away to be seen, in boxes that nothing enters."""
+    """Pad to at least `count` blocks with points too far away to be seen, in boxes that nothing enters."""
     missing = max(0, count - len(blocks.centre))
     return Blocks(
         centre=np.pad(blocks.centre, ((0, missing), (0, 0)), constant_values=PADDING_CENTRE),
@@ -157,3 +157,96 @@ def padded(blocks: Blocks, count: int) -> Blocks:
         offset=np.pad(blocks.offset, ((0, missing), (0, 0), (0, 0))),
         station=np.pad(blocks.station, (0, missing), constant_values=np.inf),
     )
+
+
+_ROWS = 128  # segments compared together: close enough to one another to share most of their blocks
+
+
+def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray, int]:
+    """Return, for each node of the station grid, the blocks within reach of a robot near that node.
+
+    Args:
+        plan: The tunnel, for its station grid.
+        blocks: Its blocks.
+        reach: Distance that the window must cover, m, wherever across the tunnel the robot is and up to half a grid
+            step along it; beyond a mouth, up to 0.5 m outside.
+
+    Returns:
+        First block of each node's window `(n,)`, and the number of blocks in a window, the same for all.
+    """
+    spacing = plan.station[1] - plan.station[0]
+    slack = np.full(len(plan.station), 0.6 * spacing + 0.01)
+    slack[[0, -1]] += 0.5
+    normal = np.stack([-plan.tangent[:, 1], plan.tangent[:, 0]], axis=-1)
+    node, block = _within(plan.centre, plan.half_width[:, None] * normal, np.zeros(len(slack)), blocks, reach + slack)
+    first = np.full(len(plan.station), len(blocks.centre) - 1)
+    last = np.zeros(len(plan.station), int)
+    np.minimum.at(first, node, block)
+    np.maximum.at(last, node, block)
+    size = int(np.clip(np.max(last - first) + 1, 1, len(blocks.centre)))
+    return np.clip(first, 0, len(blocks.centre) - size), size
+
+
+def separation(blocks: Blocks, reach: float) -> int:
+    """Return the least n such that blocks n apart in the order are never within `reach` of one another."""
+    limit = np.full(len(blocks.centre), reach)
+    first, second = _within(blocks.centre, blocks.half, blocks.thickness, blocks, limit)
+    return int(np.max(np.abs(first - second), initial=0)) + 1
+
+
+def _within(
+    middle: Float[np.ndarray, "n 2"],
+    half: Float[np.ndarray, "n 2"],
+    thickness: Float[np.ndarray, " n"],
+    blocks: Blocks,
+    limit: Float[np.ndarray, " n"],
+) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Find pairs of a thin box `middle ± half` and a block within a distance of one another.
+
+    Both may be thicker than a line. A wall behind a lid is at most a pocket further away than the box, never nearer.
+
+    Args:
+        middle: Middle of each box, m.
+        half: Half the long axis of each box, m.
+        thickness: Half the thickness of each box, m.
+        blocks: The blocks.
+        limit: Distance for each box, m.
+
+    Returns:
+        Numbers of the box and of the block of each pair.
+    """
+    length, size = np.hypot(*half.T), np.hypot(*blocks.half.T)
+    found = []
+    for first in range(0, len(middle), _ROWS):
+        rows = slice(first, first + _ROWS)
+        most = (limit[rows] + thickness[rows]).max() + (size + blocks.thickness).max() + length[rows].max()
+        low, high = middle[rows].min(axis=0) - most, middle[rows].max(axis=0) + most
+        near = np.flatnonzero(np.all((blocks.centre >= low) & (blocks.centre <= high), axis=1))
+        x, y = (middle[rows, i, None] - blocks.centre[near, i] for i in range(2))
+        room = (limit + thickness)[rows, None] + blocks.thickness[near]
+        squared, surely = x * x + y * y, np.maximum(room, 0.0)
+        maybe = surely + length[rows, None] + size[near]
+        sure = squared <= surely * surely
+        row, column = np.nonzero(~sure & (squared <= maybe * maybe))
+        gap = _gap(middle[rows][row], half[rows][row], blocks.centre[near[column]], blocks.half[near[column]])
+        sure[row, column] = gap <= room[row, column]
+        row, column = np.nonzero(sure)
+        found.append((first + row, near[column]))
+    box, block = (np.concatenate(part) for part in zip(*found, strict=True))
+    return box, block
+
+
+def _gap(
+    middle: Float[np.ndarray, "n 2"],
+    half: Float[np.ndarray, "n 2"],
+    other: Float[np.ndarray, "n 2"],
+    other_half: Float[np.ndarray, "n 2"],
+) -> Float[np.ndarray, " n"]:
+    """Return the distance between segments `middle ± half` that do not cross: it is at an end of one of them."""
+    ends = (
+        distance_to_segment(middle + half, other, other_half),
+        distance_to_segment(middle - half, other, other_half),
+        distance_to_segment(other + other_half, middle, half),
+        distance_to_segment(other - other_half, middle, half),
+    )
+    return np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))

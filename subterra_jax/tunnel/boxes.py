@@ -1,12 +1,12 @@
 """Thin boxes around many short pieces of wall at once.
 
-A piece is a row of `k` vertices, padded with its last one. Its box does not depend on what it is boxed with.
+A piece is a row of `k` vertices, padded with its last one. Its box does not depend on the other pieces.
 """
 
 import numpy as np
 from jaxtyping import Float, Int
 
-# Boxes are a little larger than their walls, so that rounding on the device cannot shut a wall out of its box: m.
+# Boxes are larger than their walls by this, m, so that rounding on the device cannot move a wall out of its box.
 BOX_MARGIN = 1e-5
 # A robot never brings its LiDAR nearer to a wall than this: footprint radius less the motion of one step, m.
 LIDAR_GAP = 0.2
@@ -17,18 +17,18 @@ _CHUNK = 256  # pieces at a time, so that intermediates stay in the cache
 def lidded(
     vertex: Float[np.ndarray, "n k 2"], count: Int[np.ndarray, " n"], inward: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n k 2"], Int[np.ndarray, " n"]]:
-    """The inner hulls of pieces of wall: their pockets and hollows closed with lids.
+    """Return the inner hulls of pieces of wall, with pockets and hollows closed by lids.
 
-    A beam from inside the tunnel can meet a piece only through this line, and what it meets behind a lid belongs to the
-    same piece; so it is enough that the box encloses the line. That keeps boxes thin where pockets are deep.
+    A beam from inside the tunnel meets a piece only through this line, and anything behind a lid belongs to the same
+    piece. So the box need only enclose the line, which keeps boxes thin at deep pockets.
 
     Args:
         vertex: Vertices of each piece in the direction of growing station, m.
-        count: How many of them count.
+        count: Vertices of each piece without padding.
         inward: -1 for a left wall, whose inside is on its right; +1 for a right wall; 0 keeps every vertex.
 
     Returns:
-        Some of the vertices of each piece, and how many; all of them where a recess is deep.
+        Vertices of each hull, and their number; all vertices of a piece if a recess is deep.
     """
     hull, size = _hulls(vertex, count, inward)
     short = np.flatnonzero(size < count)
@@ -43,7 +43,7 @@ def lidded(
 def _hulls(
     vertex: Float[np.ndarray, "n k 2"], count: Int[np.ndarray, " n"], inward: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n k 2"], Int[np.ndarray, " n"]]:
-    """Vertices that turn outward, found as in Andrew's monotone chain: the last one goes while it turns inward."""
+    """Return the vertices that turn outward, as in Andrew's monotone chain: drop the last while it turns inward."""
     n, k, _ = vertex.shape
     hull, size, row = np.zeros_like(vertex), np.zeros(n, int), np.arange(n)
     for i in range(k):
@@ -62,7 +62,7 @@ def _hulls(
 
 
 def _repeat_last(vertex: Float[np.ndarray, "n k 2"], count: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n k 2"]:
-    """Padding, whatever it was, replaced by the last vertex that counts."""
+    """Replace padding by the last vertex without padding."""
     place = np.minimum(np.arange(vertex.shape[1]), count[:, None] - 1)
     return np.take_along_axis(vertex, place[..., None], axis=1)
 
@@ -70,7 +70,7 @@ def _repeat_last(vertex: Float[np.ndarray, "n k 2"], count: Int[np.ndarray, " n"
 def _recess(
     vertex: Float[np.ndarray, "n k 2"], hull: Float[np.ndarray, "n k 2"], size: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Half the longest lid of each hull, and the furthest that a vertex lies behind the lids, m."""
+    """Return half the longest lid of each hull, and the largest distance of a vertex behind the lids, m."""
     middle, half = 0.5 * (hull[:, 1:] + hull[:, :-1]), 0.5 * (hull[:, 1:] - hull[:, :-1])
     # Padding is a point on the hull's end, which is never nearer than the last lid.
     behind = distance_to_segment(vertex[:, :, None], middle[:, None], half[:, None])
@@ -80,7 +80,7 @@ def _recess(
 def distance_to_segment(
     point: Float[np.ndarray, "*n 2"], middle: Float[np.ndarray, "*m 2"], half: Float[np.ndarray, "*m 2"]
 ) -> Float[np.ndarray, "*nm"]:
-    """Distance from points to segments `middle ± half`, m; the shapes broadcast."""
+    """Return the distance from points to segments `middle ± half`, m; the shapes broadcast."""
     from_x, from_y = point[..., 0] - middle[..., 0], point[..., 1] - middle[..., 1]
     half_x, half_y = half[..., 0], half[..., 1]
     along = (from_x * half_x + from_y * half_y) / np.maximum(half_x * half_x + half_y * half_y, 1e-12)
@@ -92,10 +92,10 @@ def distance_to_segment(
 def thin_boxes(
     vertex: Float[np.ndarray, "n k 2"], count: Int[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """Centre, half long axis as a vector and half thickness of a thin box around each piece.
+    """Return the centre, half long axis as a vector and half thickness of a thin box around each piece.
 
-    The thinnest box of a polygon lies along one of its hull's edges, so it is enough to try the directions between
-    pairs of vertices.
+    The thinnest box of a polygon lies along an edge of its hull, so only directions between pairs of vertices are
+    tried.
 
     Returns:
         Centres, exactly representable in float32, half long axes and half thicknesses, m.
@@ -111,11 +111,11 @@ def thin_boxes(
 def _boxes(
     vertex: Float[np.ndarray, "n k 2"],
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-    """`thin_boxes` of pieces that all have `k` vertices."""
+    """Return `thin_boxes` of pieces that all have `k` vertices."""
     first, second = np.triu_indices(vertex.shape[1], k=1)
     edge = vertex[:, second] - vertex[:, first]
     size = np.sqrt(edge[..., 0] * edge[..., 0] + edge[..., 1] * edge[..., 1])
-    # A file may repeat a vertex; a block of nothing else is a point, for which any direction will do.
+    # A file may repeat a vertex; a block with nothing else is a point, for which any direction will do.
     same = size <= _REPEATED
     d_x = np.where(same, 1.0, edge[..., 0] / np.where(same, 1.0, size))
     d_y = np.where(same, 0.0, edge[..., 1] / np.where(same, 1.0, size))

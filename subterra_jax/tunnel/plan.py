@@ -1,4 +1,4 @@
-"""The planar tunnel as its file describes it: float64 NumPy on the host, every lining variant."""
+"""The planar tunnel on the host: the content of its file as float64 NumPy, with every lining variant."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Lining:
 
     @property
     def segments(self) -> np.ndarray:
-        """Every wall segment as `x0, y0, x1, y1`, m, `(n, 4)`: the geometry that a LiDAR here must agree with."""
+        """Every wall segment as `x0, y0, x1, y1`, m, `(n, 4)`: the reference for LiDAR ranges."""
         chains = [np.hstack([wall.vertex[:-1], wall.vertex[1:]]) for wall in (self.left, self.right)]
         return np.concatenate([*chains, self.furniture])
 
@@ -48,17 +48,16 @@ class TunnelPlan:
     """A tunnel file in memory.
 
     Attributes:
-        name: Name for people.
+        name: Name of the tunnel.
         provenance: `measured` or `simulated`.
-        station: Uniform chainage grid from 0 to the length, m, `(n,)`.
+        station: Uniform stations from 0 to the length, m, `(n,)`.
         centre: Centreline, m, `(n, 2)`.
         tangent: Unit tangent of the centreline, `(n, 2)`.
         elevation: Height of the ground the robot drives on, m, `(n,)`.
         half_width: Half the distance between the smooth walls, m, `(n,)`.
         lidar_height: Height of the LiDAR plane above `elevation`, m.
         linings: Variant name to its walls.
-        ring_pitch: Distance from ring joint to ring joint, at which the pockets repeat, m; 0 where there are no rings
-            or nobody said.
+        ring_pitch: Distance between ring joints, at which the pockets repeat, m; 0 without rings, or if unknown.
     """
 
     name: str
@@ -79,21 +78,21 @@ class TunnelPlan:
 
     @property
     def default_lining(self) -> str:
-        """The variant to use where nobody said: `pockets`, or the first where there are none."""
+        """Variant used by default: `pockets`, or the first if there is none of that name."""
         return "pockets" if "pockets" in self.linings else next(iter(self.linings))
 
     def lining(self, name: str) -> Lining:
-        """The walls of one variant; raises `TunnelError` naming the variants there are."""
+        """Return the walls of one variant; raises `TunnelError` with the known names for an unknown one."""
         if name not in self.linings:
             raise TunnelError(f"tunnel {self.name!r} has no lining {name!r}; it has {', '.join(self.linings)}")
         return self.linings[name]
 
     def slice(self, start: float, length: float) -> TunnelPlan:
-        """The piece from `start` to `start + length`, its stations counted from 0 and both its mouths open.
+        """Return the piece from `start` to `start + length`, with stations from 0 and both mouths open.
 
         Args:
             start: Station at which the piece begins, m.
-            length: Length of the piece, m; the chainage grid keeps its spacing as nearly as a uniform grid allows.
+            length: Length of the piece, m; the station grid keeps its spacing as nearly as a uniform grid allows.
 
         Raises:
             ValueError: The piece does not lie within the tunnel.
@@ -127,7 +126,7 @@ class TunnelPlan:
         )
 
     def _furniture(self, lining: Lining, start: float, end: float) -> np.ndarray:
-        """Furniture whose middle lies between two stations."""
+        """Return the furniture whose middle lies between two stations."""
         middle = 0.5 * (lining.furniture[:, :2] + lining.furniture[:, 2:])
         nearest = np.array([np.argmin(np.sum((self.centre - m) ** 2, axis=1)) for m in middle], dtype=int)
         station = self.station[nearest]
@@ -135,7 +134,7 @@ class TunnelPlan:
 
 
 def _cut(wall: Wall, start: float, end: float) -> Wall:
-    """The part of a wall between two stations, with new vertices where it is cut."""
+    """Return the part of a wall between two stations, with new vertices at the cuts."""
     keep = (wall.station > start) & (wall.station < end)
     # A cut through the end of a wall must not invent a vertex beyond it.
     ends = np.clip([start, end], wall.station[0], wall.station[-1])

@@ -1,54 +1,171 @@
-"""Tunnels by name: packaged ones, files, and generated ones."""
+"""Tunnels by name: packaged ones, files and generated ones. A complaint about a file names the file and the field."""
 
 import hashlib
 import re
+import zipfile
 from collections.abc import Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from subterra_jax.procedural import expand, named
-from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel.reading import read_tunnel
-from subterra_jax.tunnel.stack import stack
-from subterra_jax.tunnel.tunnel import Tunnel
+from subterra_jax.errors import TunnelError
+from subterra_jax.procedural import expand, generate
+from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
+from subterra_jax.tunnel.tunnel import Tunnel, stack
+from subterra_jax.versions import other_schema
+
+SCHEMA = "subterra.tunnel/1"
+AGAIN = "build the scene again with `python -m scene.build`"
+
+
+def describe_damage(path: Path, error: Exception) -> str:
+    """Say why an archive cannot be read; NumPy's own message takes every other file for a pickle."""
+    if path.is_dir():
+        return "it is a folder"
+    return str(error) if path.stat().st_size and zipfile.is_zipfile(path) else "it is no zip file, or is cut short"
+
+
+class _Fields:
+    """Checked access to the fields of one tunnel file."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                self.data = {name: data[name] for name in data.files}
+        except FileNotFoundError as error:
+            raise TunnelError(f"{path}: no such tunnel file") from error
+        except Exception as error:  # zipfile, zlib and NumPy each raise their own for a damaged archive
+            raise TunnelError(f"{path}: not a readable .npz archive ({describe_damage(path, error)})") from error
+
+    def fail(self, field: str, problem: str) -> TunnelError:
+        return TunnelError(f"{self.path}: field '{field}' {problem}")
+
+    def text(self, field: str) -> str:
+        if field not in self.data:
+            raise self.fail(field, "is missing")
+        if self.data[field].shape != () or self.data[field].dtype.kind != "U":
+            raise self.fail(field, f"must be one string, is {self.data[field].dtype} of shape {self.data[field].shape}")
+        return str(self.data[field])
+
+    def numbers(self, field: str, *shape: int | None) -> np.ndarray:
+        """Return a finite float64 array of the given shape; `None` stands for any size."""
+        if field not in self.data:
+            raise self.fail(field, "is missing")
+        value = self.data[field]
+        if value.dtype.kind not in "fiu":
+            raise self.fail(field, f"must hold numbers, holds {value.dtype}")
+        if value.ndim != len(shape) or any(w is not None and w != h for w, h in zip(shape, value.shape, strict=True)):
+            wanted = ", ".join("any" if w is None else str(w) for w in shape)
+            raise self.fail(field, f"must have shape ({wanted}), has {value.shape}")
+        if not np.all(np.isfinite(value)):
+            where = np.argwhere(~np.isfinite(value))[0].tolist()
+            raise self.fail(field, f"has a value that is not finite, at index {where}")
+        return value.astype(np.float64)
+
+    def wall(self, side: str, lining: str) -> Wall:
+        field = f"{side}_{lining}"
+        vertex = self.numbers(field, None, 2)
+        if len(vertex) < 2:
+            raise self.fail(field, f"needs at least 2 vertices, has {len(vertex)}")
+        station = self.numbers(f"{side}_station_{lining}", len(vertex))
+        if np.any(np.diff(station) < 0.0):
+            raise self.fail(f"{side}_station_{lining}", f"decreases at index {np.argmax(np.diff(station) < 0.0)}")
+        return Wall(vertex, station)
+
+
+def read_tunnel(path: Path) -> TunnelPlan:
+    """Read and check a `tunnel.npz`.
+
+    Raises:
+        TunnelError: The file cannot be read, or a field is missing or wrong.
+    """
+    fields = _Fields(path)
+    if (schema := fields.text("schema")) != SCHEMA:
+        raise TunnelError(f"{path}: {other_schema(schema, SCHEMA, AGAIN)}")
+    station = fields.numbers("station", None)
+    n = len(station)
+    if n < 2:
+        raise fields.fail("station", f"needs at least 2 values, has {n}")
+    step = np.diff(station)
+    if station[0] != 0.0 or np.any(step <= 0.0) or np.any(np.abs(step - step.mean()) > 1e-6 * station[-1]):
+        raise fields.fail("station", "must be a uniform, growing grid that starts at 0")
+    tangent = fields.numbers("tangent", n, 2)
+    if np.any(np.abs(np.linalg.norm(tangent, axis=1) - 1.0) > 1e-3):
+        raise fields.fail("tangent", "must hold unit vectors")
+    half_width = fields.numbers("half_width", n)
+    if np.any(half_width <= 0.0):
+        raise fields.fail("half_width", "must be positive")
+    # Older files do not have the field.
+    ring_pitch = float(fields.numbers("ring_pitch")) if "ring_pitch" in fields.data else 0.0
+    if ring_pitch < 0.0:
+        raise fields.fail("ring_pitch", f"must not be negative, is {ring_pitch}")
+    names: Any = fields.data.get("lining")
+    if names is None:
+        raise fields.fail("lining", "is missing")
+    if names.ndim != 1 or names.dtype.kind != "U" or len(names) == 0:
+        raise fields.fail("lining", f"must be a list of names, is {names.dtype} of shape {names.shape}")
+    return TunnelPlan(
+        name=fields.text("name"),
+        provenance=fields.text("provenance"),
+        station=station,
+        centre=fields.numbers("centre", n, 2),
+        tangent=tangent,
+        elevation=fields.numbers("elevation", n),
+        half_width=half_width,
+        lidar_height=float(fields.numbers("lidar_height")),
+        linings={
+            str(name): Lining(
+                fields.wall("left", name), fields.wall("right", name), fields.numbers(f"furniture_{name}", None, 4)
+            )
+            for name in names
+        },
+        ring_pitch=ring_pitch,
+    )
+
+
+def tunnel_of(scene: Path) -> Path:
+    """Return the tunnel file of a scene folder, or the one beside an MJCF file."""
+    return (scene if scene.is_dir() else scene.parent) / "tunnel.npz"
+
 
 PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
-GENERATED = re.compile(r"control|procedural:.*")  # names of tunnels that are made, not read
+GENERATED = re.compile(r"control|procedural:.*")  # names of generated tunnels
 
 Source = Tunnel | TunnelPlan | str | Path | None
 
 
 def tunnel_file(path: str | Path | None) -> Traversable:
-    """The file that a path, the name of a packaged tunnel, or None (the default one) stands for."""
+    """Return the file for a path, for the name of a packaged tunnel, or for `None`, the default one."""
     name = PACKAGED[0] if path is None else str(path)
     return resources.files("subterra_jax") / "data" / f"{name}.npz" if name in PACKAGED else Path(name)
 
 
 def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
-    """Read and check a `tunnel.npz`, or make a tunnel that goes by a name.
+    """Read and check a `tunnel.npz`, or generate a tunnel by its name.
 
     Args:
         path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); `control`, the bore without
-            landmarks; or `procedural:SPLIT:INDEX`, one of the family. None is the first packaged one.
+            landmarks; or `procedural:SPLIT:INDEX`, one of the family. `None` is the first packaged one.
 
     Returns:
-        The tunnel with every lining variant; `Tunnel.from_plan` makes it ready for the device.
+        The tunnel with every lining variant; `Tunnel.from_plan` puts it on the device.
 
     Raises:
-        TunnelError: The file cannot be read, or a field is missing or wrong; the message names both. Or there is no
-            such generated tunnel.
+        TunnelError: The file cannot be read, or a field is missing or wrong; the message names both. Or the generated
+            tunnel does not exist.
     """
     if GENERATED.fullmatch(str(path)):
-        return named(str(path))
+        return generate(str(path))
     with resources.as_file(tunnel_file(path)) as file:
         return read_tunnel(file)
 
 
 def tunnel_digest(path: str | Path | None = None) -> str:
-    """SHA-256 of what `load_tunnel` would load: of the file, or of a generated tunnel's arrays."""
+    """Return the SHA-256 of a tunnel file, or of a generated tunnel's arrays."""
     if not GENERATED.fullmatch(str(path)):
         return hashlib.sha256(tunnel_file(path).read_bytes()).hexdigest()
     plan = load_tunnel(path)
@@ -67,19 +184,19 @@ def resolve(
     piece: tuple[float, float] | None,
     reach: float,
 ) -> Tunnel:
-    """A device tunnel from whatever a user names one by.
+    """Return the device tunnel for anything that a user may name one by.
 
     Args:
-        tunnel: A ready `Tunnel`, taken as it is; a plan; a file or a name, as for `load_tunnel`; None for the packaged
-            tunnel; or a list of such things, which becomes one stack, as does a name like `procedural:train:0-255`.
-        lining: The variant of the walls; None is `pockets`, or the first where a tunnel has none.
-        piece: Start and length of the piece to cut out, m; None keeps the whole tunnel. A length beyond the tunnel's
-            end is shortened to it.
-        reach: Largest range that will be asked for, m.
+        tunnel: A `Tunnel`, which is returned unchanged; a plan; a file or name, as for `load_tunnel`; `None` for the
+            packaged tunnel; or a list of these, which becomes one stack, as does a name like `procedural:train:0-255`.
+        lining: Variant of the walls; `None` is `pockets`, or the first where a tunnel has none.
+        piece: Start and length of the piece to cut out, m; `None` keeps the whole tunnel. A piece beyond the tunnel's
+            end is shortened.
+        reach: Largest LiDAR range, m.
 
     Raises:
-        TunnelError: A file is unreadable or wrong, or there is no such tunnel or lining.
-        ValueError: A ready tunnel was made for shorter ranges, or the list is empty.
+        TunnelError: A file cannot be read or is wrong, or the tunnel or lining does not exist.
+        ValueError: A `Tunnel` was made for shorter ranges, or the list is empty.
     """
     if isinstance(tunnel, Tunnel):
         if tunnel.reach < reach:

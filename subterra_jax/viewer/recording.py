@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.tunnel.reading import spoiled
+from subterra_jax.tunnel.sources import describe_damage
 from subterra_jax.versions import other_schema
 from subterra_jax.viewer.errors import RecordingError
 
@@ -148,7 +148,7 @@ def load(path: Path) -> Recording:
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: no such recording") from error
     except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
-        raise RecordingError(f"{path}: not a readable recording ({spoiled(path, error)})") from error
+        raise RecordingError(f"{path}: not a readable recording ({describe_damage(path, error)})") from error
     if "station" in fields and "pose" not in fields:
         fields |= {"trunk": np.zeros(len(fields["station"])), "pose": np.zeros((len(fields["station"]), 0, N_POSE))}
     found = str(fields["schema"]) if "schema" in fields else None

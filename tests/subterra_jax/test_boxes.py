@@ -6,7 +6,7 @@ import pytest
 from subterra_jax import procedural
 from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel, blocks, boxes
-from subterra_jax.tunnel.windows import separation, windows
+from subterra_jax.tunnel.blocks import separation, windows
 
 
 def test_the_box_of_a_turned_rectangle_is_that_rectangle():

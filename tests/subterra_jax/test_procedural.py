@@ -8,8 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import procedural
 from subterra_jax.lidar import reference
-from subterra_jax.procedural.alignment import Alignment
-from subterra_jax.procedural.walls import wander
+from subterra_jax.procedural.geometry import Alignment, wander
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.sources import resolve
 from tests.subterra_jax.test_lidar import check_exact
@@ -83,7 +82,7 @@ def test_recesses_have_their_depth_repeat_with_the_rings_and_are_missing_as_ofte
     config = dataclasses.replace(CONFIG, roughness=(0.0, 0.0), width_sd=(0.0, 0.0), one_wall_share=0.0)
     plan, drawn = procedural.plan(5, config), procedural.draw(5, config)
     wall = plan.lining("pockets").left
-    foot = procedural.alignment.draw_alignment(procedural.generate._streams(5)[1], drawn.length, config)
+    foot = geometry.draw_alignment(_streams(5)[1], drawn.length, config)
     normal = foot.tangent(wall.station)[:, ::-1] * [-1.0, 1.0]
     depth = np.sum((wall.vertex - foot.position(wall.station)) * normal, axis=1) - 0.5 * drawn.width
     deep = depth > 1e-6

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from subterra_jax.errors import TunnelError
-from subterra_jax.lidar3d import frames, surface, voxels
+from subterra_jax.lidar3d import relief, surface
 from subterra_jax.lidar3d.relief import Relief
 from tests.subterra_jax import surfaces
 
@@ -13,8 +13,8 @@ from tests.subterra_jax import surfaces
 def sorted_bend():
     axis = surfaces.axis_of(30.0, 1 / 60.0)
     vertices, faces = surfaces.tube(axis, 2.0, 24, 31)
-    blocks = frames.cut_blocks(axis["station"], axis["position"], axis["tangent"], 8.0)
-    filled = voxels.fill_voxels(blocks, axis["station"], axis["position"], vertices, faces, (0.4, 0.3, 0.3))
+    blocks = relief.cut_blocks(axis["station"], axis["position"], axis["tangent"], 8.0)
+    filled = relief.fill_voxels(blocks, axis["station"], axis["position"], vertices, faces, (0.4, 0.3, 0.3))
     return blocks, filled, vertices[faces]
 
 

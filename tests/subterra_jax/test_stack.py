@@ -11,7 +11,7 @@ import subterra_jax as st
 from subterra_jax import lidar, vehicle
 from subterra_jax.lidar import fused, planar, reference
 from subterra_jax.tunnel import Tunnel, foot, node_at
-from subterra_jax.tunnel.stack import stack
+from subterra_jax.tunnel.tunnel import stack
 from tests.subterra_jax import tunnels
 
 PARAMS = lidar.LidarParams()

@@ -1,7 +1,7 @@
-"""The LiDAR on a CPU's vector registers: the boxes and segments of `cast`, sixteen at a time, nearest boxes first.
+"""LiDAR and clearance on a CPU's vector registers: sixteen boxes, then sixteen segments at a time, nearest first.
 
-One scan is looked after from beginning to end, so that a beam need only enter the boxes that are nearer than what it
-has hit, and meet the segments of one block as a rule.
+One scan is cast from beginning to end before the next. So a beam enters only the boxes that are nearer than its hit so
+far, and as a rule meets the segments of one block.
 """
 
 import math
@@ -28,7 +28,7 @@ from subterra_jax.native.lanes import (
 _F, _I = np.float32, np.int32
 _ZERO, _ONE, _TINY = _F(0.0), _F(1.0), _F(1e-20)
 _NOTHING, _FAR = _I(2**31 - 1), _F(1e6)
-# What a box's distance may lose to rounding and to its number in the last bits: relative, and m.
+# Error of a box's distance through rounding and through the number in its last bits: relative, and m.
 _LESS, _MARGIN = _F(1.0 - 2.0**-18), _F(1e-3)
 _JOINT = _F(2e-7)
 
@@ -38,26 +38,26 @@ compiled = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
 @compiled
 @no_type_check
 def window_width(n_scan):
-    """Lanes that a window's boxes take: an odd number of groups of 16, so that there is one in the middle."""
+    """Return the lanes for a window's boxes: an odd number of groups of 16, so that one is in the middle."""
     return N_LANES * (1 + 2 * ((max(n_scan - N_LANES, 0) + 2 * N_LANES - 1) // (2 * N_LANES)))
 
 
 @compiled
 @no_type_check
 def look_around(box, first, n_scan, x, y, near, width, bound):
-    """The boxes of a window as the LiDAR sees them, whatever the beam.
+    """Transform the boxes of a window to the LiDAR's position, for all beams.
 
     Args:
         box: The tunnel's boxes, flat, six rows.
         first: First block of the window.
         n_scan: Blocks in it.
-        x: Position of the LiDAR, m.
-        y: The same.
-        near: Receives rows of `width`: middle x, y from the LiDAR; half axis x, y, turned so that middle × axis is not
-            negative; half thickness; and that product less thickness × half length: `cast._entries`. Padded at
+        x: Position of the LiDAR along x, m.
+        y: Position of the LiDAR along y, m.
+        near: Output, rows of `width`: middle x, y from the LiDAR; half axis x, y, turned so that middle × axis is not
+            negative; half thickness; and that product less thickness × half length, as `cast._entries`. Padded at
             both ends with boxes that no beam enters.
         width: Lanes of the window.
-        bound: Receives, for each group of 16, a distance that none of its boxes is nearer than, m.
+        bound: Output, least distance to any box of each group of 16, m.
     """
     n_blocks = len(box) // 6
     pad = (width - n_scan) // 2
@@ -84,7 +84,7 @@ def look_around(box, first, n_scan, x, y, near, width, bound):
 @compiled
 @no_type_check
 def bound_outward(bound, n_groups):
-    """After the groups' own bounds, those of everything at least r groups from the middle."""
+    """Append the least distance to all groups at least r groups from the middle, for each r."""
     middle, reach = n_groups // 2, _FAR
     for r in range(middle, 0, -1):
         reach = min(reach, min(bound[middle - r], bound[middle + r]))
@@ -95,21 +95,21 @@ def bound_outward(bound, n_groups):
 @compiled
 @no_type_check
 def meet(wall, n_vertices, block, d_x, d_y, m_x, m_y):
-    """Bits of the distance at which a beam meets the segments of one block, as `cast.hits`; `_NOTHING` if it does not.
+    """Return the bits of the distance at which a beam meets one block, as `cast.hits`; `_NOTHING` if it misses.
 
     Args:
         wall: The tunnel's walls, flat.
         n_vertices: Vertices of a block.
         block: Its number.
-        d_x: Unit vector of the beam.
-        d_y: The same.
-        m_x: Middle of the block from the LiDAR, m.
-        m_y: The same.
+        d_x: Unit vector of the beam, x.
+        d_y: Unit vector of the beam, y.
+        m_x: Middle of the block from the LiDAR, x, m.
+        m_y: Middle of the block from the LiDAR, y, m.
     """
     start = block * 2 * n_vertices
     middle_ahead, middle_left = d_x * m_x + d_y * m_y, d_x * m_y - d_y * m_x
     joint = _JOINT * (_ONE + abs(middle_ahead))
-    found = _NOTHING
+    nearest = _NOTHING
     for vertex in range(0, n_vertices - 1, N_LANES - 1):
         there = numbered() < _I(n_vertices - vertex)
         x = load_some(wall, start + vertex, there)
@@ -123,26 +123,26 @@ def meet(wall, n_vertices, block, d_x, d_y, m_x, m_y):
         share = where(share < _ZERO, _ZERO, share)
         share = where(share > _ONE, _ONE, share)
         distance = a_ahead + share * (b_ahead - a_ahead)
-        found = min(found, least(where(meets & (distance >= _ZERO), bits(distance), _NOTHING)))
-    return found
+        nearest = min(nearest, least(where(meets & (distance >= _ZERO), bits(distance), _NOTHING)))
+    return nearest
 
 
 @compiled
 @no_type_check
 def nearest_hit(keys, best, lane, block, near, width, wall, n_vertices, d_x, d_y):
-    """The nearest hit of a beam in a group of boxes, or `best` where that is nearer; both the bits of a distance.
+    """Return the bits of the distance to a beam's nearest hit in a group of boxes, or `best` if that is nearer.
 
     Args:
         keys: Distance at which the beam enters each box, its last bits the lane; `_NOTHING` where it does not.
         best: Nearest hit so far.
         lane: First lane of the group in `near`.
         block: Number of the group's first block.
-        near: As `look_around` left it.
+        near: Output of `look_around`.
         width: Lanes of the window.
         wall: The tunnel's walls, flat.
         n_vertices: Vertices of a block.
-        d_x: Unit vector of the beam.
-        d_y: The same.
+        d_x: Unit vector of the beam, x.
+        d_y: Unit vector of the beam, y.
     """
     while True:
         key = least(keys)
@@ -157,7 +157,7 @@ def nearest_hit(keys, best, lane, block, near, width, wall, n_vertices, d_x, d_y
 @compiled
 @no_type_check
 def cast_line(d_x, d_y, limit, both, origin, near, width, bound, wall, n_vertices):
-    """Distance to the nearest wall ahead along a line and, if `both`, behind, m; `limit` where there is none nearer."""
+    """Return the distances to the nearest wall ahead on a line and, if `both`, behind, m; at most `limit`."""
     n_groups = width // N_LANES
     middle = n_groups // 2
     ahead, behind = bits(limit), bits(limit) if both else _I(0)
@@ -191,11 +191,11 @@ def cast_line(d_x, d_y, limit, both, origin, near, width, bound, wall, n_vertice
 @compiled
 @no_type_check
 def scan_rows(begin, end, first, wanted, position, heading, box, wall, n_vertices, turn, limit, n_scan, ranges):
-    """Scans number `begin` to `end` of a batch; all arrays are flat.
+    """Take the scans `begin` to `end` of a batch; all arrays are flat.
 
     Args:
         begin: First scan to take.
-        end: The one after the last.
+        end: One after the last.
         first: First block of each window.
         wanted: 0 where the ranges may be anything.
         position: Position x, y of each scan, m.
@@ -206,7 +206,7 @@ def scan_rows(begin, end, first, wanted, position, heading, box, wall, n_vertice
         turn: Cosines of the beams' bearings, then sines.
         limit: Largest range, m.
         n_scan: Blocks in a window.
-        ranges: Receives the ranges, m.
+        ranges: Output, ranges, m.
     """
     n_beams = len(turn) // 2
     both = n_beams % 2 == 0
@@ -228,3 +228,64 @@ def scan_rows(begin, end, first, wanted, position, heading, box, wall, n_vertice
             ranges[row * n_beams + line] = ahead
             if both:
                 ranges[row * n_beams + n_lines + line] = behind
+
+
+@compiled
+@no_type_check
+def distance_squared(wall, n_vertices, block, m_x, m_y):
+    """Return the bits of the squared distance to a block's nearest segment, m²; its middle is at `m_x`, `m_y`."""
+    start, nearest = block * 2 * n_vertices, _NOTHING
+    for vertex in range(0, n_vertices - 1, N_LANES - 1):
+        there = numbered() < _I(n_vertices - vertex)
+        x = m_x + load_some(wall, start + vertex, there)
+        y = m_y + load_some(wall, start + n_vertices + vertex, there)
+        edge_x, edge_y = following(x) - x, following(y) - y
+        size = edge_x * edge_x + edge_y * edge_y
+        # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
+        share = (_ZERO - (x * edge_x + y * edge_y)) / where(size > _ZERO, size, _ONE)
+        share = where(share < _ZERO, _ZERO, share)
+        share = where(share > _ONE, _ONE, share)
+        near_x, near_y = x + share * edge_x, y + share * edge_y
+        is_segment = numbered() < _I(min(n_vertices - vertex, N_LANES) - 1)
+        nearest = min(nearest, least(where(is_segment, bits(near_x * near_x + near_y * near_y), _NOTHING)))
+    return nearest
+
+
+@compiled
+@no_type_check
+def clearance_rows(begin, end, first, position, box, wall, n_vertices, reach, n_contact, distance):
+    """Measure the clearances `begin` to `end` of a batch; all arrays are flat.
+
+    Args:
+        begin: First point to look at.
+        end: One after the last.
+        first: First block of each window.
+        position: Points x, y, m.
+        box: The tunnel's boxes, six rows.
+        wall: The tunnel's walls.
+        n_vertices: Vertices of a block.
+        reach: Largest distance to report, m.
+        n_contact: Blocks in a window.
+        distance: Output, distances, m.
+    """
+    n_blocks = len(box) // 6
+    for row in range(begin, end):
+        best = bits(reach * reach)
+        for number in range(0, n_contact, N_LANES):
+            there = numbered() < _I(n_contact - number)
+            block = np.intp(first[row]) + number
+            m_x = load_some(box, block, there) - position[2 * row]
+            m_y = load_some(box, n_blocks + block, there) - position[2 * row + 1]
+            thickness, length = load_some(box, 4 * n_blocks + block, there), load_some(box, 5 * n_blocks + block, there)
+            gap = root(m_x * m_x + m_y * m_y) * _LESS - length - thickness - _MARGIN
+            gap = where(gap > _ZERO, gap, _ZERO)
+            keys = where(there, (bits(gap * gap) & _I(-N_LANES)) | numbered(), _NOTHING)
+            while True:
+                key = least(keys)
+                if (key & _I(-N_LANES)) >= best:
+                    break
+                keys = where(keys == key, _NOTHING, keys)
+                which = block + np.intp(key & _I(N_LANES - 1))
+                x, y = box[which] - position[2 * row], box[n_blocks + which] - position[2 * row + 1]
+                best = min(best, distance_squared(wall, n_vertices, which, x, y))
+        distance[row] = _F(math.sqrt(from_bits(best)))

@@ -1,0 +1,148 @@
+"""Tunnels from arrays: their geometry is analytic, tasks run in them, and each mistake is one sentence."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import lidar
+from subterra_jax.lidar import reference
+from subterra_jax.tunnel.arrays import ROBOT_RADIUS
+from subterra_jax.vehicle import VehicleParams
+
+LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
+ASIDE = np.array([0.0, 2.5])
+LEFT, RIGHT = LINE + ASIDE, LINE - ASIDE
+
+
+def bend(radius, turn=1.0, lead=30.0, offset=0.0):
+    """A straight, a bend to the left and a straight, `offset` metres to the left of their middle."""
+    angle = np.linspace(0.0, turn, 60)
+    arc = np.column_stack([np.sin(angle), 1.0 - np.cos(angle)]) * radius + np.array([lead, 0.0])
+    ahead = np.array([np.cos(turn), np.sin(turn)])
+    line = np.concatenate([[[0.0, 0.0]], arc, [arc[-1] + lead * ahead]])
+    normal = np.array([[0.0, 1.0], *np.column_stack([-np.sin(angle), np.cos(angle)]), [-ahead[1], ahead[0]]])
+    return line + offset * normal
+
+
+def ranges(plan, x, y=0.0, heading=0.0, n_beams=4, lining=None):
+    tunnel = st.Tunnel.from_plan(plan, lining)
+    params = lidar.LidarParams(n_beams=n_beams)
+    return np.asarray(lidar.scan(tunnel, jnp.array([x, y]), jnp.float32(heading), jnp.float32(x), params))
+
+
+@pytest.mark.parametrize("make", ["half widths", "polylines"])
+def test_a_straight_corridor_has_analytic_ranges(make):
+    plan = st.tunnel.from_centreline(LINE, 2.5) if make == "half widths" else st.tunnel.from_polylines(LEFT, RIGHT)
+    # 0.5 m left of the middle of 5 m: 2 m to the left wall and 3 m to the right; along the tunnel nothing in 30 m.
+    np.testing.assert_allclose(ranges(plan, 60.0, 0.5), [30.0, 2.0, 30.0, 3.0], atol=1e-3)
+    root = np.sqrt(2.0)
+    np.testing.assert_allclose(ranges(plan, 60.0, 0.5, np.pi / 4), root * np.array([2.0, 2.0, 3.0, 3.0]), atol=1e-3)
+    assert plan.length == pytest.approx(120.0)
+    np.testing.assert_allclose(plan.half_width, 2.5, atol=1e-6)
+    np.testing.assert_allclose(plan.tangent, np.tile([1.0, 0.0], (len(plan.station), 1)), atol=1e-9)
+
+
+def test_a_pocket_is_as_deep_and_as_long_as_given():
+    plan = st.tunnel.from_centreline(LINE, 2.5, pockets=[[60.0, 1, 0.4, 0.3], [60.0, -1, 0.2, 0.1]])
+    assert plan.default_lining == "pockets"
+    np.testing.assert_allclose(ranges(plan, 60.0)[[1, 3]], [2.8, 2.6], atol=1e-3)
+    np.testing.assert_allclose(ranges(plan, 60.15)[[1, 3]], [2.8, 2.5], atol=1e-3)
+    np.testing.assert_allclose(ranges(plan, 60.0, lining="smooth")[[1, 3]], 2.5, atol=1e-3)
+
+
+def test_half_widths_may_change_along_the_tunnel():
+    plan = st.tunnel.from_centreline(LINE, np.linspace(2.0, 3.0, len(LINE)))
+    np.testing.assert_allclose(ranges(plan, 60.0)[[1, 3]], 2.5, atol=1e-3)
+    assert plan.half_width[0] == pytest.approx(2.0)
+
+
+def test_the_line_midway_between_bent_walls_is_their_middle():
+    plan = st.tunnel.from_polylines(bend(60.0, offset=2.5), bend(60.0, offset=-2.5))
+    given = st.tunnel.from_centreline(bend(60.0), 2.5)
+    assert plan.length == pytest.approx(given.length, abs=0.1)
+    gap = [np.min(np.linalg.norm(given.centre - point, axis=1)) for point in plan.centre]
+    assert np.max(gap) < 0.15  # half a step of the grid, and 2 cm
+    np.testing.assert_allclose(plan.half_width, 2.5, atol=0.03)
+    wall = np.asarray(plan.lining("smooth").left.vertex)
+    np.testing.assert_allclose(reference.clearance(given.lining("smooth").segments, wall), 0.0, atol=0.02)
+
+
+def test_walls_with_niches_keep_a_quiet_centreline():
+    niche = np.array([[50.0, 2.5], [50.0, 4.0], [52.0, 4.0], [52.0, 2.5]])
+    left = np.concatenate([LEFT[LEFT[:, 0] < 50.0], niche, LEFT[LEFT[:, 0] > 52.0]])
+    plan = st.tunnel.from_polylines(left, RIGHT)
+    np.testing.assert_allclose(plan.centre[:, 1], 0.0, atol=0.02)
+    np.testing.assert_allclose(ranges(plan, 51.0)[[1, 3]], [4.0, 2.5], atol=0.02)
+
+
+@pytest.mark.parametrize("task", ["Subterra/Traverse-v0", "Subterra/StopAt-v0"])
+def test_a_task_runs_in_a_tunnel_from_arrays_and_in_a_stack_of_them(task):
+    plans = [
+        st.tunnel.from_centreline(bend(60.0), 2.5, pockets=[[40.0, 1, 0.2, 0.13]]),
+        st.tunnel.from_polylines(LEFT, RIGHT),
+    ]
+    for tunnel in (plans[0], plans[1], plans, st.stack([st.Tunnel.from_plan(plan) for plan in plans])):
+        env, params = st.make(task, tunnel=tunnel)
+        batch = st.AutoReset(env)
+        obs, state = jax.jit(batch.reset, static_argnums=2)(jax.random.key(0), params, 8)
+        assert np.isfinite(obs).all()
+        action = np.tile(np.float32([1.0, 0.0, 1.0, 0.0][: env.action_size]), (8, 1))
+        obs, _, reward, *_ = jax.jit(batch.step)(jax.random.key(1), state, action, params)
+        assert np.isfinite(obs).all()
+        assert np.isfinite(reward).all()
+
+
+def test_the_robot_is_as_wide_as_the_vehicle():
+    assert VehicleParams().radius == ROBOT_RADIUS
+
+
+TANGENT = np.tile([1.0, 0.0], (len(LINE), 1))
+ACROSS = [[60.0, -2.5, 60.0, 2.5]]
+WALL_ACROSS = np.concatenate([LEFT[:60], [[60.0, -1.0]], LEFT[61:]])
+NARROW = np.concatenate([LEFT[:60], [[60.0, 0.3]], LEFT[61:]])
+RING = 20.0 * np.column_stack([np.cos(np.linspace(0.0, 7.0, 200)), np.sin(np.linspace(0.0, 7.0, 200))])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, tangent=-TANGENT), "tangent is flipped at index 0"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, tangent=TANGENT[1:]), "tangent has 120 values, the centreline"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, tangent=2.0 * TANGENT), "unit vectors"),
+        (lambda: st.tunnel.from_polylines(RIGHT, LEFT), "left and right are swapped"),
+        (lambda: st.tunnel.from_polylines(RIGHT, LEFT, centreline=LINE), "left and right are swapped"),
+        (lambda: st.tunnel.from_polylines(LEFT, RIGHT[::-1]), "run in opposite directions"),
+        (lambda: st.tunnel.from_polylines(LEFT, RIGHT, centreline=LINE, half_width=3.0), "half_width does not meet"),
+        (lambda: st.tunnel.from_polylines(LEFT, RIGHT, centreline=LINE, half_width=2.0), "half_width does not meet"),
+        (lambda: st.tunnel.from_polylines(LEFT[:60], RIGHT, centreline=LINE), "left goes from station 0.0 to 59.0 m"),
+        (lambda: st.tunnel.from_polylines(LEFT, RIGHT + 4.0 * ASIDE), "left and right are swapped"),
+        (lambda: st.tunnel.from_polylines(LEFT, RIGHT, centreline=LINE + 4.0 * ASIDE), "not beside the centreline"),
+        (lambda: st.tunnel.from_centreline(LINE, 0.4), "narrower than the robot: half_width is 0.40 m"),
+        (lambda: st.tunnel.from_polylines(NARROW, RIGHT, centreline=LINE), "at station 60.0 m a wall is 0.30 m"),
+        (lambda: st.tunnel.from_polylines(WALL_ACROSS, RIGHT, centreline=LINE), "a wall stands across the way"),
+        (lambda: st.tunnel.from_polylines(LEFT, RIGHT, furniture=ACROSS), "a wall stands across the way at station 60"),
+        (lambda: st.tunnel.from_centreline(LINE, np.full(7, 2.5)), "half_width has 7 values, the centreline 121"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, elevation=np.zeros(5)), "elevation has 5 values"),
+        (lambda: st.tunnel.from_centreline(np.where(LINE == 7.0, np.nan, LINE), 2.5), r"not finite at index \[7, 0\]"),
+        (lambda: st.tunnel.from_centreline(LINE, np.nan), "half_width is not finite"),
+        (lambda: st.tunnel.from_polylines(LEFT, np.full_like(RIGHT, np.inf)), "right is not finite"),
+        (lambda: st.tunnel.from_centreline([*LINE, LINE[100]], 2.5), "centreline doubles back at index 120"),
+        (lambda: st.tunnel.from_centreline(np.repeat(LINE, 2, axis=0), 2.5), "repeats the vertex at index 0"),
+        (lambda: st.tunnel.from_centreline(RING, 2.5), "centreline comes back to itself"),
+        (lambda: st.tunnel.from_centreline(bend(2.0), 2.5), "tighter than the half width"),
+        (lambda: st.tunnel.from_polylines([*LEFT[:60], *LEFT[40:]], RIGHT, centreline=LINE), "left doubles back at"),
+        (lambda: st.tunnel.from_centreline(LINE[:1], 2.5), "at least 2 vertices"),
+        (lambda: st.tunnel.from_centreline(LINE[:, :1], 2.5), r"shape \(n, 2\)"),
+        (lambda: st.tunnel.from_centreline("line", 2.5), "must hold numbers"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[60.0, 2, 0.2, 0.1]]), "side of a pocket"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[60.0, 1, 0.2, -0.1]]), "must be positive"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[60, 1, 1, 0.1], [60.5, 1, 1, 0.1]]), "overlap"),
+        (lambda: st.tunnel.from_centreline(LINE, 2.5, pockets=[[130.0, 1, 0.2, 0.1]]), "outside the tunnel"),
+    ],
+)
+def test_a_mistake_is_refused_in_one_sentence(make, message):
+    with pytest.raises(st.TunnelError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
