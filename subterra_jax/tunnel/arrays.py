@@ -23,6 +23,7 @@ _SPACING = 0.25  # m, of the station grid
 _UNEVEN = 5.0  # m: a smooth wall is the median over this length, so that pockets do not move it
 _OFF = 0.1  # m, tolerance between given half widths and walls
 _BACK = 1.0  # m, that a wall may run backwards, as in the corner of a niche
+_SHORT = 3.0  # m, that a wall may end before or behind a mouth, as in a skew portal
 _CHUNK = 256  # nodes at a time, against memory
 
 
@@ -353,7 +354,7 @@ def _wall(plan: TunnelPlan, name: str, vertex: Float[np.ndarray, "k 2"]) -> Wall
     behind = np.maximum.accumulate(station) - station
     if np.any(behind > _BACK):
         raise TunnelError(f"{name} doubles back at index {int(np.argmax(behind > _BACK))}")
-    if station[0] > _BACK or station[-1] < plan.length - _BACK:
+    if station[0] > _SHORT or station[-1] < plan.length - _SHORT:
         raise TunnelError(
             f"{name} goes from station {station[0]:.1f} to {station[-1]:.1f} m, the centreline to {plan.length:.1f} m"
         )
