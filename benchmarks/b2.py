@@ -1,7 +1,7 @@
 """Speed of the walking robot: `python -m benchmarks.b2 --robots 8192`.
 
-For each variant of solver and contacts, physics steps per second of MJX alone and of the whole environment (random
-actions, observation, reward, resets), in the same run.
+Measures physics steps per second of MJX alone and of the whole environment (random actions, observation, reward,
+resets) for each variant of solver and contacts, in one run.
 """
 
 import dataclasses
@@ -46,12 +46,12 @@ class Command:
     Example: python -m benchmarks.b2 --robots 8192 --variants all
 
     Attributes:
-        robots: At once.
-        variants: Which to measure; `all` for all of them.
-        tunnel: Tunnel file or name; a longer one costs no more.
+        robots: Robots in the batch.
+        variants: Variants to measure, or `all`.
+        tunnel: Tunnel file or name; its length does not change the speed.
         control_steps: Control periods of 5 physics steps in one timed call.
-        repeats: Timed calls, of which the median is told.
-        out: Where to write the figures as JSON.
+        repeats: Timed calls; the median is reported.
+        out: JSON file for the figures.
     """
 
     robots: int = 8192
@@ -63,7 +63,7 @@ class Command:
 
 
 def measure(physics: Physics, command: Command) -> dict[str, Any]:
-    """Both speeds of one variant, in physics steps per second."""
+    """Measures both speeds of one variant, in physics steps per second."""
     env, params = tasks.make(tunnel=command.tunnel, physics=physics)
     batch, n = st.AutoReset(env), command.robots
     key = jax.random.key(0)
@@ -71,11 +71,11 @@ def measure(physics: Physics, command: Command) -> dict[str, Any]:
 
     def alone(state: Any, key: Any) -> tuple[Any, Any]:
         del key
-        around = jax.vmap(env.surroundings, in_axes=(0, None))(state, params)
+        surroundings = jax.vmap(env.surroundings, in_axes=(0, None))(state, params)
         targets = jnp.tile(jnp.array([0.0, 0.8, -1.4], jnp.float32), (n, 4))
 
         def one(body: Any, _: None) -> tuple[Any, None]:
-            return jax.vmap(physics.run)(body, targets, around, state.build), None
+            return jax.vmap(physics.run)(body, targets, surroundings, state.build), None
 
         body, _ = jax.lax.scan(one, state.body, None, length=command.control_steps)
         return dataclasses.replace(state, body=body), jnp.sum(body.qpos)
@@ -90,34 +90,34 @@ def measure(physics: Physics, command: Command) -> dict[str, Any]:
         return jax.lax.scan(one, state, jax.random.split(key, command.control_steps))
 
     steps = n * command.control_steps * physics.substeps
-    bare, _, first = _time(alone, state, command)
-    full, told, second = _time(whole, state, command)
+    bare, _, compile_alone = _time(alone, state, command)
+    full, (outputs, ended), compile_whole = _time(whole, state, command)
     robot_seconds = n * command.control_steps * physics.period
     return {
         "contacts": int(physics.blank._impl.contact.dist.shape[0]),
         "rows": int(physics.blank._impl.nefc),
         "alone": steps / bare,
         "environment": steps / full,
-        "compile": first + second,
-        "falls": float(jnp.sum(told[1])) / robot_seconds * 20.0,
-        "finite": bool(jnp.isfinite(told[0]).all()),
+        "compile": compile_alone + compile_whole,
+        "falls": float(jnp.sum(ended)) / robot_seconds * 20.0,
+        "finite": bool(jnp.isfinite(outputs).all()),
     }
 
 
 def _time(function: Callable[..., Any], state: Any, command: Command) -> tuple[float, Any, float]:
-    """Median seconds of a call, what the last one told, and seconds to compile."""
-    began = time.perf_counter()
+    """Returns median seconds of a call, the last call's output, and seconds to compile."""
+    started = time.perf_counter()
     compiled = jax.jit(function).lower(state, jax.random.key(0)).compile()
-    spent, seconds, told = time.perf_counter() - began, [], None
+    compile_seconds, seconds, output = time.perf_counter() - started, [], None
     for repeat in range(command.repeats + 1):
         before = time.perf_counter()
-        state, told = jax.block_until_ready(compiled(state, jax.random.key(repeat)))
+        state, output = jax.block_until_ready(compiled(state, jax.random.key(repeat)))
         seconds.append(time.perf_counter() - before)
-    return statistics.median(seconds[1:]), told, spent
+    return statistics.median(seconds[1:]), output, compile_seconds
 
 
 def command(arguments: Command) -> int:
-    """Measures and prints; the status is 1 where anything is no longer finite.
+    """Measures and prints; returns 1 where a number is not finite.
 
     Raises:
         ValueError: There is no such variant, or a number is out of range.
@@ -134,9 +134,9 @@ def command(arguments: Command) -> int:
         require_file(arguments.out)
     device = jax.devices()[0]
     table = Table(*_COLUMNS, title=f"{arguments.robots} robots, {device.device_kind}, physics steps")
-    found = {}
+    results = {}
     for name in names:
-        figures = found[name] = measure(VARIANTS[name], arguments)
+        figures = results[name] = measure(VARIANTS[name], arguments)
         table.add_row(
             name, str(figures["contacts"]), str(figures["rows"]), f"{figures['alone'] / 1e6:.2f}",
             f"{figures['environment'] / 1e6:.2f}", f"{figures['environment'] / figures['alone']:.0%}",
@@ -145,8 +145,8 @@ def command(arguments: Command) -> int:
     Console(width=110).print(table)
     if arguments.out is not None:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps({"device": device.device_kind, "variants": found}, indent=1) + "\n")
-    return 0 if all(figures["finite"] for figures in found.values()) else 1
+        arguments.out.write_text(json.dumps({"device": device.device_kind, "variants": results}, indent=1) + "\n")
+    return 0 if all(figures["finite"] for figures in results.values()) else 1
 
 
 def _read(words: list[str]) -> Command:
@@ -154,7 +154,7 @@ def _read(words: list[str]) -> Command:
 
 
 def main() -> int:
-    """Entry point of `python -m benchmarks.b2`; a user's mistake is one sentence and status 2."""
+    """Runs the command line; returns 2 for a user's mistake."""
     arguments = parse(_read)
     return status(lambda: command(arguments))
 

@@ -1,7 +1,6 @@
-"""How late the B2 obeys: the lags that `subterra_jax.b2.surrogate` has as its defaults.
+"""Identifies the lags of a B2 gait, the defaults of `subterra_jax.b2.surrogate`: `python -m benchmarks.b2_lag`.
 
-`python -m benchmarks.b2_lag` has robots walk in MuJoCo, steered along the centreline by commands to which noise is
-added, and fits what they did.
+Robots walk along the centreline in MuJoCo under commands with added noise; lags and gains are fitted to their motion.
 """
 
 import dataclasses
@@ -21,12 +20,12 @@ from subterra_jax.b2.surrogate import identify
 from subterra_jax.errors import SubterraError
 from train import cli
 
-_SPEEDS = (0.0, 0.3, 0.5, 0.8)  # m/s, one of them for two seconds at a time
-_TURN = 0.3  # rad/s, largest noise of the yaw rate, for 0.6 s at a time
+_SPEEDS = (0.0, 0.3, 0.5, 0.8)  # m/s; one is drawn every 2 s
+_TURN = 0.3  # rad/s; largest noise of the yaw rate, drawn every 0.6 s
 
 
 class LagError(SubterraError):
-    """Nothing can be fitted."""
+    """The lags of a gait cannot be identified."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +35,10 @@ class Command:
     Example: python -m benchmarks.b2_lag --robots 6 --steps 150
 
     Attributes:
-        policy: The gait: a file, the name of a released one, or `trot`.
-        robots: How many walk, one after another.
-        steps: Of 0.2 s, of each.
-        seed: Of their draws and of the noise.
+        policy: Gait: a file, the name of a released gait, or `trot`.
+        robots: Number of robots, one after another.
+        steps: Steps of 0.2 s for each robot.
+        seed: Seed for robots and noise.
     """
 
     policy: str = RELEASED
@@ -51,11 +50,11 @@ class Command:
 def walk(
     env: B2Env, driver: Driver, seed: int, n_steps: int
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """One robot: what it was told and what it did, speed (m/s) and yaw rate (rad/s); until it is at an end."""
+    """Walks one robot to the end of its episode; returns commands and motion as speed (m/s) and yaw rate (rad/s)."""
     rng, period = np.random.default_rng(seed), float(env.params.vehicle.period)
     obs, _ = env.reset(seed=seed)
     driver.reset()
-    told, done = [], []
+    commands, motion = [], []
     position, heading = np.array(env.state.position), float(env.state.heading)
     speed = turn = 0.0
     for k in range(n_steps):
@@ -66,23 +65,23 @@ def walk(
         limit = float(env.env.action_space(env.params).high[1])
         action = np.array([speed, np.clip(driver.act(obs)[1] + turn, -limit, limit)], np.float32)
         obs, _, terminated, truncated, _ = env.step(action)
-        place, faced = np.array(env.state.position), float(env.state.heading)
-        turned = (faced - heading + np.pi) % (2.0 * np.pi) - np.pi
-        middle = heading + 0.5 * turned
-        ahead = float(np.sum((place - position) * [np.cos(middle), np.sin(middle)]))
-        told.append(action)
-        done.append([ahead / period, turned / period])
-        position, heading = place, faced
+        last_position, last_heading = position, heading
+        position, heading = np.array(env.state.position), float(env.state.heading)
+        angle = (heading - last_heading + np.pi) % (2.0 * np.pi) - np.pi
+        middle = last_heading + 0.5 * angle
+        ahead = float(np.sum((position - last_position) * [np.cos(middle), np.sin(middle)]))
+        commands.append(action)
+        motion.append([ahead / period, angle / period])
         if terminated or truncated:
             break
-    return np.array(told, np.float64), np.array(done)
+    return np.array(commands, np.float64), np.array(motion)
 
 
 def command(arguments: Command) -> None:
-    """Walks, fits, prints.
+    """Walks the robots, fits the lags and prints them.
 
     Raises:
-        LagError: A number is out of range, or nothing can be fitted.
+        LagError: A number is out of range, or the lags cannot be identified.
     """
     for name, least in (("robots", 1), ("steps", 1), ("seed", 0)):
         if getattr(arguments, name) < least:
@@ -90,13 +89,15 @@ def command(arguments: Command) -> None:
     env = B2Env(policy=arguments.policy)
     driver = Driver(env, "dead-reckoning")
     walks = [walk(env, driver, arguments.seed + k, arguments.steps) for k in range(arguments.robots)]
-    told, done = (np.concatenate(parts) for parts in zip(*walks, strict=True))
+    commands, motion = (np.concatenate(parts) for parts in zip(*walks, strict=True))
     try:
-        lag = identify(told, done, float(env.params.vehicle.period))
+        lag = identify(commands, motion, float(env.params.vehicle.period))
     except ValueError as cause:
         raise LagError(f"gait {arguments.policy}: {cause}") from cause
-    cut = sum(len(part) < arguments.steps for part, _ in walks)
-    cli.table(f"gait {arguments.policy}", {**dataclasses.asdict(lag), "steps": len(told), "ended_early": cut})
+    ended_early = sum(len(part) < arguments.steps for part, _ in walks)
+    cli.table(
+        f"gait {arguments.policy}", {**dataclasses.asdict(lag), "steps": len(commands), "ended_early": ended_early}
+    )
 
 
 def _read(words: list[str]) -> Command:
@@ -104,7 +105,7 @@ def _read(words: list[str]) -> Command:
 
 
 def main() -> None:
-    """Entry point of `python -m benchmarks.b2_lag`."""
+    """Runs the command line."""
     arguments = parse(_read)
     sys.exit(status(lambda: command(arguments)))
 

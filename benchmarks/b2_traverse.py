@@ -1,7 +1,7 @@
-"""How many B2s come through a tunnel on their legs: `python -m benchmarks.b2_traverse --robots 100`.
+"""Counts the B2s that walk through a tunnel: `python -m benchmarks.b2_traverse --robots 100`.
 
-Every robot is drawn anew: friction, mass, gains, sensor noise. `--engine mujoco` has the same robots walk in MuJoCo's
-own engine, on the host; with `--scene DIR` in the scene itself.
+Friction, mass, gains and sensor noise are drawn for every robot. With `--engine mujoco` the same robots walk in
+MuJoCo's own engine on the host, with `--scene DIR` in the scene itself.
 """
 
 import json
@@ -34,19 +34,19 @@ class Command:
     Example: python -m benchmarks.b2_traverse --robots 100 --agent B2Traverse-v0 --engine mujoco
 
     Attributes:
-        robots: How many.
-        seed: Of their draws.
-        agent: Who steers: a baseline, a run folder of `train.navigate --embodiment b2`, or a policy's file or name.
-        policy: The gait: a file, the name of a released one, or `trot`.
+        robots: Number of robots.
+        seed: Seed for their draws.
+        agent: Driver: a baseline, a run folder of `train.navigate --embodiment b2`, or a policy's file or name.
+        policy: Gait: a file, the name of a released gait, or `trot`.
         engine: `mjx`, or `mujoco` in C on the host.
-        tunnel: File or name; the packaged tunnel if left out.
-        scene: A built scene folder, instead of a tunnel.
-        length: Only so many metres of the tunnel; 0 is all of it. A policy that was trained on all of it has never been
-            near a far mouth; to try it for a while only, lower `coverage`.
+        tunnel: Tunnel file or name; the packaged tunnel if not given.
+        scene: Built scene folder, instead of a tunnel.
+        length: Length of the tunnel to use, m; 0 is all of it. A policy trained on all of it has never been near a far
+            mouth; for a short trial, lower `coverage` instead.
         coverage: Share of the tunnel that counts as success.
         odometer: `legs`, the robot's own, or `drift`.
-        speed: Largest speed that may be commanded, m/s.
-        out: File to which the figures are written as JSON.
+        speed: Largest commanded speed, m/s.
+        out: JSON file for the figures.
     """
 
     robots: int = 100
@@ -63,8 +63,8 @@ class Command:
     out: Path | None = None
 
 
-def opened(name: str, env: Any, params: Any) -> Any:
-    """An agent by its name, file or run folder, known to fit."""
+def load_driver(name: str, env: Any, params: Any) -> Any:
+    """Loads an agent by name, file or run folder, and checks that it fits the task."""
     if name in registry.names():
         return registry.make_agent(name, params)
     agent, _ = open_agent(Path(name), None)
@@ -72,8 +72,8 @@ def opened(name: str, env: Any, params: Any) -> Any:
     return agent
 
 
-def tell(now: trial.Walk) -> None:
-    """How the robots are, on one line."""
+def show_progress(now: trial.Walk) -> None:
+    """Prints station, falls and contacts of the robots on one line."""
     falls, contacts = int(np.sum(now.fall)), int(np.sum(now.contact))
     counts = f"{int(np.sum(now.over))} of {len(now.over)} over, {falls} falls, {contacts} contacts"
     print(f"\rstation {np.median(now.state.station):6.1f} m, {counts}", end="", file=sys.stderr, flush=True)
@@ -98,7 +98,7 @@ def _check(arguments: Command) -> None:
 
 
 def command(arguments: Command) -> None:
-    """Drives and prints.
+    """Drives the robots and prints the figures.
 
     Raises:
         ValueError: A number is out of range.
@@ -118,13 +118,14 @@ def command(arguments: Command) -> None:
         goal_coverage=arguments.coverage,
         vehicle=missions.VEHICLE.replace(speed_max=arguments.speed),  # type: ignore[attr-defined]
     )
-    agent, started = opened(arguments.agent, env, params), time.perf_counter()
-    found = trial.figures(*trial.drive(env, params, agent, arguments.robots, arguments.seed, tell), params)
+    agent, started = load_driver(arguments.agent, env, params), time.perf_counter()
+    walks = trial.drive(env, params, agent, arguments.robots, arguments.seed, show_progress)
+    figures = trial.figures(*walks, params)
     print(file=sys.stderr)
-    found["wall_seconds"] = time.perf_counter() - started
-    cli.table(f"{arguments.robots} B2s, {arguments.engine}, gait {arguments.policy}, {arguments.agent}", found)
+    figures["wall_seconds"] = time.perf_counter() - started
+    cli.table(f"{arguments.robots} B2s, {arguments.engine}, gait {arguments.policy}, {arguments.agent}", figures)
     if arguments.out is not None:
-        arguments.out.write_text(json.dumps({**vars(arguments), **found}, default=str, indent=1) + "\n")
+        arguments.out.write_text(json.dumps({**vars(arguments), **figures}, default=str, indent=1) + "\n")
 
 
 def _read(words: list[str]) -> Command:
@@ -132,7 +133,7 @@ def _read(words: list[str]) -> Command:
 
 
 def main() -> None:
-    """Entry point of `python -m benchmarks.b2_traverse`."""
+    """Runs the command line."""
     arguments = parse(_read)
     sys.exit(status(lambda: command(arguments)))
 

@@ -1,4 +1,4 @@
-"""`make demo`: a simulated survey to a scene, a trained agent and a report, by the users' own commands."""
+"""`make demo`: from a simulated survey to a scene, a trained agent and a report, by the users' own commands."""
 
 import io
 import json
@@ -13,9 +13,9 @@ from typing import Any
 
 import tyro
 
-from benchmarks import truth as truths
 from benchmarks.command import status
 from benchmarks.report import write_report
+from benchmarks.truth import Truth, compare, load_truth, start_placement
 from scene.arguments import parse
 from scene.survey.config import SurveyConfig, check_survey
 from subterra_jax.outputs import require_folder
@@ -30,10 +30,10 @@ class DemoConfig:
     Example: python -m benchmarks.demo --length 60 --out out/demo
 
     Attributes:
-        out: Folder to write.
-        length: Of the simulated tunnel, m.
-        seed: Of survey and training.
-        point_rate: Of the simulated LiDAR, 1/s.
+        out: Output folder.
+        length: Length of the simulated tunnel, m.
+        seed: Seed for survey and training.
+        point_rate: Points per second of the simulated LiDAR.
     """
 
     out: Path = Path("out/demo")
@@ -43,7 +43,7 @@ class DemoConfig:
 
 
 class Stages:
-    """Runs stages one after the other; says what each does and how long it took.
+    """Announces and times the stages of the demo.
 
     Attributes:
         seconds: Wall-clock time of each finished stage.
@@ -54,7 +54,7 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str, text: str) -> Iterator[None]:
-        """One stage; its time is kept under `name`."""
+        """Times one stage; the time is kept under `name`."""
         print(f"\n=== {text}", flush=True)
         started = time.monotonic()
         yield
@@ -63,10 +63,10 @@ class Stages:
 
 
 def run_module(*arguments: object, may_fail: bool = False) -> str | None:
-    """Runs `python -m ...` as a user would; returns its error sentence where it may fail and did.
+    """Runs `python -m ...` as a user would; returns the error sentence of a command that may fail and did.
 
     Raises:
-        SystemExit: It failed and may not.
+        SystemExit: A command failed that may not fail.
     """
     words = [str(argument) for argument in arguments]
     print(f"$ python -m {' '.join(words)}", flush=True)
@@ -79,12 +79,13 @@ def run_module(*arguments: object, may_fail: bool = False) -> str | None:
 
 
 def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
-    """Loads a scene in both and steps each once; versions, sizes and MJX's compile time."""
+    """Steps a scene once in MuJoCo and MJX; returns versions, sizes and MJX's compile time."""
     import jax
     import mujoco
     import numpy as np
 
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # it mourns the optional Warp backend
+    # Hides the message about the optional Warp backend.
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         from mujoco import mjx
 
     model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
@@ -103,7 +104,7 @@ def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
 
 
 def main(config: DemoConfig) -> None:
-    """Runs every stage and prints where the page is.
+    """Runs every stage and prints the path of the report.
 
     Raises:
         ValueError: A number is out of range.
@@ -153,11 +154,11 @@ def main(config: DemoConfig) -> None:
             run,
         )
     with stages.stage("report", "6/6 Writing the report"):
-        truth = truths.load_truth(survey / "truth.json")
+        truth = load_truth(survey / "truth.json")
         summary: dict[str, Any] = {
             "provenance": "simulated",
             "length": float(truth.station[-1] - truth.station[0]),
-            **truths.compare(scene, truth).figures(),
+            **compare(scene, truth).figures(),
             "odometry": _odometry_figures(survey, blind, truth, failure),
             **_training_figures(run),
             **loaded,
@@ -170,7 +171,7 @@ def main(config: DemoConfig) -> None:
 
 
 def _training_figures(run: Path) -> dict[str, Any]:
-    """The last line of the training's log, and its evaluation."""
+    """Returns the last line of the training's log, and its evaluation."""
     last = json.loads((run / "log.jsonl").read_text().splitlines()[-1])
     evaluation = json.loads((run / "evaluation.json").read_text())
     return {
@@ -182,13 +183,13 @@ def _training_figures(run: Path) -> dict[str, Any]:
     }
 
 
-def _odometry_figures(survey: Path, scene: Path, truth: truths.Truth, failure: str | None) -> dict[str, Any]:
+def _odometry_figures(survey: Path, scene: Path, truth: Truth, failure: str | None) -> dict[str, Any]:
     if failure:
         return {"failure": failure}
-    placement = truths.start_placement(scene / "odometry.tum", survey / "groundtruth.tum")
-    return dict(truths.compare(scene, truth, placement).figures())
+    placement = start_placement(scene / "odometry.tum", survey / "groundtruth.tum")
+    return dict(compare(scene, truth, placement).figures())
 
 
 if __name__ == "__main__":
-    wanted = parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo"))
-    sys.exit(status(lambda: main(wanted)))
+    config = parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo"))
+    sys.exit(status(lambda: main(config)))

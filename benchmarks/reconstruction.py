@@ -1,4 +1,4 @@
-"""How true a reconstruction is, on simulated surveys of seeds that the builder was not developed on.
+"""Accuracy of reconstructions on simulated surveys of seeds that the builder was not developed on.
 
 `python -m benchmarks.reconstruction --seeds 201 202 --out out/reconstruction`
 """
@@ -14,11 +14,12 @@ from typing import Any, Literal, cast, get_args
 
 import numpy as np
 import tyro
+from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
+from scipy.spatial import cKDTree
 
 from benchmarks.command import status
-from benchmarks.features import pocket_figures, sleeper_figures
 from benchmarks.fidelity.candidate import load
 from benchmarks.fidelity.derive import surface
 from benchmarks.fidelity.references import HoldConfig, load_hold
@@ -30,16 +31,16 @@ from subterra_jax.outputs import require_folder
 
 @dataclass(frozen=True)
 class ReconstructionConfig:
-    """Survey → build → truth, for every seed and both ways to have poses.
+    """Simulates surveys, builds scenes and compares them with the truth.
 
     The builder reads the Avia; the OS1 on the same rack is held out.
 
     Attributes:
-        seeds: Of the surveys.
-        length: Of each bore, m.
+        seeds: Seeds for the surveys.
+        length: Length of each bore, m.
         truth: Kind of bore; see `python -m scene.survey --help`.
-        poses: `given` true poses; `control` odometry, IMU and prism.
-        out: Folder to write; surveys that are there already are not simulated again.
+        poses: `given`: true poses; `control`: odometry, IMU and prism.
+        out: Output folder; surveys in it are not simulated again.
     """
 
     seeds: tuple[int, ...] = (201, 202)
@@ -51,7 +52,7 @@ class ReconstructionConfig:
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked of a figure: at most, or at least, with true poses and with control; `scale` is for printing."""
+    """Limit of a figure with true poses and with control; `scale` and `unit` are for printing."""
 
     given: float
     control: float
@@ -76,15 +77,15 @@ GOALS = {
 }
 
 
-def met(name: str, value: float, poses: str) -> bool:
-    """Whether a figure meets its goal; signed errors count by their size, a figure that is no number does not."""
+def meets_goal(name: str, value: float, poses: str) -> bool:
+    """Return whether a figure meets its goal; signed errors count by their size, NaN meets no goal."""
     goal = GOALS[name]
     limit = goal.given if poses == "given" else goal.control
     return value >= limit if goal.at_least else abs(value) <= limit
 
 
 def simulate(config: ReconstructionConfig, seed: int) -> Path:
-    """The survey of one seed, with the OS1 beside the Avia."""
+    """Simulates the survey of one seed with Avia and OS1; returns its folder."""
     folder = config.out / f"survey-{config.truth}-{config.length:g}-{seed}"
     if not (folder / "truth.json").exists():
         words = ["--truth", config.truth, "--length", config.length, "--seed", seed, "--out", folder]
@@ -93,7 +94,7 @@ def simulate(config: ReconstructionConfig, seed: int) -> Path:
 
 
 def build(survey: Path, out: Path, poses: str) -> dict[str, float]:
-    """Builds the scene as a user would; wall-clock time, s, and peak memory, GiB."""
+    """Builds the scene as a user would; returns wall-clock time, s, and peak memory, GiB."""
     given = ("--trajectory", survey / "groundtruth.tum")
     control = ("--control", survey / "prism.tum", "--calibration", "geode-gamma")
     started = time.monotonic()
@@ -103,18 +104,18 @@ def build(survey: Path, out: Path, poses: str) -> dict[str, float]:
 
 
 def figures(scene: Path, survey: Path) -> dict[str, float]:
-    """All figures of one scene but those of `build`; nothing is aligned, fitted or scaled first."""
+    """Return all figures of one scene but those of `build`; nothing is aligned, fitted or scaled first."""
     truth = load_truth(survey / "truth.json")
-    compared = compare(scene, truth)
+    errors = compare(scene, truth)
     candidate = load(scene)
     trajectory = survey / "groundtruth_os1.tum"
     hold = load_hold(survey / "survey_os1.bag", trajectory, candidate.origin, HoldConfig(beams_per_scan=2000))
     distance, _, _ = surface.Nearest(surface.visible(candidate)).query(hold.points)
     return {
-        "length_error": 100.0 * compared.length_error / (truth.station[-1] - truth.station[0]),
-        "lateral_rmse": float(np.sqrt(np.mean(compared.lateral**2))),
-        "width_rmse": float(np.sqrt(np.mean(compared.width**2))),
-        "height_rmse": float(np.sqrt(np.mean(compared.height**2))),
+        "length_error": 100.0 * errors.length_error / (truth.station[-1] - truth.station[0]),
+        "lateral_rmse": float(np.sqrt(np.mean(errors.lateral**2))),
+        "width_rmse": float(np.sqrt(np.mean(errors.width**2))),
+        "height_rmse": float(np.sqrt(np.mean(errors.height**2))),
         "hold_mean": float(distance.mean()),
         "hold_within_10cm": float(np.mean(distance < 0.10)),
         **pocket_figures(scene, survey),
@@ -123,7 +124,7 @@ def figures(scene: Path, survey: Path) -> dict[str, float]:
 
 
 def measure(config: ReconstructionConfig) -> list[dict[str, Any]]:
-    """One row a survey and way to have poses."""
+    """Measures every seed with every source of poses; returns one row for each."""
     rows = []
     for seed in config.seeds:
         survey = simulate(config, seed)
@@ -135,13 +136,14 @@ def measure(config: ReconstructionConfig) -> list[dict[str, Any]]:
 
 
 def show(rows: list[dict[str, Any]], console: Console) -> None:
-    """A table of the figures beside what is asked of them; what misses its goal is marked."""
+    """Prints the figures beside their goals; missed goals are marked."""
     table = Table(title="simulated surveys, held out from development")
-    for heading in ("figure", *(f"seed {row['seed']}, {row['poses']}" for row in rows), "asked: given", "control"):
+    for heading in ("figure", *(f"seed {row['seed']}, {row['poses']}" for row in rows), "goal: given", "control"):
         table.add_column(heading, justify="right")
     for name, goal in GOALS.items():
         cells = [
-            f"{row[name] * goal.scale:.3g}" + ("" if met(name, row[name], row["poses"]) else " [red]missed[/red]")
+            f"{row[name] * goal.scale:.3g}"
+            + ("" if meets_goal(name, row[name], row["poses"]) else " [red]missed[/red]")
             for row in rows
         ]
         sign = "≥" if goal.at_least else "≤"
@@ -162,7 +164,7 @@ def _run(module: str, *arguments: object) -> float:
 
 
 def main() -> None:
-    """The command."""
+    """Runs the command line."""
     config = parse(
         lambda words: tyro.cli(
             ReconstructionConfig, args=words, prog="python -m benchmarks.reconstruction", description=__doc__
@@ -172,10 +174,10 @@ def main() -> None:
 
 
 def check(config: ReconstructionConfig) -> None:
-    """Refuses what cannot be simulated or written.
+    """Refuses settings that cannot be simulated or written.
 
     Raises:
-        ValueError: Nothing is asked for, or a number is out of range.
+        ValueError: No seed or source of poses is given, or a number is out of range.
         SubterraError: The folder cannot be written.
     """
     for name in ("seeds", "poses"):
@@ -197,6 +199,89 @@ def run(config: ReconstructionConfig) -> None:
     facts = {"config": asdict(config) | {"out": str(config.out)}, "provenance": "simulated", "rows": rows}
     name = f"figures-{config.truth}-{config.length:g}.json"
     (config.out / name).write_text(json.dumps(facts, indent=1) + "\n")
+
+
+REACH = 0.15  # m, largest distance between a feature and its match
+
+
+def pocket_figures(scene: Path, survey: Path) -> dict[str, float]:
+    """Compares the pockets of `bore.npz` with the open ones of the truth, matched one to one within `REACH`.
+
+    Returns:
+        `pocket_f1`, and `pocket_depth_error`: mean depth of the matched pockets less their true mean depth, m.
+    """
+    with np.load(scene / "bore.npz") as data:
+        bore = {name: data[name] for name in ("station", "position", "lateral", "up", "angle", "radius", "pocket")}
+    pockets = [pocket for pocket in json.loads((survey / "truth.json").read_text())["pockets"] if pocket["open"]]
+    true = np.array([pocket["position"] for pocket in pockets])
+    built = _pocket_positions(bore) + _origin(scene)
+    i, j = one_to_one(built, true)
+    depth = np.array([pocket["depth"] for pocket in pockets])[j]
+    error = float(np.mean(bore["pocket"]["depth"][i]) - depth.mean()) if len(i) else float("nan")
+    return {"pocket_f1": f1(len(i), len(built), len(true)), "pocket_depth_error": error}
+
+
+def sleeper_figures(scene: Path, survey: Path) -> dict[str, float]:
+    """Compares the sleepers of `scene.xml` and the measured gauge with the truth.
+
+    Returns:
+        `sleeper_f1`, and `gauge_error`: measured less true gauge, m; NaN where none was measured.
+    """
+    import mujoco
+
+    truth: dict[str, Any] = json.loads((survey / "truth.json").read_text())
+    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
+    names = [model.geom(i).name for i in range(model.ngeom)]
+    built = model.geom_pos[[i for i, name in enumerate(names) if name.startswith("sleeper_")], :2]
+    true = np.asarray(truth["sleepers"]["position"], float).reshape(-1, 3)[:, :2]
+    i, _ = one_to_one(built + _origin(scene)[:2], true)
+    gauge = json.loads((scene / "manifest.json").read_text())["track"].get("gauge_seen")
+    return {
+        "sleeper_f1": f1(len(i), len(built), len(true)),
+        "gauge_error": float("nan") if gauge is None else gauge - truth["rails"]["gauge"],
+    }
+
+
+def f1(hits: int, built: int, true: int) -> float:
+    """Return the harmonic mean of precision and recall; 1 where there is nothing and nothing was found."""
+    return 2 * hits / (built + true) if built + true else 1.0
+
+
+def one_to_one(built: Float[np.ndarray, "n d"], true: Float[np.ndarray, "m d"]) -> tuple[np.ndarray, np.ndarray]:
+    """Match features within `REACH`, each at most once, nearest pairs first; return the indices of both."""
+    if not len(built) or not len(true):
+        return np.empty(0, int), np.empty(0, int)
+    near = cKDTree(built).sparse_distance_matrix(cKDTree(true), REACH, output_type="coo_matrix")
+    order = np.argsort(near.data, kind="stable")
+    free_built, free_true, pairs = np.ones(len(built), bool), np.ones(len(true), bool), []
+    for i, j in zip(near.row[order], near.col[order], strict=True):
+        if free_built[i] and free_true[j]:
+            free_built[i] = free_true[j] = False
+            pairs.append((i, j))
+    matched = np.array(pairs, int).reshape(-1, 2)
+    return matched[:, 0], matched[:, 1]
+
+
+def _origin(scene: Path) -> Float[np.ndarray, "3"]:
+    return np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"], float)
+
+
+def _pocket_positions(bore: dict[str, np.ndarray]) -> Float[np.ndarray, "p 3"]:
+    """Returns the middles of the pockets on the smooth wall, tunnel frame, m."""
+    pocket, station = bore["pocket"], bore["station"]
+    at = {
+        name: np.stack([np.interp(pocket["station"], station, column) for column in bore[name].T], axis=1)
+        for name in ("position", "lateral", "up")
+    }
+    row = np.rint(pocket["station"] / station[1]).astype(int).clip(0, len(station) - 1)
+    radius = np.array(
+        [
+            np.interp(a, bore["angle"], bore["radius"][k], period=2 * np.pi)
+            for a, k in zip(pocket["angle"], row, strict=True)
+        ]
+    )[:, None]
+    angle = pocket["angle"][:, None]
+    return at["position"] + radius * (np.cos(angle) * at["lateral"] + np.sin(angle) * at["up"])
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""A picture of a scene, off screen: `python -m benchmarks.render SCENE --out PNG`."""
+"""Renders a scene off screen: `python -m benchmarks.render SCENE --out PNG`."""
 
 import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from benchmarks.command import status
 from scene.arguments import parse
 from subterra_jax.outputs import require_file
 
-# MuJoCo chooses its GL backend when it is imported, so each is tried in a process of its own.
-_BACKENDS = ("egl", "osmesa", "glfw")
-_TIMEOUT = 120.0
+# MuJoCo chooses its OpenGL backend when it is imported, so each is tried in a process of its own.
+BACKENDS = ("egl", "osmesa", "glfw")
+_TIMEOUT = 120.0  # s
 _LIT = 7  # OpenGL lights a scene with eight lights, the headlight among them
 _MOST_PIXELS = 8192
 _LOOK_AHEAD = 8.0  # m
@@ -32,10 +33,10 @@ class RenderConfig:
 
     Attributes:
         scene: Scene folder, or an MJCF file.
-        out: PNG to write.
+        out: PNG file to write.
         camera: Camera of the scene: scout, chase, portal_start, middle, wall or portal_end.
-        width: Pixels.
-        height: Pixels.
+        width: Width, pixels.
+        height: Height, pixels.
     """
 
     scene: tyro.conf.Positional[Path]
@@ -46,21 +47,45 @@ class RenderConfig:
 
 
 def picture(scene: Path) -> np.ndarray | None:
-    """A view down the bore, `(height, width, 3)` uint8; `None` where no GL backend works."""
+    """Renders a view down the bore, `(height, width, 3)` uint8; `None` where no OpenGL backend works."""
+    return render_in_subprocess(["benchmarks.render", str(scene)], BACKENDS, _TIMEOUT)[0]
+
+
+def render_in_subprocess(
+    words: Sequence[str], backends: Sequence[str], timeout: float
+) -> tuple[np.ndarray | None, str]:
+    """Runs a rendering command with one OpenGL backend after another until one leaves a picture.
+
+    Args:
+        words: Words after `python -m`; `--out` is added.
+        backends: Values of `MUJOCO_GL` to try.
+        timeout: Time limit of each try, s.
+
+    Returns:
+        The picture, `(height, width, 3)` uint8, or `None`; and why the last backend failed.
+    """
+    reason = ""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "view.png"
-        for backend in _BACKENDS:
-            command = [sys.executable, "-m", "benchmarks.render", str(scene), "--out", str(out)]
+        command = [sys.executable, "-m", *words, "--out", str(out)]
+        for backend in backends:
             environment = {**os.environ, "MUJOCO_GL": backend}
-            done = subprocess.run(command, env=environment, capture_output=True, timeout=_TIMEOUT, check=False)
+            try:
+                done = subprocess.run(
+                    command, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+                )
+            except subprocess.TimeoutExpired:
+                reason = f"{backend}: no picture within {timeout:g} s"
+                continue
             if done.returncode == 0 and out.exists():
                 with Image.open(out) as image:
-                    return np.asarray(image.convert("RGB"))
-    return None
+                    return np.asarray(image.convert("RGB")), ""
+            reason = (done.stderr.strip().splitlines() or [""])[-1]
+    return None, reason
 
 
 def light_up(model: Any, data: Any, camera: str) -> None:
-    """Switches on the lamps nearest to what a camera looks at, and the others off, since few can be on at a time.
+    """Switches on the lamps nearest to a camera's view and all others off, since OpenGL allows only a few.
 
     Args:
         model: An `MjModel`.
@@ -74,7 +99,7 @@ def light_up(model: Any, data: Any, camera: str) -> None:
     model.light_active[nearest] = True
 
 
-def main(config: RenderConfig) -> None:
+def render(config: RenderConfig) -> None:
     """Renders once, with the backend that `MUJOCO_GL` names."""
     import mujoco
 
@@ -90,16 +115,16 @@ def main(config: RenderConfig) -> None:
 
 
 def command() -> int:
-    """The command line; a user's mistake, or no OpenGL, is one sentence and status 2."""
+    """Runs the command line; returns 2 for a user's mistake or without OpenGL."""
     config = parse(lambda words: tyro.cli(RenderConfig, args=words, prog="python -m benchmarks.render"))
-    return status(lambda: act(config))
+    return status(lambda: check_and_render(config))
 
 
-def act(config: RenderConfig) -> None:
-    """Renders.
+def check_and_render(config: RenderConfig) -> None:
+    """Checks the settings, then renders.
 
     Raises:
-        ValueError: What MuJoCo refuses; begins with the scene.
+        ValueError: A number is out of range, or MuJoCo cannot render the scene.
         SubterraError: The picture cannot be written.
     """
     import mujoco
@@ -109,7 +134,7 @@ def act(config: RenderConfig) -> None:
             raise ValueError(f"{name} must be 1 to {_MOST_PIXELS}, got {getattr(config, name)}")
     require_file(config.out, ".png")
     try:
-        main(config)
+        render(config)
     except (OSError, ValueError, KeyError, mujoco.FatalError) as fault:
         raise ValueError(f"{config.scene}: {fault}") from fault
 

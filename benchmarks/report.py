@@ -1,15 +1,224 @@
-"""The demo's report: what was reconstructed, how true it is, what was learnt on it."""
+"""The demo's report: one self-contained HTML page with figures, tables and no file or address outside itself."""
 
+import base64
+import html
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+
+matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import trimesh
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from PIL import Image
 
-from benchmarks import figures, page, render
-from benchmarks.truth import Truth, centreline, compare, start_placement
+from benchmarks import render
+from benchmarks.truth import Comparison, Truth, centreline, compare, start_placement
 
-# Figure in summary.json, what it is, unit, factor, decimals, goal and whether less is better.
+_STYLE = """
+:root { color-scheme: light dark; --ink: #1d2b36; --line: #d5dbe1; --soft: #f4f6f8; --paper: #ffffff; }
+@media (prefers-color-scheme: dark) { :root { --ink: #dfe6ec; --line: #3a4753; --soft: #1c252d; --paper: #131a20; } }
+body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 68rem;
+  margin: 2rem auto; padding: 0 1rem; }
+h1 { margin-bottom: .2rem; }
+h2 { margin-top: 2.4rem; border-bottom: 1px solid var(--line); padding-bottom: .2rem; }
+figure { margin: 1rem 0; }
+figure img { width: 100%; background: #fff; border: 1px solid var(--line); border-radius: 6px; }
+figcaption, .note { color: color-mix(in srgb, var(--ink) 70%, transparent); font-size: .92rem; }
+table { border-collapse: collapse; width: 100%; } th, td { text-align: left; padding: .35rem .6rem; }
+th, td { border-bottom: 1px solid var(--line); }
+th.number, td.number { text-align: right; font-variant-numeric: tabular-nums; }
+tr.missed td { background: color-mix(in srgb, #c1121f 14%, transparent); }
+.simulated { display: inline-block; background: var(--soft); border: 1px solid var(--line);
+  border-radius: 4px; padding: 0 .5rem; }
+"""
+
+
+def html_page(title: str, parts: Iterable[str]) -> str:
+    """Return a whole HTML page."""
+    body = "\n".join(parts)
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>'
+        f"<body>\n{body}\n</body></html>\n"
+    )
+
+
+def html_heading(text: str, level: int = 2) -> str:
+    """Return a heading; the text is escaped."""
+    return f"<h{level}>{html.escape(text)}</h{level}>"
+
+
+def html_paragraph(text: str, kind: str = "note") -> str:
+    """Return a paragraph; the text is escaped."""
+    return f'<p class="{kind}">{html.escape(text)}</p>'
+
+
+def html_figure(content: Figure | np.ndarray | bytes, caption: str) -> str:
+    """Embed a figure, an `(h, w, 3)` picture or PNG bytes."""
+    data = base64.b64encode(_png(content)).decode()
+    return (
+        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+    )
+
+
+def html_table(columns: tuple[str, ...], rows: Iterable[tuple[tuple[str, ...], bool]]) -> str:
+    """Return a table of strings; a row's flag marks a missed goal. The second column is set as numbers."""
+    kinds = ["number" if k == 1 else "text" for k in range(len(columns))]
+    head = "".join(f'<th class="{kind}">{html.escape(name)}</th>' for kind, name in zip(kinds, columns, strict=True))
+    lines = []
+    for cells, missed in rows:
+        data = "".join(f'<td class="{kind}">{html.escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
+        lines.append(f'<tr class="{"missed" if missed else "met"}">{data}</tr>')
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
+
+
+def _png(content: Figure | np.ndarray | bytes) -> bytes:
+    if isinstance(content, bytes):
+        return content
+    buffer = io.BytesIO()
+    if isinstance(content, Figure):
+        content.savefig(buffer, format="png", dpi=130)
+    else:
+        Image.fromarray(content).save(buffer, format="png")
+    return buffer.getvalue()
+
+
+_INK, _TRUTH, _ODOMETRY, _POINTS = "#1b4965", "#c1121f", "#e09f3e", "#8d99ae"
+_SLICE = 0.15
+_MOST_POINTS = 6_000
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A centreline to draw: label, stations (m) and positions in the survey frame (m)."""
+
+    label: str
+    station: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+
+
+def plan_and_profile(truth: Truth, given: Axis, odometry: Axis | None) -> Figure:
+    """Draws centrelines from above and from the side."""
+    figure, (plan, profile) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    start = truth.position[0]
+    direction = truth.position[-1, :2] - start[:2]
+    direction /= np.linalg.norm(direction)
+    turn = np.array([direction, [-direction[1], direction[0]]])
+
+    def draw(station: np.ndarray, position: np.ndarray, **style: object) -> None:
+        along, across = turn @ (position[:, :2] - start[:2]).T
+        plan.plot(along, across, **style)
+        profile.plot(station, position[:, 2] - start[2], **style)
+
+    draw(truth.station, truth.position, color=_TRUTH, lw=4, alpha=0.4, label="truth (simulated)")
+    draw(given.station, given.position, color=_INK, lw=1.4, label=given.label)
+    if odometry is not None:
+        draw(odometry.station, odometry.position, color=_ODOMETRY, lw=1.4, ls="--", label=odometry.label)
+    plan.set(title="Plan", xlabel="along the chord, m", ylabel="across, m")
+    plan.set_aspect("equal", adjustable="datalim")
+    profile.set(title="Profile", xlabel="station, m", ylabel="height above the start, m")
+    plan.legend(fontsize=8)
+    for axes in (plan, profile):
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: int = 4) -> Figure:
+    """Draws sections of the bore over the registered points within 15 cm.
+
+    Args:
+        bore_path: `bore.npz`.
+        points: Registered cloud in the tunnel frame, m.
+        count: Number of sections, evenly spread.
+    """
+    with np.load(bore_path) as data:
+        bore = {name: data[name] for name in data.files}
+    rows = np.linspace(0, len(bore["station"]) - 1, count + 2).astype(int)[1:-1]
+    figure, axes = plt.subplots(1, count, figsize=(3 * count, 4.4), sharey=True, layout="constrained")
+    for panel, row in zip(axes, rows, strict=True):
+        offset = points - bore["position"][row]
+        near = offset[np.abs(offset @ bore["tangent"][row]) < _SLICE]
+        near = near[np.linalg.norm(near, axis=1) < 2 * bore["radius"][row].max()]
+        near = near[:: max(1, len(near) // _MOST_POINTS)]
+        panel.plot(near @ bore["lateral"][row], near @ bore["up"][row], ".", ms=0.8, color=_POINTS, rasterized=True)
+        angle, radius = (
+            np.append(bore["angle"], bore["angle"][0]),
+            np.append(bore["radius"][row], bore["radius"][row][0]),
+        )
+        panel.plot(radius * np.cos(angle), radius * np.sin(angle), color=_INK, lw=1.2)
+        panel.set(title=f"station {bore['station'][row]:.1f} m", xlabel="lateral, m", aspect="equal")
+        panel.invert_xaxis()  # looking towards growing station, left is left
+        panel.grid(alpha=0.3)
+    axes[0].set_ylabel("above the axis, m")
+    return figure
+
+
+def section_errors(comparison: Comparison) -> Figure:
+    """Draws the errors of the axis and of the section's size along the tunnel."""
+    figure, (upper, lower) = plt.subplots(2, 1, figsize=(11, 4), sharex=True, layout="constrained")
+    for axes, names in ((upper, ("lateral", "vertical")), (lower, ("width", "height"))):
+        for name, colour in zip(names, (_INK, _ODOMETRY), strict=True):
+            axes.plot(comparison.station, 100 * getattr(comparison, name), color=colour, lw=1.2, label=name)
+        axes.axhline(0, color="0.6", lw=0.8)
+        axes.set_ylabel("error, cm")
+        axes.legend(fontsize=8, loc="upper right")
+        axes.grid(alpha=0.3)
+    lower.set_xlabel("station, m")
+    return figure
+
+
+def plan_of_walls(tunnel_path: Path, lining: str = "pockets", stretch: float = 20.0) -> Figure:
+    """Draws the first metres of the planar tunnel from above, as the environment's LiDAR sees them."""
+    with np.load(tunnel_path) as tunnel:
+        figure, axes = plt.subplots(figsize=(11, 3), layout="constrained")
+        origin, heading = tunnel["centre"][0], tunnel["tangent"][0]
+        turn = np.array([heading, [-heading[1], heading[0]]])
+        for side in ("left", "right"):
+            wall = tunnel[f"{side}_{lining}"][tunnel[f"{side}_station_{lining}"] < stretch]
+            axes.plot(*(turn @ (wall - origin).T), color=_INK, lw=1.0)
+        axes.plot(*(turn @ (tunnel["centre"][tunnel["station"] < stretch] - origin).T), color=_TRUTH, lw=0.8, ls=":")
+        axes.set(xlabel="m", ylabel="m", aspect="equal")
+        axes.set_title(f"Walls at LiDAR height, {float(tunnel['lidar_height']):g} m above the sleepers ({lining})")
+        axes.grid(alpha=0.3)
+        return figure
+
+
+def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
+    """Reads the registered cloud of a scene folder, thinned, in the tunnel frame, m."""
+    cloud = trimesh.load(scene / "cloud.ply")
+    assert isinstance(cloud, trimesh.PointCloud)  # for the type checker; the builder writes no faces
+    return np.asarray(cloud.vertices)
+
+
+def bore_in_perspective(bore_path: Path, eye: float = 2.0, reach: float = 40.0) -> Figure:
+    """Draws the bore's sections in perspective from `eye` m inside; used where nothing can be rendered."""
+    with np.load(bore_path) as data:
+        bore = {name: data[name] for name in data.files}
+    start = int(np.searchsorted(bore["station"], eye))
+    frame = np.stack([bore["lateral"][start], bore["up"][start], bore["tangent"][start]])
+    figure, axes = plt.subplots(figsize=(8, 6), layout="constrained")
+    for row in range(start + 4, len(bore["station"]), 4):
+        if bore["station"][row] > eye + reach:
+            break
+        across, along = bore["radius"][row] * np.cos(bore["angle"]), bore["radius"][row] * np.sin(bore["angle"])
+        ring = bore["position"][row] + across[:, None] * bore["lateral"][row] + along[:, None] * bore["up"][row]
+        left, up, ahead = frame @ (ring - bore["position"][start]).T
+        shown = ahead > 0.5
+        axes.plot(-left[shown] / ahead[shown], up[shown] / ahead[shown], color=_INK, lw=0.6, alpha=0.8)
+    axes.set(xlim=(-1.4, 1.4), ylim=(-1.05, 1.05), aspect="equal")
+    axes.set_axis_off()
+    return figure
+
+
+# Key in summary.json, text, unit, factor, decimals, goal, and whether less is better.
 _ROWS: tuple[tuple[str, str, str, float, int, float | None, bool], ...] = (
     ("length", "Length of the true centreline", "m", 1, 2, None, True),
     ("length_error", "Reconstructed less true length", "cm", 100, 1, None, True),
@@ -31,61 +240,61 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
     """Writes `report.html` and returns its path.
 
     Args:
-        out: The demo's folder: `survey`, `scene`, `scene-odometry`, `training` below it are read.
-        summary: The figures, SI.
-        truth: Of the simulated survey.
+        out: Folder of the demo; `survey`, `scene`, `scene-odometry` and `training` below it are read.
+        summary: Figures in SI units.
+        truth: Truth of the simulated survey.
     """
     parts = [
-        page.heading("Subterra: from a recording to a trained agent", 1),
-        page.paragraph("simulated survey: nothing here was measured in a real tunnel", "simulated"),
-        page.heading("Figures"),
-        page.table(("Figure", "Value", "Unit", "Goal"), _figure_rows(summary)),
-        page.paragraph(_odometry_sentence(summary["odometry"])),
-        page.heading("The bore"),
+        html_heading("Subterra: from a recording to a trained agent", 1),
+        html_paragraph("simulated survey: nothing here was measured in a real tunnel", "simulated"),
+        html_heading("Figures"),
+        html_table(("Figure", "Value", "Unit", "Goal"), _figure_rows(summary)),
+        html_paragraph(_odometry_sentence(summary["odometry"])),
+        html_heading("The bore"),
         *_bore_parts(out, summary, truth),
-        page.heading("The environment and what was learnt in it"),
-        page.figure(_closed(figures.drawn_view(out / "scene" / "tunnel.npz")), _caption_walls()),
-        page.figure(
+        html_heading("The environment and what was learnt in it"),
+        html_figure(_closed(plan_of_walls(out / "scene" / "tunnel.npz")), _caption_walls()),
+        html_figure(
             (out / "training" / "curve.png").read_bytes(), "Coverage of each training episode and their mean of 100."
         ),
-        page.heading("Where the time went"),
-        page.table(("Stage", "Seconds"), [((k, f"{v:.1f}"), False) for k, v in summary["stage_seconds"].items()]),
+        html_heading("Where the time went"),
+        html_table(("Stage", "Seconds"), [((k, f"{v:.1f}"), False) for k, v in summary["stage_seconds"].items()]),
     ]
     path = out / "report.html"
-    path.write_text(page.page("Subterra demo", parts))
+    path.write_text(html_page("Subterra demo", parts))
     return path
 
 
 def _bore_parts(out: Path, summary: dict[str, Any], truth: Truth) -> list[str]:
     scene, blind = out / "scene", out / "scene-odometry"
-    given = figures.Axis("reconstructed, poses given", *centreline(scene))
+    given = Axis("reconstructed, poses given", *centreline(scene))
     odometry = None
     if "failure" not in summary["odometry"]:
         placement = start_placement(blind / "odometry.tum", out / "survey" / "groundtruth.tum")
-        odometry = figures.Axis("reconstructed, odometry alone", *centreline(blind, placement))
+        odometry = Axis("reconstructed, odometry alone", *centreline(blind, placement))
     parts = []
     view = render.picture(scene)
     if view is not None:
-        parts.append(page.figure(view, "The scene in MuJoCo, from the camera of its scout robot."))
+        parts.append(html_figure(view, "The scene in MuJoCo, from the camera of its scout robot."))
     else:
-        drawn = _closed(figures.drawn_bore(scene / "bore.npz"))
-        parts.append(page.figure(drawn, "The bore, drawn section by section; no OpenGL was to be had for a rendering."))
-    plan = figures.plan_and_profile(truth, given, odometry)
-    sections = figures.section_overlays(scene / "bore.npz", figures.scene_points(scene))
-    errors = figures.section_errors(compare(scene, truth))
+        drawn = _closed(bore_in_perspective(scene / "bore.npz"))
+        parts.append(html_figure(drawn, "The bore, drawn section by section; without OpenGL nothing can be rendered."))
+    plan = plan_and_profile(truth, given, odometry)
+    sections = section_overlays(scene / "bore.npz", scene_points(scene))
+    errors = section_errors(compare(scene, truth))
     return [
         *parts,
-        page.figure(
+        html_figure(
             _closed(plan),
             "Plan and profile of the centreline. Nothing is aligned: the odometry starts at the true pose.",
         ),
-        page.figure(_closed(sections), "Sections over the registered points within 15 cm, looking along the tunnel."),
-        page.figure(_closed(errors), "Error of the axis (above) and of the section's size (below) against the truth."),
+        html_figure(_closed(sections), "Sections over the registered points within 15 cm, looking along the tunnel."),
+        html_figure(_closed(errors), "Error of the axis (above) and of the section's size (below) against the truth."),
     ]
 
 
 def _closed(figure: Any) -> Any:
-    plt.close(figure)  # so that figures do not pile up; the object can still be saved
+    plt.close(figure)  # so that figures do not pile up; a closed figure can still be saved
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Random and extreme actions over all tasks: nothing that is observed, paid or remembered may leave its space.
+"""Random and extreme actions over all tasks: observation, reward and state must stay finite and inside their spaces.
 
 `python -m benchmarks.soak --steps 10000000`
 """
@@ -26,21 +26,21 @@ _CHECKED_ENVS, _CHECKED_STEPS = 8, 50
 
 
 class SoakError(SubterraError):
-    """A soak that cannot be run as asked."""
+    """The settings of a soak are wrong."""
 
 
 @dataclass(frozen=True)
 class SoakConfig:
-    """What to run.
+    """Settings of a soak.
 
     Attributes:
-        steps: Environment steps, all tasks together.
-        tasks: Ids of tasks; none given: all.
+        steps: Environment steps of all tasks together.
+        tasks: Task ids; all tasks if not given.
         n_envs: Environments in a batch.
         tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given.
         lining: Variant of the walls.
         checkify: Run a short piece of each task under `jax.experimental.checkify` as well.
-        seed: Seed of everything.
+        seed: Seed for environments and actions.
     """
 
     steps: int = 10_000_000
@@ -53,9 +53,9 @@ class SoakConfig:
 
 
 def wild_actions(key: PRNGKeyArray, n_envs: int, low: np.ndarray, high: np.ndarray) -> Float[Array, "n_envs n_action"]:
-    """Actions of which a third lies inside the box, a third up to ten times outside of it, and a third is extreme.
+    """Draw actions: a third inside the box, a third up to ten times outside it, a third extreme.
 
-    In every eighth environment all actions lie inside, or hardly an episode would go on for long.
+    In every eighth environment all actions lie inside, so that some episodes last long.
     """
     shape = (n_envs, len(low))
     inside_key, outside_key, kind_key, which_key = jax.random.split(key, 4)
@@ -69,22 +69,22 @@ def wild_actions(key: PRNGKeyArray, n_envs: int, low: np.ndarray, high: np.ndarr
 def _violations(
     state: Any, obs: Float[Array, "n_envs n_obs"], reward: Float[Array, "n_envs"], low: np.ndarray, high: np.ndarray
 ) -> dict[str, Int[Array, ""]]:
-    """How many numbers are not what they should be, by name."""
+    """Count wrong numbers by name."""
     leaves = jax.tree_util.tree_flatten_with_path(state)[0]
-    found = {
+    counts = {
         f"state{jax.tree_util.keystr(path)} not finite": jnp.sum(~jnp.isfinite(leaf))
         for path, leaf in leaves
         if jnp.issubdtype(leaf.dtype, jnp.floating)
     }
     # Written so that a NaN counts as outside.
-    found["observation outside its space"] = jnp.sum(~((obs >= low) & (obs <= high)))
-    found["observation not finite"] = jnp.sum(~jnp.isfinite(obs))
-    found["reward not finite"] = jnp.sum(~jnp.isfinite(reward))
-    return found
+    counts["observation outside its space"] = jnp.sum(~((obs >= low) & (obs <= high)))
+    counts["observation not finite"] = jnp.sum(~jnp.isfinite(obs))
+    counts["reward not finite"] = jnp.sum(~jnp.isfinite(reward))
+    return counts
 
 
 def soak(env: st.TunnelEnv, params: st.EnvParams, n_envs: int, n_steps: int, seed: int) -> dict[str, int]:
-    """Violations by name in at least `n_steps` environment steps; empty where there are none."""
+    """Count violations by name in at least `n_steps` environment steps; empty where there are none."""
     batch, space, actions = st.AutoReset(env), env.observation_space(params), env.action_space(params)
 
     @jax.jit
@@ -109,8 +109,8 @@ def soak(env: st.TunnelEnv, params: st.EnvParams, n_envs: int, n_steps: int, see
     return {name: count for name, count in total.items() if count}
 
 
-def checked(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str | None:
-    """First complaint of checkify about a reset and some steps: NaN made, division by 0, index out of range."""
+def first_complaint(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str | None:
+    """Return checkify's first complaint about a reset and some steps: NaN, division by 0 or index out of range."""
     actions = env.action_space(params)
 
     def drive(key: PRNGKeyArray, params: st.EnvParams) -> Array:
@@ -131,10 +131,10 @@ def checked(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str | None:
 
 
 def run(config: SoakConfig, console: Console) -> bool:
-    """Runs every task; whether all of them are clean.
+    """Runs every task; returns whether all are clean.
 
     Raises:
-        SubterraError: A number out of range, or no such tunnel.
+        SubterraError: A number is out of range, or there is no such tunnel.
         ValueError: No such task.
     """
     for name, least in (("steps", 1), ("n_envs", 1), ("seed", 0)):
@@ -146,16 +146,16 @@ def run(config: SoakConfig, console: Console) -> bool:
     clean = True
     for task, (env, params) in zip(tasks, made, strict=True):
         complaints = soak(env, params, config.n_envs, -(-config.steps // len(tasks)), config.seed)
-        told = [f"{name}: {count}" for name, count in complaints.items()]
-        if config.checkify and (complaint := checked(env, params, config.seed)) is not None:
-            told.append(f"checkify: {complaint.splitlines()[0]}")
-        clean = clean and not told
-        console.print(f"{task}: {'; '.join(told) or 'clean'}")
+        messages = [f"{name}: {count}" for name, count in complaints.items()]
+        if config.checkify and (complaint := first_complaint(env, params, config.seed)) is not None:
+            messages.append(f"checkify: {complaint.splitlines()[0]}")
+        clean = clean and not messages
+        console.print(f"{task}: {'; '.join(messages) or 'clean'}")
     return clean
 
 
 def main() -> int:
-    """Entry point: 0 where everything is clean, 1 where not, 2 for a user's mistake."""
+    """Runs the command line; returns 0 where everything is clean, 1 where not, 2 for a user's mistake."""
     config = parse(
         lambda words: tyro.cli(SoakConfig, args=words, prog="python -m benchmarks.soak", description=__doc__)
     )

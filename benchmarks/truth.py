@@ -1,4 +1,4 @@
-"""A reconstructed bore against the exact truth of a simulated survey. Nothing is fitted or scaled first."""
+"""Compares a reconstructed bore with the exact truth of a simulated survey; nothing is fitted or scaled first."""
 
 import json
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
 SCHEMA = "subterra.truth/1"
-_FINE = 0.01
+_FINE = 0.01  # m between points where the nearest one is looked up
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class Truth:
     """True centreline and section sizes in the survey frame.
 
     Attributes:
-        station: m, `(n,)`.
-        position: m, `(n, 3)`.
+        station: Stations, m, `(n,)`.
+        position: Points of the centreline, m, `(n, 3)`.
         width: Largest inner width, m, `(n,)`.
         height: Floor to crown on the axis, m, `(n,)`.
     """
@@ -33,7 +33,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far a bore is from the truth, station by station.
+    """Errors of a bore against the truth, station by station.
 
     Attributes:
         station: True station of each compared section, m, `(k,)`.
@@ -52,7 +52,7 @@ class Comparison:
     length_error: float
 
     def figures(self) -> dict[str, float]:
-        """The errors as single numbers, m."""
+        """Return the errors as single numbers, m."""
         rms = {name: float(np.sqrt(np.mean(getattr(self, name) ** 2))) for name in ("width", "height")}
         return {
             "centreline_rmse": float(np.sqrt(np.mean(self.lateral**2 + self.vertical**2))),
@@ -66,7 +66,7 @@ def load_truth(path: Path) -> Truth:
     """Reads `truth.json`.
 
     Raises:
-        ValueError: Of another schema.
+        ValueError: The file has another schema.
     """
     data = json.loads(path.read_text())
     if data.get("schema") != SCHEMA:
@@ -86,32 +86,32 @@ SAME_FRAME = Placement(np.eye(3), np.zeros(3))
 
 
 def start_placement(estimated: Path, true: Path) -> Placement:
-    """Puts an estimated trajectory's first pose on the true pose of that moment; nothing else is fitted.
+    """Return the motion that puts an estimate's first pose on the true pose of that time; nothing else is fitted.
 
     Args:
         estimated: TUM file of the estimate.
         true: TUM file of the truth, covering the estimate's first row.
     """
     first, truth = np.loadtxt(estimated)[0], np.loadtxt(true)
-    then = np.array([np.interp(first[0], truth[:, 0], column) for column in truth[:, 1:4].T])
+    position = np.array([np.interp(first[0], truth[:, 0], column) for column in truth[:, 1:4].T])
     turn = Slerp(truth[:, 0], Rotation.from_quat(truth[:, 4:]))(first[0]) * Rotation.from_quat(first[4:]).inv()
-    return Placement(turn.as_matrix(), then - turn.apply(first[1:4]))
+    return Placement(turn.as_matrix(), position - turn.apply(first[1:4]))
 
 
 def centreline(scene: Path, placement: Placement = SAME_FRAME) -> tuple[np.ndarray, np.ndarray]:
-    """Stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of the truth."""
+    """Return stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of the truth."""
     with np.load(scene / "bore.npz") as bore:
         origin = np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"])
         return bore["station"], (bore["position"] + origin) @ placement.rotation.T + placement.shift
 
 
 def compare(scene: Path, truth: Truth, placement: Placement = SAME_FRAME) -> Comparison:
-    """The bore of a scene folder against the truth, each true section against the reconstruction nearest to it.
+    """Compares a scene's bore with the truth: each true section with the nearest point of the reconstruction.
 
     Args:
         scene: Folder with `bore.npz` and `manifest.json`.
-        truth: The truth.
-        placement: From the frame of the scene's input into that of the truth.
+        truth: Truth of the survey.
+        placement: Motion from the frame of the scene's input into that of the truth.
     """
     station, position = centreline(scene, placement)
     with np.load(scene / "bore.npz") as bore:

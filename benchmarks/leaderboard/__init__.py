@@ -1,4 +1,4 @@
 """Every agent on every task, on the fixed list of episodes.
 
-config ─► entries (drive, or read what an earlier run has driven) ─► board (scores) ─► report, figure
+config (tasks, agents, tunnels; a user's own files) ─► entries (evaluate, or read from an earlier run) ─► report
 """

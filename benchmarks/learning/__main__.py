@@ -1,19 +1,32 @@
 """Our PPO beside that of Stable-Baselines3: `python -m benchmarks.learning --out out/learning`."""
 
 import dataclasses
+import io
+import json
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
 import tyro
+from rich.console import Console
+from rich.table import Table
 
 from benchmarks.command import status
-from benchmarks.learning import ours, report
-from benchmarks.throughput.facts import environment_facts, version
+from benchmarks.learning.runs import Curve, require_stable_baselines, train_ours, train_stable_baselines
+from benchmarks.results import environment_facts, version, write_file
 from scene.arguments import parse
 from subterra_jax.outputs import require_folder
 from train import policies
+from train.curve import GOAL, rolling
 from train.errors import ConfigError
+from train.run.episodes import WINDOW
+
+_HEADINGS = ("", "episodes", "steps", "s", "compiled in", "steps/s")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,12 +35,12 @@ class Command:
 
     Attributes:
         out: Folder for learning.json and learning.png.
-        task: A task whose success is coverage.
-        tunnel: Tunnel file or name; the packaged tunnel if left out.
-        steps: Environment steps, at most, of Stable-Baselines3.
-        our_steps: Of ours.
-        preset: Of ours, `cpu` or `gpu`.
-        seed: Of both.
+        task: Task whose success is coverage.
+        tunnel: Tunnel file or name; the packaged tunnel if not given.
+        steps: Largest number of environment steps of Stable-Baselines3.
+        our_steps: Largest number of environment steps of ours.
+        preset: Preset of ours, `cpu` or `gpu`.
+        seed: Seed for both.
     """
 
     out: Path
@@ -53,20 +66,65 @@ def run(command: Command) -> None:
             raise ConfigError(f"{name} must be at least {least}, got {getattr(command, name)}")
     policies.open_world(command.task, command.tunnel)
     require_folder(command.out)
-    try:
-        from benchmarks.learning import stable_baselines
-    except ImportError as missing:
-        raise ConfigError("stable-baselines3 is not installed: pip install 'subterra-jax[sb3]'") from missing
+    require_stable_baselines()
     curves = [
-        ours.train(command.task, command.our_steps, command.seed, command.preset, command.tunnel),
-        stable_baselines.train(command.task, command.steps, command.seed, command.tunnel),
+        train_ours(command.task, command.our_steps, command.seed, command.preset, command.tunnel),
+        train_stable_baselines(command.task, command.steps, command.seed, command.tunnel),
     ]
-    told = {"task": command.task, "seed": command.seed, "stable-baselines3": version("stable-baselines3")}
-    report.write(command.out, curves, {**told, "torch": version("torch"), **environment_facts()})
+    facts = {"task": command.task, "seed": command.seed, "stable-baselines3": version("stable-baselines3")}
+    report(command.out, curves, {**facts, "torch": version("torch"), **environment_facts()})
+
+
+def report(out: Path, curves: list[Curve], facts: dict[str, Any]) -> None:
+    """Prints the table; writes `learning.json` and `learning.png`."""
+    table = Table(title=f"{facts['task']}: to {100 * GOAL:.0f} % coverage and 100 % success of the last {WINDOW}")
+    for heading in _HEADINGS:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for curve in curves:
+        goal = curve.reached()
+        when = [f"{goal['episodes']:,}", f"{goal['steps']:,}", f"{goal['seconds']:.1f}"] if goal else ["never"] * 3
+        table.add_row(curve.name, *when, f"{curve.compiling:.1f} s", f"{curve.rate():,.0f}")
+    Console().print(table)
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [
+        {
+            "name": curve.name,
+            "reached": curve.reached(),
+            "compiling": curve.compiling,
+            "steps_per_second": curve.rate(),
+            "episode": {
+                "step": curve.step.tolist(),
+                "seconds": np.round(curve.seconds, 3).tolist(),
+                "coverage": np.round(curve.coverage, 6).tolist(),
+                "success": curve.success.astype(int).tolist(),
+            },
+        }
+        for curve in curves
+    ]
+    content = {"schema": "subterra.learning/1", **facts, "runs": rows}
+    write_file(out / "learning.json", json.dumps(content).encode() + b"\n")
+    write_file(out / "learning.png", _draw(curves))
+
+
+def _draw(curves: list[Curve]) -> bytes:
+    """Returns coverage against steps and against seconds as a PNG file."""
+    figure, panels = plt.subplots(1, 2, figsize=(10.0, 4.0), sharey=True, layout="constrained")
+    for axes, x, label in ((panels[0], "step", "environment steps"), (panels[1], "seconds", "s, without compiling")):
+        for curve in curves:
+            axes.plot(np.maximum(getattr(curve, x), 1e-2), 100.0 * rolling(curve.coverage), label=curve.name)
+        axes.axhline(100.0 * GOAL, ls="--", lw=1.0, color="0.3")
+        axes.set(xlabel=label, xscale="log", ylim=(0.0, 100.0))
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel(f"coverage, %, mean of the last {WINDOW}")
+    panels[0].legend(loc="center left", fontsize=8)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=120, format="png")
+    plt.close(figure)
+    return buffer.getvalue()
 
 
 def main() -> int:
-    """Entry point; the status is 2 for a user's mistake."""
+    """Runs the command line; returns 2 for a user's mistake."""
     command = parse(
         lambda words: tyro.cli(Command, args=words, prog="python -m benchmarks.learning", description=__doc__)
     )

@@ -1,1 +1,4 @@
-"""The paper's figures at print size, each with its data beside it: `python -m benchmarks.paper --out out/figures`."""
+"""The paper's figures at print size, each with its data beside it.
+
+steps (survey, scene, training) ─► material ─► figures, learning ─► sheet (PDF, PNG, CSV, JSON)
+"""

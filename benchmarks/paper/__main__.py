@@ -1,4 +1,4 @@
-"""Makes the paper's figures at print size; what is made is not made again."""
+"""Makes the paper's figures at print size; a finished figure is not made again."""
 
 import json
 import sys
@@ -14,7 +14,7 @@ import tyro
 
 from benchmarks.command import status
 from benchmarks.fidelity.filehash import file_hash
-from benchmarks.paper import bore_view, learning, occupancy, pipeline, sheet, steps
+from benchmarks.paper import figures, learning, sheet, steps
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.material import Material, read_truth
 from benchmarks.paper.sheet import Drawing
@@ -22,26 +22,30 @@ from scene.arguments import parse
 from scene.files import require_output_folder
 from scene.survey.config import SurveyConfig, check_survey
 
-OF_A_SURVEY: dict[int, Callable[[Material], Drawing]] = {1: bore_view.draw, 2: pipeline.draw, 3: occupancy.draw}
+SURVEY_FIGURES: dict[int, Callable[[Material], Drawing]] = {
+    1: figures.draw_bore_view,
+    2: figures.draw_pipeline,
+    3: figures.draw_occupancy,
+}
 LEARNING = 4
 _LIBRARIES = ("matplotlib", "mujoco", "numpy", "jax")
 
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """Figures 1 to 4 of the paper as PDF and PNG, each with its data (CSV) and where it comes from (JSON).
+    """Figures 1 to 4 of the paper as PDF and PNG, each with its data (CSV) and provenance (JSON).
 
     Example: python -m benchmarks.paper --out out/figures
 
     Attributes:
-        out: Folder to write. What is made in it is not made again.
-        figures: Which: 1 recording and bore, 2 pipeline, 3 occupancy, 4 learning curves.
-        length: Of the survey that is simulated where none is given, m.
-        seed: Of that survey.
-        survey: Folder of a survey with `survey.bag`, `survey_os1.bag` and their trajectories, instead.
-        scene: Scene folder built from it, instead of building it.
-        runs: Folder with the run folders `seed-*` of `train.navigate` on T0, instead of training five seeds.
-        provenance: Printed below figures 1 to 3; read from the scene's manifest if left out.
+        out: Output folder; finished figures and steps in it are not made again.
+        figures: Numbers: 1 recording and bore, 2 pipeline, 3 occupancy, 4 learning curves.
+        length: Length of the simulated survey if none is given, m.
+        seed: Seed for that survey.
+        survey: Survey folder to use instead: `survey.bag`, `survey_os1.bag` and their trajectories.
+        scene: Scene folder built from that survey, instead of building it.
+        runs: Folder with run folders `seed-*` of `train.navigate` on T0, instead of training five seeds.
+        provenance: Line below figures 1 to 3; read from the scene's manifest if not given.
     """
 
     out: Path = Path("out/figures")
@@ -55,12 +59,12 @@ class PaperConfig:
 
 
 def check(config: PaperConfig) -> None:
-    """Refuses what cannot be drawn.
+    """Refuses settings that cannot be drawn.
 
     Raises:
-        PaperError: There is no such figure, or what is given does not go together.
+        PaperError: There is no such figure, or the given folders do not fit together.
     """
-    known = (*OF_A_SURVEY, LEARNING)
+    known = (*SURVEY_FIGURES, LEARNING)
     if not config.figures:
         raise PaperError(f"figures must name at least one of {', '.join(map(str, known))}")
     for number in config.figures:
@@ -83,7 +87,7 @@ def check(config: PaperConfig) -> None:
 
 
 def make(config: PaperConfig) -> None:
-    """Makes what is missing, step by step.
+    """Makes missing inputs and figures, step by step.
 
     Raises:
         SubterraError: A step failed, or an input is missing or broken.
@@ -91,20 +95,20 @@ def make(config: PaperConfig) -> None:
     check(config)
     config.out.mkdir(parents=True, exist_ok=True)
     material = None
-    if set(config.figures) & set(OF_A_SURVEY) or config.runs is None:
-        material = _surveyed(config)
+    if set(config.figures) & set(SURVEY_FIGURES) or config.runs is None:
+        material = _prepare_survey(config)
     with sheet.style():
         for number in config.figures:
             if number == LEARNING:
-                _learning(config, material)
+                _make_learning_figure(config, material)
             elif material is not None:
                 inputs = _hashes([material.scene / "manifest.json", material.survey / "groundtruth_os1.tum"])
-                draw = partial(OF_A_SURVEY[number], material)
-                _figure(config, number, _provenance(config, material), inputs, draw)
+                draw = partial(SURVEY_FIGURES[number], material)
+                _make_figure(config, number, _provenance(config, material), inputs, draw)
 
 
-def _surveyed(config: PaperConfig) -> Material:
-    """The survey and its scene, once they are there."""
+def _prepare_survey(config: PaperConfig) -> Material:
+    """Returns survey and scene, made first if missing."""
     survey, scene = config.survey or config.out / "survey", config.scene or config.out / "scene"
     if config.survey is None:
         steps.make(steps.survey_step(survey, config.length, config.seed))
@@ -117,57 +121,57 @@ def _surveyed(config: PaperConfig) -> Material:
     return material
 
 
-def _learning(config: PaperConfig, material: Material | None) -> None:
+def _make_learning_figure(config: PaperConfig, material: Material | None) -> None:
     folder = config.runs or config.out / "training"
     if config.runs is None and material is not None:
         steps.make(steps.training_step(folder, material.scene))
     runs = learning.find_runs(folder)
     inputs = _hashes([run / name for run in runs for name in ("config.json", "episodes.csv")])
-    _figure(config, LEARNING, learning.provenance(runs), inputs, partial(learning.draw, runs))
+    _make_figure(config, LEARNING, learning.provenance(runs), inputs, partial(learning.draw, runs))
 
 
-def _figure(
+def _make_figure(
     config: PaperConfig, number: int, provenance: str, inputs: dict[str, str], draw: Callable[[], Drawing]
 ) -> None:
-    """Draws one figure unless it is there, of the same inputs and code."""
+    """Draws one figure, unless it is there from the same inputs and code."""
     name = f"fig{number}"
-    told = {
+    facts = {
         "provenance": provenance,
         "inputs": inputs,
         "versions": {library: version(library) for library in _LIBRARIES},
     }
-    key = sha256(json.dumps([number, told, sheet.code_hash()], sort_keys=True).encode()).hexdigest()
+    key = sha256(json.dumps([number, facts, sheet.code_hash()], sort_keys=True).encode()).hexdigest()
     if sheet.is_made(config.out, name, key):
         print(f"figure {number}: {config.out / name}.pdf is there", flush=True)
         return
     print(f"figure {number}: drawing", flush=True)
-    sheet.save(draw(), config.out, name, {**told, "key": key})
+    sheet.save(draw(), config.out, name, {**facts, "key": key})
     print(f"figure {number}: {config.out / name}.pdf", flush=True)
 
 
 def _provenance(config: PaperConfig, material: Material) -> str:
-    """One line: what the survey is, and that a simulated one is."""
+    """Returns one line that names the survey and says whether it is simulated."""
     if config.provenance is not None:
         return config.provenance
     if not material.simulated:
         return f"Survey {material.survey.name}, {material.manifest.get('input_provenance')}."
     facts = read_truth(material.survey)
-    told = f"{facts['truth']}, {facts['length']:g} m, seed {facts['seed']}; python -m scene.survey" if facts else ""
-    return f"Simulated survey ({told or material.survey.name}); no real recording."
+    origin = f"{facts['truth']}, {facts['length']:g} m, seed {facts['seed']}; python -m scene.survey" if facts else ""
+    return f"Simulated survey ({origin or material.survey.name}); no real recording."
 
 
 def _hashes(paths: list[Path]) -> dict[str, str]:
-    """SHA-256 of files by their last two names."""
-    found: dict[str, Any] = {}
+    """Returns the SHA-256 of files by their last two names."""
+    hashes: dict[str, Any] = {}
     for path in paths:
         if not path.exists():
             raise PaperError(f"{path}: no such file")
-        found[f"{path.parent.name}/{path.name}"] = file_hash(path)
-    return found
+        hashes[f"{path.parent.name}/{path.name}"] = file_hash(path)
+    return hashes
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point: 0 once every figure is there, 2 for a user's mistake, 130 after Ctrl-C."""
+    """Runs the command line; returns 0 once every figure is there, 2 for a user's mistake, 130 after Ctrl-C."""
     config = parse(lambda words: tyro.cli(PaperConfig, args=words, prog="python -m benchmarks.paper"), args)
     return status(lambda: make(config), "interrupted; the same command goes on from here")
 

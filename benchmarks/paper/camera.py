@@ -1,9 +1,7 @@
-"""A picture of a scene from any place: `python -m benchmarks.paper.camera SCENE --at X Y Z --ahead X Y Z --out PNG`."""
+"""Renders a scene from any place: `python -m benchmarks.paper.camera SCENE --at X Y Z --ahead X Y Z --out PNG`."""
 
 import os
-import subprocess
 import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,27 +11,26 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from benchmarks.paper.errors import PaperError
-from benchmarks.render import light_up
+from benchmarks.render import BACKENDS, light_up, render_in_subprocess
 from scene.arguments import parse
 
-_BACKENDS = ("egl", "osmesa", "glfw")  # MuJoCo chooses its own when it is imported, hence the processes
 _NAME = "paper"
 _TIMEOUT = 300.0  # s
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where an upright pinhole camera stands.
+    """Pose and size of an upright pinhole camera.
 
     Attributes:
-        at: Tunnel frame, m, `(3,)`.
+        position: Position in the tunnel frame, m, `(3,)`.
         ahead: Unit vector of its optical axis, not vertical, `(3,)`.
         fov: Vertical field of view, rad.
-        width: Pixels.
-        height: Pixels.
+        width: Width, pixels.
+        height: Height, pixels.
     """
 
-    at: Float[np.ndarray, "3"]
+    position: Float[np.ndarray, "3"]
     ahead: Float[np.ndarray, "3"]
     fov: float
     width: int
@@ -41,7 +38,7 @@ class Pose:
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:
-        """Rows: right, up and ahead, unit vectors in the tunnel frame."""
+        """Unit vectors to the right, up and ahead in the tunnel frame, as rows."""
         right = np.cross(self.ahead, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(right, self.ahead), self.ahead])
@@ -54,18 +51,18 @@ class Pose:
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Renders a scene from a place of its own.
+    """Renders a scene from any place.
 
     Example: python -m benchmarks.paper.camera build/tunnel/scene.xml --at 5 0 1.5 --ahead 1 0 0 --out view.png
 
     Attributes:
         scene: MJCF file.
-        at: Place in the tunnel frame, m.
-        ahead: Where it looks; any length.
+        at: Position in the tunnel frame, m.
+        ahead: Viewing direction; any length.
         fov_deg: Vertical field of view, degrees.
-        width: Pixels.
-        height: Pixels.
-        out: PNG to write.
+        width: Width, pixels.
+        height: Height, pixels.
+        out: PNG file to write.
     """
 
     scene: tyro.conf.Positional[Path]
@@ -78,30 +75,17 @@ class CameraConfig:
 
 
 def picture(scene: Path, pose: Pose) -> UInt8[np.ndarray, "height width 3"]:
-    """What the camera sees.
+    """Renders a scene from a pose.
 
     Raises:
         PaperError: MuJoCo can render with none of its OpenGL backends.
     """
-    last = ""
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "view.png"
-        command = [sys.executable, "-m", "benchmarks.paper.camera", str(scene), "--out", str(out), *_words(pose)]
-        wanted = os.environ.get("MUJOCO_GL")
-        for backend in (wanted,) if wanted else _BACKENDS:
-            environment = {**os.environ, "MUJOCO_GL": backend}
-            try:
-                done = subprocess.run(
-                    command, env=environment, capture_output=True, text=True, timeout=_TIMEOUT, check=False
-                )
-            except subprocess.TimeoutExpired:
-                last = f"{backend}: no picture within {_TIMEOUT:g} s"
-                continue
-            if done.returncode == 0 and out.exists():
-                with Image.open(out) as image:
-                    return np.asarray(image.convert("RGB"))
-            last = (done.stderr.strip().splitlines() or [""])[-1]
-    raise PaperError(f"{scene}: cannot be rendered, which figures 1 and 2 need ({last})")
+    chosen = os.environ.get("MUJOCO_GL")
+    words = ["benchmarks.paper.camera", str(scene), *_words(pose)]
+    view, reason = render_in_subprocess(words, (chosen,) if chosen else BACKENDS, _TIMEOUT)
+    if view is None:
+        raise PaperError(f"{scene}: cannot be rendered, which figures 1 and 2 need ({reason})")
+    return view
 
 
 def main(config: CameraConfig) -> None:
@@ -114,7 +98,7 @@ def main(config: CameraConfig) -> None:
     right, up, _ = pose.axes
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.stack([right, up, -ahead], axis=1).ravel())  # MuJoCo's cameras look backwards
-    spec.worldbody.add_camera(name=_NAME, pos=pose.at, quat=quaternion, fovy=config.fov_deg)
+    spec.worldbody.add_camera(name=_NAME, pos=pose.position, quat=quaternion, fovy=config.fov_deg)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = config.width, config.height
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -127,7 +111,7 @@ def main(config: CameraConfig) -> None:
 
 
 def _words(pose: Pose) -> list[str]:
-    vectors = ["--at", *map(repr, pose.at.tolist()), "--ahead", *map(repr, pose.ahead.tolist())]
+    vectors = ["--at", *map(repr, pose.position.tolist()), "--ahead", *map(repr, pose.ahead.tolist())]
     size = ["--width", str(pose.width), "--height", str(pose.height)]
     return [*vectors, "--fov-deg", repr(float(np.rad2deg(pose.fov))), *size]
 

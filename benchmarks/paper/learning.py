@@ -1,4 +1,4 @@
-"""Fig. 4: coverage and success of the last hundred episodes against finished episodes, over seeds."""
+"""Figure 4: coverage and success of the last hundred episodes against finished episodes, over seeds."""
 
 import json
 from pathlib import Path
@@ -15,14 +15,14 @@ from train.curve import GOAL, read_episodes, rolling
 from train.run.episodes import WINDOW
 
 _COLOURS = {"coverage": BLUE, "success": ORANGE}
-_MOST_POINTS = 1500  # of a line in the figure: more than its dots in print
+_MOST_POINTS = 1500  # points of a line: more than its dots in print
 
 
 def find_runs(folder: Path) -> list[Path]:
-    """Run folders `seed-*` of a folder, by their number.
+    """Return the run folders `seed-*` of a folder in the order of their number.
 
     Raises:
-        PaperError: There is none.
+        PaperError: The folder has no run folder.
     """
     runs = [path for path in folder.glob("seed-*") if path.name[5:].isdigit() and (path / "config.json").exists()]
     if not runs:
@@ -30,11 +30,11 @@ def find_runs(folder: Path) -> list[Path]:
     return sorted(runs, key=lambda path: int(path.name[5:]))
 
 
-def task_of(runs: list[Path]) -> str:
-    """The task that all runs are of.
+def common_task(runs: list[Path]) -> str:
+    """Return the task of all runs.
 
     Raises:
-        PaperError: They are of several, or of one whose curve is not coverage.
+        PaperError: The runs have several tasks, or one whose curve is not coverage.
     """
     tasks = [str(read_config(run).get("task")) for run in runs]
     for run, task in zip(runs, tasks, strict=True):
@@ -46,7 +46,7 @@ def task_of(runs: list[Path]) -> str:
 
 
 def provenance(runs: list[Path]) -> str:
-    """What was learnt, in which tunnel, on what."""
+    """Return one line with task, tunnel, number of seeds and device."""
     first = read_config(runs[0])
     tunnel = f"{first.get('tunnel')} ({first.get('tunnel_provenance', 'no')} survey)"
     device = str(first.get("device")).rpartition(": ")[2]
@@ -54,10 +54,10 @@ def provenance(runs: list[Path]) -> str:
 
 
 def read_config(run: Path) -> dict[str, Any]:
-    """A run's `config.json`.
+    """Reads a run's `config.json`.
 
     Raises:
-        PaperError: It cannot be read.
+        PaperError: The file cannot be read.
     """
     try:
         return dict(json.loads((run / "config.json").read_text()))
@@ -66,13 +66,13 @@ def read_config(run: Path) -> dict[str, Any]:
 
 
 def draw(runs: list[Path]) -> Drawing:
-    """A thin line a seed, the mean and one standard deviation about it.
+    """Draws a thin line for each seed, their mean, and one standard deviation around it.
 
     Raises:
-        PaperError: The runs are not of one task, it is not T0, or no episode finished.
-        RunFolderError: One of them cannot be read.
+        PaperError: The runs have several tasks, the task is not T0, or no episode finished.
+        RunFolderError: A run cannot be read.
     """
-    facts: dict[str, Any] = {"task": task_of(runs), "runs": [run.name for run in runs]}
+    facts: dict[str, Any] = {"task": common_task(runs), "runs": [run.name for run in runs]}
     episodes = [read_episodes(run) for run in runs]
     shortest = min(len(one["episode"]) for one in episodes)
     if not shortest:
@@ -93,38 +93,38 @@ def draw(runs: list[Path]) -> Drawing:
 
 def _panel(axes: Any, name: str, table: Float[np.ndarray, "s n"], mean: np.ndarray, spread: np.ndarray) -> None:
     n = table.shape[1]
-    few = np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).round().astype(int))
-    episode, colour = few + 1, _COLOURS[name]
+    shown = np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).round().astype(int))
+    episode, colour = shown + 1, _COLOURS[name]
     for k, row in enumerate(table):
-        axes.plot(episode, row[few], color="0.6", lw=0.5, label=None if k else "one seed", zorder=2)
+        axes.plot(episode, row[shown], color="0.6", lw=0.5, label=None if k else "one seed", zorder=2)
     low, high = np.clip(mean - spread, 0.0, 100.0), np.clip(mean + spread, 0.0, 100.0)
-    axes.fill_between(episode, low[few], high[few], color=colour, alpha=0.3, lw=0.0, label="± sd", zorder=1)
-    axes.plot(episode, mean[few], color=colour, lw=1.4, label="mean", zorder=3)
+    axes.fill_between(episode, low[shown], high[shown], color=colour, alpha=0.3, lw=0.0, label="± sd", zorder=1)
+    axes.plot(episode, mean[shown], color=colour, lw=1.4, label="mean", zorder=3)
     if name == "coverage":
         axes.axhline(100.0 * GOAL, color=INK, lw=0.8, ls="--", label=f"{100 * GOAL:.0f} % goal", zorder=4)
     axes.set(ylabel=f"{name}, %\n(mean of the last {WINDOW})", ylim=(-3.0, 104.0), xlim=(0, n))
     axes.set_yticks((0, 25, 50, 75, 100))
     axes.grid(alpha=0.25, lw=0.4)
-    # Above the axes: how soon the curves rise, and so where there is room inside, depends on the batch.
+    # Above the axes: where there is room inside depends on how soon the curves rise.
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, frameon=False, handlelength=1.2, columnspacing=1.0
     )
 
 
 def _first_at_goal(mean: Float[np.ndarray, " n"]) -> int | None:
-    """First full hundred whose mean coverage over seeds is at the goal."""
+    """Returns the first full hundred whose mean coverage over seeds reaches the goal."""
     there = np.flatnonzero(mean[WINDOW - 1 :] >= GOAL)
     return int(there[0]) + WINDOW if len(there) else None
 
 
 def _caption(facts: dict[str, Any], n_runs: int, shortest: int) -> str:
     last = {name: facts[f"{name}_last"] for name in _COLOURS}
-    told = ", ".join(f"{name} {100 * one['mean']:.2f} ± {100 * one['sd']:.2f} %" for name, one in last.items())
+    results = ", ".join(f"{name} {100 * one['mean']:.2f} ± {100 * one['sd']:.2f} %" for name, one in last.items())
     reached = facts["first_at_goal"]
     when = (
         f"Mean coverage reaches {100 * GOAL:.0f} % after {reached} episodes" if reached else "The goal is not reached"
     )
     return (
         f"Learning curves of PPO on {facts['task']}: coverage and success of the last {WINDOW} episodes, mean ± "
-        f"standard deviation over {n_runs} seeds. {when}; after {shortest}: {told}."
+        f"standard deviation over {n_runs} seeds. {when}; after {shortest}: {results}."
     )

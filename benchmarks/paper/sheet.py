@@ -1,4 +1,4 @@
-"""Figures at the size and in the type of an IEEE page, and the files that one leaves."""
+"""Figures at the size and in the type of an IEEE page, and their files."""
 
 import csv
 import json
@@ -42,13 +42,13 @@ _STYLE: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with what it shows.
+    """A figure with its data.
 
     Attributes:
-        figure: As it is printed.
-        caption: What a reader is told below it.
-        columns: Of the CSV, by heading; all of one length.
-        facts: Figures measured on the way, for the JSON.
+        figure: Figure as printed.
+        caption: Caption below it.
+        columns: Columns of the CSV by heading, all of one length.
+        facts: Numbers for the JSON.
     """
 
     figure: Figure
@@ -59,13 +59,13 @@ class Drawing:
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Type, lines and fonts of print for the figures drawn inside."""
+    """Sets fonts and lines for print while figures are drawn inside."""
     with plt.rc_context(_STYLE):
         yield
 
 
 def is_made(folder: Path, name: str, key: str) -> bool:
-    """Whether a figure is there with all its files, of the same inputs and code."""
+    """Return whether a figure is there with all its files, from the same inputs and code."""
     if not all((folder / f"{name}.{suffix}").exists() for suffix in _FILES):
         return False
     try:
@@ -74,19 +74,19 @@ def is_made(folder: Path, name: str, key: str) -> bool:
         return False
 
 
-def save(drawing: Drawing, folder: Path, name: str, told: Mapping[str, Any]) -> None:
+def save(drawing: Drawing, folder: Path, name: str, extra: Mapping[str, Any]) -> None:
     """Writes PDF, PNG, CSV and, last, JSON.
 
     Args:
-        drawing: What to write; its figure is closed.
-        folder: Where to.
-        name: Of the files, without suffix.
-        told: Further entries of the JSON; `provenance` is printed below the figure as well.
+        drawing: Figure and data; the figure is closed afterwards.
+        folder: Output folder.
+        name: File name without suffix.
+        extra: Further entries of the JSON; `provenance` is printed below the figure as well.
 
     Raises:
         PaperError: A file cannot be written.
     """
-    _print_provenance(drawing.figure, str(told["provenance"]))
+    _print_provenance(drawing.figure, str(extra["provenance"]))
     try:
         for suffix in ("pdf", "png"):
             fresh = folder / f".{name}.{suffix}.partial"
@@ -98,12 +98,12 @@ def save(drawing: Drawing, folder: Path, name: str, told: Mapping[str, Any]) -> 
         raise PaperError(f"{folder / name}: cannot be written ({error.strerror or error})") from error
     finally:
         plt.close(drawing.figure)
-    content = {"schema": SCHEMA, "caption": drawing.caption, "facts": drawing.facts, **told}
+    content = {"schema": SCHEMA, "caption": drawing.caption, "facts": drawing.facts, **extra}
     write_text(folder / f"{name}.json", json.dumps(rounded(content), indent=1, sort_keys=True) + "\n")
 
 
 def code_hash() -> str:
-    """SHA-256 of the code of this room: a figure that other code drew is drawn again."""
+    """Return the SHA-256 of this folder's code: a figure drawn by other code is drawn again."""
     digest = sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(file.name.encode() + file.read_bytes())

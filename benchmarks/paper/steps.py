@@ -1,4 +1,4 @@
-"""What has to be there before figures can be drawn: survey, scene, training; each made once."""
+"""Steps before the figures: survey, scene and training, each made once by the users' own commands."""
 
 import json
 import subprocess
@@ -22,15 +22,15 @@ _MARK = "subterra.figure-step/1"
 
 @dataclass(frozen=True)
 class Step:
-    """One command that leaves a folder.
+    """A command that makes a folder.
 
     Attributes:
-        name: For people.
-        words: After `python -m`.
-        out: The folder.
-        files: Below it, that must be there for the step to be done.
-        inputs: Files that decide what comes out: where one changes, the step is done again.
-        again: Words that are added where an earlier run of the same words did not end.
+        name: Name in messages.
+        words: Words of the command after `python -m`.
+        out: Output folder.
+        files: Files below it that a finished step has.
+        inputs: Input files; the step is run again when one changes.
+        again: Words added to resume an interrupted run of the same words.
     """
 
     name: str
@@ -42,30 +42,30 @@ class Step:
 
     @property
     def mark(self) -> Path:
-        """Says with which words the folder was made, and whether that came to its end."""
+        """Path of the file that keeps the words of the step and whether it finished."""
         return self.out.parent / f"{self.out.name}.step.json"
 
 
 def survey_step(out: Path, length: float, seed: int) -> Step:
-    """The simulated survey on the real metro's alignment, with the OS1 that is held out beside the Avia."""
+    """Return the step that simulates a survey on the real metro's alignment, with an OS1 held out beside the Avia."""
     words = f"scene.survey --truth metro --length {length:g} --seed {seed} --sensors avia os1 --scan-every 10 --out"
     return Step("survey", (*words.split(), str(out)), out, SURVEY_FILES)
 
 
 def scene_step(out: Path, survey: Path, name: str, provenance: str) -> Step:
-    """The scene, from the Avia alone."""
+    """Return the step that builds the scene from the Avia alone."""
     given = ("--trajectory", str(survey / "groundtruth.tum"), "--provenance", provenance, "--name", name)
     words = ("scene.build", str(survey / "survey.bag"), *given, "--out", str(out))
     return Step("scene", words, out, SCENE_FILES, inputs=(survey / "groundtruth.tum",))
 
 
 def training_step(out: Path, scene: Path) -> Step:
-    """Five seeds of T0 in the reconstructed bore."""
+    """Return the step that trains five seeds of T0 in the reconstructed bore."""
     seeds = tuple(str(seed) for seed in SEEDS)
     words = ("--task", TASK, "--tunnel", str(scene / "tunnel.npz"), "--seeds", *seeds, "--preset", "cpu")
     files = ("seeds.json", *(f"seed-{seed}/{file}" for seed in SEEDS for file in _RUN_FILES))
-    made_of = (scene / "tunnel.npz",)
-    return Step("training", ("train.navigate", *words, "--out", str(out)), out, files, made_of, again=("--resume",))
+    inputs = (scene / "tunnel.npz",)
+    return Step("training", ("train.navigate", *words, "--out", str(out)), out, files, inputs, again=("--resume",))
 
 
 def require(folder: Path, files: tuple[str, ...]) -> None:
@@ -75,23 +75,23 @@ def require(folder: Path, files: tuple[str, ...]) -> None:
             raise PaperError(f"{folder / file}: no such file")
 
 
-def done(step: Step) -> bool:
-    """Whether the step came to its end with the same words, and its files are still there."""
-    return _marked(step) == "done" and all((step.out / file).exists() for file in step.files)
+def is_done(step: Step) -> bool:
+    """Return whether the step finished with the same words and its files are still there."""
+    return _read_mark(step) == "done" and all((step.out / file).exists() for file in step.files)
 
 
 def make(step: Step) -> None:
-    """Runs a step that is not done; its own progress goes to this process's stderr.
+    """Runs a step unless it is done; its progress goes to stderr.
 
     Raises:
         PaperError: It failed.
         KeyboardInterrupt: It was interrupted.
     """
-    if done(step):
+    if is_done(step):
         print(f"{step.name}: {step.out} is there", flush=True)
         return
-    began = _marked(step) == "begun"
-    words = (*step.words, *(step.again if began and _can_resume(step) else _afresh(step)))
+    begun = _read_mark(step) == "begun"
+    words = (*step.words, *(step.again if begun and _can_resume(step) else _overwrite(step)))
     print(f"{step.name}: python -m {' '.join(words)}", flush=True)
     step.out.parent.mkdir(parents=True, exist_ok=True)
     _write_mark(step, "begun")
@@ -107,8 +107,8 @@ def make(step: Step) -> None:
     print(f"{step.name}: {time.monotonic() - started:.0f} s", flush=True)
 
 
-def _afresh(step: Step) -> tuple[str, ...]:
-    """Training refuses to write over another run unless told."""
+def _overwrite(step: Step) -> tuple[str, ...]:
+    """Returns the option without which training refuses to replace another run."""
     return ("--overwrite",) if step.again else ()
 
 
@@ -116,8 +116,8 @@ def _can_resume(step: Step) -> bool:
     return all((step.out / f"seed-{seed}" / "checkpoint").exists() for seed in SEEDS)
 
 
-def _marked(step: Step) -> str | None:
-    """`begun` or `done` where the mark is of the same words and inputs."""
+def _read_mark(step: Step) -> str | None:
+    """Returns `begun` or `done` if the mark has the same words and inputs, else `None`."""
     try:
         mark = json.loads(step.mark.read_text())
         same = mark["words"] == list(step.words) and mark["inputs"] == _hashes(step)

@@ -1,4 +1,4 @@
-"""Ranges of both LiDARs against rays that embree casts in the built mesh.
+"""Compares ranges of both LiDARs with rays that embree casts in the built mesh.
 
 `python -m benchmarks.rays --scene build/subterra-351 --n 200000 --out out/rays.json`
 """
@@ -9,37 +9,50 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
 import tyro
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.command import status
-from benchmarks.rays.agreement import Agreement
+from benchmarks.rays.casting import (
+    DEFAULT_SCENE,
+    MEDIAN_GOAL,
+    TAIL_GOAL,
+    Agreement,
+    compare_planar,
+    compare_tilted,
+    meshed_linings,
+    require_scene,
+)
 from benchmarks.rays.errors import RaysError
-from benchmarks.rays.figure import histograms
-from benchmarks.rays.planar import compare_planar
-from benchmarks.rays.scenefiles import DEFAULT_SCENE, meshed_linings, require_scene
-from benchmarks.rays.tilted import compare_tilted
-from benchmarks.throughput.facts import environment_facts
+from benchmarks.results import environment_facts, write_file
 from scene.arguments import parse
 from subterra_jax.outputs import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 
 SCHEMA = "subterra.rays/1"
+_INK, _GOAL, _EDGE = "#1b4965", "#c1121f", "#e09f3e"
+_BINS = np.logspace(-7, 1.5, 86)
 _progress = Console(stderr=True, highlight=False)
 
 
 @dataclasses.dataclass(frozen=True)
 class RaysConfig:
-    """What to compare. Exit status 1: a goal is missed; 2: the comparison cannot be made.
+    """Settings of a comparison. Exit status 1: a goal is missed; 2: the comparison cannot be made.
 
     Attributes:
         scene: Folder of a built scene.
-        n: Rays of each comparison.
+        n: Rays in each comparison.
         linings: Variants of the walls; all that have a mesh if not given.
-        kinds: Which LiDARs.
-        seed: Of poses and beams.
-        out: JSON file to write; a figure with the histograms goes beside it.
+        kinds: LiDARs to compare.
+        seed: Seed for poses and beams.
+        out: JSON file to write; the figure with histograms is written beside it.
     """
 
     scene: Path = DEFAULT_SCENE
@@ -51,10 +64,10 @@ class RaysConfig:
 
 
 def run(config: RaysConfig) -> tuple[list[Agreement], dict[str, float]]:
-    """All comparisons, and rays per second of the 3-D LiDAR by lining.
+    """Makes all comparisons; returns them, and rays per second of the 3-D LiDAR by lining.
 
     Raises:
-        SubterraError: The folder is no scene, or lacks what was asked for; or the output cannot be written.
+        SubterraError: A setting is wrong, the folder lacks a scene or a lining, or the output cannot be written.
     """
     for name, least in (("n", 1), ("seed", 0)):
         if getattr(config, name) < least:
@@ -66,29 +79,29 @@ def run(config: RaysConfig) -> tuple[list[Agreement], dict[str, float]]:
             raise RaysError(f"there is no kind {kind!r}; there are planar and 3d")
     folder = require_scene(config.scene)
     plan = load_tunnel(folder / "tunnel.npz")
-    there = meshed_linings(folder, plan)
+    meshed = meshed_linings(folder, plan)
     for lining in config.linings:
-        if lining not in there:
-            raise RaysError(f"{folder}: has no mesh of lining {lining!r}; it has {', '.join(there)}")
-    found: list[Agreement] = []
+        if lining not in meshed:
+            raise RaysError(f"{folder}: has no mesh of lining {lining!r}; it has {', '.join(meshed)}")
+    comparisons: list[Agreement] = []
     rates: dict[str, float] = {}
-    for lining in config.linings or there:
+    for lining in config.linings or meshed:
         if "planar" in config.kinds:
             _progress.print(f"planar: {lining}")
-            found += compare_planar(folder, plan, lining, config.n, config.seed)
+            comparisons += compare_planar(folder, plan, lining, config.n, config.seed)
         if "3d" in config.kinds:
             _progress.print(f"3-D: {lining}")
             agreement, rates[lining] = compare_tilted(folder, plan, lining, config.n, config.seed)
-            found.append(agreement)
-    return found, rates
+            comparisons.append(agreement)
+    return comparisons, rates
 
 
-def table(found: list[Agreement]) -> Table:
-    """Differences in mm."""
+def table(comparisons: list[Agreement]) -> Table:
+    """Return the table of differences, mm."""
     shown = Table(title="differences from embree, mm")
     for name in ("comparison", "rays", "median", "99 %", "99.9 %", "max", "< 1 cm", "edges", "< 1 cm without", "goal"):
         shown.add_column(name, justify="left" if name == "comparison" else "right")
-    for one in found:
+    for one in comparisons:
         figures = one.figures()
         whole, plain = figures["all"], figures["without_edges"]
         shown.add_row(
@@ -99,44 +112,69 @@ def table(found: list[Agreement]) -> Table:
     return shown
 
 
-def write(path: Path, config: RaysConfig, found: list[Agreement], rates: dict[str, float]) -> None:
-    """The report as JSON, and its figure beside it.
+def histograms(comparisons: list[Agreement]) -> Figure:
+    """Draws one histogram of differences for each comparison; rays that pass an edge have their own colour."""
+    columns = min(2, len(comparisons))
+    rows = -(-len(comparisons) // columns)
+    size = (6.0 * columns, 2.6 * rows + 0.4)
+    figure, panels = plt.subplots(rows, columns, figsize=size, sharex=True, squeeze=False, layout="constrained")
+    for axes, one in zip(panels.flat, comparisons, strict=False):
+        kinds = (("passing no edge", ~one.edge, _INK), ("passing an edge", one.edge, _EDGE))
+        axes.hist(
+            [np.maximum(one.error[which], _BINS[0]) for _, which, _ in kinds], _BINS, stacked=True,
+            color=[colour for *_, colour in kinds], label=[label for label, *_ in kinds],
+        )  # fmt: skip
+        for goal in (MEDIAN_GOAL, TAIL_GOAL) if one.judged else ():
+            axes.axvline(goal, color=_GOAL, lw=1.0, ls="--")
+        axes.set(xscale="log", yscale="log", ylim=(0.5, None))
+        axes.set_title(f"{one.title}: median {1e3 * np.median(one.error):.3g} mm", fontsize=9)
+        axes.grid(alpha=0.3)
+    for axes in panels.flat[len(comparisons) :]:
+        axes.set_visible(False)
+    for axes in panels[-1]:
+        axes.set_xlabel("difference from embree, m (dashed: goals for median and 99.9 %)")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("rays")
+    panels[0, 0].legend(fontsize=8, loc="upper left")
+    return figure
+
+
+def write(path: Path, config: RaysConfig, comparisons: list[Agreement], rates: dict[str, float]) -> None:
+    """Writes the report as JSON and its figure beside it.
 
     Raises:
-        RaysError: The place cannot be written to.
+        RaysError: A file cannot be written.
     """
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "config": dataclasses.asdict(config),
         "environment": environment_facts(),
-        "comparisons": [one.figures() for one in found],
+        "comparisons": [one.figures() for one in comparisons],
         "rays_per_second_3d": rates,
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.partial")
-        partial.write_text(json.dumps(content, indent=1, default=str) + "\n")
-        partial.replace(path)
-        histograms(found).savefig(path.with_suffix(".png"), dpi=130)
+        write_file(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
+        histograms(comparisons).savefig(path.with_suffix(".png"), dpi=130)
     except OSError as error:
         raise RaysError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def main(config: RaysConfig) -> int:
-    """Runs the command; the exit status."""
-    found, rates = run(config)
+    """Compares, prints and writes; returns 1 where a goal is missed."""
+    comparisons, rates = run(config)
     console = Console(width=150)
-    console.print(table(found))
+    console.print(table(comparisons))
     for lining, rate in rates.items():
         console.print(f"3-D, {lining}: {rate / 1e6:.3g} M rays/s")
     if config.out is not None:
-        write(config.out, config, found, rates)
+        write(config.out, config, comparisons, rates)
         console.print(str(config.out))
-    return 0 if all(one.holds for one in found) else 1
+    return 0 if all(one.holds for one in comparisons) else 1
 
 
 def command(arguments: list[str] | None = None) -> int:
-    """The command line; a user's mistake is one sentence and status 2."""
+    """Runs the command line; returns 2 for a user's mistake."""
     config = parse(
         lambda words: tyro.cli(RaysConfig, args=words, prog="python -m benchmarks.rays", description=__doc__), arguments
     )

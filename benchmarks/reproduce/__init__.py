@@ -1,1 +1,4 @@
-"""Every number of the README that a CPU can measure, measured again and held against what the README says."""
+"""Every number of the README's table of results: measured again on a CPU, or listed with the command that measures it.
+
+claims (the numbers, their jobs and commands) ─► __main__ (runs jobs, compares, lists)
+"""

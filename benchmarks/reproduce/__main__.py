@@ -1,11 +1,12 @@
-"""Measures the README's numbers again and says which differ; goes on where it stopped.
+"""Measures the README's numbers again, says which differ, and lists those that need a GPU or hours.
 
 Example: python -m benchmarks.reproduce --jobs speed learning metro --out out/reproduce
 """
 
 import json
-import re
+import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,24 +16,25 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.command import status
-from benchmarks.reproduce.claims import CLAIMS, ON_A_GPU, Claim, read_result
+from benchmarks.reproduce.claims import CLAIMS, HEADING, JOBS, Claim, Job, read_result, read_tables
 from benchmarks.reproduce.errors import ReproduceError
-from benchmarks.reproduce.jobs import JOBS, run
-from benchmarks.throughput.facts import environment_facts
+from benchmarks.results import constants_facts, environment_facts
 from scene.arguments import parse
 from subterra_jax.outputs import require_folder
 
-README = Path(__file__).parents[2] / "README.md"
-_QUICK = tuple(name for name, job in JOBS.items() if job.about <= 15.0)
+ROOT = Path(__file__).parents[2]
+README, MEASUREMENTS = ROOT / "README.md", ROOT / "docs" / "measurements.md"
+_QUICK = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)
+_MISSING = "not in the documents"
 
 
 @dataclass(frozen=True)
 class ReproduceConfig:
-    """What is measured again.
+    """Settings of a reproduction.
 
     Attributes:
-        jobs: Which measurements; `leaderboard` takes hours and is left out unless named.
-        out: Folder for results; what is in it already is not measured again.
+        jobs: Measurements to make; `leaderboard` takes hours and runs only if named.
+        out: Folder for results; finished jobs in it are not run again.
         shared: Folder that holds `data/metro_asbuilt`, which is not packaged.
     """
 
@@ -41,19 +43,53 @@ class ReproduceConfig:
     shared: Path = Path("../shared")
 
 
+def result_rows() -> list[dict[str, str]]:
+    """Return the rows of the README's tables, those of its results first, then of `docs/measurements.md`."""
+    readme = README.read_text()
+    return [*read_tables(readme, HEADING), *read_tables(readme), *read_tables(MEASUREMENTS.read_text())]
+
+
 def verdict(claim: Claim, stated: float | None, measured: float | None) -> str:
-    """`same`, `differs`, or why neither can be said."""
+    """Return `same`, `differs`, or why neither can be said."""
     if stated is None:
-        return "not in the README"
+        return _MISSING
     if measured is None:
         return "not measured: its input is not here"
-    if claim.speed:
-        return f"{measured / stated:.2f} times as much on this machine"
-    return "same" if abs(measured - stated) <= claim.tolerance + 1e-9 else "differs"
+    return "same" if claim.holds(stated, measured) else "differs"
 
 
-def reproduce(config: ReproduceConfig, readme: str, console: Console) -> list[dict[str, Any]]:
-    """One row a number.
+def run_job(job: Job, folder: Path, shared: Path) -> Path | None:
+    """Runs a job unless its result is there.
+
+    Args:
+        job: Job to run.
+        folder: Its folder.
+        shared: Folder of the surveys that are not packaged.
+
+    Returns:
+        Its result; `None` where its input is missing.
+
+    Raises:
+        ReproduceError: A command failed.
+    """
+    result = folder / job.result
+    if result.exists():
+        return result
+    if job.needs and not Path(job.needs.format(shared=shared)).exists():
+        return None
+    folder.mkdir(parents=True, exist_ok=True)
+    for command in job.commands:
+        words = [word.format(out=folder, shared=shared) for word in command.split()]
+        print(f"$ python -m {' '.join(words)}", flush=True)
+        with (folder / "log.txt").open("a") as log:
+            code = subprocess.run([sys.executable, "-m", *words], stdout=log, stderr=log, check=False).returncode
+        if code and not result.exists():  # a missed goal also ends with a status
+            raise ReproduceError(f"{folder / 'log.txt'}: python -m {words[0]} ended with status {code}")
+    return result
+
+
+def reproduce(config: ReproduceConfig, documents: Sequence[dict[str, str]], console: Console) -> list[dict[str, Any]]:
+    """Runs the jobs; returns one row for each number.
 
     Raises:
         ReproduceError: There is no such job, or one failed.
@@ -63,48 +99,52 @@ def reproduce(config: ReproduceConfig, readme: str, console: Console) -> list[di
             raise ReproduceError(f"no job {name!r}; there are {', '.join(JOBS)}")
     rows = []
     for name in config.jobs:
-        console.print(f"{name}: about {JOBS[name].about:g} min on two idle cores")
-        path = run(JOBS[name], config.out / name, config.shared)
+        console.print(f"{name}: about {JOBS[name].minutes:g} min on two idle cores")
+        path = run_job(JOBS[name], config.out / name, config.shared)
         content = None if path is None else read_result(path)
         for claim in CLAIMS:
-            if claim.job == name:
-                stated, measured = claim.stated(readme), None if content is None else claim.read(content)
-                told = verdict(claim, stated, measured)
-                rows.append({"number": claim.name, "readme": stated, "measured": measured, "verdict": told})
+            if claim.job == name and claim.read is not None:
+                stated, measured = claim.stated(documents), None if content is None else claim.read(content)
+                text = f"{claim.row}: {claim.text or claim.column}"
+                result = verdict(claim, stated, measured)
+                rows.append({"number": text, "stated": stated, "measured": measured, "verdict": result})
     return rows
 
 
-def show(rows: list[dict[str, Any]], readme: str, console: Console) -> None:
-    """The table, and what a GPU is needed for."""
-    table = Table("number", "README", "measured", "verdict")
+def show(rows: list[dict[str, Any]], documents: Sequence[dict[str, str]], console: Console) -> None:
+    """Prints the measured numbers, then those that are only listed."""
+    table = Table("number", "stated", "measured", "verdict")
     for row in rows:
-        cells = ["" if value is None else f"{value:.6g}" for value in (row["readme"], row["measured"])]
+        cells = ["" if value is None else f"{value:.6g}" for value in (row["stated"], row["measured"])]
         table.add_row(row["number"], *cells, row["verdict"])
     console.print(table)
-    console.print("These need a GPU:")
-    text = " ".join(readme.split())
-    for pattern, command in ON_A_GPU:
-        if found := re.search(pattern, text):
-            console.print(f"  {found[0]}: {command}", soft_wrap=True)
+    console.print("Not measured here, since they need a GPU or hours:")
+    for claim in CLAIMS:
+        if claim.command and claim.stated(documents) is not None:
+            bound = "±" if claim.bound == "near" else f"{claim.bound}, tolerance"
+            console.print(
+                f"  {claim.row}: {claim.text}, {bound} {claim.tolerance:g} ({claim.measured})", soft_wrap=True
+            )
+            console.print(f"    python -m {claim.command}", soft_wrap=True)
 
 
-def act(config: ReproduceConfig) -> int:
-    """Measures and tells: 0 where every number is the same, 1 where one differs."""
-    console, readme = Console(highlight=False), README.read_text()
+def run(config: ReproduceConfig) -> int:
+    """Measures, prints and writes; returns 0 where every number is the same, 1 where one differs."""
+    console, documents = Console(highlight=False), result_rows()
     require_folder(config.out)
-    rows = reproduce(config, readme, console)
-    content = {"config": asdict(config), "environment": environment_facts(), "rows": rows}
+    rows = reproduce(config, documents, console)
+    content = {"config": asdict(config), "environment": environment_facts(), **constants_facts(), "rows": rows}
     config.out.mkdir(parents=True, exist_ok=True)
     (config.out / "reproduce.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
-    show(rows, readme, console)
-    return int(any(row["verdict"] in ("differs", "not in the README") for row in rows))
+    show(rows, documents, console)
+    return int(any(row["verdict"] in ("differs", _MISSING) for row in rows))
 
 
 def main(args: list[str] | None = None) -> int:
-    """Entry point: 0 where every number is the same, 1 where one differs, 2 for a user's mistake."""
+    """Runs the command line; returns 0 where every number is the same, 1 where one differs, 2 for a mistake."""
     prog = "python -m benchmarks.reproduce"
     config = parse(lambda words: tyro.cli(ReproduceConfig, args=words, prog=prog, description=__doc__), args)
-    return status(lambda: act(config))
+    return status(lambda: run(config))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,39 @@
-"""The README's numbers: where each stands, and where it is read again."""
+# ruff: noqa: RUF001 (the texts repeat the documents' characters)
+"""The README's results as a table: where each number stands, how it is measured and how far it may be off.
+
+A claim names a row by part of its first cell and a number by the words around it. The table is that of the README
+below the heading `HEADING`; a row that is not there is looked up in the tables of `docs/measurements.md`.
+"""
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-Read = Callable[[Any], float]
-_WORDS = {"three": "3", "four": "4", "five": "5"}
+HEADING = "How good"
+_NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?|\b(?:three|four|five)\b")
+_WORDS = {"three": 3.0, "four": 4.0, "five": 5.0}
+
+
+@dataclass(frozen=True)
+class Job:
+    """Commands that measure numbers and leave one file.
+
+    Attributes:
+        name: Name on the command line.
+        commands: Words after `python -m`; `{out}` is the job's folder, `{shared}` that of surveys not packaged.
+        result: File below the job's folder that holds the numbers once the job is done.
+        minutes: Duration on two idle cores, minutes.
+        needs: Path that must exist, or empty.
+    """
+
+    name: str
+    commands: tuple[str, ...]
+    result: str
+    minutes: float
+    needs: str = ""
 
 
 @dataclass(frozen=True)
@@ -16,70 +41,81 @@ class Claim:
     """One number.
 
     Attributes:
-        name: What it is.
-        pattern: Where it stands in the README, line breaks as spaces; its one group is the number.
-        job: Whose result has it.
-        read: From the result to the number, in the README's unit.
-        tolerance: How far it may be off, in that unit: the last digit that is printed, or what libraries may move.
-        speed: Whether it depends on the machine, so that another value is no difference.
+        row: Part of the row's first cell.
+        text: Words of a later cell; their first number is the claim's.
+        tolerance: Largest difference that counts as the same, in the number's unit.
+        bound: `near`: both ways; `at most`, `at least`: a smaller or larger measurement is no difference.
+        job: Job that measures it; empty for a number that is only listed.
+        read: Reads the number from the job's result, in the README's unit.
+        command: Command that measures a listed number, after `python -m`.
+        measured: Machine and date of a listed number.
+        column: Heading of the cell, in tables with a column for each task.
     """
 
-    name: str
-    pattern: str
-    job: str
-    read: Read
+    row: str
+    text: str
     tolerance: float
-    speed: bool = False
+    bound: Literal["near", "at most", "at least"] = "near"
+    job: str = ""
+    read: Callable[[Any], float] | None = None
+    command: str = ""
+    measured: str = ""
+    column: str = ""
 
-    def stated(self, readme: str) -> float | None:
-        """The number that the README has; `None` where it does not stand there any more."""
-        found = re.search(self.pattern, " ".join(readme.split()))
-        return None if found is None else float(_WORDS.get(found[1], found[1].replace(",", "")))
+    def stated(self, rows: Sequence[dict[str, str]]) -> float | None:
+        """Return the number as the documents have it; `None` where it is not there."""
+        for row in rows:
+            key, *_ = row.values()
+            cells = [row.get(self.column, "")] if self.column else list(row.values())[1:]
+            if self.row in key and (cell := next((cell for cell in cells if self.text in cell), None)) is not None:
+                number = _NUMBER.search(self.text or cell)
+                return None if number is None else _value(number[0])
+        return None
 
-
-def _surveyed(poses: str, name: str, scale: float) -> Read:
-    def read(content: Any) -> float:
-        return scale * next(row[name] for row in content["rows"] if row["poses"] == poses)
-
-    return read
-
-
-def _planar(name: str, scale: float) -> Read:
-    """Of the default lining, the mesh levelled along the track: the plane that the planar simulator is about."""
-
-    def read(content: Any) -> float:
-        title = "planar, pockets, levelled mesh"
-        return scale * next(one["all"][name] for one in content["comparisons"] if one["title"] == title)
-
-    return read
-
-
-def _rate(n_envs: int, scale: float) -> Read:
-    return lambda content: scale * next(row["median"] for row in content["speed"] if row["n_envs"] == n_envs)
+    def holds(self, stated: float, measured: float) -> bool:
+        """Return whether a measurement agrees with the documents."""
+        difference = measured - stated
+        too_large = difference > self.tolerance + 1e-9 and self.bound != "at least"
+        too_small = -difference > self.tolerance + 1e-9 and self.bound != "at most"
+        return not (too_large or too_small)
 
 
-def _success(agent: str, task: str) -> Claim:
-    column = ("T0", "T1", "hidden", "T2", "T3", "T4", "T5").index(task)
-    cells = r"[^|]*\|" * column
+def read_tables(markdown: str, heading: str = "") -> list[dict[str, str]]:
+    """Return the rows of Markdown tables, each a cell by column heading, without emphasis.
 
-    def read(content: Any) -> float:
-        return _board(content, agent, task)
+    Args:
+        markdown: Text of a page.
+        heading: Part of the heading below which the tables stand; all tables if empty.
+    """
+    rows: list[dict[str, str]] = []
+    columns: list[str] = []
+    inside = not heading
+    for line in markdown.splitlines():
+        if heading and line.startswith("#"):
+            inside = heading in line
+        if not line.startswith("|"):
+            columns = []
+        elif inside:
+            cells = [cell.strip().replace("**", "") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+            if not columns:
+                columns = cells
+            elif not set(line) <= set("|-: "):
+                rows.append(dict(zip(columns, cells, strict=False)))
+    return rows
 
-    return Claim(f"{agent}, {task}, success %", rf"\| {agent} \|[^|]*\|{cells} ([\d.]+) \|", "leaderboard", read, 0.5)
 
-
-_TASKS = {"T0": "Traverse", "T1": "StopAt", "T2": "Return", "T3": "Obstructed", "T4": "Faulted", "T5": "Relocalise"}
-
-
-def _board(content: Any, agent: str, task: str) -> float:
-    for row in content["scores"]:
-        if row["agent"].replace("-", " ") == agent and row["task"] == f"Subterra/{_TASKS[task]}-v0":
-            return 100.0 * row["success"]
-    raise KeyError(f"{agent}, {task}")
+def unclaimed(row: dict[str, str]) -> str:
+    """Return the rest of a row's cells after the first without its claims, settings and code; no digit may be left."""
+    key, *cells = row.values()
+    rest = " | ".join(cells)
+    texts = [claim.text for claim in CLAIMS if claim.row in key] + [text for part, text in SETTINGS if part in key]
+    for text in sorted(texts, key=len, reverse=True):
+        rest = rest.replace(text, "")
+    return re.sub(r"`[^`]*`", "", rest)
 
 
 def read_result(path: Path) -> Any:
-    """What a job left; of several seeds, how many reached success in every one of their last 100 episodes."""
+    """Reads a job's result; of several seeds, counts those whose last 100 episodes all succeed and cover 90 %."""
     if path.parent.name.startswith("seed-"):
         logs = [
             json.loads(log.read_text().splitlines()[-1]) for log in sorted(path.parents[1].glob("seed-*/log.jsonl"))
@@ -88,48 +124,152 @@ def read_result(path: Path) -> Any:
     return json.loads(path.read_text())
 
 
-_351 = r"351 m simulated survey of a fresh seed, poses given \| "
-_CONTROL = r"the same from odometry, IMU and prism control \| "
+def _value(number: str) -> float:
+    return _WORDS[number] if number in _WORDS else float(number.replace(",", ""))
+
+
+def _survey(poses: str, name: str, scale: float = 1.0) -> Callable[[Any], float]:
+    """Reads a figure of `benchmarks.reconstruction`."""
+    return lambda content: scale * abs(next(row[name] for row in content["rows"] if row["poses"] == poses))
+
+
+def _rays(title: str, name: str, scale: float) -> Callable[[Any], float]:
+    """Reads a figure of `benchmarks.rays`."""
+    return lambda content: scale * next(one["all"][name] for one in content["comparisons"] if one["title"] == title)
+
+
+def _success(agent: str, task: str) -> Callable[[Any], float]:
+    """Reads a success of `benchmarks.leaderboard`, %."""
+    return lambda content: (
+        100.0
+        * next(
+            row["success"] for row in content["scores"] if (row["agent"], row["task"]) == (agent, f"Subterra/{task}-v0")
+        )
+    )
+
+
+_SURVEY_351 = (
+    "scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out {out}/survey",
+    "scene.build {out}/survey/survey.bag --trajectory {out}/survey/groundtruth.tum --provenance simulated "
+    "--name subterra-351 --out {out}/scene",
+)
+_FIDELITY = (
+    "benchmarks.fidelity run --scene {out}/scene --recording {out}/survey/survey_os1.bag "
+    "--trajectory {out}/survey/groundtruth_os1.tum --truth {out}/survey --out {out}/report"
+)
+_LEARN = "train.navigate --task Subterra/TraverseShort-v0 --preset cpu --seeds 0 1 2 3 4 --overwrite --out {out}"
+_METRO = "{shared}/data/metro_asbuilt"
+JOBS = {
+    job.name: job
+    for job in (
+        Job("speed", ("benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out {out}",),
+            "throughput.json", 2.0),
+        Job("learning", (_LEARN,), "seed-4/evaluation.json", 3.0),
+        Job("metro", (f"scene.build {_METRO} --out {{out}}/scene",), "scene/manifest.json", 2.0, _METRO),
+        Job("rays", (*_SURVEY_351, "benchmarks.rays --scene {out}/scene --out {out}/rays.json"), "rays.json", 8.0),
+        Job("reconstruction", ("benchmarks.reconstruction --seeds 203 --length 351 --truth metro --out {out}",),
+            "figures-metro-351.json", 12.0),
+        Job("fidelity", (*_SURVEY_351, _FIDELITY), "report/report.json", 15.0),
+        Job("leaderboard", ("benchmarks.leaderboard --tunnels subterra-351 --out {out}",), "leaderboard.json", 180.0),
+    )
+}  # fmt: skip
+
+_CPU, _H200 = "2 CPU cores, 2026-11-21", "one H200, 2026-11-21"
+_CONTROLS = "benchmarks.fidelity controls --bold-only"
+_PEERS = "benchmarks.throughput --n 65536 --peers jaxnav --seconds 8 --poses 62500 --out out/peers"
+_LENGTHS = "benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths"
+_MANY = "benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"
+_STEP_ON_CPU = "benchmarks.throughput --n 1024 --peers none"
+_FIVE = "train.navigate --task Subterra/Traverse-v0 --preset gpu --seeds 0 1 2 3 4 --out out/five"
+_FAMILY = (
+    "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --tunnel procedural:train:0-255 "
+    "--steps 150000000 --out out/family"
+)
+_SHORT = (
+    "train.navigate --task Subterra/StopAtShort-v0 --memory gru --teacher oracle --preset cpu "
+    "--evaluation-episodes 500 --out out/short"
+)
+_WALK, _B2 = "train.walk --preset gpu --out out/walk", "benchmarks.b2 --robots 8192"
+_TRAVERSE = "benchmarks.b2_traverse --robots 100 --agent B2Traverse-v0"
+_FOUR = "train.navigate --task Subterra/Traverse-v0 --preset gpu --parts 4 --out out/four"
+_GYM = (
+    'timeit -n 2000 -r 5 -s \'import gymnasium; env = gymnasium.make("subterra_jax:Subterra/Traverse-v0"); '
+    "env.reset(); action = env.action_space.low; env.step(action)' 'env.step(action)'"
+)
+
+_GIVEN, _CONTROL = "fresh seed, poses given", "odometry, IMU and prism control"
+_PLANAR, _TILTED = "planar, pockets, levelled mesh", "3-D, pockets"
+_SUITE, _STEP = "fidelity suite", "whole environment step"
+_LEGS, _THROUGH = "Unitree B2 on sleepers", "100 of them through"
 CLAIMS = (
-    Claim("LiDAR against float64, largest error, mm", r"brute force, pockets on \| largest error ([\d.]+) mm", "speed",
-          lambda c: 1e3 * c["exactness"]["max_error"], 0.5),
-    Claim("whole step on a CPU with numba, M steps/s", r"with numba \| ([\d.]+)\D", "speed",
-          _rate(1024, 1e-6), 0.0, True),
-    Claim("seeds that learn 60 m on a CPU", r"PPO on 60 m, 2 CPU cores \|[^|]*, (\w+) of five seeds", "learning",
-          lambda c: c["learnt"], 0.0),
-    Claim("real metro, m", r"real metro, 217 rings \| ([\d,.]+) m", "metro", lambda c: c["bore"]["length"], 0.05),
-    Claim("planar LiDAR against embree, median, mm", r"in the built mesh \| median ([\d.]+) mm", "rays",
-          _planar("p50", 1e3), 0.01),
-    Claim("the same, within 1 cm, %", r"median [\d.]+ mm, ([\d.]+) % within 1 cm", "rays",
-          _planar("within_1cm", 100.0), 0.01),
-    Claim("351 m, centreline, cm", _351 + r"centreline ([\d.]+) cm", "reconstruction",
-          _surveyed("given", "lateral_rmse", 100.0), 0.1),
-    Claim("351 m, width, cm", _351 + r".*?width ([\d.]+) cm", "reconstruction",
-          _surveyed("given", "width_rmse", 100.0), 0.1),
-    Claim("351 m, height, cm", _351 + r".*?height ([\d.]+) cm", "reconstruction",
-          _surveyed("given", "height_rmse", 100.0), 0.1),
-    Claim("351 m, held-out points, cm", _351 + r".*?held-out points ([\d.]+) cm", "reconstruction",
-          _surveyed("given", "hold_mean", 100.0), 0.1),
-    Claim("351 m, within 10 cm, %", _351 + r".*?([\d.]+) % within 10 cm", "reconstruction",
-          _surveyed("given", "hold_within_10cm", 100.0), 0.02),
-    Claim("351 m with control, centreline, cm", _CONTROL + r"centreline ([\d.]+) cm", "reconstruction",
-          _surveyed("control", "lateral_rmse", 100.0), 0.1),
-    Claim("351 m with control, held-out points, cm", _CONTROL + r".*?held-out points ([\d.]+) cm", "reconstruction",
-          _surveyed("control", "hold_mean", 100.0), 0.1),
-    Claim("fidelity of subterra-351, %", r"OS1 held out \| PASS, ([\d.]+) %", "fidelity", lambda c: c["global"], 0.1),
-    Claim("its null tube, %", r"constant tube on the right axis ([\d.]+) %", "fidelity",
-          lambda c: c["global_null"], 0.2),
-    *(_success(agent, task) for agent in ("dead reckoning", "particle filter") for task in ("T0", "T1", "T4")),
+    # row, text, tolerance, bound, and where the number comes from
+    Claim(_GIVEN, "centreline 0.3 cm", 0.1, job="reconstruction", read=_survey("given", "lateral_rmse", 100.0)),
+    Claim(_GIVEN, "width 0.6 cm", 0.1, job="reconstruction", read=_survey("given", "width_rmse", 100.0)),
+    Claim(_GIVEN, "height 0.2 cm", 0.1, job="reconstruction", read=_survey("given", "height_rmse", 100.0)),
+    Claim(_GIVEN, "1.1 cm", 0.1, job="reconstruction", read=_survey("given", "hold_mean", 100.0)),
+    Claim(_GIVEN, "99.99 %", 0.02, job="reconstruction", read=_survey("given", "hold_within_10cm", 100.0)),
+    Claim(_GIVEN, "2 min", 3.0, "at most", job="reconstruction", read=_survey("given", "seconds", 1 / 60)),
+    Claim(_CONTROL, "centreline 1.8 cm", 0.1, job="reconstruction", read=_survey("control", "lateral_rmse", 100.0)),
+    Claim(_CONTROL, "0.02 %", 0.01, "at most", job="reconstruction", read=_survey("control", "length_error")),
+    Claim(_CONTROL, "1.4 cm", 0.1, job="reconstruction", read=_survey("control", "hold_mean", 100.0)),
+    Claim(_CONTROL, "6.5 min", 8.5, "at most", job="reconstruction", read=_survey("control", "seconds", 1 / 60)),
+    Claim(_SUITE, "99.3 %", 0.1, job="fidelity", read=lambda c: c["global"]),
+    Claim(_SUITE, "71.3 %", 0.2, job="fidelity", read=lambda c: c["global_null"]),
+    Claim(_SUITE, "18 categories", 0.0, job="fidelity", read=lambda c: len(c["categories"])),
+    Claim(_SUITE, "10 min", 10.0, "at most", command="benchmarks.fidelity run --out out/fidelity", measured=_CPU),
+    Claim(_SUITE, "5.4 GiB", 0.6, "at most", command="benchmarks.fidelity run --out out/fidelity", measured=_CPU),
+    Claim("its controls", "39 of 39", 0.0, command=_CONTROLS, measured=_CPU),
+    Claim("its controls", "7 of 7", 0.0, command=_CONTROLS, measured=_CPU),
+    Claim("real metro", "1,283.7 m", 0.05, job="metro", read=lambda c: c["bore"]["length"]),
+    Claim("real metro", "0.3 mm", 0.1, "at most", command="scene.build ../shared/data/metro_asbuilt", measured=_CPU),
+    Claim("float64 brute force", "0.8 mm", 0.2, "at most", job="speed",
+          read=lambda c: 1e3 * c["exactness"]["max_error"]),
+    Claim(_STEP, "215 M", 15.0, "at least", command=_PEERS, measured=_H200),
+    Claim(_STEP, "21 × JaxNav", 3.0, "at least", command=_PEERS, measured=_H200),
+    Claim(_STEP, "3 % slower", 1.0, "at most", command=_LENGTHS, measured=_H200),
+    Claim("100 different tunnels", "202 M", 15.0, "at least", command=_MANY, measured=_H200),
+    Claim("planar LiDAR against embree", "0.09 mm", 0.01, job="rays", read=_rays(_PLANAR, "p50", 1e3)),
+    Claim("planar LiDAR against embree", "99.95 %", 0.01, job="rays", read=_rays(_PLANAR, "within_1cm", 100.0)),
+    Claim("planar LiDAR against embree", "2 µm", 1.0, "at most", job="rays", read=_rays(_TILTED, "p50", 1e6)),
+    Claim("with numba", "1.05–1.11 M", 0.7, "at least", job="speed", read=lambda c: next(
+        1e-6 * row["median"] for row in c["speed"] if row["n_envs"] == 1024)),
+    Claim("with numba", "0.41 M", 0.25, "at least", command=f"{_STEP_ON_CPU} (numba not installed)", measured=_CPU),
+    Claim("one Gymnasium environment", "26,000 steps/s", 13_000.0, "at least", command=_GYM, measured=_CPU),
+    Claim("one Gymnasium environment", "10,300–16,800", 5_000.0, "at least", command=_GYM, measured=_CPU),
+    Claim("five seeds of PPO on 351 m", "10.8 s", 1.0, "at most", command=_FIVE, measured=_H200),
+    Claim("five seeds of PPO on 351 m", "5.3 s", 1.0, "at most", command=_FIVE, measured=_H200),
+    Claim("family of tunnels", "98.2 % on its test split", 1.0, command=_FAMILY, measured=_H200),
+    Claim("family of tunnels", "100 % in `subterra-351`", 0.5, command=_FAMILY, measured=_H200),
+    Claim("family of tunnels", "100 % in `metro-asbuilt`", 0.5, command=_FAMILY, measured=_H200),
+    Claim("family of tunnels", "122 s", 30.0, "at most", command=_FAMILY, measured=_H200),
+    Claim("learnt from a teacher on a CPU", "99.4 %", 1.0, command=_SHORT, measured=_CPU),
+    Claim("learnt from a teacher on a CPU", "6 CPU-minutes", 2.0, "at most", command=_SHORT, measured=_CPU),
+    Claim("learnt from a teacher on a CPU", "33 min", 33.0, "at most", command=_SHORT, measured=_CPU),
+    Claim(_LEGS, "falls 0.4 %", 0.6, "at most", command=_WALK, measured=_H200),
+    Claim(_LEGS, "0.04 m/s", 0.01, "at most", command=_WALK, measured=_H200),
+    Claim(_LEGS, "0.02 rad/s", 0.01, "at most", command=_WALK, measured=_H200),
+    Claim(_LEGS, "190 s", 30.0, "at most", command=_WALK, measured=_H200),
+    Claim(_LEGS, "5.5 M physics steps/s", 0.3, "at least", command=_B2, measured=_H200),
+    Claim(_THROUGH, "100 arrive", 1.0, command=_TRAVERSE, measured=_H200),
+    Claim(_THROUGH, "100 of 100 in MuJoCo", 1.0, command=f"{_TRAVERSE} --engine mujoco", measured=_CPU),
+    Claim("four H200s", "75.8 M", 4.0, "at least", command=_FOUR, measured="four H200s, 2026-11-21"),
+    Claim("four H200s", "97 %", 3.0, "at least", command=_FOUR, measured="four H200s, 2026-11-21"),
+    Claim("PPO on 60 m", "115 k steps", 16.0, "at most", command=_LEARN.format(out="out/t0"), measured=_CPU),
+    Claim("PPO on 60 m", "6 s", 4.0, "at most", command=_LEARN.format(out="out/t0"), measured=_CPU),
+    Claim("PPO on 60 m", "five of five seeds", 0.0, job="learning", read=lambda c: c["learnt"]),
+    # The README's table of agents.
+    *(
+        Claim(row, "", 0.5, job="leaderboard", read=_success(agent, task), column=column)
+        for row, agent in (("dead reckoning", "dead-reckoning"), ("particle filter", "particle-filter"))
+        for column, task in (("T0", "Traverse"), ("T1", "StopAt"), ("T4", "Faulted"))
+    ),
 )  # fmt: skip
 
-# What the README says of a GPU, and the command that measures it there.
-ON_A_GPU = (
-    (r"([\d.]+) M steps/s on one H200", "python -m benchmarks.throughput --n 65536 --poses 200000 --out out/speed"),
-    (r"([\d.]+) . JaxNav", "python -m benchmarks.throughput --n 65536 --peers jaxnav --out out/peers"),
-    (r"([\d.]+) % slower in a tunnel ten times as long",
-     "python -m benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths"),
-    (r"100 different tunnels at once, T1 \| ([\d.]+) M",
-     "python -m benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"),
-    (r"all five after ([\d.]+) s",
-     "python -m train.navigate --task Subterra/Traverse-v0 --seeds 0 1 2 3 4 --out out/five"),
+# Numbers in those rows that are conditions of a measurement, not results.
+SETTINGS = (
+    (_GIVEN, "within 10 cm"), (_GIVEN, "2 cores"), (_SUITE, "2 cores"), ("float64 brute force", "3.2 M rays"),
+    (_STEP, "H200"), (_STEP, "N = 65,536"), ("planar LiDAR against embree", "within 1 cm"),
+    ("five seeds of PPO on 351 m", "90 % coverage and 100 % success of the last 100 episodes"),
+    ("learnt from a teacher on a CPU", "500 listed episodes"), (_LEGS, "H200"), (_LEGS, "8,192 robots"),
+    ("PPO on 60 m", "90 % coverage and 100 % success"),
 )  # fmt: skip

@@ -1,1 +1,4 @@
-"""SLAM programs on recorded episodes: recordings to run them on, a scorer of their poses, and libraries of today."""
+"""SLAM programs on recorded episodes.
+
+recordings (sets, sweeps) ─► run (libraries of today, wheel odometry) ─► tracks (TUM files, axis) ─► score
+"""

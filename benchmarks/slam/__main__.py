@@ -10,19 +10,19 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import command as ending
-from benchmarks.slam import figure, report
+from benchmarks.command import status
+from benchmarks.results import environment_facts, write_file
+from benchmarks.slam import report
 from benchmarks.slam.errors import SlamError
-from benchmarks.slam.judge import Judged, ScoreConfig, judge
-from benchmarks.slam.recordset import SetConfig, make_set
-from benchmarks.slam.trial import RunConfig, run_all
-from benchmarks.throughput.facts import environment_facts
+from benchmarks.slam.recordings import SetConfig, make_set
+from benchmarks.slam.run import RunConfig, run_all
+from benchmarks.slam.score import ProgramScore, ScoreConfig, score_all
 from scene.arguments import parse
 
 _progress = Console(stderr=True, highlight=False)
 
 _PROG = "python -m benchmarks.slam"
-_RECORD = f"""Record listed episodes, the truth held apart.
+_RECORD = f"""Record listed episodes, with the truth kept apart.
 
 Example: {_PROG} record --scene build/tunnel --linings smooth pockets --out out/slam/set"""
 _RUN = f"""Run a LiDAR odometry library on recordings.
@@ -40,55 +40,53 @@ Command = (
 
 
 def main(config: SetConfig | RunConfig | ScoreConfig) -> None:
-    """Runs one of the three.
+    """Records, runs or scores.
 
     Raises:
-        SubterraError: Something that was asked for is not there, or cannot be written.
+        SubterraError: An input is missing or wrong, or an output cannot be written.
     """
     if isinstance(config, SetConfig):
-        for name, there in make_set(config):
-            _progress.print(f"{name}: {'there already' if there else 'recorded'}")
+        for name, existed in make_set(config):
+            _progress.print(f"{name}: {'there already' if existed else 'recorded'}")
     elif isinstance(config, RunConfig):
-        for name, what in run_all(config):
-            _progress.print(f"{name}: {what}")
+        for name, result in run_all(config):
+            _progress.print(f"{name}: {result}")
     else:
-        found = judge(config)
+        scores = score_all(config)
         if config.out is not None:
-            _write(config, found)
-        Console(width=190).print(_table(found))
+            _write(config, scores)
+        Console(width=190).print(_table(scores))
 
 
-def _table(found: list[Judged]) -> Table:
-    head, *rows = report.as_rows(found)
-    shown = Table()
+def _table(scores: list[ProgramScore]) -> Table:
+    head, *rows = report.as_rows(scores)
+    table = Table()
     for k, name in enumerate(head):
-        shown.add_column(name, justify="left" if k < 2 else "right")
+        table.add_column(name, justify="left" if k < 2 else "right")
     for row in rows:
-        shown.add_row(*row)
-    return shown
+        table.add_row(*row)
+    return table
 
 
-def _write(config: ScoreConfig, found: list[Judged]) -> None:
+def _write(config: ScoreConfig, scores: list[ProgramScore]) -> None:
     assert config.out is not None
     content = {
-        "scores.json": report.as_json(found, environment_facts()).encode(),
-        "scores.md": report.as_markdown(found).encode(),
-        "scores.png": figure.as_png(found),
+        "scores.json": report.as_json(scores, environment_facts()).encode(),
+        "scores.md": report.as_markdown(scores).encode(),
+        "scores.png": report.as_png(scores),
     }
     try:
         config.out.mkdir(parents=True, exist_ok=True)
         for name, data in content.items():
-            partial = config.out / f".{name}.partial"
-            partial.write_bytes(data)
-            partial.replace(config.out / name)
+            write_file(config.out / name, data)
     except OSError as error:
         raise SlamError(f"{config.out}: cannot be written ({error.strerror})") from error
 
 
 def command(arguments: list[str] | None = None) -> int:
-    """The command line; a user's mistake is one sentence and status 2."""
+    """Runs the command line; returns 2 for a user's mistake."""
     config = parse(lambda words: tyro.cli(Command, args=words, prog=_PROG, description=__doc__), arguments)
-    return ending.status(lambda: main(config), "interrupted; the same command goes on")
+    return status(lambda: main(config), "interrupted; the same command goes on")
 
 
 if __name__ == "__main__":

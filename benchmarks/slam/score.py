@@ -1,16 +1,80 @@
-"""The score of one estimated trajectory."""
+"""Scores of estimated trajectories: absolute and relative errors as `evo` defines them, along the tunnel and across."""
 
 import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from benchmarks.slam.axis import Axis, axis_from_file, axis_from_path
 from benchmarks.slam.errors import SlamError
-from benchmarks.slam.metrics import Spread, absolute, pairs_by_distance, relative, rms
-from benchmarks.slam.tracks import Alignment, Track, read_track
+from benchmarks.slam.tracks import Alignment, Axis, Track, axis_from_file, axis_from_path, read_track
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """Statistics of non-negative errors; `std` is about the mean, as in evo."""
+
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, errors: Float[np.ndarray, " n"]) -> "Spread":
+        """Return the statistics of at least one error."""
+        rmse = float(np.sqrt(np.mean(errors**2)))
+        rest = (np.mean(errors), np.median(errors), np.std(errors), np.min(errors), np.max(errors))
+        return cls(rmse, *(float(value) for value in rest))
+
+
+def absolute_errors(track: Track) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Return the error of each position (estimate less truth, fixed frame, m) and of each attitude (rad)."""
+    turn = track.true_rotation.inv() * track.rotation
+    return track.position - track.true_position, turn.magnitude()
+
+
+def pairs_by_distance(track: Track, delta: float) -> Int[np.ndarray, "k 2"]:
+    """Return consecutive pieces of the true path, each ended by the first pose at least `delta` m on.
+
+    Source: evo's RPE with `pairs_from_reference` and without `all_pairs`.
+    """
+    ends, since = [0], 0.0
+    for k, step in enumerate(np.linalg.norm(np.diff(track.true_position, axis=0), axis=1), start=1):
+        since += float(step)
+        if since >= delta:
+            ends.append(k)
+            since = 0.0
+    return np.column_stack([ends[:-1], ends[1:]])
+
+
+def relative_errors(
+    track: Track, pairs: Int[np.ndarray, "k 2"]
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Return the error of each piece's motion, as seen from its first pose.
+
+    Args:
+        track: Aligned track.
+        pairs: Indices of first and last pose, `(k, 2)`.
+
+    Returns:
+        Estimated less true displacement, turned into the fixed frame by the true attitude (m), and error of the turn
+        (rad). Their lengths are evo's relative errors.
+    """
+    first, last = pairs.T
+    motion = track.rotation[first].inv().apply(track.position[last] - track.position[first])
+    true_motion = track.true_position[last] - track.true_position[first]
+    turn = track.rotation[first].inv() * track.rotation[last]
+    true_turn = track.true_rotation[first].inv() * track.true_rotation[last]
+    return track.true_rotation[first].apply(motion) - true_motion, (true_turn.inv() * turn).magnitude()
+
+
+def rms(values: Float[np.ndarray, " n"]) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
 
 SCHEMA = "subterra.slam-score/1"
 AXIS_FILE = "axis.csv"
@@ -21,25 +85,25 @@ class Score:
     """Errors of one trajectory.
 
     Attributes:
-        name: Of the recording.
+        name: Name of the recording.
         distance: True distance driven between the first and the last scored time, m.
-        covered: Share of the recording's duration that was scored, 1.
-        poses: Scored poses.
-        alignment: How the estimate was aligned.
-        axis: Where the directions come from.
-        along_final: Last error of the station, m; positive where the estimate lies towards growing stations.
-        along_rms: Root mean square error of the station, m.
-        across_rms: The same of the offset from the axis to the left.
-        up_rms: The same of the height over the axis.
-        drift: |along_final| in % of the distance.
-        piece: Length of the pieces of path for the four figures that follow, m.
-        piece_along: RMS error of a piece's motion, seen from where it begins, along the axis, in % of its length; None
-            where no piece is so long.
-        piece_across: The same to the left.
+        covered: Scored share of the recording's duration.
+        poses: Number of scored poses.
+        alignment: Alignment of the estimate.
+        axis: Origin of the directions.
+        along_final: Last error of the station, m; positive if the estimate lies towards larger stations.
+        along_rms: RMS error of the station, m.
+        across_rms: RMS error of the offset to the left of the axis, m.
+        up_rms: RMS error of the height over the axis, m.
+        drift: |along_final| in % of the distance; `None` without motion.
+        piece: Length of the pieces of path for the next four figures, m.
+        piece_along: RMS error of a piece's motion along the axis, as seen from its first pose, in % of its length;
+            `None` where no piece is so long.
+        piece_across: RMS error of a piece's motion to the left, in % of its length.
         piece_turn: RMS error of a piece's turn, °/m.
-        rpe: Spread of the whole errors of the pieces, m.
+        rpe: Spread of the pieces' errors, m.
         ape: Spread of the position errors, m.
-        ape_turn: Spread of the orientation errors, °.
+        ape_turn: Spread of the attitude errors, °.
     """
 
     name: str
@@ -62,13 +126,13 @@ class Score:
     ape_turn: Spread
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the score for JSON."""
         return dataclasses.asdict(self)
 
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """Errors on the way: `travelled (n,)` and `error (n, 3)` of station, offset and height, m."""
+    """Errors against distance: `travelled (n,)` and `error (n, 3)` of station, offset and height, m."""
 
     travelled: Float[np.ndarray, " n"]
     error: Float[np.ndarray, "n 3"]
@@ -83,15 +147,15 @@ def score_files(
     piece: float = 10.0,
     name: str = "",
 ) -> tuple[Score, Curve]:
-    """Score one TUM file against another.
+    """Scores one TUM file against another.
 
     Args:
-        estimate: What a SLAM program wrote.
+        estimate: TUM file of a SLAM program.
         truth: `lidar.tum` of a recording's truth.
-        axis: `axis.csv`; the one beside the truth if left out, or else the true path gives the directions.
+        axis: `axis.csv`; by default the one beside the truth, or else the true path gives the directions.
         alignment: `origin`, `se3` or `none`.
-        piece: Length of the pieces of path whose errors are told, m.
-        name: Of the recording; the estimate's file name if left out.
+        piece: Length of the pieces of path, m.
+        name: Name of the recording; by default the estimate's file name.
 
     Raises:
         SlamError: A file is missing or wrong, or the trajectories share no times.
@@ -102,34 +166,114 @@ def score_files(
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
     line = axis_from_path(track.true_position) if axis is None else axis_from_file(axis)
-    return score(track, line, alignment, piece, name or estimate.stem)
+    return score_track(track, line, alignment, piece, name or estimate.stem)
 
 
-def score(track: Track, axis: Axis, alignment: str, piece: float, name: str) -> tuple[Score, Curve]:
-    """Score an aligned track, and its errors on the way."""
-    error, turn = absolute(track)
-    parts, travelled = axis.placed(track.position) - axis.placed(track.true_position), track.travelled
+def score_track(track: Track, axis: Axis, alignment: str, piece: float, name: str) -> tuple[Score, Curve]:
+    """Scores an aligned track; returns its errors against distance as well."""
+    error, turn = absolute_errors(track)
+    parts, travelled = axis.coordinates(track.position) - axis.coordinates(track.true_position), track.travelled
     distance = float(travelled[-1])
-    found = Score(
+    score = Score(
         name=name, distance=distance, covered=track.covered, poses=len(track.time), alignment=alignment,
         axis=axis.source, along_final=float(parts[-1, 0]), along_rms=rms(parts[:, 0]), across_rms=rms(parts[:, 1]),
         up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
         piece=piece, ape=Spread.of(np.linalg.norm(error, axis=1)), ape_turn=Spread.of(np.degrees(turn)),
         **_pieces(track, axis, piece),
     )  # fmt: skip
-    return found, Curve(travelled, parts)
+    return score, Curve(travelled, parts)
 
 
 def _pieces(track: Track, axis: Axis, piece: float) -> dict[str, Any]:
     pairs = pairs_by_distance(track, piece)
     if not len(pairs):
         return {"piece_along": None, "piece_across": None, "piece_turn": None, "rpe": None}
-    error, turn = relative(track, pairs)
+    error, turn = relative_errors(track, pairs)
     length = np.diff(track.travelled[pairs], axis=1)  # a little more than `piece`
-    parts = axis.resolved(error, track.true_position[pairs.sum(axis=1) // 2]) / length
+    parts = axis.resolve(error, track.true_position[pairs.sum(axis=1) // 2]) / length
     return {
         "piece_along": 100.0 * rms(parts[:, 0]),
         "piece_across": 100.0 * rms(parts[:, 1]),
         "piece_turn": float(np.degrees(rms(turn / length[:, 0]))),
         "rpe": Spread.of(np.linalg.norm(error, axis=1)),
     }
+
+
+TRUTH_FILE = "lidar.tum"
+
+
+@dataclasses.dataclass(frozen=True)
+class ScoreConfig:
+    """Settings of a scoring.
+
+    Attributes:
+        estimate: TUM files, or folders of `NAME.tum`, each folder one program.
+        truth: TUM file, or the `truth/` folder of a set.
+        axis: `axis.csv`, if it is not beside the truth.
+        alignment: `origin`: the first pose is known; `se3`: best fit; `none`: poses in the tunnel's frame.
+        piece: Length of the pieces of path for relative errors, m.
+        out: Folder for `scores.json`, `scores.md` and `scores.png`.
+    """
+
+    estimate: tuple[Path, ...]
+    truth: Path
+    axis: Path | None = None
+    alignment: Alignment = "origin"
+    piece: float = 10.0
+    out: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ProgramScore:
+    """A score with its program and its errors against distance."""
+
+    program: str
+    score: Score
+    curve: Curve
+
+
+def score_all(config: ScoreConfig) -> list[ProgramScore]:
+    """Scores every given estimate.
+
+    Raises:
+        SlamError: No estimate is given, a file is missing or wrong, or a folder holds no estimate of a recording with
+            known truth.
+    """
+    if not config.estimate:
+        raise SlamError("estimate must name at least one file or folder")
+    return [score for path in config.estimate for score in _score_path(path, config)]
+
+
+def _score_path(path: Path, config: ScoreConfig) -> list[ProgramScore]:
+    """Scores a TUM file, or every TUM file of a folder."""
+    if not path.exists():
+        raise SlamError(f"{path}: no such file or folder")
+    pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]
+    program, scores = path.name if path.is_dir() else path.parent.name, []
+    for estimate, truth in pairs:
+        score, curve = score_files(
+            estimate, truth, axis=config.axis, alignment=config.alignment, piece=config.piece, name=estimate.stem
+        )
+        scores.append(ProgramScore(program, score, curve))
+    return scores
+
+
+def _find_truth(estimate: Path, truth: Path) -> Path:
+    """Returns the file of the truth, also where a set's or one recording's folder is given."""
+    if not truth.is_dir():
+        return truth
+    places = (truth / estimate.stem / TRUTH_FILE, truth / TRUTH_FILE)
+    file = next((place for place in places if place.is_file()), None)
+    if file is None:
+        raise SlamError(f"{truth}: holds no truth of {estimate.stem}: neither {places[0]} nor {places[1]} is there")
+    return file
+
+
+def _pairs(folder: Path, truth: Path) -> list[tuple[Path, Path]]:
+    if not truth.is_dir():
+        raise SlamError(f"{truth}: is no folder, and {folder} is one")
+    pairs = [(path, truth / path.stem / TRUTH_FILE) for path in sorted(folder.glob("*.tum"))]
+    known = [(path, true) for path, true in pairs if true.is_file()]
+    if not known:
+        raise SlamError(f"{folder}: holds no NAME.tum of a recording whose truth is in {truth}")
+    return known

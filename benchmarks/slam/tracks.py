@@ -1,32 +1,131 @@
-"""An estimated trajectory beside the true one: read, brought to the same times, aligned."""
+"""Estimated and true trajectories at the same times, and the tunnel's axis that their errors are resolved along."""
 
 import dataclasses
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from benchmarks.slam.errors import SlamError
 from scene.errors import RecordingError
 from scene.poses.trajectory import Trajectory, load_tum
 
+_HEADER = "station,x,y,z"
+_SPACING = 0.25  # m between points of an axis made from a path
+_SMOOTHED = 8  # points to either side over which such an axis is smoothed
+_LEAST_STRETCH = 0.2  # least length of 1 m of station at a point's offset: it has no meaning beyond a bend's centre
+_ROWS = 1000  # positions looked up at a time
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """A tunnel's axis as a polyline; it continues straight beyond its ends.
+
+    Attributes:
+        station: Stations of its points, increasing, m, `(n,)`.
+        position: Positions of its points, m, `(n, 3)`.
+        frames: Unit vectors along, left and up as rows, `(n, 3, 3)`.
+        source: Origin of the axis, for the report.
+    """
+
+    station: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    frames: Float[np.ndarray, "n 3 3"]
+    source: str
+
+    def nearest(self, position: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
+        """Return the index of the axis' point nearest to each position."""
+        parts = np.split(position, range(_ROWS, len(position), _ROWS))
+        squares = [np.sum((part[:, None] - self.position) ** 2, axis=2) for part in parts]
+        return np.concatenate([np.argmin(square, axis=1) for square in squares])
+
+    def coordinates(self, position: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+        """Return station, offset to the left and height over the axis of each position, m."""
+        near = self.nearest(position)
+        aside = np.einsum("kij,kj->ki", self.frames[near], position - self.position[near])
+        curvature = np.sum(np.gradient(self.frames[:, 0], self.station, axis=0) * self.frames[:, 1], axis=1)
+        inside = (near > 0) & (near < len(self.station) - 1)
+        # A metre of station is longer on the outside of a bend and shorter on the inside.
+        stretch = np.where(inside, np.maximum(1.0 - curvature[near] * aside[:, 1], _LEAST_STRETCH), 1.0)
+        return np.column_stack([self.station[near] + aside[:, 0] / stretch, aside[:, 1:]])
+
+    def resolve(self, vectors: Float[np.ndarray, "k 3"], at: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+        """Resolve vectors of the fixed frame along, left and up of the axis near positions `at`."""
+        return np.einsum("kij,kj->ki", self.frames[self.nearest(at)], vectors)
+
+
+def axis_from_file(path: Path) -> Axis:
+    """Reads the `axis.csv` of a recording's truth.
+
+    Raises:
+        SlamError: The file is missing or is no axis.
+    """
+    try:
+        with path.open() as file:
+            if file.readline().strip() != _HEADER:
+                raise SlamError(f"{path}: not an axis: its first line must be {_HEADER!r}")
+            rows = np.loadtxt(file, delimiter=",", ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SlamError(f"{path}: not a readable axis ({error})") from error
+    if rows.shape[1:] != (4,) or len(rows) < 2 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0.0).any():
+        raise SlamError(f"{path}: an axis has at least 2 finite rows of 4 numbers with increasing stations")
+    return Axis(rows[:, 0], rows[:, 1:], _frames(rows[:, 1:]), path.name)
+
+
+def axis_from_path(position: Float[np.ndarray, "n 3"]) -> Axis:
+    """Makes an axis of the true path: smoothed over 2 m to either side, up to the pose furthest from its start.
+
+    A drive there and back is thus measured along the way there.
+
+    Raises:
+        SlamError: The path is shorter than 1 m.
+    """
+    outward = position[: int(np.argmax(np.linalg.norm(position - position[0], axis=1))) + 1]
+    steps = np.linalg.norm(np.diff(outward, axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    if travelled[-1] < 1.0:
+        raise SlamError(
+            f"the true path moves by {travelled[-1]:.2f} m and no axis was given: nothing tells along from across"
+        )
+    kept = np.concatenate([[True], steps > 0.0])
+    station = np.linspace(0.0, travelled[-1], max(2, round(travelled[-1] / _SPACING) + 1))
+    line = np.stack([np.interp(station, travelled[kept], column) for column in outward[kept].T], axis=-1)
+    return Axis(station, line, _frames(_smooth(line)), "the true path")
+
+
+def _smooth(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Returns means over neighbours, as many on one side as on the other."""
+    total, n = np.concatenate([np.zeros((1, 3)), np.cumsum(line, axis=0)]), len(line)
+    index = np.arange(n)
+    reach = np.minimum(np.minimum(index, n - 1 - index), _SMOOTHED)
+    return (total[index + reach + 1] - total[index - reach]) / (2 * reach + 1)[:, None]
+
+
+def _frames(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+    along = np.gradient(line, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    left = np.cross([0.0, 0.0, 1.0], along)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return np.stack([along, left, np.cross(along, left)], axis=1)
+
+
 Alignment = Literal["origin", "se3", "none"]
 ALIGNMENTS = ("origin", "se3", "none")
-_SLACK = 1e-3  # s: a stamp so far outside the truth's span still counts as its end
+_SLACK = 1e-3  # s: a stamp this far outside the truth's span still counts as its end
 
 
 @dataclasses.dataclass(frozen=True)
 class Track:
-    """Poses at the same times by an estimate and in truth.
+    """Estimated and true poses at the same times.
 
     Attributes:
-        time: s, growing, `(n,)`.
-        position: Estimated, m, `(n, 3)`.
-        rotation: Estimated, `n` of them.
-        true_position: m, `(n, 3)`.
-        true_rotation: `n` of them.
+        time: Times, increasing, s, `(n,)`.
+        position: Estimated positions, m, `(n, 3)`.
+        rotation: Estimated attitudes, `n` of them.
+        true_position: True positions, m, `(n, 3)`.
+        true_rotation: True attitudes, `n` of them.
         covered: Share of the truth's duration between the first and the last of these times.
     """
 
@@ -45,44 +144,44 @@ class Track:
 
 
 def read_track(estimate: Path, truth: Path, alignment: Alignment = "origin") -> Track:
-    """Both files as one track: at the estimate's times, the truth interpolated, and the estimate aligned to it.
+    """Reads both files at the estimate's times, with the truth interpolated and the estimate aligned to it.
 
     Args:
         estimate: TUM file of a SLAM program.
         truth: TUM file of the recording's truth.
-        alignment: See `aligned`.
+        alignment: See `align`.
 
     Raises:
-        SlamError: A file is missing or wrong, the two share no two times, or there is no such alignment.
+        SlamError: A file is missing or wrong, they share fewer than two times, or there is no such alignment.
     """
     if alignment not in ALIGNMENTS:
         raise SlamError(f"no alignment {alignment!r}; there are {', '.join(ALIGNMENTS)}")
     try:
-        found, true = load_tum(estimate), load_tum(truth)
+        estimated, true = load_tum(estimate), load_tum(truth)
     except RecordingError as error:
         raise SlamError(str(error)) from error
-    return aligned(_paired(found, true), alignment)
+    return align(_pair(estimated, true), alignment)
 
 
-def _paired(found: Trajectory, true: Trajectory) -> Track:
+def _pair(estimated: Trajectory, true: Trajectory) -> Track:
     begin, end = true.times[0], true.times[-1]
-    some = np.flatnonzero((found.times >= begin - _SLACK) & (found.times <= end + _SLACK))
+    some = np.flatnonzero((estimated.times >= begin - _SLACK) & (estimated.times <= end + _SLACK))
     if len(some) < 2:
         raise SlamError(
-            f"{found.source}: shares {len(some)} of its {len(found.times)} times ({found.times[0]:.3f} to "
-            f"{found.times[-1]:.3f} s) with {true.source} ({begin:.3f} to {end:.3f} s); at least 2 are needed"
+            f"{estimated.source}: shares {len(some)} of its {len(estimated.times)} times ({estimated.times[0]:.3f} to "
+            f"{estimated.times[-1]:.3f} s) with {true.source} ({begin:.3f} to {end:.3f} s); at least 2 are needed"
         )
-    time = found.times[some]
+    time = estimated.times[some]
     position, rotation = true.at(time)
     covered = float((time[-1] - time[0]) / (end - begin))
-    return Track(time, found.positions[some], found.rotations[some], position, rotation, min(covered, 1.0))
+    return Track(time, estimated.positions[some], estimated.rotations[some], position, rotation, min(covered, 1.0))
 
 
-def aligned(track: Track, alignment: Alignment) -> Track:
-    """The estimate moved as a whole: `origin` puts its first pose on the true one, `se3` all poses by least squares.
+def align(track: Track, alignment: Alignment) -> Track:
+    """Moves the estimate as a whole: `origin` puts its first pose on the true one, `se3` fits all by least squares.
 
-    A rigid motion only: a scale is never fitted, since along a tunnel the scale is what one wants to know. `none`
-    leaves poses in the frame that they are in, for programs that localise in the given map.
+    The motion is rigid. A scale is never fitted, since the error of scale along the tunnel is what matters. `none`
+    leaves poses in their frame, for programs that localise in the given map.
 
     Source of `se3`: Umeyama 1991, Least-squares estimation of transformation parameters between two point patterns.
     """

@@ -1,5 +1,4 @@
-"""How fast the batched environment steps, beside its peers, in one run with the exactness of its LiDAR.
+"""Speed of the batched environment and of its peers, measured in one run with the exactness of its LiDAR.
 
-config ─► measure (ours), floor, peers/ ─► timing ─► report, figure, result
-          exactness, variants (lengths, linings) ┘
+config ─► measure (ours, floor, exactness), variants, peers, mujoco_route ─► timing ─► report
 """

@@ -1,4 +1,4 @@
-"""What to measure, and the sizes that a machine is measured at where none are given."""
+"""Settings of a throughput run, and the batch sizes of a machine where none are given."""
 
 import math
 from dataclasses import dataclass
@@ -11,33 +11,33 @@ from benchmarks.throughput.errors import ThroughputError
 
 SIZES = (1, 16, 256, 1024, 4096, 16_384, 65_536, 262_144)
 _MOST_ON_CPU = 4096
-# Where lengths and linings are compared: large enough that a step is work, not overhead.
-_STUDIED_ON_CPU, _STUDIED = 1024, 65_536
+# Batch sizes for comparing lengths and linings: large enough that a step is mostly work, not overhead.
+_STUDY_SIZE_ON_CPU, _STUDY_SIZE = 1024, 65_536
 
 PeerChoice = Literal["auto", "none", "jaxnav", "gymnax", "mujoco"]
 
 
 @dataclass(frozen=True)
 class ThroughputConfig:
-    """What to measure.
+    """Settings of a throughput run.
 
     Attributes:
-        n: Environments in a batch; each size is measured. None given: 1 to 262,144, on a CPU to 4,096.
-        peers: Who else is measured: `auto` (everybody installed), `none`, or names. One that is named must be there.
-        task: Id of the task.
+        n: Batch sizes to measure; 1 to 262,144 if not given, on a CPU to 4,096.
+        peers: Other environments to measure: `auto` (all installed), `none`, or names, which must be installed.
+        task: Task id.
         tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given.
-        scene: Scene folder for the paper's route. It brings its own `tunnel.npz` unless `tunnel` is given. Without it,
+        scene: Scene folder for the paper's route, with its own `tunnel.npz` unless `tunnel` is given. Without it,
             MuJoCo gets the tunnel's walls, extruded.
         lining: Variant of the walls.
-        lengths: Lengths of tunnel to compare, m; a tunnel too short is continued by itself, mirrored.
+        lengths: Tunnel lengths to compare, m; a tunnel too short is continued by mirrored copies.
         linings: Variants of the walls to compare.
-        study_n: Environments in a batch for those comparisons; None is 65,536, on a CPU 1,024.
+        study_n: Batch size of those comparisons; 65,536 if not given, on a CPU 1,024.
         steps: Steps in one timed call, all within one `lax.scan`.
         repeats: Timed calls.
-        seconds: Time to spend on the calls of one size, s; where it would take longer, a call has fewer steps.
-        poses: Random poses at which the LiDAR is compared with float64 brute force; 0 leaves the gate out.
-        seed: Seed of actions, environments and poses.
-        out: Folder to write `throughput.json` and `throughput.png` into.
+        seconds: Time limit for all calls of one size, s; a call gets fewer steps to keep to it.
+        poses: Random poses at which the LiDAR is compared with float64 brute force; 0 skips the comparison.
+        seed: Seed for actions, environments and poses.
+        out: Output folder for `throughput.json` and `throughput.png`.
     """
 
     n: tuple[int, ...] = ()
@@ -57,28 +57,28 @@ class ThroughputConfig:
     out: Path | None = None
 
     def sizes(self) -> tuple[int, ...]:
-        """Batch sizes to measure on this machine, growing."""
+        """Return the batch sizes to measure on this machine, in increasing order."""
         if self.n:
             return tuple(sorted(set(self.n)))
         return tuple(size for size in SIZES if not _on_cpu() or size <= _MOST_ON_CPU)
 
-    def studied(self) -> int:
-        """Batch size at which lengths and linings are compared on this machine."""
+    def study_size(self) -> int:
+        """Return the batch size at which lengths and linings are compared on this machine."""
         if self.study_n is not None:
             return self.study_n
-        return _STUDIED_ON_CPU if _on_cpu() else _STUDIED
+        return _STUDY_SIZE_ON_CPU if _on_cpu() else _STUDY_SIZE
 
 
 def check(config: ThroughputConfig) -> None:
-    """Refuses what cannot be measured.
+    """Refuses settings that cannot be measured.
 
     Raises:
-        ThroughputError: Naming the option and its value.
+        ThroughputError: An option is out of range; the message names it with its value.
     """
     for name, least in (("steps", 1), ("repeats", 1), ("poses", 0), ("seed", 0)):
         if getattr(config, name) < least:
             raise ThroughputError(f"--{name} must be at least {least}, got {getattr(config, name)}")
-    for size in (*config.n, config.studied()):
+    for size in (*config.n, config.study_size()):
         if size < 1:
             raise ThroughputError(f"a batch holds at least 1 environment, got {size}")
     for name, value in (("seconds", config.seconds), *(("lengths", length) for length in config.lengths)):

@@ -1,14 +1,18 @@
-"""Our environment as a loop to time, and what it could not be faster than on the same machine."""
+"""Loops to time: our environment, and the least that one of its shape must do; and the exactness of its LiDAR."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 import subterra_jax as st
 from benchmarks.throughput.timing import Carry, Loop, digest
+from subterra_jax import lidar
+from subterra_jax.lidar import reference
 
 # One wall of the window of a brute-force cast: two products and a comparison at each end, and the intersection.
 _SEGMENTS, _OPERATIONS = 300, 20
@@ -18,7 +22,7 @@ _LANES = {"NVIDIA H200": 132 * 128 * 1.98e9}
 
 
 def environment_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
-    """`AutoReset` under random actions: LiDAR, noise, odometry, reward, contact, reset and both observations."""
+    """Return the loop of `AutoReset` under random actions, with LiDAR, noise, reward, contact and resets."""
     batch = st.AutoReset(env)
     low, high = (jnp.asarray(bound) for bound in dataclasses.astuple(env.action_space(params)))
 
@@ -36,7 +40,7 @@ def environment_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Lo
 
 
 def spread_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
-    """The same from starts all along the tunnel, as a trained policy's robots would be, but short of the goal."""
+    """Return the same loop with robots spread along the tunnel, short of the goal, as a trained policy's would be."""
     loop = environment_loop(env, params, n_envs)
 
     def reset(key: PRNGKeyArray, params: st.EnvParams) -> Carry:
@@ -53,33 +57,58 @@ def spread_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
 
 
 def floor_loop(loop: Loop) -> Loop:
-    """The least that any batched environment of this shape does: draw actions, read and write state and observation.
+    """Return the least that a batched environment of this shape does: draw actions, read and write its arrays.
 
-    Nothing is simulated. What a machine makes of this is what launches and memory allow there.
+    Nothing is simulated. Its speed is the limit that kernel launches and memory set on a machine.
     """
 
     def step(key: PRNGKeyArray, carry: Carry, params: Any) -> tuple[Carry, Array, Array]:
         n_envs = jax.tree.leaves(carry)[0].shape[0]
         action = jax.random.uniform(key, (n_envs, 2), minval=-1e-3, maxval=1e-3)
 
-        def moved(leaf: Array) -> Array:
+        def change(leaf: Array) -> Array:
             if not jnp.issubdtype(leaf.dtype, jnp.floating):
                 return ~leaf
             return leaf + action[:, 0].reshape(n_envs, *[1] * (leaf.ndim - 1))
 
-        return jax.tree.map(moved, carry), digest(action), jnp.zeros(())
+        return jax.tree.map(change, carry), digest(action), jnp.zeros(())
 
     return dataclasses.replace(loop, step=step)
 
 
 def arithmetic_floor(device: str, n_beams: int) -> float | None:
-    """Environment steps per second at which a brute-force cast of 300 segments a beam fills the device's lanes.
+    """Return the steps per second at which a brute-force cast of 300 segments a beam fills the device's lanes.
 
     Args:
-        device: As JAX names its kind.
+        device: Device kind, as JAX names it.
         n_beams: Beams in one scan.
 
     Returns:
-        Steps per second; None for a device whose lanes and clock are not known here. A hierarchy may be faster.
+        Steps per second; `None` for a device whose lanes and clock are not known here. A hierarchy may be faster.
     """
     return _LANES[device] / (n_beams * _SEGMENTS * _OPERATIONS) if device in _LANES else None
+
+
+# Poses scanned at a time, so that memory does not grow with their number.
+_BATCH = 1000
+
+
+def measure_exactness(
+    plan: st.TunnelPlan, lining: str, params: st.EnvParams, n_poses: int, seed: int
+) -> reference.Agreement:
+    """Compares the LiDAR on this device with float64 brute force over every segment of the same walls.
+
+    Args:
+        plan: Whole tunnel.
+        lining: Variant of its walls.
+        params: Params of an environment made of that plan and lining.
+        n_poses: Random poses, 16 rays each.
+        seed: Seed for the poses.
+    """
+    poses = reference.random_poses(plan, n_poses, np.random.default_rng(seed))
+    scan = jax.jit(jax.vmap(partial(lidar.scan, params=params.lidar), in_axes=(None, 0, 0, 0)))
+    ranges = [
+        np.asarray(scan(params.tunnel, poses.position[rows], poses.heading[rows], poses.station[rows]))
+        for rows in np.array_split(np.arange(n_poses), max(1, n_poses // _BATCH))
+    ]
+    return reference.agreement(plan.lining(lining).segments, poses, np.concatenate(ranges))

@@ -1,7 +1,7 @@
-"""The stopwatch: one `lax.scan` of steps, compiled apart, warmed, and timed again and again.
+"""Times loops: one `lax.scan` of steps, compiled separately, warmed up, then timed several times.
 
-Ours and every JAX peer go through the same loop. What a step returns is summed, and the observation that it leaves is
-read by the next one, so that no ray can be dropped and every observation is written to memory.
+Our environment and every JAX peer use the same loop. All outputs of a step are summed and the next step reads its
+observation, so that the compiler cannot drop a ray and every observation is written to memory.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,10 +22,10 @@ class Loop:
     """A batch of environments under random actions.
 
     Attributes:
-        reset: Key and params to observations and state.
-        step: Key, observations and state, and params, to new observations and state, a scalar that depends on
-            everything else the step returned, and the share of environments whose episode ended.
-        params: What the step reads and does not change; an argument of the compiled program, not a constant in it.
+        reset: Maps key and params to observations and state.
+        step: Maps key, observations and state, and params to new observations and state, a scalar that depends on all
+            other outputs of the step, and the share of environments whose episode ended.
+        params: Constant inputs of the step; an argument of the compiled program, not a constant in it.
     """
 
     reset: Callable[[PRNGKeyArray, Any], Carry]
@@ -35,13 +35,13 @@ class Loop:
 
 @dataclass(frozen=True)
 class Timing:
-    """How long to look.
+    """Number and length of timed calls.
 
     Attributes:
         steps: Steps in one call.
         repeats: Timed calls.
-        seconds: Time that all of them may take, s; where they would take longer, a call has fewer steps.
-        seed: Of resets and steps.
+        seconds: Time limit for all calls, s; a call gets fewer steps to keep to it.
+        seed: Seed for resets and steps.
     """
 
     steps: int = 100
@@ -52,15 +52,15 @@ class Timing:
 
 @dataclass(frozen=True)
 class Speed:
-    """What was measured at one batch size.
+    """Measurements at one batch size.
 
     Attributes:
         n_envs: Environments in the batch.
         steps: Steps in one call.
-        compile_seconds: To trace and compile the call, s; part of nothing else.
+        compile_seconds: Time to trace and compile the call, s; not part of any other figure.
         steps_per_second: Environment steps per second of each timed call.
         share_done: Share of steps at which an episode ended.
-        checksum: Of everything that every timed step returned; the same for the same seed, device and versions.
+        checksum: Sum of all outputs of all timed steps; the same for the same seed, device and versions.
     """
 
     n_envs: int
@@ -72,21 +72,21 @@ class Speed:
 
     @property
     def quartiles(self) -> tuple[float, float, float]:
-        """Lower quartile, median and upper quartile of the steps per second."""
+        """Return lower quartile, median and upper quartile of the steps per second."""
         lower, median, upper = np.percentile(self.steps_per_second, [25, 50, 75])
         return float(lower), float(median), float(upper)
 
 
 @dataclass
 class Program:
-    """A compiled call and what its timed calls have given so far.
+    """A compiled call and the results of its timed calls so far.
 
     Attributes:
         n_envs: Environments in the batch.
         steps: Steps in one call.
-        compile_seconds: To trace and compile it, s.
-        restart: Begin every call at the same state, in place of where the last one ended.
-        totals: Of each timed call, what its steps returned, summed.
+        compile_seconds: Time to trace and compile it, s.
+        restart: Start every call from the same state instead of where the last call ended.
+        totals: Sum of the step outputs of each timed call.
     """
 
     n_envs: int
@@ -104,7 +104,7 @@ class Program:
         """Runs one call and returns its time, s.
 
         Raises:
-            FloatingPointError: An observation or a reward was not finite.
+            FloatingPointError: An observation or a reward is not finite.
         """
         started = perf_counter()
         carry, total, done = jax.block_until_ready(self._call(key, self._carry, self._params))
@@ -120,7 +120,7 @@ class Program:
         return elapsed
 
     def speed(self) -> Speed:
-        """What its calls have given."""
+        """Return the measurements of all its calls."""
         share, total = float(np.mean(self._done)), float(np.sum(self.totals))
         return Speed(self.n_envs, self.steps, self.compile_seconds, list(self._rates), share, total)
 
@@ -131,13 +131,13 @@ def measure(loop: Loop, n_envs: int, timing: Timing) -> Speed:
 
 
 def measure_in_turn(loops: Sequence[Loop], n_envs: int, timing: Timing, restart: bool = False) -> list[Speed]:
-    """Times loops call by call in turn, so that a machine that slows down slows them all.
+    """Times several loops, one call of each in turn, so that a machine that slows down slows them all.
 
     Args:
-        loops: What to time.
-        n_envs: Environments in their batches.
-        timing: How long to look.
-        restart: Begin every call at the state after the reset.
+        loops: Loops to time.
+        n_envs: Environments in each batch.
+        timing: Number and length of calls.
+        restart: Start every call from the state after the reset.
     """
     programs = [prepare(loop, n_envs, timing, restart) for loop in loops]
     for key in jax.random.split(jax.random.key(timing.seed + 1), timing.repeats):
@@ -147,12 +147,12 @@ def measure_in_turn(loops: Sequence[Loop], n_envs: int, timing: Timing, restart:
 
 
 def prepare(loop: Loop, n_envs: int, timing: Timing, restart: bool = False) -> Program:
-    """Compiles a call and runs it once; with fewer steps where the calls would take longer than they may."""
+    """Compiles a call and runs it once; gives it fewer steps if the calls would take too long."""
     carry = jax.block_until_ready(jax.jit(loop.reset)(jax.random.key(timing.seed), loop.params))
     program = _compile(loop, n_envs, timing.steps, carry, restart)
     elapsed = program.call(jax.random.key(timing.seed), keep=False)
     steps = max(1, min(timing.steps, int(timing.steps * timing.seconds / (timing.repeats * elapsed))))
-    # A second compilation pays where it saves a third of the time.
+    # A second compilation is worth its time if it saves a third.
     if steps < 0.7 * timing.steps:
         program = _compile(loop, n_envs, steps, carry, restart)
         program.call(jax.random.key(timing.seed), keep=False)
@@ -179,5 +179,5 @@ def _many_steps(loop: Loop, steps: int) -> Callable[..., Any]:
 
 
 def digest(tree: Any) -> Float[Array, ""]:
-    """Sum of the means of all leaves: one number that depends on every number."""
+    """Return the sum of the means of all leaves: one number that depends on every number."""
     return sum((jnp.mean(leaf, dtype=jnp.float32) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.learning import __main__ as learning
-from benchmarks.learning import report
-from benchmarks.learning.curve import Curve
+from benchmarks.learning.runs import Curve
 
 
 def run(coverage, success):
@@ -25,7 +24,7 @@ def test_the_goal_is_met_when_the_last_hundred_cover_nine_tenths_and_none_of_the
 
 
 def test_table_figure_and_file_say_the_same(tmp_path, capsys):
-    report.write(tmp_path, [run(np.full(120, 0.95), np.ones(120, bool)), run([], [])], {"task": "T0"})
+    learning.report(tmp_path, [run(np.full(120, 0.95), np.ones(120, bool)), run([], [])], {"task": "T0"})
     line = next(line for line in capsys.readouterr().out.splitlines() if "one" in line)
     assert line.replace("│", " ").split() == ["one", "100", "5,000", "50.0", "0.0", "s", "100"]
     first, second = json.loads((tmp_path / "learning.json").read_text())["runs"]

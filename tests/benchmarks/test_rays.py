@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
-from benchmarks.rays.agreement import Agreement
+from benchmarks.rays.casting import Agreement
 from scene.output import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track

@@ -1,19 +1,24 @@
 """The leaderboard: what it refuses, what it keeps, what it says."""
 
 import dataclasses
+import io
 import json
 import re
+import shutil
 import sys
+from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from benchmarks.leaderboard import __main__ as command
 from benchmarks.leaderboard import entries as entry_module
-from benchmarks.leaderboard import figure, report
-from benchmarks.leaderboard.board import scores, totals
-from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, checked
+from benchmarks.leaderboard import report
+from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, check
 from benchmarks.leaderboard.entries import Entry
+from benchmarks.leaderboard.report import scores, totals
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Records
 from subterra_jax.evaluation.episodes import SHA256
@@ -36,6 +41,13 @@ def run(monkeypatch, *arguments: str) -> int:
         (("--tunnels", "no.npz"), "error: no.npz: no such tunnel file"),
         (("--agents", "policy:Fly-v0"), "error: no agent 'policy:Fly-v0'; there are random"),
         (("--tasks", "Relocalise", "--agents", "policy:StopAt-v0"), "error: policy:StopAt-v0: a policy that drives to"),
+        (("--agents", "policy:mine.safetensors"), "error: mine.safetensors: no such policy"),
+        (("--agents", "no.py:Mine"), "error: no.py: cannot be read (No such file or directory)"),
+        (("--agents", "nowhere:Mine"), "error: agent 'nowhere:Mine': No module named 'nowhere'"),
+        (("--agents", "json:Mine"), "error: agent 'json:Mine': json has no 'Mine'"),
+        (("--agents", "pathlib:Path", "--tasks", "TraverseShort"), "error: agent 'pathlib:Path' has no uses_lidar"),
+        (("--load", "no.py"), "error: no.py: cannot be read (No such file or directory)"),
+        (("--redraw", "no.md"), "error: no.md: cannot be read (No such file or directory)"),
         (("--linings", "velvet"), "error: tunnel 'subterra-351' has no lining 'velvet'"),
     ],
 )
@@ -48,7 +60,7 @@ def test_what_cannot_be_had_is_one_sentence_and_status_2(monkeypatch, capsys, tm
 
 
 def test_where_no_agent_is_named_the_policy_released_for_the_task_drives_beside_the_baselines():
-    config = checked(LeaderboardConfig(tasks=("TraverseShort", "RelocaliseShort")))
+    config = check(LeaderboardConfig(tasks=("TraverseShort", "RelocaliseShort")))
     with_policy, without = (agents_for(config, task) for task in config.tasks)
     assert set(with_policy) - set(without) == {"released-policy"}
     assert {"ring-count", "particle-filter", "oracle"} <= set(without)
@@ -132,4 +144,94 @@ def test_the_report_names_the_list_and_shows_every_agent_with_its_interval(entri
     assert "| filter | 0.500 | 0.500 to 0.500 | 1 |" in text
     assert text.count("20.0 % from commands, 25.0 % from odometry, 30.0 % from both") == 1
     assert json.loads(report.as_json(rows, overall, FACTS))["evaluation_sha256"] == SHA256
-    assert len(figure.draw(rows, FACTS).axes) == 2
+    assert len(report.draw(rows, FACTS).axes) == 2
+
+
+def test_a_task_where_an_agent_declares_other_inputs_is_named(entries):
+    of_map = {"uses_lidar": True, "uses_map": True, "privileged": False}
+    entries[-1] = dataclasses.replace(entries[-1], traits=of_map)
+    text = report.as_markdown(scores(entries), totals(entries), FACTS)
+    assert "| filter | LiDAR; Traverse: LiDAR, map |" in text
+    assert "| dead-reckoning | LiDAR |" in text
+
+
+def source_of(png: bytes) -> str:
+    with Image.open(io.BytesIO(png)) as image:
+        return image.info["Source"]
+
+
+def test_a_figure_drawn_from_the_table_has_the_numbers_of_the_one_drawn_from_the_rows(entries, tmp_path):
+    rows = scores(entries)
+    path = tmp_path / "leaderboard.md"
+    path.write_text(report.as_markdown(rows, totals(entries), FACTS))
+    again, facts = report.read_markdown(path)
+    assert facts == {"episodes": 100}
+    assert source_of(report.as_png(again, facts)) == source_of(report.as_png(rows, FACTS)) == report.figure_digest(rows)
+    again[0]["success"] += 0.001
+    assert report.figure_digest(again) != report.figure_digest(rows)
+
+
+def test_the_figure_of_the_documentation_shows_the_numbers_of_its_table():
+    docs = Path(__file__).parents[3] / "docs"
+    rows, _ = report.read_markdown(docs / "leaderboard.md")
+    assert len(rows) > 100
+    again = "python -m benchmarks.leaderboard --redraw docs/leaderboard.md"
+    assert source_of((docs / "leaderboard.png").read_bytes()) == report.figure_digest(rows), again
+
+
+MINE = """
+import jax.numpy as jnp
+from flax import struct
+
+from subterra_jax.baselines import registry
+
+
+@struct.dataclass
+class Standing:
+    gain: float = 0.0
+    name: str = struct.field(pytree_node=False, default="standing")
+    uses_lidar: bool = struct.field(pytree_node=False, default=False)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def begin(self, key, obs, params):
+        return jnp.zeros(())
+
+    def act(self, key, memory, obs, params, known):
+        return jnp.zeros(5), memory
+
+
+def of_params(params):
+    return Standing(gain=params.vehicle.speed_max)
+
+
+NAME = None
+if NAME:
+    registry.register(NAME, lambda params: Standing())
+"""
+
+
+def test_a_users_own_classes_files_and_policies_drive(monkeypatch, tmp_path):
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+    mine, out = tmp_path / "mine.py", tmp_path / "out"
+    mine.write_text(MINE)
+    (tmp_path / "more.py").write_text(MINE.replace("NAME = None", "NAME = 'standing'"))
+    released = resources.files("subterra_jax") / "data" / "policies"
+    for ending in (".safetensors", ".json"):
+        with resources.as_file(released / f"Traverse-v0{ending}") as path:
+            shutil.copy(path, tmp_path / f"weights{ending}")
+    agents = (f"{mine}:Standing", f"{mine}:of_params", "standing", f"policy:{tmp_path / 'weights.safetensors'}")
+    words = ("--tasks", "Traverse", "--agents", *agents, "--load", str(tmp_path / "more.py"), "--episodes", "2")
+    words = (*words, "--out", str(out))
+    assert run(monkeypatch, *words) == 0
+    rows = {row["agent"]: row for row in json.loads((out / "leaderboard.json").read_text())["scores"]}
+    assert set(rows) == set(agents)
+    assert [rows[agent]["success"] for agent in agents] == [0.0, 0.0, 0.0, 1.0]
+    assert [rows[agent]["uses_lidar"] for agent in agents] == [False, False, False, True]
+    # Another file under the same name is another agent.
+    before = {path: path.stat().st_mtime_ns for path in (out / "entries").iterdir()}
+    mine.write_text(MINE + "\n\nMORE = 1\n")
+    assert run(monkeypatch, *words) == 0
+    changed = [path.name for path, time in before.items() if path.stat().st_mtime_ns != time]
+    assert len(changed) == 2
+    assert all("mine_py" in name for name in changed)

@@ -12,7 +12,7 @@ from PIL import Image
 from benchmarks.paper.__main__ import main
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.learning import find_runs
-from benchmarks.paper.steps import Step, done, make, scene_step, survey_step, training_step
+from benchmarks.paper.steps import Step, is_done, make, scene_step, survey_step, training_step
 
 
 def write_run(folder, coverage, task="Subterra/TraverseShort-v0"):
@@ -115,24 +115,24 @@ def test_a_step_is_done_once_and_again_when_its_words_or_inputs_change(tmp_path,
     out.mkdir()
     source.write_text("[1]")
     step = Step("copy", ("json.tool", str(source), str(out / "copy.json")), out, ("copy.json",), inputs=(source,))
-    assert not done(step)
+    assert not is_done(step)
     make(step)
-    assert done(step)
+    assert is_done(step)
     make(step)
     assert f"{out} is there" in capfd.readouterr().out
     source.write_text("[2]")
-    assert not done(step)
+    assert not is_done(step)
     make(step)
     assert json.loads((out / "copy.json").read_text()) == [2]
     (out / "copy.json").unlink()
-    assert not done(step)
+    assert not is_done(step)
 
 
 def test_a_step_that_fails_names_its_command_and_is_not_done(tmp_path):
     step = Step("copy", ("json.tool", str(tmp_path / "none.json")), tmp_path / "out", ("copy.json",))
     with pytest.raises(PaperError, match=r"out: python -m json\.tool ended with status"):
         make(step)
-    assert not done(step)
+    assert not is_done(step)
 
 
 def test_the_steps_are_the_users_own_commands(tmp_path):

@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.fidelity.derive.voxels import Occupied
-from benchmarks.paper.bore_view import depth_image
 from benchmarks.paper.camera import Pose
 from benchmarks.paper.errors import PaperError
-from benchmarks.paper.occupancy import compared
-from benchmarks.paper.recorded import Place, load_frame
+from benchmarks.paper.figures import classify_side_view, depth_image
+from benchmarks.paper.material import Stretch, load_frame
 from tests.scene.bags import write_bag, write_tum
 
 POSE = Pose(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0]), np.pi / 2, 120, 90)
@@ -49,8 +48,8 @@ def recorded(tmp_path):
 
 def test_a_frame_is_taken_when_the_lidar_looked_along_the_bore(recorded):
     origin = np.array([100.0, 0.0, 0.0])
-    frame = load_frame(*recorded, origin, Place(np.array([3.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 4.0), 1.0)
-    assert 4.4 <= frame.at[0] <= 5.6
+    frame = load_frame(*recorded, origin, Stretch(np.array([3.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 4.0), 1.0)
+    assert 4.4 <= frame.position[0] <= 5.6
     np.testing.assert_allclose(frame.points[:, 0] - frame.origin[:, 0], 5.0, atol=1e-5)
     assert np.abs(frame.points[:, 1:]).max() == pytest.approx(0.1, abs=1e-5)
     assert np.ptp(frame.origin[:, 0]) <= 1.1
@@ -60,12 +59,12 @@ def test_a_frame_is_taken_when_the_lidar_looked_along_the_bore(recorded):
 def test_a_frame_where_nothing_was_recorded_is_one_sentence(recorded, tmp_path):
     late = write_bag(tmp_path / "late.bag", [(50.0, np.ones((3, 3)))])
     with pytest.raises(PaperError, match=r"late\.bag: no scan within 1 s of "):
-        load_frame(late, recorded[1], np.zeros(3), Place(np.zeros(3), np.array([1.0, 0.0, 0.0]), 4.0), 1.0)
+        load_frame(late, recorded[1], np.zeros(3), Stretch(np.zeros(3), np.array([1.0, 0.0, 0.0]), 4.0), 1.0)
 
 
 def test_seen_from_the_side_voxels_of_one_surface_and_of_both_are_told_apart():
     real, scene = np.zeros((4, 2, 1), bool), np.zeros((4, 2, 1), bool)
     real[[0, 1], [0, 1], 0] = True
     scene[[0, 2], [1, 1], 0] = True  # in slice 0 on the other side: one pixel from the side all the same
-    classes = compared(Occupied(real, scene, scene, real | scene, np.arange(4.0)))
+    classes = classify_side_view(Occupied(real, scene, scene, real | scene, np.arange(4.0)))
     np.testing.assert_array_equal(classes[:, 0], [0.0, 2.0, 1.0, np.nan])

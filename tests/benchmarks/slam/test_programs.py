@@ -9,10 +9,11 @@ import pytest
 import trimesh
 
 from benchmarks.fidelity.derive.surface import Caster
-from benchmarks.slam import libraries, reading
+from benchmarks.slam import recordings
+from benchmarks.slam import run as libraries
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.errors import SlamError
-from benchmarks.slam.recordset import SetConfig, planned
+from benchmarks.slam.recordings import SetConfig, plan_set
 from scene.output import write_geometry
 from scene.poses.trajectory import load_tum
 from scene.writing.mjcf import SceneConfig
@@ -39,12 +40,12 @@ def landmarks(ways: np.ndarray, k: int) -> np.ndarray:
 
 @pytest.mark.parametrize("name", ["kiss-icp", "genz-icp"])
 def test_an_odometry_that_is_right_among_landmarks_does_not_move_along_a_bare_bore(name):
-    library, version = libraries.installed(name)
+    library, version = libraries.find_library(name)
     assert version
     ways = np.random.default_rng(0).normal(size=(6000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     ends = [
-        libraries.run(library, [(EPOCH + 0.1 * k, world(ways, k)) for k in range(16)])[1][-1, :3, 3]
+        libraries.estimate_poses(library, [(EPOCH + 0.1 * k, world(ways, k)) for k in range(16)])[1][-1, :3, 3]
         for world in (landmarks, bare)
     ]
     np.testing.assert_allclose(ends[0], [15 * STEP, 0.0, 0.0], atol=0.05)
@@ -53,15 +54,15 @@ def test_an_odometry_that_is_right_among_landmarks_does_not_move_along_a_bare_bo
 
 def test_unknown_and_missing_libraries_are_named(monkeypatch):
     with pytest.raises(SlamError, match="no library 'fast'; there are kiss-icp, genz-icp"):
-        libraries.installed("fast")
-    missing = libraries.Library("no-such-package", reading.CLOUDS, lambda: None)
+        libraries.find_library("fast")
+    missing = libraries.Library("no-such-package", recordings.CLOUDS, lambda: None)
     monkeypatch.setitem(libraries.LIBRARIES, "absent", missing)
     with pytest.raises(SlamError, match="sweep 0 holds no point"):
-        libraries.run(missing._replace(make=lambda: np.eye), [(EPOCH, np.zeros((0, 3)))])
+        libraries.estimate_poses(missing._replace(make=lambda: np.eye), [(EPOCH, np.zeros((0, 3)))])
     with pytest.raises(SlamError, match="there is no sweep"):
-        libraries.run(missing, [])
+        libraries.estimate_poses(missing, [])
     with pytest.raises(SlamError, match="absent needs no-such-package, which is not installed"):
-        libraries.installed("absent")
+        libraries.find_library("absent")
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ def test_a_set_keeps_truth_apart_and_its_clouds_lie_on_the_walls(made):
     assert not list((made / "set" / "recordings").rglob("*truth*"))
     assert "secret" not in (made / "set" / "set.json").read_text()
     assert (made / "set" / "truth" / "TraverseShort-pockets-000" / "lidar.tum").is_file()
-    clouds, flat = list(reading.clouds(recording)), list(reading.planar(recording))
+    clouds, flat = list(recordings.read_clouds(recording)), list(recordings.read_planar(recording))
     assert len(clouds) == len(flat) == 31
     surface = read_scene(made / "scene", "pockets")
     caster = Caster(trimesh.Trimesh(surface.vertices, surface.faces, process=False))
@@ -131,7 +132,7 @@ def test_a_truncated_or_foreign_recording_is_one_sentence(made, tmp_path, capsys
     bag = tmp_path / "recordings" / "one" / "recording"
     shutil.copytree(made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording", bag)
     with pytest.raises(SlamError, match=r"has no topic /other; it has /cmd_vel, /imu"):
-        next(reading.clouds(bag, "/other"))
+        next(recordings.read_clouds(bag, "/other"))
     data = (bag / "recording.mcap").read_bytes()
     (bag / "recording.mcap").write_bytes(data[: len(data) // 2])
     out = ("--out", str(tmp_path / "out"))
@@ -148,18 +149,18 @@ def test_a_truncated_or_foreign_recording_is_one_sentence(made, tmp_path, capsys
 
 def test_boxes_and_faults_are_recorded_without_clouds_and_a_driver_knows_the_way(tmp_path):
     config = SetConfig(tmp_path, tasks=("StopAt", "Obstructed", "Relocalise"), episodes=2, scene=tmp_path)
-    found = dict(planned(config))
+    found = dict(plan_set(config))
     assert list(found)[:2] == ["StopAt-pockets-000", "StopAt-pockets-001"]
     assert found["StopAt-pockets-000"].cloud == "vlp16"
     assert found["Obstructed-pockets-001"].cloud == "none"
     assert found["Relocalise-pockets-000"].agent == "particle-filter"
     with pytest.raises(SlamError, match="no task 'Fly'"):
-        planned(SetConfig(tmp_path, tasks=("Fly",)))
+        plan_set(SetConfig(tmp_path, tasks=("Fly",)))
 
 
 def test_a_secret_gives_episodes_that_are_in_no_list(tmp_path):
     def seeds(secret: int) -> list[int]:
-        plan = planned(SetConfig(tmp_path, tasks=("StopAt", "Return"), secret=secret))
+        plan = plan_set(SetConfig(tmp_path, tasks=("StopAt", "Return"), secret=secret))
         assert all(one.episode is None for _, one in plan)
         return [one.seed for _, one in plan]
 

@@ -7,11 +7,11 @@ import sys
 import pytest
 
 import subterra_jax as st
+from benchmarks.results import environment_facts
 from benchmarks.throughput import __main__ as command
-from benchmarks.throughput import exactness
+from benchmarks.throughput import measure
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.facts import environment_facts
-from benchmarks.throughput.result import Result
+from benchmarks.throughput.report import Result
 
 QUICK = ("--n", "2", "--steps", "1", "--repeats", "1", "--poses", "20", "--peers", "none")
 
@@ -76,10 +76,10 @@ def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, ca
 
 
 def test_a_lidar_that_is_a_centimetre_off_fails_the_run(monkeypatch, capsys):
-    plan, true_scan = st.load_tunnel().slice(0.0, 50.0), exactness.lidar.scan
+    plan, true_scan = st.load_tunnel().slice(0.0, 50.0), measure.lidar.scan
     params = st.make("Subterra/Traverse-v0", plan)[1]
-    monkeypatch.setattr(exactness.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
-    gate = exactness.measure_exactness(plan, "pockets", params, 20, seed=0)
+    monkeypatch.setattr(measure.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
+    gate = measure.measure_exactness(plan, "pockets", params, 20, seed=0)
     # Beams that leave through a mouth report the largest range, a centimetre more now.
     assert gate.n_wrong == gate.n_rays == 320
     facts = {"name": "t", "length": 50.0, "lining": "pockets"}

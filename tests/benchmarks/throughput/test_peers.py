@@ -1,7 +1,6 @@
 """Peers do the same work as ours, or say what they do instead."""
 
 import sys
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +8,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.throughput.peers import gymnax, jaxnav, mujoco, walls
-from benchmarks.throughput.peers.run import Route, measure_peer, wanted
+from benchmarks.throughput import mujoco_route
+from benchmarks.throughput.peers import BatchedPeer, Route, find_peers, jaxnav_loop, measure_peer, pendulum_loop
 from benchmarks.throughput.timing import Loop, Timing
 from subterra_jax.lidar import reference
 from subterra_jax.odometry import OdometryParams
@@ -21,13 +20,13 @@ def plan() -> st.TunnelPlan:
     return st.load_tunnel().slice(100.0, 60.0)
 
 
-def route(plan: st.TunnelPlan, **overrides) -> tuple[mujoco.MujocoTunnel, st.TunnelEnv, st.EnvParams]:
+def route(plan: st.TunnelPlan, **overrides) -> tuple[mujoco_route.MujocoTunnel, st.TunnelEnv, st.EnvParams]:
     quiet = st.make("Subterra/Traverse-v0")[1]
     sigmas = ("distance_sigma", "distance_bias_sigma", "heading_sigma", "heading_bias_sigma")
     overrides["odometry"] = OdometryParams(**dict.fromkeys(sigmas, 0.0))
     overrides["lidar"] = quiet.lidar.replace(range_sigma=0.0)
     env, params = st.make("Subterra/Traverse-v0", plan, **overrides)
-    return mujoco.MujocoTunnel(walls.extruded(plan, "pockets"), plan, params), env, params
+    return mujoco_route.MujocoTunnel(mujoco_route.extrude_walls(plan, "pockets"), plan, params), env, params
 
 
 def test_extruded_walls_give_the_ranges_of_the_reference(plan):
@@ -74,35 +73,35 @@ def test_the_papers_route_ends_at_a_wall_and_begins_anew(plan):
     peer.reset(seed=0)
     ended = [peer.step(np.array([2.0, 1.5]))[2] for _ in range(60)]
     assert any(ended)
-    speed = mujoco.measure(peer, Timing(steps=80, repeats=2))
+    speed = mujoco_route.measure(peer, Timing(steps=80, repeats=2))
     assert speed.n_envs == 1
     assert 0.0 < speed.share_done < 1.0
 
 
 def test_a_scene_folder_without_a_scene_is_named(plan, tmp_path):
     with pytest.raises(st.SubterraError, match=r"scene\.xml"):
-        walls.built(tmp_path, plan, "pockets")
+        mujoco_route.load_scene(tmp_path, plan, "pockets")
     (tmp_path / "scene.xml").write_text("<mujoco><nonsense/></mujoco>")
     with pytest.raises(st.SubterraError, match="cannot read it"):
-        walls.built(tmp_path, plan, "pockets")
+        mujoco_route.load_scene(tmp_path, plan, "pockets")
 
 
 def test_a_peer_that_is_not_installed_is_left_out_with_its_reason(plan, monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnax", None)
-    found = wanted(("auto",))
+    found = find_peers(("auto",))
     assert set(found) == {"jaxnav", "gymnax", "mujoco"}
     where = Route(plan, "pockets", st.make("Subterra/Traverse-v0", plan)[1], None)
     peer = measure_peer("gymnax", found["gymnax"], (1, 2), where, Timing(), lambda _: None)
     assert peer.speeds == []
     assert "gymnax" in peer.left_out["all"]
-    assert wanted(("none",)) == {}
+    assert find_peers(("none",)) == {}
 
 
 def test_a_peer_that_breaks_is_left_out_with_its_reason(plan):
     def broken(n_envs: int) -> Loop:
         raise RuntimeError("RESOURCE_EXHAUSTED: 1 TiB" if n_envs > 4 else "no such map")
 
-    module = SimpleNamespace(ABOUT="a", PACKAGE="numpy", N_BEAMS=16, loop=broken)
+    module = BatchedPeer("numpy", "a", 16, broken)
     where = Route(plan, "pockets", st.make("Subterra/Traverse-v0", plan)[1], None)
     peer = measure_peer("jaxnav", module, (4, 8), where, Timing(), lambda _: None)
     assert peer.left_out == {"4": "RuntimeError: no such map", "8": "out of memory"}
@@ -119,10 +118,10 @@ def stepped(loop: Loop, n_envs: int):
 
 def test_jaxnav_has_as_many_beams_as_ours_and_one_agent():
     pytest.importorskip("jaxmarl")
-    obs = stepped(jaxnav.loop(3), 3)
+    obs = stepped(jaxnav_loop(3), 3)
     assert {name: value.shape for name, value in obs.items()} == {"agent_0": (3, 16 + 5)}
 
 
 def test_pendulum_has_no_sensor():
     pytest.importorskip("gymnax")
-    assert stepped(gymnax.loop(3), 3).shape == (3, 3)
+    assert stepped(pendulum_loop(3), 3).shape == (3, 3)

@@ -6,10 +6,10 @@ import matplotlib.pyplot as plt
 import pytest
 from rich.console import Console
 
-from benchmarks.throughput import figure, report
+from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.peers.run import Peer
-from benchmarks.throughput.result import Result
+from benchmarks.throughput.peers import Peer
+from benchmarks.throughput.report import Result
 from benchmarks.throughput.timing import Speed
 from benchmarks.throughput.variants import Variant
 from subterra_jax.lidar.reference import Agreement
@@ -53,7 +53,7 @@ def test_the_tables_hold_speeds_ratios_and_what_was_left_out(result):
 
 
 def test_the_figure_has_a_line_for_everybody_on_logarithmic_axes(result):
-    drawn = figure.draw(result)
+    drawn = report.draw(result)
     (axes,) = drawn.axes
     named = {line.get_label(): line for line in axes.lines if not line.get_label().startswith("_")}
     assert next(iter(named)) == "Subterra, 16 beams"
@@ -68,4 +68,4 @@ def test_the_figure_has_a_line_for_everybody_on_logarithmic_axes(result):
     ("value", "said"), [(2.315e8, "231.5 M"), (1.2e9, "1.2 G"), (950.0, "950"), (41_400.0, "41.4 k")]
 )
 def test_large_rates_are_written_short(value, said):
-    assert report.short(value) == said
+    assert report.format_rate(value) == said

@@ -77,8 +77,8 @@ def test_the_arithmetic_floor_of_an_h200_is_that_of_96_thousand_operations_a_ste
 def test_sizes_are_measured_once_each_and_stop_at_4096_on_a_cpu(monkeypatch):
     assert ThroughputConfig(n=(16, 1, 16)).sizes() == (1, 16)
     assert ThroughputConfig().sizes() == (1, 16, 256, 1024, 4096)
-    assert ThroughputConfig().studied() == 1024
+    assert ThroughputConfig().study_size() == 1024
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert ThroughputConfig().sizes()[-1] == 262_144
-    assert ThroughputConfig().studied() == 65_536
-    assert ThroughputConfig(study_n=8).studied() == 8
+    assert ThroughputConfig().study_size() == 65_536
+    assert ThroughputConfig(study_n=8).study_size() == 8

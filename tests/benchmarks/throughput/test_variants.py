@@ -1,4 +1,4 @@
-"""A tunnel continued by itself is still a tunnel."""
+"""A tunnel continued by copies of itself is still a tunnel."""
 
 from dataclasses import replace
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from benchmarks.throughput import joined
-from benchmarks.throughput.exactness import measure_exactness
+from benchmarks.throughput.measure import measure_exactness
+from benchmarks.throughput.variants import extend_tunnel
 
 
 @pytest.fixture(scope="module")
@@ -17,13 +17,13 @@ def plan() -> st.TunnelPlan:
 
 
 def test_a_shorter_one_is_a_slice(plan):
-    part = joined.of_length(plan, 100.0)
+    part = extend_tunnel(plan, 100.0)
     assert part.length == pytest.approx(100.0)
     np.testing.assert_allclose(part.centre[0], plan.centre[0])
 
 
 def test_ten_in_a_row_are_ten_times_as_long_and_have_no_kink(plan):
-    long = joined.of_length(plan, 3510.0)
+    long = extend_tunnel(plan, 3510.0)
     assert long.length == pytest.approx(3510.0)
     step = np.diff(long.centre, axis=0)
     spacing = np.linalg.norm(step, axis=1)
@@ -35,7 +35,7 @@ def test_ten_in_a_row_are_ten_times_as_long_and_have_no_kink(plan):
 
 
 def test_left_stays_left_and_walls_keep_their_distance(plan):
-    long = joined.of_length(plan, 900.0)
+    long = extend_tunnel(plan, 900.0)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         wall = getattr(long.lining("smooth"), side)
         assert np.all(np.diff(wall.station) >= 0.0)
@@ -51,7 +51,7 @@ def test_left_stays_left_and_walls_keep_their_distance(plan):
 
 
 def test_it_does_not_meet_itself(plan):
-    long = joined.of_length(plan, 3510.0)
+    long = extend_tunnel(plan, 3510.0)
     node = long.centre[:: max(1, len(long.centre) // 700)]
     station = np.linspace(0.0, long.length, len(node))
     distance = np.hypot(*(node[:, None, k] - node[None, :, k] for k in (0, 1)))
@@ -59,7 +59,7 @@ def test_it_does_not_meet_itself(plan):
 
 
 def test_its_lidar_is_exact_across_the_seams(plan):
-    long = joined.of_length(plan.slice(0.0, 40.0), 110.0)
+    long = extend_tunnel(plan.slice(0.0, 40.0), 110.0)
     _, params = st.make("Subterra/Traverse-v0", long)
     gate = measure_exactness(long, "pockets", params, 300, seed=0)
     assert gate.n_wrong == 0

@@ -3,20 +3,20 @@ import re
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks import page
+from benchmarks import report
 
 
 def test_a_page_refers_to_nothing_outside_itself():
     figure, axes = plt.subplots()
     axes.plot([0, 1])
     parts = [
-        page.heading("A & B"),
-        page.figure(figure, "a line"),
-        page.figure(np.zeros((4, 4, 3), np.uint8), "a picture"),
-        page.table(("What", "Value"), [(("x < y", "1"), True)]),
+        report.html_heading("A & B"),
+        report.html_figure(figure, "a line"),
+        report.html_figure(np.zeros((4, 4, 3), np.uint8), "a picture"),
+        report.html_table(("What", "Value"), [(("x < y", "1"), True)]),
     ]
     plt.close(figure)
-    text = page.page("T", parts)
+    text = report.html_page("T", parts)
     assert all(source.startswith("data:image/png;base64,") for source in re.findall(r'src="([^"]*)"', text))
     assert "http" not in text
     assert "A &amp; B" in text

@@ -1,4 +1,4 @@
-"""Where and when something was measured."""
+"""Facts that every result file carries, and files written whole or not at all."""
 
 import os
 import platform
@@ -9,11 +9,13 @@ from typing import Any
 
 import jax
 
+from subterra_jax import tasks
+
 _PACKAGES = ("jax", "jaxlib", "flax", "numpy", "mujoco", "jaxmarl", "gymnax", "subterra-jax")
 
 
 def environment_facts() -> dict[str, Any]:
-    """Date (UTC), hardware and versions; None for a package that is not installed."""
+    """Return date (UTC), hardware and versions; `None` for a package that is not installed."""
     device = jax.devices()[0]
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -27,16 +29,33 @@ def environment_facts() -> dict[str, Any]:
     }
 
 
+def constants_facts() -> dict[str, str]:
+    """Return the digest of the benchmark's constants; empty where `subterra_jax.tasks` has none to give."""
+    digest = getattr(tasks, "constants_digest", None)
+    return {} if digest is None else {"constants_sha256": str(digest())}
+
+
 def version(package: str) -> str | None:
-    """Version of a package; None where it is not installed, or runs from a checkout that was not."""
+    """Return a package's version; `None` where it is not installed, or runs from a checkout that was not."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
 
 
+def write_file(path: Path, content: bytes) -> None:
+    """Writes a file under a temporary name, then renames it, so that no half-written file is left.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(content)
+    partial.replace(path)
+
+
 def _processor() -> str:
-    """Name of the processor, as well as the system tells it."""
+    """Return the processor's name, as far as the system gives it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

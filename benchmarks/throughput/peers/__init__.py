@@ -1,1 +1,0 @@
-"""Who else steps: each file one environment, its package optional."""
