@@ -254,7 +254,7 @@ def compare_tilted(folder: Path, plan: TunnelPlan, lining: str, n_rays: int, see
 
 def random_scans(folder: Path, plan: TunnelPlan, n: int, rng: np.random.Generator) -> Scans:
     """Draws tilted sensors anywhere above the track, with any heading."""
-    with np.load_bore(folder / "bore.npz") as bore:
+    with np.load(folder / "bore.npz") as bore:
         grid, axis, lateral = bore["station"], bore["position"], bore["lateral"]
     station = rng.uniform(0.0, grid[-1], n)
 
