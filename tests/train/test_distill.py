@@ -9,6 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.baselines import registry
+from tests.subterra_jax.probes import PROBES
 from tests.train.conftest import call, log_without_timing
 from train import navigate
 from train.errors import ConfigError
@@ -45,6 +46,17 @@ def test_what_a_teacher_wants_before_the_tanh_gives_its_action_after_it(learner)
     # The ends cannot be reached; what comes closest is finite.
     ends = networks.action(learner[0]._before_tanh(jnp.array([[2.0, 1.5], [2.0, -1.5]])))
     np.testing.assert_allclose(ends, [[2.0, 1.5], [2.0, -1.5]], atol=0.04)
+
+
+@pytest.mark.parametrize("name", ["nothing", "truth", "ranges", "map"])
+def test_a_teacher_gets_what_it_declares_and_no_more(learner, name):
+    agent, speed = PROBES[name]
+    env, params = learner[0].env.env, learner[1]
+    observation, state = learner[0].env.reset(jax.random.key(0), params, 2)
+    memory = teacher.blank(env, agent, params, 2)
+    advise = jax.jit(lambda *seen: teacher.advise(env, agent, *seen, jnp.ones(2, bool), params))
+    advice, _ = advise(jax.random.key(1), memory, observation, state)
+    np.testing.assert_allclose(advice[:, 0], speed, rtol=1e-4)
 
 
 def test_a_teacher_who_is_not_obeyed_remembers_what_was_done_and_has_not_arrived(learner):

@@ -1,12 +1,17 @@
 """What is made of many robots' walks, and of one that is filmed."""
 
+import dataclasses
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import subterra_jax as st
 from subterra_jax.b2 import film, trial
 from subterra_jax.b2.view import PictureError
+from subterra_jax.env import TunnelEnv
+from tests.subterra_jax import probes
 
 PARAMS = SimpleNamespace(
     start=SimpleNamespace(station=2.0), vehicle=SimpleNamespace(period=0.2), tunnel=SimpleNamespace(length=100.0)
@@ -52,3 +57,20 @@ def test_a_film_holds_its_pictures_and_says_so_where_it_cannot_be_written(tmp_pa
 def test_the_command_ends_with_one_sentence_where_the_gait_is_missing(capsys):
     assert film.main(["run.gif", "--policy", "nobody"]) == 2
     assert "error: nobody: no such policy" in capsys.readouterr().err
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rolling(TunnelEnv):
+    """An environment on wheels that says, as one on legs does, that nobody fell."""
+
+    def advance(self, state, action, noise, params):
+        *results, info = super().advance(state, action, noise, params)
+        return (*results, {**info, "fall": jnp.zeros((), bool)})
+
+
+@pytest.mark.parametrize("name", ["nothing", "truth"])
+def test_a_robot_on_legs_is_driven_by_what_its_agent_declares_and_no_more(name):
+    agent, speed = probes.PROBES[name]
+    env, params = st.make("Subterra/TraverseShort-v0", horizon=3)
+    walk, _ = trial.drive(_Rolling(env.id, env.rule), params, agent, 2)
+    np.testing.assert_allclose(walk.state.command[:, 0], speed, rtol=1e-4)
