@@ -129,12 +129,12 @@ WALKING: dict[str, Value] = {
     "command.hold": 4.0,
     "command.still": 0.15,
     "command.corridor": 0.25,
-    "variety.friction": [0.4, 1.0],
-    "variety.mass": [0.8, 1.05],
-    "variety.shift": [0.04, 0.02, 0.02],
-    "variety.gain": [0.9, 1.1],
-    "variety.push": 0.5,
-    "variety.push_every": 5.0,
+    "randomisation.friction": [0.4, 1.0],
+    "randomisation.mass": [0.8, 1.05],
+    "randomisation.shift": [0.04, 0.02, 0.02],
+    "randomisation.gain": [0.9, 1.1],
+    "randomisation.push": 0.5,
+    "randomisation.push_every": 5.0,
     "sensor.rate": 0.2,
     "sensor.gravity": 0.03,
     "sensor.angle": 0.02,
@@ -183,7 +183,7 @@ TABLE: dict[str, dict[str, Value]] = {
 }
 # m: the whole packaged tunnel, or its first metres.
 LENGTHS = {"Subterra/TraverseShort-v0": 60.0} | {name: 65.0 for name in TABLE if "Short" in name and "Trav" not in name}
-SHA256 = "b4280581a73d96b0c4f50ad90269c970009601d43b1fe25f561eb3d9587c0814"
+SHA256 = "4b15c44cfe5a7868cd04351a9c76ef4636ff32a818d761decc365b4d8056280d"
 
 
 def canonical(table: dict[str, dict[str, Value]]) -> str:
