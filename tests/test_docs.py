@@ -116,9 +116,9 @@ def command_line() -> Callable[[list[str]], None]:
 
 
 def _as_argparse(words: list[str]) -> None:
-    from subterra_jax.viewer.cli import parsed
+    from subterra_jax.viewer.__main__ import parse_arguments
 
-    parsed(words[1:])
+    parse_arguments(words[1:])
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")

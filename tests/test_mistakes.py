@@ -157,7 +157,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("scene.xml", "bore.npz", "tunnel.npz", "manifest.json", "meshes/lining.ply"):
         (tmp_path / "tunnel" / name).write_bytes(JUNK)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("subterra_jax.viewer.cli._compile_once", lambda: None)
+    monkeypatch.setattr("subterra_jax.viewer.__main__._compile_once", lambda: None)
     return tmp_path
 
 

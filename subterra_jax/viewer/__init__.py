@@ -1,5 +1,5 @@
-"""A tunnel, a robot and what it believes, in the browser: `python -m subterra_jax.viewer`.
+"""A tunnel, a robot and its belief in the browser: `python -m subterra_jax.viewer`.
 
-plan, scene folder ─► shapes ─► stage ◄─ player ◄─ recording ◄─ driving (env + agent)
-                                  └────── session, panel, charts ──────┘
+plan, scene folder ─► shapes ─► scene ◄─ player ◄─ recording ◄─ driving (env + agent)
+                                  └────── session, panel, browsers ────┘
 """

@@ -1,8 +1,117 @@
-"""`python -m subterra_jax.viewer`."""
+"""`python -m subterra_jax.viewer`: shows episodes in the browser."""
 
+import argparse
+import logging
+import os
 import sys
+import time
+import warnings
+from pathlib import Path
 
-from subterra_jax.viewer.cli import main
+from subterra_jax.arguments import parse
+from subterra_jax.errors import SubterraError
+from subterra_jax.viewer.config import LOOPBACK, ViewerConfig
+
+_EXAMPLE = "example: python -m subterra_jax.viewer --scene build/tunnel --task StopAt --driver particle-filter"
+
+
+def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
+    """Read a command line.
+
+    Raises:
+        ArgumentsError: The command line is malformed.
+        SystemExit: Help was shown.
+    """
+    default = ViewerConfig()
+    parser = argparse.ArgumentParser(
+        prog="python -m subterra_jax.viewer", description="Shows episodes in the browser.", epilog=_EXAMPLE
+    )
+    add = parser.add_argument
+    add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build: its lining, track and tunnel")
+    add("--tunnel", action="append", default=[], metavar="NAME|FILE", help="offer another tunnel; may be repeated")
+    add("--lining", default=default.lining, metavar="NAME", help="pockets (default), smooth or furnished")
+    add("--task", default=default.task, metavar="ID", help="first task, as StopAt or Subterra/StopAt-v0 (the default)")
+    add("--driver", default=default.agent, metavar="NAME", help="first driver: a baseline, or policy:StopAt-v0")
+    add("--policy", action="append", default=[], type=Path, metavar="FILE", help="offer this .safetensors as driver")
+    add("--seed", type=int, default=default.seed, metavar="N", help="seed of the first episode")
+    add(
+        "--recordings",
+        type=Path,
+        default=default.recordings,
+        metavar="DIR",
+        help="folder for saved episodes and pictures",
+    )
+    add("--replay", type=Path, metavar="FILE", help="begin with this recorded episode")
+    add(
+        "--host",
+        default=default.host,
+        metavar="ADDRESS",
+        help="address to listen on; the default is this machine alone",
+    )
+    add("--port", type=int, default=default.port, metavar="N", help="first port to try")
+    given = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
+    return ViewerConfig(
+        scene=given.scene,
+        tunnels=tuple(given.tunnel),
+        lining=given.lining,
+        task=given.task,
+        agent=given.driver,
+        policies=tuple(given.policy),
+        seed=given.seed,
+        recordings=given.recordings,
+        replay=given.replay,
+        host=given.host,
+        port=given.port,
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the viewer; return 2 for a user's mistake."""
+    try:
+        config = parse_arguments(arguments)
+    except SubterraError as error:
+        return _report(error)
+    # Malformed messages are refused silently: a traceback for each would bury the others.
+    for name in ("websockets.server", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
+    try:
+        from subterra_jax.viewer.session import Viewer
+
+        _compile_once()
+        viewer = Viewer(config)
+    except ModuleNotFoundError as error:
+        return _report(f"{error.name} is not installed: pip install 'subterra-jax[viewer]'")
+    except (SubterraError, ValueError) as error:
+        return _report(error)
+    print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
+    if config.host not in (LOOPBACK, "localhost", "::1"):
+        print(
+            f"listening on {config.host}: everyone who reaches this address can drive and save in {config.recordings}"
+        )
+    try:
+        while True:
+            time.sleep(3600.0)
+    except KeyboardInterrupt:
+        viewer.stop()
+    return 0
+
+
+def _report(cause: object) -> int:
+    """Print a user's mistake on one line; return the exit status."""
+    print(f"error: {' '.join(str(cause).split())}", file=sys.stderr)
+    return 2
+
+
+def _compile_once() -> None:
+    """Compute on the CPU, which suits one episode, and keep compiled programs on disk."""
+    import jax
+
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    jax.config.update("jax_platforms", "cpu")
+    jax.config.update("jax_compilation_cache_dir", str(base / "subterra" / "viewer"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
 
 if __name__ == "__main__":
     sys.exit(main())

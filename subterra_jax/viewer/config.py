@@ -1,14 +1,19 @@
-"""What the viewer is asked to show, and whether it can."""
+"""Config of the viewer, its errors, and the checks before it starts."""
 
 import socket
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from subterra_jax.b2 import MISSIONS
+from subterra_jax.errors import SubterraError
 from subterra_jax.outputs import require_folder
 from subterra_jax.tasks import TASKS
 from subterra_jax.versions import no_task
-from subterra_jax.viewer.errors import ViewerError
+
+
+class ViewerError(SubterraError):
+    """The viewer cannot start, or cannot show the choice."""
+
 
 LOOPBACK = "127.0.0.1"
 _PORTS_TRIED = 20
@@ -17,18 +22,18 @@ LININGS = ("pockets", "smooth", "furnished")
 
 @dataclass(frozen=True)
 class ViewerConfig:
-    """What to show, and where to serve it.
+    """Tunnels, task and driver to show, and the address to serve them at.
 
     Attributes:
-        scene: A scene folder, whose lining and track are shown and whose tunnel is driven in; None is none.
+        scene: Scene folder with the lining, track and tunnel to show; `None`: no scene.
         tunnels: Further tunnel files, or names as for `load_tunnel`.
         task: Id of the first task, as `Subterra/StopAt-v0` or `StopAt`.
-        agent: Name of who drives first.
+        agent: Name of the first driver.
         policies: Trained policies, `.safetensors` files, offered beside the baselines.
-        lining: Variant of the walls to begin with.
+        lining: First variant of the walls.
         seed: Seed of the first episode.
-        recordings: Folder in which episodes and pictures are saved, and from which episodes are replayed.
-        replay: A recorded episode to begin with; None drives one.
+        recordings: Folder for saved episodes and pictures.
+        replay: First episode, if it is a recorded one.
         host: Address to listen on. The default is this machine alone.
         port: First port to try.
     """
@@ -46,18 +51,18 @@ class ViewerConfig:
     port: int = 8080
 
 
-def checked(config: ViewerConfig) -> ViewerConfig:
-    """The config with the task's id in full.
+def check_config(config: ViewerConfig) -> ViewerConfig:
+    """Check a config; return it with the task's full id.
 
     Raises:
-        ViewerError: A folder or file is not there, there is no such task, or a value is out of range.
+        ViewerError: A folder or file is missing, the task does not exist, or a value is out of range.
     """
     if config.scene is not None:
         for needed in ("scene.xml", "tunnel.npz", "meshes"):
             if not (config.scene / needed).exists():
                 raise ViewerError(f"{config.scene} is no scene folder: {needed} is missing")
     if config.recordings != ViewerConfig.recordings or config.recordings.exists():
-        require_folder(config.recordings)  # where nobody named one, looking on works wherever one stands
+        require_folder(config.recordings)  # the default folder need not be writable until something is saved
     if config.lining not in LININGS:
         raise ViewerError(f"lining must be one of {', '.join(LININGS)}, got {config.lining!r}")
     if not 0 <= config.seed < 2**31:
@@ -71,10 +76,10 @@ def checked(config: ViewerConfig) -> ViewerConfig:
 
 
 def free_port(host: str, port: int) -> int:
-    """The first free port from one on; 0 is left to the system.
+    """Find the first free port from `port` on; 0 is left to the system.
 
     Raises:
-        ViewerError: The address is not this machine's, or all of them are taken.
+        ViewerError: The address is not this machine's, or all ports are taken.
     """
     cause: OSError | None = None
     for candidate in range(port, min(port + _PORTS_TRIED, 2**16)) if port else (0,):

@@ -1,28 +1,92 @@
-"""What can be chosen: tunnels, tasks, agents, recorded episodes. Nothing else is ever read."""
+"""The tunnels, tasks, agents and recorded episodes to choose from; no other file is ever read."""
 
 import dataclasses
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+import subterra_jax as st
+from subterra_jax import policies, tasks
+from subterra_jax.b2 import MISSIONS
+from subterra_jax.baselines import registry
+from subterra_jax.errors import SubterraError
+from subterra_jax.policies.loading import Agent
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest
-from subterra_jax.viewer import drivers
-from subterra_jax.viewer.config import ViewerConfig
-from subterra_jax.viewer.errors import RecordingError, ViewerError
-from subterra_jax.viewer.recording import Recording, load
+from subterra_jax.viewer.config import ViewerConfig, ViewerError
+from subterra_jax.viewer.driving import drive
+from subterra_jax.viewer.geometry import Centreline
+from subterra_jax.viewer.recording import EpisodeFileError, Recording, load
+from subterra_jax.viewer.scene import SceneView
+from subterra_jax.viewer.shapes import lining_shape, planar_shapes, scene_shapes
+
+TASKS = (*tasks.TASKS, *MISSIONS)  # tasks that the viewer shows
+
+
+def register_agents(files: tuple[Path, ...]) -> tuple[str, ...]:
+    """Register all released policies and those of the command line; return the names of all agents.
+
+    Args:
+        files: Trained policies, registered as `file:STEM`.
+
+    Raises:
+        PolicyError: A file is missing or damaged.
+    """
+    policies.register_released()
+    for name in sorted(policies.released().keys() & {policies.name_for(task) for task in MISSIONS}):
+        _register(policies.PREFIX + name, policies.load(name)[0])
+    for path in files:
+        agent, _ = policies.load(path)
+        _register(f"file:{path.stem}", agent)
+    return registry.names()
+
+
+def _register(name: str, agent: Any) -> None:
+    if name not in registry.names():
+        registry.register(name, lambda params: policies.told(agent, params))
+
+
+def drive_episode(
+    plan: TunnelPlan, digest: str, title: str, lining: str, task: str, agent: str, seed: int
+) -> Iterator[Recording]:
+    """Drive an episode; yield the recording so far, again and again.
+
+    Args:
+        plan: The tunnel.
+        digest: SHA-256 of the tunnel.
+        title: Name of the tunnel.
+        lining: Variant of its walls.
+        task: Id of the task.
+        agent: Name of the driver.
+        seed: Seed of the episode.
+
+    Raises:
+        SubterraError: The agent does not exist, or does not fit the task.
+        ValueError: The task does not exist, or the tunnel is too short for it.
+    """
+    legs: dict[str, Any] = {"engine": "mujoco"} if task in MISSIONS else {}
+    env, params = st.make(task, tunnel=plan, lining=lining, **legs)
+    driver = registry.make_agent(agent, params)
+    if isinstance(driver, Agent):
+        policies.check_fits(driver, env, params, agent)
+    names = {"tunnel": title, "tunnel_sha256": digest, "lining": lining, "agent": agent}
+    yield from drive(env, params, driver, seed, names)
+
 
 _GENERATED = ("control", "procedural:test:0", "procedural:test:1", "procedural:test:2")
 
 
 @dataclasses.dataclass(frozen=True)
-class Tunnel:
-    """A tunnel that can be chosen.
+class TunnelEntry:
+    """A tunnel to choose.
 
     Attributes:
-        title: What it is called in the list.
-        source: What `load_tunnel` takes.
-        scene: The scene folder with its lining and track; None where there is only the plan.
+        title: Name in the list.
+        source: File or name for `load_tunnel`.
+        scene: Scene folder with lining and track; `None` if there is only the plan.
     """
 
     title: str
@@ -31,37 +95,41 @@ class Tunnel:
 
 
 class Library:
-    """Everything that the viewer was given.
+    """The tunnels, agents and recordings of a config.
 
     Args:
-        config: What it was given.
+        config: Config of the viewer.
+
+    Attributes:
+        tunnels: Tunnels by title.
+        agents: Names of the agents.
 
     Raises:
-        SubterraError: A tunnel or a policy of the command line cannot be read, or there is no such driver.
+        SubterraError: A tunnel or policy cannot be read, or the driver does not exist.
     """
 
     def __init__(self, config: ViewerConfig):
         self._folder = config.recordings
         self._plans: dict[str, TunnelPlan] = {}
-        self.tunnels: dict[str, Tunnel] = {}
+        self.tunnels: dict[str, TunnelEntry] = {}
         if config.scene is not None:
             source = str(config.scene / "tunnel.npz")
             name = f"{load_tunnel(source).name} (scene)"
-            self.tunnels[name] = Tunnel(name, source, config.scene)
+            self.tunnels[name] = TunnelEntry(name, source, config.scene)
         for source in (*config.tunnels, *PACKAGED, *_GENERATED):
-            self.tunnels.setdefault(source, Tunnel(source, source))
+            self.tunnels.setdefault(source, TunnelEntry(source, source))
         for source in config.tunnels:
             self.plan(source)
-        self.agents = drivers.offer(config.policies)
+        self.agents = register_agents(config.policies)
         if config.agent not in self.agents:
             raise ViewerError(f"no driver {config.agent!r}; there are {', '.join(self.agents)}")
 
     def plan(self, title: str) -> TunnelPlan:
-        """A tunnel, read when it is first asked for.
+        """Return a tunnel, read at its first use.
 
         Raises:
-            ViewerError: It is not on the list.
-            TunnelError: It cannot be read.
+            ViewerError: The tunnel is not on the list.
+            TunnelError: The tunnel cannot be read.
         """
         if title not in self.tunnels:
             raise ViewerError(f"no tunnel {title!r}; there are {', '.join(self.tunnels)}")
@@ -70,28 +138,28 @@ class Library:
         return self._plans[title]
 
     def digest(self, title: str) -> str:
-        """SHA-256 of a tunnel."""
+        """Return the SHA-256 of a tunnel."""
         return tunnel_digest(self.tunnels[title].source)
 
     def recordings(self) -> tuple[str, ...]:
-        """Names of the recorded episodes in the folder."""
+        """Return the names of the recorded episodes in the folder."""
         return tuple(sorted(path.name for path in self._folder.glob("*.npz") if path.is_file()))
 
-    def recorded(self, name: str) -> Recording:
-        """One of them.
+    def load_recording(self, name: str) -> Recording:
+        """Read a recorded episode of the folder.
 
         Raises:
-            RecordingError: It is not in the folder, or cannot be read.
+            EpisodeFileError: It is not in the folder, or cannot be read.
         """
         if name not in self.recordings():
-            raise RecordingError(f"no recording {name!r} in {self._folder}")
+            raise EpisodeFileError(f"no recording {name!r} in {self._folder}")
         return load(self._folder / name)
 
-    def tunnel_of(self, recording: Recording) -> str:
-        """Title of the tunnel that an episode was recorded in, wherever that file lies now.
+    def find_tunnel(self, recording: Recording) -> str:
+        """Return the title of the tunnel that an episode was recorded in, found by its digest.
 
         Raises:
-            ViewerError: The viewer was not given that tunnel, or its file has changed since.
+            ViewerError: The tunnel is not on the list, or its file has changed since.
         """
         named = [title for title in self.tunnels if title == recording.tunnel]
         for title in (*named, *(title for title in self.tunnels if title not in named)):
@@ -103,10 +171,86 @@ class Library:
         )
 
     def path_for(self, name: str) -> Path:
-        """Where a file of that name is saved."""
+        """Return the path for saving a file of that name."""
         return self._folder / Path(name).name
 
 
-def course_plan(plan: TunnelPlan, length: float) -> TunnelPlan:
-    """The part of a tunnel that a task happens in, from its first mouth on."""
+def cut_piece(plan: TunnelPlan, length: float) -> TunnelPlan:
+    """Return the first `length` metres of a tunnel, or the whole."""
     return plan if length >= plan.length - 1e-6 or not np.isfinite(length) else plan.slice(0.0, length)
+
+
+class TunnelView:
+    """Shows one tunnel at a time: its plan or lining at once, every detail as soon as it has been read.
+
+    Args:
+        scene_view: Scene to show it in.
+        library: Tunnels to choose from.
+        report_error: Called with a sentence if the details of a scene cannot be read.
+    """
+
+    def __init__(self, scene_view: SceneView, library: Library, report_error: Callable[[str], None]):
+        self._scene_view, self._library, self._report_error = scene_view, library, report_error
+        self._shown: tuple[str, str, float] | None = None
+        self.cutaway = True
+
+    def choose_lining(self, title: str, lining: str) -> str:
+        """Return the lining to show: the chosen one, or the tunnel's only one.
+
+        Raises:
+            TunnelError: The tunnel has several linings, but not the chosen one.
+        """
+        plan = self._library.plan(title)
+        if len(plan.linings) == 1:
+            return next(iter(plan.linings))
+        plan.lining(lining)
+        return lining
+
+    def show(self, title: str, lining: str, length: float) -> Centreline:
+        """Show the first `length` metres of a tunnel; return its centreline.
+
+        Args:
+            title: Title of the tunnel.
+            lining: Variant of its walls.
+            length: Length to show, m; a scene is shown as a whole.
+
+        Raises:
+            SubterraError: A file cannot be read.
+        """
+        plan, scene = self._library.plan(title), self._library.tunnels[title].scene
+        centreline = Centreline(cut_piece(plan, length))
+        key = (title, lining, -1.0 if scene is not None else length)
+        if key == self._shown:
+            return centreline
+        if scene is None:
+            self._scene_view.set_tunnel(planar_shapes(centreline.plan, lining), cutaway=self.cutaway)
+        else:
+            self._scene_view.set_tunnel([lining_shape(scene, lining)], cutaway=self.cutaway)
+            threading.Thread(target=self._show_details, args=(key,), daemon=True).start()
+        self._shown = key
+        return centreline
+
+    def note(self, title: str) -> str:
+        """Return a caveat for the picture of a tunnel; empty for a scene, which is shown as built."""
+        planar = self._library.tunnels[title].scene is None
+        return "walls pulled up from the plan at LiDAR height" if planar else ""
+
+    def set_cutaway(self, cutaway: bool) -> None:
+        """Draw walls from within only, or from both sides."""
+        self.cutaway = cutaway
+        self._scene_view.set_cutaway(cutaway)
+
+    def _show_details(self, key: tuple[str, str, float]) -> None:
+        """Replace a bare lining by the whole scene, unless another tunnel is shown by then."""
+        title, lining, _ = key
+        scene = self._library.tunnels[title].scene
+        assert scene is not None
+        try:
+            shapes = scene_shapes(scene, lining)
+            if lining == "smooth":
+                shapes = [lining_shape(scene, lining), *shapes]
+        except SubterraError as error:
+            self._report_error(str(error))
+            return
+        if self._shown == key:
+            self._scene_view.set_tunnel(shapes, cutaway=self.cutaway)

@@ -1,110 +1,116 @@
-"""The clock of a replay: play, pause, seek, speed."""
+"""Two threads: the clock of a replay, and a worker for long jobs."""
 
 import logging
 import threading
 import time
 from collections.abc import Callable
 
-from subterra_jax.viewer.frames import Film, Frame
+from subterra_jax.errors import SubterraError
+from subterra_jax.viewer.geometry import EpisodeGeometry, Moment
 
-RATE = 40.0  # frames/s that are aimed at; a screen shows 60, an episode has 10 rows a second
+RATE = 40.0  # target, frames/s; a screen shows 60, an episode has 10 rows a second
 _LOG = logging.getLogger(__name__)
 
 
 class Player:
-    """Shows an episode moment by moment, on a thread of its own.
+    """Clock of a replay: plays, pauses and seeks an episode on its own thread.
 
     Args:
-        show: Called with the film, the moment, and whether it must be shown in full (after a seek, a stop, a new
-            episode) and not only moved on.
+        show: Called with the episode, the moment, and whether everything must be drawn again, as after a seek, a stop
+            or a new episode.
+
+    Attributes:
+        playing: Whether time passes.
+        speed: Seconds of the episode per second.
+        frames_per_second: Frames shown in the last second.
     """
 
-    def __init__(self, show: Callable[[Film, Frame, bool], None]):
+    def __init__(self, show: Callable[[EpisodeGeometry, Moment, bool], None]):
         self._show = show
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self._film: Film | None = None
+        self._episode: EpisodeGeometry | None = None
         self._at, self._dirty = 0.0, False
         self.playing, self.speed = False, 1.0
         self.frames_per_second = 0.0
         self._thread = threading.Thread(target=self._loop, name="player", daemon=True)
 
     @property
-    def film(self) -> Film | None:
-        """What is being shown."""
-        return self._film
+    def episode(self) -> EpisodeGeometry | None:
+        """Episode that is shown."""
+        return self._episode
 
     @property
     def time(self) -> float:
         """Time since the start of the episode, s."""
-        film = self._film
-        return 0.0 if film is None else self._at * film.recording.period
+        episode = self._episode
+        return 0.0 if episode is None else self._at * episode.recording.period
 
     def start(self) -> None:
-        """Starts the clock."""
+        """Start the clock."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stops the clock for good."""
+        """Stop the clock for good."""
         self._stop.set()
         self._thread.join(timeout=2.0)
 
-    def begin(self, film: Film, *, playing: bool) -> None:
-        """Another episode, from its start."""
+    def begin(self, episode: EpisodeGeometry, *, playing: bool) -> None:
+        """Show another episode from its start."""
         with self._lock:
-            self._film, self._at, self.playing, self._dirty = film, 0.0, playing, True
+            self._episode, self._at, self.playing, self._dirty = episode, 0.0, playing, True
 
-    def grow(self, film: Film) -> None:
-        """The same episode, longer than before."""
+    def grow(self, episode: EpisodeGeometry) -> None:
+        """Replace the episode by a longer recording of it."""
         with self._lock:
-            self._film = film
+            self._episode = episode
 
     def seek(self, seconds: float) -> None:
-        """Goes to a time of the episode, s; clipped to it."""
+        """Go to a time of the episode, s; clipped to its end."""
         with self._lock:
-            if self._film is not None:
-                rows = round(seconds / self._film.recording.period, 4)  # 0.3 s are three rows of 0.1 s
-                self._at, self._dirty = min(max(rows, 0.0), len(self._film) - 1.0), True
+            if self._episode is not None:
+                rows = round(seconds / self._episode.recording.period, 4)  # 0.3 s are three rows of 0.1 s
+                self._at, self._dirty = min(max(rows, 0.0), len(self._episode) - 1.0), True
 
     def toggle(self) -> None:
-        """Plays or pauses; plays from the start where the end has been reached."""
+        """Play or pause; play from the start after the end."""
         with self._lock:
-            if self._film is None:
+            if self._episode is None:
                 return
-            if not self.playing and self._at >= len(self._film) - 1:
+            if not self.playing and self._at >= len(self._episode) - 1:
                 self._at = 0.0
             self.playing, self._dirty = not self.playing, True
 
     def pause(self) -> None:
-        """Stands still."""
+        """Pause."""
         with self._lock:
             self.playing, self._dirty = False, True
 
     def refresh(self) -> None:
-        """Has the present moment shown again."""
+        """Draw the present moment again."""
         with self._lock:
             self._dirty = True
 
-    def advance(self, seconds: float) -> tuple[Film, Frame, bool] | None:
-        """Lets time pass.
+    def advance(self, seconds: float) -> tuple[EpisodeGeometry, Moment, bool] | None:
+        """Advance the replay.
 
         Args:
-            seconds: How much of it, s, before the speed is counted in.
+            seconds: Time that has passed, s, without the factor `speed`.
 
         Returns:
-            What to show now; None where nothing has changed.
+            Arguments of `show`; `None` if nothing has changed.
         """
         with self._lock:
-            film = self._film
-            if film is None or not (self.playing or self._dirty):
+            episode = self._episode
+            if episode is None or not (self.playing or self._dirty):
                 return None
-            last = len(film) - 1.0
+            last = len(episode) - 1.0
             if self.playing:
-                self._at = min(self._at + seconds * self.speed / film.recording.period, last)
-            if self.playing and self._at >= last and film.whole:
+                self._at = min(self._at + seconds * self.speed / episode.recording.period, last)
+            if self.playing and self._at >= last and episode.finished:
                 self.playing, self._dirty = False, True
             full, self._dirty = self._dirty, False
-            return film, film.frame(self._at), full
+            return episode, episode.moment(self._at), full
 
     def _loop(self) -> None:
         before, counted, since = time.monotonic(), 0, time.monotonic()
@@ -116,7 +122,59 @@ class Player:
                 if moment is not None:
                     self._show(*moment)
                     counted += 1
-            except Exception:  # whatever a browser did, the others go on watching
+            except Exception:  # the other browsers must go on
                 _LOG.exception("a frame could not be shown")
             if now - since >= 1.0:
                 self.frames_per_second, counted, since = counted / (now - since), 0, now
+
+
+Job = Callable[[Callable[[], bool]], None]
+
+
+class Worker:
+    """Runs the newest job on its own thread; a running job can ask whether a newer one waits.
+
+    Args:
+        report_error: Called with a sentence if a job fails.
+    """
+
+    def __init__(self, report_error: Callable[[str], None]):
+        self._report_error = report_error
+        self._waiting: Job | None = None
+        self._newest = 0
+        self._ready = threading.Condition()
+        self._done = False
+        self._thread = threading.Thread(target=self._loop, name="worker", daemon=True)
+        self._thread.start()
+
+    def submit(self, job: Job) -> None:
+        """Run a job once the running one has ended.
+
+        Args:
+            job: Called with a function that returns whether a newer job waits; the job should ask it often.
+        """
+        with self._ready:
+            self._waiting, self._newest = job, self._newest + 1
+            self._ready.notify()
+
+    def stop(self) -> None:
+        """End the thread."""
+        with self._ready:
+            self._done, self._newest = True, self._newest + 1
+            self._ready.notify()
+        self._thread.join(timeout=5.0)
+
+    def _loop(self) -> None:
+        while True:
+            with self._ready:
+                self._ready.wait_for(lambda: self._done or self._waiting is not None)
+                if self._done or self._waiting is None:
+                    return
+                job, number, self._waiting = self._waiting, self._newest, None
+            try:
+                job(lambda number=number: self._newest != number)  # type: ignore[misc]
+            except (SubterraError, ValueError) as error:
+                self._report_error(str(error))
+            except Exception as error:  # the thread must live on for the next job
+                _LOG.exception("a job failed")
+                self._report_error(f"{type(error).__name__}: {error}")

@@ -1,4 +1,4 @@
-"""One recorded episode: everything that is needed to show it again, in one `.npz`."""
+"""A recorded episode in one `.npz`, with everything needed to show it again."""
 
 import dataclasses
 import io
@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from subterra_jax.tunnel.sources import describe_damage
 from subterra_jax.versions import other_schema
-from subterra_jax.viewer.errors import RecordingError
+from subterra_jax.viewer.config import ViewerError
 
 SCHEMA = "subterra.episode/1"
 N_POSE = 16  # a quaternion and twelve joints
@@ -34,40 +34,44 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
 }
 
 
+class EpisodeFileError(ViewerError):
+    """A recorded episode cannot be read or written."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """An episode, or as much of it as has been driven. Row 0 of a series is the start, row t comes after step t.
+    """An episode so far. Row 0 of a series is the start, row t comes after step t.
 
     Attributes:
         task: Id of the task.
-        agent: Name of who drove.
-        tunnel: Name of the tunnel as the viewer lists it.
-        tunnel_sha256: Digest of that tunnel, from `tunnel_digest`.
+        agent: Name of the driver.
+        tunnel: Name of the tunnel in the viewer's list.
+        tunnel_sha256: Digest of the tunnel, from `tunnel_digest`.
         lining: Variant of the walls.
         seed: Seed of the episode.
         period: Control period, s.
         radius: Radius of the robot, m.
-        range_max: A beam that hits nothing reports this, m.
-        length: Length of the course, m.
+        range_max: Range of a beam that hits nothing, m.
+        length: Length of the driven piece of tunnel, m.
         start: Station at which the robot believes to start, m.
-        goal: Station of the goal, m; NaN where there is none.
-        success: 1 where the task was achieved, else 0.
-        contact: 1 where it ended at a wall or an obstacle, else 0.
+        goal: Station of the goal, m; NaN without a goal.
+        success: 1 if the task was achieved, else 0.
+        contact: 1 if the episode ended at a wall or an obstacle, else 0.
         position: True position, tunnel frame, m.
         heading: True heading, rad.
         station: True station, m.
         odometry: Dead-reckoned distance (m) and heading (rad) as observed.
         ranges: LiDAR ranges as observed, m.
         command: Speed (m/s) and yaw rate (rad/s) that led here; 0 in row 0.
-        estimate: Estimated station and its standard deviation, m; NaN from one who makes none, and in row 0.
+        estimate: Estimated station and its standard deviation, m; NaN without an estimate, and in row 0.
         reward: Reward of the step that led here.
         coverage: Share of the tunnel covered.
         cloud: Some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `k` is 0
-            for one who has none.
+            without a particle filter.
         boxes: Obstacles: middle x, y (m), unit vector along the first side, half sides (m).
-        trunk: Of who walks, height of the trunk, tunnel frame, m; else 0.
-        pose: Of who walks, on the way to this row: orientation w, x, y, z and joints (rad) at even times, the last
-            one at the row itself; `m` is 0 for who rolls, as in files from before anybody walked.
+        trunk: Height of a walking robot's trunk, tunnel frame, m; 0 for wheeled robots.
+        pose: Orientation w, x, y, z and joints (rad) of a walking robot at even times up to this row, the last at the
+            row itself; `m` is 0 for wheeled robots and in older files.
     """
 
     task: str
@@ -108,22 +112,22 @@ class Recording:
 
     @property
     def file_name(self) -> str:
-        """A name for its file; the same episode always has the same one."""
+        """Name of its file; the same episode always has the same name."""
         parts = (self.task.split("/")[-1], self.agent, Path(self.tunnel).stem, self.lining, str(int(self.seed)))
         plain = ("".join(c if c.isalnum() or c in "-." else "-" for c in part) for part in parts)
         return "_".join(plain) + ".npz"
 
     def extended(self, rows: dict[str, Any], success: float, contact: float) -> "Recording":
-        """The same with further rows of every series."""
+        """Return the episode with further rows of every series."""
         series: dict[str, Any] = {name: np.concatenate([getattr(self, name), values]) for name, values in rows.items()}
         return dataclasses.replace(self, success=success, contact=contact, **series)
 
 
 def save(recording: Recording, path: Path) -> None:
-    """Writes an episode, under a temporary name first; the same episode gives the same bytes.
+    """Write an episode, under a temporary name first; the same episode gives the same bytes.
 
     Raises:
-        RecordingError: The file cannot be written.
+        EpisodeFileError: The file cannot be written.
     """
     buffer = io.BytesIO()
     np.savez_compressed(buffer, schema=np.array(SCHEMA), **vars(recording))
@@ -133,49 +137,49 @@ def save(recording: Recording, path: Path) -> None:
         partial.write_bytes(buffer.getvalue())
         os.replace(partial, path)
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be written ({error.strerror})") from error
+        raise EpisodeFileError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def load(path: Path) -> Recording:
-    """Reads an episode.
+    """Read an episode.
 
     Raises:
-        RecordingError: There is no such file, it is no recording, or a field is missing or misshapen.
+        EpisodeFileError: The file is missing or is no recording, or a field is missing or has the wrong shape.
     """
     try:
         with np.load(path, allow_pickle=False) as data:
             fields = {name: data[name] for name in data.files}
     except FileNotFoundError as error:
-        raise RecordingError(f"{path}: no such recording") from error
-    except Exception as error:  # zipfile, zlib and NumPy each raise their own for a spoiled archive
-        raise RecordingError(f"{path}: not a readable recording ({describe_damage(path, error)})") from error
+        raise EpisodeFileError(f"{path}: no such recording") from error
+    except Exception as error:  # zipfile, zlib and NumPy each raise their own for a damaged archive
+        raise EpisodeFileError(f"{path}: not a readable recording ({describe_damage(path, error)})") from error
     if "station" in fields and "pose" not in fields:
         fields |= {"trunk": np.zeros(len(fields["station"])), "pose": np.zeros((len(fields["station"]), 0, N_POSE))}
-    found = str(fields["schema"]) if "schema" in fields else None
-    if found != SCHEMA:
-        raise RecordingError(f"{path}: {other_schema(found, SCHEMA, 'save the episode again in the viewer')}")
+    schema = str(fields["schema"]) if "schema" in fields else None
+    if schema != SCHEMA:
+        raise EpisodeFileError(f"{path}: {other_schema(schema, SCHEMA, 'save the episode again in the viewer')}")
     texts: dict[str, Any] = {name: str(_field(path, fields, name, (), "U")) for name in _TEXTS}
     numbers: dict[str, Any] = {name: float(_field(path, fields, name, (), "fiub")) for name in _NUMBERS}
     series: dict[str, Any] = {name: _field(path, fields, name, shape, "f") for name, shape in _SHAPES.items()}
     sizes = {len(values) for name, values in series.items() if name != "boxes"}
     if len(sizes) != 1 or 0 in sizes:
-        raise RecordingError(f"{path}: its series must have one length of at least 1, have {sorted(sizes)}")
+        raise EpisodeFileError(f"{path}: its series must have one length of at least 1, have {sorted(sizes)}")
     for name in ("position", "heading", "station", "odometry", "reward", "coverage"):
         if not np.isfinite(series[name]).all():
-            raise RecordingError(f"{path}: field {name!r} has a value that is not finite")
+            raise EpisodeFileError(f"{path}: field {name!r} has a value that is not finite")
     if not (np.isfinite(numbers["period"]) and numbers["period"] > 0.0):
-        raise RecordingError(f"{path}: field 'period' must be positive, is {numbers['period']}")
+        raise EpisodeFileError(f"{path}: field 'period' must be positive, is {numbers['period']}")
     return Recording(**texts, **numbers, **series)
 
 
 def _field(path: Path, fields: dict[str, Any], name: str, shape: tuple[str | int, ...], kinds: str) -> Any:
-    """One array of the right kind and rank."""
+    """Return one array of the right kind and rank."""
     if name not in fields:
-        raise RecordingError(f"{path}: field {name!r} is missing")
+        raise EpisodeFileError(f"{path}: field {name!r} is missing")
     value = fields[name]
     fits = value.ndim == len(shape) and all(
         isinstance(want, str) or want == have for want, have in zip(shape, value.shape, strict=True)
     )
     if value.dtype.kind not in kinds or not fits:
-        raise RecordingError(f"{path}: field {name!r} must have shape {shape}, is {value.dtype} of {value.shape}")
+        raise EpisodeFileError(f"{path}: field {name!r} must have shape {shape}, is {value.dtype} of {value.shape}")
     return value

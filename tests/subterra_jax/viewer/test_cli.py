@@ -4,7 +4,7 @@ import socket
 
 import pytest
 
-from subterra_jax.viewer.cli import main, parsed
+from subterra_jax.viewer.__main__ import main, parse_arguments
 from subterra_jax.viewer.recording import save
 from tests.subterra_jax.viewer.episodes import straight
 
@@ -27,7 +27,7 @@ from tests.subterra_jax.viewer.episodes import straight
 )
 def test_a_mistake_ends_in_one_sentence_and_status_2(capsys, monkeypatch, tmp_path, arguments, says):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("subterra_jax.viewer.cli._compile_once", lambda: None)
+    monkeypatch.setattr("subterra_jax.viewer.__main__._compile_once", lambda: None)
     assert main(["--port", "0", *arguments]) == 2
     said = capsys.readouterr()
     assert said.err.startswith(f"error: {says}")
@@ -46,7 +46,7 @@ def test_a_taken_port_is_passed_over(monkeypatch):
 
 def test_help_fits_a_screen_and_has_an_example(capsys):
     with pytest.raises(SystemExit) as ended:
-        parsed(["--help"])
+        parse_arguments(["--help"])
     assert ended.value.code == 0
     told = capsys.readouterr().out
     assert len(told.splitlines()) <= 40
@@ -55,4 +55,4 @@ def test_help_fits_a_screen_and_has_an_example(capsys):
 
 def test_a_recording_may_lie_anywhere_when_the_command_names_it(tmp_path):
     save(straight(), tmp_path / "a.npz")
-    assert parsed(["--replay", str(tmp_path / "a.npz")]).replay == tmp_path / "a.npz"
+    assert parse_arguments(["--replay", str(tmp_path / "a.npz")]).replay == tmp_path / "a.npz"

@@ -11,7 +11,7 @@ from subterra_jax.baselines.registry import make_agent
 from subterra_jax.errors import SubterraError
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.policies.feedforward import FeedForward
-from subterra_jax.viewer import drivers
+from subterra_jax.viewer import library
 from subterra_jax.viewer.driving import drive
 from tests.subterra_jax import tunnels
 
@@ -58,10 +58,10 @@ def test_an_episode_grows_from_its_start_and_keeps_what_it_had(parts):
 def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
     few = FeedForward({"statistics.mean": jnp.zeros(3)}, jnp.zeros(2), jnp.ones(2), frames=1)
-    monkeypatch.setattr(drivers.registry, "make_agent", lambda name, params: few)
+    monkeypatch.setattr(library.registry, "make_agent", lambda name, params: few)
     with pytest.raises(SubterraError, match="few: made for observations of 3 numbers, Subterra/Traverse-v0 has 18"):
-        next(drivers.episode(plan, "0", "t", "smooth", "Subterra/Traverse-v0", "few", 0))
+        next(library.drive_episode(plan, "0", "t", "smooth", "Subterra/Traverse-v0", "few", 0))
 
 
 def test_baselines_and_released_policies_are_offered():
-    assert {"particle-filter", "oracle", "policy:StopAt-v0"} <= set(drivers.offer(()))
+    assert {"particle-filter", "oracle", "policy:StopAt-v0"} <= set(library.register_agents(()))

@@ -9,11 +9,10 @@ import pytest
 import subterra_jax as st
 from subterra_jax.b2.constants import HIP_X, STAND_HEIGHT
 from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.viewer import drivers
-from subterra_jax.viewer.course import Course
-from subterra_jax.viewer.frames import Film, Frame
-from subterra_jax.viewer.legged import Legged
+from subterra_jax.viewer import library
+from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment
 from subterra_jax.viewer.recording import N_POSE, load, save
+from subterra_jax.viewer.scene import LeggedRobot
 from tests.subterra_jax import tunnels
 from tests.subterra_jax.viewer.episodes import straight
 
@@ -29,17 +28,17 @@ class Scene:
         return self.made[name]
 
 
-def frame(turned, trunk):
+def moment(turned, trunk):
     pose = np.concatenate([[np.cos(turned / 2), 0.0, 0.0, np.sin(turned / 2)], standing_pose()[0]])
-    return Frame(0, np.array([3.0, 4.0, 0.0]), turned, np.zeros(3), 0.0, trunk, pose)
+    return Moment(0, np.array([3.0, 4.0, 0.0]), turned, np.zeros(3), 0.0, trunk, pose)
 
 
 def test_thirteen_bodies_stand_where_mujoco_has_them():
     scene = Scene()
-    robot = Legged(scene)
+    robot = LeggedRobot(scene)
     assert len(robot.nodes) == 13
     assert all(len(node.mesh.faces) for node in robot.nodes)
-    robot.place(frame(0.0, 1.0 + STAND_HEIGHT))
+    robot.place(moment(0.0, 1.0 + STAND_HEIGHT))
     np.testing.assert_allclose(scene.made["/robot/base_link"].position, [3.0, 4.0, 1.0 + STAND_HEIGHT])
     assert scene.made["/robot/FL_hip"].position[0] == pytest.approx(3.0 + HIP_X)
     lowest = min(float((_turned(node.wxyz, node.mesh.vertices) + node.position)[:, 2].min()) for node in robot.nodes)
@@ -48,21 +47,21 @@ def test_thirteen_bodies_stand_where_mujoco_has_them():
 
 def test_it_faces_where_its_trunk_does():
     scene = Scene()
-    robot = Legged(scene)
-    robot.place(frame(np.pi / 2, 0.6))
+    robot = LeggedRobot(scene)
+    robot.place(moment(np.pi / 2, 0.6))
     assert scene.made["/robot/FL_hip"].position[1] == pytest.approx(4.0 + HIP_X)
 
 
 def test_between_two_rows_the_legs_move(plan_of):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(60.0)))
     poses = np.arange(3 * 4, dtype=np.float32).reshape(3, 4, 1) * np.ones(N_POSE, np.float32)
-    film = Film(straight(3, pose=poses), Course(plan))
-    assert [film.frame(at).pose[0] for at in (0.0, 0.3, 0.99, 1.0, 1.6, 2.0)] == [4.0, 5.0, 7.0, 8.0, 10.0, 11.0]
+    episode = EpisodeGeometry(straight(3, pose=poses), Centreline(plan))
+    assert [episode.moment(at).pose[0] for at in (0.0, 0.3, 0.99, 1.0, 1.6, 2.0)] == [4.0, 5.0, 7.0, 8.0, 10.0, 11.0]
 
 
 def test_an_episode_from_before_anybody_walked_still_opens(tmp_path):
-    path, whole = tmp_path / "old.npz", straight(5)
-    save(whole, path)
+    path, episode = tmp_path / "old.npz", straight(5)
+    save(episode, path)
     with np.load(path) as data:
         old = {name: data[name] for name in data.files if name not in ("trunk", "pose")}
     np.savez(path, **old)
@@ -71,9 +70,9 @@ def test_an_episode_from_before_anybody_walked_still_opens(tmp_path):
 
 @pytest.mark.slow
 def test_a_b2_is_driven_and_its_legs_are_recorded():
-    drivers.offer(())
+    library.register_agents(())
     plan = st.load_tunnel()
-    parts = drivers.episode(plan, "0", "t", "pockets", "Subterra/B2Traverse-v0", "policy:B2Traverse-v0", 3)
+    parts = library.drive_episode(plan, "0", "t", "pockets", "Subterra/B2Traverse-v0", "policy:B2Traverse-v0", 3)
     recording = list(itertools.islice(parts, 6))[-1]
     assert recording.pose.shape == (26, 10, N_POSE)
     np.testing.assert_allclose(np.linalg.norm(recording.pose[..., :4], axis=-1), 1.0, atol=1e-4)

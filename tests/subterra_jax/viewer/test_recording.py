@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from subterra_jax.viewer.errors import RecordingError
-from subterra_jax.viewer.recording import load, save
+from subterra_jax.viewer.recording import EpisodeFileError, load, save
 from tests.subterra_jax.viewer.episodes import straight
 
 
@@ -41,13 +40,13 @@ def test_the_same_episode_has_the_same_bytes_and_name(tmp_path):
 def test_a_spoiled_recording_is_refused_by_file_and_field(tmp_path, spoil, says):
     fields = {"schema": np.array("subterra.episode/1"), **{k: np.asarray(v) for k, v in vars(straight()).items()}}
     np.savez(tmp_path / "a.npz", **{name: v for name, v in {**fields, **spoil}.items() if v is not None})
-    with pytest.raises(RecordingError, match=f"a.npz: .*{says}"):
+    with pytest.raises(EpisodeFileError, match=f"a.npz: .*{says}"):
         load(tmp_path / "a.npz")
 
 
 def test_what_is_no_archive_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 but no more")
-    with pytest.raises(RecordingError, match="not a readable recording"):
+    with pytest.raises(EpisodeFileError, match="not a readable recording"):
         load(tmp_path / "a.npz")
-    with pytest.raises(RecordingError, match="no such recording"):
+    with pytest.raises(EpisodeFileError, match="no such recording"):
         load(tmp_path / "b.npz")

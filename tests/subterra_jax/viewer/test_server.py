@@ -12,11 +12,10 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from subterra_jax.tunnel.sources import tunnel_digest
-from subterra_jax.viewer.config import ViewerConfig
-from subterra_jax.viewer.errors import ViewerError
-from subterra_jax.viewer.frames import Film
+from subterra_jax.viewer.config import ViewerConfig, ViewerError
+from subterra_jax.viewer.geometry import EpisodeGeometry
 from subterra_jax.viewer.recording import load, save
-from subterra_jax.viewer.serving import Viewer
+from subterra_jax.viewer.session import Viewer
 from tests.subterra_jax import tunnels
 from tests.subterra_jax.viewer.clients import heard, join, say
 from tests.subterra_jax.viewer.episodes import straight
@@ -41,7 +40,7 @@ def viewer(folder):
         tunnels=(str(folder / "t.npz"),), recordings=folder / "rec", replay=folder / "rec" / "drive.npz", port=0
     )
     viewer = Viewer(config)
-    until(lambda: viewer.session.screening.player.film is not None)
+    until(lambda: viewer.session.view.player.episode is not None)
     yield viewer
     viewer.stop()
 
@@ -55,7 +54,7 @@ def until(holds, seconds=20.0):
 
 def moves(viewer):
     """Whether the replay goes on: the clock, and a client that hears the robot move."""
-    player = viewer.session.screening.player
+    player = viewer.session.view.player
     player.seek(0.0)
     if not player.playing:
         player.toggle()
@@ -79,19 +78,19 @@ def test_a_client_is_sent_tunnel_robot_and_controls(viewer):
 def test_the_server_side_makes_at_least_30_frames_a_second_of_351_m(viewer, plan_of):
     session = viewer.session
     title = "subterra-351"
-    course = session.screening.scenes.show(title, "pockets", 1e9)
-    film = Film(straight(3001, length=course.plan.length), course)
-    session.screening.stage.set_episode(film, course)
+    centreline = session.view.tunnel_view.show(title, "pockets", 1e9)
+    episode = EpisodeGeometry(straight(3001, length=centreline.plan.length), centreline)
+    session.view.scene_view.set_episode(episode, centreline)
     with join(viewer.url) as link:
         drain = threading.Thread(target=lambda: [heard(link, 1.0) for _ in range(20)], daemon=True)
         drain.start()
         began, n = time.thread_time(), 60
         for row in range(n):
-            session.screening.show(film, film.frame(2000.0 + row), False)
+            session.view.show(episode, episode.moment(2000.0 + row), False)
         took = time.thread_time() - began
         drain.join()
     assert n / took > 30.0
-    session.screening.scenes.show(str(viewer.session.panel.choice.tunnel), "smooth", 60.0)
+    session.view.tunnel_view.show(str(viewer.session.panel.choice.tunnel), "smooth", 60.0)
 
 
 def test_what_is_saved_can_be_replayed(viewer, folder):
@@ -99,10 +98,10 @@ def test_what_is_saved_can_be_replayed(viewer, folder):
     name = session.save()
     assert load(folder / "rec" / straight(tunnel=str(folder / "t.npz")).file_name).agent == "by hand"
     assert session.panel.recorded.value in name
-    session.screening.player.seek(5.0)
+    session.view.player.seek(5.0)
     session.panel.list_recordings(("drive.npz",), "drive.npz")
     session.replay()
-    until(lambda: session.screening.player.time < 5.0)
+    until(lambda: session.view.player.time < 5.0)
 
 
 def test_it_listens_on_this_machine_alone(viewer):
@@ -132,7 +131,7 @@ def test_a_recording_outside_the_folder_is_not_read(viewer):
     session = viewer.session
     for name in ("../secret.npz", "/etc/passwd", "rec/drive.npz"):
         with pytest.raises(ViewerError, match="no recording"):
-            session._library.recorded(name)
+            session._library.load_recording(name)
 
 
 def nonsense(viewer, seed):
@@ -200,36 +199,36 @@ def test_sound_values_of_a_control_get_through(viewer):
     with join(viewer.url) as link:
         heard(link, 10.0)
         say(link, {"type": "GuiUpdateMessage", "uuid": session.panel.speed._impl.uuid, "updates": {"value": "25 x"}})
-        until(lambda: session.screening.player.speed == 25.0)
+        until(lambda: session.view.player.speed == 25.0)
         say(link, {"type": "GuiUpdateMessage", "uuid": session.panel.speed._impl.uuid, "updates": {"value": "2 x"}})
-        until(lambda: session.screening.player.speed == 2.0)
+        until(lambda: session.view.player.speed == 2.0)
         say(link, {"type": "GuiUpdateMessage", "uuid": session.panel.time._impl.uuid, "updates": {"value": 11.0}})
-        until(lambda: 10.9 < session.screening.player.time < 13.0)
-        playing = session.screening.player.playing
+        until(lambda: 10.9 < session.view.player.time < 13.0)
+        playing = session.view.player.playing
         say(link, {"type": "GuiUpdateMessage", "uuid": session.panel.play._impl.uuid, "updates": {"value": True}})
-        until(lambda: session.screening.player.playing != playing)
+        until(lambda: session.view.player.playing != playing)
 
 
 def test_a_recording_of_a_tunnel_that_it_was_not_given_is_refused_in_a_sentence(viewer, folder):
     said = []
-    viewer.session.worker._complain = said.append
+    viewer.session.worker._report_error = said.append
     save(straight(tunnel="elsewhere"), folder / "rec" / "other.npz")
     viewer.session.panel.list_recordings(("other.npz",), "other.npz")
     viewer.session.replay()
     until(lambda: said)
     assert "recorded in a tunnel 'elsewhere' that the viewer was not given" in said[0]
-    viewer.session.worker._complain = viewer.session.complain
+    viewer.session.worker._report_error = viewer.session.report_error
 
 
 @pytest.mark.slow
 def test_what_is_chosen_is_driven_when_a_browser_says_so(viewer):
-    panel, player = viewer.session.panel, viewer.session.screening.player
+    panel, player = viewer.session.panel, viewer.session.view.player
     wanted = [(panel.tunnel, "control"), (panel.task, "Subterra/TraverseShort-v0"), (panel.agent, "heading-hold")]
     with join(viewer.url) as link:
         for control, value in [*wanted, (panel.seed, 11), (panel.drive, True)]:
             say(link, {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}})
-        until(lambda: player.film.recording.agent == "heading-hold" and player.film.whole, 120.0)
-    driven = player.film.recording
+        until(lambda: player.episode.recording.agent == "heading-hold" and player.episode.finished, 120.0)
+    driven = player.episode.recording
     assert (driven.tunnel, driven.lining, driven.task) == ("control", "smooth", "Subterra/TraverseShort-v0")
     assert (driven.seed, driven.length) == (11.0, 60.0)
     assert len(driven) > 100

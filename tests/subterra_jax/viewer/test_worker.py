@@ -2,8 +2,8 @@
 
 import threading
 
-from subterra_jax.viewer.errors import ViewerError
-from subterra_jax.viewer.worker import Worker
+from subterra_jax.viewer.config import ViewerError
+from subterra_jax.viewer.player import Worker
 
 
 def test_the_newest_job_makes_the_one_under_way_stale_and_those_between_are_never_begun():
@@ -19,10 +19,10 @@ def test_the_newest_job_makes_the_one_under_way_stale_and_those_between_are_neve
         done.append(("last", stale()))
         finished.set()
 
-    worker.do(first)
+    worker.submit(first)
     assert began.wait(10.0)
-    worker.do(lambda stale: done.append("between"))
-    worker.do(last)
+    worker.submit(lambda stale: done.append("between"))
+    worker.submit(last)
     go.set()
     assert finished.wait(10.0)
     worker.stop()
@@ -32,7 +32,7 @@ def test_the_newest_job_makes_the_one_under_way_stale_and_those_between_are_neve
 def test_a_job_that_fails_is_told_in_a_sentence_and_the_next_is_done():
     said, told, finished = [], threading.Event(), threading.Event()
 
-    def complain(sentence):
+    def report_error(sentence):
         said.append(sentence)
         told.set()
 
@@ -42,12 +42,12 @@ def test_a_job_that_fails_is_told_in_a_sentence_and_the_next_is_done():
 
         return job
 
-    worker = Worker(complain)
+    worker = Worker(report_error)
     for error in (ViewerError("no such thing"), KeyError("seed")):
         told.clear()
-        worker.do(failing(error))
+        worker.submit(failing(error))
         assert told.wait(10.0)
-    worker.do(lambda stale: finished.set())
+    worker.submit(lambda stale: finished.set())
     assert finished.wait(10.0)
     worker.stop()
     assert said == ["no such thing", "KeyError: 'seed'"]

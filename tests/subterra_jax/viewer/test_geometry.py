@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from subterra_jax.viewer.charts import error_series, progress_series
-from subterra_jax.viewer.course import Course, dead_reckoned
-from subterra_jax.viewer.frames import Film
+from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, dead_reckon
+from subterra_jax.viewer.panel import error_series, progress_series
 from subterra_jax.viewer.player import Player
 from subterra_jax.viewer.shapes import planar_shapes
 from tests.subterra_jax import tunnels
@@ -13,30 +12,30 @@ from tests.subterra_jax.viewer.episodes import straight
 
 
 @pytest.fixture(scope="module")
-def course(plan_of):
-    return Course(plan_of(tunnels.tunnel_arrays(tunnels.straight(60.0))))
+def centreline(plan_of):
+    return Centreline(plan_of(tunnels.tunnel_arrays(tunnels.straight(60.0))))
 
 
 @pytest.fixture(scope="module")
-def film(course):
-    return Film(straight(), course)
+def episode(centreline):
+    return EpisodeGeometry(straight(), centreline)
 
 
-def test_the_robot_is_half_way_between_two_rows_at_half_a_row(film):
-    frame = film.frame(2.5)
-    np.testing.assert_allclose(frame.position, [0.5, 0.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(frame.odometry, [0.55, 0.0, 0.0], atol=1e-6)
-    assert (frame.row, film.frame(-3.0).row, film.frame(1e9).row) == (2, 0, 20)
+def test_the_robot_is_half_way_between_two_rows_at_half_a_row(episode):
+    moment = episode.moment(2.5)
+    np.testing.assert_allclose(moment.position, [0.5, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(moment.odometry, [0.55, 0.0, 0.0], atol=1e-6)
+    assert (moment.row, episode.moment(-3.0).row, episode.moment(1e9).row) == (2, 0, 20)
 
 
-def test_a_turn_through_south_is_not_shown_the_long_way_round(course):
+def test_a_turn_through_south_is_not_shown_the_long_way_round(centreline):
     heading = np.array([3.1, -3.1], np.float32)
-    frame = Film(straight(2, heading=heading), course).frame(0.5)
-    assert abs(np.cos(frame.heading) + 1.0) < 1e-3
+    moment = EpisodeGeometry(straight(2, heading=heading), centreline).moment(0.5)
+    assert abs(np.cos(moment.heading) + 1.0) < 1e-3
 
 
-def test_beams_end_where_they_measured(film):
-    beams, hit = film.beams(10)
+def test_beams_end_where_they_measured(episode):
+    beams, hit = episode.beams(10)
     np.testing.assert_allclose(beams[:, 0], [[2.0, 0.0, 0.6]] * 4, atol=1e-6)
     np.testing.assert_allclose(beams[:, 1], [[32, 0, 0.6], [2, 2, 0.6], [-1, 0, 0.6], [2, -4, 0.6]], atol=1e-5)
     assert hit.tolist() == [False, True, True, True]
@@ -45,61 +44,61 @@ def test_beams_end_where_they_measured(film):
 def test_odometry_that_turns_too_much_drives_a_circle():
     turn = np.linspace(0.0, np.pi, 2001)
     odometry = np.stack([5.0 * turn, turn], axis=-1)
-    way = dead_reckoned(np.array([1.0, 2.0]), 0.0, odometry)
+    way = dead_reckon(np.array([1.0, 2.0]), 0.0, odometry)
     np.testing.assert_allclose(way[-1], [1.0, 12.0], atol=1e-4)
     np.testing.assert_allclose(np.hypot(*(way - [1.0, 7.0]).T), 5.0, atol=1e-4)
 
 
-def test_exact_odometry_lies_on_the_true_way(course):
+def test_exact_odometry_lies_on_the_true_way(centreline):
     episode = straight()
-    film = Film(straight(odometry=np.stack([episode.station, episode.heading], axis=-1)), course)
+    episode = EpisodeGeometry(straight(odometry=np.stack([episode.station, episode.heading], axis=-1)), centreline)
     for at in (0.0, 7.3, 20.0):
-        np.testing.assert_allclose(film.frame(at).odometry, film.frame(at).position, atol=1e-6)
+        np.testing.assert_allclose(episode.moment(at).odometry, episode.moment(at).position, atol=1e-6)
 
 
-def test_the_ellipse_reaches_two_standard_deviations_along_the_axis(film):
-    points = film.ellipse(10).reshape(-1, 3)
+def test_the_ellipse_reaches_two_standard_deviations_along_the_axis(episode):
+    points = episode.ellipse(10).reshape(-1, 3)
     np.testing.assert_allclose([points[:, 0].min(), points[:, 0].max()], [2.0, 4.0], atol=0.01)
-    assert film.ellipse(0).shape == (0, 2, 3)
+    assert episode.ellipse(0).shape == (0, 2, 3)
 
 
-def test_the_ellipse_is_as_wide_as_the_particles(course):
+def test_the_ellipse_is_as_wide_as_the_particles(centreline):
     cloud = np.zeros((21, 2, 3), np.float32)
     cloud[:, :, 1], cloud[:, :, 2] = [0.5, 1.5], 1.0
-    points = Film(straight(cloud=cloud), course).ellipse(10).reshape(-1, 3)
+    points = EpisodeGeometry(straight(cloud=cloud), centreline).ellipse(10).reshape(-1, 3)
     np.testing.assert_allclose([points[:, 1].min(), points[:, 1].max()], [0.0, 2.0], atol=0.01)
 
 
 def test_the_ellipse_follows_a_bend(plan_of):
-    bend = Course(plan_of(tunnels.tunnel_arrays(tunnels.arc(60.0, 40.0))))
+    bend = Centreline(plan_of(tunnels.tunnel_arrays(tunnels.arc(60.0, 40.0))))
     estimate = np.tile(np.array([30.0, 10.0], np.float32), (21, 1))
-    points = Film(straight(estimate=estimate), bend).ellipse(5).reshape(-1, 3)
+    points = EpisodeGeometry(straight(estimate=estimate), bend).ellipse(5).reshape(-1, 3)
     away = np.sqrt(((points[:, None, :2] - bend.plan.centre) ** 2).sum(-1)).min(axis=1)
     assert away.max() < 0.5
 
 
-def test_the_gate_stands_at_the_goal_and_is_as_wide_as_the_tunnel(film, course):
-    gate = film.goal().reshape(-1, 3)
+def test_the_gate_stands_at_the_goal_and_is_as_wide_as_the_tunnel(episode, centreline):
+    gate = episode.goal().reshape(-1, 3)
     np.testing.assert_allclose(gate[:, 0], 40.0, atol=1e-6)
     np.testing.assert_allclose(np.ptp(gate[:, 1]), 2 * 2.825 - 0.1, atol=1e-6)
-    assert len(Film(straight(goal=np.nan), course).goal()) == 0
+    assert len(EpisodeGeometry(straight(goal=np.nan), centreline).goal()) == 0
 
 
-def test_trails_end_at_the_robot_and_at_the_odometer(film):
-    truth, odometry = film.trails(film.frame(10.5))
+def test_trails_end_at_the_robot_and_at_the_odometer(episode):
+    truth, odometry = episode.trails(episode.moment(10.5))
     np.testing.assert_allclose(truth[-1, 1, :2], [2.1, 0.0], atol=1e-6)
     np.testing.assert_allclose(odometry[-1, 1, :2], [2.31, 0.0], atol=1e-6)
 
 
-def test_charts_hold_coverage_reward_and_errors(film):
-    time, coverage, reward = progress_series(film)
+def test_charts_hold_coverage_reward_and_errors(episode):
+    time, coverage, reward = progress_series(episode)
     assert (time[-1], round(float(coverage[-1]), 4), reward[-1]) == (2.0, round(100 * 4.0 / 60.0, 4), 10.5)
-    _, odometer, error, low, high = error_series(film)
+    _, odometer, error, low, high = error_series(episode)
     np.testing.assert_allclose([odometer[-1], error[-1], low[-1], high[-1]], [0.4, 1.0, 0.0, 2.0], atol=1e-5)
 
 
-def test_walls_and_floor_of_a_plan_are_seen_from_within(course):
-    for shape in planar_shapes(course.plan, "smooth"):
+def test_walls_and_floor_of_a_plan_are_seen_from_within(centreline):
+    for shape in planar_shapes(centreline.plan, "smooth"):
         corners = shape.vertices[shape.faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         inside = np.array([30.0, 0.0, 1.3]) - corners.mean(axis=1)
@@ -107,18 +106,18 @@ def test_walls_and_floor_of_a_plan_are_seen_from_within(course):
         assert (np.sum(normal * inside, axis=1) > 0.0).all(), shape.name
 
 
-def test_walls_stand_where_the_lining_has_them(course):
-    left, right, floor = planar_shapes(course.plan, "pockets")
+def test_walls_stand_where_the_lining_has_them(centreline):
+    left, right, floor = planar_shapes(centreline.plan, "pockets")
     np.testing.assert_allclose(left.vertices[:, 1].min(), 2.825, atol=1e-6)
     np.testing.assert_allclose(left.vertices[:, 1].max(), 2.825 + tunnels.POCKET_DEPTH, atol=1e-6)
     assert right.vertices[:, 1].max() < 0.0 < left.vertices[:, 2].max()
     assert not floor.vertices[:, 2].any()
 
 
-def test_the_clock_plays_pauses_seeks_and_stops_at_the_end(film):
+def test_the_clock_plays_pauses_seeks_and_stops_at_the_end(episode):
     player = Player(lambda *moment: None)
     assert player.advance(1.0) is None
-    player.begin(film, playing=True)
+    player.begin(episode, playing=True)
     player.speed = 2.0
     assert player.advance(0.5)[1].row == 10
     player.toggle()
@@ -133,12 +132,12 @@ def test_the_clock_plays_pauses_seeks_and_stops_at_the_end(film):
     assert (player.playing, player.time) == (True, 0.0)
 
 
-def test_the_clock_waits_for_an_episode_that_is_still_being_driven(course):
+def test_the_clock_waits_for_an_episode_that_is_still_being_driven(centreline):
     player = Player(lambda *moment: None)
-    player.begin(Film(straight(5), course, whole=False), playing=True)
+    player.begin(EpisodeGeometry(straight(5), centreline, finished=False), playing=True)
     assert player.advance(100.0)[1].row == 4
     assert player.playing
-    player.grow(Film(straight(9), course))
+    player.grow(EpisodeGeometry(straight(9), centreline))
     assert player.advance(0.2)[1].row == 6
 
 

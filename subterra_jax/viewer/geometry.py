@@ -1,0 +1,214 @@
+"""The geometry of an episode in three dimensions, as plain arrays; no drawing library is used."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float
+
+from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.viewer.recording import Recording
+
+
+@dataclasses.dataclass(frozen=True)
+class Centreline:
+    """A tunnel's centreline and its ground in three dimensions.
+
+    Attributes:
+        plan: The tunnel.
+    """
+
+    plan: TunnelPlan
+
+    def ground(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return the height of the ground, m; level beyond the mouths."""
+        return np.interp(station, self.plan.station, self.plan.elevation)
+
+    def points_at(self, station: Float[np.ndarray, "n"], lateral: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """Return points on the ground, m, `lateral` metres left of the centreline; straight on beyond the mouths."""
+        centre, tangent = self.axis_at(station)
+        offset = lateral[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+        return np.column_stack([centre + offset, self.ground(station)])
+
+    def axis_at(self, station: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+        """Return centre (m) and unit tangent in plan."""
+        plan = self.plan
+        centre, tangent = (
+            np.stack([np.interp(station, plan.station, values[:, i]) for i in range(2)], axis=-1)
+            for values in (plan.centre, plan.tangent)
+        )
+        tangent = tangent / np.linalg.norm(tangent, axis=-1, keepdims=True)
+        beyond = station - np.clip(station, 0.0, plan.length)
+        return centre + beyond[:, None] * tangent, tangent
+
+    def lift(
+        self, points: Float[np.ndarray, "n 2"], station: Float[np.ndarray, "n"], above: float
+    ) -> Float[np.ndarray, "n 3"]:
+        """Add the height `above` the ground to plan positions at known stations, m."""
+        return np.column_stack([points, self.ground(station) + above])
+
+
+def dead_reckon(
+    position: Float[np.ndarray, "2"], heading: float, odometry: Float[np.ndarray, "t 2"]
+) -> Float[np.ndarray, "t 2"]:
+    """Return the robot's positions by the odometer alone.
+
+    Args:
+        position: True position at the start, m.
+        heading: True heading at the start, rad.
+        odometry: Dead-reckoned distance (m) and heading since the start (rad).
+
+    Returns:
+        Positions, m: each step along the mean of the headings before and after it.
+    """
+    turned = heading + np.unwrap(odometry[:, 1].astype(np.float64))
+    middle, moved = 0.5 * (turned[1:] + turned[:-1]), np.diff(odometry[:, 0].astype(np.float64))
+    steps = moved[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
+    return position + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+
+
+_TRAIL_POINTS = 500  # of a whole trail
+_ELLIPSE_POINTS = 48
+SIGMAS = 2.0  # half axes of the ellipse, in standard deviations
+_SLIM = 0.35  # m, half width of an ellipse without an estimate across the tunnel
+_ON_GROUND = 0.06  # m above the ground, of lines on the ground
+
+
+@dataclasses.dataclass(frozen=True)
+class Moment:
+    """One moment of an episode.
+
+    Attributes:
+        row: Last row of the recording at or before it.
+        position: True position on the ground, m.
+        heading: True heading, rad.
+        odometry: Dead-reckoned position on the ground, m.
+        odometry_heading: Dead-reckoned heading, rad.
+        trunk: Height of a walking robot's trunk, tunnel frame, m.
+        pose: Orientation w, x, y, z and joints (rad) of a walking robot; empty for a wheeled one.
+    """
+
+    row: int
+    position: Float[np.ndarray, "3"]
+    heading: float
+    odometry: Float[np.ndarray, "3"]
+    odometry_heading: float
+    trunk: float
+    pose: Float[np.ndarray, "k"]
+
+
+class EpisodeGeometry:
+    """Lines and points of an episode in three dimensions.
+
+    Args:
+        recording: The episode.
+        centreline: Its tunnel.
+        finished: Whether the episode is over.
+    """
+
+    def __init__(self, recording: Recording, centreline: Centreline, *, finished: bool = True):
+        self.recording, self.centreline, self.finished = recording, centreline, finished
+        start = recording.position[0].astype(np.float64)
+        reckoned = dead_reckon(start, float(recording.heading[0]), recording.odometry)
+        self._truth = centreline.lift(recording.position, recording.station, 0.0)
+        self._reckoned = centreline.lift(reckoned, recording.station, 0.0)
+        self._heading = np.unwrap(recording.heading.astype(np.float64))
+        self._reckoned_heading = recording.heading[0] + np.unwrap(recording.odometry[:, 1].astype(np.float64))
+
+    def __len__(self) -> int:
+        return len(self.recording)
+
+    def moment(self, at: float) -> Moment:
+        """Return the moment `at` rows after the start, interpolated between rows and clipped to the episode."""
+        at = float(np.clip(at, 0.0, len(self) - 1))
+        row = int(at)
+        after, share = min(row + 1, len(self) - 1), at - row
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return (1.0 - share) * values[row] + share * values[after]
+
+        return Moment(
+            row,
+            between(self._truth),
+            float(between(self._heading)),
+            between(self._reckoned),
+            float(between(self._reckoned_heading)),
+            float(between(self.recording.trunk)),
+            self._pose(row, after, share),
+        )
+
+    def _pose(self, row: int, after: int, share: float) -> Float[np.ndarray, "k"]:
+        """Return the pose between two rows."""
+        poses = self.recording.pose[after]
+        if not len(poses) or after == row:
+            return poses[-1] if len(poses) else np.zeros(0)
+        return poses[min(int(share * len(poses)), len(poses) - 1)]
+
+    def beams(self, row: int) -> tuple[Float[np.ndarray, "n_beams 2 3"], np.ndarray]:
+        """Return the beams of a row from the LiDAR to their ends, m, and whether each hit something."""
+        recording = self.recording
+        ranges = recording.ranges[row].astype(np.float64)
+        angle = recording.heading[row] + np.arange(len(ranges)) * (2.0 * np.pi / len(ranges))
+        lidar = self._truth[row] + np.array([0.0, 0.0, self.centreline.plan.lidar_height])
+        reach = np.where(np.isfinite(ranges), ranges, 0.0)
+        along = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
+        tips = lidar + reach[:, None] * along
+        return np.stack([np.broadcast_to(lidar, tips.shape), tips], axis=1), reach < 0.99 * recording.range_max
+
+    def trails(self, moment: Moment) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 3"]]:
+        """Return the path so far, true and dead-reckoned, as segments, m."""
+        stride = max(1, -(-len(self) // _TRAIL_POINTS))
+        rows = np.arange(0, moment.row + 1, stride)
+        # At different heights, so that they do not flicker where they coincide.
+        truth, reckoned = (np.array([0.0, 0.0, share * _ON_GROUND]) for share in (1.0, 0.6))
+        return _chain(np.vstack([self._truth[rows], moment.position]) + truth), _chain(
+            np.vstack([self._reckoned[rows], moment.odometry]) + reckoned
+        )
+
+    def ellipse(self, row: int) -> Float[np.ndarray, "n 2 3"]:
+        """Return the ellipse of two standard deviations of the agent's estimate, bent along the tunnel, as segments, m.
+
+        Across the tunnel it shows the spread of the particles, or `_SLIM` about the centreline without particles. It is
+        empty without an estimate.
+        """
+        station, sigma = self.recording.estimate[row].astype(np.float64)
+        if not (np.isfinite(station) and np.isfinite(sigma)):
+            return np.zeros((0, 2, 3))
+        middle, across = self._across(row)
+        turn = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
+        # A straight stretch of an ellipse 100 m long would leave the tunnel in a bend.
+        along = np.clip(station + SIGMAS * sigma * np.cos(turn), -5.0, self.centreline.plan.length + 5.0)
+        points = self.centreline.points_at(along, middle + across * np.sin(turn))
+        return _chain(points + np.array([0.0, 0.0, 1.5 * _ON_GROUND]))
+
+    def particles(self, row: int) -> Float[np.ndarray, "k 3"]:
+        """Return some of the agent's particles, m."""
+        cloud = self.recording.cloud[row].astype(np.float64)
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
+        points = self.centreline.points_at(cloud[:, 0], cloud[:, 1])
+        return points + np.array([0.0, 0.0, 2.0 * _ON_GROUND])
+
+    def goal(self) -> Float[np.ndarray, "n 2 3"]:
+        """Return a gate across the tunnel at the goal, as segments, m; empty without a goal."""
+        if not np.isfinite(self.recording.goal):
+            return np.zeros((0, 2, 3))
+        station = np.array([self.recording.goal])
+        half = float(np.interp(station[0], self.centreline.plan.station, self.centreline.plan.half_width)) - 0.05
+        left, right = (self.centreline.points_at(station, np.array([side * half]))[0] for side in (1.0, -1.0))
+        up = np.array([0.0, 0.0, 2.2])
+        low = np.array([0.0, 0.0, _ON_GROUND])
+        return _chain(np.array([left + low, left + up, right + up, right + low, left + low]))
+
+    def _across(self, row: int) -> tuple[float, float]:
+        """Return middle and half width of the ellipse across the tunnel, m."""
+        cloud = self.recording.cloud[row]
+        cloud = cloud[np.isfinite(cloud).all(axis=1)]
+        if not len(cloud):
+            return 0.0, _SLIM
+        weight = cloud[:, 2] / max(float(cloud[:, 2].sum()), 1e-12)
+        mean = float(np.sum(weight * cloud[:, 1]))
+        return mean, max(SIGMAS * float(np.sqrt(np.sum(weight * (cloud[:, 1] - mean) ** 2))), 0.15)
+
+
+def _chain(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 2 3"]:
+    """Join neighbouring points by segments."""
+    return np.stack([points[:-1], points[1:]], axis=1)
