@@ -17,7 +17,7 @@ from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.recorder import Recording, record
 from subterra_jax.tunnel import at_station
-from subterra_jax.viewer import drivers
+from subterra_jax.viewer import library
 from tests.subterra_jax import tunnels
 from tests.subterra_jax.probes import PROBES
 
@@ -472,7 +472,7 @@ def test_neither_evaluation_nor_viewer_counts_coverage_in_contact_as_success(blo
     assert (records.coverage >= 0.9).any()
     assert records.contact.all()
     assert not records.success.any()
-    *_, whole = drivers.episode(blocked, "0", "blocked", "smooth", "Subterra/Traverse-v0", name, 0)
+    *_, whole = library.drive_episode(blocked, "0", "blocked", "smooth", "Subterra/Traverse-v0", name, 0)
     assert (whole.contact, whole.success) == (1.0, 0.0)
 
 
@@ -666,7 +666,7 @@ def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path
 @pytest.mark.parametrize("name", ["nothing", "truth"])
 def test_the_viewer_gives_an_agent_what_it_declares_and_no_more(name):
     plan = st.load_tunnel()
-    parts = drivers.episode(plan, "0", "t", "smooth", "Subterra/TraverseShort-v0", probe(name), 0)
+    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/TraverseShort-v0", probe(name), 0)
     next(parts)
     np.testing.assert_allclose(next(parts).command[1:, 0], PROBES[name][1], rtol=1e-4)
 
