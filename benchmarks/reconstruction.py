@@ -20,8 +20,8 @@ from rich.table import Table
 from scipy.spatial import cKDTree
 
 from benchmarks.command import status
-from benchmarks.fidelity.candidate import load
-from benchmarks.fidelity.derive import surface
+from benchmarks.fidelity.candidate import load_candidate
+from benchmarks.fidelity.derive.surface import Nearest, visible_mesh
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.truth import compare, load_truth
 from scene.arguments import parse
@@ -107,10 +107,10 @@ def figures(scene: Path, survey: Path) -> dict[str, float]:
     """Return all figures of one scene but those of `build`; nothing is aligned, fitted or scaled first."""
     truth = load_truth(survey / "truth.json")
     errors = compare(scene, truth)
-    candidate = load(scene)
+    candidate = load_candidate(scene)
     trajectory = survey / "groundtruth_os1.tum"
     hold = load_hold(survey / "survey_os1.bag", trajectory, candidate.origin, HoldConfig(beams_per_scan=2000))
-    distance, _, _ = surface.Nearest(surface.visible(candidate)).query(hold.points)
+    distance, _, _ = Nearest(visible_mesh(candidate)).query(hold.points)
     return {
         "length_error": 100.0 * errors.length_error / (truth.station[-1] - truth.station[0]),
         "lateral_rmse": float(np.sqrt(np.mean(errors.lateral**2))),

@@ -1,21 +1,221 @@
-"""How good a reconstruction is, in 18 categories.
+"""Scores a reconstruction in 18 categories.
 
 Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held_out.bag --trajectory poses.tum
 """
 
 import functools
+import json
+import math
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.fidelity import calibrate, commands
-from benchmarks.fidelity.split import SplitConfig, split
+from benchmarks.fidelity import judge, scoring
+from benchmarks.fidelity.case import Case, case_hash
+from benchmarks.fidelity.controls.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
+from benchmarks.fidelity.files import FidelityError, write_json
+from benchmarks.fidelity.inputs import (
+    FOREIGN,
+    Inputs,
+    SplitConfig,
+    complete_inputs,
+    foreign_scene,
+    read_case,
+    split_recording,
+)
+from benchmarks.fidelity.judge import Judgement
+from benchmarks.fidelity.registry import Value, evaluate
+from benchmarks.fidelity.report import write_report
+from benchmarks.fidelity.tools import calibrate
 from scene.arguments import parse
 from scene.cli import run as command
+from scene.files import require_input, require_output_folder
+
+CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
+SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
+MIDDLING = (("N02", 2.0), ("N25", 30.0))  # corruptions that the sweep makes where `controls` has not left them
+
+
+@dataclass(frozen=True)
+class ControlsConfig(Inputs):
+    """Which controls are run.
+
+    Attributes:
+        only: Their ids; all where empty.
+        bold_only: Only the doses that must fail.
+        processes: At a time.
+        foreign: Scene folder of another tunnel of the same class, for N33; made where not given.
+    """
+
+    only: tuple[str, ...] = ()
+    bold_only: bool = False
+    processes: int = 2
+    foreign: Path | None = None
+
+
+@dataclass(frozen=True)
+class SweepConfig(Inputs):
+    """What is swept.
+
+    Attributes:
+        seeds: Of the runs that compute all geometry anew; empty for none.
+        tolerances: Factors on the tolerances inside metrics; empty for none.
+    """
+
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    tolerances: tuple[float, ...] = (0.9, 1.1)
+
+
+@dataclass(frozen=True)
+class OpenCase:
+    """A case with its judgement and where results go."""
+
+    inputs: Inputs
+    case: Case
+    judgement: Judgement
+    values: dict[str, dict[str, Value]] = field(default_factory=dict)
+
+
+def open_case(inputs: Inputs) -> OpenCase:
+    """Reads what was given and judges it without controls; values from an earlier command are taken up."""
+    require_output_folder(inputs.out)
+    resolved = complete_inputs(inputs)
+    case = read_case(resolved)
+    judgement = judge.judge_case(case, resolved.out, resolved.strict)
+    return OpenCase(resolved, case, judgement, judgement.values)
+
+
+def run(inputs: Inputs) -> None:
+    """Scores a scene against its references and writes the report.
+
+    Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held.bag --trajectory poses.tum
+    """
+    opened = open_case(inputs)
+    written = _write_report(opened)
+    _print_summary(written)
+
+
+def run_controls(config: ControlsConfig) -> None:
+    """Spoils the scene in 36 ways and changes nothing in 7, and says which were noticed.
+
+    Example: python -m benchmarks.fidelity controls --bold-only --out out/fidelity
+    """
+    _check_controls(config)
+    opened = open_case(config)
+    foreign = config.foreign
+    if foreign is None and (not config.only or "N33" in config.only):
+        foreign = foreign_scene(opened.case, config.out)
+    bench = Bench(opened.case, opened.values["base"], config.out / "controls", foreign)
+    wanted = [job for job in list_jobs(config.only, foreign is not None) if not config.bold_only or is_bold(job)]
+    outcomes = run_jobs(bench, wanted, config.processes)
+    rows = judge_outcomes(outcomes, opened.judgement.base)
+    content = {"schema": CONTROLS_SCHEMA, "key": case_hash(opened.case), "rows": rows}
+    write_json(config.out / "controls.json", content)
+    _print_summary(_write_report(opened))
+
+
+def _check_controls(config: ControlsConfig) -> None:
+    """Refuses what cannot be run before the scene is judged, which takes minutes."""
+    known = {job.control for job in list_jobs()}
+    if unknown := [name for name in config.only if name not in known]:
+        raise FidelityError(f"no control {unknown[0]!r}; there are {', '.join(sorted(known))}")
+    if config.processes < 1:
+        raise FidelityError(f"processes must be at least 1, got {config.processes}")
+    if config.foreign is not None:
+        require_input(config.foreign / "manifest.json")
+
+
+def run_sweep(config: SweepConfig) -> None:
+    """Moves thresholds, tolerances and seeds, and says how far the scores follow.
+
+    Whatever `controls` has left in `--out` takes part in the order that must be kept.
+
+    Example: python -m benchmarks.fidelity sweep --seeds 0 1 2 --out out/fidelity
+    """
+    for name, values, least in (("seeds", config.seeds, 0.0), ("tolerances", config.tolerances, 1e-6)):
+        for value in values:
+            if not least <= value < math.inf:
+                raise FidelityError(f"{name} must be {'positive' if least else 'at least 0'}, got {value}")
+    opened = open_case(config)
+    candidates = dict(opened.values)
+    foreign = config.out / FOREIGN
+    known = foreign if foreign.exists() else None
+    bench = Bench(opened.case, candidates["base"], config.out / "controls", known)
+    run_jobs(bench, [Job(*one) for one in MIDDLING], processes=1)
+    candidates |= {outcome.job.name: outcome.values for outcome in bench.kept() if is_ranked(outcome.job)}
+    rows = scoring.sweep_thresholds(candidates)
+    for kind, runs in _recompute(opened, config).items():
+        rows += scoring.compare_runs(kind, runs, candidates["base"])
+    content = {
+        "schema": SWEEP_SCHEMA,
+        "key": case_hash(opened.case),
+        "rows": rows,
+        "summary": scoring.summarise(rows),
+    }
+    write_json(config.out / "sweep.json", content)
+    _print_summary(_write_report(opened))
+
+
+def run_report(inputs: Inputs) -> None:
+    """Writes the report of what earlier commands left in `--out`.
+
+    Example: python -m benchmarks.fidelity report --out out/fidelity
+    """
+    resolved = complete_inputs(inputs)
+    if not (resolved.out / "values.json").exists():
+        raise FidelityError(f"{resolved.out}: holds no values.json; run the suite first")
+    run(inputs)
+
+
+def _recompute(opened: OpenCase, config: SweepConfig) -> dict[str, dict[str, dict[str, Value]]]:
+    base = opened.values["base"]
+    found: dict[str, dict[str, dict[str, Value]]] = {"tolerance": {}, "seed": {}}
+    for kind, name, fresh in _variants(opened.case, config):
+        same = kind == "seed" and fresh.seed == opened.case.seed
+        found[kind][name] = base if same else evaluate(fresh, judge.geometry_categories(), base)
+        print(f"{kind} {name}: done", flush=True)
+    return found
+
+
+def _variants(case: Case, config: SweepConfig) -> Iterator[tuple[str, str, Case]]:
+    """The case with other tolerances and seeds, nothing of it computed."""
+    for factor in config.tolerances:
+        yield "tolerance", f"x{factor}", replace(case.fresh(), tolerance=factor)
+    for seed in config.seeds:
+        yield "seed", str(seed), replace(case.fresh(), seed=seed)
+
+
+def _write_report(opened: OpenCase) -> dict[str, Any]:
+    """Report and verdict over everything that there is for this case in `--out`."""
+    folder = opened.inputs.out
+    controls = _kept_result(folder / "controls.json", opened.case)
+    swept = _kept_result(folder / "sweep.json", opened.case)
+    rows = controls["rows"] if controls else None
+    found = judge.find_leaks(opened.case, opened.values["base"])
+    judgement = judge.make_judgement(opened.values, found, rows, opened.inputs.strict)
+    return write_report(folder, opened.case, opened.inputs, judgement, rows, swept)
+
+
+def _kept_result(path: Path, case: Case) -> dict[str, Any] | None:
+    """What an earlier command left for the same case, else nothing."""
+    if not path.exists():
+        return None
+    content = json.loads(path.read_text())
+    return content if content.get("key") == case_hash(case) else None
+
+
+def _print_summary(written: dict[str, Any]) -> None:
+    overall = written["global"]
+    text = "none" if overall is None else f"{overall:.1f} %"
+    print(f"{written['title']} of {written['name']}: {written['verdict']}, global {text} "
+          f"over {written['categories_evaluated']} of {len(written['categories'])} categories")  # fmt: skip
+    for reason in written["reasons"]:
+        print(f"  {reason}")
+
 
 _PROG = "python -m benchmarks.fidelity"
 
@@ -45,14 +245,14 @@ def main() -> None:
 
         Example: python -m benchmarks.fidelity split recording.bag --out build/parts
         """
-        facts = split(config.recording, config.out, config.rule)
+        facts = split_recording(config.recording, config.out, config.rule)
         print(", ".join(f"{name} {count} messages" for name, count in facts["messages"].items()))
 
     actions: dict[str, Callable[[Any], None]] = {
-        "run": commands.run, "controls": commands.run_controls, "sweep": commands.run_sweep,
-        "calibrate": calibrate.run, "split": cut, "report": commands.run_report,
+        "run": run, "controls": run_controls, "sweep": run_sweep,
+        "calibrate": calibrate.run, "split": cut, "report": run_report,
     }  # fmt: skip
-    wrapped = {name: _flat(action) for name, action in actions.items()}
+    wrapped = {name: _without_prefix(action) for name, action in actions.items()}
 
     def act() -> None:
         parse(
@@ -62,7 +262,7 @@ def main() -> None:
     command(act)
 
 
-def _flat(action: Callable[[Any], None]) -> Callable[[Any], Callable[[], None]]:
+def _without_prefix(action: Callable[[Any], None]) -> Callable[[Any], Callable[[], None]]:
     """An action, still to be run, whose one configuration's fields are flags without a prefix."""
     (name,) = [key for key in action.__annotations__ if key != "return"]
 

@@ -1,9 +1,15 @@
-"""A candidate with the references that it is judged against, and the seeds and tolerances of this run."""
+"""A candidate with its references, seed and tolerance; results kept once per case, recording or truth; hashes."""
 
+import ctypes
+import gc
+import json
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import cache as run_once
 from functools import wraps
+from hashlib import sha256
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,20 +19,25 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
 
 Result = TypeVar("Result")
+NOT_VALUES = (
+    "report", "figures", "controls", "tools", "__main__.py", "inputs.py", "judge.py", "scoring.py", "table.py",
+)  # fmt: skip  # raw values do not depend on these; the results of controls have a key of their own
+SHARED: dict[tuple[Any, ...], Any] = {}  # results from released files, for all cases of this process
+_KEPT_UNTIL: dict[tuple[str, str], str] = {}
 
 
 @dataclass(frozen=True)
 class Case:
-    """Everything a metric may look at.
+    """Everything that a metric may read.
 
     Attributes:
-        candidate: What is judged.
+        candidate: The reconstruction to judge.
         hold: Held-out recording; `None` where there is none.
         fit: Beams of the recording that the builder read, for `c2m_fit_hold_gap`; `None` where it is not at hand.
-        truth: Generator's truth; `None` for real data.
-        seed: Of sampling, noise and bootstrap.
+        truth: Truth of the generator; `None` for real data.
+        seed: Seed of sampling, noise and bootstrap.
         tolerance: Factor on the tolerances inside metrics, for the sweep.
-        cache: What `derive` has computed of this case.
+        cache: Results of `derive` for this case.
     """
 
     candidate: Candidate
@@ -38,84 +49,137 @@ class Case:
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def fresh(self) -> "Case":
-        """The same with nothing computed, of its references either."""
+        """Return a copy without any kept result, its references included."""
         bare: dict[str, Any] = {
             name: None if reference is None else replace(reference, cache={})
             for name, reference in (("hold", self.hold), ("fit", self.fit), ("truth", self.truth))
         }
         return replace(self, **bare, cache={})
 
-    def let_go(self, category: str) -> None:
-        """Forgets what is marked as of no use once a category is done, of the references too, and what meshes keep.
+    def forget(self, category: str) -> None:
+        """Drops the results that no later category needs, and the caches of the meshes.
 
         Edges, adjacency and normals that `trimesh` keeps beside a mesh are several times the mesh.
         """
         caches = [self.cache, SHARED, *(reference.cache for reference in (self.hold, self.truth) if reference)]
-        for cache in caches:
-            for key in [key for key in cache if _UNTIL.get(key[:2]) == category]:
-                del cache[key]
+        for results in caches:
+            for key in [key for key in results if _KEPT_UNTIL.get(key[:2]) == category]:
+                del results[key]
         meshes = [value for value in self.cache.values() if isinstance(value, trimesh.Trimesh)]
         for mesh in (*meshes, self.candidate.lining, self.candidate.solid):
             mesh._cache.clear()
 
     def rng(self, id: str) -> np.random.Generator:
-        """Random numbers of one metric; other metrics do not shift them."""
+        """Return the random numbers of one metric; other metrics do not shift them."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(id.encode()),)))
 
 
-SHARED: dict[tuple[Any, ...], Any] = {}  # what was computed from released files, for all cases of this process
-_UNTIL: dict[tuple[str, str], str] = {}
+Function = Callable[[Case], Result]
 
 
-def until(category: str) -> Callable[[Callable[[Case], Result]], Callable[[Case], Result]]:
-    """Marks a large result as the last of whose users a category is; asked for again, it is computed again.
+def kept_until(category: str) -> Callable[[Function[Result]], Function[Result]]:
+    """Marks a large result as not needed after a category; asked for again, it is computed again.
 
-    On top of `derived`, `of_hold` or `of_truth`. A mark that is wrong costs time and no more.
+    Stands above `per_case`, `per_hold` or `per_truth`. A wrong mark costs time and nothing else.
     """
 
-    def mark(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
-        _UNTIL[function.__module__, function.__qualname__] = category
+    def mark(function: Function[Result]) -> Function[Result]:
+        _KEPT_UNTIL[function.__module__, function.__qualname__] = category
         return function
 
     return mark
 
 
-def derived(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
-    """Computes a function of a case once a case."""
+def per_case(function: Function[Result]) -> Function[Result]:
+    """Keeps the result of a function once per case."""
+    return _kept_in(function, lambda case: (case.cache, ()))
 
+
+def per_hold(function: Function[Result]) -> Function[Result]:
+    """Keeps the result of a function of recording, seed and tolerance once for all candidates."""
+    return _kept_in(function, lambda case: _reference_cache(case, case.hold))
+
+
+def per_truth(function: Function[Result]) -> Function[Result]:
+    """Keeps the result of a function of truth, seed and tolerance once for all candidates."""
+    return _kept_in(function, lambda case: _reference_cache(case, case.truth))
+
+
+def _kept_in(
+    function: Function[Result], place: Callable[[Case], tuple[dict[Any, Any], tuple[Any, ...]]]
+) -> Function[Result]:
     @wraps(function)
     def once(case: Case) -> Result:
-        key = (function.__module__, function.__qualname__)
-        if key not in case.cache:
-            case.cache[key] = function(case)
-        return case.cache[key]
+        results, settings = place(case)
+        key = (function.__module__, function.__qualname__, *settings)
+        if key not in results:
+            results[key] = function(case)
+        return results[key]
 
     return once
 
 
-def of_hold(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
-    """Computes a function of the held-out recording, seed and tolerance alone once for all candidates."""
-
-    @wraps(function)
-    def once(case: Case) -> Result:
-        assert case.hold is not None
-        key = (function.__module__, function.__qualname__, case.seed, case.tolerance)
-        if key not in case.hold.cache:
-            case.hold.cache[key] = function(case)
-        return case.hold.cache[key]
-
-    return once
+def _reference_cache(case: Case, reference: Hold | Truth | None) -> tuple[dict[Any, Any], tuple[Any, ...]]:
+    assert reference is not None
+    return reference.cache, (case.seed, case.tolerance)
 
 
-def of_truth(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
-    """Computes a function of the truth, seed and tolerance alone once for all candidates."""
+@run_once
+def code_hash() -> str:
+    """Return the SHA-256 of the code that raw values depend on; values of other code are not read again.
 
-    @wraps(function)
-    def once(case: Case) -> Result:
-        assert case.truth is not None
-        key = (function.__module__, function.__qualname__, case.seed, case.tolerance)
-        if key not in case.truth.cache:
-            case.truth.cache[key] = function(case)
-        return case.truth.cache[key]
+    Thresholds, roles and required falls are no part of it: they are applied to kept values at no cost.
+    """
+    here = Path(__file__).parent
+    return _hash_of(file for file in here.rglob("*.py") if file.relative_to(here).parts[0] not in NOT_VALUES)
 
-    return once
+
+@run_once
+def controls_hash() -> str:
+    """Return the SHA-256 of the code of controls and leak detector; required falls are no part of it."""
+    here = Path(__file__).parent
+    return _hash_of([*(here / "controls").glob("*.py"), here / "judge.py"])
+
+
+def _hash_of(files: Iterable[Path]) -> str:
+    digest = sha256()
+    for file in sorted(files):
+        digest.update(file.relative_to(Path(__file__).parent).as_posix().encode() + file.read_bytes())
+    return digest.hexdigest()
+
+
+def case_hash(case: Case) -> str:
+    """Return the SHA-256 of candidate, references, seed, tolerance and code."""
+    digest = sha256(f"{code_hash()} {case.seed} {case.tolerance}".encode())
+    digest.update(candidate_hash(case.candidate).encode())
+    for hold in (case.hold, case.fit):
+        digest.update(b"none" if hold is None else f"{hold.hash} {len(hold.range)}".encode())
+    if case.truth is not None:
+        digest.update(case.truth.surface.vertices.tobytes() + case.truth.position.tobytes())
+    return digest.hexdigest()
+
+
+def candidate_hash(candidate: Candidate) -> str:
+    """Return the SHA-256 of a candidate's geometry and scene."""
+    digest = sha256(json.dumps(candidate.manifest, sort_keys=True, default=str).encode())
+    track = candidate.track
+    for mesh in (candidate.lining, candidate.solid, candidate.extra, candidate.nails, candidate.bed,
+                 track.sleeper_mesh, track.rail_mesh):  # fmt: skip
+        digest.update(mesh.vertices.tobytes() + mesh.faces.tobytes())
+    digest.update(candidate.bore.position.tobytes() + candidate.bore.radius.tobytes())
+    for file in (candidate.scene, candidate.tunnel):
+        digest.update(file.read_bytes() if file.exists() else b"none")
+    return digest.hexdigest()
+
+
+def release_memory() -> None:
+    """Collects garbage and returns free memory to the system.
+
+    Meshes and their rays refer to each other, so that only the collector frees them. glibc keeps the heap between two
+    blocks in use: after the metrics of a bore of 36 m that is half of the process. Without glibc the second part is
+    left out.
+    """
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)

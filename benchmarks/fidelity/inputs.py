@@ -1,18 +1,28 @@
-"""What a command is given: a scene, what was held out of it, the truth; or the packaged tunnel."""
+"""Inputs of a command: scene, held-out recording and truth; and the cut of a recording into fit, val and hold."""
 
 import json
 import subprocess
 import sys
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from benchmarks.fidelity.candidate import load
+import numpy as np
+from jaxtyping import Int
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Reader as Reader1
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer as Writer2
+
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.errors import FidelityError
-from benchmarks.fidelity.filehash import file_hash
+from benchmarks.fidelity.files import FidelityError, file_hash, write_json
 from benchmarks.fidelity.references import HoldConfig, load_hold, load_truth
+from scene.cli import progress_bar
 from scene.errors import SubterraError
-from scene.files import require_input
+from scene.files import replace_folder, require_input
 
 PACKAGED = "subterra-351"
 PACKAGED_LENGTH = 351
@@ -51,7 +61,7 @@ class Inputs:
     out: Path = Path("out/fidelity")
 
 
-def completed(inputs: Inputs) -> Inputs:
+def complete_inputs(inputs: Inputs) -> Inputs:
     """The inputs as given, checked, or those of the packaged tunnel.
 
     Raises:
@@ -63,7 +73,7 @@ def completed(inputs: Inputs) -> Inputs:
     if inputs.scene is None:
         if inputs.recording or inputs.truth:
             raise FidelityError("--recording and --truth need --scene: what was reconstructed?")
-        return packaged(inputs)
+        return packaged_inputs(inputs)
     for path in (inputs.scene, inputs.recording, inputs.trajectory, inputs.truth, inputs.fit_recording):
         if path is not None:
             require_input(path)
@@ -74,7 +84,7 @@ def completed(inputs: Inputs) -> Inputs:
     return inputs
 
 
-def read(inputs: Inputs) -> Case:
+def read_case(inputs: Inputs) -> Case:
     """The case of completed inputs.
 
     Raises:
@@ -82,7 +92,7 @@ def read(inputs: Inputs) -> Case:
         SubterraError: A recording cannot be read.
     """
     assert inputs.scene is not None
-    candidate = load(inputs.scene)
+    candidate = load_candidate(inputs.scene)
     hold = fit = None
     if inputs.recording is not None and inputs.trajectory is not None:
         hold = load_hold(
@@ -107,23 +117,23 @@ def with_sigma(config: HoldConfig, recording: Path) -> HoldConfig:
     return replace(config, sigma=known[0]) if known else config
 
 
-def packaged(inputs: Inputs) -> Inputs:
+def packaged_inputs(inputs: Inputs) -> Inputs:
     """The packaged tunnel's scene and survey, made by the users' own commands where missing or not matching."""
     survey, scene = Path("build/survey-351"), Path("build") / PACKAGED
     fitted, held = survey / "survey.bag", survey / f"survey_{HELD_OUT}.bag"
     if not fitted.exists() or not held.exists():
-        make("scene.survey", "--truth", "metro", "--length", PACKAGED_LENGTH, "--seed", 0,
+        run_module("scene.survey", "--truth", "metro", "--length", PACKAGED_LENGTH, "--seed", 0,
              "--sensors", "avia", HELD_OUT, "--scan-every", 10, "--out", survey)  # fmt: skip
-    if not built_from(scene, fitted):
+    if not is_built_from(scene, fitted):
         given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated", "--name", PACKAGED)
-        make("scene.build", fitted, *given, "--out", scene)
+        run_module("scene.build", fitted, *given, "--out", scene)
     return replace(
         inputs, scene=scene, recording=held, trajectory=survey / f"groundtruth_{HELD_OUT}.tum",
         truth=survey, fit_recording=fitted, fit_trajectory=survey / "groundtruth.tum",
     )  # fmt: skip
 
 
-def built_from(scene: Path, recording: Path) -> bool:
+def is_built_from(scene: Path, recording: Path) -> bool:
     """Whether a scene folder is there and its manifest has the recording's hash."""
     if not (scene / "manifest.json").exists():
         return False
@@ -131,18 +141,18 @@ def built_from(scene: Path, recording: Path) -> bool:
     return file_hash(recording) in [entry.get("sha256") for entry in inputs]
 
 
-def foreign(case: Case, folder: Path) -> Path:
+def foreign_scene(case: Case, folder: Path) -> Path:
     """A scene of another tunnel of the same class and length, made where it is missing, for N33."""
     scene = folder / FOREIGN
     if not (scene / "manifest.json").exists():
         survey = folder / "foreign-survey"
-        make("scene.survey", "--length", round(case.candidate.length), "--seed", FOREIGN_SEED, "--out", survey)
+        run_module("scene.survey", "--length", round(case.candidate.length), "--seed", FOREIGN_SEED, "--out", survey)
         given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated")
-        make("scene.build", survey / "survey.bag", *given, "--out", scene)
+        run_module("scene.build", survey / "survey.bag", *given, "--out", scene)
     return scene
 
 
-def make(*words: object) -> None:
+def run_module(*words: object) -> None:
     """Runs `python -m ...` as a user would.
 
     Raises:
@@ -152,3 +162,121 @@ def make(*words: object) -> None:
     print(f"$ python -m {' '.join(command)}", flush=True)
     if subprocess.run([sys.executable, "-m", *command]).returncode:
         raise SubterraError(f"python -m {' '.join(command)} failed")
+
+
+SPLIT_PARTS = ("fit", "val", "hold")
+GUARD = -1
+SPLIT_SCHEMA = "subterra.split/1"
+
+
+@dataclass(frozen=True)
+class SplitConfig:
+    """The rule.
+
+    Attributes:
+        block: Length of a block, s.
+        guard: Left out around every border between parts, s.
+        shares: Of fit, val and hold.
+        seed: Of the order of the blocks.
+    """
+
+    block: float = 2.0
+    guard: float = 0.2
+    shares: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    seed: int = 0
+
+
+def deal_blocks(duration: float, config: SplitConfig) -> Int[np.ndarray, " b"]:
+    """The part of each block of a recording of some seconds.
+
+    Blocks are dealt in hands of five, each of which holds the parts in their shares, so that every part sees the whole
+    tunnel; the order within a hand is drawn.
+    """
+    hand = np.repeat(np.arange(3), np.round(5 * np.asarray(config.shares)).astype(int))
+    rng = np.random.default_rng(config.seed)
+    return np.concatenate([rng.permutation(hand) for _ in range(int(duration / config.block) // len(hand) + 2)])
+
+
+def part_at(time: float, dealt: Int[np.ndarray, " b"], config: SplitConfig) -> int:
+    """0 fit, 1 val, 2 hold for a time since the start of the recording, s; -1 within the guard of a border."""
+    block = int(time // config.block)
+    into = time - block * config.block
+    if block and into < 0.5 * config.guard and dealt[block - 1] != dealt[block]:
+        return GUARD
+    if config.block - into <= 0.5 * config.guard and dealt[block + 1] != dealt[block]:
+        return GUARD
+    return int(dealt[block])
+
+
+def split_recording(recording: Path, out: Path, config: SplitConfig) -> dict[str, Any]:
+    """Writes `fit.bag`, `val.bag` and `hold.bag` with the messages as they were recorded, and `split.json`.
+
+    Args:
+        recording: A ROS1 bag, a ROS2 bag or an MCAP file.
+        out: Folder to write, whole or not at all.
+        config: The rule.
+
+    Raises:
+        FidelityError: It is no bag, or too short to give every part a block.
+    """
+    require_input(recording)
+    with _open_bag(recording) as reader, replace_folder(out) as folder:
+        counts = _copy_messages(reader, folder, config, recording)
+        facts = {
+            "schema": SPLIT_SCHEMA, "rule": asdict(config), "messages": counts,
+            "recording": _file_record(recording),
+            "parts": {name: _file_record(folder / _part_name(name, recording)) for name in SPLIT_PARTS},
+        }  # fmt: skip
+        write_json(folder / "split.json", facts)
+    return facts
+
+
+@contextmanager
+def _open_bag(recording: Path) -> Iterator[Any]:
+    try:
+        reader = Reader1(recording) if recording.suffix == ".bag" else AnyReader([recording])
+        reader.open()
+    except Exception as error:
+        raise FidelityError(f"{recording}: is no bag that can be split ({error})") from error
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _copy_messages(reader: Any, folder: Path, config: SplitConfig, recording: Path) -> dict[str, int]:
+    duration = (reader.end_time - reader.start_time) * 1e-9
+    if duration < 5 * config.block:
+        raise FidelityError(f"{recording}: is shorter than five blocks of {config.block:g} s")
+    dealt, counts = deal_blocks(duration, config), dict.fromkeys((*SPLIT_PARTS, "guard"), 0)
+    with ExitStack() as stack, progress_bar() as progress:
+        writers = [stack.enter_context(_make_writer(folder / _part_name(name, recording))) for name in SPLIT_PARTS]
+        channels = [{c.id: _add_channel(writer, c) for c in reader.connections} for writer in writers]
+        stage = progress.start("split", reader.message_count)
+        for connection, stamp, raw in reader.messages():
+            part = part_at((stamp - reader.start_time) * 1e-9, dealt, config)
+            counts["guard" if part == GUARD else SPLIT_PARTS[part]] += 1
+            if part != GUARD:
+                writers[part].write(channels[part][connection.id], stamp, raw)
+            stage.advance()
+    return counts
+
+
+def _file_record(path: Path) -> dict[str, str]:
+    return {"file": path.name, "sha256": file_hash(path)}
+
+
+def _make_writer(path: Path) -> Any:
+    return Writer1(path) if path.suffix == ".bag" else Writer2(path, version=9)
+
+
+def _add_channel(writer: Any, connection: Any) -> Any:
+    """The recording's channel anew, with its own message definition."""
+    name, kind, definition = connection.topic, connection.msgtype, connection.msgdef.data
+    if isinstance(writer, Writer1):
+        return writer.add_connection(name, kind, msgdef=definition, md5sum=connection.digest)
+    return writer.add_connection(name, kind, msgdef=definition, rihs01=connection.digest)
+
+
+def _part_name(part: str, recording: Path) -> str:
+    return f"{part}.bag" if recording.suffix == ".bag" else part

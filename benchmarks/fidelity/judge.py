@@ -1,26 +1,51 @@
-"""Runs the whole judgement of a case: reconstruction, null tubes, ceiling, leaks, and the verdict over all of it."""
+"""The judgement of a case: values of reconstruction, null tubes and truth, the leak detector, and the verdict."""
 
 import json
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fidelity import leaks, scoring, store, table
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity import scoring, table
 from benchmarks.fidelity.candidate import Candidate
-from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.ceiling import truth_candidate
-from benchmarks.fidelity.controls import verdicts
-from benchmarks.fidelity.controls.verdicts import Base
-from benchmarks.fidelity.evaluate import evaluate
-from benchmarks.fidelity.memory import give_back
-from benchmarks.fidelity.null import null_tube
+from benchmarks.fidelity.case import Case, case_hash, release_memory
+from benchmarks.fidelity.files import write_json
+from benchmarks.fidelity.impostors import null_tube, truth_candidate
+from benchmarks.fidelity.references import Hold
+from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from benchmarks.fidelity.scoring import Scored
-from benchmarks.fidelity.value import Value
+from benchmarks.fidelity.table import Metric
 from scene.cli import Stage, progress_bar
 
-SCHEMA = "subterra.fidelity-values/1"
+VALUES_SCHEMA = "subterra.fidelity-values/1"
+NOISE_BAND = (0.5, 3.0)  # times the sensor's stated sigma
+MEDIAN_FLOOR = 0.5  # of the recording's own noise that the median distance to the mesh must not undercut
+PATCH_NEIGHBOURS = 12
+PATCH_RADIUS = 0.25  # m within which neighbours must lie to make a plane
+PATCH_SAMPLES = 8_000
+
+
+@dataclass(frozen=True)
+class Base:
+    """What controls are compared with.
+
+    Attributes:
+        scored: The reconstruction.
+        null: The null tube.
+        values: Raw, of reconstruction, null tube and ceiling.
+        reasons: Why the reconstruction itself fails, if it does.
+    """
+
+    scored: Scored
+    null: Scored | None
+    values: dict[str, dict[str, Value]]
+    reasons: list[str]
 
 
 @dataclass(frozen=True)
@@ -52,29 +77,30 @@ class Judgement:
         return Base(self.scored["base"], self.scored["null"], self.values, self.reasons)
 
 
-def geometry() -> tuple[str, ...]:
-    """The categories that do not read the compiled scene."""
-    return tuple(name for name in table.categories() if name not in ("SCN", "PAR"))
+def judge_case(case: Case, folder: Path, strict: bool = False) -> Judgement:
+    """Values, leaks and the verdict without controls."""
+    values = compute_values(case, folder)
+    return make_judgement(values, find_leaks(case, values["base"]), None, strict)
 
 
-def values_of(case: Case, folder: Path) -> dict[str, dict[str, Value]]:
+def compute_values(case: Case, folder: Path) -> dict[str, dict[str, Value]]:
     """Raw values of the reconstruction, its null tubes and the ceiling.
 
     Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
     """
-    path, key = folder / "values.json", store.case_hash(case)
-    values = _kept(path, key)
+    path, key = folder / "values.json", case_hash(case)
+    values = _kept_values(path, key)
     candidates = _candidates(case)
     with progress_bar() as progress:
         for name in [name for name in candidates if name not in values]:
             stage = progress.start(f"metrics of {name}", table.COUNT)
             one = replace(case, candidate=candidates[name](), cache={})
-            chosen = None if name == "base" else geometry()
+            chosen = None if name == "base" else geometry_categories()
             values[name] = evaluate(one, chosen, values.get("base"), partial(_advance, stage))
-            dumped = {name: store.dump_values(entry) for name, entry in values.items()}
-            store.write_json(path, {"schema": SCHEMA, "key": key, "values": dumped}, digits=17)
+            dumped = {name: dump_values(entry) for name, entry in values.items()}
+            write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
             one.cache.clear()
-            give_back()
+            release_memory()
     return values
 
 
@@ -90,19 +116,24 @@ def _candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
     return made
 
 
-def _kept(path: Path, key: str) -> dict[str, dict[str, Value]]:
+def _kept_values(path: Path, key: str) -> dict[str, dict[str, Value]]:
     """What an earlier run of the same case left; nothing where there is none."""
     content = json.loads(path.read_text()) if path.exists() else {}
-    if content.get("schema") != SCHEMA or content.get("key") != key:
+    if content.get("schema") != VALUES_SCHEMA or content.get("key") != key:
         return {}
-    return {name: store.load_values(entry) for name, entry in content["values"].items()}
+    return {name: load_values(entry) for name, entry in content["values"].items()}
 
 
 def _advance(stage: Stage, id: str) -> None:
     stage.advance()
 
 
-def judged(
+def geometry_categories() -> tuple[str, ...]:
+    """The categories that do not read the compiled scene."""
+    return tuple(name for name in table.categories() if name not in ("SCN", "PAR"))
+
+
+def make_judgement(
     values: dict[str, dict[str, Value]],
     found: list[str],
     controls: list[dict[str, Any]] | None = None,
@@ -110,15 +141,142 @@ def judged(
 ) -> Judgement:
     """The verdict over values, leaks and, where they were run, controls."""
     scored = {name: scoring.score_all(entry, strict=strict) for name, entry in values.items()}
-    skill = verdicts.median_skill(values["base"], values)
+    skill = median_skill(values["base"], values)
     rows = controls or []
-    reasons = scoring.reasons_against(
-        scored["base"], scored["null"], skill, verdicts.undetected(rows), verdicts.loud(rows), found
-    )
+    reasons = scoring.reasons_against(scored["base"], scored["null"], skill, undetected(rows), loud(rows), found)
     return Judgement(values, scored, skill, found, reasons)
 
 
-def judge(case: Case, folder: Path, strict: bool = False) -> Judgement:
-    """Values, leaks and the verdict without controls."""
-    values = values_of(case, folder)
-    return judged(values, leaks.find(case, values["base"]), None, strict)
+def median_skill(values: dict[str, Value], base: dict[str, dict[str, Value]]) -> float | None:
+    """Median skill over the null tube of the scored metrics with H or T evidence; `None` without a ceiling."""
+    if "ceiling" not in base or "null" not in base:
+        return None
+    skills = []
+    for id, metric in table.load().items():
+        if metric.scored and set(metric.evidence) & set("HT"):
+            x, null, ceiling = (_signed_error(metric, v[id].value) for v in (values, base["null"], base["ceiling"]))
+            skill = scoring.skill(x, null, ceiling)
+            if skill is not None and null is not None and ceiling is not None and null > ceiling:
+                skills.append(skill)
+    return float(np.median(skills)) if skills else None
+
+
+def _signed_error(metric: Metric, value: float | None) -> float | None:
+    """A value as something of which less is better."""
+    if value is None:
+        return None
+    if metric.map.kind == "B":
+        return abs(value - metric.map.target)
+    return -value if metric.map.kind in "UP" else value
+
+
+def undetected(rows: list[dict[str, Any]]) -> list[str]:
+    """Ids of negative controls that went unnoticed at a bold dose."""
+    return sorted({row["id"] for row in rows if row["kind"] == "negative" and row["bold"] and not row["detected"]})
+
+
+def loud(rows: list[dict[str, Any]]) -> list[str]:
+    """Ids of invariance controls that moved the scores."""
+    return sorted({row["id"] for row in rows if row["kind"] == "invariance" and not row["quiet"]})
+
+
+def find_leaks(case: Case, values: dict[str, Value], recorded: str | None = None) -> list[str]:
+    """What speaks against a clean split, in sentences; empty where nothing does or nothing is held out.
+
+    Args:
+        case: With the held-out recording.
+        values: Of the case; `c2m_median` is read.
+        recorded: SHA-256 of the file that was held out, to which the scored points must lead back.
+    """
+    if case.hold is None:
+        return []
+    found = [*provenance_leaks(case, recorded), *noise_leaks(case, values)]
+    if case.fit is not None:
+        share = duplicate_share(case.hold, case.fit)
+        if share > 0.0:
+            found.append(f"{share:.2%} of the held-out points are exact duplicates of points that the builder had")
+    return found
+
+
+def duplicate_share(hold: Hold, fit: Hold) -> float:
+    """Share of held-out points with an exact duplicate among those of the fit."""
+    known = {row.tobytes() for row in np.round(fit.points, 6) + 0.0}
+    rows = np.round(hold.points, 6) + 0.0
+    return float(np.mean([row.tobytes() in known for row in rows])) if len(rows) else 0.0
+
+
+def noise_leaks(case: Case, values: dict[str, Value]) -> list[str]:
+    """A recording without noise of its own is no recording."""
+    hold = case.hold
+    assert hold is not None
+    sigma = plane_noise(hold, case.rng("leaks"))
+    low, high = (factor * hold.sigma for factor in NOISE_BAND)
+    found = []
+    if not low <= sigma <= high:
+        found.append(
+            f"the held-out points scatter by {sigma * 100:.2f} cm about local planes, "
+            f"outside the sensor's {low * 100:.1f} to {high * 100:.1f} cm"
+        )
+    median = values.get("c2m_median")
+    floor = MEDIAN_FLOOR * 0.6745 * sigma
+    if median is not None and median.value is not None and median.value < floor:
+        found.append(f"the median distance of {median.value * 100:.2f} cm undercuts half of the recording's own noise")
+    return found
+
+
+def plane_noise(hold: Hold, rng: np.random.Generator) -> float:
+    """Robust scatter of the returns along their beams about planes through their neighbours, m.
+
+    The median over patches of the residual scatter, with the three degrees of freedom that a plane takes away; patches
+    come from scans near in time, since all scans together also hold the errors of poses.
+    """
+    points, scan = hold.points, hold.scan[hold.returned]
+    numbers = np.unique(scan)
+    picked = rng.permutation(numbers)[:12]
+    spread: list[float] = []
+    for number in picked:
+        cloud = points[scan == number]
+        if len(cloud) < 4 * PATCH_NEIGHBOURS:
+            continue
+        tree = cKDTree(cloud)
+        eyes = rng.permutation(len(cloud))[: PATCH_SAMPLES // len(picked)]
+        distance, index = tree.query(cloud[eyes], PATCH_NEIGHBOURS)
+        for patch in cloud[index[distance[:, -1] < PATCH_RADIUS]]:
+            residual = np.linalg.svd(patch - patch.mean(axis=0), compute_uv=False)[-1]
+            spread.append(residual / np.sqrt(PATCH_NEIGHBOURS - 3))
+    return float(np.median(spread)) if spread else float("nan")
+
+
+def provenance_leaks(case: Case, recorded: str | None) -> list[str]:
+    """Hashes: the builder's inputs must not hold the scored recording, which must be what was held out."""
+    hold, manifest = case.hold, case.candidate.manifest
+    assert hold is not None
+    inputs: list[dict[str, Any]] = manifest.get("inputs", [])
+    found = [
+        f"the builder read the held-out recording: {entry.get('file')} of the manifest has its hash"
+        for entry in inputs
+        if entry.get("sha256") == hold.hash
+    ]
+    if not all("sha256" in entry for entry in inputs) or not hold.hash:
+        found.append("an input of the builder, or the held-out recording, has no hash")
+    if recorded is not None and recorded != hold.hash:
+        found.append("the scored points do not come from the recording that was held out: its hash is another")
+    return found
+
+
+@contextmanager
+def opened_files() -> Iterator[set[Path]]:
+    """Collects every file that this process opens while the block runs, seen by the interpreter's audit events."""
+    seen: set[Path] = set()
+    active = [True]
+
+    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+        if active[0] and event == "open" and isinstance(arguments[0], str | bytes):
+            name = arguments[0] if isinstance(arguments[0], str) else arguments[0].decode(errors="replace")
+            seen.add(Path(name).absolute())
+
+    sys.addaudithook(hook)  # cannot be taken away again, hence the switch
+    try:
+        yield seen
+    finally:
+        active[0] = False

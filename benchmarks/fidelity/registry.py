@@ -1,13 +1,20 @@
-"""Every metric once: the decorator that registers one, and the check that all 199 are there."""
+"""Values, the registry of metrics, and the computation of all of them."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
 
 from benchmarks.fidelity import table
-from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.value import Value, missing
+from benchmarks.fidelity.case import Case, release_memory
 
+BLOCK = 10.0  # m along the tunnel; points nearer than this are not independent
+RESAMPLES = 200
+
+Statistic = Callable[[Float[np.ndarray, " k"]], float]
 Need = Literal["hold", "truth", "reference"]
 _ABSENT = {
     "hold": "no held-out recording",
@@ -17,25 +24,126 @@ _ABSENT = {
 
 
 @dataclass(frozen=True)
-class Registered:
-    """A metric's function and what it cannot do without."""
+class Value:
+    """A raw value of a metric.
+
+    Attributes:
+        value: Number in the unit of the table; `None` where there is none.
+        interval: 95 % block-bootstrap interval.
+        n: Number of samples.
+        reason: Cause of a missing value, or remark on the value.
+        failed: The computation broke on this candidate; it scores 0 instead of being left out.
+    """
+
+    value: float | None
+    interval: tuple[float, float] | None = None
+    n: int = 0
+    reason: str = ""
+    failed: bool = False
+
+
+def number(value: float, n: int = 0, reason: str = "") -> Value:
+    """Return a value without an interval; one that is not finite becomes `None` and counts as failed."""
+    if not np.isfinite(value):
+        return Value(None, None, n, reason or "not a finite number", failed=True)
+    return Value(float(value), None, n, reason)
+
+
+def pass_or_fail(condition: bool, reason: str = "") -> Value:
+    """Return 1 or 0."""
+    return Value(float(bool(condition)), None, 1, reason)
+
+
+def missing(reason: str) -> Value:
+    """Return a value without reference: it is left out of every mean and never counts as good."""
+    return Value(None, None, 0, reason)
+
+
+def mean(values: np.ndarray) -> float:
+    """Return the arithmetic mean."""
+    return float(np.mean(values))
+
+
+def mean_magnitude(values: np.ndarray) -> float:
+    """Return the magnitude of the mean."""
+    return abs(mean(values))
+
+
+def rms(values: np.ndarray) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def root_of_mean(squares: np.ndarray) -> float:
+    """Return the root of the mean of squares."""
+    return float(np.sqrt(np.mean(squares)))
+
+
+def percentile(percent: float) -> Statistic:
+    """Return the function that takes a percentile."""
+    return lambda values: float(np.percentile(values, percent))
+
+
+def estimate(
+    statistic: Statistic,
+    samples: Float[np.ndarray, " n"],
+    station: Float[np.ndarray, " n"],
+    rng: np.random.Generator,
+    most: int = 200_000,
+) -> Value:
+    """Return a statistic of samples along the tunnel with its block-bootstrap interval.
+
+    Args:
+        statistic: Function of any subset of the samples.
+        samples: One number each, `(n,)`.
+        station: Station of each sample, m, `(n,)`; blocks are `BLOCK` long.
+        rng: Random numbers that draw the blocks.
+        most: Largest number of samples for the interval; the value itself uses all.
+    """
+    keep = np.isfinite(samples)
+    samples, station = samples[keep], station[keep]
+    if not len(samples):
+        return Value(None, None, 0, "no samples", failed=True)
+    value = float(statistic(samples))
+    if not np.isfinite(value):
+        return Value(None, None, len(samples), "not a finite number", failed=True)
+    stride = max(1, len(samples) // most)
+    order = np.argsort(station[::stride] // BLOCK, kind="stable")
+    thin, block = samples[::stride][order], (station[::stride] // BLOCK)[order]
+    groups = np.split(thin, np.flatnonzero(np.diff(block)) + 1)
+    if len(groups) < 3:
+        return Value(value, None, len(samples), "too short for an interval")
+    draws = rng.integers(0, len(groups), (RESAMPLES, len(groups)))
+    spread = [statistic(np.concatenate([groups[i] for i in draw])) for draw in draws]
+    low, high = np.nanpercentile(spread, [2.5, 97.5])
+    return Value(value, (float(low), float(high)), len(samples))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A registered metric.
+
+    Attributes:
+        compute: Function from a case to a value.
+        needs: Reference that it cannot do without.
+    """
 
     compute: Callable[[Case], Value]
     needs: Need | None
 
 
-_REGISTRY: dict[str, Registered] = {}
+_REGISTRY: dict[str, Entry] = {}
 
 
 def metric(id: str, needs: Need | None = None) -> Callable[[Callable[[Case], Value]], Callable[[Case], Value]]:
     """Registers the function that computes a metric of the table.
 
     Args:
-        id: Its id in `metrics.csv`.
+        id: Id in `metrics.csv`.
         needs: `hold` a held-out recording; `truth` the generator's truth or unseen control; `reference` either.
 
     Raises:
-        ValueError: Not in the table, or registered before.
+        ValueError: The id is not in the table, or registered before.
     """
     if id not in table.load():
         raise ValueError(f"{id} is not in {table.METRICS.name}")
@@ -43,17 +151,38 @@ def metric(id: str, needs: Need | None = None) -> Callable[[Callable[[Case], Val
         raise ValueError(f"{id} is registered twice")
 
     def register(function: Callable[[Case], Value]) -> Callable[[Case], Value]:
-        _REGISTRY[id] = Registered(function, needs)
+        _REGISTRY[id] = Entry(function, needs)
         return function
 
     return register
 
 
-def registered() -> dict[str, Registered]:
-    """All metrics, in the order of the table.
+def family(needs: Need | None, members: Mapping[str, Any]) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
+    """Registers one function for several metrics.
+
+    Args:
+        needs: As for `metric`.
+        members: By id the arguments after case and id; a single one need not be a tuple.
+    """
+
+    def register(function: Callable[..., Value]) -> Callable[..., Value]:
+        for id, arguments in members.items():
+            rest = arguments if isinstance(arguments, tuple) else (arguments,)
+            metric(id, needs)(partial(_call_member, function, id, rest))
+        return function
+
+    return register
+
+
+def _call_member(function: Callable[..., Value], id: str, rest: tuple[Any, ...], case: Case) -> Value:
+    return function(case, id, *rest)
+
+
+def all_metrics() -> dict[str, Entry]:
+    """Return all metrics of the suite, in the order of the table.
 
     Raises:
-        ValueError: Some of the table are not computed by anything.
+        ValueError: Nothing computes some metric of the table.
     """
     import benchmarks.fidelity.categories  # noqa: F401  (registers them)
 
@@ -63,8 +192,8 @@ def registered() -> dict[str, Registered]:
     return {id: _REGISTRY[id] for id in table.load()}
 
 
-def compute(case: Case, id: str, entry: Registered) -> Value:
-    """The value of one metric; a computation that breaks counts as failed, with its reason."""
+def compute_metric(case: Case, id: str, entry: Entry) -> Value:
+    """Return the value of one metric; a computation that breaks counts as failed, with its reason."""
     present = {
         "hold": case.hold is not None,
         "truth": case.truth is not None,
@@ -78,3 +207,44 @@ def compute(case: Case, id: str, entry: Registered) -> Value:
         return missing(f"{error.name} is not installed")
     except Exception as error:  # a spoilt candidate may break any library
         return Value(None, None, 0, f"{type(error).__name__}: {error}"[:200], failed=True)
+
+
+def evaluate(
+    case: Case,
+    categories: Collection[str] | None = None,
+    reuse: dict[str, Value] | None = None,
+    advance: Callable[[str], None] = lambda id: None,
+) -> dict[str, Value]:
+    """Return the raw values of the suite by id, in the order of the table.
+
+    Args:
+        case: Candidate and references.
+        categories: Categories to compute; the others come from `reuse`.
+        reuse: Values of a case that differs in nothing that the other categories read.
+        advance: Function called with each id that is done.
+    """
+    rows, values, last = table.load(), {}, ""
+    for id, entry in all_metrics().items():
+        category = rows[id].category
+        if reuse is not None and categories is not None and category not in categories:
+            values[id] = reuse[id]
+        else:
+            if category != last:
+                case.forget(last)
+                release_memory()
+            values[id], last = compute_metric(case, id, entry), category
+        advance(id)
+    return values
+
+
+def dump_values(values: dict[str, Value]) -> dict[str, Any]:
+    """Return values as plain data."""
+    return {id: asdict(value) for id, value in values.items()}
+
+
+def load_values(content: dict[str, Any]) -> dict[str, Value]:
+    """Return the values that `dump_values` wrote."""
+    return {
+        id: Value(**{**entry, "interval": tuple(entry["interval"]) if entry["interval"] else None})
+        for id, entry in content.items()
+    }

@@ -1,4 +1,4 @@
-"""The table of the 199 metrics: `metrics.csv` with the thresholds that calibration has put in place of its guesses."""
+"""The table of the 199 metrics of the suite: `metrics.csv` with the thresholds that calibration has set."""
 
 import csv
 import json
@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+
+import numpy as np
 
 HERE = Path(__file__).parent
 METRICS = HERE / "metrics.csv"
@@ -21,13 +23,13 @@ _MAP = re.compile(
 
 @dataclass(frozen=True)
 class Map:
-    """From a raw value to a score of 0 to 100.
+    """Map from a raw value to a score of 0 to 100.
 
     Attributes:
         kind: `D` less is better, `U` more is better, `B` near `target` is better, `P` pass or fail, `-` not scored.
-        good: Where the score reaches 100.
-        bad: Where it reaches 0.
-        target: Of `B`.
+        good: Value from which on the score is 100; for `B` a distance from the target.
+        bad: Value from which on the score is 0.
+        target: Best value of a `B` map.
     """
 
     kind: str
@@ -36,7 +38,7 @@ class Map:
     target: float = 0.0
 
     def score(self, value: float) -> float:
-        """0 to 100; a value that is not a number scores 0."""
+        """Return the score; a value that is not a number scores 0."""
         if math.isnan(value):
             return 0.0
         if self.kind == "P":
@@ -47,7 +49,10 @@ class Map:
         return 100.0 * min(max((self.bad - distance) / (self.bad - self.good), 0.0), 1.0)
 
     def scaled(self, factor: float) -> "Map":
-        """Both thresholds moved by a factor; a share moves by its shortfall from 1, pass or fail does not move."""
+        """Return the map with both thresholds times a factor.
+
+        A share moves by its shortfall from 1; pass or fail does not move.
+        """
         if self.kind == "U" and max(self.good, self.bad) <= 1.0:
             return replace(self, good=1.0 - factor * (1.0 - self.good), bad=1.0 - factor * (1.0 - self.bad))
         if self.kind in "DUB":
@@ -60,17 +65,19 @@ class Metric:
     """A row of the table.
 
     Attributes:
-        number: 1 to 199.
+        number: Row, 1 to 199 in the suite.
         category: Three letters.
-        category_name: In words.
-        id: Unique.
-        definition: In a sentence.
-        unit: SI, `1` for a share, `bool`, `count`.
+        category_name: Name in words.
+        id: Unique name.
+        definition: Definition in a sentence.
+        unit: Unit of value and thresholds, as the row says: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation),
+            `bool`, `count`; and where practice has its own: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`,
+            `log10`.
         direction: `down`, `up`, `band` or `info`.
         role: `S` scored, `G` scored and a gate, `L` logged.
-        map: To a score.
+        map: Map to a score.
         evidence: Letters of H held-out, T truth, K standard, S self-consistency, C true by construction.
-        library: What computes it.
+        library: Libraries beside NumPy that its code calls on the way to the value.
     """
 
     number: int
@@ -87,15 +94,15 @@ class Metric:
 
     @property
     def scored(self) -> bool:
-        """Whether it counts."""
+        """True where the metric counts in its category."""
         return self.role in "SG"
 
 
 def parse_map(text: str) -> Map:
-    """`D(a,b)`, `U(a,b)`, `B(t;a,b)`, `P` or `-`.
+    """Reads `D(a,b)`, `U(a,b)`, `B(t;a,b)`, `P` or `-`.
 
     Raises:
-        ValueError: Anything else.
+        ValueError: Any other text.
     """
     found = _MAP.match(text.strip())
     if found is None:
@@ -109,9 +116,16 @@ def parse_map(text: str) -> Map:
     return Map("P" if found["p"] else "-")
 
 
+def map_text(map: Map) -> str:
+    """Return the map as the table writes it."""
+    good, bad, target = (np.format_float_positional(v, trim="-") for v in (map.good, map.bad, map.target))
+    texts = {"D": f"D({good},{bad})", "U": f"U({bad},{good})", "B": f"B({target};{good},{bad})"}
+    return texts.get(map.kind, map.kind)
+
+
 @cache
 def load() -> dict[str, Metric]:
-    """The table by id, in its order, with the calibrated thresholds and roles where there are some."""
+    """Return the table by id, in its order, with the calibrated thresholds and roles."""
     calibrated = json.loads(THRESHOLDS.read_text())["maps"] if THRESHOLDS.exists() else {}
     table: dict[str, Metric] = {}
     with METRICS.open(newline="") as file:
@@ -126,11 +140,11 @@ def load() -> dict[str, Metric]:
 
 
 def categories() -> dict[str, str]:
-    """Names by their three letters, in the order of the table."""
+    """Return the names of the categories by their three letters, in the order of the table."""
     return {metric.category: metric.category_name for metric in load().values()}
 
 
 def thresholds_hash() -> str:
-    """SHA-256 of table and calibrated thresholds together."""
+    """Return the SHA-256 of table and calibrated thresholds as files."""
     frozen = THRESHOLDS.read_bytes() if THRESHOLDS.exists() else b""
     return sha256(METRICS.read_bytes() + frozen).hexdigest()

@@ -13,7 +13,7 @@ from typing import Any
 import tyro
 
 from benchmarks.command import status
-from benchmarks.fidelity.filehash import file_hash
+from benchmarks.fidelity.files import file_hash
 from benchmarks.paper import figures, learning, sheet, steps
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.material import Material, read_truth

@@ -12,9 +12,9 @@ from matplotlib.patches import FancyArrowPatch, Patch
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import returns
-from benchmarks.fidelity.derive.surface import intersector
-from benchmarks.fidelity.derive.voxels import EDGE, Occupied, iou, occupied, tolerant
-from benchmarks.fidelity.figures.style import AGREE, BLUE, GREY, INK, ONLY_CLOUD, ONLY_MESH
+from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, iou, occupied_voxels, tolerant_f1
+from benchmarks.fidelity.derive.surface import surface_caster
+from benchmarks.fidelity.figures.sheet import AGREE, BLUE, GREY, INK, ONLY_CLOUD, ONLY_MESH
 from benchmarks.paper.camera import Pose
 from benchmarks.paper.material import Material
 from benchmarks.paper.sheet import PAGE, Drawing
@@ -91,7 +91,7 @@ def _residual(material: Material) -> Float[np.ndarray, " k"]:
     frame = material.frame
     beam = frame.points - frame.origin
     reach = np.linalg.norm(beam, axis=1)
-    cast, _ = intersector(material.case).first(frame.origin, beam / np.maximum(reach, 1e-9)[:, None])
+    cast, _ = surface_caster(material.case).first(frame.origin, beam / np.maximum(reach, 1e-9)[:, None])
     return (cast - reach)[np.isfinite(cast)]
 
 
@@ -219,7 +219,7 @@ _CLASSES = (("both", AGREE), ("scene only", ONLY_MESH), ("held-out cloud only", 
 
 def draw_occupancy(material: Material) -> Drawing:
     """Draws figure 3: X-Y, X-Z and Y-Z sums of the scene's voxels, and X-Z against the held-out cloud."""
-    grids = occupied(material.case)
+    grids = occupied_voxels(material.case)
     low = grid_corner(material.case, grids)
     figure = plt.figure(figsize=(PAGE, 3.3), layout="constrained")
     layout = figure.add_gridspec(3, 3, width_ratios=(4.2, 1.45, 0.08))
@@ -239,15 +239,15 @@ def draw_occupancy(material: Material) -> Drawing:
     legend = figure.add_subplot(layout[2, 1:])
     legend.set_axis_off()
     legend.legend(handles=handles, loc="center left", frameon=False, title="pixels of (b)", alignment="left")
-    facts = _facts(grids) | {"edge": EDGE, "pixels": share}
+    facts = _facts(grids) | {"edge": VOXEL_EDGE, "pixels": share}
     return Drawing(figure, _caption(facts), _table(grids, low), facts)
 
 
 def grid_corner(case: Case, grids: Occupied) -> Float[np.ndarray, "3"]:
     """Return the lowest corner of the grid: along the held-out path from the cloud's start, left and up, m."""
     first = np.argwhere(grids.real).min(axis=0)
-    cell = np.floor(returns(case).local.min(axis=0) / EDGE)
-    return EDGE * np.array([-first[0], *(cell[1:] - first[1:])])
+    cell = np.floor(returns(case).local.min(axis=0) / VOXEL_EDGE)
+    return VOXEL_EDGE * np.array([-first[0], *(cell[1:] - first[1:])])
 
 
 def classify_side_view(grids: Occupied) -> Float[np.ndarray, "i k"]:
@@ -278,7 +278,7 @@ def _mismatch(axes: Any, classes: Float[np.ndarray, "i k"], low: np.ndarray) -> 
 
 
 def _extent(low: np.ndarray, shape: tuple[int, ...], across: int, upward: int) -> list[float]:
-    return [float(low[k] + EDGE * n) for k in (across, upward) for n in (0, shape[k])]
+    return [float(low[k] + VOXEL_EDGE * n) for k in (across, upward) for n in (0, shape[k])]
 
 
 def _shares(classes: Float[np.ndarray, "i k"]) -> dict[str, float]:
@@ -291,7 +291,7 @@ def _facts(grids: Occupied) -> dict[str, Any]:
     return {
         "iou": iou(grids.real, grids.first),
         "iou_of_two_draws": iou(grids.second, grids.first),
-        "f1_one_voxel": float(tolerant(grids, whole)[0]),
+        "f1_one_voxel": float(tolerant_f1(grids, whole)[0]),
         "voxels_scene": int(grids.first.sum()),
         "voxels_cloud": int(grids.real.sum()),
     }
@@ -300,7 +300,7 @@ def _facts(grids: Occupied) -> dict[str, Any]:
 def _table(grids: Occupied, low: np.ndarray) -> dict[str, np.ndarray]:
     """Returns one row for each occupied voxel: its middle, m, and which surfaces occupy it."""
     index = np.argwhere(grids.real | grids.first)
-    middle = np.round(low + EDGE * (index + 0.5), 6)
+    middle = np.round(low + VOXEL_EDGE * (index + 0.5), 6)
     cells = tuple(index.T)
     columns = dict(zip(("along", "left", "up"), middle.T, strict=True))
     return columns | {"scene": grids.first[cells].astype(int), "cloud": grids.real[cells].astype(int)}

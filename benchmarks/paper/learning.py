@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.fidelity.figures.style import BLUE, INK, ORANGE
+from benchmarks.fidelity.figures.sheet import BLUE, INK, ORANGE
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.sheet import COLUMN, Drawing
 from train.curve import GOAL, read_episodes, rolling

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import minimum_filter1d
 
-from benchmarks.fidelity.candidate import load
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.beams import paired
+from benchmarks.fidelity.derive.beams import cast_beams
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.paper.camera import Pose, picture
 from benchmarks.paper.errors import PaperError
@@ -164,7 +164,7 @@ class Material:
     @cached_property
     def case(self) -> Case:
         """Scene with the held-out OS1."""
-        candidate = load(self.scene)
+        candidate = load_candidate(self.scene)
         config = HoldConfig(scan_spacing=0.5, sigma=_OS1_SIGMA)
         held_out = (self.survey / "survey_os1.bag", self.survey / "groundtruth_os1.tum")
         return Case(candidate, load_hold(*held_out, candidate.origin, config))
@@ -172,7 +172,7 @@ class Material:
     @cached_property
     def residual(self) -> Float[np.ndarray, " k"]:
         """Range in the scene less held-out range of every held-out beam that meets the scene, m."""
-        pairs = paired(self.case)
+        pairs = cast_beams(self.case)
         return pairs.difference[pairs.hit]
 
     @cached_property

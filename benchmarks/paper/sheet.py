@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.fidelity.store import rounded, write_text
+from benchmarks.fidelity.files import round_floats, write_text
 from benchmarks.paper.errors import PaperError
 
 SCHEMA = "subterra.figure/1"
@@ -99,7 +99,7 @@ def save(drawing: Drawing, folder: Path, name: str, extra: Mapping[str, Any]) ->
     finally:
         plt.close(drawing.figure)
     content = {"schema": SCHEMA, "caption": drawing.caption, "facts": drawing.facts, **extra}
-    write_text(folder / f"{name}.json", json.dumps(rounded(content), indent=1, sort_keys=True) + "\n")
+    write_text(folder / f"{name}.json", json.dumps(round_floats(content), indent=1, sort_keys=True) + "\n")
 
 
 def code_hash() -> str:

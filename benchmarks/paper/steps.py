@@ -7,8 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.fidelity.filehash import file_hash
-from benchmarks.fidelity.store import write_json
+from benchmarks.fidelity.files import file_hash, write_json
 from benchmarks.paper.errors import PaperError
 
 TASK = "Subterra/TraverseShort-v0"

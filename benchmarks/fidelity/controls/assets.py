@@ -1,4 +1,4 @@
-"""Controls of sleepers, rails and pockets."""
+"""Controls of sleepers, rails and pockets, and of bodies that stand in the bore."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,10 +6,8 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import Candidate
-from benchmarks.fidelity.compiled import Track
-from benchmarks.fidelity.controls.parts import cut_components, moved_components
-from benchmarks.fidelity.controls.warp import curve, warped_mesh
+from benchmarks.fidelity.candidate import Candidate, Track, concatenate_meshes
+from benchmarks.fidelity.controls.shape import axis_of, keep_bodies, move_bodies, warp_mesh
 from benchmarks.fidelity.derive.curve import Curve
 
 _NEAR = 0.3  # m along the track within which a fastening belongs to a sleeper
@@ -19,26 +17,26 @@ _NAIL_ALONG, _NAIL_AROUND = 0.4, 0.1  # m and rad between a nail and a pocket th
 _LEFT_DEPTH = 5e-4  # m that a removed pocket keeps, so that its sides do not vanish
 
 
-def sleepers_removed(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
+def remove_sleepers(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
     """Sleepers missing with what fastens rails to them."""
-    track, line = candidate.track, curve(candidate)
+    track, line = candidate.track, axis_of(candidate)
     count = len(track.sleeper)
     gone = rng.permutation(count)[: round(share * count)]
     away = np.sort(line.local(track.sleeper[gone])[:, 0])
 
     def stays(middles: np.ndarray) -> np.ndarray:
-        return _gap(line.local(middles)[:, 0], away) > _NEAR
+        return _nearest_gap(line.local(middles)[:, 0], away) > _NEAR
 
     kept = np.setdiff1d(np.arange(count), gone)
     return replace(candidate, track=replace(
-        track, sleeper=track.sleeper[kept], sleeper_mesh=cut_components(track.sleeper_mesh, stays),
-        fastening_mesh=cut_components(track.fastening_mesh, stays),
+        track, sleeper=track.sleeper[kept], sleeper_mesh=keep_bodies(track.sleeper_mesh, stays),
+        fastening_mesh=keep_bodies(track.fastening_mesh, stays),
     ))  # fmt: skip
 
 
-def sleepers_respaced(candidate: Candidate, spacing: float) -> Candidate:
+def respace_sleepers(candidate: Candidate, spacing: float) -> Candidate:
     """Sleepers at another spacing from the first one on; those beyond the end are gone."""
-    track, line = candidate.track, curve(candidate)
+    track, line = candidate.track, axis_of(candidate)
     old = line.local(track.sleeper)[:, 0]
     factor = spacing / float(np.median(np.diff(old)))
 
@@ -56,14 +54,14 @@ def sleepers_respaced(candidate: Candidate, spacing: float) -> Candidate:
     sleeper = track.sleeper + shift(track.sleeper)
     return replace(candidate, track=replace(
         track, sleeper=sleeper[inside(sleeper)],
-        sleeper_mesh=cut_components(moved_components(track.sleeper_mesh, shift), inside),
-        fastening_mesh=cut_components(moved_components(track.fastening_mesh, shift), inside),
+        sleeper_mesh=keep_bodies(move_bodies(track.sleeper_mesh, shift), inside),
+        fastening_mesh=keep_bodies(move_bodies(track.fastening_mesh, shift), inside),
     ))  # fmt: skip
 
 
-def gauge_changed(candidate: Candidate, gauge: float) -> Candidate:
+def change_gauge(candidate: Candidate, gauge: float) -> Candidate:
     """Rails and fastenings moved apart or together, half on each side, m."""
-    track, line = candidate.track, curve(candidate)
+    track, line = candidate.track, axis_of(candidate)
     middle = np.mean([line.local(points)[:, 1].mean() for points in track.rail.values() if len(points)])
     aside = 0.5 * (gauge - (track.gauge or gauge))
 
@@ -74,18 +72,18 @@ def gauge_changed(candidate: Candidate, gauge: float) -> Candidate:
 
     return replace(candidate, track=Track(
         track.sleeper, track.sleeper_mesh, {side: move(points) for side, points in track.rail.items()},
-        warped_mesh(track.rail_mesh, move), warped_mesh(track.fastening_mesh, move), gauge,
+        warp_mesh(track.rail_mesh, move), warp_mesh(track.fastening_mesh, move), gauge,
     ))  # fmt: skip
 
 
-def pockets_scaled(candidate: Candidate, factor: float, share: float, rng: np.random.Generator) -> Candidate:
+def scale_pockets(candidate: Candidate, factor: float, share: float, rng: np.random.Generator) -> Candidate:
     """Depth of a share of the pockets times a factor; 0 closes them, and the nails in them are gone."""
     bore = candidate.bore
     if not len(bore.pocket):
         return candidate
     pick = rng.permutation(len(bore.pocket))[: round(share * len(bore.pocket))]
     chosen = bore.pocket[pick]
-    line = curve(candidate)
+    line = axis_of(candidate)
 
     def deeper(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         local = line.local(mesh.vertices)
@@ -103,16 +101,16 @@ def pockets_scaled(candidate: Candidate, factor: float, share: float, rng: np.ra
     pocket["depth"][pick] *= factor
     if not factor:
         pocket = np.delete(pocket, pick)
-    nails = candidate.nails if factor else cut_components(candidate.nails, _out_of(chosen, line))
+    nails = candidate.nails if factor else keep_bodies(candidate.nails, _outside_pockets(chosen, line))
     return replace(
         candidate, lining=deeper(candidate.lining), solid=deeper(candidate.solid),
         bore=replace(bore, pocket=pocket), nails=nails,
     )  # fmt: skip
 
 
-def pattern_shifted(candidate: Candidate, shift: float) -> Candidate:
+def shift_pattern(candidate: Candidate, shift: float) -> Candidate:
     """Pockets and joints along the tunnel by some metres; mouths and track stay."""
-    bore, line = candidate.bore, curve(candidate)
+    bore, line = candidate.bore, axis_of(candidate)
 
     def target(station: np.ndarray) -> np.ndarray:
         fade = np.interp(station, [0.0, _RAMP, candidate.length - _RAMP, candidate.length], [0.0, 1.0, 1.0, 0.0])
@@ -126,9 +124,9 @@ def pattern_shifted(candidate: Candidate, shift: float) -> Candidate:
     pocket = bore.pocket.copy()
     pocket["station"] = target(pocket["station"])
     return replace(
-        candidate, lining=warped_mesh(candidate.lining, move), solid=warped_mesh(candidate.solid, move),
+        candidate, lining=warp_mesh(candidate.lining, move), solid=warp_mesh(candidate.solid, move),
         bore=replace(bore, pocket=pocket, ring_station=target(bore.ring_station)),
-        nails=warped_mesh(candidate.nails, move),
+        nails=warp_mesh(candidate.nails, move),
     )  # fmt: skip
 
 
@@ -164,7 +162,7 @@ def _in_pockets(pocket: np.ndarray, station: np.ndarray, angle: np.ndarray, radi
     return inside
 
 
-def _out_of(pocket: np.ndarray, line: Curve) -> Callable[[np.ndarray], np.ndarray]:
+def _outside_pockets(pocket: np.ndarray, line: Curve) -> Callable[[np.ndarray], np.ndarray]:
     """Whether bodies lie farther from every pocket than a nail reaches."""
 
     def away(middles: np.ndarray) -> np.ndarray:
@@ -177,7 +175,89 @@ def _out_of(pocket: np.ndarray, line: Curve) -> Callable[[np.ndarray], np.ndarra
     return away
 
 
-def _gap(station: np.ndarray, away: np.ndarray) -> np.ndarray:
+def _nearest_gap(station: np.ndarray, away: np.ndarray) -> np.ndarray:
     if not len(away):
         return np.full(len(station), np.inf)
     return np.min(np.abs(station[:, None] - away[None]), axis=1)
+
+
+_WALL_THICKNESS = 0.3  # m thick
+_DEBRIS_RADIUS = 0.3  # m, radius of a piece of debris
+_PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel
+
+
+def place_box(
+    candidate: Candidate, station: float, left: float, up: float, size: tuple[float, float, float]
+) -> trimesh.Trimesh:
+    """A box in the frame of the axis, m."""
+    position, tangent, side, top = axis_of(candidate).frames(np.array([station]))
+    placement = np.eye(4)
+    placement[:3, :3] = np.column_stack([tangent[0], side[0], top[0]])
+    placement[:3, 3] = position[0] + left * side[0] + up * top[0]
+    return trimesh.creation.box(size, transform=placement)
+
+
+def add_bodies(candidate: Candidate, parts: list[trimesh.Trimesh]) -> Candidate:
+    """The candidate with closed bodies standing in it; the air volume loses what they take."""
+    solid = candidate.solid.copy()
+    solid.merge_vertices(digits_vertex=6)
+    taken = trimesh.boolean.difference([solid, *parts], engine="manifold", check_volume=False)
+    extra = [part for part in (candidate.extra, *parts) if len(part.faces)]
+    return replace(candidate, solid=taken, extra=concatenate_meshes(extra))
+
+
+def block_bore(candidate: Candidate, whole: bool) -> Candidate:
+    """A box of 1 m on the track in mid-tunnel, or a wall across the whole section."""
+    bore, station = candidate.bore, 0.5 * candidate.length
+    width, height = float(bore.width.max()), float(bore.height.max())
+    if whole:
+        return add_bodies(
+            candidate, [place_box(candidate, station, 0.0, 0.0, (_WALL_THICKNESS, width + 0.5, height + 0.5))]
+        )
+    low = -0.5 * float(np.median(bore.height))
+    return add_bodies(candidate, [place_box(candidate, station, 0.0, low + 0.6, (1.0, 1.0, 1.0))])
+
+
+def add_debris(candidate: Candidate, count: int, rng: np.random.Generator) -> Candidate:
+    """Pieces of debris that float in the bore."""
+    station = rng.uniform(1.0, candidate.length - 1.0, count)
+    local = np.column_stack([station, rng.uniform(-1.5, 1.5, count), rng.uniform(-1.0, 1.5, count)])
+    parts = []
+    for middle in axis_of(candidate).point(local):
+        blob = trimesh.creation.icosphere(subdivisions=1, radius=_DEBRIS_RADIUS)
+        blob.apply_translation(middle)
+        parts.append(blob)
+    return add_bodies(candidate, parts)
+
+
+def add_pillars(candidate: Candidate, spacing: float) -> Candidate:
+    """Pillars beside the track, floor to crown, as landmarks that are not there."""
+    bore = candidate.bore
+    stations = np.arange(0.5 * min(spacing, candidate.length), candidate.length - 1.0, spacing)
+    aside, height = 0.36 * float(np.median(bore.width)), float(np.median(bore.height))
+    size = (*_PILLAR_SIZE, height)
+    return add_bodies(candidate, [place_box(candidate, s, aside, 0.0, size) for s in stations])
+
+
+def close_mouth(candidate: Candidate) -> Candidate:
+    """An end wall where the tunnel goes on."""
+    lining = candidate.lining.copy()
+    lining.merge_vertices(digits_vertex=6)
+    edges, count = np.unique(lining.edges_sorted, axis=0, return_counts=True)
+    rim = edges[count == 1]
+    middle = lining.vertices[rim].mean(axis=1)
+    bore = candidate.bore
+    near = np.abs((middle - bore.position[-1]) @ bore.tangent[-1]) < 0.3
+    near &= np.linalg.norm(middle - bore.position[-1], axis=1) < 2.0 * float(bore.radius[-1].max())
+    fan = np.column_stack([rim[near], np.full(int(near.sum()), len(lining.vertices))])
+    vertices = np.vstack([lining.vertices, bore.position[-1]])
+    inward = (
+        np.einsum(
+            "ij,j->i",
+            np.cross(vertices[fan[:, 1]] - vertices[fan[:, 0]], vertices[fan[:, 2]] - vertices[fan[:, 0]]),
+            bore.tangent[-1],
+        )
+        < 0
+    )
+    fan = np.where(inward[:, None], fan, fan[:, ::-1])
+    return replace(candidate, lining=trimesh.Trimesh(vertices, np.vstack([lining.faces, fan]), process=False))

@@ -1,4 +1,4 @@
-"""The table of controls: `controls.csv` beside the functions that carry each out."""
+"""The table of negative controls with the functions that carry them out, and the invariances."""
 
 import csv
 from collections.abc import Callable
@@ -7,11 +7,57 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
 
-from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.candidate import Bore, Candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls import assets, damage, objects, references, scenes, shape
-from benchmarks.fidelity.null import null_tube
+from benchmarks.fidelity.controls.assets import (
+    add_debris,
+    add_pillars,
+    block_bore,
+    change_gauge,
+    close_mouth,
+    remove_sleepers,
+    respace_sleepers,
+    ring_pitch,
+    scale_pockets,
+    shift_pattern,
+)
+from benchmarks.fidelity.controls.damage import (
+    add_fins,
+    add_vertex_noise,
+    coarsen,
+    collide_whole_mesh,
+    cut_hole,
+    double_faces,
+    drop_faces,
+    drop_scene_faces,
+    flip_faces,
+    forge_recording,
+    judge_foreign,
+    leak_hold,
+    move_panels,
+    permute_poses,
+    scale_scene,
+    turn_beams,
+    widen_plan,
+)
+from benchmarks.fidelity.controls.shape import (
+    add_wave,
+    move_references,
+    raise_floor,
+    roll_sections,
+    scale_all,
+    scale_section,
+    shift_left,
+    shorten,
+    straighten,
+    stretch_axis,
+    turn_yaw,
+)
+from benchmarks.fidelity.impostors import null_tube
+from benchmarks.fidelity.references import Hold
 
 TABLE = Path(__file__).with_name("controls.csv")
 OUT_OF_SCENE = "all but SCN PAR"
@@ -61,13 +107,13 @@ Spoil = Callable[[Case, float, Setting], Case]
 
 
 @cache
-def load() -> dict[str, Control]:
+def load_controls() -> dict[str, Control]:
     """The controls by id, in order."""
     with TABLE.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {
         row["id"]: Control(
-            row["id"], row["corruption"], _numbers(row["doses"]), _numbers(row["bold"]),
+            row["id"], row["corruption"], _parse_numbers(row["doses"]), _parse_numbers(row["bold"]),
             {pair.split()[0]: float(pair.split()[1]) for pair in row["falls"].split(";") if pair.strip()},
             tuple(row["quiet"].split()), row["evaluated"], row["reason"],
         )
@@ -75,7 +121,7 @@ def load() -> dict[str, Control]:
     }  # fmt: skip
 
 
-def spoiled(case: Case, control: str, dose: float, setting: Setting) -> Case:
+def spoil_case(case: Case, control: str, dose: float, setting: Setting) -> Case:
     """The case with one control at one dose.
 
     Raises:
@@ -84,78 +130,214 @@ def spoiled(case: Case, control: str, dose: float, setting: Setting) -> Case:
     return SPOIL[control](case, dose, setting)
 
 
-def _numbers(text: str) -> tuple[float, ...]:
+def _parse_numbers(text: str) -> tuple[float, ...]:
     return tuple(float(word) for word in text.split())
 
 
-def _of(change: Callable[[Candidate, float, Setting], Candidate]) -> Spoil:
+def _change_candidate(change: Callable[[Candidate, float, Setting], Candidate]) -> Spoil:
     return lambda case, dose, setting: replace(case, candidate=change(case.candidate, dose, setting), cache={})
 
 
-def _scaled(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
+def _scale_all(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
     factor = 1.0 + dose / 100.0
-    made = scenes.scaled_scene(candidate, factor, setting.scratch)
-    moved = shape.scaled(candidate, factor)
+    made = scale_scene(candidate, factor, setting.scratch)
+    moved = scale_all(candidate, factor)
     return replace(moved, folder=made.folder, scene=made.scene, tunnel=made.tunnel)
 
 
-def _dropped(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
-    made = scenes.holed_scene(candidate, dose / 100.0, setting.rng, setting.scratch)
-    return damage.faces_dropped(made, dose / 100.0, setting.rng)
+def _drop_faces(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
+    made = drop_scene_faces(candidate, dose / 100.0, setting.rng, setting.scratch)
+    return drop_faces(made, dose / 100.0, setting.rng)
 
 
-def _references(case: Case, dose: float, setting: Setting) -> Case:
-    return (
-        references.extrinsic_wrong(case, np.radians(2.0)) if dose < 2 else references.poses_permuted(case, setting.rng)
-    )
+def _spoil_poses(case: Case, dose: float, setting: Setting) -> Case:
+    return turn_beams(case, np.radians(2.0)) if dose < 2 else permute_poses(case, setting.rng)
 
 
-def _forged(case: Case, dose: float, setting: Setting) -> Case:
+def _forge_recording(case: Case, dose: float, setting: Setting) -> Case:
     assert case.hold is not None
-    return references.sampled_from_mesh(case, case.hold.sigma if dose >= 2 else 0.0, setting.rng)
+    return forge_recording(case, case.hold.sigma if dose >= 2 else 0.0, setting.rng)
 
 
-def _pockets(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
+def _spoil_pockets(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
     if dose >= 3.0:
-        return assets.pattern_shifted(candidate, 0.5 * assets.ring_pitch(candidate))
-    return assets.pockets_scaled(candidate, dose, 1.0, setting.rng)
+        return shift_pattern(candidate, 0.5 * ring_pitch(candidate))
+    return scale_pockets(candidate, dose, 1.0, setting.rng)
 
 
 SPOIL: dict[str, Spoil] = {
-    "N01": _of(_scaled),
-    "N02": _of(lambda c, d, s: shape.section_scaled(c, 1 + d / 100, 1 + d / 100)),
-    "N03": _of(lambda c, d, s: shape.section_scaled(c, 1 + d / 100, 1.0)),
-    "N04": lambda case, d, s: shape.axial_stretch(case, 1 + d / 100),
-    "N05": _of(lambda c, d, s: shape.yawed(c, np.radians(d))),
-    "N06": _of(lambda c, d, s: shape.rolled(c, np.radians(d))),
-    "N07": _of(lambda c, d, s: shape.shifted(c, d)),
-    "N08": _of(lambda c, d, s: shape.floor_raised(c, d)),
-    "N09": _of(lambda c, d, s: shape.shortened(c, d / 100)),
-    "N10": _of(lambda c, d, s: shape.straightened(c, d / 100)),
-    "N11": _of(lambda c, d, s: shape.waved(c, d)),
-    "N12": _of(_dropped),
-    "N13": _of(lambda c, d, s: damage.holed(c, d, s.rng)),
-    "N14": _of(lambda c, d, s: damage.flipped(c, 1.0, s.rng)),
-    "N15": _of(lambda c, d, s: damage.flipped(c, d / 100, s.rng)),
-    "N16": _of(lambda c, d, s: damage.doubled(c, d / 100, s.rng)),
-    "N17": _of(lambda c, d, s: damage.finned(c, int(d), s.rng)),
-    "N18": _of(lambda c, d, s: damage.noisy(c, d, s.rng)),
-    "N19": _of(lambda c, d, s: damage.coarsened(c, d / 100)),
-    "N20": _of(lambda c, d, s: objects.blocked(c, whole=d >= 2)),
-    "N21": _of(lambda c, d, s: objects.littered(c, int(d), s.rng)),
-    "N22": _of(lambda c, d, s: assets.sleepers_removed(c, d / 100, s.rng)),
-    "N23": _of(lambda c, d, s: assets.sleepers_respaced(c, d)),
-    "N24": _of(lambda c, d, s: assets.gauge_changed(c, d)),
-    "N25": _of(lambda c, d, s: assets.pockets_scaled(c, 0.0, d / 100, s.rng)),
-    "N26": _of(_pockets),
-    "N27": _of(lambda c, d, s: objects.pillared(c, d)),
-    "N28": _of(lambda c, d, s: objects.mouth_closed(c)),
-    "N29": _of(lambda c, d, s: scenes.one_collidable_mesh(c, s.scratch)),
-    "N30": _of(lambda c, d, s: scenes.panels_off(c, d, s.scratch)),
-    "N31": _of(lambda c, d, s: scenes.other_plan(c, d, s.scratch)),
-    "N32": _references,
-    "N33": lambda case, d, s: references.foreign(case, s.foreign()),
-    "N34": _of(lambda c, d, s: null_tube(c, sleepers=d < 2)),
-    "N35": _forged,
-    "N36": lambda case, d, s: references.builder_read_hold(case),
+    "N01": _change_candidate(_scale_all),
+    "N02": _change_candidate(lambda c, d, s: scale_section(c, 1 + d / 100, 1 + d / 100)),
+    "N03": _change_candidate(lambda c, d, s: scale_section(c, 1 + d / 100, 1.0)),
+    "N04": lambda case, d, s: stretch_axis(case, 1 + d / 100),
+    "N05": _change_candidate(lambda c, d, s: turn_yaw(c, np.radians(d))),
+    "N06": _change_candidate(lambda c, d, s: roll_sections(c, np.radians(d))),
+    "N07": _change_candidate(lambda c, d, s: shift_left(c, d)),
+    "N08": _change_candidate(lambda c, d, s: raise_floor(c, d)),
+    "N09": _change_candidate(lambda c, d, s: shorten(c, d / 100)),
+    "N10": _change_candidate(lambda c, d, s: straighten(c, d / 100)),
+    "N11": _change_candidate(lambda c, d, s: add_wave(c, d)),
+    "N12": _change_candidate(_drop_faces),
+    "N13": _change_candidate(lambda c, d, s: cut_hole(c, d, s.rng)),
+    "N14": _change_candidate(lambda c, d, s: flip_faces(c, 1.0, s.rng)),
+    "N15": _change_candidate(lambda c, d, s: flip_faces(c, d / 100, s.rng)),
+    "N16": _change_candidate(lambda c, d, s: double_faces(c, d / 100, s.rng)),
+    "N17": _change_candidate(lambda c, d, s: add_fins(c, int(d), s.rng)),
+    "N18": _change_candidate(lambda c, d, s: add_vertex_noise(c, d, s.rng)),
+    "N19": _change_candidate(lambda c, d, s: coarsen(c, d / 100)),
+    "N20": _change_candidate(lambda c, d, s: block_bore(c, whole=d >= 2)),
+    "N21": _change_candidate(lambda c, d, s: add_debris(c, int(d), s.rng)),
+    "N22": _change_candidate(lambda c, d, s: remove_sleepers(c, d / 100, s.rng)),
+    "N23": _change_candidate(lambda c, d, s: respace_sleepers(c, d)),
+    "N24": _change_candidate(lambda c, d, s: change_gauge(c, d)),
+    "N25": _change_candidate(lambda c, d, s: scale_pockets(c, 0.0, d / 100, s.rng)),
+    "N26": _change_candidate(_spoil_pockets),
+    "N27": _change_candidate(lambda c, d, s: add_pillars(c, d)),
+    "N28": _change_candidate(lambda c, d, s: close_mouth(c)),
+    "N29": _change_candidate(lambda c, d, s: collide_whole_mesh(c, s.scratch)),
+    "N30": _change_candidate(lambda c, d, s: move_panels(c, d, s.scratch)),
+    "N31": _change_candidate(lambda c, d, s: widen_plan(c, d, s.scratch)),
+    "N32": _spoil_poses,
+    "N33": lambda case, d, s: judge_foreign(case, s.foreign()),
+    "N34": _change_candidate(lambda c, d, s: null_tube(c, sleepers=d < 2)),
+    "N35": _forge_recording,
+    "N36": lambda case, d, s: leak_hold(case),
+}
+SHIFT = np.array([1000.0, -640.0, 35.0])  # m
+YAW = np.radians(30.0)
+GLOBAL_LIMIT = 0.3
+CATEGORY_LIMIT = 1.0
+THINNED_LIMIT = 2.0
+
+
+@dataclass(frozen=True)
+class Invariance:
+    """A control that must be quiet.
+
+    Attributes:
+        change: Of the case.
+        text: In words.
+        category_limit: Points that a category may move.
+        exempt: Categories that may move.
+    """
+
+    change: Callable[[Case, np.random.Generator], Case]
+    text: str
+    category_limit: float = CATEGORY_LIMIT
+    exempt: tuple[str, ...] = ()
+
+
+def _on_candidate(change: Callable[[Candidate, np.random.Generator], Candidate]) -> Callable[..., Case]:
+    return lambda case, rng: replace(case, candidate=change(case.candidate, rng), cache={})
+
+
+def _on_meshes(change: Callable[[trimesh.Trimesh], trimesh.Trimesh]) -> Callable[..., Candidate]:
+    return lambda candidate, rng: replace(candidate, lining=change(candidate.lining), solid=change(candidate.solid))
+
+
+def permute(candidate: Candidate, rng: np.random.Generator) -> Candidate:
+    """Vertices and faces in another order."""
+
+    def mixed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+        order = rng.permutation(len(mesh.vertices))
+        place = np.argsort(order)
+        return trimesh.Trimesh(mesh.vertices[order], place[mesh.faces][rng.permutation(len(mesh.faces))], process=False)
+
+    return replace(candidate, lining=mixed(candidate.lining), solid=mixed(candidate.solid))
+
+
+def subdivide(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Every face in four by the middles of its edges."""
+    vertices, faces = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def move_together(case: Case, rng: np.random.Generator) -> Case:
+    """Reconstruction and references turned and shifted alike."""
+    turn = Rotation.from_euler("z", YAW).as_matrix()
+    candidate = case.candidate
+
+    def move(points: np.ndarray) -> np.ndarray:
+        return points @ turn.T + SHIFT
+
+    def mesh(old: trimesh.Trimesh) -> trimesh.Trimesh:
+        return trimesh.Trimesh(move(old.vertices), old.faces, process=False) if len(old.faces) else old
+
+    bore, track = candidate.bore, candidate.track
+    turned = {name: getattr(bore, name) @ turn.T for name in ("tangent", "lateral", "up")}
+    made = replace(
+        candidate, lining=mesh(candidate.lining), solid=mesh(candidate.solid), extra=mesh(candidate.extra),
+        nails=mesh(candidate.nails), bed=mesh(candidate.bed),
+        bore=replace(bore, position=move(bore.position), **turned),
+        track=replace(
+            track, sleeper=move(track.sleeper) if len(track.sleeper) else track.sleeper,
+            sleeper_mesh=mesh(track.sleeper_mesh), rail_mesh=mesh(track.rail_mesh),
+            fastening_mesh=mesh(track.fastening_mesh),
+            rail={side: move(points) if len(points) else points for side, points in track.rail.items()},
+        ),
+    )  # fmt: skip
+    return replace(move_references(case, turn, SHIFT), candidate=made)
+
+
+def reverse_axis(case: Case, rng: np.random.Generator) -> Case:
+    """Chainage from the other end, of the reconstruction alone."""
+    bore, track = case.candidate.bore, case.candidate.track
+    angle = np.pi - bore.angle
+    angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
+    order = np.argsort(angle)
+    pocket = bore.pocket[::-1].copy()
+    if len(pocket):
+        pocket["station"] = bore.station[-1] - pocket["station"]
+        pocket["angle"] = (2.0 * np.pi - pocket["angle"]) % (2.0 * np.pi) - np.pi
+    turned = Bore(
+        bore.station[-1] - bore.station[::-1], bore.position[::-1], -bore.tangent[::-1], -bore.lateral[::-1],
+        bore.up[::-1],
+        bore.width[::-1], bore.height[::-1], angle[order], bore.radius[::-1][:, order],
+        bore.station[-1] - bore.ring_station[::-1], pocket,
+    )  # fmt: skip
+    rail = {"left": track.rail["right"][::-1], "right": track.rail["left"][::-1]}
+    laid = replace(track, sleeper=track.sleeper[::-1], rail=rail)
+    return replace(case, candidate=replace(case.candidate, bore=turned, track=laid), cache={})
+
+
+def exchange_formats(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Written as OBJ and as binary STL, and read again."""
+    for kind in ("obj", "stl"):
+        data = mesh.export(file_type=kind)
+        assert isinstance(data, str | bytes)
+        loaded = trimesh.load_mesh(trimesh.util.wrap_as_stream(data), file_type=kind, process=False)
+        mesh = trimesh.Trimesh(loaded.vertices, loaded.faces, process=False)
+        mesh.merge_vertices(digits_vertex=5)
+    return mesh
+
+
+def shuffle_beams(hold: Hold, rng: np.random.Generator) -> Hold:
+    """Beams of each scan in another order; scans stay in theirs."""
+    order = np.lexsort((rng.random(len(hold.scan)), hold.scan))
+    return take_beams(hold, order)
+
+
+def thin_beams(hold: Hold, rng: np.random.Generator) -> Hold:
+    """Every second beam."""
+    return take_beams(hold, np.flatnonzero(rng.random(len(hold.scan)) < 0.5))
+
+
+def take_beams(hold: Hold, rows: np.ndarray) -> Hold:
+    """Some beams of a recording."""
+    names = ("time", "scan", "origin", "direction", "range")
+    return replace(hold, **{name: getattr(hold, name)[rows] for name in names}, cache={})
+
+
+def _on_hold(change: Callable[[Hold, np.random.Generator], Hold]) -> Callable[..., Case]:
+    return lambda case, rng: case if case.hold is None else replace(case, hold=change(case.hold, rng), cache={})
+
+
+INVARIANCES: dict[str, Invariance] = {
+    "I1": Invariance(_on_candidate(permute), "vertices and faces in another order"),
+    "I2": Invariance(_on_candidate(_on_meshes(subdivide)), "every face in four", exempt=("TRI",)),
+    "I3": Invariance(move_together, "everything 1 km away and turned by 30 degrees"),
+    "I4": Invariance(reverse_axis, "chainage from the other end"),
+    "I5": Invariance(_on_candidate(_on_meshes(exchange_formats)), "meshes through OBJ and STL"),
+    "I6": Invariance(_on_hold(shuffle_beams), "beams of the held-out recording in another order"),
+    "I7": Invariance(_on_hold(thin_beams), "half of the held-out beams", category_limit=THINNED_LIMIT),
 }

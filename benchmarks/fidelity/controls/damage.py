@@ -1,32 +1,40 @@
-"""Controls of the mesh itself: holes, flipped, doubled and crossing faces, noise, over-smoothing."""
+"""Controls of meshes, of the compiled scene and of the references."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import pymeshlab
 import trimesh
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from benchmarks.fidelity.candidate import Candidate
-from benchmarks.fidelity.compiled import concatenated
-from benchmarks.fidelity.controls.parts import without_faces
+from benchmarks.fidelity.candidate import Candidate, concatenate_meshes
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.controls.shape import move_references, without_faces
+from benchmarks.fidelity.derive.surface import Caster, visible_mesh
+from benchmarks.fidelity.files import FidelityError
+from benchmarks.fidelity.references import Hold
 
 _SAME = 1e-6  # m between a vertex of the lining and its twin in the solid
-_FIN = 0.6  # m that a fin stands into the bore
+_FIN_HEIGHT = 0.6  # m that a fin stands into the bore
 _SLIVER = 1e-4
 
 
-def both(candidate: Candidate, change) -> Candidate:
+def change_both(candidate: Candidate, change) -> Candidate:
     """Lining and solid changed alike."""
     return replace(candidate, lining=change(candidate.lining), solid=change(candidate.solid))
 
 
-def faces_dropped(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
+def drop_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
     """Random faces missing."""
-    return both(candidate, lambda mesh: without_faces(mesh, rng.random(len(mesh.faces)) < share))
+    return change_both(candidate, lambda mesh: without_faces(mesh, rng.random(len(mesh.faces)) < share))
 
 
-def holed(candidate: Candidate, area: float, rng: np.random.Generator) -> Candidate:
+def cut_hole(candidate: Candidate, area: float, rng: np.random.Generator) -> Candidate:
     """One round hole in a wall, m²."""
     bore = candidate.bore
     row = int(rng.integers(len(bore.station) // 4, 3 * len(bore.station) // 4))
@@ -40,20 +48,20 @@ def holed(candidate: Candidate, area: float, rng: np.random.Generator) -> Candid
         gone[order[: int(np.searchsorted(np.cumsum(mesh.area_faces[order]), area)) + 1]] = True
         return without_faces(mesh, gone)
 
-    return both(candidate, pierced)
+    return change_both(candidate, pierced)
 
 
-def flipped(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
+def flip_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
     """Faces wound the wrong way; a share of 1 flips all."""
 
     def wrong(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         turned = rng.random(len(mesh.faces)) < share
         return trimesh.Trimesh(mesh.vertices, np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces), process=False)
 
-    return both(candidate, wrong)
+    return change_both(candidate, wrong)
 
 
-def doubled(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
+def double_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
     """Faces there twice, and as many slivers along edges."""
 
     def worse(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -62,21 +70,21 @@ def doubled(candidate: Candidate, share: float, rng: np.random.Generator) -> Can
         thin = corner.copy()
         thin[:, 2] = corner[:, 0] + 0.5 * (corner[:, 1] - corner[:, 0]) + _SLIVER * (corner[:, 2] - corner[:, 0])
         slivers = trimesh.Trimesh(thin.reshape(-1, 3), np.arange(3 * len(pick)).reshape(-1, 3), process=False)
-        return concatenated(
+        return concatenate_meshes(
             [trimesh.Trimesh(mesh.vertices, np.vstack([mesh.faces, mesh.faces[pick]]), process=False), slivers]
         )
 
-    return both(candidate, worse)
+    return change_both(candidate, worse)
 
 
-def finned(candidate: Candidate, count: int, rng: np.random.Generator) -> Candidate:
+def add_fins(candidate: Candidate, count: int, rng: np.random.Generator) -> Candidate:
     """Fins on edges of the wall, so that three faces share an edge; each pierces the wall behind it."""
 
     def fin(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         pick = rng.permutation(len(mesh.faces))[:count]
         edge = mesh.faces[pick][:, :2]
         middle = mesh.vertices[edge].mean(axis=1)
-        inward, outward = middle + _FIN * mesh.face_normals[pick], middle - _FIN * mesh.face_normals[pick]
+        inward, outward = middle + _FIN_HEIGHT * mesh.face_normals[pick], middle - _FIN_HEIGHT * mesh.face_normals[pick]
         slanted = 0.3 * np.roll(mesh.face_normals[pick], 1, axis=1)
         first = len(mesh.vertices) + np.arange(2 * count)
         faces = [mesh.faces, np.column_stack([edge, first[:count]]), np.column_stack([edge, first[count:]])]
@@ -84,10 +92,10 @@ def finned(candidate: Candidate, count: int, rng: np.random.Generator) -> Candid
             np.vstack([mesh.vertices, inward + slanted, outward + slanted]), np.vstack(faces), process=False
         )
 
-    return both(candidate, fin)
+    return change_both(candidate, fin)
 
 
-def noisy(candidate: Candidate, sigma: float, rng: np.random.Generator) -> Candidate:
+def add_vertex_noise(candidate: Candidate, sigma: float, rng: np.random.Generator) -> Candidate:
     """Every vertex displaced at random, m; twins in lining and solid alike."""
     solid = trimesh.Trimesh(candidate.solid.vertices, candidate.solid.faces, process=False)
     offset = rng.normal(0.0, sigma, solid.vertices.shape)
@@ -98,7 +106,7 @@ def noisy(candidate: Candidate, sigma: float, rng: np.random.Generator) -> Candi
     return replace(candidate, lining=lining, solid=trimesh.Trimesh(solid.vertices + offset, solid.faces, process=False))
 
 
-def coarsened(candidate: Candidate, share: float) -> Candidate:
+def coarsen(candidate: Candidate, share: float) -> Candidate:
     """Smoothed (Laplace, the more the larger the share) and then left with fewer faces."""
 
     def smooth(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -113,4 +121,180 @@ def coarsened(candidate: Candidate, share: float) -> Candidate:
         made = work.current_mesh()
         return trimesh.Trimesh(made.vertex_matrix() + origin, made.face_matrix(), process=False)
 
-    return both(candidate, smooth)
+    return change_both(candidate, smooth)
+
+
+PANELS = ("wall_", "bed_")
+
+
+def copy_scene(candidate: Candidate, scratch: Path, changed: Callable[[Path], bool] = lambda file: False) -> Candidate:
+    """The candidate with its folder linked file by file into a scratch folder, less what is to be written anew."""
+    folder = scratch / "scene"
+    for file in sorted(path for path in candidate.folder.rglob("*") if path.is_file()):
+        if file.name not in ("scene.xml", "cloud.ply") and not changed(file):
+            link = folder / file.relative_to(candidate.folder)
+            link.parent.mkdir(parents=True, exist_ok=True)
+            if not link.exists():
+                link.symlink_to(file.resolve())
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "scene.xml").write_bytes(candidate.scene.read_bytes())
+    return replace(candidate, folder=folder, scene=folder / "scene.xml", tunnel=folder / "tunnel.npz")
+
+
+def edit_scene(candidate: Candidate, change: Callable[[mujoco.MjSpec], None]) -> Candidate:
+    """The scene of a copied candidate with its model changed."""
+    spec = mujoco.MjSpec.from_file(str(candidate.scene))
+    change(spec)
+    spec.compile()
+    candidate.scene.write_text(spec.to_xml())
+    return candidate
+
+
+def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate:
+    """Everything that does not move larger about the middle of the axis, and the planar tunnel with it."""
+    middle = candidate.bore.position.mean(axis=0)
+    made = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
+
+    def change(spec: mujoco.MjSpec) -> None:
+        for mesh in spec.meshes:
+            mesh.scale = np.asarray(mesh.scale) * factor
+        for geom in spec.worldbody.geoms:
+            geom.pos = middle + factor * (np.asarray(geom.pos) - middle)
+            geom.size = np.asarray(geom.size) * factor
+        for body in spec.worldbody.bodies:
+            body.pos = middle + factor * (np.asarray(body.pos) - middle)
+
+    edit_scene(made, change)
+    with np.load(candidate.tunnel) as data:
+        arrays = {name: data[name] for name in data.files}
+    for name, value in arrays.items():
+        if name in ("station", "half_width") or "station_" in name:
+            arrays[name] = value * factor
+        elif name == "centre" or name.startswith(("left_", "right_")):
+            arrays[name] = middle[:2] + factor * (value - middle[:2])
+        elif name == "elevation":
+            arrays[name] = middle[2] + factor * (value - middle[2])
+        elif name == "lidar_height":
+            arrays[name] = np.asarray(value * factor)
+    np.savez(made.tunnel, **arrays)
+    return made
+
+
+def drop_scene_faces(candidate: Candidate, share: float, rng: np.random.Generator, scratch: Path) -> Candidate:
+    """Random faces of the drawn lining missing in the compiled scene."""
+    made = copy_scene(candidate, scratch, lambda file: file.name.startswith("lining_"))
+    for file in sorted((candidate.folder / "meshes").glob("lining_*.obj")):
+        mesh = trimesh.load_mesh(file, process=False)
+        without_faces(mesh, rng.random(len(mesh.faces)) < share).export(made.folder / "meshes" / file.name)
+    return made
+
+
+def collide_whole_mesh(candidate: Candidate, scratch: Path) -> Candidate:
+    """The bore as collidable meshes instead of panels: MuJoCo takes the convex hull of each."""
+    made = copy_scene(candidate, scratch)
+    candidate.lining.export(made.folder / "meshes" / "whole_bore.obj")
+
+    def change(spec: mujoco.MjSpec) -> None:
+        for geom in list(spec.worldbody.geoms):
+            if geom.name.startswith(PANELS):
+                spec.delete(geom)
+        whole = spec.add_mesh(name="whole_bore", file="whole_bore.obj")
+        whole.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        spec.worldbody.add_geom(
+            name="whole_bore",
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname="whole_bore",
+            contype=1 | 2 | 4 | 8,
+            conaffinity=0,
+            group=3,
+        )
+
+    return edit_scene(made, change)
+
+
+def move_panels(candidate: Candidate, distance: float, scratch: Path) -> Candidate:
+    """Collision panels of the walls farther out than the wall, m."""
+    made = copy_scene(candidate, scratch)
+    axis = candidate.bore.position
+
+    def change(spec: mujoco.MjSpec) -> None:
+        for geom in spec.worldbody.geoms:
+            if geom.name.startswith(("wall_", "low_")):
+                away = np.asarray(geom.pos) - axis[np.argmin(np.linalg.norm(axis - geom.pos, axis=1))]
+                turn = np.zeros(9)
+                mujoco.mju_quat2Mat(turn, np.asarray(geom.quat))
+                sides = turn.reshape(3, 3)[:, 1:].T  # x runs along the tunnel
+                normal = sides[np.argmax(np.abs(sides @ away))]
+                geom.pos = np.asarray(geom.pos) + distance * np.sign(normal @ away) * normal
+
+    return edit_scene(made, change)
+
+
+def widen_plan(candidate: Candidate, wider: float, scratch: Path) -> Candidate:
+    """The environment's planar tunnel made from another geometry than the mesh: walls apart by some metres more."""
+    made = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
+    with np.load(candidate.tunnel) as data:
+        arrays = {name: data[name] for name in data.files}
+    normal = np.column_stack([-arrays["tangent"][:, 1], arrays["tangent"][:, 0]])
+    for side, sign in (("left", 0.5), ("right", -0.5)):
+        for lining in arrays["lining"]:
+            at = arrays[f"{side}_station_{lining}"]
+            away = np.stack([np.interp(at, arrays["station"], column) for column in normal.T], axis=1)
+            arrays[f"{side}_{lining}"] = arrays[f"{side}_{lining}"] + sign * wider * away
+    arrays["half_width"] = arrays["half_width"] + 0.5 * wider
+    np.savez(made.tunnel, **arrays)
+    return made
+
+
+def turn_beams(case: Case, angle: float) -> Case:
+    """Beams of the held-out recording turned about each sensor's own vertical and side axis, rad."""
+    hold = _require_hold(case)
+    turn = Rotation.from_euler("zy", [angle, angle]).as_matrix()
+    return replace(case, hold=replace(hold, direction=hold.direction @ turn.T, cache={}), cache={})
+
+
+def permute_poses(case: Case, rng: np.random.Generator) -> Case:
+    """Every scan at the place of another."""
+    hold = _require_hold(case)
+    scans, first, index = np.unique(hold.scan, return_index=True, return_inverse=True)
+    place = hold.origin[first][rng.permutation(len(scans))]
+    return replace(
+        case, hold=replace(hold, origin=hold.origin - hold.origin[first][index] + place[index], cache={}), cache={}
+    )
+
+
+def judge_foreign(case: Case, other: Candidate) -> Case:
+    """Another tunnel judged by this one's references, brought to begin at its mouth in its direction."""
+    here, there = case.candidate.bore, other.bore
+    turn = _yaw_matrix(there.tangent[0]) @ _yaw_matrix(here.tangent[0]).T
+    shift = there.position[0] - turn @ here.position[0]
+    return replace(move_references(case, turn, shift), candidate=other)
+
+
+def forge_recording(case: Case, sigma: float, rng: np.random.Generator) -> Case:
+    """The recording replaced by beams cast in the candidate itself, with range noise or without."""
+    hold = _require_hold(case)
+    reach, _ = Caster(visible_mesh(case.candidate)).first(hold.origin, hold.direction)
+    reach = reach + rng.normal(0.0, 1.0, len(reach)) * sigma
+    forged = sha256(reach.tobytes()).hexdigest()
+    keep = np.isfinite(reach)
+    columns = {name: getattr(hold, name)[keep] for name in ("time", "scan", "origin", "direction")}
+    return replace(case, hold=replace(hold, **columns, range=reach[keep], hash=forged, cache={}), cache={})
+
+
+def leak_hold(case: Case) -> Case:
+    """A builder that had the held-out recording: the manifest's inputs hold its hash, and the fit is the hold."""
+    hold = _require_hold(case)
+    manifest = dict(case.candidate.manifest)
+    manifest["inputs"] = [*manifest.get("inputs", []), {"file": "hold", "sha256": hold.hash}]
+    return replace(case, candidate=replace(case.candidate, manifest=manifest), fit=hold, cache={})
+
+
+def _require_hold(case: Case) -> Hold:
+    if case.hold is None:
+        raise FidelityError("this control needs a held-out recording, give one with --recording and --trajectory")
+    return case.hold
+
+
+def _yaw_matrix(tangent: np.ndarray) -> np.ndarray:
+    return Rotation.from_euler("z", np.arctan2(tangent[1], tangent[0])).as_matrix()

@@ -1,4 +1,4 @@
-"""Runs controls side by side, keeps what is done, and judges what each did to the scores."""
+"""Runs controls in parallel, keeps finished ones, and judges whether each was noticed."""
 
 import multiprocessing
 import re
@@ -9,20 +9,77 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.stats import spearmanr
 
-from benchmarks.fidelity import leaks, store, table
-from benchmarks.fidelity.candidate import Candidate, load
-from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls import catalogue, kept
-from benchmarks.fidelity.controls.catalogue import OUT_OF_SCENE, Setting
-from benchmarks.fidelity.controls.invariance import INVARIANCES
-from benchmarks.fidelity.controls.kept import Job, Outcome
-from benchmarks.fidelity.evaluate import evaluate
-from benchmarks.fidelity.memory import give_back
-from benchmarks.fidelity.value import Value
+from benchmarks.fidelity import judge, scoring, table
+from benchmarks.fidelity.candidate import Candidate, load_candidate
+from benchmarks.fidelity.case import Case, candidate_hash, case_hash, controls_hash, release_memory
+from benchmarks.fidelity.controls.catalogue import (
+    GLOBAL_LIMIT,
+    INVARIANCES,
+    OUT_OF_SCENE,
+    THINNED_LIMIT,
+    Control,
+    Setting,
+    load_controls,
+    spoil_case,
+)
+from benchmarks.fidelity.files import read_json, write_json
+from benchmarks.fidelity.judge import Base
+from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from scene.cli import progress_bar
+
+OUTCOME_SCHEMA = "subterra.fidelity-control/1"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One control at one dose; an invariance has dose 0."""
+
+    control: str
+    dose: float
+
+    @property
+    def name(self) -> str:
+        """For files."""
+        return f"{self.control}-{self.dose:g}"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a control did.
+
+    Attributes:
+        job: Which.
+        values: All 199.
+        leaks: What the leak detector said.
+    """
+
+    job: Job
+    values: dict[str, Value]
+    leaks: list[str]
+
+
+def read_outcome(folder: Path | None, job: Job, key: str) -> Outcome | None:
+    """What an earlier run of the same base left for a job; `None` where nothing did."""
+    path = None if folder is None else folder / f"{job.name}.json"
+    if path is None or not path.exists():
+        return None
+    content = read_json(path, OUTCOME_SCHEMA)
+    if content["key"] != key:
+        return None
+    return Outcome(job, load_values(content["values"]), content["leaks"])
+
+
+def write_outcome(folder: Path | None, outcome: Outcome, key: str) -> None:
+    """Keeps an outcome; without a folder nothing is kept."""
+    if folder is not None:
+        content = {"schema": OUTCOME_SCHEMA, "key": key, "values": dump_values(outcome.values), "leaks": outcome.leaks}
+        write_json(folder / f"{outcome.job.name}.json", content, digits=17)
+
 
 Evaluate = Callable[..., dict[str, Value]]
 
@@ -47,24 +104,24 @@ class Bench:
 
     def key(self, job: Job) -> str:
         """Of base and code, for N33 of the foreign scene too: a kept result of others is not taken up."""
-        other = "" if self.foreign is None or job.control != "N33" else store.candidate_hash(_foreign(self))
+        other = "" if self.foreign is None or job.control != "N33" else candidate_hash(_foreign_candidate(self))
         return sha256(f"{self._own} {other}".encode()).hexdigest()
 
     @cached_property
     def _own(self) -> str:
-        return f"{store.case_hash(self.case)} {store.controls_hash()}"
+        return f"{case_hash(self.case)} {controls_hash()}"
 
     def kept(self) -> list[Outcome]:
         """What earlier runs left of this base, in the order of `jobs`."""
-        found = (kept.read(self.folder, job, self.key(job)) for job in jobs(foreign=self.foreign is not None))
+        found = (read_outcome(self.folder, job, self.key(job)) for job in list_jobs(foreign=self.foreign is not None))
         return [outcome for outcome in found if outcome is not None]
 
 
-def jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
+def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
     """Every control at every dose, then the invariances; N33 only where a foreign tunnel is at hand."""
     wanted = [
         Job(control.id, dose)
-        for control in catalogue.load().values()
+        for control in load_controls().values()
         for dose in control.doses
         if foreign or control.id != "N33"
     ] + [Job(id, 0.0) for id in INVARIANCES]
@@ -73,15 +130,15 @@ def jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
 
 def is_bold(job: Job) -> bool:
     """Whether this dose must be noticed; invariances always count."""
-    return job.control in INVARIANCES or job.dose in catalogue.load()[job.control].bold
+    return job.control in INVARIANCES or job.dose in load_controls()[job.control].bold
 
 
-def run(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcome]:
+def run_jobs(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcome]:
     """Does the jobs, in their order; those kept from an earlier run of the same base are read."""
     done: dict[Job, Outcome] = {}
     todo = []
     for job in wanted:
-        known = kept.read(bench.folder, job, bench.key(job))
+        known = read_outcome(bench.folder, job, bench.key(job))
         if known is None:
             todo.append(job)
         else:
@@ -90,14 +147,14 @@ def run(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcome]:
         stage = progress.start("controls", len(wanted))
         if done:
             stage.resume(len(done))
-        for outcome in _computed(bench, todo, processes):
+        for outcome in _compute_outcomes(bench, todo, processes):
             done[outcome.job] = outcome
-            kept.write(bench.folder, outcome, bench.key(outcome.job))
+            write_outcome(bench.folder, outcome, bench.key(outcome.job))
             stage.advance()
     return [done[job] for job in wanted]
 
 
-def one(bench: Bench, job: Job) -> Outcome:
+def run_control(bench: Bench, job: Job) -> Outcome:
     """One control at one dose."""
     rng = np.random.default_rng(np.random.SeedSequence(bench.case.seed, spawn_key=tuple(job.control.encode())))
     fresh = replace(bench.case, cache={})
@@ -105,20 +162,20 @@ def one(bench: Bench, job: Job) -> Outcome:
         if job.control in INVARIANCES:
             spoiled, evaluated = INVARIANCES[job.control].change(fresh, rng), OUT_OF_SCENE
         else:
-            setting = Setting(rng, Path(scratch), partial(_foreign, bench))
-            spoiled = catalogue.spoiled(fresh, job.control, job.dose, setting)
-            evaluated = catalogue.load()[job.control].evaluated
-        values = bench.compute(spoiled, _categories(evaluated), bench.base)
+            setting = Setting(rng, Path(scratch), partial(_foreign_candidate, bench))
+            spoiled = spoil_case(fresh, job.control, job.dose, setting)
+            evaluated = load_controls()[job.control].evaluated
+        values = bench.compute(spoiled, _evaluated_categories(evaluated), bench.base)
         recorded = None if bench.case.hold is None else bench.case.hold.hash
-        return Outcome(job, values, leaks.find(spoiled, values, recorded))
+        return Outcome(job, values, judge.find_leaks(spoiled, values, recorded))
 
 
-def failures(reasons: list[str]) -> set[str]:
+def without_figures(reasons: list[str]) -> set[str]:
     """Reasons without their figures, so that two candidates' can be compared."""
     return {re.sub(r"(?<![\w.])-?\d[\d.e-]*(?!\w)", "#", reason) for reason in reasons}
 
 
-def _categories(evaluated: str) -> tuple[str, ...] | None:
+def _evaluated_categories(evaluated: str) -> tuple[str, ...] | None:
     if evaluated == "all":
         return None
     if evaluated == OUT_OF_SCENE:
@@ -126,31 +183,109 @@ def _categories(evaluated: str) -> tuple[str, ...] | None:
     return tuple(evaluated.split())
 
 
-def _foreign(bench: Bench) -> Candidate:
+def _foreign_candidate(bench: Bench) -> Candidate:
     assert bench.foreign is not None
-    return load(bench.foreign)
+    return load_candidate(bench.foreign)
 
 
 _worker: dict[str, Bench] = {}
 
 
-def _start(bench: Bench) -> None:
+def _start_worker(bench: Bench) -> None:
     _worker["bench"] = bench
 
 
-def _in_worker(job: Job) -> Outcome:
-    outcome = one(_worker["bench"], job)
-    give_back()
+def _run_in_worker(job: Job) -> Outcome:
+    outcome = run_control(_worker["bench"], job)
+    release_memory()
     return outcome
 
 
-def _computed(bench: Bench, todo: list[Job], processes: int) -> Iterator[Outcome]:
+def _compute_outcomes(bench: Bench, todo: list[Job], processes: int) -> Iterator[Outcome]:
     if processes < 2 or len(todo) < 2:
-        yield from (one(bench, job) for job in todo)
+        yield from (run_control(bench, job) for job in todo)
         return
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, _start, (replace(bench, case=bench.case.fresh()),))
+    pool = ProcessPoolExecutor(processes, context, _start_worker, (replace(bench, case=bench.case.fresh()),))
     try:
-        yield from pool.map(_in_worker, todo)
+        yield from pool.map(_run_in_worker, todo)
     finally:
         pool.shutdown(cancel_futures=True)  # an interrupt waits for what is under way, not for all that was asked
+
+
+QUIET = 2.0
+MONOTONE = -0.9
+KINDS = ("N20", "N26", "N32", "N34", "N35")  # their doses are kinds, not amounts
+
+
+def judge_outcomes(outcomes: list[Outcome], base: Base) -> list[dict[str, Any]]:
+    """One row a control and dose, for `controls.csv` and the heat map.
+
+    A control is *detected* where its bold doses fail for a reason that the reconstruction has not, and every category
+    named for it falls by its points.
+    """
+    judged = [_outcome_row(outcome, base) for outcome in outcomes]
+    for row in judged:
+        control = load_controls().get(row["id"])
+        row["spearman"] = _spearman([r for r in judged if r["id"] == row["id"]], control, base)
+    return judged
+
+
+def _outcome_row(outcome: Outcome, base: Base) -> dict[str, Any]:
+    scored = scoring.score_all(outcome.values)
+    reasons = scoring.reasons_against(
+        scored, base.null, judge.median_skill(outcome.values, base.values), [], [], outcome.leaks
+    )
+    falls = {c: _fall(base.scored.categories[c], scored.categories[c]) for c in base.scored.categories}
+    new = sorted(without_figures(reasons) - without_figures(base.reasons))
+    row = {
+        "id": outcome.job.control, "dose": outcome.job.dose, "overall": scored.overall,
+        "verdict": "FAIL" if new else "PASS",
+        "why": [reason for reason in reasons if without_figures([reason]) & set(new)], "falls": falls,
+        "categories": scored.categories, "base": base.scored.overall,
+    }  # fmt: skip
+    return {**row, **(_invariance_row(row) if outcome.job.control in INVARIANCES else _negative_row(row))}
+
+
+def _negative_row(row: dict[str, Any]) -> dict[str, Any]:
+    control = load_controls()[row["id"]]
+    bold = row["dose"] in control.bold
+    short = {c: (row["falls"][c], asked) for c, asked in control.falls.items() if (row["falls"][c] or 0.0) < asked}
+    moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > QUIET}
+    return {
+        "kind": "negative", "corruption": control.corruption, "bold": bold, "short": short if bold else {},
+        "detected": row["verdict"] == "FAIL" and not short, "quiet": not moved, "moved": moved,
+        "evaluated": control.evaluated,
+    }  # fmt: skip
+
+
+def _invariance_row(row: dict[str, Any]) -> dict[str, Any]:
+    control = INVARIANCES[row["id"]]
+    falls = {c: fall for c, fall in row["falls"].items() if c not in control.exempt and fall is not None}
+    moved = {c: fall for c, fall in falls.items() if abs(fall) > control.category_limit}
+    known = row["overall"] is not None and row["base"] is not None
+    limit = GLOBAL_LIMIT if control.category_limit < THINNED_LIMIT else THINNED_LIMIT
+    quiet = not moved and known and (bool(control.exempt) or abs(row["overall"] - row["base"]) <= limit)
+    return {
+        "kind": "invariance", "corruption": control.text, "bold": True, "short": {}, "detected": False,
+        "quiet": quiet, "moved": moved, "evaluated": OUT_OF_SCENE,
+    }  # fmt: skip
+
+
+def _fall(before: float | None, after: float | None) -> float | None:
+    return None if before is None or after is None else before - after
+
+
+def _spearman(same: list[dict[str, Any]], control: Control | None, base: Base) -> float | None:
+    """Rank correlation of dose and mean score of the named categories, the reconstruction itself being dose 0."""
+    if control is None or len(same) < 2 or control.id in KINDS or not control.falls:
+        return None
+    order = sorted(same, key=lambda row: control.doses.index(row["dose"]))
+    before = [base.scored.categories[c] or 0.0 for c in control.falls]
+    scores = [np.mean(before)] + [np.mean([row["categories"][c] or 0.0 for c in control.falls]) for row in order]
+    return float(spearmanr(range(len(scores)), scores).statistic)
+
+
+def is_ranked(job: Job) -> bool:
+    """Whether a control's outcome has a place in the order: invariances change nothing, and cheats no geometry."""
+    return job.control not in INVARIANCES and bool(load_controls()[job.control].falls)

@@ -1,72 +1,241 @@
-"""Controls of size and shape: scale, width, length, place, roll, curvature."""
+"""Controls of size and shape, and maps of space applied to all of a candidate."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.candidate import Bore, Candidate, Track
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.compiled import Track
-from benchmarks.fidelity.controls.parts import cut_components
-from benchmarks.fidelity.controls.warp import Map, bent, curve, warped
 from benchmarks.fidelity.derive.curve import Curve
+from benchmarks.fidelity.references import Hold, Truth
+
+Points = Float[np.ndarray, "n 3"]
+PointMap = Callable[[Points], Points]
+_ARM = 1.0  # m from the axis at which a section's stretch is measured
+
+
+def axis_of(candidate: Candidate) -> Curve:
+    """The candidate's centreline."""
+    return Curve(candidate.bore.station, candidate.bore.position)
+
+
+def warp(candidate: Candidate, move: PointMap) -> Candidate:
+    """The candidate with every point moved; stations become arc length of the moved axis."""
+    return replace(
+        candidate,
+        lining=warp_mesh(candidate.lining, move),
+        solid=warp_mesh(candidate.solid, move),
+        bore=warp_bore(candidate.bore, move),
+        track=warp_track(candidate.track, move),
+        extra=warp_mesh(candidate.extra, move),
+        nails=warp_mesh(candidate.nails, move),
+        bed=warp_mesh(candidate.bed, move),
+    )
+
+
+def warp_mesh(mesh: trimesh.Trimesh, move: PointMap) -> trimesh.Trimesh:
+    """The mesh with its vertices moved."""
+    if not len(mesh.faces):
+        return mesh
+    return trimesh.Trimesh(move(np.asarray(mesh.vertices, float)), mesh.faces, process=False)
+
+
+def warp_track(track: Track, move: PointMap) -> Track:
+    """The track with every point moved; its gauge becomes the distance of the moved rails."""
+    rail = {side: move(points) if len(points) else points for side, points in track.rail.items()}
+    return replace(
+        track,
+        sleeper=move(track.sleeper) if len(track.sleeper) else track.sleeper,
+        sleeper_mesh=warp_mesh(track.sleeper_mesh, move),
+        rail=rail,
+        rail_mesh=warp_mesh(track.rail_mesh, move),
+        fastening_mesh=warp_mesh(track.fastening_mesh, move),
+    )
+
+
+def warp_bore(bore: Bore, move: PointMap) -> Bore:
+    """Axis and frames moved; width, height and radii grow as the map stretches a section at its axis."""
+    position = move(bore.position)
+    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    tangent = _unit(np.gradient(position, station, axis=0))
+    lateral = _unit(np.cross([0.0, 0.0, 1.0], tangent))
+    up = np.cross(tangent, lateral)
+    wide, high = (_stretch(bore, axis, move) for axis in (bore.lateral, bore.up))
+    across, along = np.cos(bore.angle)[None] * wide[:, None], np.sin(bore.angle)[None] * high[:, None]
+    radius = bore.radius * np.hypot(across, along)
+
+    def moved(old: np.ndarray) -> np.ndarray:
+        return np.interp(old, bore.station, station)
+
+    pocket = bore.pocket.copy()
+    if len(pocket):
+        pocket["station"] = moved(pocket["station"])
+    return Bore(
+        station, position, tangent, lateral, up, bore.width * wide, bore.height * high, bore.angle, radius,
+        moved(bore.ring_station), pocket,
+    )  # fmt: skip
+
+
+def move_references(case: Case, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Case:
+    """The case with held-out recording, fit and truth turned about the origin and shifted."""
+    hold, fit = (None if h is None else move_hold(h, turn, shift) for h in (case.hold, case.fit))
+    truth = None if case.truth is None else move_truth(case.truth, turn, shift)
+    return replace(case, hold=hold, fit=fit, truth=truth, cache={})
+
+
+def move_hold(hold: Hold, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Hold:
+    """A recording turned about the origin and shifted, with nothing computed of it yet."""
+    return replace(hold, origin=hold.origin @ turn.T + shift, direction=hold.direction @ turn.T, cache={})
+
+
+def move_truth(truth: Truth, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Truth:
+    """A truth turned about the origin of the tunnel frame and shifted, with nothing computed of it yet."""
+    surface = warp_mesh(truth.surface, lambda points: points @ turn.T + shift)
+    return replace(
+        truth, position=truth.position @ turn.T + shift, tangent=truth.tangent @ turn.T, surface=surface,
+        furniture=_turn_positions(truth.furniture, truth.origin, turn, shift), cache={},
+    )  # fmt: skip
+
+
+def bend_recording(hold: Hold, move: PointMap) -> Hold:
+    """A recording whose sensor positions and returns are moved, and the beams with them."""
+    origin, end = (
+        move(hold.origin),
+        move(hold.origin + np.where(hold.returned, hold.range, 1.0)[:, None] * hold.direction),
+    )
+    away = end - origin
+    reach = np.linalg.norm(away, axis=1)
+    direction = away / np.maximum(reach, 1e-9)[:, None]
+    return replace(hold, origin=origin, direction=direction, range=np.where(hold.returned, reach, hold.range), cache={})
+
+
+def _turn_positions(value: Any, origin: np.ndarray, turn: np.ndarray, shift: np.ndarray, key: str = "") -> Any:
+    """Positions of truth.json (survey frame) turned with the rest."""
+    if isinstance(value, dict):
+        return {name: _turn_positions(inner, origin, turn, shift, name) for name, inner in value.items()}
+    if key in ("position", "left", "right"):
+        return (
+            ((np.asarray(value, float).reshape(-1, 3) - origin) @ turn.T + shift + origin)
+            .reshape(np.shape(value))
+            .tolist()
+        )
+    if key == "outward":
+        return (turn @ np.asarray(value, float)).tolist()
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return [_turn_positions(inner, origin, turn, shift) for inner in value]
+    return value
+
+
+def _stretch(bore: Bore, axis: np.ndarray, move: PointMap) -> np.ndarray:
+    ends = [move(bore.position + sign * _ARM * axis) for sign in (-1.0, 1.0)]
+    return np.linalg.norm(ends[1] - ends[0], axis=1) / (2.0 * _ARM)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:
+    """Number of the body of each vertex, and the middle of each body, m."""
+    count = len(mesh.vertices)
+    if not count:
+        return np.zeros(0, int), np.zeros((0, 3))
+    welded = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)[1].ravel()
+    first, second = welded[mesh.faces[:, [0, 0]].ravel()], welded[mesh.faces[:, [1, 2]].ravel()]
+    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    label = np.unique(connected_components(graph, directed=False)[1][welded], return_inverse=True)[1]
+    size = np.maximum(np.bincount(label), 1)[:, None]
+    return label, np.stack([np.bincount(label, axis) for axis in mesh.vertices.T], axis=1) / size
+
+
+def keep_bodies(
+    mesh: trimesh.Trimesh, keep: Callable[[Float[np.ndarray, "b 3"]], Bool[np.ndarray, " b"]]
+) -> trimesh.Trimesh:
+    """The bodies whose middle is to be kept."""
+    if not len(mesh.faces):
+        return mesh
+    label, middle = find_bodies(mesh)
+    return without_faces(mesh, ~keep(middle)[label[mesh.faces[:, 0]]])
+
+
+def move_bodies(
+    mesh: trimesh.Trimesh, shift: Callable[[Float[np.ndarray, "b 3"]], Float[np.ndarray, "b 3"]]
+) -> trimesh.Trimesh:
+    """Each body moved by what is asked for its middle."""
+    if not len(mesh.faces):
+        return mesh
+    label, middle = find_bodies(mesh)
+    return trimesh.Trimesh(mesh.vertices + shift(middle)[label], mesh.faces, process=False)
+
+
+def without_faces(mesh: trimesh.Trimesh, gone: Bool[np.ndarray, " f"]) -> trimesh.Trimesh:
+    """The mesh less some faces; vertices that no face uses go too."""
+    left = trimesh.Trimesh(mesh.vertices, mesh.faces[~gone], process=False)
+    left.remove_unreferenced_vertices()
+    return left
+
 
 _FLOOR_RISE = (0.5, 1.3)  # m above the floor between which a raised floor fades into the wall
 _WAVE = 100.0  # m
 
 
-def local_map(candidate: Candidate, change: Map) -> Map:
+def local_map(candidate: Candidate, change: PointMap) -> PointMap:
     """A map of (station, left, up) about the candidate's axis as a map of points."""
-    line = curve(candidate)
+    line = axis_of(candidate)
     return lambda points: line.point(change(line.local(points)))
 
 
-def scaled(candidate: Candidate, factor: float) -> Candidate:
+def scale_all(candidate: Candidate, factor: float) -> Candidate:
     """Everything larger about the middle of the axis."""
     middle = candidate.bore.position.mean(axis=0)
-    return warped(candidate, lambda points: middle + factor * (points - middle))
+    return warp(candidate, lambda points: middle + factor * (points - middle))
 
 
-def section_scaled(candidate: Candidate, wide: float, high: float) -> Candidate:
+def scale_section(candidate: Candidate, wide: float, high: float) -> Candidate:
     """Every section wider and higher about its axis."""
-    return warped(candidate, local_map(candidate, lambda local: local * [1.0, wide, high]))
+    return warp(candidate, local_map(candidate, lambda local: local * [1.0, wide, high]))
 
 
-def axial_stretch(case: Case, factor: float) -> Case:
+def stretch_axis(case: Case, factor: float) -> Case:
     """Reconstruction and recording longer together, as a drifting odometry makes them; control stays."""
     candidate = case.candidate
-    line, middle = curve(candidate), candidate.bore.position.mean(axis=0)
+    line, middle = axis_of(candidate), candidate.bore.position.mean(axis=0)
     longer = Curve(line.station * factor, middle + factor * (line.position - middle))
 
     def move(points: np.ndarray) -> np.ndarray:
         return longer.point(line.local(points) * [factor, 1.0, 1.0])
 
-    hold = None if case.hold is None else bent(case.hold, move)
-    fit = None if case.fit is None else bent(case.fit, move)
-    return replace(case, candidate=warped(candidate, move), hold=hold, fit=fit, cache={})
+    hold = None if case.hold is None else bend_recording(case.hold, move)
+    fit = None if case.fit is None else bend_recording(case.fit, move)
+    return replace(case, candidate=warp(candidate, move), hold=hold, fit=fit, cache={})
 
 
-def yawed(candidate: Candidate, angle: float) -> Candidate:
+def turn_yaw(candidate: Candidate, angle: float) -> Candidate:
     """Turned about the vertical through the middle of the axis, rad."""
     middle = candidate.bore.position.mean(axis=0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    return warped(candidate, lambda points: middle + (points - middle) @ turn.T)
+    return warp(candidate, lambda points: middle + (points - middle) @ turn.T)
 
 
-def rolled(candidate: Candidate, angle: float) -> Candidate:
+def roll_sections(candidate: Candidate, angle: float) -> Candidate:
     """Every section turned about its axis, rad."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-    return warped(candidate, local_map(candidate, lambda local: local @ turn.T))
+    return warp(candidate, local_map(candidate, lambda local: local @ turn.T))
 
 
-def shifted(candidate: Candidate, left: float) -> Candidate:
+def shift_left(candidate: Candidate, left: float) -> Candidate:
     """Everything to the left, m."""
-    return warped(candidate, local_map(candidate, lambda local: local + np.array([0.0, left, 0.0])))
+    return warp(candidate, local_map(candidate, lambda local: local + np.array([0.0, left, 0.0])))
 
 
-def floor_raised(candidate: Candidate, rise: float) -> Candidate:
+def raise_floor(candidate: Candidate, rise: float) -> Candidate:
     """Floor and track higher; the walls above 1.3 m stay, m."""
     bottom = -0.5 * float(np.median(candidate.bore.height))
 
@@ -74,18 +243,18 @@ def floor_raised(candidate: Candidate, rise: float) -> Candidate:
         fade = np.interp(local[:, 2] - bottom, _FLOOR_RISE, [1.0, 0.0])
         return local + np.column_stack([np.zeros((len(local), 2)), rise * fade])
 
-    moved = warped(candidate, local_map(candidate, change))
+    moved = warp(candidate, local_map(candidate, change))
     bore = candidate.bore
     lower = np.sin(bore.angle) < -0.5
     radius = np.where(lower[None], bore.radius + rise * np.minimum(np.sin(bore.angle), 0.0), bore.radius)
     return replace(moved, bore=replace(bore, height=bore.height - rise, radius=radius))
 
 
-def shortened(candidate: Candidate, share: float) -> Candidate:
+def shorten(candidate: Candidate, share: float) -> Candidate:
     """The last part cut off."""
     bore = candidate.bore
     end = candidate.length * (1.0 - share)
-    line = curve(candidate)
+    line = axis_of(candidate)
     position, tangent, *_ = line.frames(np.array([end]))
     kept = bore.station <= end
 
@@ -100,34 +269,34 @@ def shortened(candidate: Candidate, share: float) -> Candidate:
         pocket=bore.pocket[bore.pocket["station"] <= end] if len(bore.pocket) else bore.pocket,
     )
     return replace(
-        candidate, lining=cut(candidate.lining, False), solid=_capped_cut(candidate, cut), bore=short,
+        candidate, lining=cut(candidate.lining, False), solid=_cut_solid(candidate, cut), bore=short,
         track=_short_track(candidate.track, line, end),
-        nails=cut_components(candidate.nails, lambda middles: line.local(middles)[:, 0] <= end),
+        nails=keep_bodies(candidate.nails, lambda middles: line.local(middles)[:, 0] <= end),
     )  # fmt: skip
 
 
-def straightened(candidate: Candidate, share: float) -> Candidate:
+def straighten(candidate: Candidate, share: float) -> Candidate:
     """The axis taken towards a straight line of the same length and mean direction; 1 leaves no curvature."""
-    line = curve(candidate)
+    line = axis_of(candidate)
     chord = line.position[-1] - line.position[0]
     chord /= np.linalg.norm(chord)
     middle = line.station - line.station.mean()
     straight = line.position.mean(axis=0) + middle[:, None] * chord
     target = Curve(line.station, (1.0 - share) * line.position + share * straight)
-    return warped(candidate, lambda points: target.point(line.local(points)))
+    return warp(candidate, lambda points: target.point(line.local(points)))
 
 
-def waved(candidate: Candidate, amplitude: float) -> Candidate:
+def add_wave(candidate: Candidate, amplitude: float) -> Candidate:
     """A sideways wave of 100 m length, amplitude in m."""
 
     def change(local: np.ndarray) -> np.ndarray:
         aside = amplitude * np.sin(2.0 * np.pi * local[:, 0] / _WAVE)
         return local + np.column_stack([np.zeros(len(local)), aside, np.zeros(len(local))])
 
-    return warped(candidate, local_map(candidate, change))
+    return warp(candidate, local_map(candidate, change))
 
 
-def _capped_cut(candidate: Candidate, cut) -> trimesh.Trimesh:
+def _cut_solid(candidate: Candidate, cut) -> trimesh.Trimesh:
     welded = candidate.solid.copy()
     welded.merge_vertices(digits_vertex=6)
     return cut(welded, True)
@@ -135,7 +304,7 @@ def _capped_cut(candidate: Candidate, cut) -> trimesh.Trimesh:
 
 def _short_track(track: Track, line: Curve, end: float) -> Track:
     def before(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-        return cut_components(mesh, lambda middles: line.local(middles)[:, 0] <= end)
+        return keep_bodies(mesh, lambda middles: line.local(middles)[:, 0] <= end)
 
     rail = {side: points[line.local(points)[:, 0] <= end] for side, points in track.rail.items() if len(points)}
     return replace(

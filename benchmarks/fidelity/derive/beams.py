@@ -1,13 +1,66 @@
-"""Held-out beams and the same beams cast in the candidate."""
+"""Held-out beams, the sensor's path, and the same beams cast in the candidate."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.signal import savgol_filter
+from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, derived, of_hold, until
-from benchmarks.fidelity.derive.path import sensor_path
-from benchmarks.fidelity.derive.surface import intersector, normals
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
+from benchmarks.fidelity.derive.curve import Curve
+from benchmarks.fidelity.derive.surface import face_normals, surface_caster
+
+NODE_STEP = 1.0  # m between nodes
+_SWAY_WINDOW = 11  # nodes over which the sway of the carrier is smoothed away
+
+
+@per_hold
+def sensor_path(case: Case) -> Curve:
+    """Smoothed sensor positions of the held-out recording, straight on beyond both ends.
+
+    The positions are strung by nearness, not by time: a way back adds nothing, and poses in a wrong order leave the
+    path where it is.
+
+    Raises:
+        ValueError: The sensor passed fewer than four positions `STEP` apart.
+    """
+    hold = case.hold
+    assert hold is not None
+    order = np.argsort(hold.time, kind="stable")
+    _, first = np.unique(hold.scan[order], return_index=True)
+    nodes: list[np.ndarray] = []
+    for position in hold.origin[order[first]]:
+        if not nodes or np.linalg.norm(np.asarray(nodes) - position, axis=1).min() >= 0.9 * NODE_STEP:
+            nodes.append(position)
+    if len(nodes) < 4:
+        raise ValueError(f"the held-out sensor passed {len(nodes)} positions {NODE_STEP} m apart; 4 are needed")
+    strung = _string_nodes(np.asarray(nodes))
+    window = min(_SWAY_WINDOW, len(nodes) - (len(nodes) + 1) % 2)
+    smooth = savgol_filter(strung, window, min(2, window - 1), axis=0, mode="interp")
+    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    return Curve(station, smooth)
+
+
+def _string_nodes(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Positions in order from the end that is nearer to the first of them: always on to the nearest one left."""
+    far = nodes[np.argmax(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1))]
+    other = nodes[np.argmax(np.linalg.norm(nodes - far, axis=1))]
+    here = min((far, other), key=lambda end: float(np.linalg.norm(end - nodes[0])))
+    left, order = np.ones(len(nodes), bool), []
+    for _ in nodes:
+        order.append(int(np.argmin(np.where(left, np.sum((nodes - here) ** 2, axis=1), np.inf))))
+        left[order[-1]] = False
+        here = nodes[order[-1]]
+    return nodes[order]
+
+
+def mouths_on_path(case: Case) -> tuple[float, float]:
+    """Stations of the candidate's two ends on the sensor's path, m, the smaller one first."""
+    ends = sensor_path(case).local(case.candidate.bore.position[[0, -1]])[:, 0]
+    return float(ends.min()), float(ends.max())
+
 
 _NEAR = 1.0  # m over which the path's frame is taken as straight: less than a millimetre at a radius of 500 m
 
@@ -36,7 +89,7 @@ class Returns:
 
 
 @dataclass(frozen=True)
-class Paired:
+class CastBeams:
     """`Returns` cast in the candidate.
 
     Attributes:
@@ -57,7 +110,7 @@ class Paired:
         return self.face >= 0
 
 
-@of_hold
+@per_hold
 def returns(case: Case) -> Returns:
     """The held-out returns, sorted so that the order in the file does not matter."""
     hold = case.hold
@@ -72,21 +125,21 @@ def returns(case: Case) -> Returns:
     return Returns(hold.scan[order], hold.origin[order], direction, hold.range[order], points, local, heading)
 
 
-@until("LIN")
-@derived
-def paired(case: Case) -> Paired:
+@kept_until("LIN")
+@per_case
+def cast_beams(case: Case) -> CastBeams:
     """Every held-out return's beam, cast in everything visible of the candidate."""
-    real, rays = returns(case), intersector(case)
+    real, rays = returns(case), surface_caster(case)
     reach, face = rays.first(real.origin, real.direction)
     cosine = np.zeros(len(face))
     hit = face >= 0
-    normal = normals(rays.mesh, face[hit])
+    normal = face_normals(rays.mesh, face[hit])
     length = np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
     cosine[hit] = np.abs(np.einsum("ij,ij->i", normal, real.direction[hit])) / length
-    return Paired(reach, face, np.minimum(cosine, 1.0), reach - real.range)
+    return CastBeams(reach, face, np.minimum(cosine, 1.0), reach - real.range)
 
 
-def at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def points_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """Points on the held-out beams at other ranges, m; not a number where the range is not finite."""
     real = returns(case)
     return real.origin + np.where(np.isfinite(reach), reach, np.nan)[:, None] * real.direction
@@ -102,13 +155,13 @@ def local_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n
     return local
 
 
-@until("OCC")
-@derived
-def _draws(case: Case) -> dict[str, Float[np.ndarray, " n"]]:
+@kept_until("OCC")
+@per_case
+def _noise_draws(case: Case) -> dict[str, Float[np.ndarray, " n"]]:
     return {}
 
 
-def noisy(case: Case, draw: str) -> Float[np.ndarray, " n"]:
+def noisy_ranges(case: Case, draw: str) -> Float[np.ndarray, " n"]:
     """Ranges that the sensor would have measured in the candidate, m; `inf` where a beam leaves it.
 
     Args:
@@ -116,13 +169,139 @@ def noisy(case: Case, draw: str) -> Float[np.ndarray, " n"]:
         draw: Name of the draw; the same name gives the same noise.
     """
     assert case.hold is not None
-    if draw not in _draws(case):
-        noise = case.rng(f"range noise {draw}").standard_normal(len(paired(case).range))
-        _draws(case)[draw] = paired(case).range + case.hold.sigma * noise
-    return _draws(case)[draw]
+    if draw not in _noise_draws(case):
+        noise = case.rng(f"range noise {draw}").standard_normal(len(cast_beams(case).range))
+        _noise_draws(case)[draw] = cast_beams(case).range + case.hold.sigma * noise
+    return _noise_draws(case)[draw]
 
 
-@derived
-def synthetic(case: Case) -> Float[np.ndarray, "n 3"]:
+@per_case
+def synthetic_points(case: Case) -> Float[np.ndarray, "n 3"]:
     """Noisy points of the paired beams, m, `(n, 3)`; not a number where a beam leaves the candidate."""
-    return at(case, noisy(case, "first"))
+    return points_at(case, noisy_ranges(case, "first"))
+
+
+BIN = 10.0  # m
+
+
+@per_hold
+def observed_extent(case: Case) -> tuple[float, float]:
+    """Stations between which the held-out returns lie, but for one in a thousand at either end, m."""
+    low, high = np.percentile(returns(case).local[:, 0], [0.1, 99.9])
+    return float(low), float(high)
+
+
+def station_bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Equal bins of about `BIN` over `extent`; what lies beyond belongs to the first and the last."""
+    low, high = observed_extent(case)
+    count = max(round((high - low) / BIN), 1)
+    return np.clip(((station - low) / (high - low) * count).astype(int), 0, count - 1)
+
+
+@dataclass(frozen=True)
+class Silence:
+    """Of every beam, returned or not.
+
+    Attributes:
+        silent: Nothing came back, `(n,)`.
+        expected_silent: Cast in the candidate it meets nothing within reach, `(n,)`.
+    """
+
+    silent: Bool[np.ndarray, " n"]
+    expected_silent: Bool[np.ndarray, " n"]
+
+
+@per_case
+def silence(case: Case) -> Silence:
+    """Real and expected beams without a return.
+
+    A beam is expected back if it meets the candidate within the sensor's reach and its echo, cos(incidence) over the
+    squared distance, is not too weak. No data sheet says how weak: the cut is the one number that the recording sets,
+    where beams with a weaker echo in the candidate were more often silent than not.
+    """
+    hold = case.hold
+    assert hold is not None
+    rays = surface_caster(case)
+    reach, face = rays.first(hold.origin, hold.direction)
+    met = np.flatnonzero((face >= 0) & (reach <= hold.range_max))
+    normal = face_normals(rays.mesh, face[met])
+    cosine = np.abs(np.einsum("ij,ij->i", normal, hold.direction[met]))
+    cosine /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+    order = np.argsort(cosine / np.maximum(reach[met], 0.1) ** 2, kind="stable")
+    balance = np.concatenate([[0], np.cumsum(np.where(hold.returned[met[order]], -1, 1))])
+    expected_silent = np.ones(len(reach), bool)
+    expected_silent[met[order[int(np.argmax(balance)) :]]] = False
+    return Silence(~hold.returned, expected_silent)
+
+
+_DIRECTION_SECTORS = (12, 4)  # of azimuth and elevation
+_QUANTILES = (5, 25, 50, 75, 95)
+
+
+@dataclass(frozen=True)
+class BeamDirections:
+    """Of every returned beam, relative to the tunnel at the sensor.
+
+    Attributes:
+        azimuth: From the tunnel's axis ahead, to the left, rad, `(n,)`.
+        elevation: rad, `(n,)`.
+    """
+
+    azimuth: Float[np.ndarray, " n"]
+    elevation: Float[np.ndarray, " n"]
+
+
+@per_hold
+def beam_directions(case: Case) -> BeamDirections:
+    """Azimuth and elevation of the held-out returns' beams."""
+    real, path = returns(case), sensor_path(case)
+    _, starts = np.unique(real.scan, return_index=True)
+    tangent, left, up = path.frames(path.local(real.origin[starts])[:, 0])[1:]
+    number = np.searchsorted(real.scan[starts], real.scan)
+    ahead, aside, above = (np.einsum("ij,ij->i", axis[number], real.direction) for axis in (tangent, left, up))
+    return BeamDirections(np.arctan2(aside, ahead), np.arcsin(np.clip(above, -1.0, 1.0)))
+
+
+@per_case
+def scan_descriptors(case: Case) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "s d"], Int[np.ndarray, " s"]]:
+    """Descriptors of the scans, real and synthetic, and the number of each scan.
+
+    A descriptor holds quantiles of the ranges and their median in sectors of azimuth and elevation, in log metres; a
+    sector without beams in either holds the scan's median.
+    """
+    real, seen = returns(case), beam_directions(case)
+    reach = noisy_ranges(case, "first")
+    both = np.isfinite(reach)
+    sector = np.zeros(len(reach), int)
+    for angle, count in zip((seen.azimuth, seen.elevation), _DIRECTION_SECTORS, strict=True):
+        edges = np.quantile(angle, np.linspace(0.0, 1.0, count + 1)[1:-1])
+        sector = sector * count + np.searchsorted(edges, angle)
+    rows: list[tuple[np.ndarray, np.ndarray]] = []
+    numbers = np.unique(real.scan)
+    bounds = np.searchsorted(real.scan, np.append(numbers, numbers[-1] + 1))
+    for start, end in itertools.pairwise(bounds):
+        kept = np.flatnonzero(both[start:end]) + start
+        if len(kept) > np.prod(_DIRECTION_SECTORS):
+            pair = (_describe_scan(np.maximum(r[kept], 0.01), sector[kept]) for r in (real.range, reach))
+            rows.append(tuple(pair))  # type: ignore[arg-type]
+    if len(rows) < 10:
+        raise ValueError(f"{len(rows)} scans with returns from the candidate are too few to tell apart")
+    left, right = zip(*rows, strict=True)
+    return np.asarray(left), np.asarray(right), np.arange(len(rows))
+
+
+def _describe_scan(reach: Float[np.ndarray, " n"], sector: Int[np.ndarray, " n"]) -> Float[np.ndarray, " d"]:
+    log = np.log(reach)
+    quantiles = np.percentile(log, _QUANTILES)
+    parts = np.full(int(np.prod(_DIRECTION_SECTORS)), quantiles[len(quantiles) // 2])
+    order = np.argsort(sector, kind="stable")
+    groups, starts = np.unique(sector[order], return_index=True)
+    parts[groups] = [np.median(group) for group in np.split(log[order], starts[1:])]
+    return np.concatenate([quantiles, parts])
+
+
+@kept_until("DIS")
+@per_hold
+def cloud_tree(case: Case) -> cKDTree:
+    """Of all held-out returns."""
+    return cKDTree(returns(case).points, balanced_tree=False)

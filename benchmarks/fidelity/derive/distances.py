@@ -1,28 +1,43 @@
-"""Distances between held-out points and the candidate, both ways."""
+"""Held-out points against the candidate: distances both ways, M3C2, the self-cast check, occupied voxels."""
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, derived, of_hold, until
-from benchmarks.fidelity.derive.beams import at, paired, returns
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
+from benchmarks.fidelity.derive.beams import (
+    cast_beams,
+    cloud_tree,
+    local_at,
+    noisy_ranges,
+    points_at,
+    returns,
+    sensor_path,
+)
+from benchmarks.fidelity.derive.clouds import Planes, plane_rows, real_planes
 from benchmarks.fidelity.derive.curve import Curve
-from benchmarks.fidelity.derive.packing import cells
-from benchmarks.fidelity.derive.path import sensor_path
-from benchmarks.fidelity.derive.surface import lattice, nearest, normals, surface
+from benchmarks.fidelity.derive.surface import (
+    cell_numbers,
+    face_normals,
+    sample_surface,
+    surface_nearest,
+    visible_surface,
+)
 from benchmarks.fidelity.references import Hold
 
-MOST = 120_000
-BOOTSTRAP = 50_000  # samples behind an interval; the value itself uses all
+MOST_POINTS = 120_000
+BOOTSTRAP_SAMPLES = 50_000  # samples behind an interval; the value itself uses all
 STEEPEST = np.cos(np.deg2rad(80.0))  # beams that graze a surface at more than 80° do not observe it
-_CELL = 0.1  # m between samples of the candidate
-_SECTORS = 8
+_MESH_CELL = 0.1  # m between samples of the candidate
+_AXIS_SECTORS = 8
 
 
 @dataclass(frozen=True)
-class ToMesh:
+class MeshDistances:
     """Held-out points against the candidate.
 
     Attributes:
@@ -39,7 +54,7 @@ class ToMesh:
 
 
 @dataclass(frozen=True)
-class ToCloud:
+class CloudDistances:
     """Samples of the candidate that held-out beams observed, against the held-out points.
 
     Attributes:
@@ -51,61 +66,280 @@ class ToCloud:
     station: Float[np.ndarray, " n"]
 
 
-@of_hold
-def thinned(case: Case) -> Int[np.ndarray, " k"]:
+@per_hold
+def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
     """Numbers of at most `MOST` of the returns, evenly spaced in time."""
     count = len(returns(case).range)
-    return np.linspace(0, count - 1, min(count, MOST)).astype(int)
+    return np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
 
 
-@until("DIS")
-@of_hold
-def cloud_tree(case: Case) -> cKDTree:
-    """Of all held-out returns."""
-    return cKDTree(returns(case).points, balanced_tree=False)
-
-
-@until("CMP")
-@derived
-def to_mesh(case: Case) -> ToMesh:
+@kept_until("CMP")
+@per_case
+def mesh_distances(case: Case) -> MeshDistances:
     """Distances of held-out points to everything visible of the candidate; nothing is registered first."""
-    pick, real = thinned(case), returns(case)
+    pick, real = thinned_rows(case), returns(case)
     points = real.points[pick]
-    distance, closest, face = nearest(case).query(points)
-    normal = normals(surface(case), face)
+    distance, closest, face = surface_nearest(case).query(points)
+    normal = face_normals(visible_surface(case), face)
     side = np.einsum("ij,ij->i", normal, points - closest) * np.einsum("ij,ij->i", normal, real.origin[pick] - closest)
     bore = case.candidate.bore
     local = Curve(bore.station, bore.position).local(points)
-    sector = np.round(np.arctan2(local[:, 2], local[:, 1]) / (2.0 * np.pi / _SECTORS)).astype(int) % _SECTORS
-    return ToMesh(distance, np.copysign(distance, side), real.local[pick, 0], sector)
+    sector = np.round(np.arctan2(local[:, 2], local[:, 1]) / (2.0 * np.pi / _AXIS_SECTORS)).astype(int) % _AXIS_SECTORS
+    return MeshDistances(distance, np.copysign(distance, side), real.local[pick, 0], sector)
 
 
 def mean_distance(case: Case, other: Hold) -> float:
     """Mean distance of another recording's points to the candidate, m."""
     points = other.points
     return float(
-        nearest(case).query(points[np.linspace(0, len(points) - 1, min(len(points), MOST)).astype(int)])[0].mean()
+        surface_nearest(case)
+        .query(points[np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int)])[0]
+        .mean()
     )
 
 
-@derived
-def to_cloud(case: Case) -> ToCloud:
+@per_case
+def cloud_distances(case: Case) -> CloudDistances:
     """One sample in 10 cm of the candidate, of those that a held-out beam cast in it would have hit.
 
     A sample counts as observed if a beam hits the candidate within 5 cm of it at less than 80° of incidence; half the
     smallest tolerance, so that a return that is there is within reach of it.
     """
-    cast = paired(case)
+    cast = cast_beams(case)
     seen = cast.cosine > STEEPEST
-    hits = at(case, cast.range)[seen]
-    samples, _ = lattice(surface(case), _CELL)
-    samples = samples[:: max(len(samples) // (4 * MOST), 1)]
+    hits = points_at(case, cast.range)[seen]
+    samples, _ = sample_surface(visible_surface(case), _MESH_CELL)
+    samples = samples[:: max(len(samples) // (4 * MOST_POINTS), 1)]
     if not len(hits) or not len(samples):
         raise ValueError("no held-out beam meets the candidate")
     gap, _ = cKDTree(hits, balanced_tree=False).query(samples, distance_upper_bound=0.05 * case.tolerance)
     samples = samples[np.isfinite(gap)]
     local = sensor_path(case).local(samples)
-    even = np.unique(cells(local, _CELL), return_index=True)[1]  # small triangles have more samples than their area's
-    even = even[np.linspace(0, len(even) - 1, min(len(even), MOST)).astype(int)]
+    even = np.unique(cell_numbers(local, _MESH_CELL), return_index=True)[
+        1
+    ]  # small triangles have more samples than their area's
+    even = even[np.linspace(0, len(even) - 1, min(len(even), MOST_POINTS)).astype(int)]
     distance, _ = cloud_tree(case).query(samples[even])
-    return ToCloud(distance, local[even, 0])
+    return CloudDistances(distance, local[even, 0])
+
+
+_OBSERVED_CELL = 0.1  # m
+_EARLY = 0.15  # m
+
+
+@per_case
+def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
+    """For each cell of observable candidate surface, whether most beams that hit it came back from behind it.
+
+    Cells of 10 cm stand for equal areas; beams at more than 80° of incidence do not count, for there a millimetre off
+    the surface is centimetres along the beam. A beam passes through if its return lies over 15 cm behind the surface.
+    """
+    cast = cast_beams(case)
+    seen = cast.cosine > STEEPEST
+    _, cell = np.unique(cell_numbers(local_at(case, cast.range)[seen], _OBSERVED_CELL), return_inverse=True)
+    crossed = np.bincount(cell, cast.difference[seen] < -_EARLY * case.tolerance)
+    return crossed > 0.5 * np.bincount(cell)
+
+
+ALPHA = 40.0  # 1/m
+_THIN = 0.1  # m
+
+
+def density_aware_chamfer(case: Case) -> float:
+    """Between held-out points and the candidate's points on the same beams, each thinned to one in 10 cm; 0 to 1.
+
+    Source: Wu et al. 2021, arXiv 2111.12702, eq. 6: ½ Σ over both of the mean of 1 - exp(-α d) / n, with n the
+    number of points that share the nearest neighbour.
+    """
+    edge, hit = _THIN * case.tolerance, cast_beams(case).hit
+    clouds = [
+        points[np.unique(cell_numbers(points, edge), return_index=True)[1]]
+        for points in (returns(case).local, local_at(case, cast_beams(case).range)[hit])
+    ]
+    return 0.5 * (_one_way(clouds[0], clouds[1]) + _one_way(clouds[1], clouds[0]))
+
+
+def _one_way(points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"]) -> float:
+    distance, index = cKDTree(others).query(points)
+    shared = np.bincount(index, minlength=len(others))[index]
+    return float(np.mean(1.0 - np.exp(-ALPHA * distance) / shared))
+
+
+M3C2_CORES = 5000
+M3C2_RADIUS = 0.15  # m, of the cylinder
+M3C2_REACH = 0.5  # m along the normal, either way
+M3C2_REGISTRATION = 0.01  # m: what poses that are given to a centimetre leave between two clouds
+
+
+@dataclass(frozen=True)
+class M3C2Distances:
+    """At each core point that has both clouds in its cylinder.
+
+    Attributes:
+        significant: 1 where |distance| exceeds the level of detection, else 0, `(n,)`.
+        distance: Signed, m, `(n,)`.
+        station: Along the sensor's path, m, `(n,)`.
+    """
+
+    significant: Float[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]
+    station: Float[np.ndarray, " n"]
+
+
+@per_case
+def m3c2_distances(case: Case) -> M3C2Distances:
+    """M3C2 of held-out points against the candidate's points on the same beams.
+
+    The candidate's points carry no noise; the level of detection is 1.96·√(s₁²/n₁ + s₂²/n₂) + registration, in which
+    the registration error is the given poses' (`REGISTRATION`).
+
+    Source: Lague, Brodu, Leroux 2013, ISPRS J. Photogramm. 82; computed by py4dgeo.
+    """
+    import py4dgeo
+
+    logging.getLogger("py4dgeo").setLevel(logging.WARNING)  # below that it writes a log into the working directory
+    real, cast = returns(case), cast_beams(case)
+    hit = cast.hit
+    flat: Planes = real_planes(case)
+    pick = np.linspace(0, len(flat.point) - 1, min(len(flat.point), M3C2_CORES)).astype(int)
+    offset = np.round(real.points.mean(axis=0))
+    clean = points_at(case, cast.range)[hit]
+    m3c2 = py4dgeo.M3C2(
+        epochs=(py4dgeo.Epoch(real.points - offset), py4dgeo.Epoch(clean - offset)),
+        corepoints=flat.point[pick] - offset,
+        corepoint_normals=flat.normal[pick],
+        cyl_radius=M3C2_RADIUS,
+        max_distance=M3C2_REACH,
+        registration_error=M3C2_REGISTRATION * case.tolerance,
+    )
+    distance, uncertainty = m3c2.run()
+    known = np.isfinite(distance)
+    beyond = np.abs(distance[known]) > uncertainty["lodetection"][known]
+    return M3C2Distances(beyond.astype(float), distance[known], real.local[plane_rows(case)][pick][known, 0])
+
+
+PAPER_SIGMA = 0.05  # m: the range noise that the paper states for its LiDAR
+_MOST_SELF_CAST = 30_000
+
+
+@dataclass(frozen=True)
+class SelfCast:
+    """Distances of a noisy cloud to the mesh that it was cast in.
+
+    Attributes:
+        distance: m, `(n,)`.
+        noise_alone: σ·√(2/π)·mean|cos incidence|, m: the mean distance that noise gives on planes.
+    """
+
+    distance: Float[np.ndarray, " n"]
+    noise_alone: float
+
+
+@per_case
+def self_cast(case: Case) -> SelfCast:
+    """At the held-out beams; logged only, since any mesh passes."""
+    real, cast = returns(case), cast_beams(case)
+    pick = thinned_rows(case)
+    pick = pick[cast.hit[pick]]
+    pick = pick[:: max(len(pick) // _MOST_SELF_CAST, 1)]
+    reach = cast.range[pick] + PAPER_SIGMA * case.rng("selfcast").standard_normal(len(pick))
+    distance, _, _ = surface_nearest(case).query(real.origin[pick] + reach[:, None] * real.direction[pick])
+    return SelfCast(distance, float(PAPER_SIGMA * np.sqrt(2.0 / np.pi) * np.mean(cast.cosine[pick])))
+
+
+VOXEL_EDGE = 0.20  # m
+SHELL_VOXELS = 3  # voxels about either surface that count for kappa: 0.6 m
+_FREE_LENGTH = 1.5  # m of a beam before its return that are known to be free
+_BEAM_STEP = 0.1  # m between samples along it
+_AROUND_PATH = 12.0  # m from the path; what lies farther is no tunnel
+_FREE_RAYS = 150_000
+
+
+@dataclass(frozen=True)
+class Occupied:
+    """Voxels on one grid, axes station, left, up, `(i, j, k)` each.
+
+    Attributes:
+        real: Holds a held-out point.
+        first: Holds a point of the first noisy draw in the candidate.
+        second: Of the second draw; differs from the first in noise alone.
+        known: The held-out beams tell what is there, or one of the surfaces is.
+        station: Of the middle of each slice, m, `(i,)`.
+    """
+
+    real: Bool[np.ndarray, "i j k"]
+    first: Bool[np.ndarray, "i j k"]
+    second: Bool[np.ndarray, "i j k"]
+    known: Bool[np.ndarray, "i j k"]
+    station: Float[np.ndarray, " i"]
+
+
+@kept_until("OCC")
+@per_case
+def occupied_voxels(case: Case) -> Occupied:
+    """Held-out and synthetic points, and what is known about the voxels near them."""
+    edge = VOXEL_EDGE * case.tolerance
+    real = returns(case)
+    clouds = [_voxel_indices(real.local, edge)]
+    for draw in ("first", "second"):
+        clouds.append(_voxel_indices(local_at(case, noisy_ranges(case, draw)), edge))
+    both = np.concatenate(clouds[:2])
+    low, high = both.min(axis=0) - SHELL_VOXELS - 1, both.max(axis=0) + SHELL_VOXELS + 2
+    grids = [_fill_grid(cloud, low, high) for cloud in (*clouds, free_voxels(case))]
+    station = (np.arange(low[0], high[0]) + 0.5) * edge
+    return Occupied(grids[0], grids[1], grids[2], grids[0] | grids[1] | grids[3], station)
+
+
+@per_hold
+def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
+    """Indices of voxels through which held-out beams passed in the last metres before their returns."""
+    real = returns(case)
+    pick = np.linspace(0, len(real.range) - 1, min(len(real.range), _FREE_RAYS)).astype(int)
+    edge = VOXEL_EDGE * case.tolerance
+    before = np.arange(edge, _FREE_LENGTH, _BEAM_STEP)
+    steps = (real.local[pick] - back * real.heading[pick] for back in before)
+    return np.unique(np.concatenate([_voxel_indices(step, edge) for step in steps]), axis=0)
+
+
+def dilate(grid: Bool[np.ndarray, "i j k"], by: int = 1) -> Bool[np.ndarray, "i j k"]:
+    """A grid grown by whole voxels in every direction."""
+    return ndimage.maximum_filter(grid.astype(np.uint8), 2 * by + 1, mode="constant").astype(bool)
+
+
+def shell_voxels(grids: Occupied) -> Bool[np.ndarray, "i j k"]:
+    """Known voxels within `SHELL` of either surface."""
+    return grids.known & dilate(grids.real | grids.first, SHELL_VOXELS)
+
+
+def iou(a: Bool[np.ndarray, "..."], b: Bool[np.ndarray, "..."]) -> float:
+    """Intersection over union."""
+    return float((a & b).sum() / max((a | b).sum(), 1))
+
+
+def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarray, " g"]:
+    """F1 with a tolerance of one voxel for each group of slices; 0 where one of the surfaces is not there.
+
+    Args:
+        grids: Both surfaces.
+        group: Number of the group of each slice.
+    """
+    counts = [
+        np.bincount(group, grid.sum(axis=(1, 2)))
+        for grid in (
+            grids.real, grids.first, grids.real & dilate(grids.first), grids.first & dilate(grids.real)
+        )
+    ]  # fmt: skip
+    recall, precision = counts[2] / np.maximum(counts[0], 1), counts[3] / np.maximum(counts[1], 1)
+    return 2.0 * precision * recall / np.maximum(precision + recall, 1e-12)
+
+
+def _voxel_indices(local: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, "n 3"]:
+    near = local[(np.abs(local[:, 1:]) < _AROUND_PATH).all(axis=1)]
+    return np.floor(near[np.unique(cell_numbers(near, edge), return_index=True)[1]] / edge).astype(np.int64)
+
+
+def _fill_grid(index: Int[np.ndarray, "n 3"], low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> np.ndarray:
+    grid = np.zeros(tuple(high - low), bool)
+    inside = ((index >= low) & (index < high)).all(axis=1)
+    grid[tuple((index[inside] - low).T)] = True
+    return grid

@@ -1,168 +1,341 @@
-"""Free space on a grid along a curve, and the persistence of its clearance."""
+"""Free space in voxels along the reference axis, and clearances near it."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.ndimage import binary_closing, distance_transform_edt, label
+import shapely
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, derived, of_hold, of_truth, until
-from benchmarks.fidelity.derive import surface
-from benchmarks.fidelity.derive.curve import Curve, candidate_curve, truth_curve
-from benchmarks.fidelity.derive.reference_axis import hold_curve
+from benchmarks.fidelity.candidate import concatenate_meshes
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.derive.axis import hold_local, hold_points, reference_curve
+from benchmarks.fidelity.derive.beams import returns
+from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian
+from benchmarks.fidelity.derive.sections import lining_radii, sections, true_part, truth_caster, truth_radii
+from benchmarks.fidelity.derive.surface import Nearest, sample_surface, surface_caster, surface_nearest
 
-_CELL = (0.5, 0.25, 0.25)  # m along, left, up
-_SAMPLES = 0.10  # m between samples of a surface
-_AT_ONCE = 300_000  # points, whose coordinates take 100 MB on their way
-_PAD = 0.3  # m beyond the walls; more would give leaks room to loop in
-_KEPT = 0.05  # m; pairs of less persistence are the grid's
-_MIDDLE = 0.5  # m about the curve, in which the flood starts
-
-Diagrams = tuple[np.ndarray, np.ndarray, np.ndarray]
+_BEAMS_PER_METRE = 300  # beams followed for each metre of chainage
+_CARVE_STEP = 0.15  # m
+_CARVE_FARTHEST = 25.0  # m
+CARVE_MARGIN = 0.20  # m before the return where a beam's air ends
 
 
 @dataclass(frozen=True)
-class Grid:
-    """A box along a curve.
+class Carved:
+    """Samples along beams.
 
     Attributes:
-        curve: Along which it lies.
-        cell: Sizes along, left and up, m.
-        low: Station, left and up of its first corner, m.
-        shape: Cells each way.
+        passed: Points that beams went through, tunnel frame, m, `(k, 3)`.
+        beam: Which beam passed each, `(k,)`.
+        ended: Returns of the same beams, m, `(b, 3)`.
+    """
+
+    passed: Float[np.ndarray, "k 3"]
+    beam: Int[np.ndarray, " k"]
+    ended: Float[np.ndarray, "b 3"]
+
+
+@per_hold
+def carve_beams(case: Case) -> Carved:
+    """Every 15 cm of about 300 beams a metre, from the sensor to 20 cm before the return or 25 m."""
+    real = returns(case)
+    length = np.linalg.norm(np.ptp(real.origin, axis=0)) + 10.0
+    back = np.arange(0, len(real.range), max(1, int(len(real.range) / (_BEAMS_PER_METRE * length))))
+    origin, direction = real.origin[back], real.direction[back]
+    reach = np.minimum(real.range[back] - CARVE_MARGIN, _CARVE_FARTHEST)
+    count = np.maximum((reach / _CARVE_STEP).astype(int), 0)
+    beam = np.repeat(np.arange(len(back)), count)
+    place = np.arange(len(beam)) - np.repeat(np.cumsum(count) - count, count)
+    along = (place + 0.5) * _CARVE_STEP
+    passed = origin[beam] + along[:, None] * direction[beam]
+    return Carved(passed, beam, real.points[back])
+
+
+def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
+    """Passed and ended points as station, left and up about a curve; remembered."""
+    assert case.hold is not None
+    key = ("carving.about", id(curve))
+    if key not in case.hold.cache:
+        found = carve_beams(case)
+        case.hold.cache[key] = (curve, curve.local(found.passed), curve.local(found.ended))
+    return case.hold.cache[key][1:]
+
+
+AIR_VOXEL = 0.20  # m
+KNOWN_AROUND = 0.6  # m around the reference's air that is known, too
+_OBJECTS = ("sleeper", "rail", "fastening")
+_MOUTH_VOXELS = 5  # voxels at either end where air begins
+HIT_RETURNS = 2
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Cells about a curve.
+
+    Attributes:
+        curve: Axis.
+        low: Corner of the first cell: station, left, up, m.
+        shape: Cells.
+        edge: Of a cell, m.
     """
 
     curve: Curve
-    cell: Float[np.ndarray, "3"]
     low: Float[np.ndarray, "3"]
     shape: tuple[int, int, int]
+    edge: float
 
-    def occupied(self, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "a b c"]:
-        """Cells with a point in them; points outside the box are left out."""
-        cells = np.zeros(self.shape, bool)
-        for start in range(0, len(points), _AT_ONCE):
-            local = self.curve.local(points[start : start + _AT_ONCE])
-            index = np.floor((local - self.low) / self.cell).astype(int)
-            index = index[((index >= 0) & (index < self.shape)).all(axis=1)]
-            cells[tuple(index.T)] = True
-        return cells
+    def local(self) -> Float[np.ndarray, "k 3"]:
+        """Middles of all cells: station, left, up, m."""
+        axes = [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
-    def on_curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The cells along the curve itself."""
-        middle = np.floor((0.0 - self.low[1:]) / self.cell[1:]).astype(int)
-        along = np.arange(self.shape[0])
-        return along, np.full_like(along, middle[0]), np.full_like(along, middle[1])
+    def points(self) -> Float[np.ndarray, "k 3"]:
+        """Middles of all cells in the tunnel frame, m."""
+        axes = [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
+        position, _, left, up = (a[:, None, None] for a in self.curve.frames(axes[0]))
+        placed = position + axes[1][None, :, None, None] * left + axes[2][None, None, :, None] * up
+        return placed.reshape(-1, 3)
 
-    def clearance(self, occupied: Bool[np.ndarray, "a b c"]) -> Float[np.ndarray, "a b c"]:
-        """Distance to what bounds the space about the curve, m; 0 outside it. The mouths bound nothing."""
-        number, _ = label(~occupied)
-        _, left, up = self.on_curve()
-        reach = np.ceil(_MIDDLE / self.cell[1:]).astype(int)
-        tube = number[:, left[0] - reach[0] : left[0] + reach[0] + 1, up[0] - reach[1] : up[0] + reach[1] + 1]
-        free = np.isin(number, np.setdiff1d(np.unique(tube), [0]))
-        return distance_transform_edt(free, sampling=self.cell)
+    def cell(self, local: Float[np.ndarray, "k 3"]) -> tuple[Int[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
+        """Flat index of the cell of each point, and whether it lies in the lattice at all."""
+        place = np.floor((local - self.low) / self.edge).astype(int)
+        inside = ((place >= 0) & (place < self.shape)).all(axis=1)
+        return np.ravel_multi_index(tuple(np.where(inside[:, None], place, 0).T), self.shape), inside
 
-
-def _grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Grid:
-    """A grid that holds the points between the ends of a curve."""
-    cell = np.asarray(_CELL) * case.tolerance
-    across = np.abs(curve.local(points[::10])[:, 1:])
-    half = np.percentile(across, 99.9, axis=0) + _PAD
-    low = np.array([curve.station[0], *-half])
-    shape = np.ceil(np.array([curve.length, *2 * half]) / cell).astype(int)
-    return Grid(curve, cell, low, (int(shape[0]), int(shape[1]), int(shape[2])))
+    def marked(self, local: Float[np.ndarray, "k 3"], least: int = 1) -> Bool[np.ndarray, "n m k"]:
+        """Cells with at least so many of the points."""
+        cell, inside = self.cell(local)
+        return (np.bincount(cell[inside], minlength=int(np.prod(self.shape))) >= least).reshape(self.shape)
 
 
-@until("TOP")
-@derived
-def samples(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Points all over the candidate's visible surface."""
-    return surface.lattice(surface.surface(case), _SAMPLES)[0]
+@dataclass(frozen=True)
+class Air:
+    """Air of candidate and reference in the same voxels.
 
-
-@until("TOP")
-@of_truth
-def _truth_samples(case: Case) -> Float[np.ndarray, "k 3"]:
-    assert case.truth is not None
-    return surface.lattice(case.truth.surface, _SAMPLES)[0]
-
-
-@derived
-def own_components(case: Case) -> tuple[int, int]:
-    """Components of the candidate's free space that its centreline runs through, and cells of the centreline free."""
-    import cc3d
-
-    curve = candidate_curve(case)
-    grid = _grid(case, curve, samples(case))
-    number = cc3d.connected_components(~grid.occupied(samples(case)), connectivity=6)
-    ends = 1  # a mouth's own cell is cut by its rim
-    found = number[grid.on_curve()][ends:-ends]
-    return len(np.setdiff1d(np.unique(found), [0])), int((found > 0).sum())
-
-
-@of_truth
-def truth_grid(case: Case) -> Grid:
-    """The grid of the comparison with the truth."""
-    return _grid(case, truth_curve(case), _truth_samples(case))
-
-
-@of_hold
-def hold_grid(case: Case) -> Grid:
-    """The grid of the comparison with the held-out recording."""
-    assert case.hold is not None
-    return _grid(case, hold_curve(case), case.hold.points)
-
-
-@of_truth
-def truth_diagrams(case: Case) -> Diagrams:
-    """Persistence of the true clearance."""
-    grid = truth_grid(case)
-    return persistence(grid.clearance(grid.occupied(_truth_samples(case))))
-
-
-@of_hold
-def hold_diagrams(case: Case) -> Diagrams:
-    """Persistence of the clearance that the held-out returns leave."""
-    assert case.hold is not None
-    grid = hold_grid(case)
-    return persistence(grid.clearance(_closed(grid.occupied(case.hold.points))))
-
-
-@derived
-def candidate_diagrams(case: Case) -> Diagrams:
-    """Persistence of the candidate's clearance, sampled as the reference is."""
-    if case.truth is not None:
-        grid = truth_grid(case)
-        return persistence(grid.clearance(grid.occupied(samples(case))))
-    assert case.hold is not None
-    hold, grid = case.hold, hold_grid(case)
-    distance = surface.intersector(case).first(hold.origin, hold.direction)[0]
-    hit = np.isfinite(distance) & hold.returned
-    distance = distance[hit] + hold.sigma * case.rng("clearance").normal(size=int(hit.sum()))
-    points = hold.origin[hit] + distance[:, None] * hold.direction[hit]
-    return persistence(grid.clearance(_closed(grid.occupied(points))))
-
-
-def _closed(occupied: Bool[np.ndarray, "a b c"]) -> Bool[np.ndarray, "a b c"]:
-    """Occupied cells with the gaps of one cell shut that lie between the beams of a recording."""
-    return binary_closing(np.pad(occupied, 1, mode="edge"), np.ones((3, 3, 3)))[1:-1, 1:-1, 1:-1]
-
-
-def reference_diagrams(case: Case) -> Diagrams:
-    """Of the truth where there is one, else of the held-out recording."""
-    return truth_diagrams(case) if case.truth is not None else hold_diagrams(case)
-
-
-def persistence(clearance: Float[np.ndarray, "a b c"]) -> Diagrams:
-    """Birth and death of components, loops and voids of the space wider than a falling clearance, m, `(k, 2)` each.
-
-    Nothing lies below 0, so that a slit between two beams, however deep the wall behind it, lasts no longer than it is
-    wide. Signs are turned, so that births come before deaths: the space at level t is where minus the clearance is
-    below t.
+    Attributes:
+        lattice: The voxels.
+        judged, reference: Whether each is air that can be reached from a mouth, `(n, m, k)`.
+        known: Whether the reference says anything of it, `(n, m, k)`.
+        blocked: Voxels inside the candidate's lining that are not its air, `(n, m, k)`.
+        filled: Those of them that its extra surfaces take or close off, not its track, `(n, m, k)`.
     """
-    import gudhi
 
-    complex_ = gudhi.CubicalComplex(top_dimensional_cells=-clearance)
-    complex_.compute_persistence(min_persistence=_KEPT)
-    zero, one, two = (np.asarray(complex_.persistence_intervals_in_dimension(k)).reshape(-1, 2) for k in range(3))
-    return zero, one, two
+    lattice: Lattice
+    judged: Bool[np.ndarray, "n m k"]
+    reference: Bool[np.ndarray, "n m k"]
+    known: Bool[np.ndarray, "n m k"]
+    blocked: Bool[np.ndarray, "n m k"]
+    filled: Bool[np.ndarray, "n m k"]
+
+
+@per_case
+def air_lattice(case: Case) -> Lattice:
+    """20 cm voxels around the reference's sections."""
+    return make_lattice(case, AIR_VOXEL * case.tolerance)
+
+
+def make_lattice(case: Case, edge: float) -> Lattice:
+    """Cells from mouth to mouth of the reference, with 0.8 m to spare around its largest section."""
+    curve, cut = reference_curve(case), sections(case)
+    x, z = cut.reference * np.cos(cut.angle), cut.reference * np.sin(cut.angle)
+    low = np.floor((np.array([np.nanmin(x), np.nanmin(z)]) - 0.8) / edge)
+    high = np.ceil((np.array([np.nanmax(x), np.nanmax(z)]) + 0.8) / edge)
+    count = (high - low).astype(int)
+    start = np.array([curve.station[0], low[0] * edge, low[1] * edge])
+    return Lattice(curve, start, (int(curve.length / edge), int(count[0]), int(count[1])), edge)
+
+
+@kept_until("F3D")
+@per_case
+def air_voxels(case: Case) -> Air:
+    """Both, in voxels."""
+    cells = air_lattice(case)
+    inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape)
+    track = cells.marked(cells.curve.local(track_points(case, cells.edge)))
+    extra = cells.marked(cells.curve.local(sample_surface(case.candidate.extra, cells.edge / 2)[0]))
+    judged = reachable(inside & ~track & ~extra)
+    reference, known = reference_air(case, cells)
+    return Air(cells, judged, reference, known, inside & ~judged, inside & ~judged & ~track)
+
+
+def object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
+    """Samples of what stands in the candidate's bore: track and extra surfaces."""
+    return np.concatenate([track_points(case, edge), sample_surface(case.candidate.extra, edge / 2)[0]])
+
+
+def track_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
+    """Samples of the candidate's track."""
+    track = case.candidate.track
+    parts = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
+    return sample_surface(concatenate_meshes([part for part in parts if len(part.faces)]), edge / 2)[0]
+
+
+def true_object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
+    """The same of the truth."""
+    return sample_surface(true_part(case, _OBJECTS), edge / 2)[0]
+
+
+def reference_air(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
+    """Air of the reference and where it is known.
+
+    The truth is known to 0.6 m behind its surface. Held-out beams know the cells that they pass; a cell in which at
+    least two of them end is air where its middle lies nearer to the axis than their ends do.
+    """
+    if case.truth is not None:
+        inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape)
+        free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge))))
+        return free, binary_dilation(inside, iterations=max(int(KNOWN_AROUND / cells.edge), 1))
+    passed, ended = carved_about(case, cells.curve)
+    cell, kept = cells.cell(ended)
+    size = int(np.prod(cells.shape))
+    ends = np.bincount(cell[kept], minlength=size)
+    far = np.bincount(cell[kept], np.hypot(ended[kept, 1], ended[kept, 2]), size) / np.maximum(ends, 1)
+    middle = cells.local()
+    hit = ends >= HIT_RETURNS
+    free = np.where(hit, np.hypot(middle[:, 1], middle[:, 2]) < far, cells.marked(passed).ravel())
+    return free.reshape(cells.shape), (free | hit).reshape(cells.shape)
+
+
+def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
+    """What of the air is connected with the first or last metre of the lattice that has any."""
+    part, count = label(free)
+    if not count:
+        return free
+    rows = np.flatnonzero(free.any(axis=tuple(range(1, free.ndim))))
+    ends = np.concatenate(
+        [part[rows[0] : rows[0] + _MOUTH_VOXELS].ravel(), part[rows[-1] - _MOUTH_VOXELS + 1 : rows[-1] + 1].ravel()]
+    )
+    found = np.bincount(ends, minlength=count + 1)
+    found[0] = 0
+    return np.isin(part, np.flatnonzero(found > 0.1 * found.max()))
+
+
+@per_case
+def clearance(case: Case) -> tuple[Float[np.ndarray, "n m k"], Float[np.ndarray, "n m k"]]:
+    """Distance to the edge of the air in every voxel, of candidate and reference, m; negative outside the air."""
+    both = air_voxels(case)
+    return signed_distance(both.judged, both.lattice.edge), signed_distance(both.reference, both.lattice.edge)
+
+
+def signed_distance(free: Bool[np.ndarray, "n m k"], edge: float) -> Float[np.ndarray, "n m k"]:
+    """Signed Euclidean distance to the edge of free cells, m."""
+    if free.all() or not free.any():
+        return np.full(free.shape, np.inf if free.all() else -np.inf)
+    return distance_transform_edt(free, edge) - distance_transform_edt(~free, edge)
+
+
+LANES = (-1.0, 0.0, 1.0)  # m to the left of the axis
+_AROUND_AXIS = 1.0  # m to either side of the axis, and up and down
+_NODE = 0.25  # m between the places in a section
+_LANE_HALF = 0.15  # m
+_LANE_BIN = 0.5  # m of chainage
+_VEHICLE = (2.8, 3.8)  # m; a metro car (type B), width and height above the rails
+_VEHICLE_FLOOR = 0.45  # m; where its envelope begins
+_TIGHTER = (0.0, 0.05, 0.10)  # m that the reference's own median outline is drawn in
+
+
+@dataclass(frozen=True)
+class Clearances:
+    """Distance to the nearest surface around the axis.
+
+    Attributes:
+        station: Of the sections, m, `(n,)`.
+        judged, reference: By section and place in it, m, `(n, k)`.
+    """
+
+    station: Float[np.ndarray, " n"]
+    judged: Float[np.ndarray, "n k"]
+    reference: Float[np.ndarray, "n k"]
+
+
+def _places_near_axis(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "k 3"]]:
+    station = sections(case).station
+    offset = np.arange(-_AROUND_AXIS, _AROUND_AXIS + 1e-9, _NODE)
+    grid = np.stack(np.meshgrid(station, offset, offset, indexing="ij"), axis=-1)
+    return station, reference_curve(case).point(grid.reshape(-1, 3))
+
+
+@kept_until("F3D")
+@per_truth
+def _truth_nearest(case: Case) -> Nearest:
+    assert case.truth is not None
+    return Nearest(case.truth.surface)
+
+
+@per_case
+def axis_clearances(case: Case) -> Clearances:
+    """Of candidate and reference; a held-out recording's is the distance to its nearest return."""
+    station, points = _places_near_axis(case)
+    judged = surface_nearest(case).query(points)[0]
+    if case.truth is not None:
+        reference = _truth_nearest(case).query(points)[0]
+    else:
+        reference = cKDTree(hold_points(case)).query(points)[0]
+    shape = (len(station), -1)
+    return Clearances(station, judged.reshape(shape), reference.reshape(shape))
+
+
+@per_case
+def headrooms(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Stations, and floor to crown in three lanes of candidate and reference, m; NaN where not known.
+
+    Medians over 0.5 m of chainage, so that a sleeper a centimetre off counts by its centimetre.
+    """
+    curve = reference_curve(case)
+    station = np.arange(curve.station[0] + _LANE_BIN, curve.station[-1] - _LANE_BIN, _LANE_BIN)
+    judged = _cast_headroom(surface_caster(case).first, curve, station)
+    if case.truth is not None:
+        return station, judged, _cast_headroom(truth_caster(case).first, curve, station)
+    return station, judged, _seen_headroom(case)(station)
+
+
+def _cast_headroom(first, curve: Curve, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    fine = (station[:, None] + np.linspace(-0.4, 0.4, 5) * _LANE_BIN).ravel()
+    position, _, left, up = curve.frames(fine)
+    lanes = []
+    for lane in LANES:
+        eye = position + lane * left
+        total = first(eye, up)[0] + first(eye, -up)[0]
+        lanes.append(nanmedian(np.where(np.isfinite(total), total, np.nan).reshape(len(station), -1)))
+    return np.column_stack(lanes)
+
+
+@per_hold
+def _seen_headroom(case: Case):
+    local = hold_local(case)
+
+    def at(station: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+        row = np.floor((local[:, 0] - station[0]) / _LANE_BIN + 0.5).astype(int)
+        lanes = []
+        for lane in LANES:
+            near = (np.abs(local[:, 1] - lane) < _LANE_HALF) & (row >= 0) & (row < len(station))
+            ends = [near & (sign * local[:, 2] > 1.0) for sign in (1, -1)]
+            top, bottom = (grouped_median(row[kept], local[kept, 2], len(station), 5) for kept in ends)
+            lanes.append(top - bottom)
+        return np.column_stack(lanes)
+
+    return at
+
+
+@per_case
+def infringements(case: Case) -> tuple[Bool[np.ndarray, "n e"], Bool[np.ndarray, "n e"]]:
+    """Whether lining and reference cut into each of four envelopes in every section.
+
+    A metro car's envelope, and the median outline of the reference drawn in by 0, 5 and 10 cm: a car alone is clear of
+    any bore that it is driven through and would tell nothing apart.
+    """
+    cut = sections(case)
+    typical = nanmedian(cut.reference.T)
+    known = np.isfinite(typical)
+    ring = (typical[:, None] * np.column_stack([np.cos(cut.angle), np.sin(cut.angle)]))[known]
+    outline = shapely.make_valid(shapely.Polygon(ring))
+    floor = shapely.bounds(outline)[1] + _VEHICLE_FLOOR
+    car = shapely.box(-_VEHICLE[0] / 2, floor, _VEHICLE[0] / 2, floor + _VEHICLE[1])
+    envelopes = [car, *(outline.buffer(-inset) for inset in _TIGHTER)]
+    both = []
+    for sides in (cut.judged_outline, cut.reference_outline):
+        lost = [shapely.area(shapely.difference(envelope, sides)) > 0.005 * envelope.area for envelope in envelopes]
+        both.append(np.column_stack(lost))
+    return both[0], both[1]

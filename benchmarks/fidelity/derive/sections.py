@@ -1,4 +1,4 @@
-"""Smooth cross-sections of lining and reference in the same planes, as polygons about the reference axis."""
+"""Cross-sections: smooth outlines every metre, and polar radii with pockets every 5 cm."""
 
 from dataclasses import dataclass
 
@@ -6,19 +6,30 @@ import numpy as np
 import shapely
 import trimesh
 from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
 from scipy.signal import detrend
 
-from benchmarks.fidelity.case import Case, derived, of_hold, of_truth, until
-from benchmarks.fidelity.derive import profiles
-from benchmarks.fidelity.derive.curve import Curve, truth_curve
-from benchmarks.fidelity.derive.reference_axis import hold_curve, hold_local, lining_caster, reference_curve
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.derive.axis import hold_curve, hold_local, lining_caster, lining_curve, reference_curve
+from benchmarks.fidelity.derive.curve import (
+    ROW_STEP,
+    SLICE,
+    TRACK_HALF,
+    Curve,
+    cast_profile,
+    nanmedian,
+    point_profile,
+    running_median,
+    section_angles,
+    truth_curve,
+)
 from benchmarks.fidelity.derive.surface import Caster
 
-SHELL = ("lining", "joint", "pocket", "floor")  # parts of the truth that bound the air
-EVERY = 1.0  # m
-END = 0.75  # m from the mouths where no window is whole
+SHELL_PARTS = ("lining", "joint", "pocket", "floor")  # parts of the truth that bound the air
+SECTION_STEP = 1.0  # m
+SECTION_END = 0.75  # m from the mouths where no window is whole
 WIDTH_HEIGHT = 1.2  # m above the floor
-_CLOSED = 0.7  # share of the directions that must meet the lining
+_CLOSED_SHARE = 0.7  # share of the directions that must meet the lining
 
 
 @dataclass(frozen=True)
@@ -54,38 +65,38 @@ def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
     return trimesh.Trimesh(truth.surface.vertices, truth.surface.faces[kept], process=False)
 
 
-@until("F2D")
-@of_truth
-def truth_shell(case: Case) -> Caster:
+@kept_until("F2D")
+@per_truth
+def truth_bore_caster(case: Case) -> Caster:
     """Rays in the true bore: lining with its joints and pockets, floor; no track."""
-    return Caster(true_part(case, SHELL))
+    return Caster(true_part(case, SHELL_PARTS))
 
 
-def rows(curve: Curve) -> Float[np.ndarray, " n"]:
+def row_stations(curve: Curve) -> Float[np.ndarray, " n"]:
     """Stations of the rows that medians are taken over."""
-    return np.arange(curve.station[0] + 0.5 * profiles.STEP, curve.station[-1], profiles.STEP)
+    return np.arange(curve.station[0] + 0.5 * ROW_STEP, curve.station[-1], ROW_STEP)
 
 
-@of_truth
-def truth_rows(case: Case) -> Float[np.ndarray, "n m"]:
+@per_truth
+def truth_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
     """Smooth polar radii of the truth in 360 directions, m."""
     curve = truth_curve(case)
-    cast = profiles.cast(truth_shell(case), curve, rows(curve), profiles.directions(360))
-    return profiles.windowed(cast, profiles.STEP)
+    cast = cast_profile(truth_bore_caster(case), curve, row_stations(curve), section_angles(360))
+    return running_median(cast, ROW_STEP)
 
 
-@of_hold
-def hold_rows(case: Case) -> Float[np.ndarray, "n m"]:
+@per_hold
+def hold_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
     """Smooth polar radii of the held-out recording by 5 degree sector, m; NaN where too few points lie."""
     curve = hold_curve(case)
     local = hold_local(case)
-    low = (np.abs(local[:, 1]) > profiles.TRACK_HALF) & (local[:, 2] < -1.0) & (np.abs(local[:, 1]) < 2.0)
+    low = (np.abs(local[:, 1]) > TRACK_HALF) & (local[:, 2] < -1.0) & (np.abs(local[:, 1]) < 2.0)
     floor = float(np.median(local[low, 2])) if low.any() else None
-    station = np.arange(curve.station[0], curve.station[-1], profiles.SLICE)
-    return profiles.windowed(profiles.of_points(local, station, floor), profiles.SLICE)
+    station = np.arange(curve.station[0], curve.station[-1], SLICE)
+    return running_median(point_profile(local, station, floor), SLICE)
 
 
-@derived
+@per_case
 def sections(case: Case) -> Sections:
     """Sections of both, the reference being the truth where there is one.
 
@@ -95,23 +106,23 @@ def sections(case: Case) -> Sections:
     Raises:
         ValueError: The reference is shorter than two sections.
     """
-    curve, angle = reference_curve(case), profiles.directions(360)
-    raw = profiles.cast(lining_caster(case), curve, rows(curve), angle)
-    cast = profiles.windowed(raw, profiles.STEP)
+    curve, angle = reference_curve(case), section_angles(360)
+    raw = cast_profile(lining_caster(case), curve, row_stations(curve), angle)
+    cast = running_median(raw, ROW_STEP)
     if case.truth is not None:
-        reference, place = truth_rows(case), rows(curve)
+        reference, place = truth_radius_rows(case), row_stations(curve)
     else:
-        reference = hold_rows(case)
-        place = curve.station[0] + profiles.SLICE * np.arange(len(reference))
-        angle = profiles.directions(reference.shape[1])
-        cast = profiles.nanmedian(cast.reshape(len(cast), len(angle), -1))
-    station = np.arange(curve.station[0] + END, curve.station[-1] - END + 1e-9, EVERY)
+        reference = hold_radius_rows(case)
+        place = curve.station[0] + SLICE * np.arange(len(reference))
+        angle = section_angles(reference.shape[1])
+        cast = nanmedian(cast.reshape(len(cast), len(angle), -1))
+    station = np.arange(curve.station[0] + SECTION_END, curve.station[-1] - SECTION_END + 1e-9, SECTION_STEP)
     if len(station) < 2:
         raise ValueError("the reference is too short for sections")
     reference = reference[np.argmin(np.abs(place - station[:, None]), axis=1)]
-    row = np.argmin(np.abs(rows(curve) - station[:, None]), axis=1)
-    judged, closed = cast[row], np.isfinite(raw[row]).mean(axis=1) > _CLOSED  # a median reaches past a mouth
-    whole = np.isfinite(reference).mean(axis=1) > _CLOSED
+    row = np.argmin(np.abs(row_stations(curve) - station[:, None]), axis=1)
+    judged, closed = cast[row], np.isfinite(raw[row]).mean(axis=1) > _CLOSED_SHARE  # a median reaches past a mouth
+    whole = np.isfinite(reference).mean(axis=1) > _CLOSED_SHARE
     station, reference, judged, closed = station[whole], reference[whole], judged[whole], closed[whole]
     judged = np.where(closed[:, None], judged, 0.0)
     known = np.isfinite(reference)
@@ -145,7 +156,7 @@ def heights(outline: np.ndarray) -> Float[np.ndarray, " n"]:
     return shapely.length(shapely.intersection(outline, shapely.LineString([(0.0, -50.0), (0.0, 50.0)])))
 
 
-@derived
+@per_case
 def dimensions(case: Case) -> dict[str, Float[np.ndarray, "2 n"]]:
     """`width` at 1.2 m above the reference's floor, `height` and `area` of lining and reference."""
     cut = sections(case)
@@ -158,9 +169,88 @@ def dimensions(case: Case) -> dict[str, Float[np.ndarray, "2 n"]]:
     }
 
 
-@derived
+@per_case
 def variation(case: Case) -> Float[np.ndarray, "2 n 2"]:
     """Width and height of lining and reference less their straight trends along the tunnel, m."""
     size = dimensions(case)
     stacked = np.stack([size["width"], size["height"]], axis=-1)
     return detrend(stacked, axis=1)
+
+
+ROW = 0.05  # m
+COLUMNS = 360
+
+
+@dataclass(frozen=True)
+class Radii:
+    """A bore seen from its axis.
+
+    Attributes:
+        curve: The axis.
+        station: Of the rows, m, `(n,)`.
+        radius: To the first surface, m; NaN where there is none, `(n, 360)`.
+        filled: The same with holes closed by their nearest neighbour, `(n, 360)`.
+    """
+
+    curve: Curve
+    station: Float[np.ndarray, " n"]
+    radius: Float[np.ndarray, "n m"]
+    filled: Float[np.ndarray, "n m"]
+
+    def depth(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+        """How far inside the bore points lie, along the ray from the axis, m; negative outside or past its mouths."""
+        return self.depth_local(self.curve.local(points))
+
+    def depth_local(self, local: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
+        """The same of points given as station, left and up about `curve`."""
+        row = np.clip(np.round((local[:, 0] - self.station[0]) / ROW).astype(int), 0, len(self.station) - 1)
+        angle = (np.arctan2(local[:, 2], local[:, 1]) + np.pi) / (2 * np.pi) * COLUMNS
+        column = np.minimum(angle.astype(int), COLUMNS - 1)
+        inside = self.filled[row, column] - np.hypot(local[:, 1], local[:, 2])
+        low, high = self.station[0] - ROW, self.station[-1] + ROW
+        beyond = np.maximum(low - local[:, 0], local[:, 0] - high)
+        return np.where(beyond > 0, -np.maximum(beyond, 1e-9), inside)
+
+
+def cast_radii(curve: Curve, caster: Caster) -> Radii:
+    """Rays from a curve.
+
+    Raises:
+        ValueError: Less than half of them meet anything.
+    """
+    count = max(int(curve.length / ROW), 2)
+    station = curve.station[0] + (np.arange(count) + 0.5) * curve.length / count
+    radius = cast_profile(caster, curve, station, section_angles(COLUMNS))
+    if np.isfinite(radius).mean() < 0.5:
+        raise ValueError("most rays from the axis leave the bore")
+    return Radii(curve, station, radius, _close_holes(radius))
+
+
+def _close_holes(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    known = np.isfinite(radius)
+    if known.all():
+        return radius
+    margin = COLUMNS // 8
+    around = np.concatenate([radius[:, -margin:], radius, radius[:, :margin]], axis=1)
+    nearest = distance_transform_edt(~np.isfinite(around), return_distances=False, return_indices=True)
+    return around[tuple(nearest)][:, margin:-margin]
+
+
+@per_case
+def lining_radii(case: Case) -> Radii:
+    """The candidate's lining from its own axis."""
+    return cast_radii(lining_curve(case), lining_caster(case))
+
+
+@per_truth
+def truth_radii(case: Case) -> Radii:
+    """The true bore, pockets with it and track without, from the true axis."""
+    return cast_radii(truth_curve(case), truth_bore_caster(case))
+
+
+@kept_until("NAV")
+@per_truth
+def truth_caster(case: Case) -> Caster:
+    """Rays in all of the true surface."""
+    assert case.truth is not None
+    return Caster(case.truth.surface)

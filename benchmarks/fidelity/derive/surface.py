@@ -1,4 +1,4 @@
-"""The visible surface of a candidate, rays in it and distances to it."""
+"""The visible surface of a candidate: rays into it, distances to it, samples of it."""
 
 import numpy as np
 import trimesh
@@ -6,12 +6,11 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from benchmarks.fidelity.candidate import Candidate
-from benchmarks.fidelity.case import Case, derived, until
-from benchmarks.fidelity.compiled import concatenated
+from benchmarks.fidelity.candidate import Candidate, concatenate_meshes
+from benchmarks.fidelity.case import Case, kept_until, per_case
 
-CELL = 0.08  # m between the samples that lead to the nearest triangle
-CANDIDATES = 8
+SAMPLE_CELL = 0.08  # m between the samples that lead to the nearest triangle
+NEAREST_CANDIDATES = 8
 _CHUNK = 200_000
 _PARALLEL = 1e-12
 
@@ -45,7 +44,7 @@ class Caster:
                 face[part] = self._rays.intersects_first(origin[part] - self._offset, direction[part])
         hit = face >= 0
         reach = np.full(len(origin), np.inf)
-        corner = corners(self.mesh, face[hit])
+        corner = face_corners(self.mesh, face[hit])
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         along = np.einsum("ij,ij->i", normal, direction[hit])
         along = np.where(np.abs(along) < _PARALLEL, np.inf, along)
@@ -66,7 +65,7 @@ class Nearest:
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.mesh = mesh
-        samples, self._face = lattice(mesh, CELL)
+        samples, self._face = sample_surface(mesh, SAMPLE_CELL)
         self._tree = cKDTree(samples, balanced_tree=False)
 
     def query(
@@ -79,13 +78,15 @@ class Nearest:
         """
         if not len(self._face):
             raise ValueError("no surface to measure distances to")
-        proposed = self._face[self._tree.query(points, min(CANDIDATES, len(self._face)))[1].reshape(len(points), -1)]
+        proposed = self._face[
+            self._tree.query(points, min(NEAREST_CANDIDATES, len(self._face)))[1].reshape(len(points), -1)
+        ]
         best = np.full(len(points), np.inf)
         closest, face = np.zeros((len(points), 3)), np.full(len(points), -1)
         for column in range(proposed.shape[1]):
             repeated = (proposed[:, :column] == proposed[:, column, None]).any(axis=1)
             rows = np.flatnonzero(~repeated)
-            near = trimesh.triangles.closest_point(corners(self.mesh, proposed[rows, column]), points[rows])
+            near = trimesh.triangles.closest_point(face_corners(self.mesh, proposed[rows, column]), points[rows])
             distance = np.linalg.norm(near - points[rows], axis=1)
             better = distance < best[rows]
             rows = rows[better]
@@ -93,21 +94,21 @@ class Nearest:
         return best, closest, face
 
 
-def corners(mesh: trimesh.Trimesh, face: Int[np.ndarray, " k"] | slice) -> Float[np.ndarray, "k 3 3"]:
+def face_corners(mesh: trimesh.Trimesh, face: Int[np.ndarray, " k"] | slice) -> Float[np.ndarray, "k 3 3"]:
     """Corners of some faces, m; unlike `mesh.triangles` they stay with nobody: 72 bytes a face are most of a mesh."""
     return np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]]
 
 
-def normals(mesh: trimesh.Trimesh, face: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
+def face_normals(mesh: trimesh.Trimesh, face: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
     """Normals of some faces, as long as twice their areas, m²."""
-    return trimesh.triangles.cross(corners(mesh, face))
+    return trimesh.triangles.cross(face_corners(mesh, face))
 
 
-def lattice(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " k"]]:
+def sample_surface(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " k"]]:
     """Points on every triangle, at most about `cell` apart, and the face of each; at least one a triangle."""
     if not len(mesh.faces):
         return np.zeros((0, 3)), np.zeros(0, np.int64)
-    triangles = corners(mesh, slice(None))
+    triangles = face_corners(mesh, slice(None))
     sides = np.linalg.norm(triangles[:, [2, 0, 1]] - triangles[:, [1, 2, 0]], axis=2)  # opposite corner 0, 1, 2
     turn = (np.argmax(sides, axis=1)[:, None] + np.arange(3)) % 3
     apex, left, right = np.take_along_axis(triangles, turn[:, :, None], axis=1).transpose(1, 0, 2)
@@ -123,30 +124,36 @@ def lattice(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray, "k 3"
     return apex[face] + down[:, None] * (foot - apex[face]), face
 
 
-def visible(candidate: Candidate) -> trimesh.Trimesh:
+def visible_mesh(candidate: Candidate) -> trimesh.Trimesh:
     """Everything that a sensor can see of a candidate: lining, nails, track, its bed, what else is there."""
     track = candidate.track
     laid = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
     parts = [candidate.lining, *laid, candidate.extra, candidate.nails, candidate.bed]
-    return concatenated([part for part in parts if len(part.faces)])
+    return concatenate_meshes([part for part in parts if len(part.faces)])
 
 
-@until("NAV")
-@derived
-def surface(case: Case) -> trimesh.Trimesh:
+@kept_until("NAV")
+@per_case
+def visible_surface(case: Case) -> trimesh.Trimesh:
     """Everything visible of the candidate, tunnel frame."""
-    return visible(case.candidate)
+    return visible_mesh(case.candidate)
 
 
-@until("NAV")
-@derived
-def intersector(case: Case) -> Caster:
+@kept_until("NAV")
+@per_case
+def surface_caster(case: Case) -> Caster:
     """Rays in `surface`."""
-    return Caster(surface(case))
+    return Caster(visible_surface(case))
 
 
-@until("F3D")
-@derived
-def nearest(case: Case) -> Nearest:
+@kept_until("F3D")
+@per_case
+def surface_nearest(case: Case) -> Nearest:
     """Distances to `surface`."""
-    return Nearest(surface(case))
+    return Nearest(visible_surface(case))
+
+
+def cell_numbers(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, " n"]:
+    """A whole number for the cube that each point lies in."""
+    index = np.floor(points / edge).astype(np.int64) + (1 << 20)
+    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]

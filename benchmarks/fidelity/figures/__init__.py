@@ -1,50 +1,49 @@
-"""The figures of a judgement, one file a theme; each is left out, with its reason, where what it shows is not there."""
+"""The figures of a report; a figure whose material is missing is left out with its reason."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import matplotlib
+import matplotlib.pyplot as plt
+
+from benchmarks.fidelity.figures.errors import (
+    draw_depth_maps,
+    draw_error_distribution,
+    draw_errors_along,
+    draw_mismatch,
+    draw_projections,
+    draw_sections,
+    draw_signed_errors,
+)
+from benchmarks.fidelity.figures.sheet import Draw, Sheet, draw_categories, draw_controls, draw_sweep
+from benchmarks.fidelity.figures.tunnel import (
+    draw_axis,
+    draw_degeneracy,
+    draw_free_space,
+    draw_persistence,
+    draw_range_image,
+    draw_sensor_distributions,
+)
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.figure import Figure
 
-from benchmarks.fidelity.case import Case
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """What figures draw from.
-
-    Attributes:
-        case: What was judged.
-        null: The same with the null tube in its place.
-        report: See `report.content`.
-        controls: Rows of controls; may be empty.
-        sweep: Rows of the sweep; may be empty.
-    """
-
-    case: Case
-    null: Case
-    report: dict[str, Any]
-    controls: list[dict[str, Any]]
-    sweep: list[dict[str, Any]]
-
-    def note(self, n: int | None = None) -> str:
-        """What every caption ends with: samples, seed, split."""
-        hold = self.report["split"]["hold"]
-        split = (
-            f"held out: {hold['file']}" if hold and hold["file"] else "held-out beams" if hold else "nothing held out"
-        )
-        return (
-            f" n = {n:,}." if n is not None else ""
-        ) + f" Seed {self.report['seed']}; {split}; split {self.report['split']['rule']}."
-
-
-Drawn = tuple[Figure, str]
-Draw = Callable[[Sheet], Drawn | None]
+FIGURES: tuple[tuple[str, Draw], ...] = (
+    ("F13-categories", draw_categories),
+    ("F14-controls", draw_controls),
+    ("F15-sweep", draw_sweep),
+    ("F01-voxels", draw_projections),
+    ("F02-mismatch", draw_mismatch),
+    ("F03-signed-error", draw_signed_errors),
+    ("F04-along-chainage", draw_errors_along),
+    ("F05-sections", draw_sections),
+    ("F06-depth-maps", draw_depth_maps),
+    ("F07-distribution", draw_error_distribution),
+    ("F08-range-image", draw_range_image),
+    ("F09-sensor", draw_sensor_distributions),
+    ("F10-persistence", draw_persistence),
+    ("F11-free-space", draw_free_space),
+    ("F12-degeneracy", draw_degeneracy),
+    ("F16-axis", draw_axis),
+)
 
 
 def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
@@ -62,7 +61,7 @@ def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
     with plt.rc_context(
         {"svg.hashsalt": "subterra", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
     ):
-        for name, draw in _figures():
+        for name, draw in FIGURES:
             try:
                 drawn = draw(sheet)
             except Exception as error:  # a recording that shows too little, or a spoilt candidate, costs its own figure
@@ -78,34 +77,3 @@ def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
             plt.close(figure)
             written[name] = (folder / f"{name}.png", caption)
     return written
-
-
-def _figures() -> Iterator[tuple[str, Draw]]:
-    from benchmarks.fidelity.figures import (
-        axis,
-        beams,
-        degeneracy,
-        errors,
-        freespace,
-        scores,
-        sections,
-        topology,
-        voxels,
-    )
-
-    yield "F13-categories", scores.categories
-    yield "F14-controls", scores.heat_map
-    yield "F15-sweep", scores.strips
-    yield "F01-voxels", voxels.projections
-    yield "F02-mismatch", voxels.mismatch
-    yield "F03-signed-error", errors.unrolled
-    yield "F04-along-chainage", errors.along
-    yield "F05-sections", sections.overlays
-    yield "F06-depth-maps", sections.depth_maps
-    yield "F07-distribution", errors.distribution
-    yield "F08-range-image", beams.range_image
-    yield "F09-sensor", beams.distributions
-    yield "F10-persistence", topology.diagrams
-    yield "F11-free-space", freespace.plan
-    yield "F12-degeneracy", degeneracy.along
-    yield "F16-axis", axis.plan_and_profile

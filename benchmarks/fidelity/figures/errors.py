@@ -1,23 +1,39 @@
-"""Distances of held-out points to the mesh: where, along the tunnel, and how distributed."""
+"""Figures of the surface: distances, cross-sections, voxels."""
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.patches import Patch
 
-from benchmarks.fidelity.derive.beams import returns, synthetic
-from benchmarks.fidelity.derive.distances import thinned, to_mesh
-from benchmarks.fidelity.derive.noise import real_planes
-from benchmarks.fidelity.derive.surface import nearest
-from benchmarks.fidelity.figures import Drawn, Sheet
-from benchmarks.fidelity.figures.style import BLUE, DIVERGING, GREY, INK, ORANGE, RED, binned
+from benchmarks.fidelity.derive.axis import reference_curve
+from benchmarks.fidelity.derive.beams import cast_beams, returns, synthetic_points
+from benchmarks.fidelity.derive.clouds import real_planes
+from benchmarks.fidelity.derive.distances import VOXEL_EDGE, mesh_distances, occupied_voxels, thinned_rows
+from benchmarks.fidelity.derive.sections import sections
+from benchmarks.fidelity.derive.surface import surface_nearest
+from benchmarks.fidelity.figures.sheet import (
+    AGREE,
+    BLUE,
+    DIVERGING,
+    GREY,
+    INK,
+    ONLY_CLOUD,
+    ONLY_MESH,
+    ORANGE,
+    RED,
+    Drawn,
+    Sheet,
+    bin_along,
+)
 
 _LIMIT = 5.0  # cm
 
 
-def unrolled(sheet: Sheet) -> Drawn | None:
+def draw_signed_errors(sheet: Sheet) -> Drawn | None:
     """F3: signed distance over chainage and angle."""
     if sheet.case.hold is None:
         return None
-    found, local = to_mesh(sheet.case), returns(sheet.case).local[thinned(sheet.case)]
+    found, local = mesh_distances(sheet.case), returns(sheet.case).local[thinned_rows(sheet.case)]
     figure, axes = plt.subplots(figsize=(12, 3.6), layout="constrained")
     middle = np.median(local[:, 2])
     angle = np.degrees(np.arctan2(local[:, 2] - middle, local[:, 1]))
@@ -34,23 +50,23 @@ def unrolled(sheet: Sheet) -> Drawn | None:
     )
 
 
-def along(sheet: Sheet) -> Drawn | None:
+def draw_errors_along(sheet: Sheet) -> Drawn | None:
     """F4: mean and 95th percentile of the distance along the tunnel, with the null tube."""
     if sheet.case.hold is None:
         return None
     figure, axes = plt.subplots(figsize=(12, 3.2), layout="constrained")
-    found, null = to_mesh(sheet.case), to_mesh(sheet.null)
+    found, null = mesh_distances(sheet.case), mesh_distances(sheet.null)
     width = max(1.0, float(np.ptp(found.station)) / 120)
-    x, mean = binned(found.station, 100 * found.distance, width, np.mean)
-    _, low = binned(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 25))
-    _, high = binned(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 75))
-    _, p95 = binned(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 95))
+    x, mean = bin_along(found.station, 100 * found.distance, width, np.mean)
+    _, low = bin_along(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 25))
+    _, high = bin_along(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 75))
+    _, p95 = bin_along(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 95))
     axes.fill_between(x, low, high, color=BLUE, alpha=0.2, label="middle half")
     axes.plot(x, mean, color=BLUE, label="mean")
     axes.plot(x, p95, color=BLUE, ls="--", lw=1, label="95th percentile")
-    axes.plot(*binned(null.station, 100 * null.distance, width, np.mean), color=GREY, label="null tube, mean")
+    axes.plot(*bin_along(null.station, 100 * null.distance, width, np.mean), color=GREY, label="null tube, mean")
     axes.plot(
-        *binned(null.station, 100 * null.distance, width, lambda v: np.percentile(v, 95)),
+        *bin_along(null.station, 100 * null.distance, width, lambda v: np.percentile(v, 95)),
         color=GREY,
         ls="--",
         lw=1,
@@ -63,17 +79,17 @@ def along(sheet: Sheet) -> Drawn | None:
     )
 
 
-def distribution(sheet: Sheet) -> Drawn | None:
+def draw_error_distribution(sheet: Sheet) -> Drawn | None:
     """F7: histogram and distribution of the distance, with the recording's own noise and the self-cast curve."""
     if sheet.case.hold is None:
         return None
-    own = synthetic(sheet.case)[thinned(sheet.case)]
+    own = synthetic_points(sheet.case)[thinned_rows(sheet.case)]
     own = own[np.isfinite(own).all(axis=1)][:20_000]
     curves = (
-        ("held-out points", 100 * to_mesh(sheet.case).distance, BLUE, "-"),
-        ("held-out points, null tube", 100 * to_mesh(sheet.null).distance, GREY, "-"),
+        ("held-out points", 100 * mesh_distances(sheet.case).distance, BLUE, "-"),
+        ("held-out points, null tube", 100 * mesh_distances(sheet.null).distance, GREY, "-"),
         ("noise of the recording itself", 100 * np.abs(real_planes(sheet.case).residual), ORANGE, "--"),
-        ("self-cast: synthetic points to the same mesh", 100 * nearest(sheet.case).query(own)[0], RED, ":"),
+        ("self-cast: synthetic points to the same mesh", 100 * surface_nearest(sheet.case).query(own)[0], RED, ":"),
     )
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
     for label, values, colour, style in curves:
@@ -91,3 +107,198 @@ def distribution(sheet: Sheet) -> Drawn | None:
         "Distances to the mesh. The self-cast curve is the range noise alone and says nothing of the tunnel."
         + sheet.note(len(curves[0][1])),
     )
+
+
+_SLICE = 0.15  # m
+_MAP_CELL = (0.10, 2.0)  # m, deg
+
+
+def draw_sections(sheet: Sheet) -> Drawn | None:
+    """F5: reconstruction, reference and held-out points at eight stations."""
+    if sheet.case.hold is None and sheet.case.truth is None:
+        return None
+    found = sections(sheet.case)
+    rows = np.linspace(0, len(found.station) - 1, 10).astype(int)[1:-1]
+    local = None if sheet.case.hold is None else reference_curve(sheet.case).local(returns(sheet.case).points)
+    figure, axes = plt.subplots(2, 4, figsize=(12, 6.6), layout="constrained", sharex=True, sharey=True)
+    count = 0
+    for axis, row in zip(axes.flat, rows, strict=True):
+        if local is not None:
+            near = local[np.abs(local[:, 0] - found.station[row]) < _SLICE]
+            count += len(near)
+            axis.plot(near[:, 1], near[:, 2], ".", color=ORANGE, ms=1.2, rasterized=True)
+        wall, real = found.judged[row], found.reference[row]
+        c, s = np.cos(found.angle), np.sin(found.angle)
+        axis.fill(
+            np.append(wall * c, (real * c)[::-1]), np.append(wall * s, (real * s)[::-1]), color=RED, alpha=0.25, lw=0
+        )
+        axis.plot(real * c, real * s, color=INK, lw=0.9)
+        axis.plot(wall * c, wall * s, color=BLUE, lw=0.9)
+        axis.set(title=f"{found.station[row]:.1f} m", aspect="equal")
+    names = (("reconstruction", BLUE), ("reference", INK), ("held-out points", ORANGE), ("between the two", RED))
+    figure.legend(
+        handles=[plt.Line2D([], [], color=c, label=n) for n, c in names],
+        loc="outside lower center",
+        ncol=4,
+        frameon=False,
+    )
+    for axis in axes[1]:
+        axis.set(xlabel="left, m")
+    for axis in axes[:, 0]:
+        axis.set(ylabel="up, m")
+    return figure, "Cross-sections; shaded: over- and under-break between reconstruction and reference." + sheet.note(
+        count
+    )
+
+
+def draw_depth_maps(sheet: Sheet) -> Drawn | None:
+    """F6: radii along held-out beams unrolled: candidate, recording, difference; the smooth part removed."""
+    if sheet.case.hold is None:
+        return None
+    real, cast = returns(sheet.case), cast_beams(sheet.case)
+    reach = np.where(cast.hit, cast.range, np.nan)[:, None]
+    path_scale = (reach[:, 0] - real.range)[:, None]
+    figure, axes = plt.subplots(3, 1, figsize=(12, 7), layout="constrained", sharex=True)
+    radius = np.hypot(real.local[:, 1], real.local[:, 2] - np.median(real.local[:, 2]))
+    outward = radius + path_scale[:, 0] * np.clip(_outward_share(real), 0, 1)
+    angle = np.degrees(np.arctan2(real.local[:, 2] - np.median(real.local[:, 2]), real.local[:, 1]))
+    maps = [_cell_means(real.local[:, 0], angle, values) for values in (outward, radius)]
+    smooth = [m - _running_median(m) for m in maps]
+    pictures = (("reconstruction", smooth[0]), ("recording", smooth[1]), ("difference", maps[0] - maps[1]))
+    extent = [real.local[:, 0].min(), real.local[:, 0].max(), -180, 180]
+    for axis, (name, picture) in zip(axes, pictures, strict=True):
+        shown = axis.imshow(
+            100 * picture.T,
+            origin="lower",
+            extent=extent,
+            aspect="auto",
+            cmap=DIVERGING,
+            vmin=-12,
+            vmax=12,
+            interpolation="nearest",
+        )
+        axis.set_facecolor(GREY)
+        axis.set(ylabel=f"{name}\nangle, deg", yticks=(-180, -90, 0, 90, 180))
+    axes[-1].set(xlabel="station, m")
+    figure.colorbar(shown, ax=axes, label="cm outward", shrink=0.5)
+    return figure, "Lining unrolled in cells of 10 cm by 2 degrees, smooth part removed; grey: not seen." + sheet.note(
+        len(radius)
+    )
+
+
+def _outward_share(real) -> np.ndarray:
+    away = real.local[:, 1:] - np.array([0.0, np.median(real.local[:, 2])])
+    away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    return np.einsum("ij,ij->i", real.heading[:, 1:], away)
+
+
+def _cell_means(station: np.ndarray, angle: np.ndarray, values: np.ndarray) -> np.ndarray:
+    shape = (int(np.ptp(station) / _MAP_CELL[0]) + 1, int(360 / _MAP_CELL[1]))
+    i = np.minimum(((station - station.min()) / _MAP_CELL[0]).astype(int), shape[0] - 1)
+    j = np.minimum(((angle + 180) / _MAP_CELL[1]).astype(int), shape[1] - 1)
+    good = np.isfinite(values)
+    flat = i[good] * shape[1] + j[good]
+    total, count = (np.bincount(flat, weights, shape[0] * shape[1]) for weights in (values[good], None))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
+
+
+def _running_median(values: np.ndarray, half: int = 12) -> np.ndarray:
+    padded = np.pad(values, ((half, half), (0, 0)), constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
+    known = np.isfinite(windows).any(axis=-1)
+    return np.where(known, np.nanmedian(np.where(known[..., None], windows, 0.0), axis=-1), np.nan)
+
+
+_PLANES = (("station, m", "left, m", 2), ("station, m", "up, m", 1), ("left, m", "up, m", 0))
+
+
+def draw_projections(sheet: Sheet) -> Drawn | None:
+    """F1: occupied voxels of the mesh as held-out beams see it, summed along each axis."""
+    if sheet.case.hold is None:
+        return None
+    grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance
+    low = _low_corner(sheet, grids)
+    figure, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained", width_ratios=(3, 3, 1.4))
+    for axis, (x, y, along) in zip(axes, _PLANES, strict=True):
+        total = grids.first.sum(axis=along).astype(float)
+        rest = [k for k in range(3) if k != along]
+        extent = [
+            low[rest[0]],
+            low[rest[0]] + edge * total.shape[0],
+            low[rest[1]],
+            low[rest[1]] + edge * total.shape[1],
+        ]
+        aspect = "equal" if along == 0 else "auto"
+        picture = axis.imshow(
+            np.where(total > 0, total, np.nan).T,
+            origin="lower",
+            extent=extent,
+            aspect=aspect,
+            cmap="viridis",
+            norm=LogNorm(1),
+        )
+        axis.set(xlabel=x, ylabel=y)
+        figure.colorbar(picture, ax=axis, shrink=0.8, label="voxels" if along == 0 else None)
+    return (
+        figure,
+        f"Occupied voxels of {edge * 100:.0f} cm of the bore's shell, summed along the third axis."
+        + sheet.note(int(grids.first.sum())),
+    )
+
+
+def draw_mismatch(sheet: Sheet) -> Drawn | None:
+    """F2: agreement by voxel from the side, and unrolled."""
+    if sheet.case.hold is None:
+        return None
+    grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance
+    low = _low_corner(sheet, grids)
+    figure, (side, unrolled) = plt.subplots(2, 1, figsize=(12, 5.4), layout="constrained", sharex=True)
+    colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
+    picture = _agreement_classes(np.asarray(grids.real.any(axis=1)), np.asarray(grids.first.any(axis=1)))
+    extent = [low[0], low[0] + edge * picture.shape[0], low[2], low[2] + edge * picture.shape[1]]
+    side.imshow(
+        picture.T, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=0, vmax=2, interpolation="nearest"
+    )
+    side.set(ylabel="up, m")
+    rolled = _unroll_classes(grids, low, edge)
+    extent = [low[0], low[0] + edge * rolled.shape[0], -180, 180]
+    unrolled.imshow(
+        rolled.T, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=0, vmax=2, interpolation="nearest"
+    )
+    unrolled.set(ylabel="angle from left\ntowards up, deg", xlabel="station, m", yticks=(-180, -90, 0, 90, 180))
+    names = (("both", AGREE), ("mesh only", ONLY_MESH), ("held-out cloud only", ONLY_CLOUD))
+    side.legend(
+        handles=[Patch(color=c, label=n) for n, c in names],
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1.22),
+        ncol=3,
+        frameon=False,
+    )
+    both, either = int((grids.real & grids.first).sum()), int((grids.real | grids.first).sum())
+    return (
+        figure,
+        f"Voxels of {edge * 100:.0f} cm: from the side and unrolled. {both / max(either, 1):.1%} agree."
+        + sheet.note(either),
+    )
+
+
+def _low_corner(sheet: Sheet, grids) -> np.ndarray:
+    real, edge = returns(sheet.case), VOXEL_EDGE * sheet.case.tolerance
+    low = [grids.station[0] - 0.5 * edge]
+    first = np.argwhere(grids.real).min(axis=0)
+    return np.array(low + [edge * (np.floor(real.local[:, k].min() / edge) - first[k]) for k in (1, 2)])
+
+
+def _agreement_classes(real: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    return np.where(real & mesh, 0.0, np.where(mesh, 1.0, np.where(real, 2.0, np.nan)))
+
+
+def _unroll_classes(grids, low: np.ndarray, edge: float, sectors: int = 90) -> np.ndarray:
+    real, mesh = (np.zeros((grids.real.shape[0], sectors), bool) for _ in range(2))
+    for target, grid in ((real, grids.real), (mesh, grids.first)):
+        index = np.argwhere(grid)
+        place = low[1:] + edge * (index[:, 1:] + 0.5)
+        middle = np.median(low[1:] + edge * (np.argwhere(grids.real)[:, 1:] + 0.5), axis=0)
+        angle = np.arctan2(place[:, 1] - middle[1], place[:, 0] - middle[0])
+        target[index[:, 0], np.floor((angle + np.pi) / (2 * np.pi) * sectors).astype(int) % sectors] = True
+    return _agreement_classes(real, mesh)

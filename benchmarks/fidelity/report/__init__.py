@@ -1,20 +1,206 @@
-"""What a judgement is written as: JSON, CSV, HTML, Markdown, JUnit, figures."""
+"""The report as plain data, and all its forms: JSON, CSV, HTML, Markdown, JUnit, figures."""
 
-from dataclasses import replace
+import platform
+import subprocess
+from dataclasses import asdict, replace
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fidelity import store
-from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.figures import Sheet, draw_all
+from benchmarks.fidelity import judge, scoring, table
+from benchmarks.fidelity.case import Case, code_hash
+from benchmarks.fidelity.controls.runner import is_bold, list_jobs
+from benchmarks.fidelity.figures import draw_all
+from benchmarks.fidelity.figures.sheet import Sheet
+from benchmarks.fidelity.files import write_json
+from benchmarks.fidelity.impostors import null_tube
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
-from benchmarks.fidelity.null import null_tube
-from benchmarks.fidelity.report import page, tables
-from benchmarks.fidelity.report.content import content
+from benchmarks.fidelity.report import forms
+from benchmarks.fidelity.scoring import Score
+from benchmarks.fidelity.table import Metric
+
+SOURCE = "Subterra: An Open-Source Validated Benchmark for GNSS-Denied Tunnel Navigation"
 
 
-def write(
+def paper_rows(judgement: Judgement, controls: list[dict[str, Any]] | None = None) -> list[dict[str, Any]]:
+    """One row a number: what it is, the paper's, ours, unit, evidence class and what it says."""
+    base = judgement.values["base"]
+    scored = judgement.scored["base"]
+
+    def ours(id: str, factor: float = 1.0) -> float | None:
+        value = base[id].value
+        return None if value is None else factor * value
+
+    null = judgement.scored["null"].overall
+    counts = f"{len(scored.categories)} / {len(base)}"
+    return [
+        _paper_row("global score", 97.1, scored.overall, "%", "mixed", f"over {scored.evaluated} of "
+                   f"{len(scored.categories)} categories; the null tube has {_score_text(null)}"),
+        _paper_row("categories / metrics", "18 / 199", counts, "", "-", "same counts"),
+        _paper_row("cloud to mesh, mean, cloud cast in the same mesh", 2.46, ours("selfcast_p2s_mean", 100.0), "cm",
+                   "C", "by construction: range noise alone, alike for any mesh; logged, never scored"),
+        _paper_row("the same within 10 cm", 97.5, ours("selfcast_within_10cm", 100.0), "%", "C",
+                   "by construction, as above"),
+        _paper_row("cloud to mesh, mean, held-out points", 2.46, ours("c2m_mean", 100.0), "cm", "H",
+                   "the comparable claim, on points that the builder never read"),
+        _paper_row("the same within 10 cm", 97.5, ours("c2m_within_10cm", 100.0), "%", "H", "held-out points"),
+        _paper_row("the same, null tube", None, _value_of(judgement, "null", "c2m_mean", 100.0), "cm", "H",
+                   "what a constant tube on the right axis gets"),
+    ]  # fmt: skip
+
+
+def _paper_row(what: str, paper: Any, here: Any, unit: str, evidence: str, note: str) -> dict[str, Any]:
+    return {"what": what, "paper": paper, "here": here, "unit": unit, "evidence": evidence, "note": note}
+
+
+def _value_of(judgement: Judgement, name: str, id: str, factor: float) -> float | None:
+    value = judgement.values[name][id].value
+    return None if value is None else factor * value
+
+
+def _score_text(value: float | None) -> str:
+    return "none" if value is None else f"{value:.1f}"
+
+
+SCHEMA = "subterra.fidelity/1"
+VERSIONS = ("mujoco", "mujoco-mjx", "jax", "numpy", "scipy", "trimesh", "embreex", "shapely", "scikit-image",
+            "scikit-learn", "manifold3d", "gudhi", "small-gicp",
+            "pymeshlab", "py4dgeo", "connected-components-3d")  # fmt: skip
+
+
+def report_content(
+    case: Case,
+    inputs: Inputs,
+    judgement: Judgement,
+    controls: list[dict[str, Any]] | None = None,
+    sweep: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Everything that `report.json` holds.
+
+    Args:
+        case: What was judged and against what.
+        inputs: As the command resolved them.
+        judgement: Of the case.
+        controls: Rows of `verdicts.rows` where controls were run.
+        sweep: Summary of the sweep where it was run.
+    """
+    scored, null = judgement.scored["base"], judgement.scored["null"]
+    worst = min((v, c) for c, v in scored.categories.items() if v is not None) if scored.evaluated else (None, None)
+    rows = controls or []
+    return {
+        "schema": SCHEMA,
+        "title": report_title(case),
+        "name": case.candidate.name,
+        "verdict": judgement.verdict,
+        "reasons": judgement.reasons,
+        "global": scored.overall,
+        "categories_evaluated": scored.evaluated,
+        "global_evidence": scored.evidence,
+        "global_null": null.overall,
+        "lead_over_null": None if scored.overall is None or null.overall is None else scored.overall - null.overall,
+        "median_skill": judgement.skill,
+        "worst_category": {"category": worst[1], "score": worst[0]},
+        "failed_gates": list(scored.failed_gates),
+        "saturated_frac": scored.saturated,
+        "strict": inputs.strict,
+        "leaks": judgement.leaks,
+        "split": _split_entry(case, inputs),
+        "seed": inputs.seed,
+        "thresholds_hash": table.thresholds_hash(),
+        "code_hash": code_hash(),
+        "commit": _commit(),
+        "versions": _versions(),
+        "config": asdict(inputs.hold),
+        "paper": paper_rows(judgement),
+        "categories": {
+            name: {"name": words, "score": scored.categories[name], "null": null.categories[name],
+                   "ceiling": _ceiling_score(judgement, name)}
+            for name, words in table.categories().items()
+        },
+        "metrics": [_metric_entry(row, judgement) for row in table.load().values()],
+        "controls": {
+            "run": len(rows),
+            "complete": _all_bold(rows),
+            "undetected": judge.undetected(rows),
+            "loud": judge.loud(rows),
+        } if controls is not None else None,
+        "sweep": sweep,
+    }  # fmt: skip
+
+
+def report_title(case: Case) -> str:
+    """`Fidelity` where something was held out or is known, else what it is."""
+    return "Fidelity" if case.hold is not None or case.truth is not None else "Self-consistency"
+
+
+def _all_bold(rows: list[dict[str, Any]]) -> bool:
+    """Whether every control was run at every dose that must fail."""
+    asked = {(job.control, job.dose) for job in list_jobs() if is_bold(job)}
+    return asked <= {(row["id"], row["dose"]) for row in rows}
+
+
+def _metric_entry(row: Metric, judgement: Judgement) -> dict[str, Any]:
+    score = judgement.scored["base"].scores[row.id]
+    value = score.value
+    null, ceiling = (
+        judgement.values[name][row.id].value if name in judgement.values else None for name in ("null", "ceiling")
+    )
+    return {
+        "id": row.id, "category": row.category, "definition": row.definition, "value": value.value, "unit": row.unit,
+        "ci95": value.interval, "n": value.n, "score": score.score, "role": row.role, "evidence": row.evidence,
+        "map": table.map_text(row.map), "null_value": null, "ceiling_value": ceiling,
+        "skill": scoring.skill(value.value, null, ceiling), "status": _status(row, score), "reason": value.reason,
+    }  # fmt: skip
+
+
+def _status(row: Metric, score: Score) -> str:
+    if score.value.failed:
+        return "failed"
+    if score.value.value is None:
+        return "missing"
+    if "C" in row.evidence:
+        return "by construction"
+    if row.role == "G" and (score.score or 0.0) < scoring.GATE_FLOOR:
+        return "gate failed"
+    return "scored" if row.scored else "logged"
+
+
+def _ceiling_score(judgement: Judgement, name: str) -> float | None:
+    return judgement.scored["ceiling"].categories[name] if "ceiling" in judgement.scored else None
+
+
+def _split_entry(case: Case, inputs: Inputs) -> dict[str, Any]:
+    hold = case.hold
+    given = case.candidate.manifest.get("inputs", [])
+    return {
+        "builder": [{"file": entry.get("file"), "sha256": entry.get("sha256")} for entry in given],
+        "hold": None if hold is None else {
+            "file": inputs.recording.name if inputs.recording else "", "sha256": hold.hash, "sensor": hold.sensor,
+            "sigma": hold.sigma, "beams": len(hold.range), "scans": len(set(hold.scan.tolist())),
+        },
+        "truth": None if case.truth is None else "generator",
+        "rule": "cross-sensor" if hold is not None and case.fit is not None else "as given",
+    }  # fmt: skip
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in VERSIONS:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _commit() -> str | None:
+    here = Path(__file__).parent
+    done = subprocess.run(["git", "-C", str(here), "rev-parse", "HEAD"], capture_output=True, text=True)
+    return done.stdout.strip() or None
+
+
+def write_report(
     folder: Path,
     case: Case,
     inputs: Inputs,
@@ -32,16 +218,16 @@ def write(
         controls: Rows of controls where they were run.
         swept: What `sweep.json` holds where the sweep was run.
     """
-    made = content(case, inputs, judgement, controls, swept["summary"] if swept else None)
+    made = report_content(case, inputs, judgement, controls, swept["summary"] if swept else None)
     rows = controls or []
-    store.write_json(folder / "report.json", made)
-    tables.write_metrics(folder, made)
-    tables.write_categories(folder, made)
-    tables.write_controls(folder, rows)
-    tables.write_sweep(folder, swept["rows"] if swept else [])
-    tables.write_junit(folder, made)
+    write_json(folder / "report.json", made)
+    forms.write_metrics(folder, made)
+    forms.write_categories(folder, made)
+    forms.write_controls(folder, rows)
+    forms.write_sweep(folder, swept["rows"] if swept else [])
+    forms.write_junit(folder, made)
     null = replace(case, candidate=null_tube(case.candidate), cache={})
     figures = draw_all(folder / "figures", Sheet(case, null, made, rows, swept["rows"] if swept else []))
-    page.write_markdown(folder, made)
-    page.write_html(folder, made, figures, rows)
+    forms.write_markdown(folder, made)
+    forms.write_html(folder, made, figures, rows)
     return made

@@ -5,10 +5,9 @@ from functools import cache
 
 import trimesh
 
-from benchmarks.fidelity import registry, table
+from benchmarks.fidelity import scoring, table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.scoring import score_one
-from benchmarks.fidelity.value import Value
+from benchmarks.fidelity.registry import Value, all_metrics, compute_metric
 from tests.benchmarks.fidelity import tube
 
 BEAMS = 2000
@@ -29,14 +28,14 @@ def obstructed(size: float = 0.5) -> Case:
     return Case(replace(right.candidate, extra=box), right.hold, None, right.truth)
 
 
-def value(id: str, case: Case) -> Value:
+def measure(id: str, case: Case) -> Value:
     """One metric by its id, as the suite computes it."""
-    return registry.compute(case, id, registry.registered()[id])
+    return compute_metric(case, id, all_metrics()[id])
 
 
 def raw(id: str, case: Case) -> float:
     """Its raw value; fails where there is none."""
-    found = value(id, case)
+    found = measure(id, case)
     assert found.value is not None, f"{id}: {found.reason}"
     return found.value
 
@@ -45,7 +44,7 @@ def scores(category: str, case: Case) -> dict[str, float | None]:
     """Scores of a category's scored metrics."""
     rows = table.load()
     ids = [id for id, metric in rows.items() if metric.category == category and metric.scored]
-    return {id: score_one(rows[id], value(id, case)).score for id in ids}
+    return {id: scoring.score_one(rows[id], measure(id, case)).score for id in ids}
 
 
 def category(name: str, case: Case) -> float:

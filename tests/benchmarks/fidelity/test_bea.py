@@ -6,10 +6,10 @@ import trimesh
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.beams import paired
+from benchmarks.fidelity.derive.beams import cast_beams
 from benchmarks.fidelity.derive.surface import Caster
 from tests.benchmarks.fidelity import tube
-from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw, value
+from tests.benchmarks.fidelity.judged import category, judged, measure, obstructed, raw
 
 SIGMA = 0.02
 
@@ -17,7 +17,7 @@ SIGMA = 0.02
 def test_in_the_right_tube_nothing_but_the_range_noise_is_left():
     assert raw("beam_range_mae", judged()) == pytest.approx(SIGMA * np.sqrt(2 / np.pi), rel=0.03)
     assert raw("beam_range_medae", judged()) == pytest.approx(0.6745 * SIGMA, rel=0.03)
-    assert raw("beam_range_bias", judged()) < 4 * SIGMA / np.sqrt(len(paired(judged()).range))
+    assert raw("beam_range_bias", judged()) < 4 * SIGMA / np.sqrt(len(cast_beams(judged()).range))
     assert raw("beam_early_frac", judged()) == raw("beam_late_frac", judged()) == 0.0
 
 
@@ -47,7 +47,7 @@ def test_an_obstacle_is_early_and_a_missing_end_is_late():
     assert raw("beam_early_frac", obstructed()) > 0.005
     assert raw("beam_late_frac", obstructed()) == 0.0
     short = judged(length=14.0)
-    assert raw("beam_late_frac", short) == pytest.approx(np.mean(~paired(short).hit), abs=0.01)
+    assert raw("beam_late_frac", short) == pytest.approx(np.mean(~cast_beams(short).hit), abs=0.01)
     assert raw("beam_within_10cm", short) < 0.9
 
 
@@ -57,7 +57,7 @@ def test_a_spoilt_tube_scores_lower(spoilt):
 
 
 def test_returns_are_foreseen_where_the_recording_knows_its_silent_beams():
-    assert value("beam_return_bacc", judged()).value is None
+    assert measure("beam_return_bacc", judged()).value is None
     hold = judged().hold
     out = np.tile(tube.Tube().frames([0.0])[1], (300, 1)) * -1.0
     eye = np.repeat(hold.origin[:1], 300, axis=0)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.fidelity.candidate import load
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.invariance import INVARIANCES
-from benchmarks.fidelity.derive.surface import visible
-from benchmarks.fidelity.null import null_tube
+from benchmarks.fidelity.controls.catalogue import INVARIANCES
+from benchmarks.fidelity.derive.surface import visible_mesh
+from benchmarks.fidelity.impostors import null_tube
 from tests.benchmarks.fidelity import tubescene
 from tests.benchmarks.fidelity.tube import Tube
 
@@ -24,7 +24,7 @@ def with_slab(scene, group: int):
     text = path.read_text()
     path.write_text(text.replace("</worldbody>", SLAB.format(group=group) + "</worldbody>"))
     try:
-        return load(scene)
+        return load_candidate(scene)
     finally:
         path.write_text(text)
 
@@ -32,7 +32,7 @@ def with_slab(scene, group: int):
 def test_a_bed_that_the_scene_shows_is_seen(scene) -> None:
     judged = with_slab(scene, 0)
     np.testing.assert_allclose(judged.bed.bounds, [[1, -1.5, -2.1], [5, 1.5, -1.9]], atol=1e-6)
-    assert len(visible(judged).faces) == len(visible(load(scene)).faces) + 12
+    assert len(visible_mesh(judged).faces) == len(visible_mesh(load_candidate(scene)).faces) + 12
     assert len(null_tube(judged).bed.faces) == 12
     assert not len(null_tube(judged, sleepers=False).bed.faces)
 

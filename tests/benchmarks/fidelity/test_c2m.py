@@ -5,10 +5,10 @@ import pytest
 import trimesh
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.distances import to_mesh
+from benchmarks.fidelity.derive.distances import mesh_distances
 from benchmarks.fidelity.derive.surface import Nearest
 from tests.benchmarks.fidelity import tube
-from tests.benchmarks.fidelity.judged import category, judged, raw, value
+from tests.benchmarks.fidelity.judged import category, judged, measure, raw
 
 SIGMA = 0.02
 
@@ -29,7 +29,7 @@ def test_without_noise_the_distance_is_none():
 
 def test_walls_ten_centimetres_too_wide_lie_five_centimetres_off_behind_the_points():
     wide = tube.case(tube.Tube(), replace(tube.Tube(), width=5.7, depth=0.0), sigma=1e-6, beams=1200)
-    found = to_mesh(wide)
+    found = mesh_distances(wide)
     wall = found.sector % 4 == 0
     assert np.median(found.signed[wall]) == pytest.approx(0.05, abs=0.002)
     assert raw("c2m_sector_worst", wide) > 0.035
@@ -54,8 +54,8 @@ def test_a_constant_tube_without_pockets_is_farther_off():
 
 
 def test_the_gap_is_left_out_without_the_recording_that_was_fitted():
-    assert value("c2m_fit_hold_gap", judged()).value is None
-    assert not value("c2m_fit_hold_gap", judged()).failed
+    assert measure("c2m_fit_hold_gap", judged()).value is None
+    assert not measure("c2m_fit_hold_gap", judged()).failed
     right = judged()
     fitted = Case(right.candidate, right.hold, tube.hold(tube.Tube(), beams=600, seed=3), right.truth)
     assert raw("c2m_fit_hold_gap", fitted) < 0.002
@@ -67,7 +67,7 @@ def test_without_a_surface_the_metric_has_failed_and_is_not_missing():
     empty = judged().candidate.extra
     nothing = replace(judged().candidate, lining=empty, track=replace(
         judged().candidate.track, sleeper_mesh=empty, rail_mesh=empty, fastening_mesh=empty))  # fmt: skip
-    assert value("c2m_mean", Case(nothing, judged().hold)).failed
+    assert measure("c2m_mean", Case(nothing, judged().hold)).failed
 
 
 def test_distances_agree_with_trimesh():

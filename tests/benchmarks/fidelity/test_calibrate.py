@@ -4,21 +4,21 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.fidelity import calibrate, evidence, table
-from benchmarks.fidelity.evidence import Survey
-from benchmarks.fidelity.report.content import map_text
+from benchmarks.fidelity import table
+from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.table import Metric
-from benchmarks.fidelity.value import Value
+from benchmarks.fidelity.tools import calibrate
+from benchmarks.fidelity.tools.calibrate import Survey
 
-ROWS = evidence.draft()
+ROWS = calibrate.draft_table()
 
 
 def at(share: float, **single: float) -> dict[str, Value]:
     """Every metric at a share of its good end's distance from the ideal; some at a value."""
     made = {}
     for id, row in ROWS.items():
-        good, _ = evidence.ends(row.map)
-        placed = evidence.moved(row.map, share * good, 1.0)
+        good, _ = calibrate.map_ends(row.map)
+        placed = calibrate.move_ends(row.map, share * good, 1.0)
         made[id] = Value(placed.good + row.map.target if row.map.kind == "B" else placed.good)
         if row.map.kind == "P":
             made[id] = Value(1.0)
@@ -37,7 +37,7 @@ def distant(row: Metric) -> float:
 
 
 def moves(*surveys: Survey) -> dict[str, tuple[Metric, str]]:
-    return calibrate.calibrated(ROWS, {}, list(surveys))
+    return calibrate.calibrate(ROWS, {}, list(surveys))
 
 
 def test_nothing_moves_where_the_truth_reaches_every_good_end() -> None:
@@ -83,8 +83,8 @@ def test_a_null_tube_as_good_as_the_truth_moves_nothing() -> None:
 
 
 def test_what_was_decided_by_hand_is_kept_with_its_reason_and_no_rule_touches_it() -> None:
-    decided = evidence.decided(ROWS)
-    found = calibrate.calibrated(ROWS, decided, [survey(at(5.0))])
+    decided = calibrate.decided_rows(ROWS)
+    found = calibrate.calibrate(ROWS, decided, [survey(at(5.0))])
     for id, (row, reason) in decided.items():
         assert reason
         assert found[id] == (row, reason)
@@ -97,7 +97,7 @@ def test_a_metric_that_does_not_see_the_control_stays() -> None:
 
 def test_what_was_moved_reads_back_from_the_text_of_its_map() -> None:
     for row in table.load().values():
-        assert table.parse_map(map_text(row)) == row.map, row.id
+        assert table.parse_map(table.map_text(row.map)) == row.map, row.id
 
 
 def test_a_threshold_is_not_tightened_beyond_what_an_invariance_moves_it() -> None:

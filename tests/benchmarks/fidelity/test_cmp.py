@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.derive.beams import returns
-from benchmarks.fidelity.derive.observed import phantom
+from benchmarks.fidelity.derive.distances import phantom_cells
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
 
@@ -27,7 +27,7 @@ def test_missing_surface_is_the_share_of_returns_beyond_the_end():
 def test_an_obstacle_that_beams_pass_through_is_extra_surface():
     found = raw("extra_surface_frac", obstructed())
     assert found > 0.003
-    assert found == np.mean(phantom(obstructed()))
+    assert found == np.mean(phantom_cells(obstructed()))
     assert raw("comp_10cm", obstructed()) < raw("comp_10cm", judged())
     assert raw("hausdorff_p99", obstructed()) >= raw("hausdorff_p99", judged())
 

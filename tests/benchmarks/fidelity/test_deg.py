@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.aliasing import real_alias
-from benchmarks.fidelity.derive.hessian import real_frames
-from benchmarks.fidelity.derive.planarscan import localised
+from benchmarks.fidelity.derive.degeneracy import localised_stations, real_alias, real_information
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import category, judged, raw
 
@@ -23,7 +21,7 @@ def test_the_right_tube_is_as_degenerate_as_the_real_one():
 
 
 def test_a_straight_smooth_tube_tells_nothing_along_its_axis():
-    frames = real_frames(tube.case(SMOOTH, sigma=1e-4, beams=2000))
+    frames = real_information(tube.case(SMOOTH, sigma=1e-4, beams=2000))
     assert np.median(frames.axial) < 1e-3
     axis = SMOOTH.frames([9.0])[1][0]
     assert np.median(np.abs(frames.weakest @ axis)) > 0.999
@@ -32,7 +30,7 @@ def test_a_straight_smooth_tube_tells_nothing_along_its_axis():
 
 def test_sleepers_tell_the_axis():
     bare, laid = (tube.case(replace(SMOOTH, track=laid), sigma=1e-3, beams=2000) for laid in (False, True))
-    assert np.median(real_frames(laid).axial) > 5 * np.median(real_frames(bare).axial)
+    assert np.median(real_information(laid).axial) > 5 * np.median(real_information(bare).axial)
 
 
 def test_a_scan_fits_as_well_elsewhere_in_a_smooth_tube_and_nowhere_else_in_a_wavy_one():
@@ -67,10 +65,10 @@ def _planar(path, walls, lining="smooth"):
 
 def test_a_planar_scan_is_lost_between_smooth_walls_and_found_between_pilasters(tmp_path):
     straight = [np.array([[0.0, side], [20.0, side]]) for side in (2.5, -2.5)]
-    assert not localised(_planar(tmp_path / "smooth.npz", straight)).any()
+    assert not localised_stations(_planar(tmp_path / "smooth.npz", straight)).any()
     x = np.repeat(np.arange(0.0, 20.5, 1.0), 2)
     step = np.tile([0.0, 0.5, 0.5, 0.0], len(x) // 4 + 1)[: len(x)]
     stepped = [np.column_stack([x, side * (2.0 + step)]) for side in (1, -1)]
     pilasters = _planar(tmp_path / "pockets.npz", stepped, "pockets")
-    assert localised(pilasters).mean() > 0.5
-    assert raw("deg_planar_axial_info", pilasters) == localised(pilasters).mean()
+    assert localised_stations(pilasters).mean() > 0.5
+    assert raw("deg_planar_axial_info", pilasters) == localised_stations(pilasters).mean()

@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.derive.mapstats import voxelised, wasserstein
-from benchmarks.fidelity.derive.noise import mean_entropy, planes
-from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw, value
+from benchmarks.fidelity.derive.clouds import fit_planes, mean_entropy, voxel_map, voxel_wasserstein
+from tests.benchmarks.fidelity.judged import category, judged, measure, obstructed, raw
 
 
 def test_the_right_tube_gives_the_same_distributions():
@@ -18,7 +17,7 @@ def test_the_right_tube_gives_the_same_distributions():
 def test_a_moved_cloud_is_as_far_in_wasserstein_as_it_was_moved():
     rng = np.random.default_rng(0)
     cloud = rng.uniform(0.15, 0.35, (400, 3)) + np.repeat(0.5 * np.arange(4), 100)[:, None] * [1.0, 0.0, 0.0]
-    key, distance = wasserstein(voxelised(cloud, 0.5), voxelised(cloud + np.array([0.03, -0.04, 0.0]), 0.5))
+    key, distance = voxel_wasserstein(voxel_map(cloud, 0.5), voxel_map(cloud + np.array([0.03, -0.04, 0.0]), 0.5))
     assert len(key) == 4
     np.testing.assert_allclose(distance, 0.05, atol=1e-6)
 
@@ -27,8 +26,8 @@ def test_a_cloud_twice_as_rough_is_as_far_as_its_roughness():
     rng = np.random.default_rng(1)
     flat = rng.uniform(0.05, 0.45, (200_000, 3)) * [1.0, 1.0, 0.0]
     noise = rng.normal(size=len(flat))[:, None] * [0.0, 0.0, 1.0]
-    smooth, rough = (voxelised(flat + 0.25 * np.array([0, 0, 1.0]) + sigma * noise, 0.5) for sigma in (0.01, 0.03))
-    _, distance = wasserstein(smooth, rough)
+    smooth, rough = (voxel_map(flat + 0.25 * np.array([0, 0, 1.0]) + sigma * noise, 0.5) for sigma in (0.01, 0.03))
+    _, distance = voxel_wasserstein(smooth, rough)
     np.testing.assert_allclose(distance, 0.02, atol=1e-4)
 
 
@@ -42,7 +41,7 @@ def test_the_entropy_of_a_normal_cloud_is_its_formula():
 def test_a_local_plane_knows_its_normal_and_its_noise():
     rng = np.random.default_rng(3)
     cloud = np.column_stack([rng.uniform(-1, 1, (5000, 2)), 0.01 * rng.normal(size=5000)])
-    found = planes(cloud, cKDTree(cloud), cloud[:2000])
+    found = fit_planes(cloud, cKDTree(cloud), cloud[:2000])
     assert np.median(np.abs(found.normal[:, 2])) > 0.99
     assert np.median(found.sigma) == pytest.approx(0.01, rel=0.1)
     assert np.median(found.residual) == pytest.approx(0.00674, rel=0.1)
@@ -54,8 +53,8 @@ def test_a_wider_tube_shifts_the_distribution(id):
 
 
 def test_what_is_not_recorded_is_missing():
-    assert value("dropout_diff", judged()).value is None
-    assert not value("dropout_diff", judged()).failed
+    assert measure("dropout_diff", judged()).value is None
+    assert not measure("dropout_diff", judged()).failed
 
 
 @pytest.mark.parametrize("id", ["mme_diff", "noise_sigma_diff", "scs_diff"])

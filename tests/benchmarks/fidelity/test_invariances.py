@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import registry, table
+from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.invariance import INVARIANCES
+from benchmarks.fidelity.controls.catalogue import INVARIANCES
+from benchmarks.fidelity.registry import all_metrics, compute_metric
 from tests.benchmarks.fidelity import tube
 
 WATCHED = ("c2m_mean", "beam_range_mae", "cl_lateral_rmse", "sec_width_rmse", "mesh_orientation_frac", "trk_sleeper_f1")
@@ -17,8 +18,8 @@ def base() -> Case:
 
 
 def scores(case: Case) -> dict[str, float | None]:
-    entries, rows = registry.registered(), table.load()
-    return {id: rows[id].map.score(registry.compute(case, id, entries[id]).value or 0.0) for id in WATCHED}
+    entries, rows = all_metrics(), table.load()
+    return {id: rows[id].map.score(compute_metric(case, id, entries[id]).value or 0.0) for id in WATCHED}
 
 
 @pytest.mark.parametrize("control", INVARIANCES)

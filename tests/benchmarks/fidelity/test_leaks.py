@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.fidelity import leaks
+from benchmarks.fidelity import judge
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls import references
-from benchmarks.fidelity.value import Value
+from benchmarks.fidelity.controls.damage import forge_recording, leak_hold
+from benchmarks.fidelity.registry import Value
 from scene.build import BuildConfig, build
 from scene.survey.config import SurveyConfig
 from scene.survey.simulate import simulate
@@ -26,35 +26,37 @@ def case() -> Case:
 
 def test_a_clean_split_has_no_leak(case: Case) -> None:
     other = tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)
-    assert leaks.find(replace(case, fit=other, cache={}), GOOD, case.hold.hash) == []
+    assert judge.find_leaks(replace(case, fit=other, cache={}), GOOD, case.hold.hash) == []
 
 
 def test_nothing_held_out_is_no_leak(case: Case) -> None:
-    assert leaks.find(replace(case, hold=None), {}) == []
+    assert judge.find_leaks(replace(case, hold=None), {}) == []
 
 
 def test_the_noise_of_the_recording_is_found(case: Case) -> None:
-    sigma = leaks.plane_noise(case.hold, np.random.default_rng(0))
+    sigma = judge.plane_noise(case.hold, np.random.default_rng(0))
     assert 0.4 * 0.02 < sigma < 1.3 * 0.02  # a beam meets the wall aslant, so less of its noise is across the plane
 
 
 def test_shared_points_are_duplicates(case: Case) -> None:
-    assert leaks.duplicates(case.hold, case.hold) == 1.0
-    assert leaks.duplicates(case.hold, tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)) == 0.0
+    assert judge.duplicate_share(case.hold, case.hold) == 1.0
+    assert (
+        judge.duplicate_share(case.hold, tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)) == 0.0
+    )
 
 
 def test_mesh_samples_without_noise_are_no_recording(case: Case) -> None:
-    forged = references.sampled_from_mesh(case, 0.0, np.random.default_rng(0))
-    assert any("scatter" in found for found in leaks.find(forged, {"c2m_median": Value(0.0)}))
+    forged = forge_recording(case, 0.0, np.random.default_rng(0))
+    assert any("scatter" in found for found in judge.find_leaks(forged, {"c2m_median": Value(0.0)}))
 
 
 def test_mesh_samples_with_noise_are_told_by_their_provenance(case: Case) -> None:
-    forged = references.sampled_from_mesh(case, 0.02, np.random.default_rng(0))
-    assert any("hash is another" in found for found in leaks.find(forged, GOOD, case.hold.hash))
+    forged = forge_recording(case, 0.02, np.random.default_rng(0))
+    assert any("hash is another" in found for found in judge.find_leaks(forged, GOOD, case.hold.hash))
 
 
 def test_a_builder_that_read_the_held_out_recording_is_caught(case: Case) -> None:
-    found = leaks.find(references.builder_read_hold(case), GOOD)
+    found = judge.find_leaks(leak_hold(case), GOOD)
     assert any("builder read the held-out recording" in one for one in found)
     assert any("duplicates" in one for one in found)
 
@@ -63,7 +65,7 @@ def test_a_builder_that_read_the_held_out_recording_is_caught(case: Case) -> Non
 def test_the_builder_opens_only_its_own_recording(tmp_path: Path) -> None:
     simulate(SurveyConfig(out=tmp_path, length=24.0, sensors=("avia", "vlp16"), point_rate=60_000), Console())
     given = tmp_path / "groundtruth.tum"
-    with leaks.opened_files() as opened:
+    with judge.opened_files() as opened:
         build(tmp_path / "survey.bag", tmp_path / "scene", given, BuildConfig())
     inside = {
         path.name for path in opened if path.is_relative_to(tmp_path) and not path.is_relative_to(tmp_path / "scene")
@@ -75,7 +77,7 @@ def test_the_builder_opens_only_its_own_recording(tmp_path: Path) -> None:
 def test_the_hook_sees_what_is_opened(tmp_path: Path) -> None:
     file = tmp_path / "seen"
     file.write_text("x")
-    with leaks.opened_files() as opened:
+    with judge.opened_files() as opened:
         file.read_text()
     assert file in opened
     other = tmp_path / "later"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.fidelity.categories import msh
 from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import measure
 
 SHORT = tube.Tube(length=6.0)
 
@@ -29,43 +29,45 @@ def both(change):
 
 
 PASSING = [
-    msh.mesh_finite, msh.mesh_watertight, msh.mesh_winding_consistent, msh.mesh_is_volume, msh.mesh_manifold_status,
+    "mesh_finite", "mesh_watertight", "mesh_winding_consistent", "mesh_is_volume", "mesh_manifold_status",
 ]  # fmt: skip
 SHARES = [
-    msh.mesh_boundary_unexpected, msh.mesh_nonmanifold_edges, msh.mesh_duplicate_faces, msh.mesh_degenerate_faces,
-    msh.mesh_self_intersections,
+    "mesh_boundary_unexpected", "mesh_nonmanifold_edges", "mesh_duplicate_faces", "mesh_degenerate_faces",
+    "mesh_self_intersections",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("metric", PASSING)
-def test_a_sound_tube_passes(metric):
-    assert metric(good()).value == 1.0
+@pytest.mark.parametrize("id", PASSING)
+def test_a_sound_tube_passes(id):
+    assert measure(id, good()).value == 1.0
 
 
-@pytest.mark.parametrize("metric", SHARES)
-def test_a_sound_tube_has_nothing_wrong(metric):
-    assert metric(good()).value == 0.0
+@pytest.mark.parametrize("id", SHARES)
+def test_a_sound_tube_has_nothing_wrong(id):
+    assert measure(id, good()).value == 0.0
 
 
 def test_all_of_a_sound_lining_looks_at_the_axis():
-    assert msh.mesh_orientation_frac(good()).value == 1.0
+    assert measure("mesh_orientation_frac", good()).value == 1.0
 
 
 def test_a_dropped_face_opens_the_solid_and_shows_as_a_rim():
     case = both(lambda mesh: remade(mesh, np.delete(mesh.faces, 777, axis=0)))
-    assert msh.mesh_watertight(case).value == 0.0
-    assert msh.mesh_is_volume(case).value == 0.0
-    assert msh.mesh_manifold_status(case).value == 0.0
+    assert measure("mesh_watertight", case).value == 0.0
+    assert measure("mesh_is_volume", case).value == 0.0
+    assert measure("mesh_manifold_status", case).value == 0.0
     edges = trimesh.Trimesh(good().candidate.lining.vertices, good().candidate.lining.faces, process=False)
     rim = np.linalg.norm(np.diff(edges.triangles[777][[0, 1, 2, 0]], axis=0), axis=1).sum()
-    assert msh.mesh_boundary_unexpected(case).value == pytest.approx(rim / edges.edges_unique_length.sum(), rel=1e-2)
+    assert measure("mesh_boundary_unexpected", case).value == pytest.approx(
+        rim / edges.edges_unique_length.sum(), rel=1e-2
+    )
 
 
 def test_an_inside_out_mesh_is_consistent_yet_no_volume_and_turned_away():
     case = both(lambda mesh: remade(mesh, mesh.faces[:, ::-1]))
-    assert msh.mesh_winding_consistent(case).value == 1.0
-    assert msh.mesh_orientation_frac(case).value == 0.0
-    assert msh.mesh_is_volume(case).value == 0.0
+    assert measure("mesh_winding_consistent", case).value == 1.0
+    assert measure("mesh_orientation_frac", case).value == 0.0
+    assert measure("mesh_is_volume", case).value == 0.0
 
 
 def test_a_tenth_of_the_faces_turned_breaks_winding_and_costs_a_tenth_of_the_area():
@@ -73,21 +75,21 @@ def test_a_tenth_of_the_faces_turned_breaks_winding_and_costs_a_tenth_of_the_are
     flip = good().candidate.lining.faces.copy()
     flip[turned] = flip[turned][:, ::-1]
     case = spoiled(lining=remade(good().candidate.lining, flip))
-    assert msh.mesh_winding_consistent(case).value == 0.0
-    assert msh.mesh_orientation_frac(case).value == pytest.approx(0.9, abs=0.02)
+    assert measure("mesh_winding_consistent", case).value == 0.0
+    assert measure("mesh_orientation_frac", case).value == pytest.approx(0.9, abs=0.02)
 
 
 def test_repeated_faces_are_counted():
     lining = good().candidate.lining
     case = spoiled(lining=remade(lining, np.concatenate([lining.faces, lining.faces[:50, [1, 0, 2]]])))
-    assert msh.mesh_duplicate_faces(case).value == pytest.approx(50 / (len(lining.faces) + 50))
-    assert msh.mesh_nonmanifold_edges(case).value > 0.0
+    assert measure("mesh_duplicate_faces", case).value == pytest.approx(50 / (len(lining.faces) + 50))
+    assert measure("mesh_nonmanifold_edges", case).value > 0.0
 
 
 def test_a_needle_is_degenerate():
     lining = good().candidate.lining
     case = spoiled(lining=remade(lining, np.concatenate([lining.faces, [[3, 3, 9]]])))
-    assert msh.mesh_degenerate_faces(case).value == pytest.approx(1 / (len(lining.faces) + 1))
+    assert measure("mesh_degenerate_faces", case).value == pytest.approx(1 / (len(lining.faces) + 1))
 
 
 def test_a_fin_through_the_wall_cuts_it():
@@ -97,20 +99,22 @@ def test_a_fin_through_the_wall_cuts_it():
     fin[2, 2] += 0.3
     faces = np.concatenate([lining.faces, [len(lining.vertices) + np.arange(3)]])
     case = spoiled(lining=trimesh.Trimesh(np.concatenate([lining.vertices, fin]), faces, process=False))
-    assert msh.mesh_self_intersections(case).value >= 2 / len(faces)
+    assert measure("mesh_self_intersections", case).value >= 2 / len(faces)
 
 
 def test_a_vertex_that_is_no_number_fails():
     lining = good().candidate.lining.copy()
     lining.vertices[5, 1] = np.nan
-    assert msh.mesh_finite(spoiled(lining=lining)).value == 0.0
+    assert measure("mesh_finite", spoiled(lining=lining)).value == 0.0
 
 
 def test_the_volume_is_that_of_the_sections_and_a_scaled_solid_is_off_by_its_cube():
-    assert msh.mesh_volume_vs_sections(good()).value < 0.2
+    assert measure("mesh_volume_vs_sections", good()).value < 0.2
     solid = good().candidate.solid.copy()
     solid.apply_scale(1.05)
-    assert msh.mesh_volume_vs_sections(spoiled(solid=solid)).value == pytest.approx(100 * (1 - 1.05**-3), abs=0.2)
+    assert measure("mesh_volume_vs_sections", spoiled(solid=solid)).value == pytest.approx(
+        100 * (1 - 1.05**-3), abs=0.2
+    )
 
 
 def test_a_mesh_that_went_through_a_format_without_shared_corners_is_judged_the_same():
@@ -119,5 +123,5 @@ def test_a_mesh_that_went_through_a_format_without_shared_corners_is_judged_the_
         return trimesh.Trimesh(soup, np.arange(len(soup)).reshape(-1, 3), process=False)
 
     case = both(torn)
-    assert [metric(case).value for metric in PASSING] == [1.0] * len(PASSING)
-    assert msh.mesh_boundary_unexpected(case).value == 0.0
+    assert [measure(id, case).value for id in PASSING] == [1.0] * len(PASSING)
+    assert measure("mesh_boundary_unexpected", case).value == 0.0

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.fidelity.categories import nav
-from benchmarks.fidelity.derive import ground
+from benchmarks.fidelity.derive.ground import cell_steps, judged_ground
 from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import measure
 from tests.benchmarks.fidelity.tube import Tube
 
 TUBE = Tube(length=12.0)
@@ -26,53 +26,53 @@ def with_box(left):
 
 def test_a_true_copy_drives_like_the_truth():
     case = judged()
-    assert nav.nav_path_exists(case).value == 1.0
-    assert nav.nav_path_len_ratio(case).value == 1.0
-    assert nav.nav_path_dev_p95(case).value == 0.0
-    assert nav.nav_feasible_agree(case).value == 1.0
-    assert nav.nav_traversable_iou(case).value == 1.0
-    assert nav.nav_blocked_diff(case).value == 0.0
+    assert measure("nav_path_exists", case).value == 1.0
+    assert measure("nav_path_len_ratio", case).value == 1.0
+    assert measure("nav_path_dev_p95", case).value == 0.0
+    assert measure("nav_feasible_agree", case).value == 1.0
+    assert measure("nav_traversable_iou", case).value == 1.0
+    assert measure("nav_blocked_diff", case).value == 0.0
 
 
 def test_rails_keep_the_robot_between_them():
-    shown = ground.judged_ground(judged())
+    shown = judged_ground(judged())
     assert not shown.traversable[:, np.abs(np.abs(shown.left) - 0.75) < 0.06].any()
     assert shown.traversable[:, np.abs(shown.left) < 0.45].all()
 
 
 def test_without_rails_the_whole_floor_is_driven():
     case = tube.case(TUBE, replace(TUBE, track=False))
-    assert nav.nav_drivable_width_mae(case).value > 0.5
-    assert nav.nav_traversable_iou(case).value < 0.9
+    assert measure("nav_drivable_width_mae", case).value > 0.5
+    assert measure("nav_traversable_iou", case).value < 0.9
 
 
 def test_a_box_between_the_rails_blocks_the_way():
     case = with_box(0.0)
-    assert nav.nav_path_exists(case).value == 0.0
-    assert nav.nav_path_len_ratio(case).failed
-    assert nav.nav_blocked_diff(case).value >= 1.0
-    assert nav.nav_feasible_agree(case).value < 1.0
+    assert measure("nav_path_exists", case).value == 0.0
+    assert measure("nav_path_len_ratio", case).failed
+    assert measure("nav_blocked_diff", case).value >= 1.0
+    assert measure("nav_feasible_agree", case).value < 1.0
 
 
 def test_a_thin_wall_across_the_bore_blocks_the_way():
     corners = TUBE.point([6.0] * 4, [-4.0, 4.0, 4.0, -4.0], [-4.0, -4.0, 4.0, 4.0])
     wall = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
     case = replace(judged(), candidate=replace(judged().candidate, extra=wall), cache={})
-    assert nav.nav_path_exists(case).value == 0.0
-    assert nav.nav_feasible_agree(case).value < 0.97
+    assert measure("nav_path_exists", case).value == 0.0
+    assert measure("nav_feasible_agree", case).value < 0.97
 
 
 def test_a_box_beside_the_rails_does_not():
     case = with_box(1.9)
-    assert nav.nav_path_exists(case).value == 1.0
-    assert nav.nav_blocked_diff(case).value == 0.0
-    assert nav.nav_traversable_iou(case).value < 0.99
+    assert measure("nav_path_exists", case).value == 1.0
+    assert measure("nav_blocked_diff", case).value == 0.0
+    assert measure("nav_traversable_iou", case).value < 0.99
 
 
 def test_a_step_is_the_largest_difference_to_a_neighbour():
     height = np.zeros((3, 4))
     height[:, 3] = 0.2
-    found = ground.steps(height)
+    found = cell_steps(height)
     assert np.isnan(found[:, [0, 3]]).all()
     assert found[1, 2] == pytest.approx(0.2)
     assert found[1, 1] == 0.0
@@ -80,5 +80,5 @@ def test_a_step_is_the_largest_difference_to_a_neighbour():
 
 def test_the_recording_alone_shows_a_way():
     case = replace(judged(), truth=None, cache={})
-    assert nav.nav_path_len_ratio(case).value == pytest.approx(1.0, abs=0.05)
-    assert nav.nav_traversable_iou(case).value > 0.6
+    assert measure("nav_path_len_ratio", case).value == pytest.approx(1.0, abs=0.05)
+    assert measure("nav_traversable_iou", case).value > 0.6

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import noreturn
+from benchmarks.fidelity.references import SILENT_RANGE, beam_directions, is_organised, organised_scans
 
 POINT = np.dtype({
     "names": ["x", "y", "z", "t", "ring"], "formats": ["<f4", "<f4", "<f4", "<u4", "u1"],
@@ -48,7 +48,7 @@ def recording(points, height=RINGS):
 @pytest.mark.parametrize("sense", [-1, 1])
 def test_a_silent_beam_looked_where_its_ring_and_column_look(sense):
     look, points = sweep(sense)
-    found, known = noreturn.directions(points, (points != 0).any(axis=2))
+    found, known = beam_directions(points, (points != 0).any(axis=2))
     assert known.all()
     np.testing.assert_allclose(found, look, atol=1e-6)
 
@@ -56,22 +56,22 @@ def test_a_silent_beam_looked_where_its_ring_and_column_look(sense):
 def test_a_ring_that_never_came_back_looks_nobody_knows_where():
     _, points = sweep()
     points[3] = 0.0
-    assert (~noreturn.directions(points, (points != 0).any(axis=2))[1]).nonzero()[0].tolist() == [3] * COLUMNS
+    assert (~beam_directions(points, (points != 0).any(axis=2))[1]).nonzero()[0].tolist() == [3] * COLUMNS
 
 
 def test_a_sweep_keeps_every_beam_in_the_order_of_time():
     look, points = sweep()
-    (scan,) = noreturn.scans(recording(points))
+    (scan,) = organised_scans(recording(points))
     reach = np.linalg.norm(scan.points, axis=1)
-    silent = reach > 0.5 * noreturn.SILENT
+    silent = reach > 0.5 * SILENT_RANGE
     assert len(reach) == RINGS * COLUMNS
     assert silent.sum() == (points == 0).all(axis=2).sum()
     assert (np.diff(scan.times) >= 0).all()
     expected = look.transpose(1, 0, 2).reshape(-1, 3)
-    np.testing.assert_allclose(scan.points[silent] / noreturn.SILENT, expected[silent], atol=1e-6)
+    np.testing.assert_allclose(scan.points[silent] / SILENT_RANGE, expected[silent], atol=1e-6)
 
 
 def test_only_rings_by_columns_count_as_organised():
     _, points = sweep()
-    assert noreturn.organised(recording(points))
-    assert not noreturn.organised(recording(points, height=1))
+    assert is_organised(recording(points))
+    assert not is_organised(recording(points, height=1))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import registry, table
+from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.ceiling import truth_candidate
-from benchmarks.fidelity.null import null_tube
+from benchmarks.fidelity.impostors import null_tube, truth_candidate
+from benchmarks.fidelity.registry import all_metrics, compute_metric
 from tests.benchmarks.fidelity import tube
 
 
@@ -16,7 +16,7 @@ def case() -> Case:
 
 
 def score(case: Case, id: str) -> float:
-    return table.load()[id].map.score(registry.compute(case, id, registry.registered()[id]).value or 0.0)
+    return table.load()[id].map.score(compute_metric(case, id, all_metrics()[id]).value or 0.0)
 
 
 def judged(case: Case, candidate: object) -> Case:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.path import sensor_path
-from benchmarks.fidelity.derive.voxels import EDGE, Occupied, dilated, occupied, tolerant
+from benchmarks.fidelity.derive.beams import sensor_path
+from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, dilate, occupied_voxels, tolerant_f1
 from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
 
 
@@ -18,9 +18,9 @@ def test_the_right_tube_reaches_the_ceiling_that_noise_leaves():
 
 
 def test_two_draws_differ_in_noise_alone():
-    grids = occupied(judged())
+    grids = occupied_voxels(judged())
     assert (grids.first != grids.second).any()
-    assert (dilated(grids.first) & grids.second).sum() > 0.999 * grids.second.sum()
+    assert (dilate(grids.first) & grids.second).sum() > 0.999 * grids.second.sum()
 
 
 def test_f1_by_hand():
@@ -28,14 +28,14 @@ def test_f1_by_hand():
     real[:3, 2, 2] = True
     first[:2, 2, 3] = True  # beside the first two, one voxel off
     first[5, 2, 2] = True  # alone
-    grids = Occupied(real, first, first, real | first, np.arange(6) * EDGE)
-    assert tolerant(grids, np.zeros(6, int))[0] == pytest.approx(2 * 1.0 * (2 / 3) / (1.0 + 2 / 3))
-    np.testing.assert_allclose(tolerant(grids, np.array([0, 0, 0, 1, 1, 1])), [1.0, 0.0], atol=1e-9)
+    grids = Occupied(real, first, first, real | first, np.arange(6) * VOXEL_EDGE)
+    assert tolerant_f1(grids, np.zeros(6, int))[0] == pytest.approx(2 * 1.0 * (2 / 3) / (1.0 + 2 / 3))
+    np.testing.assert_allclose(tolerant_f1(grids, np.array([0, 0, 0, 1, 1, 1])), [1.0, 0.0], atol=1e-9)
 
 
 @pytest.mark.parametrize("id", ["vox_iou_norm", "vox_precision", "vox_recall", "vox_kappa", "vox_proj_iou_yz"])
 def test_a_shift_of_a_voxel_lowers(id):
-    assert raw(id, judged(shift=(EDGE, 0.0))) < raw(id, judged()) - 0.1
+    assert raw(id, judged(shift=(VOXEL_EDGE, 0.0))) < raw(id, judged()) - 0.1
 
 
 def test_an_obstacle_is_a_mismatch_in_the_interior():

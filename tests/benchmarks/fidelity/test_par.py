@@ -3,12 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import candidate
+from benchmarks.fidelity import table
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.categories import par
-from benchmarks.fidelity.derive import episodes, mjxscene, planarenv
-from benchmarks.fidelity.table import load
+from benchmarks.fidelity.derive import planar
+from benchmarks.fidelity.derive.contact import contact_depths
 from tests.benchmarks.fidelity import tubescene
+from tests.benchmarks.fidelity.judged import measure
 from tests.benchmarks.fidelity.tube import Tube, hold
 
 SHORT = Tube(length=9.0, track=False, variation=0.0)
@@ -17,7 +18,7 @@ DEVICE = ("mjx_put_model", "mjx_contact_parity", "mjx_traj_divergence")
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    return Case(candidate.load(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", SHORT)))
+    return Case(load_candidate(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", SHORT)))
 
 
 @pytest.fixture
@@ -27,35 +28,35 @@ def wider(good, tmp_path):
     return Case(replace(good.candidate, tunnel=other / "tunnel.npz"))
 
 
-@pytest.mark.parametrize("id", [row.id for row in load().values() if row.category == "PAR" and row.scored])
+@pytest.mark.parametrize("id", [row.id for row in table.load().values() if row.category == "PAR" and row.scored])
 def test_a_sound_scene_scores_full_marks(good, id):
-    value = getattr(par, id)(good)
-    assert load()[id].map.score(value.value) > 95.0, value
+    value = measure(id, good)
+    assert table.load()[id].map.score(value.value) > 95.0, value
 
 
 def test_the_robot_is_placed_on_both_sides_of_first_contact(good):
-    ours, _ = mjxscene.contacts(good)
+    ours, _ = contact_depths(good)
     assert 0.2 < np.mean(ours < 0.0) < 0.9
 
 
 def test_an_environment_on_a_wider_tunnel_sees_it_wider(wider, good):
-    assert par.env_lidar_vs_mesh(wider).value > 0.09
-    assert par.mjx_ray_parity(wider).value > 0.09
-    further = planarenv.observed_ranges(wider) - planarenv.observed_ranges(good)
+    assert measure("env_lidar_vs_mesh", wider).value > 0.09
+    assert measure("mjx_ray_parity", wider).value > 0.09
+    further = planar.observed_ranges(wider) - planar.observed_ranges(good)
     abreast = np.where(further > 1e-3, further, np.inf).min(axis=1)  # of the beam that meets a wall most squarely
     assert np.median(abreast) == pytest.approx(0.1, abs=0.02)
 
 
 def test_noise_of_another_size_is_told(good, monkeypatch):
-    monkeypatch.setattr(planarenv, "noise", lambda case: np.random.default_rng(0).normal(scale=0.08, size=100_000))
-    assert par.env_noise_sigma_err(good).value == pytest.approx(0.03, abs=1e-3)
+    monkeypatch.setattr(planar, "range_noise", lambda case: np.random.default_rng(0).normal(scale=0.08, size=100_000))
+    assert measure("env_noise_sigma_err", good).value == pytest.approx(0.03, abs=1e-3)
 
 
 def test_an_environment_that_does_not_repeat_fails(good, monkeypatch):
     drawn = np.random.default_rng(0)
-    monkeypatch.setattr(episodes, "_episode", lambda case, actions: drawn.normal(size=(65, 18)))
-    monkeypatch.setattr(episodes, "repeats", episodes.repeats.__wrapped__)
-    assert par.env_determinism(good).value == 0.0
+    monkeypatch.setattr(planar, "_observe_episode", lambda case, actions: drawn.normal(size=(65, 18)))
+    monkeypatch.setattr(planar, "repeated_observations", planar.repeated_observations.__wrapped__)
+    assert measure("env_determinism", good).value == 0.0
 
 
 def test_a_scene_that_mjx_refuses_fails(good, tmp_path):
@@ -63,14 +64,14 @@ def test_a_scene_that_mjx_refuses_fails(good, tmp_path):
     path = good.candidate.folder / "ellipsoid.xml"
     shape = 'type="ellipsoid" size="0.3 0.2 0.3" mass="20" contype="3" conaffinity="3"'
     path.write_text(text.replace('type="sphere" size="0.3" mass="20" contype="0" conaffinity="3"', shape))
-    value = par.mjx_put_model(Case(replace(good.candidate, scene=path)))
+    value = measure("mjx_put_model", Case(replace(good.candidate, scene=path)))
     assert value.value == 0.0
     assert value.reason
 
 
 def test_without_odometry_of_its_own_the_drift_has_nothing_to_be_compared_with(good):
     case = replace(good, hold=hold(SHORT))
-    assert par.env_odom_drift_ratio(case).value is None
+    assert measure("env_odom_drift_ratio", case).value is None
 
 
 def test_drift_is_compared_with_the_recordings_own_odometry(good, tmp_path):
@@ -81,4 +82,4 @@ def test_drift_is_compared_with_the_recordings_own_odometry(good, tmp_path):
     rows[:, 1:4] = heard.origin[first] * 1.02  # two metres in a hundred
     np.savetxt(tmp_path / "odometry.tum", rows)
     case = replace(good, hold=heard, candidate=replace(good.candidate, folder=tmp_path))
-    assert par.env_odom_drift_ratio(case).value == pytest.approx(0.0, abs=0.15)
+    assert measure("env_odom_drift_ratio", case).value == pytest.approx(0.0, abs=0.15)

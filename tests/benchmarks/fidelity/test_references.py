@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fidelity.errors import FidelityError
+from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.references import TRUTH_SCHEMA, Truth, load_truth
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.tube import Tube

@@ -2,11 +2,11 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.fidelity import candidate
+from benchmarks.fidelity import table
+from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.categories import scn
-from benchmarks.fidelity.table import load
 from tests.benchmarks.fidelity import tubescene
+from tests.benchmarks.fidelity.judged import measure
 from tests.benchmarks.fidelity.tube import Tube
 
 SHORT = Tube(length=12.0)
@@ -14,7 +14,7 @@ SHORT = Tube(length=12.0)
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    return Case(candidate.load(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", SHORT)))
+    return Case(load_candidate(tubescene.write(tmp_path_factory.mktemp("scene") / "tube", SHORT)))
 
 
 @pytest.fixture
@@ -31,46 +31,46 @@ def rewritten(good, tmp_path):
     return rewrite
 
 
-@pytest.mark.parametrize("id", [row.id for row in load().values() if row.category == "SCN" and row.scored])
+@pytest.mark.parametrize("id", [row.id for row in table.load().values() if row.category == "SCN" and row.scored])
 def test_a_sound_scene_scores_full_marks(good, id):
-    value = getattr(scn, id)(good)
-    assert load()[id].map.score(value.value) == 100.0, value
+    value = measure(id, good)
+    assert table.load()[id].map.score(value.value) == 100.0, value
 
 
 def test_the_step_rate_is_measured(good):
-    assert scn.mj_step_rate(good).value > 100.0
+    assert measure("mj_step_rate", good).value > 100.0
 
 
 def test_a_scene_that_does_not_compile_fails(rewritten):
-    assert scn.mj_compiles(rewritten('type="sphere"', 'type="no-such"')).value == 0.0
+    assert measure("mj_compiles", rewritten('type="sphere"', 'type="no-such"')).value == 0.0
 
 
 def test_a_bore_that_collides_as_one_mesh_is_full_of_its_convex_hull(rewritten):
     case = rewritten('mesh="lining" contype="0"', 'mesh="lining" contype="1"')
-    assert scn.mj_probe_free_frac(case).value == 0.0
-    assert scn.mj_wall_contact_err(case).value > 1.0
-    assert scn.mj_ray_vs_mesh_mae(case).value < 1e-3  # rays alone would not notice
+    assert measure("mj_probe_free_frac", case).value == 0.0
+    assert measure("mj_wall_contact_err", case).value > 1.0
+    assert measure("mj_ray_vs_mesh_mae", case).value < 1e-3  # rays alone would not notice
 
 
 def test_panels_off_by_a_hand_are_touched_too_late(tmp_path):
-    off = Case(candidate.load(tubescene.write(tmp_path / "tube", SHORT, panels_off=0.10)))
-    assert scn.mj_wall_contact_err(off).value == pytest.approx(0.10, abs=0.01)
+    off = Case(load_candidate(tubescene.write(tmp_path / "tube", SHORT, panels_off=0.10)))
+    assert measure("mj_wall_contact_err", off).value == pytest.approx(0.10, abs=0.01)
 
 
 def test_a_shifted_lining_is_off_by_its_shift(rewritten):
     case = rewritten('name="lining_000" type="mesh"', 'name="lining_000" pos="0 0 0.05" type="mesh"')
-    assert scn.mj_frame_err(case).value == pytest.approx(0.05, abs=1e-3)
-    assert 0.01 < scn.mj_ray_vs_mesh_mae(case).value < 0.5
+    assert measure("mj_frame_err", case).value == pytest.approx(0.05, abs=1e-3)
+    assert 0.01 < measure("mj_ray_vs_mesh_mae", case).value < 0.5
 
 
 def test_a_lining_left_out_lets_rays_through(rewritten):
     case = rewritten('name="lining_000" type="mesh"', 'name="lining_000" group="4" type="mesh"')
-    assert scn.mj_ray_leak_rate(case).value > 0.5
+    assert measure("mj_ray_leak_rate", case).value > 0.5
 
 
 def test_a_sleeper_less_than_the_manifest_says_is_told(rewritten):
     case = rewritten('name="sleeper_0003"', 'name="plank"')
-    value = scn.mj_manifest_match(case)
+    value = measure("mj_manifest_match", case)
     assert value.value == 0.0
     assert "sleepers: 19 of 20" in value.reason
 
@@ -78,15 +78,15 @@ def test_a_sleeper_less_than_the_manifest_says_is_told(rewritten):
 def test_a_robot_heavier_than_it_states_is_invalid(rewritten):
     heavier = '</freejoint><inertial pos="0 0 0" mass="25" diaginertia="1 1 1"/>'
     case = rewritten("<freejoint/>", heavier.replace("</freejoint>", "<freejoint/>"))
-    assert scn.mj_inertia_valid(case).value == 0.0
+    assert measure("mj_inertia_valid", case).value == 0.0
 
 
 def test_a_scene_without_a_robot_fails_the_step(rewritten):
     with pytest.raises(ValueError, match="moves freely"):
-        scn.mj_step_finite(rewritten("<freejoint/>", ""))
+        measure("mj_step_finite", rewritten("<freejoint/>", ""))
 
 
 def test_what_does_not_change_is_not_computed_again(good, monkeypatch):
-    before = scn.mj_wall_contact_err(good).value
-    monkeypatch.setattr("benchmarks.fidelity.derive.probe.Probe", None)
-    assert scn.mj_wall_contact_err(Case(good.candidate)).value == before
+    before = measure("mj_wall_contact_err", good).value
+    monkeypatch.setattr("benchmarks.fidelity.derive.contact.Probe", None)
+    assert measure("mj_wall_contact_err", Case(good.candidate)).value == before

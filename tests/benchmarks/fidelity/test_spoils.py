@@ -8,12 +8,11 @@ import trimesh
 
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls import catalogue
-from benchmarks.fidelity.controls.catalogue import Setting
-from benchmarks.fidelity.derive.surface import visible
+from benchmarks.fidelity.controls.catalogue import SPOIL, Setting, load_controls, spoil_case
+from benchmarks.fidelity.derive.surface import visible_mesh
 from tests.benchmarks.fidelity import tube
 
-NO_SCENE = sorted(set(catalogue.SPOIL) - {"N01", "N12", "N29", "N30", "N31", "N33"})
+NO_SCENE = sorted(set(SPOIL) - {"N01", "N12", "N29", "N30", "N31", "N33"})
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +21,7 @@ def base() -> Case:
 
 
 def spoil(case: Case, control: str, dose: float, scratch: Path = Path("unused")) -> Case:
-    return catalogue.spoiled(case, control, dose, Setting(np.random.default_rng(0), scratch, lambda: case.candidate))
+    return spoil_case(case, control, dose, Setting(np.random.default_rng(0), scratch, lambda: case.candidate))
 
 
 def candidate(case: Case, control: str, dose: float) -> Candidate:
@@ -30,9 +29,9 @@ def candidate(case: Case, control: str, dose: float) -> Candidate:
 
 
 def test_the_table_has_36_controls_and_each_has_a_function() -> None:
-    assert list(catalogue.load()) == [f"N{k:02d}" for k in range(1, 37)]
-    assert set(catalogue.SPOIL) == set(catalogue.load())
-    for control in catalogue.load().values():
+    assert list(load_controls()) == [f"N{k:02d}" for k in range(1, 37)]
+    assert set(SPOIL) == set(load_controls())
+    for control in load_controls().values():
         assert set(control.bold) <= set(control.doses)
         assert control.falls or "leak" in control.reason
 
@@ -40,7 +39,7 @@ def test_the_table_has_36_controls_and_each_has_a_function() -> None:
 @pytest.mark.parametrize("control", NO_SCENE)
 def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, control: str) -> None:
     before = base.candidate.lining.vertices.copy(), base.candidate.solid.faces.copy(), base.hold.origin.copy()
-    spoilt = spoil(base, control, catalogue.load()[control].bold[0])
+    spoilt = spoil(base, control, load_controls()[control].bold[0])
     np.testing.assert_array_equal(before[0], base.candidate.lining.vertices)
     np.testing.assert_array_equal(before[1], base.candidate.solid.faces)
     np.testing.assert_array_equal(before[2], base.hold.origin)
@@ -50,7 +49,7 @@ def test_a_control_changes_something_and_leaves_the_base_alone(base: Case, contr
 
 @pytest.mark.parametrize("control", NO_SCENE)
 def test_the_same_dose_gives_the_same_bytes(base: Case, control: str) -> None:
-    dose = catalogue.load()[control].bold[0]
+    dose = load_controls()[control].bold[0]
     one, other = spoil(base, control, dose), spoil(base, control, dose)
     np.testing.assert_array_equal(one.candidate.lining.vertices, other.candidate.lining.vertices)
     np.testing.assert_array_equal(one.hold.range, other.hold.range)
@@ -175,7 +174,7 @@ def test_permuted_poses_keep_every_beam(base: Case) -> None:
 def test_a_foreign_tunnel_is_brought_to_our_mouth(base: Case) -> None:
     other = tube.candidate(tube.Tube(heading=1.0, bend=70.0))
     setting = Setting(np.random.default_rng(0), Path("unused"), lambda: other)
-    spoilt = catalogue.spoiled(base, "N33", 1, setting)
+    spoilt = spoil_case(base, "N33", 1, setting)
     assert spoilt.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
     flat = spoilt.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
     assert flat == pytest.approx(1.0, abs=2e-3)
@@ -189,7 +188,7 @@ def test_nails_are_seen_move_with_the_pattern_and_go_with_their_pockets(base: Ca
     nail = trimesh.creation.icosphere(subdivisions=0, radius=0.02)
     nail.apply_translation(bore.position[row] + 2.7 * away)
     nailed = tube.spoiled(base, nails=nail)
-    assert len(visible(nailed.candidate).faces) == len(visible(base.candidate).faces) + len(nail.faces)
+    assert len(visible_mesh(nailed.candidate).faces) == len(visible_mesh(base.candidate).faces) + len(nail.faces)
     assert not len(candidate(nailed, "N25", 100).nails.faces)
     assert len(candidate(nailed, "N26", 2).nails.faces) == len(nail.faces)
     along = (candidate(nailed, "N26", 3).nails.centroid - nail.centroid) @ bore.tangent[row]

@@ -4,8 +4,9 @@ import math
 
 import pytest
 
-from benchmarks.fidelity import registry, table
-from benchmarks.fidelity.table import Map, parse_map
+from benchmarks.fidelity import table
+from benchmarks.fidelity.registry import all_metrics
+from benchmarks.fidelity.table import Map
 
 
 def test_there_are_18_categories_and_199_metrics_with_unique_ids() -> None:
@@ -23,7 +24,7 @@ def test_nothing_that_is_true_by_construction_is_scored() -> None:
 
 
 def test_every_metric_of_the_table_is_computed_by_something() -> None:
-    assert list(registry.registered()) == list(table.load())
+    assert list(all_metrics()) == list(table.load())
 
 
 def test_every_scored_metric_has_a_map_and_every_logged_one_has_none() -> None:
@@ -46,11 +47,11 @@ def test_every_scored_metric_has_a_map_and_every_logged_one_has_none() -> None:
     ],
 )
 def test_a_map_scores_as_the_specification_says(text: str, value: float, score: float) -> None:
-    assert parse_map(text).score(value) == pytest.approx(score)
+    assert table.parse_map(text).score(value) == pytest.approx(score)
 
 
 def test_a_share_moves_by_its_shortfall_and_never_past_one() -> None:
-    moved = parse_map("U(0.85,0.97)").scaled(1.1)
+    moved = table.parse_map("U(0.85,0.97)").scaled(1.1)
     assert (moved.good, moved.bad) == (pytest.approx(0.967), pytest.approx(0.835))
-    assert parse_map("D(1,3)").scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
-    assert parse_map("P").scaled(1.1) == parse_map("P")
+    assert table.parse_map("D(1,3)").scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
+    assert table.parse_map("P").scaled(1.1) == table.parse_map("P")

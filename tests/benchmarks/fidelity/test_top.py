@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.fidelity.categories import top
-from benchmarks.fidelity.derive import freespace
 from benchmarks.fidelity.derive.curve import Curve
+from benchmarks.fidelity.derive.mesh import Grid, persistence_diagrams
 from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import measure
 
 SHORT = tube.Tube(length=12.0)
 MIDDLE = 6.13
@@ -35,46 +35,48 @@ WALL = placed((0.1, 8.0, 8.0))
 PILLAR = placed((0.4, 0.4, 8.0))
 BLOB = placed((0.5, 0.5, 0.5), 0.4, 0.4)
 ERRORS = [
-    top.topo_body_count_err, top.topo_chi_err, top.topo_genus, top.topo_mouth_err, top.topo_leak_frac,
-    top.topo_free_b1_err, top.topo_free_b2_err, top.topo_bottleneck_h0, top.topo_floater_area,
+    "topo_body_count_err", "topo_chi_err", "topo_genus", "topo_mouth_err", "topo_leak_frac",
+    "topo_free_b1_err", "topo_free_b2_err", "topo_bottleneck_h0", "topo_floater_area",
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("metric", ERRORS)
-def test_a_good_tube_has_no_error_of_topology(metric):
-    assert metric(good()).value == pytest.approx(0.0, abs=1e-9)
+@pytest.mark.parametrize("id", ERRORS)
+def test_a_good_tube_has_no_error_of_topology(id):
+    assert measure(id, good()).value == pytest.approx(0.0, abs=1e-9)
 
 
 def test_free_space_of_a_good_tube_is_one_piece():
-    assert top.topo_free_b0(good()).value == 1
+    assert measure("topo_free_b0", good()).value == 1
 
 
 def test_a_wall_across_cuts_it_in_two():
     case = tube.spoiled(good(), extra=WALL)
-    assert top.topo_free_b0(case).value == 2
-    assert top.topo_body_count_err(case).value == 1
+    assert measure("topo_free_b0", case).value == 2
+    assert measure("topo_body_count_err", case).value == 1
 
 
 def test_a_pillar_from_floor_to_crown_makes_a_loop():
-    assert top.topo_free_b1_err(tube.spoiled(good(), extra=PILLAR)).value == 1
-    assert top.topo_free_b2_err(tube.spoiled(good(), extra=PILLAR)).value == 0
+    assert measure("topo_free_b1_err", tube.spoiled(good(), extra=PILLAR)).value == 1
+    assert measure("topo_free_b2_err", tube.spoiled(good(), extra=PILLAR)).value == 0
 
 
 def test_a_body_in_the_air_makes_a_void_and_is_loose_area():
     case = tube.spoiled(good(), extra=BLOB)
-    assert top.topo_free_b2_err(case).value == 1
-    assert top.topo_floater_area(case).value == pytest.approx(1.5 / (1.5 + good().candidate.lining.area), rel=1e-6)
+    assert measure("topo_free_b2_err", case).value == 1
+    assert measure("topo_floater_area", case).value == pytest.approx(
+        1.5 / (1.5 + good().candidate.lining.area), rel=1e-6
+    )
 
 
 def test_held_out_returns_show_the_pillar_too():
     known = replace(heard(), truth=None)
-    assert top.topo_free_b1_err(known).value == 0
-    assert top.topo_free_b1_err(tube.spoiled(known, extra=PILLAR)).value == 1
+    assert measure("topo_free_b1_err", known).value == 0
+    assert measure("topo_free_b1_err", tube.spoiled(known, extra=PILLAR)).value == 1
 
 
 def test_a_narrower_bore_moves_the_diagram_by_what_it_is_narrower():
     narrow = tube.Tube(length=12.0, width=5.0, height=5.6)
-    assert top.topo_bottleneck_h0(tube.case(SHORT, narrow)).value == pytest.approx(0.3, abs=0.11)
+    assert measure("topo_bottleneck_h0", tube.case(SHORT, narrow)).value == pytest.approx(0.3, abs=0.11)
 
 
 def test_a_hole_leaks_by_its_solid_angle_and_is_a_third_rim():
@@ -82,15 +84,15 @@ def test_a_hole_leaks_by_its_solid_angle_and_is_a_third_rim():
     local = lining.triangles_center - SHORT.point(MIDDLE, 0.0, 3.3)[0]
     hole = np.linalg.norm(local, axis=1) < 0.8
     case = tube.spoiled(good(), lining=trimesh.Trimesh(lining.vertices, lining.faces[~hole], process=False))
-    assert top.topo_mouth_err(case).value == 1
-    assert top.topo_leak_frac(case).value == pytest.approx(lining.area_faces[hole].sum() / lining.area, rel=0.5)
+    assert measure("topo_mouth_err", case).value == 1
+    assert measure("topo_leak_frac", case).value == pytest.approx(lining.area_faces[hole].sum() / lining.area, rel=0.5)
 
 
 def test_a_handle_is_counted():
     ring = trimesh.creation.torus(1.0, 0.2)
     case = tube.spoiled(good(), solid=ring)
-    assert top.topo_genus(case).value == 1
-    assert top.topo_chi_err(case).value == 2
+    assert measure("topo_genus", case).value == 1
+    assert measure("topo_chi_err", case).value == 2
 
 
 def test_persistence_of_a_box_with_a_floating_block_is_known():
@@ -98,7 +100,7 @@ def test_persistence_of_a_box_with_a_floating_block_is_known():
     occupied[:, 1:-1, 1:-1] = False
     occupied[5:7, 5:7, 5:7] = True
     straight = Curve(np.linspace(0, 12, 13), np.column_stack([np.linspace(0, 12, 13), np.zeros((13, 2))]))
-    grid = freespace.Grid(straight, np.ones(3), np.array([0.0, -3.0, -3.0]), occupied.shape)
-    zero, _, two = freespace.persistence(grid.clearance(occupied))
+    grid = Grid(straight, np.ones(3), np.array([0.0, -3.0, -3.0]), occupied.shape)
+    zero, _, two = persistence_diagrams(grid.clearance(occupied))
     assert np.isinf(zero[:, 1]).sum() == 1
     assert (two[:, 1] - two[:, 0] > 1.0).sum() == 1

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.fidelity.categories import tri
-from benchmarks.fidelity.derive import roughness
+from benchmarks.fidelity.derive.clouds import hold_patches
 from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import measure
 
 SHORT = tube.Tube(length=9.0)
 
@@ -33,46 +33,46 @@ def sheet(step, skew=1.0):
 
 def test_right_triangles_have_the_shape_of_right_triangles():
     case = with_lining(*sheet(0.2))
-    assert tri.tri_aspect_p95(case).value == pytest.approx(2.0, rel=0.02)
-    assert tri.tri_min_angle_p05(case).value == pytest.approx(45.0, rel=0.02)
-    assert tri.tri_sliver_frac(case).value == 0.0
-    assert tri.tri_edge_p95(case).value == pytest.approx(0.2 * np.sqrt(2), rel=0.02)
-    assert tri.tri_normal_noise(case).value < 0.1
-    assert tri.tri_face_count(case).value == len(case.candidate.lining.faces)
+    assert measure("tri_aspect_p95", case).value == pytest.approx(2.0, rel=0.02)
+    assert measure("tri_min_angle_p05", case).value == pytest.approx(45.0, rel=0.02)
+    assert measure("tri_sliver_frac", case).value == 0.0
+    assert measure("tri_edge_p95", case).value == pytest.approx(0.2 * np.sqrt(2), rel=0.02)
+    assert measure("tri_normal_noise", case).value < 0.1
+    assert measure("tri_face_count", case).value == len(case.candidate.lining.faces)
 
 
 def test_needles_are_slivers():
     case = with_lining(*sheet(0.004, 100.0))
-    assert tri.tri_sliver_frac(case).value == 1.0
-    assert tri.tri_min_angle_p05(case).value == pytest.approx(np.degrees(np.arctan(0.01)), rel=0.02)
-    assert tri.tri_aspect_p95(case).value == pytest.approx(100.0, rel=0.02)
+    assert measure("tri_sliver_frac", case).value == 1.0
+    assert measure("tri_min_angle_p05", case).value == pytest.approx(np.degrees(np.arctan(0.01)), rel=0.02)
+    assert measure("tri_aspect_p95", case).value == pytest.approx(100.0, rel=0.02)
 
 
 def test_an_edge_over_the_bend_misses_it_by_its_sagitta():
     ends = SHORT.point([1.0, 7.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0])
     case = with_lining(ends, np.array([[0, 1, 2]]))
-    assert tri.tri_chord_error_max(case).value == pytest.approx(6.0**2 / 8 / SHORT.bend, rel=0.05)
+    assert measure("tri_chord_error_max", case).value == pytest.approx(6.0**2 / 8 / SHORT.bend, rel=0.05)
 
 
 def test_a_good_tube_follows_the_bend():
-    assert tri.tri_chord_error_max(good()).value < 1e-3
+    assert measure("tri_chord_error_max", good()).value < 1e-3
 
 
 def test_noise_on_the_vertices_shows_in_normals_and_roughness():
     vertices = good().candidate.lining.vertices
     noisy = with_lining(vertices + np.random.default_rng(0).normal(scale=0.06, size=vertices.shape))
-    assert tri.tri_normal_noise(noisy).value > tri.tri_normal_noise(good()).value + 5.0
-    assert tri.tri_roughness_ratio(good()).value == pytest.approx(1.0, abs=0.1)
-    assert tri.tri_roughness_ratio(noisy).value > 1.5
+    assert measure("tri_normal_noise", noisy).value > measure("tri_normal_noise", good()).value + 5.0
+    assert measure("tri_roughness_ratio", good()).value == pytest.approx(1.0, abs=0.1)
+    assert measure("tri_roughness_ratio", noisy).value > 1.5
 
 
 def test_the_noise_of_the_recording_is_taken_off_the_wall():
-    patches = roughness.of_reference(good())
+    patches = hold_patches(good())
     assert abs(patches.roughness) < 0.1 * patches.noise
     assert 0.010 < np.sqrt(patches.noise) < 0.020  # 2 cm along beams that meet the wall aslant
 
 
 def test_a_wall_without_returns_has_no_roughness_to_compare():
     case = tube.case(SHORT, beams=200)
-    assert tri.tri_roughness_ratio(case).value is None
-    assert not tri.tri_roughness_ratio(case).failed
+    assert measure("tri_roughness_ratio", case).value is None
+    assert not measure("tri_roughness_ratio", case).failed

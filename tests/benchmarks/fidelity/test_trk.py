@@ -4,10 +4,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.fidelity.categories import trk
-from benchmarks.fidelity.derive.railway import hold_railway
-from benchmarks.fidelity.table import load
+from benchmarks.fidelity import table
+from benchmarks.fidelity.derive.track import hold_railway
 from tests.benchmarks.fidelity import tube
+from tests.benchmarks.fidelity.judged import measure
 
 SHORT = tube.Tube(length=12.0)
 RATIOS = {"trk_sleeper_f1", "trk_sleeper_in_bore", "trk_fastener_ratio"}
@@ -24,17 +24,17 @@ def heard():
     return replace(tube.case(SHORT, beams=20_000), truth=None)
 
 
-@pytest.mark.parametrize("id", [row.id for row in load().values() if row.category == "TRK" and row.scored])
+@pytest.mark.parametrize("id", [row.id for row in table.load().values() if row.category == "TRK" and row.scored])
 def test_the_right_track_scores_full_marks(id):
-    value = getattr(trk, id)(judged()).value
-    assert load()[id].map.score(value) > 90.0, value
+    value = measure(id, judged()).value
+    assert table.load()[id].map.score(value) > 90.0, value
 
 
 def test_a_spacing_of_66_cm_is_6_cm_off_and_few_sleepers_match():
     case = judged(spacing=0.66)
-    assert trk.trk_sleeper_spacing_err(case).value == pytest.approx(0.06, abs=1e-3)
-    assert trk.trk_sleeper_f1(case).value < 0.7
-    assert trk.trk_sleeper_count_rel_err(case).value == pytest.approx(100 * 2 / 20, abs=0.1)
+    assert measure("trk_sleeper_spacing_err", case).value == pytest.approx(0.06, abs=1e-3)
+    assert measure("trk_sleeper_f1", case).value < 0.7
+    assert measure("trk_sleeper_count_rel_err", case).value == pytest.approx(100 * 2 / 20, abs=0.1)
 
 
 def test_jitter_shows_in_the_standard_deviation():
@@ -42,26 +42,26 @@ def test_jitter_shows_in_the_standard_deviation():
     moved = case.candidate.track.sleeper.copy()
     moved += np.random.default_rng(0).normal(scale=0.02, size=(len(moved), 1)) * SHORT.frames(5.0)[1]
     shaken = tube.spoiled(case, track=replace(case.candidate.track, sleeper=moved))
-    assert trk.trk_sleeper_spacing_std_err(shaken).value == pytest.approx(0.02 * np.sqrt(2), rel=0.5)
+    assert measure("trk_sleeper_spacing_std_err", shaken).value == pytest.approx(0.02 * np.sqrt(2), rel=0.5)
 
 
 def test_a_missing_third_of_the_sleepers_costs_recall():
     case = judged()
     fewer = replace(case.candidate.track, sleeper=case.candidate.track.sleeper[np.arange(20) % 3 != 0])
     kept = len(fewer.sleeper)
-    assert trk.trk_sleeper_f1(tube.spoiled(case, track=fewer)).value == pytest.approx(2 * kept / (kept + 20))
+    assert measure("trk_sleeper_f1", tube.spoiled(case, track=fewer)).value == pytest.approx(2 * kept / (kept + 20))
 
 
 def test_a_wide_gauge_is_wide_by_millimetres():
     case = judged(gauge=1.445)
-    assert trk.trk_gauge_mean_err(case).value == pytest.approx(10.0, abs=0.2)
-    assert trk.trk_gauge_p95_dev(case).value == pytest.approx(10.0, abs=0.5)
+    assert measure("trk_gauge_mean_err", case).value == pytest.approx(10.0, abs=0.2)
+    assert measure("trk_gauge_p95_dev", case).value == pytest.approx(10.0, abs=0.5)
 
 
 def test_a_track_shifted_to_the_left_and_up_is_off_by_that():
     case = judged(shift=(0.05, 0.03))
-    assert trk.trk_rail_lateral_rmse(case).value == pytest.approx(0.05, abs=2e-3)
-    assert trk.trk_rail_height_rmse(case).value == pytest.approx(0.03, abs=4e-3)
+    assert measure("trk_rail_lateral_rmse", case).value == pytest.approx(0.05, abs=2e-3)
+    assert measure("trk_rail_height_rmse", case).value == pytest.approx(0.03, abs=4e-3)
 
 
 def test_a_missing_length_of_rail_is_the_gap():
@@ -71,24 +71,24 @@ def test_a_missing_length_of_rail_is_the_gap():
     part = np.arange(len(track.rail_mesh.faces)) // 12 // 3  # twelve faces a box, three boxes a length
     holed = track.rail_mesh.copy()
     holed.update_faces(part != 4)
-    assert trk.trk_rail_gap_max(tube.spoiled(case, track=replace(track, rail_mesh=holed))).value == pytest.approx(
-        length, abs=0.01
-    )
+    assert measure(
+        "trk_rail_gap_max", tube.spoiled(case, track=replace(track, rail_mesh=holed))
+    ).value == pytest.approx(length, abs=0.01)
 
 
 def test_a_lifted_rail_floats_over_its_pads():
     case = judged()
     lifted = case.candidate.track.rail_mesh.copy()
     lifted.apply_translation([0.0, 0.0, 0.04])
-    before = trk.trk_asset_penetration_max(case).value
+    before = measure("trk_asset_penetration_max", case).value
     case = tube.spoiled(case, track=replace(case.candidate.track, rail_mesh=lifted))
-    assert trk.trk_asset_penetration_max(case).value == pytest.approx(0.04 + before, abs=0.01)
+    assert measure("trk_asset_penetration_max", case).value == pytest.approx(0.04 + before, abs=0.01)
 
 
 def test_a_narrow_bore_does_not_hold_its_sleepers():
     case = judged()
     bore = replace(case.candidate.bore, radius=case.candidate.bore.radius * 0.43)
-    assert trk.trk_sleeper_in_bore(tube.spoiled(case, bore=bore)).value == 0.0
+    assert measure("trk_sleeper_in_bore", tube.spoiled(case, bore=bore)).value == 0.0
 
 
 def test_missing_pads_lower_the_ratio():
@@ -96,7 +96,7 @@ def test_missing_pads_lower_the_ratio():
     fewer = case.candidate.track.fastening_mesh.copy()
     fewer.update_faces(np.arange(len(fewer.faces)) >= 12 * 4)
     case = tube.spoiled(case, track=replace(case.candidate.track, fastening_mesh=fewer))
-    assert trk.trk_fastener_ratio(case).value == pytest.approx(36 / 40)
+    assert measure("trk_fastener_ratio", case).value == pytest.approx(36 / 40)
 
 
 def test_the_recording_alone_shows_sleepers_and_rails_where_they_are():
@@ -105,18 +105,18 @@ def test_the_recording_alone_shows_sleepers_and_rails_where_they_are():
     gap = np.linalg.norm(seen.sleeper[:, None] - real, axis=2).min(axis=1)
     assert len(seen.sleeper) >= 18
     assert gap.max() < 0.06
-    assert trk.trk_rail_lateral_rmse(heard()).value < 0.01
-    assert trk.trk_rail_height_rmse(heard()).value < 0.01
-    assert trk.trk_sleeper_f1(heard()).value > 0.97
-    assert trk.trk_gauge_mean_err(heard()).reason.startswith("K:")
+    assert measure("trk_rail_lateral_rmse", heard()).value < 0.01
+    assert measure("trk_rail_height_rmse", heard()).value < 0.01
+    assert measure("trk_sleeper_f1", heard()).value > 0.97
+    assert measure("trk_gauge_mean_err", heard()).reason.startswith("K:")
 
 
 def test_where_the_recording_shows_no_track_there_is_nothing_to_match():
     bare = replace(tube.case(replace(SHORT, track=False), SHORT), truth=None)
-    for metric in (trk.trk_sleeper_f1, trk.trk_gauge_mean_err, trk.trk_rail_lateral_rmse):
-        assert metric(bare).value is None
-        assert not metric(bare).failed
+    for id in ("trk_sleeper_f1", "trk_gauge_mean_err", "trk_rail_lateral_rmse"):
+        assert measure(id, bare).value is None
+        assert not measure(id, bare).failed
 
 
 def test_sleepers_that_the_truth_has_not_match_nothing():
-    assert trk.trk_sleeper_f1(tube.case(replace(SHORT, track=False), SHORT)).value == 0.0
+    assert measure("trk_sleeper_f1", tube.case(replace(SHORT, track=False), SHORT)).value == 0.0

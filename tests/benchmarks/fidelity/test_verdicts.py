@@ -8,16 +8,25 @@ from xml.etree import ElementTree
 
 import pytest
 
-from benchmarks.fidelity import figures, judge, report, scoring, sweep, table
+from benchmarks.fidelity import figures, judge, scoring, table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls import verdicts
-from benchmarks.fidelity.controls.invariance import INVARIANCES
-from benchmarks.fidelity.controls.kept import Job, Outcome
-from benchmarks.fidelity.controls.runner import Bench, failures, jobs, one, run
-from benchmarks.fidelity.controls.verdicts import Base
-from benchmarks.fidelity.figures import scores
+from benchmarks.fidelity.controls.catalogue import INVARIANCES
+from benchmarks.fidelity.controls.runner import (
+    Bench,
+    Job,
+    Outcome,
+    is_ranked,
+    judge_outcomes,
+    list_jobs,
+    run_control,
+    run_jobs,
+    without_figures,
+)
+from benchmarks.fidelity.figures.sheet import Sheet, draw_categories
 from benchmarks.fidelity.inputs import Inputs
-from benchmarks.fidelity.value import Value, missing
+from benchmarks.fidelity.judge import Base
+from benchmarks.fidelity.registry import Value, missing
+from benchmarks.fidelity.report import write_report
 from tests.benchmarks.fidelity import tube
 
 Values = dict[str, Value]
@@ -47,92 +56,92 @@ def outcome(control: str, dose: float, made: Values, leaks: tuple[str, ...] = ()
 
 def test_a_good_reconstruction_passes_and_a_null_tube_beside_it_does_not() -> None:
     made = {"base": values(0.98), "null": values(0.8), "null_bare": values(0.7), "ceiling": values(1.0)}
-    found = judge.judged(made, [])
+    found = judge.make_judgement(made, [])
     assert found.verdict == "PASS", found.reasons
     assert found.skill == pytest.approx(0.9, abs=0.02)
-    assert judge.judged(made | {"base": made["null"]}, []).verdict == "FAIL"
-    assert judge.judged(made, ["the builder read it"]).reasons == ["leak: the builder read it"]
+    assert judge.make_judgement(made | {"base": made["null"]}, []).verdict == "FAIL"
+    assert judge.make_judgement(made, ["the builder read it"]).reasons == ["leak: the builder read it"]
 
 
 def test_a_control_that_falls_as_asked_is_detected() -> None:
-    (row,) = verdicts.rows([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
+    (row,) = judge_outcomes([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
     assert row["detected"]
     assert row["quiet"]
     assert row["falls"]["TRK"] == pytest.approx(68.0, abs=2.0)
 
 
 def test_a_control_that_changes_nothing_is_not_detected() -> None:
-    rows = verdicts.rows([outcome("N24", 1.445, values(0.98))], base())
-    assert verdicts.undetected(rows) == ["N24"]
+    rows = judge_outcomes([outcome("N24", 1.445, values(0.98))], base())
+    assert judge.undetected(rows) == ["N24"]
     assert rows[0]["short"] == {"TRK": (pytest.approx(0.0), 15.0)}
 
 
 def test_a_control_that_fails_only_by_another_category_is_not_detected() -> None:
-    rows = verdicts.rows([outcome("N24", 1.445, values(0.98, ("SEC",), 0.3))], base())
+    rows = judge_outcomes([outcome("N24", 1.445, values(0.98, ("SEC",), 0.3))], base())
     assert rows[0]["verdict"] == "FAIL"
-    assert verdicts.undetected(rows) == ["N24"]
+    assert judge.undetected(rows) == ["N24"]
     assert not rows[0]["quiet"]
 
 
 def test_a_cheat_is_detected_by_its_leak_alone() -> None:
-    rows = verdicts.rows([outcome("N35", 1, values(1.0), ("no noise",)), outcome("N35", 2, values(1.0))], base())
+    rows = judge_outcomes([outcome("N35", 1, values(1.0), ("no noise",)), outcome("N35", 2, values(1.0))], base())
     assert [row["detected"] for row in rows] == [True, False]
 
 
 def test_growing_doses_give_a_rank_correlation_of_minus_one() -> None:
     doses = [(0.61, 0.9), (0.63, 0.6), (0.66, 0.1)]
-    rows = verdicts.rows([outcome("N23", d, values(0.98, ("TRK",), q)) for d, q in doses], base())
+    rows = judge_outcomes([outcome("N23", d, values(0.98, ("TRK",), q)) for d, q in doses], base())
     assert rows[0]["spearman"] == pytest.approx(-1.0)
 
 
 def test_an_invariance_that_moves_a_category_is_loud() -> None:
-    rows = verdicts.rows([outcome("I1", 0, values(0.98)), outcome("I4", 0, values(0.98, ("LIN",), 0.9))], base())
-    assert verdicts.loud(rows) == ["I4"]
+    rows = judge_outcomes([outcome("I1", 0, values(0.98)), outcome("I4", 0, values(0.98, ("LIN",), 0.9))], base())
+    assert judge.loud(rows) == ["I4"]
 
 
 def test_reasons_are_compared_without_their_figures() -> None:
-    assert failures(["category F2D is 61.2, below 70"]) == failures(["category F2D is 12.9, below 70"])
-    assert failures(["category F2D is 61.2, below 70"]) != failures(["category F3D is 61.2, below 70"])
+    assert without_figures(["category F2D is 61.2, below 70"]) == without_figures(["category F2D is 12.9, below 70"])
+    assert without_figures(["category F2D is 61.2, below 70"]) != without_figures(["category F3D is 61.2, below 70"])
 
 
 def test_the_sweep_has_its_runs_and_moves_scores_by_the_closed_form() -> None:
-    rows = sweep.thresholds({"base": values(0.95), "null": values(0.5), "ceiling": values(1.0)})
+    rows = scoring.sweep_thresholds({"base": values(0.95), "null": values(0.5), "ceiling": values(1.0)})
     assert [sum(row["kind"] == kind for row in rows) for kind in ("common", "category", "independent")] == [2, 36, 128]
     looser, tighter = (next(r for r in rows if r["run"] == name) for name in ("x1.1", "x0.9"))
     assert looser["delta"] > 0.0 > tighter["delta"]
     assert all(row["order_kept"] for row in rows)
-    summary = sweep.summary(rows)
+    summary = scoring.summarise(rows)
     assert summary["independent"]["most"] - summary["independent"]["least"] < looser["delta"] - tighter["delta"]
 
 
 def test_the_order_is_lost_where_the_null_tube_overtakes() -> None:
-    rows = sweep.thresholds({"base": values(0.5), "null": values(0.9)})
+    rows = scoring.sweep_thresholds({"base": values(0.5), "null": values(0.9)})
     assert not any(row["order_kept"] for row in rows)
 
 
 def test_the_order_of_every_candidate_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     made = {"base": values(0.95), "null": values(0.5), "N02-2": values(0.7), "N25-30": values(0.6)}
-    rows = sweep.thresholds(made)
+    rows = scoring.sweep_thresholds(made)
     assert {row["lower"] for row in rows} == {3}
     assert all(row["order_kept"] and row["tau"] == pytest.approx(1.0) for row in rows)
-    assert sweep.summary(rows)["common"]["lower"] == 3
+    assert scoring.summarise(rows)["common"]["lower"] == 3
     maps = {id: replace(row.map, good=row.map.bad, bad=row.map.good) for id, row in table.load().items()}
-    monkeypatch.setattr(sweep, "threshold_maps", lambda: iter([("common", "turned round", maps)]))
-    (turned,) = sweep.thresholds(made)
+    monkeypatch.setattr(scoring, "threshold_maps", lambda: iter([("common", "turned round", maps)]))
+    (turned,) = scoring.sweep_thresholds(made)
     assert not turned["order_kept"]
     assert turned["tau"] < 0.0
 
 
 def test_invariances_and_cheats_have_no_place_in_the_order() -> None:
-    ranked = [job for job in jobs() if sweep.ranked(job)]
-    assert {job.control for job in jobs()} - {job.control for job in ranked} == {*INVARIANCES, "N35", "N36"}
+    ranked = [job for job in list_jobs() if is_ranked(job)]
+    assert {job.control for job in list_jobs()} - {job.control for job in ranked} == {*INVARIANCES, "N35", "N36"}
 
 
 def test_without_any_reference_nothing_is_asked_over_the_null_tube() -> None:
     entries = table.load()
     alone = {id: v if set(entries[id].evidence) <= set("SK") else missing("none") for id, v in values(0.98).items()}
-    assert judge.judged({"base": alone, "null": alone}, []).verdict == "PASS"
-    assert judge.judged({"base": values(0.98), "null": values(0.98)}, []).verdict == "FAIL"
+    assert judge.make_judgement({"base": alone, "null": alone}, []).verdict == "PASS"
+    assert judge.make_judgement({"base": values(0.98), "null": values(0.98)}, []).verdict == "FAIL"
 
 
 def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
@@ -142,11 +151,11 @@ def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
         "null": values(0.7),
         "null_bare": values(0.6),
     }
-    controls = verdicts.rows([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
-    judgement = judge.judged(made, [], controls)
-    swept = {"rows": sweep.thresholds(made), "summary": {}}
-    swept["summary"] = sweep.summary(swept["rows"])
-    report.write(tmp_path, case, Inputs(out=tmp_path), judgement, controls, swept)
+    controls = judge_outcomes([outcome("N24", 1.445, values(0.98, ("TRK",), 0.3))], base())
+    judgement = judge.make_judgement(made, [], controls)
+    swept = {"rows": scoring.sweep_thresholds(made), "summary": {}}
+    swept["summary"] = scoring.summarise(swept["rows"])
+    write_report(tmp_path, case, Inputs(out=tmp_path), judgement, controls, swept)
     content = json.loads((tmp_path / "report.json").read_text())
     with (tmp_path / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -167,22 +176,22 @@ def test_all_forms_are_written_and_agree(tmp_path: Path) -> None:
 def test_a_figure_that_cannot_be_drawn_costs_no_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def broken(sheet: figures.Sheet) -> None:
+    def broken(sheet: Sheet) -> None:
         raise ValueError("too little of the section")
 
-    monkeypatch.setattr(figures, "_figures", lambda: iter([("F00-broken", broken), ("F13", scores.categories)]))
+    monkeypatch.setattr(figures, "FIGURES", (("F00-broken", broken), ("F13", draw_categories)))
     case = replace(tube.case(), hold=None, truth=None, cache={})
-    judgement = judge.judged({"base": values(0.98), "null": values(0.7)}, [])
-    report.write(tmp_path, case, Inputs(), judgement, None, None)
+    judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
+    write_report(tmp_path, case, Inputs(), judgement, None, None)
     assert "F00-broken is left out: too little of the section" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"F13.png", "F13.svg"}
 
 
 def test_the_same_values_write_the_same_bytes(tmp_path: Path) -> None:
     case = replace(tube.case(), hold=None, truth=None, cache={})
-    judgement = judge.judged({"base": values(0.98), "null": values(0.7)}, [])
+    judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
     for name in ("one", "other"):
-        report.write(tmp_path / name, case, Inputs(), judgement, None, None)
+        write_report(tmp_path / name, case, Inputs(), judgement, None, None)
     for file in ("report.json", "metrics.csv", "report.html", "figures/F13-categories.svg"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "other" / file).read_bytes()
 
@@ -201,13 +210,13 @@ def test_a_run_that_was_cut_short_goes_on_with_the_next_candidate(
     monkeypatch.setattr(judge, "evaluate", evaluate)
     case = tube.case().fresh()
     with pytest.raises(KeyboardInterrupt):
-        judge.values_of(case, tmp_path)
+        judge.compute_values(case, tmp_path)
     first, done = done, []
-    found = judge.values_of(case, tmp_path)
+    found = judge.compute_values(case, tmp_path)
     assert first == ["tube", "tube as null tube"]
     assert done == ["tube as null tube without track", "truth"]
     assert list(found) == ["base", "null", "null_bare", "ceiling"]
-    assert judge.values_of(case, tmp_path) == found
+    assert judge.compute_values(case, tmp_path) == found
     assert len(done) == 2
 
 
@@ -220,8 +229,8 @@ def test_controls_are_kept_and_taken_up_again(tmp_path: Path) -> None:
 
     bench = Bench(tube.case(), values(0.9), tmp_path, None, compute)
     jobs = [Job("N07", 0.1), Job("I6", 0.0)]
-    first = run(bench, jobs, processes=1)
-    again = run(bench, jobs, processes=1)
+    first = run_jobs(bench, jobs, processes=1)
+    again = run_jobs(bench, jobs, processes=1)
     assert len(calls) == 2
     assert [o.values for o in again] == [o.values for o in first]
-    assert one(bench, jobs[0]).job == jobs[0]
+    assert run_control(bench, jobs[0]).job == jobs[0]

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import __main__ as commandline
-from benchmarks.fidelity.filehash import file_hash
+from benchmarks.fidelity.__main__ import main
+from benchmarks.fidelity.files import file_hash
 from tests.benchmarks.fidelity import tubescene
 from tests.benchmarks.fidelity.tube import Tube, hold
 from tests.scene.bags import write_bag, write_tum
@@ -22,7 +22,7 @@ SHORT = Tube(length=12.0)
 def fidelity(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
     """`python -m benchmarks.fidelity`, in this process."""
     monkeypatch.setattr(sys, "argv", ["fidelity", *map(str, words)])
-    commandline.main()
+    main()
 
 
 @pytest.fixture(scope="module")

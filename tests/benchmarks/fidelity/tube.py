@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate
+from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate, Track, concatenate_meshes
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.compiled import Track, concatenated
 from benchmarks.fidelity.references import PARTS, Hold, Truth
 from tests.benchmarks.fidelity.tubemesh import rolled
 from tests.benchmarks.fidelity.tubeshape import Tube
@@ -47,7 +46,7 @@ def track(tube: Tube) -> Track:
             fastenings.append(_box(tube, s, side * offset, z + 0.005, (0.18, 0.15, 0.01)))
     points = {name: np.asarray(ends).reshape(-1, 3) for name, ends in rail.items()}
     tops = tube.point(tube.sleepers, np.zeros(len(tube.sleepers)), top).reshape(-1, 3)
-    meshes = [concatenated(parts) for parts in (sleepers, rails, fastenings)]
+    meshes = [concatenate_meshes(parts) for parts in (sleepers, rails, fastenings)]
     return Track(tops, meshes[0], points, meshes[1], meshes[2], tube.gauge if tube.track else None)
 
 
@@ -112,7 +111,7 @@ def truth(tube: Tube) -> Truth:
     }  # fmt: skip
     position, tangent, *_ = tube.frames(station)
     return Truth(
-        station, position, tangent, tube.width * scale, tube.height * scale, concatenated(meshes),
+        station, position, tangent, tube.width * scale, tube.height * scale, concatenate_meshes(meshes),
         np.concatenate(parts), PARTS, furniture if tube.track else {**furniture, "rails": {}}, origin,
     )  # fmt: skip
 

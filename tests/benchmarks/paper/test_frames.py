@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.fidelity.derive.voxels import Occupied
+from benchmarks.fidelity.derive.distances import Occupied
 from benchmarks.paper.camera import Pose
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.figures import classify_side_view, depth_image

@@ -1,0 +1,328 @@
+"""CEN, SEC and LIN: centreline, cross-sections, pockets and rings."""
+
+from collections.abc import Callable
+
+import numpy as np
+import shapely
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.axis import (
+    axis_pair,
+    chord_heading,
+    drift_slope,
+    lining_curve,
+    lining_mouths,
+    longitudinal_slope,
+    plan_curvature,
+    registration,
+    rotation_angle,
+)
+from benchmarks.fidelity.derive.curve import truth_curve
+from benchmarks.fidelity.derive.lining import (
+    PHASE_PITCHES,
+    RING_BAND,
+    both_maps,
+    coarse_pitch,
+    judged_pockets,
+    matched_pockets,
+    paired_depths,
+    pocket_rows,
+    reference_arc,
+    reference_pockets,
+    relief_along,
+    ring_phases,
+    ring_pitch,
+)
+from benchmarks.fidelity.derive.sections import dimensions, sections, variation
+from benchmarks.fidelity.registry import (
+    Statistic,
+    Value,
+    estimate,
+    family,
+    mean,
+    mean_magnitude,
+    metric,
+    missing,
+    number,
+    percentile,
+    rms,
+)
+
+_FEWEST_FEATURES = 10  # features that show a drift
+_NO_VARIATION = 1e-3  # m; a section that varies by less is constant
+_NO_GRID = 100.0  # %; error of a lining without any grid
+_UNKNOWN_PHASE = 0.25  # share of a pitch; mean error of an unknown phase
+_NO_POCKETS = "the reference shows no pockets"
+_NO_MATCH = "no pocket of the candidate lies where the reference has one"
+_POCKET_NEIGHBOURS = (0.10, 0.80)  # m of station between pockets that a nail joins
+_SAME_ROW = 0.05  # rad
+
+
+# CEN: the axis of the lining against the axis of the reference, sampled every metre.
+
+
+@metric("cl_lateral_rmse", needs="reference")
+def cl_lateral_rmse(case: Case) -> Value:
+    """Root mean square of the horizontal offset, m."""
+    return estimate(rms, axis_pair(case).left, axis_pair(case).station, case.rng("cl_lateral_rmse"))
+
+
+@metric("cl_lateral_p95", needs="reference")
+def cl_lateral_p95(case: Case) -> Value:
+    """95th percentile of the horizontal offset, m."""
+    both = axis_pair(case)
+    return estimate(percentile(95), np.abs(both.left), both.station, case.rng("cl_lateral_p95"))
+
+
+@metric("cl_vertical_rmse", needs="reference")
+def cl_vertical_rmse(case: Case) -> Value:
+    """Root mean square of the vertical offset, m."""
+    both = axis_pair(case)
+    return estimate(rms, both.judged[:, 2] - both.reference[:, 2], both.station, case.rng("cl_vertical_rmse"))
+
+
+@metric("cl_length_rel_err", needs="truth")
+def cl_length_rel_err(case: Case) -> Value:
+    """Error of the arc length from mouth to mouth, %."""
+    true = truth_curve(case).length
+    return number(100.0 * abs(lining_curve(case).length - true) / true, 1)
+
+
+@metric("cl_end_station_err", needs="truth")
+def cl_end_station_err(case: Case) -> Value:
+    """Larger axial error of the two mouths, m."""
+    curve = truth_curve(case)
+    low, high = lining_mouths(case)
+    return number(max(abs(low - curve.station[0]), abs(high - curve.station[-1])), 2)
+
+
+@metric("cl_heading_rmse", needs="reference")
+def cl_heading_rmse(case: Case) -> Value:
+    """Root mean square of the heading error on a base of 2 m, degrees."""
+    both = axis_pair(case)
+    gap = chord_heading(both.judged) - chord_heading(both.reference)
+    gap = np.rad2deg((gap + np.pi) % (2 * np.pi) - np.pi)
+    return estimate(rms, gap, both.station[1:-1], case.rng("cl_heading_rmse"))
+
+
+@family("reference", {"cl_curvature_rmse": (plan_curvature, 1.0), "cl_grade_rmse": (longitudinal_slope, 100.0)})
+def axis_shape_error(case: Case, id: str, quantity: Callable[[np.ndarray], np.ndarray], factor: float) -> Value:
+    """Root mean square error of curvature (1/m) or longitudinal slope (%), each over 10 m."""
+    both = axis_pair(case)
+    difference = quantity(both.judged) - quantity(both.reference)
+    trim = (len(both.station) - len(difference)) // 2
+    return estimate(rms, factor * difference, both.station[trim : len(both.station) - trim], case.rng(id))
+
+
+@metric("cl_axial_drift_slope", needs="truth")
+def cl_axial_drift_slope(case: Case) -> Value:
+    """Drift of the ring joints along the true axis, of the sleepers where there are no joints, m per 100 m."""
+    assert case.truth is not None
+    curve, bore, furniture = truth_curve(case), case.candidate.bore, case.truth.furniture
+    joints = np.stack([np.interp(bore.ring_station, bore.station, axis) for axis in bore.position.T], axis=1)
+    pairs = [
+        (joints, np.asarray(furniture.get("rings", {}).get("station", ()), float)),
+        (case.candidate.track.sleeper, np.asarray(furniture.get("sleepers", {}).get("station", ()), float)),
+    ]
+    for points, true in pairs:
+        if min(len(points), len(true)) >= _FEWEST_FEATURES:
+            judged = np.sort(curve.local(points)[:, 0])
+            return number(100.0 * abs(drift_slope(judged, true)), len(judged))
+    return missing("neither ring joints nor sleepers to follow along the tunnel")
+
+
+@metric("cl_icp_rotation", needs="hold")
+def cl_icp_rotation(case: Case) -> Value:
+    """Angle of the best rigid motion onto the held-out cloud, degrees; the motion is not applied."""
+    return number(rotation_angle(registration(case)), 1)
+
+
+@metric("cl_icp_translation", needs="hold")
+def cl_icp_translation(case: Case) -> Value:
+    """Shift of that motion at the middle of the cloud, m."""
+    return number(float(np.linalg.norm(registration(case)[:3, 3])), 1)
+
+
+# SEC: size and shape of the sections, every metre, pockets left out.
+
+
+@family("reference", {
+    "sec_width_bias": ("width", mean_magnitude), "sec_width_rmse": ("width", rms),
+    "sec_height_bias": ("height", mean_magnitude), "sec_height_rmse": ("height", rms),
+})  # fmt: skip
+def size_error(case: Case, id: str, name: str, statistic: Statistic) -> Value:
+    """Error of the width 1.2 m above the floor, or of the height on the axis, m."""
+    judged, reference = dimensions(case)[name]
+    return estimate(statistic, judged - reference, sections(case).station, case.rng(id))
+
+
+@family("reference", {"sec_area_rel_err_mean": mean, "sec_area_rel_err_p95": percentile(95)})
+def area_error(case: Case, id: str, statistic: Statistic) -> Value:
+    """Relative error of the area, %."""
+    judged, reference = dimensions(case)["area"]
+    return estimate(statistic, 100.0 * np.abs(judged / reference - 1.0), sections(case).station, case.rng(id))
+
+
+@family("reference", {"sec_iou_mean": mean, "sec_iou_p05": percentile(5)})
+def outline_overlap(case: Case, id: str, statistic: Statistic) -> Value:
+    """Intersection over union of the outlines."""
+    cut = sections(case)
+    union = shapely.area(shapely.union(cut.judged_outline, cut.reference_outline))
+    return estimate(statistic, shapely.area(cut.common) / union, cut.station, case.rng(id))
+
+
+@family("reference", {"sec_overbreak_vol": 0, "sec_underbreak_vol": 1})
+def outside_volume(case: Case, id: str, side: int) -> Value:
+    """Volume of one side (0 lining, 1 reference) outside the other, % of the reference's volume."""
+    area = dimensions(case)["area"]
+    outside = area[side] - shapely.area(sections(case).common)
+    return estimate(mean, 100.0 * outside / area[1].mean(), sections(case).station, case.rng(id))
+
+
+@metric("sec_radial_rmse", needs="reference")
+def sec_radial_rmse(case: Case) -> Value:
+    """Root mean square error of the radius about the reference axis, where the reference is known, m."""
+    cut = sections(case)
+    error = (cut.judged - cut.reference).ravel()
+    return estimate(rms, error, np.repeat(cut.station, len(cut.angle)), case.rng("sec_radial_rmse"))
+
+
+@metric("sec_variation_corr", needs="reference")
+def sec_variation_corr(case: Case) -> Value:
+    """Correlation of width and height, trends removed; 0 for a constant section."""
+    judged, reference = variation(case)
+    if judged.std() < _NO_VARIATION:
+        return number(0.0, judged.size, "the lining's section does not vary")
+
+    def correlation(index: np.ndarray) -> float:
+        row = index.astype(int)
+        return float(np.corrcoef(judged[row].ravel(), reference[row].ravel())[0, 1])
+
+    index = np.arange(len(judged), dtype=float)
+    return estimate(correlation, index, sections(case).station, case.rng("sec_variation_corr"))
+
+
+@metric("sec_variation_ratio", needs="reference")
+def sec_variation_ratio(case: Case) -> Value:
+    """Standard deviation of that variation in the lining over the one in the reference."""
+    judged, reference = variation(case)
+
+    def ratio(index: np.ndarray) -> float:
+        row = index.astype(int)
+        return float(judged[row].std() / max(reference[row].std(), 1e-12))
+
+    index = np.arange(len(judged), dtype=float)
+    return estimate(ratio, index, sections(case).station, case.rng("sec_variation_ratio"))
+
+
+# LIN: pockets and ring grid on the unrolled lining.
+
+
+@metric("lin_depth_map_ncc", needs="hold")
+def lin_depth_map_ncc(case: Case) -> Value:
+    """Correlation of the unrolled depths with those of the held-out recording, smooth section removed."""
+    station, judged, hold = paired_depths(case)
+    if judged.std() < 1e-4:
+        return number(0.0, len(judged), "the lining is smooth")
+
+    def correlation(index: np.ndarray) -> float:
+        chosen = index.astype(int)
+        return float(np.corrcoef(judged[chosen], hold[chosen])[0, 1])
+
+    return estimate(correlation, np.arange(len(judged), dtype=float), station, case.rng("lin_depth_map_ncc"))
+
+
+@metric("lin_pocket_f1", needs="reference")
+def lin_pocket_f1(case: Case) -> Value:
+    """F1 of the pockets, matched within 15 cm on the unrolled wall."""
+    judged, reference = judged_pockets(case), reference_pockets(case)
+    if not len(reference):
+        return missing(_NO_POCKETS)
+    return number(2.0 * len(matched_pockets(case)) / (len(judged) + len(reference)), len(reference))
+
+
+@metric("lin_pocket_count_rel_err", needs="reference")
+def lin_pocket_count_rel_err(case: Case) -> Value:
+    """Relative error of the number of pockets, %."""
+    judged, reference = judged_pockets(case), reference_pockets(case)
+    if not len(reference):
+        return missing(_NO_POCKETS)
+    return number(100.0 * abs(len(judged) / len(reference) - 1.0), len(reference))
+
+
+def _relative_error(judged: np.ndarray, true: np.ndarray) -> np.ndarray:
+    return 100.0 * np.abs(judged / true - 1.0)
+
+
+@family("reference", {
+    "lin_pocket_depth_bias": ("depth", np.subtract, mean_magnitude),
+    "lin_pocket_depth_mae": ("depth", lambda judged, true: np.abs(judged - true), mean),
+    "lin_pocket_area_rel_err": ("area", _relative_error, np.median),
+})  # fmt: skip
+def matched_pocket_error(
+    case: Case, id: str, name: str, error: Callable[..., np.ndarray], statistic: Statistic
+) -> Value:
+    """Error of depth (m) or area (%) of the matched pockets."""
+    if not len(reference_pockets(case)):
+        return missing(_NO_POCKETS)
+    pairs = matched_pockets(case)
+    if not len(pairs):
+        return Value(None, None, 0, _NO_MATCH, failed=True)
+    judged, reference = judged_pockets(case), reference_pockets(case)
+    sizes = getattr(judged, name)[pairs[:, 0]], getattr(reference, name)[pairs[:, 1]]
+    return estimate(statistic, error(*sizes), reference.station[pairs[:, 1]], case.rng(id))
+
+
+def _reference_pitch(case: Case) -> float | None:
+    reference = both_maps(case)[1]
+    coarse = coarse_pitch(relief_along(reference))
+    return None if coarse is None else ring_pitch(reference, coarse, 0.1)
+
+
+@metric("lin_axial_pitch_err", needs="reference")
+def lin_axial_pitch_err(case: Case) -> Value:
+    """Relative error of the pitch of the rings along the tunnel, %."""
+    reference = _reference_pitch(case)
+    if reference is None:
+        return missing(_NO_POCKETS)
+    judged = ring_pitch(both_maps(case)[0], reference, RING_BAND)
+    if judged is None:
+        return number(_NO_GRID, 0, "the lining has no relief")
+    return number(100.0 * abs(judged / reference - 1.0), 1, f"{judged:.4f} m against {reference:.4f} m")
+
+
+@metric("lin_circ_pitch_err", needs="reference")
+def lin_circ_pitch_err(case: Case) -> Value:
+    """Relative error of the median distance between rows of pockets around the section, %."""
+    judged, reference = (np.diff(pocket_rows(side, reference_arc(case))) for side in both_maps(case))
+    if not len(reference):
+        return missing(_NO_POCKETS)
+    if not len(judged):
+        return number(_NO_GRID, 0, "the lining has no rows of pockets")
+    return number(100.0 * abs(float(np.median(judged) / np.median(reference)) - 1.0), len(reference))
+
+
+@metric("lin_ring_phase_err", needs="reference")
+def lin_ring_phase_err(case: Case) -> Value:
+    """Mean absolute error of the grid's phase in windows of four pitches, share of a pitch."""
+    length = _reference_pitch(case)
+    if length is None:
+        return missing(_NO_POCKETS)
+    judged, reference = (ring_phases(side, length) for side in both_maps(case))
+    count = min(len(judged), len(reference))
+    gap = np.abs((judged[:count] - reference[:count] + np.pi) % (2 * np.pi) - np.pi) / (2 * np.pi)
+    share = np.where(np.isnan(judged[:count]), _UNKNOWN_PHASE, gap)
+    centre = length * PHASE_PITCHES / 2 * (1 + np.arange(count))
+    return estimate(mean, share, centre, case.rng("lin_ring_phase_err"))
+
+
+@metric("lin_nail_count_ratio")
+def lin_nail_count_ratio(case: Case) -> Value:
+    """Connecting nails of the candidate over its pairs of neighbouring pockets in a row."""
+    pocket = case.candidate.bore.pocket
+    order = np.lexsort((pocket["station"], np.round(pocket["angle"] / _SAME_ROW)))
+    gap, turn = np.diff(pocket["station"][order]), np.abs(np.diff(pocket["angle"][order]))
+    pairs = int(((gap > _POCKET_NEIGHBOURS[0]) & (gap < _POCKET_NEIGHBOURS[1]) & (turn < _SAME_ROW)).sum())
+    if not pairs:
+        return missing("the candidate has no neighbouring pockets")
+    return number(case.candidate.manifest.get("count", {}).get("nails", 0) / pairs, pairs)

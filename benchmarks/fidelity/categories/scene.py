@@ -1,0 +1,414 @@
+"""TRK, SCN and PAR: track, compiled scene, agreement of the simulators."""
+
+import time
+from importlib.metadata import requires
+
+import mujoco
+import numpy as np
+from jaxtyping import Int
+from packaging.requirements import Requirement
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity.candidate import geom_mesh
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive import planar
+from benchmarks.fidelity.derive.contact import (
+    contact_depths,
+    first_contacts,
+    path_divergence,
+    probe_free,
+    step_is_finite,
+)
+from benchmarks.fidelity.derive.scene import (
+    LINING_NAMES,
+    asset_files,
+    count_assets,
+    fastening_sets,
+    per_release,
+    placed_data,
+    rays_from_axis,
+    robot_body,
+    scene_model,
+    seat_mismatches,
+)
+from benchmarks.fidelity.derive.track import (
+    STANDARD_GAUGE,
+    candidate_gauge,
+    candidate_sleepers,
+    rail_gaps,
+    rail_offsets,
+    rail_twist,
+    reference_railway,
+    reference_sleepers,
+    sleeper_spacings,
+    sleepers_fit,
+)
+from benchmarks.fidelity.registry import (
+    Statistic,
+    Value,
+    estimate,
+    family,
+    metric,
+    missing,
+    number,
+    pass_or_fail,
+    rms,
+)
+from scene.poses.trajectory import load_tum
+
+_SLEEPER_MATCH = 0.15  # m
+_BORE_MARGIN = 0.02  # m between a sleeper and the wall
+_TWIST_BASE = 3.0  # m
+_NO_SLEEPERS = "the reference shows no sleepers"
+_NO_RAILS = "the reference shows no rails"
+_NO_TRACK = "the candidate has no track"
+_STEPS = 1000
+_PUSH = 0.5  # m/s
+_SAME_POSE = 1e-6
+_MASS_TOLERANCE = 0.01
+_SAME_DEPTH = 1e-3  # m
+_SIGMA = 0.05  # m; the range noise that the paper gives its environment
+
+
+# TRK: sleepers and rails against those of truth or recording, and against the bore that they lie in.
+
+
+@metric("trk_sleeper_f1", needs="reference")
+def trk_sleeper_f1(case: Case) -> Value:
+    """F1 of sleepers that are each other's nearest within 0.15 m; 0 where the truth has none but the candidate."""
+    real, made = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
+    if not len(real) and (case.truth is None or not len(made)):
+        return missing(_NO_SLEEPERS)
+    if not len(real) or not len(made):
+        return number(0.0, len(real) + len(made))
+    gap, nearest = cKDTree(real).query(made)
+    back: Int[np.ndarray, " r"] = cKDTree(made).query(real)[1]
+    matched = (back[nearest] == np.arange(len(made))) & (gap <= _SLEEPER_MATCH * case.tolerance)
+    return number(2.0 * matched.sum() / (len(real) + len(made)), len(real) + len(made))
+
+
+@metric("trk_sleeper_count_rel_err", needs="reference")
+def trk_sleeper_count_rel_err(case: Case) -> Value:
+    """Relative difference of counts, %."""
+    real, made = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
+    if not len(real):
+        return missing(_NO_SLEEPERS)
+    return number(100.0 * abs(len(made) - len(real)) / len(real), len(real))
+
+
+@family("reference", {"trk_sleeper_spacing_err": np.mean, "trk_sleeper_spacing_std_err": np.std})
+def spacing_error(case: Case, id: str, statistic: Statistic) -> Value:
+    """Difference of mean or standard deviation of the spacings, missing sleepers left out, m."""
+    real = sleeper_spacings(reference_sleepers(reference_railway(case)))
+    made = sleeper_spacings(candidate_sleepers(case))
+    if not len(real):
+        return missing(_NO_SLEEPERS)
+    if not len(made):
+        return number(float("nan"), 0, "the candidate has no two sleepers side by side")
+    return number(abs(float(statistic(made)) - float(statistic(real))), len(made))
+
+
+@metric("trk_sleeper_in_bore")
+def trk_sleeper_in_bore(case: Case) -> Value:
+    """Share of sleepers whose top keeps 2 cm from the wall of the local section."""
+    if not len(case.candidate.track.sleeper):
+        return missing(_NO_TRACK)
+    fits = sleepers_fit(case, _BORE_MARGIN)
+    return number(float(np.mean(fits)), len(fits))
+
+
+def _reference_gauge(case: Case) -> tuple[float | None, str]:
+    """Return the gauge to be met and its source; `None` where the reference shows no rails."""
+    reference = reference_railway(case)
+    if not reference.rail.shape[1]:
+        return None, _NO_RAILS
+    if reference.gauge is not None:
+        return reference.gauge, "against the truth's own rails"
+    return STANDARD_GAUGE, "K: against the standard gauge, held-out returns being too coarse for millimetres"
+
+
+@metric("trk_gauge_mean_err", needs="reference")
+def trk_gauge_mean_err(case: Case) -> Value:
+    """Error of the mean gauge of the exported rails, mm."""
+    asked, reason = _reference_gauge(case)
+    if asked is None:
+        return missing(reason)
+    return number(1e3 * abs(candidate_gauge(case).mean() - asked), len(candidate_gauge(case)), reason)
+
+
+@metric("trk_gauge_p95_dev", needs="reference")
+def trk_gauge_p95_dev(case: Case) -> Value:
+    """95th percentile of the deviation of the gauge along the track, mm."""
+    asked, reason = _reference_gauge(case)
+    if asked is None:
+        return missing(reason)
+    gauge = candidate_gauge(case)
+    return number(1e3 * np.percentile(np.abs(gauge - asked), 95), len(gauge), reason)
+
+
+@family("reference", {"trk_rail_lateral_rmse": 1, "trk_rail_height_rmse": 2})
+def rail_offset(case: Case, id: str, column: int) -> Value:
+    """Root mean square offset of the track's middle (1 lateral, 2 in height), m."""
+    if not reference_railway(case).rail.shape[1]:
+        return missing(_NO_RAILS)
+    offsets = rail_offsets(case)
+    return estimate(rms, offsets[:, column], offsets[:, 0], case.rng(id))
+
+
+@metric("trk_rail_gap_max")
+def trk_rail_gap_max(case: Case) -> Value:
+    """Longest stretch between the first and the last sleeper that a rail leaves out, m."""
+    if not len(case.candidate.track.sleeper):
+        return missing(_NO_TRACK)
+    return number(max(rail_gaps(case)), 2)
+
+
+@metric("trk_twist_p95")
+def trk_twist_p95(case: Case) -> Value:
+    """95th percentile of the change of the rails' difference in height over 3 m, mm/m."""
+    twist = 1e3 * np.abs(rail_twist(case, _TWIST_BASE))
+    if not len(twist):
+        return missing(_NO_TRACK)
+    return number(np.percentile(twist, 95), len(twist), "K: railway practice judges twist on a base of 3 m")
+
+
+@metric("trk_fastener_ratio")
+def trk_fastener_ratio(case: Case) -> Value:
+    """Fastenings over rail seats, two to a sleeper."""
+    count = 2 * len(case.candidate.track.sleeper)
+    if not count:
+        return missing(_NO_TRACK)
+    return number(len(fastening_sets(case)) / count, count, "K: one fastening to a seat")
+
+
+@metric("trk_asset_penetration_max")
+def trk_asset_penetration_max(case: Case) -> Value:
+    """Largest overlap or gap of rail, pad, sleeper and bed, m."""
+    if not len(case.candidate.track.sleeper):
+        return missing(_NO_TRACK)
+    found = seat_mismatches(case)
+    return number(np.abs(found).max(), len(found))
+
+
+# SCN: the released scene is in MuJoCo what the meshes say.
+
+
+@metric("mj_compiles")
+def mj_compiles(case: Case) -> Value:
+    """MuJoCo compiles the released MJCF."""
+    try:
+        model = scene_model(case)
+    except ValueError as error:
+        return pass_or_fail(False, str(error)[:200])
+    return pass_or_fail(model.ngeom > 0, f"{model.ngeom} geoms")
+
+
+@metric("mj_version_match")
+def mj_version_match(case: Case) -> Value:
+    """The MuJoCo in use is one that this project asks for."""
+    wanted = [Requirement(text) for text in requires("subterra-jax") or ()]
+    pin = next(one for one in wanted if one.name == "mujoco" and one.marker is None)
+    reason = (
+        f"{mujoco.__version__}, asked for {pin.specifier} by the project's own metadata; "
+        "not the paper's 3.8.1, because mujoco and mujoco-mjx must be of one release and MJX is tested at this one"
+    )
+    return pass_or_fail(pin.specifier.contains(mujoco.__version__), reason)
+
+
+@metric("mj_step_finite")
+def mj_step_finite(case: Case) -> Value:
+    """1,000 steps of the robot, pushed forwards, stay finite and raise no warning."""
+    state, warnings, _ = _push_robot(case)
+    return pass_or_fail(bool(np.isfinite(state).all()) and warnings == 0, f"{warnings} warnings")
+
+
+@per_release("scene")
+def _push_robot(case: Case) -> tuple[np.ndarray, int, float]:
+    """Return the last state, the number of warnings, and the steps per second."""
+    model = scene_model(case)
+    data = placed_data(model)
+    body = robot_body(model)
+    start = int(model.jnt_dofadr[model.body_jntadr[body]])
+    data.qvel[start : start + 3] = _PUSH * data.xmat[body].reshape(3, 3)[:, 0]
+    began = time.perf_counter()
+    for _ in range(_STEPS):
+        mujoco.mj_step(model, data)
+    rate = _STEPS / (time.perf_counter() - began)
+    return np.concatenate([data.qpos, data.qvel]), sum(int(w.number) for w in data.warning), rate
+
+
+@metric("mj_probe_free_frac")
+def mj_probe_free_frac(case: Case) -> Value:
+    """Share of axis stations where a sphere of 0.3 m touches nothing."""
+    free = probe_free(case)
+    return number(free.mean(), len(free))
+
+
+@metric("mj_wall_contact_err")
+def mj_wall_contact_err(case: Case) -> Value:
+    """Median difference between first contact in MuJoCo and in the mesh, towards both walls at LiDAR height, m.
+
+    Of several sets of walls, for bodies that collide with different bits, the finest one counts.
+    """
+    sets, meant = first_contacts(case)
+    errors = [float(np.median(np.abs(made - meant))) for made in sets]
+    reason = "by set of walls: " + ", ".join(f"{1e3 * error:.1f} mm" for error in errors)
+    return number(errors[0], len(meant), reason)
+
+
+@metric("mj_ray_vs_mesh_mae")
+def mj_ray_vs_mesh_mae(case: Case) -> Value:
+    """Mean difference of ranges, compiled scene against the meshes, m."""
+    pairs = rays_from_axis(case)
+    both = np.isfinite(pairs.scene) & np.isfinite(pairs.mesh) & pairs.comparable
+    return number(np.mean(np.abs(pairs.scene[both] - pairs.mesh[both])), int(both.sum()))
+
+
+@metric("mj_ray_leak_rate")
+def mj_ray_leak_rate(case: Case) -> Value:
+    """Share of rays that meet the meshes and nothing in the scene."""
+    pairs = rays_from_axis(case)
+    due = np.isfinite(pairs.mesh)
+    return number(np.mean(~np.isfinite(pairs.scene[due])), int(due.sum()))
+
+
+@metric("mj_manifest_match")
+def mj_manifest_match(case: Case) -> Value:
+    """The scene holds the numbers of assets that the manifest states."""
+    found, stated = count_assets(case), case.candidate.manifest.get("count", {})
+    shared = sorted(set(found) & set(stated))
+    wrong = [f"{name}: {found[name]} of {stated[name]}" for name in shared if found[name] != stated[name]]
+    reason = "; ".join(wrong) or ", ".join(f"{found[n]} {n}" for n in shared)
+    return pass_or_fail(bool(shared) and not wrong, reason)
+
+
+@metric("mj_frame_err")
+def mj_frame_err(case: Case) -> Value:
+    """Largest distance between a vertex of the compiled lining, the compiler's recentring undone, and the mesh's, m."""
+    return number(_frame_error(case), len(case.candidate.lining.vertices))
+
+
+@per_release("scene", "mesh")
+def _frame_error(case: Case) -> float:
+    model = scene_model(case)
+    data = placed_data(model)
+    lining = [k for k in range(model.ngeom) if model.geom(k).name.split("_")[0] in LINING_NAMES]
+    if not lining:
+        raise ValueError("no geom of the scene is called lining")
+    made, meant = np.concatenate([geom_mesh(model, data, k).vertices for k in lining]), case.candidate.lining.vertices
+    return float(max(cKDTree(meant).query(made)[0].max(), cKDTree(made).query(meant)[0].max()))
+
+
+@metric("mj_inertia_valid")
+def mj_inertia_valid(case: Case) -> Value:
+    """Inertias are positive and possible for a body; compiled masses are those that the MJCF states."""
+    model = scene_model(case)
+    moving = [k for k in range(1, model.nbody) if model.body_weldid[k] != 0]
+    if not moving:
+        return pass_or_fail(False, "nothing in the scene moves")
+    inertia = np.sort(model.body_inertia[moving], axis=1)
+    possible = bool((inertia[:, 0] > 0).all() and (inertia[:, 2] <= inertia[:, 0] + inertia[:, 1] + 1e-9).all())
+    stated = {
+        body.name: sum(geom.mass for geom in body.geoms)
+        for body in mujoco.MjSpec.from_file(str(case.candidate.scene)).bodies
+    }
+    mass = {model.body(k).name: float(model.body_mass[k]) for k in moving}
+    off = [n for n, m in mass.items() if np.isfinite(stated[n]) and abs(m - stated[n]) > _MASS_TOLERANCE * stated[n]]
+    valid = possible and not off and min(mass.values()) > 0
+    return pass_or_fail(valid, ", ".join(f"{n} {m:g} kg" for n, m in mass.items()))
+
+
+@metric("mj_xml_roundtrip")
+def mj_xml_roundtrip(case: Case) -> Value:
+    """Written out and read again, the scene has the same geoms at the same places."""
+    scene, before = case.candidate.scene, scene_model(case)
+    files = {str(path.relative_to(scene.parent)): path.read_bytes() for path in asset_files(scene)}
+    after = mujoco.MjSpec.from_string(mujoco.MjSpec.from_file(str(scene)).to_xml(), assets=files).compile()
+    if (before.ngeom, before.nbody, before.nmesh) != (after.ngeom, after.nbody, after.nmesh):
+        return pass_or_fail(False, f"{before.ngeom} geoms became {after.ngeom}")
+    moved = max(
+        float(np.abs(getattr(before, name) - getattr(after, name)).max())
+        for name in ("geom_pos", "geom_quat", "geom_size", "body_pos", "body_quat")
+    )
+    return pass_or_fail(moved <= _SAME_POSE, f"moved by {moved:.1e}")
+
+
+@metric("mj_step_rate")
+def mj_step_rate(case: Case) -> Value:
+    """Steps per second on the CPU, 1/s."""
+    return number(_push_robot(case)[2], _STEPS)
+
+
+# PAR: MJX, the JAX LiDAR and the environment agree with MuJoCo and with the meshes.
+
+
+@metric("mjx_put_model")
+def mjx_put_model(case: Case) -> Value:
+    """MJX accepts the whole released scene and makes one compiled step."""
+    try:
+        return pass_or_fail(step_is_finite(case))
+    except (NotImplementedError, ValueError, RuntimeError) as error:
+        return pass_or_fail(False, f"{type(error).__name__}: {error}"[:200])
+
+
+@metric("mjx_ray_parity")
+def mjx_ray_parity(case: Case) -> Value:
+    """Mean difference between the JAX LiDAR and `mj_multiRay` in the compiled scene at the same poses, m."""
+    difference = np.abs(planar.lidar_ranges(case) - planar.mujoco_ranges(case))
+    reason = "the JAX LiDAR sees walls and pockets in plan, no nails; track and crown lie outside its plane"
+    return number(difference.mean(), difference.size, reason)
+
+
+@metric("mjx_contact_parity")
+def mjx_contact_parity(case: Case) -> Value:
+    """Share of 200 placements of the robot with the same contact decision and a depth within 1 mm."""
+    ours, theirs = contact_depths(case)
+    same = ((ours < 0.0) == (theirs < 0.0)) & (np.abs(ours - theirs) <= _SAME_DEPTH)
+    return number(same.mean(), len(same), f"{np.mean(ours < 0.0):.0%} of them in contact")
+
+
+@metric("mjx_traj_divergence")
+def mjx_traj_divergence(case: Case) -> Value:
+    """Largest distance of the robot between MuJoCo and MJX over 100 steps, m."""
+    gap = path_divergence(case)
+    return number(gap.max(), len(gap))
+
+
+@metric("env_lidar_vs_mesh")
+def env_lidar_vs_mesh(case: Case) -> Value:
+    """Mean difference between the environment's noise-free beams and rays in the meshes, m."""
+    difference = np.abs(planar.observed_ranges(case) - planar.mesh_ranges(case))
+    return number(difference.mean(), difference.size)
+
+
+@metric("env_noise_sigma_err")
+def env_noise_sigma_err(case: Case) -> Value:
+    """Standard deviation of the environment's range noise against 5 cm, m."""
+    noise = planar.range_noise(case)
+    return number(abs(float(np.std(noise)) - _SIGMA), len(noise))
+
+
+@metric("env_determinism")
+def env_determinism(case: Case) -> Value:
+    """Same seed and actions give the same observations in two environments made one after the other."""
+    same = planar.repeated_observations(case)
+    return pass_or_fail(bool(same.all()), f"{int(same.sum())} of {len(same)} observations")
+
+
+@metric("env_odom_drift_ratio", needs="hold")
+def env_odom_drift_ratio(case: Case) -> Value:
+    """Decimal logarithm of the environment's drift over 100 m by that of the recording's own LiDAR odometry."""
+    assert case.hold is not None
+    path = case.candidate.folder / "odometry.tum"
+    if not path.exists():
+        return missing("poses were given, so that the recording has no LiDAR odometry of its own")
+    odometry, hold = load_tum(path), case.hold
+    first = np.flatnonzero(np.diff(hold.scan, prepend=-1))
+    when = np.array([odometry.covers(t, t) for t in hold.time[first]])
+    if when.sum() < 2:
+        return missing("the odometry and the held-out recording have no time in common")
+    chosen = first[when]
+    way = odometry.at(hold.time[chosen])[0]
+    arcs = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (way, hold.origin[chosen])]
+    real = abs(arcs[0] - arcs[1]) * 100.0 / max(arcs[1], 1e-9)
+    return number(np.log10(planar.odometry_drift(case) / max(real, 1e-6)), len(chosen))

@@ -1,0 +1,383 @@
+"""BEA, DIS and DEG: paired beams, distributions, degeneracy."""
+
+import numpy as np
+from scipy.stats import ks_2samp, norm, spearmanr, wasserstein_distance
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.beams import (
+    beam_directions,
+    cast_beams,
+    cloud_tree,
+    noisy_ranges,
+    returns,
+    scan_descriptors,
+    silence,
+)
+from benchmarks.fidelity.derive.clouds import (
+    Planes,
+    map_distances,
+    mean_entropy,
+    own_consistency,
+    plane_rows,
+    real_planes,
+    spatial_consistency,
+    synthetic_planes,
+    synthetic_tree,
+)
+from benchmarks.fidelity.derive.degeneracy import (
+    ScanInformation,
+    localised_stations,
+    real_alias,
+    real_icp,
+    real_information,
+    synthetic_alias,
+    synthetic_icp,
+    synthetic_information,
+)
+from benchmarks.fidelity.derive.distances import BOOTSTRAP_SAMPLES, self_cast
+from benchmarks.fidelity.registry import (
+    Statistic,
+    Value,
+    estimate,
+    family,
+    mean_magnitude,
+    metric,
+    missing,
+    number,
+    percentile,
+)
+
+_FAR = 0.20  # m
+_DIRECTION_BIN = np.deg2rad(5.0)
+_FEWEST_BEAMS = 50  # beams in a bin that counts
+_FOLDS = 5
+_NO_SILENCE = "the recording does not hold the beams that came back with nothing"
+_CIRCULAR = "by construction: noise about the same mesh, whatever the mesh"
+CONDITION = 10.0  # ratio to the strongest direction from which on a direction is degenerate
+SPREAD = 0.05  # of log10 of the axial information of one scan, by the sampling of its normals
+LOST = 2.0  # of log10, where the candidate gives a scan next to nothing
+_FEWEST_FRAMES = 10
+
+
+# BEA: recorded held-out beams, cast one by one in the candidate.
+
+
+def _range_error(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Range differences of beams that meet the candidate, and their stations; others count in `beam_late_frac`."""
+    hit = cast_beams(case).hit
+    return cast_beams(case).difference[hit], returns(case).local[hit, 0]
+
+
+@family("hold", {"beam_range_mae": np.mean, "beam_range_medae": np.median, "beam_range_p95": percentile(95)})
+def range_error(case: Case, id: str, statistic: Statistic) -> Value:
+    """Statistic of the absolute range difference, m."""
+    error, station = _range_error(case)
+    return estimate(statistic, np.abs(error), station, case.rng(id), BOOTSTRAP_SAMPLES)
+
+
+@metric("beam_range_bias", needs="hold")
+def beam_range_bias(case: Case) -> Value:
+    """Magnitude of the mean range difference, m."""
+    error, station = _range_error(case)
+    return estimate(mean_magnitude, error, station, case.rng("beam_range_bias"), BOOTSTRAP_SAMPLES)
+
+
+@metric("beam_rel_medae", needs="hold")
+def beam_rel_medae(case: Case) -> Value:
+    """Median absolute range difference as a share of the range, %."""
+    hit, (error, station) = cast_beams(case).hit, _range_error(case)
+    relative = 100.0 * np.abs(error) / returns(case).range[hit]
+    return estimate(np.median, relative, station, case.rng("beam_rel_medae"), BOOTSTRAP_SAMPLES)
+
+
+@metric("beam_within_10cm", needs="hold")
+def beam_within_10cm(case: Case) -> Value:
+    """Share of the returns that the candidate gives within 10 cm; a beam that leaves it is not within."""
+    return _beam_share(case, "beam_within_10cm", np.abs(cast_beams(case).difference) <= 0.10 * case.tolerance)
+
+
+@metric("beam_early_frac", needs="hold")
+def beam_early_frac(case: Case) -> Value:
+    """Share of the returns in front of which, by more than 20 cm, the candidate stands."""
+    return _beam_share(case, "beam_early_frac", cast_beams(case).difference < -_FAR * case.tolerance)
+
+
+@metric("beam_late_frac", needs="hold")
+def beam_late_frac(case: Case) -> Value:
+    """Share of the returns that the candidate gives more than 20 cm later, or not at all."""
+    return _beam_share(case, "beam_late_frac", cast_beams(case).difference > _FAR * case.tolerance)
+
+
+def _beam_share(case: Case, id: str, marked: np.ndarray) -> Value:
+    return estimate(np.mean, marked.astype(float), returns(case).local[:, 0], case.rng(id), BOOTSTRAP_SAMPLES)
+
+
+@metric("beam_return_bacc", needs="hold")
+def beam_return_bacc(case: Case) -> Value:
+    """Balanced accuracy of the prediction whether a beam comes back."""
+    assert case.hold is not None
+    if not case.hold.knows_missing:
+        return missing(_NO_SILENCE)
+    found = silence(case)
+    if not found.silent.any() or found.silent.all():
+        return missing("all beams of the recording came back, or none")
+    right = [np.mean(found.expected_silent[found.silent]), np.mean(~found.expected_silent[~found.silent])]
+    return number(float(np.mean(right)), len(found.silent))
+
+
+@metric("selfcast_p2s_mean", needs="hold")
+def selfcast_p2s_mean(case: Case) -> Value:
+    """The paper's headline: mean distance of a cloud cast in the mesh to that mesh, m."""
+    return number(float(np.mean(self_cast(case).distance)), len(self_cast(case).distance), _CIRCULAR)
+
+
+@metric("selfcast_within_10cm", needs="hold")
+def selfcast_within_10cm(case: Case) -> Value:
+    """The paper's headline: share of that cloud within 10 cm."""
+    near = self_cast(case).distance <= 0.10 * case.tolerance
+    return number(float(np.mean(near)), len(near), _CIRCULAR)
+
+
+@metric("selfcast_noise_ratio", needs="hold")
+def selfcast_noise_ratio(case: Case) -> Value:
+    """That mean over the mean that noise alone gives on a plane; 1: only noise was measured."""
+    found = self_cast(case)
+    return number(float(np.mean(found.distance) / found.noise_alone), len(found.distance), _CIRCULAR)
+
+
+# DIS: the distributions that a sensor measures in the candidate against those of the recording.
+
+
+def _both_ranges(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Measured ranges, and the synthetic ones that are finite, m."""
+    reach = noisy_ranges(case, "first")
+    return returns(case).range, reach[np.isfinite(reach)]
+
+
+@metric("range_ks", needs="hold")
+def range_ks(case: Case) -> Value:
+    """Kolmogorov-Smirnov statistic of the ranges."""
+    real, synthetic = _both_ranges(case)
+    return number(float(ks_2samp(real, synthetic, method="asymp").statistic), len(real))
+
+
+@metric("range_w1", needs="hold")
+def range_w1(case: Case) -> Value:
+    """Wasserstein-1 distance of the ranges, m."""
+    real, synthetic = _both_ranges(case)
+    return number(float(wasserstein_distance(real, synthetic)), len(real))
+
+
+@metric("elevation_w1", needs="hold")
+def elevation_w1(case: Case) -> Value:
+    """Mean over bins of 5° of elevation of the ranges' Wasserstein-1 distance, m."""
+    elevation = np.round(beam_directions(case).elevation / _DIRECTION_BIN).astype(int)
+    distances = [wasserstein_distance(real, synthetic) for real, synthetic in _ranges_by_bin(case, elevation)]
+    return number(float(np.mean(distances)), len(elevation))
+
+
+@metric("azimuth_profile_rmse", needs="hold")
+def azimuth_profile_rmse(case: Case) -> Value:
+    """Root mean square over bins of 5° of azimuth of the difference of median ranges, m."""
+    azimuth = np.round(beam_directions(case).azimuth / _DIRECTION_BIN).astype(int)
+    gaps = [np.median(real) - np.median(synthetic) for real, synthetic in _ranges_by_bin(case, azimuth)]
+    return number(float(np.sqrt(np.mean(np.square(gaps)))), len(azimuth))
+
+
+def _ranges_by_bin(case: Case, group: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Measured and synthetic ranges by bin, of bins in which both have enough."""
+    reach = noisy_ranges(case, "first")
+    order = np.argsort(group, kind="stable")
+    starts = np.flatnonzero(np.diff(group[order])) + 1
+    pairs = []
+    for rows in np.split(order, starts):
+        cast = reach[rows][np.isfinite(reach[rows])]
+        if len(rows) >= _FEWEST_BEAMS and len(cast) >= _FEWEST_BEAMS:
+            pairs.append((returns(case).range[rows], cast))
+    if not pairs:
+        raise ValueError("no bin of directions has enough beams")
+    return pairs
+
+
+@metric("incidence_w1", needs="hold")
+def incidence_w1(case: Case) -> Value:
+    """Wasserstein-1 distance of the incidence angles, normals of both clouds by local planes, degrees."""
+    real, synthetic = (_incidence_angles(case, planes) for planes in (real_planes(case), synthetic_planes(case)))
+    return number(float(wasserstein_distance(real, synthetic)), len(real))
+
+
+def _incidence_angles(case: Case, planes: Planes) -> np.ndarray:
+    cosine = np.abs(np.einsum("ij,ij->i", planes.normal, returns(case).direction[plane_rows(case)]))
+    return np.rad2deg(np.arccos(np.minimum(cosine[np.isfinite(cosine)], 1.0)))
+
+
+@metric("dropout_diff", needs="hold")
+def dropout_diff(case: Case) -> Value:
+    """Difference between the shares of beams without a return."""
+    assert case.hold is not None
+    if not case.hold.knows_missing:
+        return missing(_NO_SILENCE)
+    found = silence(case)
+    return number(abs(float(np.mean(found.silent)) - float(np.mean(found.expected_silent))), len(found.silent))
+
+
+@metric("noise_sigma_diff", needs="hold")
+def noise_sigma_diff(case: Case) -> Value:
+    """Difference of the median spread about local planes, m."""
+    sigma = [float(np.nanmedian(planes.sigma)) for planes in (real_planes(case), synthetic_planes(case))]
+    return number(abs(sigma[0] - sigma[1]), len(plane_rows(case)))
+
+
+@metric("awd", needs="hold")
+def awd(case: Case) -> Value:
+    """Mean Wasserstein distance of the points in voxels of 0.5 m, m."""
+    _, distance = map_distances(case)
+    return number(float(np.mean(distance)), len(distance))
+
+
+@metric("scs_diff", needs="hold")
+def scs_diff(case: Case) -> Value:
+    """Spatial consistency score against the synthetic map less that of two halves of the held-out cloud."""
+    key, distance = map_distances(case)
+    return number(abs(spatial_consistency(key, distance) - own_consistency(case)), len(distance))
+
+
+@metric("mme_diff", needs="hold")
+def mme_diff(case: Case) -> Value:
+    """Difference of the mean map entropies, nat."""
+    cloud, tree = synthetic_tree(case)
+    return number(abs(mean_entropy(cloud_tree(case), returns(case).points) - mean_entropy(tree, cloud)))
+
+
+@metric("c2st_auc", needs="hold")
+def c2st_auc(case: Case) -> Value:
+    """Area under the curve of a forest that tells real from synthetic scans; 0.5: it cannot.
+
+    A scan and its twin are never on both sides of a fold. Blocks of neighbouring scans make the folds, since
+    neighbouring scans are nearly the same scan.
+    """
+    from sklearn.ensemble import RandomForestClassifier
+    from sklearn.metrics import roc_auc_score
+    from sklearn.model_selection import GroupKFold, cross_val_predict
+
+    real, synthetic, scan = scan_descriptors(case)
+    descriptors = np.concatenate([real, synthetic])
+    label = np.repeat([0, 1], len(real))
+    block = np.tile(scan * _FOLDS // len(scan), 2)
+    forest = RandomForestClassifier(100, min_samples_leaf=3, random_state=case.seed)
+    guess = cross_val_predict(
+        forest, descriptors, label, groups=block, cv=GroupKFold(_FOLDS), method="predict_proba"
+    )[:, 1]  # fmt: skip
+    return number(float(roc_auc_score(label, guess)), len(label))
+
+
+# DEG: whether a scan in the candidate tells its own pose as well, and as badly, as the recorded one.
+
+
+def _both_information(case: Case) -> tuple[ScanInformation, ScanInformation]:
+    return real_information(case), synthetic_information(case)
+
+
+def _condition(scans: ScanInformation) -> np.ndarray:
+    return scans.translation[:, 2] / scans.translation[:, 0]
+
+
+@family("hold", {
+    "deg_axial_info_logratio": lambda scans: scans.axial,
+    "deg_cond_logratio": _condition,
+    "deg_rot_info_logratio": lambda scans: scans.rotation,
+})  # fmt: skip
+def information_logratio(case: Case, id: str, quantity) -> Value:
+    """Median over the scans of |log10| of the ratio of an information, synthetic over real."""
+    real, synthetic = (quantity(scans) for scans in _both_information(case))
+    log = np.abs(np.log10(synthetic / real))
+    log = np.where(np.isfinite(real) & ~np.isfinite(synthetic), LOST, log)
+    return estimate(np.median, log, real_information(case).station, case.rng(id))
+
+
+@metric("deg_weak_angle_diff", needs="hold")
+def deg_weak_angle_diff(case: Case) -> Value:
+    """Median angle between the weakest directions of translation, degrees."""
+    real, synthetic = _both_information(case)
+    cosine = np.abs(np.einsum("ij,ij->i", real.weakest, synthetic.weakest))
+    angle = np.rad2deg(np.arccos(np.minimum(np.nan_to_num(cosine), 1.0)))
+    return estimate(np.median, angle, real.station, case.rng("deg_weak_angle_diff"))
+
+
+@metric("deg_eig_w1", needs="hold")
+def deg_eig_w1(case: Case) -> Value:
+    """Wasserstein-1 distance of the distributions of log10 of the smallest eigenvalue."""
+    smallest = [np.log10(scans.translation[:, 0]) for scans in _both_information(case)]
+    real, synthetic = (values[np.isfinite(values)] for values in smallest)
+    return number(float(wasserstein_distance(real, synthetic)), len(real))
+
+
+@metric("deg_profile_corr", needs="hold")
+def deg_profile_corr(case: Case) -> Value:
+    """Spearman correlation along the tunnel of the axial information."""
+    real, synthetic = _axial_pairs(case)
+    return number(float(spearmanr(real, synthetic).statistic), len(real))
+
+
+@metric("deg_class_kappa", needs="hold")
+def deg_class_kappa(case: Case) -> Value:
+    """Cohen's kappa of the scans' classes: poor, middling or rich in axial information.
+
+    The classes are the real scans' thirds: X-ICP's fixed cuts put all scans of one tunnel into one class, where
+    agreement means nothing. They are ordered, so that being one class off counts half (linear weights).
+    """
+    from sklearn.metrics import cohen_kappa_score
+
+    real, synthetic = _axial_pairs(case)
+    cuts = np.quantile(real, [1 / 3, 2 / 3])
+    classes = [np.searchsorted(cuts, values, side="right") for values in (real, synthetic)]
+    return number(float(cohen_kappa_score(*classes, weights="linear")), len(real))
+
+
+def _axial_pairs(case: Case) -> tuple[np.ndarray, np.ndarray]:
+    """Axial information of the scans, real and synthetic; 0 where the candidate returns too little of a scan.
+
+    Raises:
+        ValueError: Too few scans.
+    """
+    real, synthetic = _both_information(case)
+    known = np.isfinite(real.axial)
+    if known.sum() < _FEWEST_FRAMES:
+        raise ValueError(f"{known.sum()} frames are too few; {_FEWEST_FRAMES} are needed")
+    return real.axial[known], np.nan_to_num(synthetic.axial[known])
+
+
+@metric("deg_landmark_diff", needs="hold")
+def deg_landmark_diff(case: Case) -> Value:
+    """Difference in stations per 100 scans at which the axis is not degenerate.
+
+    A scan near the cut counts by the probability that it lies beyond it.
+    """
+    counts = []
+    for scans in _both_information(case):
+        known = np.isfinite(scans.axial)
+        excess = np.log10(CONDITION * scans.axial[known] / scans.translation[known, 2])
+        counts.append(100.0 * float(norm.cdf(excess / SPREAD).sum()) / len(known))
+    return number(abs(counts[0] - counts[1]), len(real_information(case).axial))
+
+
+@metric("deg_alias_diff", needs="hold")
+def deg_alias_diff(case: Case) -> Value:
+    """Difference of the median alias ratios."""
+    real, synthetic = real_alias(case), synthetic_alias(case)
+    return number(abs(float(np.median(real)) - float(np.median(synthetic))), len(real))
+
+
+@metric("deg_icp_axial_logratio", needs="hold")
+def deg_icp_axial_logratio(case: Case) -> Value:
+    """|log10| of the ratio of median axial errors of scan-to-scan registration."""
+    real, synthetic = real_icp(case), synthetic_icp(case)
+    if not len(real):
+        return missing("no two scans with enough returns")
+    return number(abs(float(np.log10(np.median(synthetic) / np.median(real)))), len(real))
+
+
+@metric("deg_planar_axial_info")
+def deg_planar_axial_info(case: Case) -> Value:
+    """Share of stations at which the environment's planar scan alone tells the station."""
+    return number(float(np.mean(localised_stations(case))), len(localised_stations(case)))

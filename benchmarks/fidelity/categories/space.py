@@ -1,0 +1,352 @@
+"""F2D, F3D and NAV: free space and routes through it."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.axis import hold_points, reference_curve
+from benchmarks.fidelity.derive.freespace import (
+    air_voxels,
+    axis_clearances,
+    carve_beams,
+    carved_about,
+    headrooms,
+    infringements,
+)
+from benchmarks.fidelity.derive.ground import (
+    ROBOT_RADIUS,
+    Route,
+    blocked_metres,
+    both_grounds,
+    both_routes,
+    draw_trips,
+    feasible_trips,
+    judged_route,
+)
+from benchmarks.fidelity.derive.plane import (
+    cell_distances,
+    edge_cells,
+    free_plane,
+    free_widths,
+    gapless_maps,
+    medial_axis,
+    unknown_share,
+)
+from benchmarks.fidelity.derive.sections import lining_radii, sections
+from benchmarks.fidelity.derive.surface import surface_nearest
+from benchmarks.fidelity.registry import (
+    Value,
+    estimate,
+    family,
+    mean,
+    metric,
+    missing,
+    number,
+    pass_or_fail,
+    percentile,
+    root_of_mean,
+)
+
+_EDGE_NEAR = 0.10  # m between two edges that agree
+_WIDEST = 20.0  # m in place of an open side
+_DEEP_RETURN = 0.20  # m
+_RADII_SLACK = 0.05  # m; error of the table of radii at the edge of a pocket
+_SENSOR_CLEARANCE = 0.20  # m that a sensor keeps from any surface
+_NO_WAY = "the candidate has no way from mouth to mouth"
+_NO_REFERENCE = "the reference shows no way from mouth to mouth"
+
+
+# F2D: free space in the plane of the sensor.
+
+
+def _agreement(case: Case, id: str, among: np.ndarray, both: np.ndarray) -> Value:
+    """Share of the cells `among` that are free in `both`, where the reference is known."""
+    picked = among & free_plane(case).known
+    station = np.broadcast_to(free_plane(case).station[:, None], picked.shape)[picked]
+    return estimate(mean, both[picked].astype(float), station, case.rng(id))
+
+
+@metric("occ2d_free_iou", needs="reference")
+def occ2d_free_iou(case: Case) -> Value:
+    """Intersection over union of the free cells, where the reference is known."""
+    judged, reference = free_plane(case).judged, free_plane(case).reference
+    return _agreement(case, "occ2d_free_iou", judged | reference, judged & reference)
+
+
+@metric("occ2d_free_precision", needs="reference")
+def occ2d_free_precision(case: Case) -> Value:
+    """Share of the candidate's free cells that are free in the reference."""
+    return _agreement(case, "occ2d_free_precision", free_plane(case).judged, free_plane(case).reference)
+
+
+@metric("occ2d_free_recall", needs="reference")
+def occ2d_free_recall(case: Case) -> Value:
+    """Share of the reference's free cells that are free in the candidate."""
+    return _agreement(case, "occ2d_free_recall", free_plane(case).reference, free_plane(case).judged)
+
+
+@metric("occ2d_boundary_f1", needs="reference")
+def occ2d_boundary_f1(case: Case) -> Value:
+    """F1 of the edges of free space, matched within 10 cm."""
+    judged, reference = (edge_cells(free) for free in gapless_maps(case)[:2])
+    edge, reach = free_plane(case).lattice.edge, _EDGE_NEAR * case.tolerance + 1e-9
+    precision = mean(cell_distances(judged, reference, edge) <= reach)
+    recall = mean(cell_distances(reference, judged, edge) <= reach)
+    return number(2 * precision * recall / max(precision + recall, 1e-12), int(judged.sum() + reference.sum()))
+
+
+@metric("free2d_area_rel_err", needs="reference")
+def free2d_area_rel_err(case: Case) -> Value:
+    """Relative error of the free area, %."""
+    judged, reference, _ = gapless_maps(case)
+    return number(100.0 * abs(judged.sum() / max(reference.sum(), 1) - 1.0), int(reference.sum()))
+
+
+@metric("free2d_width_mae", needs="reference")
+def free2d_width_mae(case: Case) -> Value:
+    """Mean absolute error of the free width, m; an open side counts as 20 m."""
+    station, judged, reference = free_widths(case)
+    error = np.abs(np.minimum(judged, _WIDEST) - np.minimum(reference, _WIDEST))
+    return estimate(mean, error, station, case.rng("free2d_width_mae"))
+
+
+@metric("free2d_width_min_err", needs="reference")
+def free2d_width_min_err(case: Case) -> Value:
+    """Absolute error of the narrowest width, m."""
+    _, judged, reference = free_widths(case)
+    return number(abs(float(np.min(judged)) - float(np.min(reference))), len(judged))
+
+
+@metric("free2d_edt_rmse", needs="reference")
+def free2d_edt_rmse(case: Case) -> Value:
+    """Root mean square error of the distance to the edge of free space, where either is free, m."""
+    judged, reference, rows = gapless_maps(case)
+    picked = judged | reference
+    clear = [_edge_distance(free, free_plane(case).lattice.edge) for free in (judged, reference)]
+    station = np.broadcast_to(rows[:, None], picked.shape)[picked]
+    return estimate(root_of_mean, ((clear[0] - clear[1]) ** 2)[picked], station, case.rng("free2d_edt_rmse"))
+
+
+def _edge_distance(free: np.ndarray, edge: float) -> np.ndarray:
+    if not free.any():
+        return np.zeros(free.shape)
+    return cell_distances(np.ones_like(free), ~free, edge).reshape(free.shape)
+
+
+@metric("free2d_skeleton_p95", needs="reference")
+def free2d_skeleton_p95(case: Case) -> Value:
+    """95th percentile of the distance between the medial axes, both ways, m."""
+    judged, reference = (medial_axis(free) for free in gapless_maps(case)[:2])
+    edge = free_plane(case).lattice.edge
+    apart = [cell_distances(judged, reference, edge), cell_distances(reference, judged, edge)]
+    return number(float(np.percentile(np.concatenate(apart), 95)), sum(map(len, apart)))
+
+
+@metric("occ2d_unknown_frac", needs="hold")
+def occ2d_unknown_frac(case: Case) -> Value:
+    """Share of the candidate's free cells that no held-out beam shows."""
+    return number(unknown_share(case), int(free_plane(case).judged.sum()))
+
+
+# F3D: free space in three dimensions, along the reference axis.
+
+
+@metric("free3d_iou", needs="reference")
+def free3d_iou(case: Case) -> Value:
+    """Intersection over union of free voxels, where the reference is known."""
+    both = air_voxels(case)
+    either = (both.judged | both.reference) & both.known
+    station = both.lattice.low[0] + both.lattice.edge * np.nonzero(either)[0]
+    return estimate(mean, (both.judged & both.reference)[either].astype(float), station, case.rng("free3d_iou"))
+
+
+@metric("free3d_volume_rel_err", needs="reference")
+def free3d_volume_rel_err(case: Case) -> Value:
+    """Relative error of the free volume, where the reference is known, %."""
+    both = air_voxels(case)
+    judged, reference = ((side & both.known).sum() for side in (both.judged, both.reference))
+    return number(100.0 * abs(judged / max(reference, 1) - 1.0), int(reference))
+
+
+@metric("free3d_false_free", needs="hold")
+def free3d_false_free(case: Case) -> Value:
+    """Share of held-out returns deeper than 20 cm in the candidate's air."""
+    points, deep = hold_points(case), _DEEP_RETURN * case.tolerance
+    inside = lining_radii(case).depth(points) > deep
+    wrong = np.zeros(len(points))
+    if inside.any():
+        wrong[inside] = surface_nearest(case).query(points[inside])[0] > deep
+    return estimate(mean, wrong, reference_curve(case).local(points)[:, 0], case.rng("free3d_false_free"))
+
+
+@metric("free3d_false_occupied", needs="hold")
+def free3d_false_occupied(case: Case) -> Value:
+    """Share of the length of held-out beams, up to 20 cm before their returns, that the candidate holds occupied.
+
+    Occupied is whatever lies 5 cm outside its lining, and what its extra surfaces fill or close off.
+    """
+    passed, both = carve_beams(case).passed, air_voxels(case)
+    local = carved_about(case, reference_curve(case))[0]
+    outside = lining_radii(case).depth(passed) < -_RADII_SLACK
+    if len(case.candidate.extra.faces):
+        cell, kept = both.lattice.cell(local)
+        outside |= kept & both.filled.ravel()[cell]
+    # Beyond the ends of the reference a beam still runs in air that nobody reconstructed.
+    among = (local[:, 0] > both.lattice.low[0]) & (local[:, 0] < reference_curve(case).station[-1])
+    return estimate(mean, outside[among].astype(float), local[among, 0], case.rng("free3d_false_occupied"))
+
+
+@metric("free3d_esdf_rmse", needs="reference")
+def free3d_esdf_rmse(case: Case) -> Value:
+    """Root mean square error of the distance to the nearest surface within 1 m of the axis, m."""
+    both = axis_clearances(case)
+    error = both.judged - both.reference
+    station = np.repeat(both.station, error.shape[1])
+    return estimate(root_of_mean, (error**2).ravel(), station, case.rng("free3d_esdf_rmse"))
+
+
+@metric("free3d_inscribed_err", needs="reference")
+def free3d_inscribed_err(case: Case) -> Value:
+    """Mean absolute error of the radius of the largest sphere near the axis, m."""
+    both = axis_clearances(case)
+    error = np.abs(both.judged.max(axis=1) - both.reference.max(axis=1))
+    return estimate(mean, error, both.station, case.rng("free3d_inscribed_err"))
+
+
+@metric("free3d_headroom_rmse", needs="reference")
+def free3d_headroom_rmse(case: Case) -> Value:
+    """Root mean square error of floor to crown in three lanes, m."""
+    station, judged, reference = headrooms(case)
+    squares = (judged - reference) ** 2
+    lanes = np.repeat(station, squares.shape[1])
+    return estimate(root_of_mean, squares.ravel(), lanes, case.rng("free3d_headroom_rmse"))
+
+
+@metric("free3d_envelope_agree", needs="reference")
+def free3d_envelope_agree(case: Case) -> Value:
+    """Share of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
+    judged, reference = infringements(case)
+    agree = (judged == reference).mean(axis=1)
+    return estimate(mean, agree, sections(case).station, case.rng("free3d_envelope_agree"))
+
+
+@metric("free3d_hold_poses_free", needs="hold")
+def free3d_hold_poses_free(case: Case) -> Value:
+    """Share of the sensor positions between the reference's mouths that are inside and 20 cm clear of any surface."""
+    assert case.hold is not None
+    at, curve = case.hold.origin[np.unique(case.hold.scan, return_index=True)[1]], reference_curve(case)
+    station = curve.local(at)[:, 0]
+    within = (station > curve.station[0]) & (station < curve.station[-1])
+    at, station = at[within], station[within]
+    clear = surface_nearest(case).query(at)[0] >= _SENSOR_CLEARANCE * case.tolerance
+    free = (lining_radii(case).depth(at) > 0) & clear
+    return estimate(mean, free.astype(float), station, case.rng("free3d_hold_poses_free"))
+
+
+@metric("free3d_voxel_vs_mesh_vol", needs="reference")
+def free3d_voxel_vs_mesh_vol(case: Case) -> Value:
+    """Difference between the volume of the voxels inside the lining and that of the solid, %."""
+    both, radii = air_voxels(case), lining_radii(case)
+    inside = both.judged | both.blocked
+    share = (both.lattice.shape[0] * both.lattice.edge) / radii.curve.length
+    volume = abs(float(case.candidate.solid.volume)) * min(share, 1.0)
+    voxels = float(inside.sum()) * both.lattice.edge**3
+    return number(100.0 * abs(voxels / volume - 1.0), int(inside.sum()))
+
+
+# NAV: the ways of a small robot over the candidate's ground and the reference's.
+
+
+def _both_ways(case: Case) -> tuple[Route, Route] | Value:
+    judged, reference = both_routes(case)
+    if reference is None:
+        return missing(_NO_REFERENCE)
+    if judged is None:
+        return Value(None, None, 0, _NO_WAY, failed=True)
+    return judged, reference
+
+
+@metric("nav_path_exists")
+def nav_path_exists(case: Case) -> Value:
+    """The robot gets from mouth to mouth."""
+    exists = judged_route(case) is not None
+    return pass_or_fail(exists, "" if exists else _NO_WAY)
+
+
+@metric("nav_path_len_ratio", needs="reference")
+def nav_path_len_ratio(case: Case) -> Value:
+    """Length of the way over the length of the reference's."""
+    ways = _both_ways(case)
+    return ways if isinstance(ways, Value) else number(ways[0].length / ways[1].length, len(ways[0].place))
+
+
+@metric("nav_path_dev_p95", needs="reference")
+def nav_path_dev_p95(case: Case) -> Value:
+    """95th percentile of the distance from the way to the reference's, m."""
+    ways = _both_ways(case)
+    if isinstance(ways, Value):
+        return ways
+    apart = cKDTree(ways[1].place).query(ways[0].place)[0]
+    return estimate(percentile(95), apart, ways[0].place[:, 0], case.rng("nav_path_dev_p95"))
+
+
+@family("reference", {"nav_clearance_min_err": np.min, "nav_clearance_mean_err": mean})
+def way_clearance_error(case: Case, id: str, statistic) -> Value:
+    """Absolute error of the least or mean clearance on the way, m."""
+    ways = _both_ways(case)
+    if isinstance(ways, Value):
+        return ways
+    judged, reference = (statistic(way.clearance) for way in ways)
+    return number(abs(float(judged - reference)), len(ways[0].place))
+
+
+@metric("nav_drivable_width_mae", needs="reference")
+def nav_drivable_width_mae(case: Case) -> Value:
+    """Mean absolute error of the drivable width, m."""
+    judged, reference = both_grounds(case)
+    width = [ground.traversable.sum(axis=1) * ground.cell for ground in (judged, reference)]
+    return estimate(mean, np.abs(width[0] - width[1]), judged.station, case.rng("nav_drivable_width_mae"))
+
+
+@metric("nav_feasible_agree", needs="reference")
+def nav_feasible_agree(case: Case) -> Value:
+    """Share of 1,000 random starts, goals and inflations that are feasible on both grounds or on neither."""
+    judged, reference = both_grounds(case)
+    trips = draw_trips(reference, case.rng("nav_feasible_agree"))
+    agree = feasible_trips(judged, trips) == feasible_trips(reference, trips)
+    return number(mean(agree.astype(float)), len(agree))
+
+
+@metric("nav_blocked_diff", needs="reference")
+def nav_blocked_diff(case: Case) -> Value:
+    """Absolute difference in the number of blocked metres between the rails."""
+    judged, reference = both_grounds(case)
+    return number(abs(blocked_metres(judged) - blocked_metres(reference)), 1)
+
+
+@metric("nav_traversable_iou", needs="reference")
+def nav_traversable_iou(case: Case) -> Value:
+    """Intersection over union of traversable cells, where the reference sees the ground."""
+    judged, reference = both_grounds(case)
+    free = [judged.traversable, reference.traversable]
+    among = free[0] | free[1]
+    if case.truth is None:
+        among &= np.isfinite(reference.step) & np.isfinite(judged.step)
+    station = np.broadcast_to(judged.station[:, None], among.shape)[among]
+    return estimate(mean, (free[0] & free[1])[among].astype(float), station, case.rng("nav_traversable_iou"))
+
+
+@metric("nav_step_p95_err", needs="reference")
+def nav_step_p95_err(case: Case) -> Value:
+    """Absolute error of the 95th percentile of the step between neighbouring cells, m."""
+    judged, reference = both_grounds(case)
+    among = np.isfinite(judged.step) & np.isfinite(reference.step)
+    steps = np.percentile([judged.step[among], reference.step[among]], 95, axis=1)
+    return number(abs(float(np.diff(steps)[0])), int(among.sum()))
+
+
+@metric("nav_footprint_margin")
+def nav_footprint_margin(case: Case) -> Value:
+    """Least clearance on the way less the robot's radius, m."""
+    way = judged_route(case)
+    return missing(_NO_WAY) if way is None else number(float(way.clearance.min()) - ROBOT_RADIUS, len(way.place))

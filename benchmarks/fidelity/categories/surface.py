@@ -1,0 +1,248 @@
+"""C2M, CMP and OCC: distances to the surface, completeness, voxel occupancy."""
+
+import numpy as np
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.beams import mouths_on_path, returns, station_bins
+from benchmarks.fidelity.derive.clouds import real_planes
+from benchmarks.fidelity.derive.distances import (
+    BOOTSTRAP_SAMPLES,
+    cloud_distances,
+    density_aware_chamfer,
+    dilate,
+    iou,
+    m3c2_distances,
+    mean_distance,
+    mesh_distances,
+    occupied_voxels,
+    phantom_cells,
+    shell_voxels,
+    tolerant_f1,
+)
+from benchmarks.fidelity.registry import Statistic, Value, estimate, family, metric, missing, number, percentile, rms
+
+_FEWEST_IN_GROUP = 50  # points of a bin or sector that counts
+_FEWEST_RETURNS = 100  # held-out returns of a bin that counts for completeness
+_FEWEST_IN_BIN = 200  # held-out returns of a bin that counts for voxels
+_FAR = 0.20  # m
+_MOUTH_LENGTH = 2.0  # m
+
+
+# C2M: held-out points to the candidate, without any registration.
+
+
+@family("hold", {
+    "c2m_mean": np.mean, "c2m_median": np.median, "c2m_rmse": rms,
+    "c2m_p95": percentile(95), "c2m_p99": percentile(99),
+})  # fmt: skip
+def mesh_distance(case: Case, id: str, statistic: Statistic) -> Value:
+    """Statistic of the distance from held-out points to the surface, m."""
+    found = mesh_distances(case)
+    return estimate(statistic, found.distance, found.station, case.rng(id), BOOTSTRAP_SAMPLES)
+
+
+@family("hold", {"c2m_within_5cm": 0.05, "c2m_within_10cm": 0.10})
+def mesh_precision(case: Case, id: str, within: float) -> Value:
+    """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
+    found = mesh_distances(case)
+    near = (found.distance <= within * case.tolerance).astype(float)
+    return estimate(np.mean, near, found.station, case.rng(id), BOOTSTRAP_SAMPLES)
+
+
+@metric("c2m_signed_bias", needs="hold")
+def c2m_signed_bias(case: Case) -> Value:
+    """Magnitude of the mean distance, signed by the side of the sensor, m."""
+    found, rng = mesh_distances(case), case.rng("c2m_signed_bias")
+    return estimate(lambda d: float(abs(np.mean(d))), found.signed, found.station, rng, BOOTSTRAP_SAMPLES)
+
+
+@metric("c2m_chainage_worst", needs="hold")
+def c2m_chainage_worst(case: Case) -> Value:
+    """Largest mean distance of a bin of about 10 m, m."""
+    return _worst_group(mesh_distances(case).distance, station_bins(case, mesh_distances(case).station))
+
+
+@metric("c2m_sector_worst", needs="hold")
+def c2m_sector_worst(case: Case) -> Value:
+    """Largest mean distance of eight sectors about the axis, m."""
+    return _worst_group(mesh_distances(case).distance, mesh_distances(case).sector)
+
+
+def _worst_group(distance: np.ndarray, group: np.ndarray) -> Value:
+    count = np.bincount(group)
+    mean = np.bincount(group, distance) / np.maximum(count, 1)
+    full = count >= min(_FEWEST_IN_GROUP, count.max())
+    return number(float(mean[full].max()), len(distance))
+
+
+@metric("c2m_noise_ratio", needs="hold")
+def c2m_noise_ratio(case: Case) -> Value:
+    """Median distance over the median residual of the held-out points from their own local planes."""
+    return number(float(np.median(mesh_distances(case).distance) / np.median(real_planes(case).residual)))
+
+
+@metric("c2m_fit_hold_gap", needs="hold")
+def c2m_fit_hold_gap(case: Case) -> Value:
+    """Mean distance of held-out points less that of the points that the builder read, m; at least 0."""
+    if case.fit is None:
+        return missing("the recording that the builder read is not at hand")
+    gap = float(np.mean(mesh_distances(case).distance)) - mean_distance(case, case.fit)
+    return number(max(gap, 0.0), len(mesh_distances(case).distance))
+
+
+@metric("m3c2_signif_frac", needs="hold")
+def m3c2_signif_frac(case: Case) -> Value:
+    """Share of core points whose M3C2 distance exceeds its level of detection."""
+    found = m3c2_distances(case)
+    return estimate(np.mean, found.significant, found.station, case.rng("m3c2_signif_frac"), BOOTSTRAP_SAMPLES)
+
+
+# CMP: completeness both ways, of the surface that held-out beams observed.
+
+
+def _completeness(case: Case, within: float) -> np.ndarray:
+    return (cloud_distances(case).distance <= within * case.tolerance).astype(float)
+
+
+@family("hold", {"comp_10cm": 0.10, "comp_20cm": 0.20})
+def completeness(case: Case, id: str, within: float) -> Value:
+    """Share of the observed surface with a held-out point within a distance."""
+    station = cloud_distances(case).station
+    return estimate(np.mean, _completeness(case, within), station, case.rng(id), BOOTSTRAP_SAMPLES)
+
+
+@family("hold", {"fscore_5cm": 0.05, "fscore_10cm": 0.10, "fscore_20cm": 0.20})
+def fscore(case: Case, id: str, within: float) -> Value:
+    """Harmonic mean of precision and completeness at a distance."""
+    precision = float(np.mean(mesh_distances(case).distance <= within * case.tolerance))
+    recall = float(np.mean(_completeness(case, within)))
+    return number(2.0 * precision * recall / max(precision + recall, 1e-12), len(cloud_distances(case).distance))
+
+
+@metric("chamfer_l1", needs="hold")
+def chamfer_l1(case: Case) -> Value:
+    """Mean of the two directed mean distances, m."""
+    return number(float(np.mean(mesh_distances(case).distance) + np.mean(cloud_distances(case).distance)) / 2.0)
+
+
+@metric("dcd", needs="hold")
+def dcd(case: Case) -> Value:
+    """Density-aware Chamfer distance between held-out and synthetic cloud."""
+    return number(density_aware_chamfer(case))
+
+
+@metric("hausdorff_p99", needs="hold")
+def hausdorff_p99(case: Case) -> Value:
+    """Larger of the two directed 99th percentiles, m."""
+    both = mesh_distances(case).distance, cloud_distances(case).distance
+    return number(max(float(np.percentile(d, 99)) for d in both))
+
+
+@metric("comp_chainage_min", needs="hold")
+def comp_chainage_min(case: Case) -> Value:
+    """Smallest `comp_10cm` of a bin of about 10 m; 0 where there are held-out returns but no candidate."""
+    group = station_bins(case, cloud_distances(case).station)
+    total = station_bins(case, returns(case).local[:, 0])
+    bin_count = int(total.max()) + 1
+    count = np.bincount(group, minlength=bin_count)
+    share = np.bincount(group, _completeness(case, 0.10), minlength=bin_count) / np.maximum(count, 1)
+    judged = np.bincount(total, minlength=bin_count) >= _FEWEST_RETURNS
+    return number(float(share[judged].min()), len(group))
+
+
+@metric("extra_surface_frac", needs="hold")
+def extra_surface_frac(case: Case) -> Value:
+    """Share of the observable surface through which held-out beams passed."""
+    return number(float(np.mean(phantom_cells(case))), len(phantom_cells(case)))
+
+
+@metric("missing_surface_frac", needs="hold")
+def missing_surface_frac(case: Case) -> Value:
+    """Share of held-out points with no surface within 20 cm."""
+    found = mesh_distances(case)
+    far = (found.distance > _FAR * case.tolerance).astype(float)
+    return estimate(np.mean, far, found.station, case.rng("missing_surface_frac"), BOOTSTRAP_SAMPLES)
+
+
+# OCC: voxels of held-out points against the candidate seen by the same beams (the paper's Fig. 3).
+
+
+@metric("vox_iou_20cm", needs="hold")
+def vox_iou_20cm(case: Case) -> Value:
+    """Intersection over union of occupied voxels of 20 cm."""
+    grids = occupied_voxels(case)
+    return number(iou(grids.real, grids.first), int(grids.real.sum()))
+
+
+@metric("vox_iou_norm", needs="hold")
+def vox_iou_norm(case: Case) -> Value:
+    """`vox_iou_20cm` over the value that two noisy draws of the candidate reach."""
+    grids = occupied_voxels(case)
+    return number(iou(grids.real, grids.first) / max(iou(grids.first, grids.second), 1e-12), int(grids.real.sum()))
+
+
+@family("hold", {"vox_precision": "first", "vox_recall": "real"})
+def voxel_share(case: Case, id: str, side: str) -> Value:
+    """Share of the voxels of one side (`first` the candidate, `real` the held-out cloud) that the other has too."""
+    grids = occupied_voxels(case)
+    own = getattr(grids, side).sum()
+    return number(float((grids.real & grids.first).sum() / max(own, 1)), int(own))
+
+
+@metric("vox_f1_tol1", needs="hold")
+def vox_f1_tol1(case: Case) -> Value:
+    """F1 with a tolerance of one voxel."""
+    grids = occupied_voxels(case)
+    return number(float(tolerant_f1(grids, np.zeros(len(grids.station), int))[0]), int(grids.real.sum()))
+
+
+@metric("vox_kappa", needs="hold")
+def vox_kappa(case: Case) -> Value:
+    """Cohen's kappa over known voxels within 0.6 m of either surface."""
+    from sklearn.metrics import cohen_kappa_score
+
+    grids = occupied_voxels(case)
+    judged = shell_voxels(grids)
+    return number(float(cohen_kappa_score(grids.real[judged], grids.first[judged])), int(judged.sum()))
+
+
+@metric("vox_interior_mismatch", needs="hold")
+def vox_interior_mismatch(case: Case) -> Value:
+    """Share of mismatches farther than one voxel from the other surface and over 2 m from a mouth."""
+    grids = occupied_voxels(case)
+    far = (grids.real & ~dilate(grids.first)) | (grids.first & ~dilate(grids.real))
+    far &= ~_mouth_slices(case)[:, None, None]
+    mismatches = int((grids.real ^ grids.first).sum())
+    return number(float(far.sum() / max(mismatches, 1)), mismatches)
+
+
+@metric("vox_mouth_mismatch", needs="hold")
+def vox_mouth_mismatch(case: Case) -> Value:
+    """Share of mismatches within 2 m of a mouth."""
+    grids = occupied_voxels(case)
+    mismatch = grids.real ^ grids.first
+    return number(float(mismatch[_mouth_slices(case)].sum() / max(mismatch.sum(), 1)), int(mismatch.sum()))
+
+
+def _mouth_slices(case: Case) -> np.ndarray:
+    """Mark the slices within 2 m of an end of the candidate, or beyond it."""
+    low, high = mouths_on_path(case)
+    station = occupied_voxels(case).station
+    return (station < low + _MOUTH_LENGTH) | (station > high - _MOUTH_LENGTH)
+
+
+@family("hold", {"vox_proj_iou_xy": 2, "vox_proj_iou_xz": 1, "vox_proj_iou_yz": 0})
+def projected_iou(case: Case, id: str, axis: int) -> Value:
+    """Intersection over union seen along an axis: 0 the tunnel, 1 from the side, 2 from above."""
+    grids = occupied_voxels(case)
+    return number(iou(*(np.asarray(grid.any(axis=axis)) for grid in (grids.real, grids.first))), int(grids.real.sum()))
+
+
+@metric("vox_chainage_min_f1", needs="hold")
+def vox_chainage_min_f1(case: Case) -> Value:
+    """Smallest tolerant F1 of a bin of about 10 m."""
+    grids = occupied_voxels(case)
+    total = np.bincount(station_bins(case, returns(case).local[:, 0]))
+    score = tolerant_f1(grids, station_bins(case, grids.station))
+    judged = np.flatnonzero(total >= _FEWEST_IN_BIN)
+    return number(float(score[judged].min()), int(grids.real.sum()))

@@ -1,0 +1,321 @@
+"""Statistics of point clouds: local planes, voxel maps, roughness of the wall."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
+from benchmarks.fidelity.derive.beams import cloud_tree, local_at, noisy_ranges, returns, synthetic_points
+from benchmarks.fidelity.derive.mesh import first_hits, weld_offset, welded_lining
+from benchmarks.fidelity.derive.surface import cell_numbers
+
+NEIGHBOURS = 24
+_MOST_PER_SCAN = 1500  # points of each scan at most
+_MOST_PLANES = 240_000
+_ENTROPY_RADIUS = 0.3  # m
+_ENTROPY_POINTS = 4000
+
+
+@dataclass(frozen=True)
+class Planes:
+    """A plane through the neighbours of each chosen point.
+
+    Attributes:
+        point: m, `(n, 3)`.
+        normal: Unit vectors, `(n, 3)`.
+        residual: Distance of the point from its plane, freed of the plane's three parameters, m, `(n,)`.
+        sigma: Standard deviation of the neighbours about it, m, `(n,)`.
+        planarity: (middle - smallest) / largest spread: near 0 for a line or a ball, `(n,)`.
+    """
+
+    point: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    residual: Float[np.ndarray, " n"]
+    sigma: Float[np.ndarray, " n"]
+    planarity: Float[np.ndarray, " n"]
+
+
+def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> Planes:
+    """Principal axes of the `NEIGHBOURS` nearest points of a cloud."""
+    count = min(NEIGHBOURS, len(cloud))
+    around = cloud[tree.query(query, count)[1]]
+    middle = around.mean(axis=1)
+    away = around - middle[:, None]
+    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away) / count)
+    freed = np.sqrt(count / max(count - 3, 1))
+    spread = np.sqrt(np.maximum(spread, 0.0))
+    residual = np.abs(np.einsum("ni,ni->n", query - middle, axes[:, :, 0])) * freed
+    planarity = (spread[:, 1] - spread[:, 0]) / np.maximum(spread[:, 2], 1e-9)
+    return Planes(query, axes[:, :, 0], residual, spread[:, 0] * freed, planarity)
+
+
+@per_hold
+def plane_rows(case: Case) -> Int[np.ndarray, " k"]:
+    """Numbers of the returns at which planes are fitted: the same count of each scan, evenly in time."""
+    scan = returns(case).scan
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
+    ends = np.append(starts[1:], len(scan))
+    each = int(np.clip(_MOST_PLANES // len(starts), 50, _MOST_PER_SCAN))
+    return np.concatenate([
+        np.linspace(a, b - 1, min(b - a, each)).astype(int) for a, b in zip(starts, ends, strict=True)
+    ])  # fmt: skip
+
+
+@per_hold
+def real_planes(case: Case) -> Planes:
+    """Of the held-out cloud at `chosen`."""
+    points = returns(case).points
+    return fit_planes(points, cloud_tree(case), points[plane_rows(case)])
+
+
+@kept_until("DIS")
+@per_case
+def synthetic_tree(case: Case) -> tuple[Float[np.ndarray, "m 3"], cKDTree]:
+    """The synthetic points that there are, and their tree."""
+    points = synthetic_points(case)
+    points = points[np.isfinite(points[:, 0])]
+    if len(points) < NEIGHBOURS:
+        raise ValueError("held-out beams hardly meet the candidate")
+    return points, cKDTree(points, balanced_tree=False)
+
+
+@per_case
+def synthetic_planes(case: Case) -> Planes:
+    """Of the synthetic cloud at `chosen`; rows of a beam that leaves the candidate are not a number."""
+    cloud, tree = synthetic_tree(case)
+    query = synthetic_points(case)[plane_rows(case)]
+    there = np.isfinite(query[:, 0])
+    found = fit_planes(cloud, tree, query[there])
+    full = [np.full((len(query), *column.shape[1:]), np.nan) for column in vars(found).values()]
+    for column, values in zip(full, vars(found).values(), strict=True):
+        column[there] = values
+    return Planes(*full)
+
+
+def mean_entropy(tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> float:
+    """Mean map entropy: the mean of ½ ln det(2πe Σ) of the points within 0.3 m, nat.
+
+    Source: Razlaw et al. 2015, Evaluation of registration methods for sparse 3D laser scans; MapEval uses it too.
+    """
+    query = query[np.linspace(0, len(query) - 1, min(len(query), _ENTROPY_POINTS)).astype(int)]
+    values = []
+    for near in tree.query_ball_point(query, _ENTROPY_RADIUS):
+        if len(near) >= 10:
+            sign, logdet = np.linalg.slogdet(2.0 * np.pi * np.e * np.cov(tree.data[near].T))
+            values.append(0.5 * logdet if sign > 0 else np.nan)
+    return float(np.nanmean(values))
+
+
+MAP_VOXEL = 0.5  # m
+FEWEST_IN_VOXEL = 10  # points of either cloud in a voxel that is compared
+
+
+@dataclass(frozen=True)
+class VoxelMap:
+    """Normal distributions of a cloud in voxels.
+
+    Attributes:
+        key: Voxel, `(v, 3)`, sorted.
+        mean: m, `(v, 3)`.
+        covariance: m², `(v, 3, 3)`.
+    """
+
+    key: Int[np.ndarray, "v 3"]
+    mean: Float[np.ndarray, "v 3"]
+    covariance: Float[np.ndarray, "v 3 3"]
+
+
+def voxel_map(local: Float[np.ndarray, "n 3"], edge: float) -> VoxelMap:
+    """Means and covariances of the voxels that hold at least `FEWEST` points."""
+    _, first, voxel, count = np.unique(
+        cell_numbers(local, edge), return_index=True, return_inverse=True, return_counts=True
+    )
+    key = np.floor(local[first] / edge).astype(np.int64)
+    mean = np.stack([np.bincount(voxel, axis) for axis in local.T], axis=1) / count[:, None]
+    away = local - mean[voxel]
+    covariance = np.empty((len(key), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            covariance[:, i, j] = np.bincount(voxel, away[:, i] * away[:, j]) / np.maximum(count - 1, 1)
+    kept = count >= FEWEST_IN_VOXEL
+    return VoxelMap(key[kept], mean[kept], covariance[kept])
+
+
+def voxel_wasserstein(a: VoxelMap, b: VoxelMap) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
+    """Voxels that both clouds have, and the 2-Wasserstein distance of their normal distributions, m.
+
+    Source: MapEval, arXiv 2411.17928: W² = |μ₁ - μ₂|² + tr(Σ₁ + Σ₂ - 2 (Σ₂^½ Σ₁ Σ₂^½)^½).
+    """
+    index = {tuple(key): row for row, key in enumerate(b.key)}
+    pairs = np.array([(i, index[key]) for i, key in enumerate(map(tuple, a.key)) if key in index]).reshape(-1, 2)
+    first, second = pairs.T
+    root = _matrix_root(b.covariance[second])
+    inner = np.linalg.eigvalsh(root @ a.covariance[first] @ root)
+    cross = np.sqrt(np.maximum(inner, 0.0)).sum(axis=1)
+    trace = np.trace(a.covariance[first] + b.covariance[second], axis1=1, axis2=2)
+    squared = np.sum((a.mean[first] - b.mean[second]) ** 2, axis=1) + trace - 2.0 * cross
+    return a.key[first], np.sqrt(np.maximum(squared, 0.0))
+
+
+def spatial_consistency(key: Int[np.ndarray, "v 3"], distance: Float[np.ndarray, " v"]) -> float:
+    """Spatial consistency score: mean over the voxels of deviation over mean of the distances of their neighbours."""
+    ratios = []
+    for near in cKDTree(key.astype(float)).query_ball_point(key.astype(float), 1.8):  # 26 neighbours
+        if len(near) >= 3 and (mean := distance[near].mean()) > 0:
+            ratios.append(distance[near].std() / mean)
+    return float(np.mean(ratios))
+
+
+@per_hold
+def real_map(case: Case) -> VoxelMap:
+    """Of the held-out points."""
+    return voxel_map(returns(case).local, MAP_VOXEL * case.tolerance)
+
+
+@per_case
+def map_distances(case: Case) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
+    """Voxels and Wasserstein distances between held-out and synthetic map.
+
+    Raises:
+        ValueError: They share no voxel.
+    """
+    local = local_at(case, noisy_ranges(case, "first"))
+    local = local[np.isfinite(local[:, 0])]
+    key, distance = voxel_wasserstein(real_map(case), voxel_map(local, MAP_VOXEL * case.tolerance))
+    if not len(key):
+        raise ValueError("held-out and synthetic map share no voxel")
+    return key, distance
+
+
+@per_hold
+def own_consistency(case: Case) -> float:
+    """Spatial consistency score of the odd held-out points against the even ones."""
+    local = returns(case).local
+    halves = [voxel_map(local[k::2], MAP_VOXEL * case.tolerance) for k in (0, 1)]
+    return spatial_consistency(*voxel_wasserstein(*halves))
+
+
+def _matrix_root(matrix: Float[np.ndarray, "v 3 3"]) -> Float[np.ndarray, "v 3 3"]:
+    values, axes = np.linalg.eigh(matrix)
+    return (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
+
+
+_PATCH_RADIUS = 0.25  # m; planes of 0.5 m
+_PATCH_LEAST = 20  # points on a plane
+_PATCH_MOST = 60
+_MOST_PATCHES = 1500
+_FEWEST_PATCHES = 20
+_PATCH_STEP = 0.06  # m; a plane from which a point is further away holds a pocket or an edge
+_UPRIGHT = 0.8  # |z| of a normal beyond which a plane is floor or crown
+_MEDIAN_ERROR = 1.4826 * 1.2533  # times the median absolute deviation over root n: standard error of a median
+_PATCHES_AT_ONCE = 100  # planes, whose pairs of points take 26 MB
+_CLOSE_PAIR = 0.05  # m; two returns so near to each other differ by their noise
+
+
+@dataclass(frozen=True)
+class Patches:
+    """Smooth pieces of wall in the held-out recording.
+
+    Attributes:
+        beam: Numbers of the beams on each plane, `(planes, at most _MOST)`, -1 as padding.
+        roughness: Variance about the planes, noise taken off, m²; may come out below 0 where there is hardly any.
+        noise: Variance of the returns along the normals, m².
+        resolved: Whether the roughness stands out of its own standard error.
+    """
+
+    beam: Int[np.ndarray, "p k"]
+    roughness: float
+    noise: float
+    resolved: bool
+
+    @property
+    def planes(self) -> int:
+        """How many."""
+        return len(self.beam)
+
+
+@per_hold
+def hold_patches(case: Case) -> Patches | None:
+    """The held-out wall; `None` where its points lie too far apart."""
+    assert case.hold is not None
+    hold = case.hold
+    index = np.flatnonzero(hold.returned)
+    index = index[np.lexsort((hold.direction[index, 2], hold.time[index]))]  # the same planes in whatever order
+    points = hold.origin[index] + hold.range[index, None] * hold.direction[index]
+    points -= np.floor(points.mean(axis=0))
+    tree = cKDTree(points)
+    seeds = case.rng("tri_roughness_ratio").permutation(len(points))[: 4 * _MOST_PATCHES]
+    distance, near = tree.query(points[seeds], k=_PATCH_MOST, distance_upper_bound=_PATCH_RADIUS)
+    inside = np.isfinite(distance)
+    enough = inside.sum(axis=1) >= _PATCH_LEAST
+    near, inside = near[enough], inside[enough]
+    if not len(near):
+        return None
+    place = points[np.where(inside, near, 0)]
+    normal, away = _patch_planes(place, inside)
+    smooth = (np.abs(normal[:, 2]) < _UPRIGHT) & (np.where(inside, np.abs(away), 0.0).max(axis=1) < _PATCH_STEP)
+    smooth &= np.cumsum(smooth) <= _MOST_PATCHES
+    if smooth.sum() < _FEWEST_PATCHES:
+        return None
+    near, inside, normal, away = near[smooth], inside[smooth], normal[smooth], away[smooth]
+    whole, noise = _patch_variance(away, inside), _return_noise(points[np.where(inside, near, 0)], inside, normal, away)
+    judged = np.isfinite(noise)
+    if judged.sum() < _FEWEST_PATCHES:
+        return None
+    excess = (whole - noise)[judged]
+    middle = float(np.median(excess))
+    error = _MEDIAN_ERROR * float(np.median(np.abs(excess - middle))) / np.sqrt(len(excess))
+    beam = np.where(inside, index[np.where(inside, near, 0)], -1)[judged]
+    return Patches(beam, middle, float(np.median(noise[judged])), middle > 2.0 * error)
+
+
+def lining_roughness(case: Case) -> float:
+    """Variance of the lining about the same planes, sampled by the same beams, m²; `nan` without planes."""
+    patches = hold_patches(case)
+    if patches is None:
+        return float("nan")
+    assert case.hold is not None
+    beam = np.unique(patches.beam[patches.beam >= 0])
+    origin, direction = case.hold.origin[beam] - weld_offset(case), case.hold.direction[beam]
+    distance = np.full(len(case.hold.range), np.nan)
+    distance[beam] = first_hits(welded_lining(case), origin, direction)[1]
+    # A beam that meets something else than the wall says nothing about its roughness.
+    distance[np.abs(distance - case.hold.range) > 0.5] = np.nan
+    reach = np.where(patches.beam >= 0, distance[patches.beam], np.nan)
+    inside = np.isfinite(reach)
+    full = inside.sum(axis=1) >= _PATCH_LEAST
+    patch, inside, reach = patches.beam[full], inside[full], reach[full]
+    hit = case.hold.origin[patch] + np.nan_to_num(reach)[..., None] * case.hold.direction[patch]
+    return float(np.median(_patch_variance(_patch_planes(hit - hit[:, :1], inside)[1], inside)))
+
+
+def _patch_planes(points: Float[np.ndarray, "p k 3"], inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normal of the plane through each set of points, and their signed distances from it."""
+    weight = inside[..., None] / inside.sum(axis=1)[:, None, None]
+    centred = np.where(inside[..., None], points - (weight * points).sum(axis=1, keepdims=True), 0.0)
+    normal = np.linalg.eigh(np.einsum("pki,pkj->pij", centred, centred))[1][..., 0]
+    return normal, np.einsum("pki,pi->pk", centred, normal)
+
+
+def _patch_variance(away: Float[np.ndarray, "p k"], inside: np.ndarray) -> Float[np.ndarray, " p"]:
+    """Variance about each plane, three degrees of freedom taken off, m²."""
+    return (np.where(inside, away, 0.0) ** 2).sum(axis=1) / (inside.sum(axis=1) - 3)
+
+
+def _return_noise(
+    points: Float[np.ndarray, "p k 3"], inside: np.ndarray, normal: Float[np.ndarray, "p 3"], away: np.ndarray
+) -> Float[np.ndarray, " p"]:
+    """Variance of one return along the normal, from pairs close to each other in the plane, m²; `nan` without."""
+    points = np.where(inside[..., None], points - points[:, :1], 1e3 * (1.0 + np.arange(points.shape[1]))[:, None])
+    parts = [slice(start, start + _PATCHES_AT_ONCE) for start in range(0, len(points), _PATCHES_AT_ONCE)]
+    return np.concatenate([_pair_noise(points[part], normal[part]) for part in parts])
+
+
+def _pair_noise(points: Float[np.ndarray, "p k 3"], normal: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, " p"]:
+    gap = points[:, :, None] - points[:, None]
+    across = np.einsum("pkli,pi->pkl", gap, normal)
+    pair = np.triu(np.sum(gap**2, axis=-1) - across**2 < _CLOSE_PAIR**2, 1)
+    with np.errstate(invalid="ignore"):
+        return np.sum(pair * across**2, axis=(1, 2)) / (2.0 * pair.sum(axis=(1, 2)))

@@ -1,0 +1,222 @@
+"""Information of a scan about its own pose: Hessians, shifted scans, the planar scan of the environment."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.signal import find_peaks
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity.case import Case, per_case, per_hold
+from benchmarks.fidelity.derive.beams import returns, sensor_path, synthetic_points
+from benchmarks.fidelity.derive.clouds import Planes, plane_rows, real_planes, synthetic_planes
+
+_FEWEST_POINTS = 20  # points of a scan
+_EIGEN_FLOOR = 1e-6  # of an eigenvalue; less than the noise of any normal
+
+
+@dataclass(frozen=True)
+class ScanInformation:
+    """Information of the scans, a point's share of it each.
+
+    Attributes:
+        station: Of the sensor, m, `(s,)`.
+        axial: Of a shift along the tunnel: mean of (normal · axis)², `(s,)`.
+        translation: Eigenvalues of the translation block, growing, `(s, 3)`.
+        weakest: Direction of the smallest of them, `(s, 3)`.
+        rotation: Smallest eigenvalue of the rotation block, arms in units of the scan's mean range, `(s,)`.
+        strong: Share of points whose normal lies within 60° of the axis, `(s,)`.
+    """
+
+    station: Float[np.ndarray, " s"]
+    axial: Float[np.ndarray, " s"]
+    translation: Float[np.ndarray, "s 3"]
+    weakest: Float[np.ndarray, "s 3"]
+    rotation: Float[np.ndarray, " s"]
+    strong: Float[np.ndarray, " s"]
+
+
+@per_hold
+def real_information(case: Case) -> ScanInformation:
+    """Of the held-out scans."""
+    return _information(case, real_planes(case))
+
+
+@per_case
+def synthetic_information(case: Case) -> ScanInformation:
+    """Of the same scans taken in the candidate."""
+    return _information(case, synthetic_planes(case))
+
+
+def _information(case: Case, planes: Planes) -> ScanInformation:
+    """Hessians of point-to-plane registration about the sensor, from normals by local planes on either side."""
+    real, pick = returns(case), plane_rows(case)
+    scan = real.scan[pick]
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
+    bounds = np.append(starts, len(scan))
+    station = sensor_path(case).local(real.origin[pick[starts]])[:, 0]
+    axis = sensor_path(case).frames(station)[1]
+    rows = [
+        _scan_information(planes.point[a:b] - real.origin[pick[a:b]], planes.normal[a:b], axis[k])
+        for k, (a, b) in enumerate(itertools.pairwise(bounds))
+    ]
+    columns = [np.asarray(column) for column in zip(*rows, strict=True)]
+    return ScanInformation(station, *columns)
+
+
+def _scan_information(
+    arm: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], axis: Float[np.ndarray, "3"]
+) -> tuple[float, np.ndarray, np.ndarray, float, float]:
+    known = np.isfinite(normal[:, 0])
+    arm, normal = arm[known], normal[known]
+    if len(arm) < _FEWEST_POINTS:
+        return np.nan, np.full(3, np.nan), np.full(3, np.nan), np.nan, np.nan
+    values, vectors = np.linalg.eigh(normal.T @ normal / len(normal))
+    turn = np.cross(arm / np.mean(np.linalg.norm(arm, axis=1)), normal)
+    rotation = float(np.linalg.eigvalsh(turn.T @ turn / len(turn))[0])
+    along = np.square(normal @ axis)
+    return (
+        max(float(np.mean(along)), _EIGEN_FLOOR), np.maximum(values, _EIGEN_FLOOR), vectors[:, 0],
+        max(rotation, _EIGEN_FLOOR), float(np.mean(along > 0.25)),
+    )  # fmt: skip
+
+
+SHIFT_STEP, SHIFT_MOST = 0.05, 3.0  # m
+SHIFT_LEAST = 0.2  # m; a smaller shift is the same place
+_ALIAS_SCANS, _ALIAS_POINTS = 24, 250
+_COST_CLIP = 0.3  # m; a point farther from its plane has no counterpart
+_ICP_PAIRS = 16
+
+
+@per_hold
+def real_alias(case: Case) -> Float[np.ndarray, " s"]:
+    """Alias ratios of the held-out scans."""
+    return _alias_ratios(case, real_planes(case))
+
+
+@per_case
+def synthetic_alias(case: Case) -> Float[np.ndarray, " s"]:
+    """Alias ratios of the same scans taken in the candidate."""
+    return _alias_ratios(case, synthetic_planes(case))
+
+
+def _alias_ratios(case: Case, planes: Planes) -> Float[np.ndarray, " s"]:
+    """Cost at the best shift of 0.2 to 3 m over the cost at none, of some scans against the map; 1 is a perfect alias.
+
+    The cost is the mean distance from the planes of the nearest map points, cut off at 0.3 m. Scans without a
+    minimum of the cost among the shifts count with the smallest cost there.
+    """
+    numbers, scan = np.unique(returns(case).scan[plane_rows(case)], return_inverse=True)
+    known = np.isfinite(planes.normal[:, 0])
+    rows = np.flatnonzero(known & (scan % 2 == 1))  # the map: no scan meets itself in it
+    tree = cKDTree(planes.point[rows])
+    shifts = np.arange(-SHIFT_MOST, SHIFT_MOST + SHIFT_STEP / 2, SHIFT_STEP)
+    same = np.abs(shifts) < SHIFT_LEAST - SHIFT_STEP / 2
+    ratios = []
+    even = np.arange(0, len(numbers), 2)
+    for index in even[np.linspace(0, len(even) - 1, min(len(even), _ALIAS_SCANS)).astype(int)]:
+        own = np.flatnonzero((scan == index) & known)
+        if len(own) < 20:
+            continue
+        own = own[np.linspace(0, len(own) - 1, min(len(own), _ALIAS_POINTS)).astype(int)]
+        points = planes.point[own]
+        axis = sensor_path(case).frames(sensor_path(case).local(points.mean(axis=0)[None])[:, 0])[1][0]
+        moved = (points[None] + shifts[:, None, None] * axis).reshape(-1, 3)
+        near = rows[tree.query(moved)[1]]
+        off = np.abs(np.einsum("ij,ij->i", planes.normal[near], moved - planes.point[near]))
+        cost = np.minimum(off, _COST_CLIP).reshape(len(shifts), -1).mean(axis=1)
+        valleys = np.setdiff1d(find_peaks(-cost)[0], np.flatnonzero(same))
+        rival = cost[valleys].min() if len(valleys) else cost[~same].min()
+        ratios.append(rival / max(cost[same].min(), 1e-9))
+    if not ratios:
+        raise ValueError("no scan has enough points")
+    return np.asarray(ratios)
+
+
+@per_hold
+def real_icp(case: Case) -> Float[np.ndarray, " p"]:
+    """Axial errors of scan-to-scan registration of held-out scans, m."""
+    return _icp_errors(case, returns(case).points)
+
+
+@per_case
+def synthetic_icp(case: Case) -> Float[np.ndarray, " p"]:
+    """The same of scans taken in the candidate."""
+    return _icp_errors(case, synthetic_points(case))
+
+
+def _icp_errors(case: Case, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " p"]:
+    """How far along the axis generalised ICP moves each of some scans that lie on their predecessors already, m."""
+    import small_gicp
+
+    scan = returns(case).scan
+    numbers = np.unique(scan)
+    bounds = np.searchsorted(scan, np.append(numbers, numbers[-1] + 1))
+    errors = []
+    for k in np.linspace(1, len(numbers) - 1, min(len(numbers) - 1, _ICP_PAIRS)).astype(int):
+        before, here = (points[bounds[i] : bounds[i + 1]] for i in (k - 1, k))
+        before, here = (cloud[np.isfinite(cloud[:, 0])] for cloud in (before, here))
+        if min(len(before), len(here)) < 200:
+            continue
+        middle = np.round(here.mean(axis=0))
+        found = small_gicp.align(before - middle, here - middle, downsampling_resolution=0.25, num_threads=1)
+        axis = sensor_path(case).frames(sensor_path(case).local(here.mean(axis=0)[None])[:, 0])[1][0]
+        errors.append(abs(float(found.T_target_source[:3, 3] @ axis)))
+    return np.asarray(errors)
+
+
+PLANAR_BEAMS = 16
+PLANAR_SIGMA = 0.05  # m, of a range; the environment's default
+PLANAR_REACH = 30.0  # m
+LOCALISED_SIGMA = 0.25  # m: standard deviation along the axis from which on a station counts as localised
+_STATION_SPACING = 1.0  # m
+
+
+@per_case
+def localised_stations(case: Case) -> Bool[np.ndarray, " s"]:
+    """For each metre of `tunnel.npz` whether 16 beams on its axis fix the place along it.
+
+    Shifted along the axis t, a range changes by (n·t)/(n·d) and its distance from the wall by n·t; the standard
+    deviation of the shift is σ over the root of the sum of (n·t)² over the beams that return.
+    """
+    with np.load(case.candidate.tunnel) as data:
+        lining = "pockets" if "left_pockets" in data else "smooth"
+        walls = [data[f"{side}_{lining}"] for side in ("left", "right")]
+        station, centre, tangent = (data[name] for name in ("station", "centre", "tangent"))
+    start, end = (np.concatenate([wall[part] for wall in walls]) for part in (slice(None, -1), slice(1, None)))
+    places = np.arange(station[0] + 0.5 * _STATION_SPACING, station[-1], _STATION_SPACING)
+    centres, tangents = (np.stack([np.interp(places, station, a) for a in xy.T], axis=1) for xy in (centre, tangent))
+    information = [
+        _axial_information(c, t / np.linalg.norm(t), start, end) for c, t in zip(centres, tangents, strict=True)
+    ]
+    return np.asarray(information) > (PLANAR_SIGMA / LOCALISED_SIGMA) ** 2
+
+
+def _axial_information(
+    place: Float[np.ndarray, "2"],
+    tangent: Float[np.ndarray, "2"],
+    start: Float[np.ndarray, "w 2"],
+    end: Float[np.ndarray, "w 2"],
+) -> float:
+    """Sum of (n·t)² over the beams from a place."""
+    near = np.minimum(np.linalg.norm(start - place, axis=1), np.linalg.norm(end - place, axis=1)) < PLANAR_REACH
+    wall, offset = (end - start)[near], start[near] - place
+    length = np.linalg.norm(wall, axis=1)
+    wall, offset, length = wall[length > 0], offset[length > 0], length[length > 0]
+    if not len(wall):
+        return 0.0
+    angle = np.arctan2(tangent[1], tangent[0]) + 2.0 * np.pi * np.arange(PLANAR_BEAMS) / PLANAR_BEAMS
+    beam = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    across = _cross(beam[:, None], wall[None])
+    across = np.where(np.abs(across) < 1e-12, np.nan, across)
+    reach = _cross(offset[None], wall[None]) / across
+    share = _cross(offset[None], beam[:, None]) / across
+    reach = np.where((reach > 0.0) & (share >= 0.0) & (share <= 1.0), reach, np.inf)
+    first = np.argmin(reach, axis=1)
+    returned = reach[np.arange(PLANAR_BEAMS), first] < PLANAR_REACH
+    return float(np.sum(np.square(_cross(wall[first], tangent) / length[first])[returned]))
+
+
+def _cross(a: Float[np.ndarray, "... 2"], b: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -1,0 +1,359 @@
+"""The unrolled lining: depth maps, the grid of the rings, pockets."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import convolve, label, map_coordinates
+from scipy.signal import correlate, find_peaks
+from scipy.spatial import cKDTree
+from skimage.measure import regionprops
+
+from benchmarks.fidelity.case import Case, per_case, per_truth
+from benchmarks.fidelity.derive.axis import hold_local, hold_points, lining_caster, reference_curve
+from benchmarks.fidelity.derive.beams import cast_beams, points_at
+from benchmarks.fidelity.derive.curve import (
+    Curve,
+    grouped_median,
+    nanmedian,
+    running_median,
+    section_angles,
+    truth_curve,
+)
+from benchmarks.fidelity.derive.sections import COLUMNS, ROW, Radii, cast_radii, truth_radii
+
+_COARSE_ROWS = 5  # rows between those that the smooth section is taken from
+_LARGEST_DEPTH = 0.40  # m; what lies farther off the smooth section is no lining
+_WALL_FOOT = 0.30  # m; below is floor
+_BLUR = np.ones((3, 3))
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """A map of depths.
+
+    Attributes:
+        station: Of the rows, m, `(n,)`.
+        angle: Of the columns, from left towards up, rad, `(m,)`.
+        depth: Behind the smooth section along the ray from the axis, m; NaN where not known, `(n, m)`.
+        smooth: Radius of the typical smooth section, m, `(m,)`.
+        wall: Columns that are wall or roof, not floor, `(m,)`.
+    """
+
+    station: Float[np.ndarray, " n"]
+    angle: Float[np.ndarray, " m"]
+    depth: Float[np.ndarray, "n m"]
+    smooth: Float[np.ndarray, " m"]
+    wall: Bool[np.ndarray, " m"]
+
+    @property
+    def arc(self) -> Float[np.ndarray, " m"]:
+        """Length along the section, from the middle of the floor, m, at each column."""
+        return np.cumsum(self.pitch)
+
+    @property
+    def pitch(self) -> Float[np.ndarray, " m"]:
+        """Length along the section that a column covers, m."""
+        return self.smooth * 2 * np.pi / COLUMNS / self.slant
+
+    @property
+    def slant(self) -> Float[np.ndarray, " m"]:
+        """Cosine between the ray and the normal of the section at each column, at least 0.3."""
+        change = (np.roll(self.smooth, -2) - np.roll(self.smooth, 2)) / (8 * np.pi / COLUMNS)
+        return np.maximum(self.smooth / np.hypot(self.smooth, change), 0.3)
+
+
+def _make_map(station: np.ndarray, radius: np.ndarray, smooth: np.ndarray) -> Unrolled:
+    angle = section_angles(COLUMNS)
+    depth = radius - smooth
+    depth = np.where(np.abs(depth) < _LARGEST_DEPTH, depth, np.nan)
+    typical = nanmedian(smooth.T)
+    height = typical * np.sin(angle)
+    wall = np.isfinite(typical) & (height > np.nanmin(height) + _WALL_FOOT)
+    return Unrolled(station, angle, depth, np.where(np.isfinite(typical), typical, np.nanmedian(typical)), wall)
+
+
+def map_of_radii(radii: Radii) -> Unrolled:
+    """A map from a table of radii; its smooth section is the running median over 1.5 m."""
+    coarse = running_median(radii.radius[::_COARSE_ROWS], _COARSE_ROWS * ROW)
+    return _make_map(radii.station, radii.radius, _stretch(coarse, len(radii.station), _COARSE_ROWS))
+
+
+def _stretch(coarse: Float[np.ndarray, "c m"], rows: int, step: int, first: float = 0.0) -> Float[np.ndarray, "n m"]:
+    place = np.clip((np.arange(rows) - first) / step, 0, len(coarse) - 1)
+    below = np.minimum(place.astype(int), max(len(coarse) - 2, 0))
+    share = (place - below)[:, None]
+    return (1 - share) * coarse[below] + share * coarse[np.minimum(below + 1, len(coarse) - 1)]
+
+
+@per_case
+def lining_map(case: Case) -> Unrolled:
+    """The candidate's lining, from the reference axis."""
+    return map_of_radii(cast_radii(reference_curve(case), lining_caster(case)))
+
+
+@per_truth
+def truth_map(case: Case) -> Unrolled:
+    """The true lining, from the same axis."""
+    return map_of_radii(truth_radii(case))
+
+
+@per_case
+def hold_map(case: Case) -> Unrolled:
+    """The held-out recording's, from the same axis, each return put into its cell; the mean of each."""
+    assert case.hold is not None
+    curve = reference_curve(case)
+    key = ("unrolled.hold_map", case.truth is None)
+    if key not in case.hold.cache:
+        local = hold_local(case) if case.truth is None else curve.local(hold_points(case))
+        case.hold.cache[key] = map_of_points(curve, local)
+    return case.hold.cache[key]
+
+
+def map_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
+    """A map from points given as station, left and up."""
+    rows = max(int(curve.length / ROW), 2)
+    step = curve.length / rows
+    row = (local[:, 0] - curve.station[0]) / step
+    angle = (np.arctan2(local[:, 2], local[:, 1]) + np.pi) / (2 * np.pi) * COLUMNS
+    kept = (row >= 0) & (row < rows)
+    row, angle, radius = row[kept], angle[kept], np.hypot(local[kept, 1], local[kept, 2])
+    column = np.minimum(angle.astype(int), COLUMNS - 1)
+    coarse_rows = -(-rows // _COARSE_ROWS)
+    group = (row / _COARSE_ROWS).astype(int) * COLUMNS + column
+    coarse = grouped_median(group, radius, coarse_rows * COLUMNS).reshape(coarse_rows, COLUMNS)
+    coarse = running_median(coarse, _COARSE_ROWS * ROW)
+    smooth = _stretch(coarse, rows, _COARSE_ROWS, (_COARSE_ROWS - 1) / 2)
+    # Between columns the section slants: a return is compared with the section at its own angle.
+    padded = np.concatenate([smooth[:, -1:], smooth, smooth[:, :1]], axis=1)
+    expected = map_coordinates(padded, [np.minimum(row, rows - 1), angle + 0.5], order=1, mode="nearest")
+    depth = radius - expected
+    good = np.isfinite(depth) & (np.abs(depth) < _LARGEST_DEPTH)
+    cell = row.astype(int)[good] * COLUMNS + column[good]
+    count = np.bincount(cell, minlength=rows * COLUMNS)
+    total = np.bincount(cell, depth[good], rows * COLUMNS)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(rows, COLUMNS)
+    return _make_map(curve.station[0] + (np.arange(rows) + 0.5) * step, smooth + mean, smooth)
+
+
+@per_case
+def observed_map(case: Case) -> Unrolled:
+    """The candidate's as the held-out beams would have shown it: the same beams, so the same gaps and shadows."""
+    points = points_at(case, cast_beams(case).range)
+    return map_of_points(reference_curve(case), reference_curve(case).local(points[np.isfinite(points).all(axis=1)]))
+
+
+def both_maps(case: Case) -> tuple[Unrolled, Unrolled]:
+    """Candidate and truth, each whole; without a truth candidate and recording by the same held-out beams."""
+    return (lining_map(case), truth_map(case)) if case.truth is not None else (observed_map(case), hold_map(case))
+
+
+def blur(depth: Float[np.ndarray, "n m"], known: Bool[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
+    """Mean over the known cells among nine, m; NaN where there is none."""
+    usable = known & np.isfinite(depth)
+    weight = convolve(usable.astype(float), _BLUR, mode="constant")
+    total = convolve(np.where(usable, depth, 0.0), _BLUR, mode="constant")
+    return np.where(weight > 0, total / np.maximum(weight, 1.0), np.nan)
+
+
+def common_rows(first: Unrolled, second: Unrolled) -> int:
+    """Rows of two maps of one axis that are compared."""
+    return min(len(first.station), len(second.station))
+
+
+@per_case
+def paired_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Stations, and depths of candidate and held-out recording in the cells that beams show of both, m.
+
+    Both are averaged over the same cells of three by three, so that range noise of single returns does not decide.
+    """
+    judged, hold = observed_map(case), hold_map(case)
+    rows = common_rows(judged, hold)
+    known = np.isfinite(hold.depth[:rows]) & np.isfinite(judged.depth[:rows]) & hold.wall & judged.wall
+    both = [blur(side.depth[:rows], known)[known] for side in (judged, hold)]
+    return np.repeat(hold.station[:rows], known.sum(axis=1)), both[0], both[1]
+
+
+RING_LAGS = (0.5, 4.0)  # m; pitch of rings
+RING_BAND = 0.30  # of the pitch to either side in which the candidate's is looked for
+PITCH_HARMONICS = 4
+PHASE_PITCHES = 4.0  # in a window of phase
+_RELIEF = 0.03  # m; less is roughness
+_FAINT = 1e-4  # m; a mean relief below it is no grid
+_HIGH_PEAK = 0.75  # of the highest peak
+_PITCH_STEPS = 2001
+_ROW_HEIGHT = 0.25  # of the highest row
+
+
+def relief(unrolled: Unrolled) -> Float[np.ndarray, "n m"]:
+    """Depth of recesses, m; 0 on plain wall, on the floor and where nothing is known."""
+    depth = np.nan_to_num(unrolled.depth)
+    return np.where((depth > _RELIEF) & unrolled.wall, depth, 0.0)
+
+
+def relief_along(unrolled: Unrolled) -> Float[np.ndarray, " n"]:
+    """Mean relief by chainage, where the wall is known, m."""
+    known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=1)
+    return relief(unrolled).sum(axis=1) / np.maximum(known, 1)
+
+
+def relief_around(unrolled: Unrolled) -> Float[np.ndarray, " m"]:
+    """Mean relief by direction, m."""
+    known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=0)
+    return relief(unrolled).sum(axis=0) / np.maximum(known, 1)
+
+
+def coarse_pitch(signal: Float[np.ndarray, " n"]) -> float | None:
+    """Lag of the first high peak of the autocorrelation, m; `None` without relief. Multiples of a pitch are as high."""
+    if signal.mean() < _FAINT:
+        return None
+    centred = signal - signal.mean()
+    full = correlate(centred, centred, mode="full")[len(centred) - 1 :]
+    full /= np.maximum(len(centred) - np.arange(len(centred)), 1)
+    low, high = (min(int(lag / ROW), len(full) - 1) for lag in RING_LAGS)
+    peaks, _ = find_peaks(full[low:high])
+    if not len(peaks):
+        return None
+    height = full[low + peaks]
+    return float((low + peaks[np.argmax(height > _HIGH_PEAK * height.max())]) * ROW)
+
+
+def ring_pitch(unrolled: Unrolled, near: float, band: float) -> float | None:
+    """Pitch near another whose comb of four harmonics is strongest, m; `None` without relief."""
+    signal = relief_along(unrolled)
+    if signal.mean() < _FAINT:
+        return None
+    tried = near * np.linspace(1 - band, 1 + band, _PITCH_STEPS)
+    centred = (signal - signal.mean()) * np.hanning(len(signal))
+    power = sum(
+        np.abs(_fourier(centred, unrolled.station, order / tried)) ** 2 for order in range(1, PITCH_HARMONICS + 1)
+    )
+    return float(tried[np.argmax(power)])
+
+
+def ring_phases(unrolled: Unrolled, length: float) -> Float[np.ndarray, " w"]:
+    """Phase of a pitch in overlapping windows, rad; NaN in a window without relief."""
+    signal = relief_along(unrolled)
+    size = int(PHASE_PITCHES * length / ROW)
+    result = []
+    for start in range(0, max(len(signal) - size, 0) + 1, max(size // 2, 1)):
+        part, station = signal[start : start + size], unrolled.station[start : start + size]
+        value = _fourier(part - part.mean(), station, np.array([1.0 / length]))[0]
+        result.append(np.angle(value) if part.mean() > _FAINT else np.nan)
+    return np.array(result)
+
+
+def pocket_rows(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Float[np.ndarray, " r"]:
+    """Where along the section rows of recesses lie, m."""
+    signal = relief_around(unrolled)
+    smooth = np.convolve(np.concatenate([signal[-2:], signal, signal[:2]]), np.ones(5) / 5, mode="valid")
+    if smooth.max() < _FAINT:
+        return np.zeros(0)
+    peaks, _ = find_peaks(smooth, height=_ROW_HEIGHT * smooth.max(), distance=4)
+    return arc[peaks]
+
+
+def _fourier(signal: np.ndarray, station: np.ndarray, frequency: np.ndarray) -> np.ndarray:
+    """Fourier integral of a signal at frequencies, 1/m."""
+    parts = np.array_split(frequency, max(len(frequency) // 100, 1))
+    return np.concatenate([np.exp(-2j * np.pi * part[:, None] * station) @ signal for part in parts])
+
+
+POCKET_MATCH = 0.15  # m
+DEEP_POCKET = (0.06, 0.008)  # m behind the smooth section, about half a pocket, and m² of it
+GRAZED_POCKET = (0.025, 0.004)  # the same of what beams show: most end on a pocket's far side and miss its bottom
+_LARGEST_POCKET = 0.20  # m²
+_EIGHT = np.ones((3, 3), int)
+
+
+@dataclass(frozen=True)
+class Pockets:
+    """Recesses of the lining.
+
+    Attributes:
+        station: m, `(p,)`.
+        arc: Along the section, m, `(p,)`.
+        depth: Normal to the wall, m, `(p,)`.
+        area: Of the opening, m², `(p,)`.
+    """
+
+    station: Float[np.ndarray, " p"]
+    arc: Float[np.ndarray, " p"]
+    depth: Float[np.ndarray, " p"]
+    area: Float[np.ndarray, " p"]
+
+    def __len__(self) -> int:
+        return len(self.station)
+
+    @property
+    def place(self) -> Float[np.ndarray, "p 2"]:
+        """On the unrolled wall, m."""
+        return np.column_stack([self.station, self.arc])
+
+
+def detect_pockets(
+    unrolled: Unrolled, depth: Float[np.ndarray, "n m"], arc: Float[np.ndarray, " m"], least: tuple[float, float]
+) -> Pockets:
+    """Connected cells that are deep enough and together have the area of a pocket.
+
+    Args:
+        unrolled: Where the cells are.
+        depth: Of the cells, m.
+        arc: Along the section at each column, m: that of the reference, so that both sides are measured alike.
+        least: Depth, m, and area, m².
+    """
+    deep = (np.nan_to_num(depth) * unrolled.slant > least[0]) & unrolled.wall
+    size = np.where(unrolled.wall, unrolled.pitch, 0.0) * ROW
+    found = []
+    for region in regionprops(label(deep, _EIGHT)[0]):
+        rows, columns = region.coords.T
+        area = float(size[columns].sum())
+        if least[1] < area < _LARGEST_POCKET:
+            values = depth[rows, columns] * unrolled.slant[columns]
+            bottom = float(np.median(values[values >= np.median(values)]))
+            found.append((unrolled.station[rows].mean(), arc[columns].mean(), bottom, area))
+    return Pockets(*np.array(found, float).reshape(-1, 4).T)
+
+
+def shown_pockets(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Pockets:
+    """Those that beams show."""
+    return detect_pockets(unrolled, blur(unrolled.depth, np.isfinite(unrolled.depth)), arc, GRAZED_POCKET)
+
+
+@per_case
+def judged_pockets(case: Case) -> Pockets:
+    """Those of the candidate's lining; against a held-out recording those that its beams would have shown."""
+    judged, arc = both_maps(case)[0], reference_arc(case)
+    return shown_pockets(judged, arc) if case.truth is None else detect_pockets(judged, judged.depth, arc, DEEP_POCKET)
+
+
+@per_case
+def reference_pockets(case: Case) -> Pockets:
+    """The open pockets of the truth; otherwise those that the held-out recording shows."""
+    if case.truth is None:
+        return shown_pockets(hold_map(case), reference_arc(case))
+    rows = [pocket for pocket in case.truth.furniture.get("pockets", ()) if pocket["open"]]
+    if not rows:
+        return Pockets(*np.zeros((4, 0)))
+    local = truth_curve(case).local(np.array([row["position"] for row in rows]) - case.truth.origin)
+    angle = np.arctan2(local[:, 2], local[:, 1])
+    arc = reference_arc(case)[np.minimum(((angle + np.pi) / (2 * np.pi) * COLUMNS).astype(int), COLUMNS - 1)]
+    depth = np.array([row["depth"] for row in rows], float)
+    return Pockets(local[:, 0], arc, depth, np.array([row["length"] * row["width"] for row in rows], float))
+
+
+def reference_arc(case: Case) -> Float[np.ndarray, " m"]:
+    """Length along the reference's section at each column, m: both sides are measured by it."""
+    return both_maps(case)[1].arc
+
+
+@per_case
+def matched_pockets(case: Case) -> Int[np.ndarray, "k 2"]:
+    """Pairs (judged, reference) that are each other's nearest and at most 15 cm apart on the unrolled wall."""
+    judged, reference = judged_pockets(case), reference_pockets(case)
+    if not len(judged) or not len(reference):
+        return np.zeros((0, 2), int)
+    apart, there = cKDTree(reference.place).query(judged.place)
+    back = cKDTree(judged.place).query(reference.place)[1]
+    mutual = (back[there] == np.arange(len(judged))) & (apart <= POCKET_MATCH * case.tolerance)
+    return np.column_stack([np.flatnonzero(mutual), there[mutual]])

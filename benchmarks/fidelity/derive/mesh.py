@@ -1,0 +1,317 @@
+"""Welded meshes of lining and solid, and the topology of the space inside."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_closing, distance_transform_edt, label
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.derive.axis import hold_curve
+from benchmarks.fidelity.derive.curve import Curve, candidate_curve, truth_curve
+from benchmarks.fidelity.derive.surface import sample_surface, surface_caster, visible_surface
+
+_WELD_DIGITS = 6  # a format with float32 keeps corners together and moves them by less
+_MOUTH_RIM = 0.15  # m from the plane of a mouth: its rim need not be cut straight
+_AXIS_RAYS = 60_000
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Undirected edges of a welded mesh.
+
+    Attributes:
+        ends: Vertex numbers, `(e, 2)`.
+        faces: How many faces meet there, `(e,)`.
+        length: m, `(e,)`.
+    """
+
+    ends: Int[np.ndarray, "e 2"]
+    faces: Int[np.ndarray, " e"]
+    length: Float[np.ndarray, " e"]
+
+
+def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """A copy in which corners at one place are one vertex, about a whole-metre origin.
+
+    Raises:
+        ValueError: Vertices that are not finite, or faces that name none.
+    """
+    if not is_sound(mesh):
+        raise ValueError("vertices are not finite or faces name none")
+    origin = np.floor(mesh.vertices.mean(axis=0)) if len(mesh.vertices) else np.zeros(3)
+    copy = trimesh.Trimesh(np.asarray(mesh.vertices) - origin, np.asarray(mesh.faces), process=False)
+    copy.merge_vertices(digits_vertex=_WELD_DIGITS)
+    return copy
+
+
+def is_sound(mesh: trimesh.Trimesh) -> bool:
+    """Whether all vertices are finite and all faces name vertices that there are."""
+    faces = np.asarray(mesh.faces)
+    in_range = not len(faces) or (faces.min() >= 0 and faces.max() < len(mesh.vertices))
+    return bool(np.isfinite(np.asarray(mesh.vertices)).all() and in_range)
+
+
+def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
+    """Of a welded mesh."""
+    ends, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    return Edges(ends, count, np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1))
+
+
+@kept_until("TOP")
+@per_case
+def welded_lining(case: Case) -> trimesh.Trimesh:
+    """The lining, welded."""
+    return weld(case.candidate.lining)
+
+
+@kept_until("TOP")
+@per_case
+def welded_solid(case: Case) -> trimesh.Trimesh:
+    """The solid, welded."""
+    return weld(case.candidate.solid)
+
+
+@kept_until("TOP")
+@per_case
+def lining_edges(case: Case) -> Edges:
+    """Edges of the welded lining."""
+    return mesh_edges(welded_lining(case))
+
+
+@kept_until("MSH")
+@per_case
+def solid_edges(case: Case) -> Edges:
+    """Edges of the welded solid."""
+    return mesh_edges(welded_solid(case))
+
+
+def weld_offset(case: Case) -> Float[np.ndarray, "3"]:
+    """What `welded` subtracted from the lining."""
+    return np.floor(case.candidate.lining.vertices.mean(axis=0))
+
+
+def mouth_vertices(case: Case) -> Bool[np.ndarray, " v"]:
+    """Whether each vertex of the welded lining lies in the plane of a declared mouth."""
+    bore, vertices = case.candidate.bore, welded_lining(case).vertices + weld_offset(case)
+    flush = np.zeros(len(vertices), bool)
+    for end in (0, -1):
+        away = vertices - bore.position[end]
+        near = np.linalg.norm(away, axis=1) < 2.0 * bore.radius[end].max()
+        flush |= near & (np.abs(away @ bore.tangent[end]) < _MOUTH_RIM)
+    return flush
+
+
+def face_parts(mesh: trimesh.Trimesh) -> Int[np.ndarray, " f"]:
+    """Number of the component of each face; faces that share an edge belong together."""
+    ends, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
+    count = len(mesh.faces)
+    face = mesh.edges_face
+    graph = coo_array((np.ones(len(face), bool), (face, count + edge.ravel())), shape=(count + len(ends),) * 2)
+    label = connected_components(graph, directed=False)[1][:count]
+    return np.unique(label, return_inverse=True)[1]
+
+
+@dataclass(frozen=True)
+class AxisHits:
+    """First hits of rays from the axis.
+
+    Attributes:
+        origin: m, less `offset`, `(k, 3)`.
+        direction: Unit vectors, `(k, 3)`.
+        distance: m; `inf` where nothing was hit, `(k,)`.
+        cosine: Between the ray and the face's normal; negative where the face looks at the eye, `(k,)`.
+    """
+
+    origin: Float[np.ndarray, "k 3"]
+    direction: Float[np.ndarray, "k 3"]
+    distance: Float[np.ndarray, " k"]
+    cosine: Float[np.ndarray, " k"]
+
+
+@kept_until("TOP")
+@per_case
+def axis_hits(case: Case) -> AxisHits:
+    """Rays in random directions from random places of the axis, into the lining alone."""
+    bore, rng = case.candidate.bore, case.rng("axis_hits")
+    station = rng.uniform(bore.station[0] + 0.2, bore.station[-1] - 0.2, _AXIS_RAYS)
+    middle = np.stack([np.interp(station, bore.station, axis) for axis in bore.position.T], axis=1)
+    direction = rng.normal(size=(_AXIS_RAYS, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    origin, mesh = middle - weld_offset(case), welded_lining(case)
+    face, distance = first_hits(mesh, origin, direction)
+    cosine = np.where(face >= 0, np.einsum("ij,ij->i", mesh.face_normals[face], direction), 0.0)
+    return AxisHits(origin, direction, distance, cosine)
+
+
+def first_hits(
+    mesh: trimesh.Trimesh, origin: Float[np.ndarray, "k 3"], direction: Float[np.ndarray, "k 3"]
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Face that each ray meets first (-1 for none) and how far away, m; exact in the plane that embree finds."""
+    caster = RayMeshIntersector(mesh, scale_to_box=False)
+    face = np.asarray(caster.intersects_first(origin, direction), np.int64)
+    normal = mesh.face_normals[face]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.einsum("ij,ij->i", mesh.triangles[face, 0] - origin, normal)
+        distance = reach / np.einsum("ij,ij->i", direction, normal)
+    return face, np.where(face >= 0, distance, np.inf)
+
+
+_GRID_CELL = (0.5, 0.25, 0.25)  # m along, left, up
+_SAMPLE_SPACING = 0.10  # m between samples of a surface
+_POINTS_AT_ONCE = 300_000  # points, whose coordinates take 100 MB on their way
+_GRID_PAD = 0.3  # m beyond the walls; more would give leaks room to loop in
+_LEAST_PERSISTENCE = 0.05  # m; pairs of less persistence are the grid's
+_FLOOD_HALF = 0.5  # m about the curve, in which the flood starts
+Diagrams = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A box along a curve.
+
+    Attributes:
+        curve: Along which it lies.
+        cell: Sizes along, left and up, m.
+        low: Station, left and up of its first corner, m.
+        shape: Cells each way.
+    """
+
+    curve: Curve
+    cell: Float[np.ndarray, "3"]
+    low: Float[np.ndarray, "3"]
+    shape: tuple[int, int, int]
+
+    def occupied(self, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "a b c"]:
+        """Cells with a point in them; points outside the box are left out."""
+        cells = np.zeros(self.shape, bool)
+        for start in range(0, len(points), _POINTS_AT_ONCE):
+            local = self.curve.local(points[start : start + _POINTS_AT_ONCE])
+            index = np.floor((local - self.low) / self.cell).astype(int)
+            index = index[((index >= 0) & (index < self.shape)).all(axis=1)]
+            cells[tuple(index.T)] = True
+        return cells
+
+    def on_curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The cells along the curve itself."""
+        middle = np.floor((0.0 - self.low[1:]) / self.cell[1:]).astype(int)
+        along = np.arange(self.shape[0])
+        return along, np.full_like(along, middle[0]), np.full_like(along, middle[1])
+
+    def clearance(self, occupied: Bool[np.ndarray, "a b c"]) -> Float[np.ndarray, "a b c"]:
+        """Distance to what bounds the space about the curve, m; 0 outside it. The mouths bound nothing."""
+        number, _ = label(~occupied)
+        _, left, up = self.on_curve()
+        reach = np.ceil(_FLOOD_HALF / self.cell[1:]).astype(int)
+        tube = number[:, left[0] - reach[0] : left[0] + reach[0] + 1, up[0] - reach[1] : up[0] + reach[1] + 1]
+        free = np.isin(number, np.setdiff1d(np.unique(tube), [0]))
+        return distance_transform_edt(free, sampling=self.cell)
+
+
+def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Grid:
+    """A grid that holds the points between the ends of a curve."""
+    cell = np.asarray(_GRID_CELL) * case.tolerance
+    across = np.abs(curve.local(points[::10])[:, 1:])
+    half = np.percentile(across, 99.9, axis=0) + _GRID_PAD
+    low = np.array([curve.station[0], *-half])
+    shape = np.ceil(np.array([curve.length, *2 * half]) / cell).astype(int)
+    return Grid(curve, cell, low, (int(shape[0]), int(shape[1]), int(shape[2])))
+
+
+@kept_until("TOP")
+@per_case
+def surface_samples(case: Case) -> Float[np.ndarray, "k 3"]:
+    """Points all over the candidate's visible surface."""
+    return sample_surface(visible_surface(case), _SAMPLE_SPACING)[0]
+
+
+@kept_until("TOP")
+@per_truth
+def _truth_samples(case: Case) -> Float[np.ndarray, "k 3"]:
+    assert case.truth is not None
+    return sample_surface(case.truth.surface, _SAMPLE_SPACING)[0]
+
+
+@per_case
+def free_components(case: Case) -> tuple[int, int]:
+    """Components of the candidate's free space that its centreline runs through, and cells of the centreline free."""
+    import cc3d
+
+    curve = candidate_curve(case)
+    grid = _make_grid(case, curve, surface_samples(case))
+    number = cc3d.connected_components(~grid.occupied(surface_samples(case)), connectivity=6)
+    ends = 1  # a mouth's own cell is cut by its rim
+    found = number[grid.on_curve()][ends:-ends]
+    return len(np.setdiff1d(np.unique(found), [0])), int((found > 0).sum())
+
+
+@per_truth
+def truth_grid(case: Case) -> Grid:
+    """The grid of the comparison with the truth."""
+    return _make_grid(case, truth_curve(case), _truth_samples(case))
+
+
+@per_hold
+def hold_grid(case: Case) -> Grid:
+    """The grid of the comparison with the held-out recording."""
+    assert case.hold is not None
+    return _make_grid(case, hold_curve(case), case.hold.points)
+
+
+@per_truth
+def truth_diagrams(case: Case) -> Diagrams:
+    """Persistence of the true clearance."""
+    grid = truth_grid(case)
+    return persistence_diagrams(grid.clearance(grid.occupied(_truth_samples(case))))
+
+
+@per_hold
+def hold_diagrams(case: Case) -> Diagrams:
+    """Persistence of the clearance that the held-out returns leave."""
+    assert case.hold is not None
+    grid = hold_grid(case)
+    return persistence_diagrams(grid.clearance(_close_gaps(grid.occupied(case.hold.points))))
+
+
+@per_case
+def candidate_diagrams(case: Case) -> Diagrams:
+    """Persistence of the candidate's clearance, sampled as the reference is."""
+    if case.truth is not None:
+        grid = truth_grid(case)
+        return persistence_diagrams(grid.clearance(grid.occupied(surface_samples(case))))
+    assert case.hold is not None
+    hold, grid = case.hold, hold_grid(case)
+    distance = surface_caster(case).first(hold.origin, hold.direction)[0]
+    hit = np.isfinite(distance) & hold.returned
+    distance = distance[hit] + hold.sigma * case.rng("clearance").normal(size=int(hit.sum()))
+    points = hold.origin[hit] + distance[:, None] * hold.direction[hit]
+    return persistence_diagrams(grid.clearance(_close_gaps(grid.occupied(points))))
+
+
+def _close_gaps(occupied: Bool[np.ndarray, "a b c"]) -> Bool[np.ndarray, "a b c"]:
+    """Occupied cells with the gaps of one cell shut that lie between the beams of a recording."""
+    return binary_closing(np.pad(occupied, 1, mode="edge"), np.ones((3, 3, 3)))[1:-1, 1:-1, 1:-1]
+
+
+def reference_diagrams(case: Case) -> Diagrams:
+    """Of the truth where there is one, else of the held-out recording."""
+    return truth_diagrams(case) if case.truth is not None else hold_diagrams(case)
+
+
+def persistence_diagrams(clearance: Float[np.ndarray, "a b c"]) -> Diagrams:
+    """Birth and death of components, loops and voids of the space wider than a falling clearance, m, `(k, 2)` each.
+
+    Nothing lies below 0, so that a slit between two beams, however deep the wall behind it, lasts no longer than it is
+    wide. Signs are turned, so that births come before deaths: the space at level t is where minus the clearance is
+    below t.
+    """
+    import gudhi
+
+    complex_ = gudhi.CubicalComplex(top_dimensional_cells=-clearance)
+    complex_.compute_persistence(min_persistence=_LEAST_PERSISTENCE)
+    zero, one, two = (np.asarray(complex_.persistence_intervals_in_dimension(k)).reshape(-1, 2) for k in range(3))
+    return zero, one, two

@@ -1,0 +1,174 @@
+"""Free space in the plane of the sensor, along the reference axis: cells of 10 cm, widths, medial axes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float
+from scipy.ndimage import binary_dilation, binary_erosion, binary_opening, distance_transform_edt
+from skimage.morphology import skeletonize
+
+from benchmarks.fidelity.case import Case, per_case
+from benchmarks.fidelity.derive.axis import hold_local, reference_curve
+from benchmarks.fidelity.derive.curve import grouped_median
+from benchmarks.fidelity.derive.freespace import (
+    HIT_RETURNS,
+    KNOWN_AROUND,
+    Lattice,
+    carved_about,
+    make_lattice,
+    object_points,
+    reachable,
+    true_object_points,
+)
+from benchmarks.fidelity.derive.sections import WIDTH_HEIGHT, lining_radii, sections, truth_caster, truth_radii, widths
+from benchmarks.fidelity.derive.surface import surface_caster
+
+PLANE_CELL = 0.10  # m
+_SLAB = 0.15  # m to either side of the plane in which held-out beams count
+_LEAST_RETURNS = 5
+_SPUR = 3  # cells; pockets narrower than twice this grow no branch of the medial axis
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Free cells of candidate and reference at the height of the sensor.
+
+    Attributes:
+        lattice: Cells, one layer.
+        judged, reference: Whether each is free, `(n, m)`.
+        known: Whether the reference says anything of it, `(n, m)`.
+        height: Of the plane above the reference axis, m.
+    """
+
+    lattice: Lattice
+    judged: Bool[np.ndarray, "n m"]
+    reference: Bool[np.ndarray, "n m"]
+    known: Bool[np.ndarray, "n m"]
+    height: float
+
+    @property
+    def station(self) -> Float[np.ndarray, " n"]:
+        """Of the rows, m."""
+        return self.lattice.low[0] + self.lattice.edge * (np.arange(self.lattice.shape[0]) + 0.5)
+
+
+def sensor_height(case: Case) -> float:
+    """Of the held-out sensor above the reference axis, m; 1.2 m above the floor where nothing was held out."""
+    if case.hold is not None:
+        return float(np.median(reference_curve(case).local(case.hold.origin[::100])[:, 2]))
+    return float(np.median(shapely.bounds(sections(case).reference_outline)[:, 1])) + WIDTH_HEIGHT
+
+
+@per_case
+def free_plane(case: Case) -> Plane:
+    """Both, in cells."""
+    around, height = make_lattice(case, PLANE_CELL * case.tolerance), sensor_height(case)
+    low = np.array([around.low[0], around.low[1], height - around.edge / 2])
+    cells = Lattice(around.curve, low, (around.shape[0], around.shape[1], 1), around.edge)
+    inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape[:2])
+    objects = cells.marked(cells.curve.local(object_points(case, cells.edge)))[..., 0]
+    judged = reachable(inside & ~objects)
+    if case.truth is None:
+        free, known = carved_cells(case, cells)
+        return Plane(cells, judged, free, known, height)
+    inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape[:2])
+    free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge)))[..., 0])
+    return Plane(cells, judged, free, binary_dilation(inside, iterations=int(KNOWN_AROUND / cells.edge)), height)
+
+
+def carved_cells(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
+    """Free and known cells by the held-out beams that run or end within 15 cm of the plane.
+
+    A cell in which at least two beams end is free where its middle lies nearer to the axis than their ends do.
+    """
+    middle = cells.low[2] + cells.edge / 2
+    near = [local[np.abs(local[:, 2] - middle) < _SLAB] for local in carved_about(case, cells.curve)]
+    passed, ended = (np.column_stack([local[:, :2], np.full(len(local), middle)]) for local in near)
+    cell, kept = cells.cell(ended)
+    size = int(np.prod(cells.shape))
+    ends = np.bincount(cell[kept], minlength=size)
+    far = np.bincount(cell[kept], np.abs(ended[kept, 1]), size) / np.maximum(ends, 1)
+    hit = ends >= HIT_RETURNS
+    free = np.where(hit, np.abs(cells.local()[:, 1]) < far, cells.marked(passed).ravel())
+    return free.reshape(cells.shape[:2]), (free | hit).reshape(cells.shape[:2])
+
+
+def unknown_share(case: Case) -> float:
+    """Share of the candidate's free cells of which held-out beams say nothing."""
+    _, known = carved_cells(case, free_plane(case).lattice)
+    return float(1.0 - known[free_plane(case).judged].mean())
+
+
+@per_case
+def gapless_maps(case: Case) -> tuple[Bool[np.ndarray, "r m"], Bool[np.ndarray, "r m"], Float[np.ndarray, " r"]]:
+    """Both maps without gaps, and the stations of their rows.
+
+    The truth has none. A held-out recording's map lies between its two walls, each the median of the returns near the
+    plane in a row and its neighbours; rows in which it does not show both are left out.
+    """
+    both = free_plane(case)
+    if case.truth is not None:
+        return both.judged, both.reference, both.station
+    wall = _wall_distances(hold_local(case), both)
+    rows = np.isfinite(wall).all(axis=0)
+    left = both.lattice.low[1] + both.lattice.edge * (np.arange(both.lattice.shape[1]) + 0.5)
+    free = (left < wall[0, rows, None]) & (left > -wall[1, rows, None])
+    return both.judged[rows], free, both.station[rows]
+
+
+def _wall_distances(local: Float[np.ndarray, "k 3"], both: Plane) -> Float[np.ndarray, "2 n"]:
+    """Distance from the axis to the left and right wall in every row, m; NaN where fewer than 5 returns tell."""
+    near = local[np.abs(local[:, 2] - both.height) < _SLAB]
+    rows = len(both.station)
+    row = ((near[:, 0] - both.lattice.low[0]) / both.lattice.edge).astype(int)
+    wall = np.empty((2, rows))
+    for side, sign in enumerate((1, -1)):
+        mine = (sign * near[:, 1] > 1.0) & (near[:, 0] > both.lattice.low[0]) & (row < rows)
+        spread = np.concatenate([row[mine] + shift for shift in (-1, 0, 1)])
+        value = np.tile(sign * near[mine, 1], 3)
+        kept = (spread >= 0) & (spread < rows)
+        wall[side] = grouped_median(spread[kept], value[kept], rows, _LEAST_RETURNS)
+    return wall
+
+
+def edge_cells(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
+    """Free cells beside cells that are not; the mouths are open."""
+    return free & ~binary_erosion(np.pad(free, ((1, 1), (0, 0)), mode="edge"))[1:-1]
+
+
+def cell_distances(from_cells: Bool[np.ndarray, "n m"], to: Bool[np.ndarray, "n m"], edge: float) -> np.ndarray:
+    """Distance from each of some cells to the nearest of others, m.
+
+    Raises:
+        ValueError: There are none to go to.
+    """
+    if not to.any():
+        raise ValueError("no free space at the height of the sensor")
+    return distance_transform_edt(~to, edge)[from_cells]
+
+
+def medial_axis(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
+    """Skeleton of the free space without its pockets."""
+    padded = np.pad(free, ((20, 20), (1, 1)), mode="edge")  # a skeleton shrinks from the mouths
+    padded[:, [0, -1]] = False
+    return skeletonize(binary_opening(padded, np.ones((2 * _SPUR + 1,) * 2)))[20:-20, 1:-1]
+
+
+@per_case
+def free_widths(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Stations, and free widths of candidate and reference in the plane, m; `inf` where a side is open.
+
+    Against the truth they are measured every 10 cm by rays, pockets with them; against a held-out recording every
+    metre in the smooth sections.
+    """
+    both = free_plane(case)
+    if case.truth is None:
+        cut = sections(case)
+        above = np.full(len(cut.station), both.height)
+        return cut.station, widths(cut.judged_outline, above), widths(cut.reference_outline, above)
+    position, _, left, up = both.lattice.curve.frames(both.station)
+    eye = position + both.height * up
+    pair = (surface_caster(case), truth_caster(case))
+    width = [caster.first(eye, left)[0] + caster.first(eye, -left)[0] for caster in pair]
+    return both.station, width[0], width[1]

@@ -1,0 +1,337 @@
+"""The released scene: files and hashes, rays, inventory, rail seats."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import wraps
+from hashlib import sha256
+from pathlib import Path
+from typing import TypeVar
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from benchmarks.fidelity.candidate import Track, concatenate_meshes, geom_mesh, track_of
+from benchmarks.fidelity.case import SHARED, Case, per_case
+from benchmarks.fidelity.derive.curve import candidate_curve
+from benchmarks.fidelity.derive.mesh import face_parts
+from benchmarks.fidelity.derive.surface import Caster, surface_caster
+
+Result = TypeVar("Result")
+
+
+def per_release(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[Case], Result]]:
+    """Computes a function of released files once in this process for as long as what it reads stays the same.
+
+    Args:
+        *reads: Of `scene` (the MJCF with its meshes), `tunnel` (the planar tunnel), `mesh` (visible surface and
+            centreline).
+    """
+
+    def decorate(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
+        @wraps(function)
+        def once(case: Case) -> Result:
+            hashes = tuple(_HASHES[name](case) for name in reads)
+            key = (function.__module__, function.__qualname__, case.seed, case.tolerance, hashes)
+            if key not in SHARED:
+                SHARED[key] = function(case)
+            return SHARED[key]
+
+        return once
+
+    return decorate
+
+
+@per_case
+def scene_hash(case: Case) -> str:
+    """SHA-256 of the MJCF and of every file that it names."""
+    scene = case.candidate.scene
+    digest = sha256(scene.read_bytes())
+    for path in asset_files(scene):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+@per_case
+def tunnel_hash(case: Case) -> str:
+    """SHA-256 of the planar tunnel."""
+    return sha256(case.candidate.tunnel.read_bytes()).hexdigest()
+
+
+@per_case
+def mesh_hash(case: Case) -> str:
+    """SHA-256 of the visible surface and the centreline in memory."""
+    digest, judged = sha256(case.candidate.bore.position.tobytes()), case.candidate
+    track = judged.track
+    laid = (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh)
+    for mesh in (judged.lining, *laid, judged.extra, judged.nails, judged.bed):
+        digest.update(np.ascontiguousarray(mesh.vertices).tobytes() + np.ascontiguousarray(mesh.faces).tobytes())
+    return digest.hexdigest()
+
+
+_HASHES = {"scene": scene_hash, "tunnel": tunnel_hash, "mesh": mesh_hash}
+
+
+def asset_files(scene: Path) -> list[Path]:
+    """Files that an MJCF names, where they lie."""
+    root = ElementTree.parse(scene).getroot()
+    compiler = root.find("compiler")
+    where = compiler.attrib if compiler is not None else {}
+    folders = {kind: scene.parent / where.get(f"{kind}dir", "") for kind in ("mesh", "texture")}
+    files = {(kind, one.get("file")) for kind in ("mesh", "texture") for one in root.iter(kind) if one.get("file")}
+    return [folders[kind] / str(name) for kind, name in sorted(files)]
+
+
+@per_release("scene")
+def scene_model(case: Case) -> mujoco.MjModel:
+    """The compiled scene.
+
+    Raises:
+        ValueError: MuJoCo refuses it.
+    """
+    return mujoco.MjModel.from_xml_path(str(case.candidate.scene))
+
+
+@per_release("scene")
+def scene_track(case: Case) -> Track:
+    """The track that the compiled scene holds, whatever the candidate has in memory."""
+    return track_of(scene_model(case), case.candidate.manifest)
+
+
+def placed_data(model: mujoco.MjModel) -> mujoco.MjData:
+    """Data with every geom where the model's first pose puts it."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def robot_body(model: mujoco.MjModel) -> int:
+    """Number of the first body that moves freely.
+
+    Raises:
+        ValueError: None does.
+    """
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            return int(model.jnt_bodyid[joint])
+    raise ValueError("no body of the scene moves freely")
+
+
+def lidar_elevation(case: Case, station: np.ndarray) -> np.ndarray:
+    """Height of the environment's LiDAR plane at stations, tunnel frame, m."""
+    with np.load(case.candidate.tunnel) as tunnel:
+        return np.interp(station, tunnel["station"], tunnel["elevation"]) + float(tunnel["lidar_height"])
+
+
+def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Random stations of the centreline, so that none lies in a ring of vertices.
+
+    Returns:
+        Stations (m, `(count,)`), positions on the centreline and unit vectors to the left, `(count, 3)`.
+    """
+    bore = case.candidate.bore
+    station = np.sort(case.rng(id).uniform(bore.station[0] + inset, bore.station[-1] - inset, count))
+    position, left = (
+        np.stack([np.interp(station, bore.station, column) for column in rows.T], axis=1)
+        for rows in (bore.position, bore.lateral)
+    )
+    return station, position, left / np.linalg.norm(left, axis=1, keepdims=True)
+
+
+LINING_NAMES = ("lining", "recess", "floor")  # what pieces of the lining are called
+VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups that a camera draws
+_MESH_NAMES = {
+    "bed",
+    *LINING_NAMES,
+    "sleeper",
+    "rail",
+    "fastening",
+    "fastenings",
+}  # what geoms of lining and track are called
+_EYES = 100
+_RAYS_PER_EYE = 1000
+
+
+@dataclass(frozen=True)
+class RayPairs:
+    """Ranges of the same rays.
+
+    Attributes:
+        scene: By MuJoCo, m; `inf` for none, `(k,)`.
+        mesh: By embree in lining and track, m; `inf` for none, `(k,)`.
+        comparable: Whether what MuJoCo hit is among those meshes, `(k,)`.
+    """
+
+    scene: Float[np.ndarray, " k"]
+    mesh: Float[np.ndarray, " k"]
+    comparable: Bool[np.ndarray, " k"]
+
+
+@per_release("scene", "mesh")
+def rays_from_axis(case: Case) -> RayPairs:
+    """Rays all around from random places of the centreline."""
+    _, eye, _ = random_stations(case, "mj_ray_vs_mesh_mae", _EYES)
+    way = case.rng("mj_ray_leak_rate").normal(size=(_EYES, _RAYS_PER_EYE, 3))
+    way /= np.linalg.norm(way, axis=2, keepdims=True)
+    return ray_pairs(case, eye, way)
+
+
+def ray_pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r 3"]) -> RayPairs:
+    """Casts rays from eyes in both."""
+    model = scene_model(case)
+    reach, geom = scene_ranges(model, eye, way)
+    flat = way.reshape(-1, 3)
+    mesh = surface_caster(case).first(np.repeat(eye, way.shape[1], axis=0), flat)[0]
+    # Nails and lamps are of the scene alone.
+    ours = np.array([model.geom(k).name.split("_")[0] in _MESH_NAMES for k in range(model.ngeom)] + [True])
+    return RayPairs(reach, mesh, ours[geom])
+
+
+def scene_ranges(
+    model: mujoco.MjModel, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r 3"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges by `mj_multiRay` in what is drawn, robot left out, m, `inf` for none, and the geoms hit, `(e·r,)` each."""
+    data = placed_data(model)
+    try:
+        robot = robot_body(model)
+    except ValueError:
+        robot = -1
+    count = way.shape[1]
+    reach, geom = np.empty((len(eye), count)), np.empty((len(eye), count), np.int32)
+    for row in range(len(eye)):
+        mujoco.mj_multiRay(
+            model, data, eye[row], np.ascontiguousarray(way[row]).ravel(), VISIBLE_GROUPS, True, robot, geom[row],
+            reach[row], None, count, mujoco.mjMAXVAL,
+        )  # fmt: skip
+    return np.where(reach < 0.0, np.inf, reach).ravel(), geom.ravel()
+
+
+_PAD_HEIGHT = 0.03  # m; what is lower is a pad, what is higher a clip
+_FASTENER_REACH = 0.10  # m between clip and shoulder
+_SEAT_REACH = 0.20  # m between parts of the fastening of one seat
+
+
+def count_assets(case: Case) -> dict[str, int]:
+    """Assets by the names of the manifest; a fastener is a clip with its shoulder, two to a seat."""
+    model = scene_model(case)
+    names = [model.geom(k).name for k in range(model.ngeom)]
+    pieces = fastening_pieces(scene_track(case).fastening_mesh)
+    pad = pieces.height <= _PAD_HEIGHT
+    return {
+        "sleepers": sum(name.startswith("sleeper_") for name in names),
+        "rails": len({name.split("_")[1] for name in names if name.startswith("rail_")}),
+        "fasteners": len(cluster_points(pieces.middle[~pad], _FASTENER_REACH)),
+        "pads": int(pad.sum()),
+        "lining_chunks": sum(name.startswith("lining") for name in names),
+        "wall_panels": sum(name.startswith("wall_") for name in names),
+    }
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Connected pieces of a mesh.
+
+    Attributes:
+        middle: m, `(k, 3)`.
+        height: Vertical extent, m, `(k,)`.
+    """
+
+    middle: Float[np.ndarray, "k 3"]
+    height: Float[np.ndarray, " k"]
+
+
+def fastening_pieces(mesh: trimesh.Trimesh) -> Pieces:
+    """Pads and clips one by one."""
+    if not len(mesh.faces):
+        return Pieces(np.zeros((0, 3)), np.zeros(0))
+    part = face_parts(mesh)
+    order = np.argsort(part, kind="stable")
+    corners = mesh.triangles[order].reshape(-1, 3)
+    starts = 3 * np.searchsorted(part[order], np.arange(part.max() + 1))
+    low, high = np.minimum.reduceat(corners, starts), np.maximum.reduceat(corners, starts)
+    return Pieces((low + high) / 2, (high - low)[:, 2])
+
+
+@per_case
+def fastening_sets(case: Case) -> Float[np.ndarray, "k 3"]:
+    """Middle of each fastening, that is, of the pieces that lie together, m."""
+    return cluster_points(fastening_pieces(case.candidate.track.fastening_mesh).middle, _SEAT_REACH)
+
+
+def cluster_points(middle: Float[np.ndarray, "p 3"], reach: float) -> Float[np.ndarray, "k 3"]:
+    """Mean of each group of points that hang together by steps of at most `reach`, m."""
+    if not len(middle):
+        return middle
+    pair = cKDTree(middle).query_pairs(reach, output_type="ndarray")
+    graph = coo_array((np.ones(len(pair), bool), (pair[:, 0], pair[:, 1])), shape=(len(middle),) * 2)
+    label: Int[np.ndarray, " p"] = connected_components(graph, directed=False)[1]
+    weight = np.bincount(label)[:, None]
+    return np.stack([np.bincount(label, column) for column in middle.T], axis=1) / weight
+
+
+_HEAD_HALF = 0.0365  # m from a head's inner face to its middle
+_RAY_START = 1.0  # m
+_BED_ASIDE = 0.3  # m from the track's middle, where the bed is looked for
+
+
+@per_case
+def seat_mismatches(case: Case) -> Float[np.ndarray, " k"]:
+    """Overlaps (below 0) and gaps (above) of pad on sleeper, rail on pad, and of sleepers that hang over the bed, m.
+
+    Raises:
+        ValueError: There is no track.
+    """
+    track, curve = case.candidate.track, candidate_curve(case)
+    if not len(track.sleeper) or min(len(rail) for rail in track.rail.values()) < 2:
+        raise ValueError("there is no track")
+    sleepers, rails, pads = (Caster(m) for m in (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh))
+    at = curve.local(track.sleeper)
+    _, _, left, up = curve.frames(at[:, 0])
+    found = []
+    for rail in track.rail.values():
+        face = curve.local(rail)
+        face = face[np.argsort(face[:, 0])]
+        inner = np.interp(at[:, 0], face[:, 0], face[:, 1])
+        across = inner + np.sign(inner - at[:, 1]) * _HEAD_HALF
+        seat = track.sleeper + (across - at[:, 1])[:, None] * left
+        top = _surface_level(sleepers, seat, up, above=True)
+        pad = _surface_level(pads, seat, up, above=False), _surface_level(pads, seat, up, above=True)
+        foot = _surface_level(rails, seat, up, above=False)
+        found += [pad[0] - top, foot - np.where(np.isfinite(pad[1]), pad[1], top)]
+    found.append(np.maximum(_hanging_gaps(case, sleepers, track.sleeper, left, up), 0.0))
+    every = np.concatenate(found)
+    return every[np.isfinite(every)]
+
+
+def _surface_level(caster: Caster, at: np.ndarray, up: np.ndarray, above: bool) -> Float[np.ndarray, " k"]:
+    """Height about `at` of the first surface met from far above or from far below, m; `nan` for none."""
+    sign = 1.0 if above else -1.0
+    reach = caster.first(at + sign * _RAY_START * up, -sign * up)[0]
+    return np.where(np.isfinite(reach), sign * (_RAY_START - reach), np.nan)
+
+
+def _hanging_gaps(case: Case, sleepers: Caster, at: np.ndarray, left: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """How far the bottom of each sleeper is above the bed, or its top below it, m."""
+    place = at + _BED_ASIDE * left
+    bed = Caster(concatenate_meshes([case.candidate.lining, *_bed_slabs(case)]))
+    # From just above the sleeper: the lining overhead is out of the way.
+    level = 0.3 - bed.first(place + 0.3 * up, -up)[0]
+    bottom, top = _surface_level(sleepers, place, up, above=False), _surface_level(sleepers, place, up, above=True)
+    return np.maximum(bottom - level, level - top)
+
+
+def _bed_slabs(case: Case) -> list[trimesh.Trimesh]:
+    """Slabs of the released scene on which sleepers lie; none where there is no scene."""
+    return _scene_slabs(case) if case.candidate.scene.exists() else []
+
+
+@per_release("scene")
+def _scene_slabs(case: Case) -> list[trimesh.Trimesh]:
+    model = scene_model(case)
+    data = placed_data(model)
+    return [geom_mesh(model, data, k) for k in range(model.ngeom) if model.geom(k).name.startswith("bed_")]

@@ -1,0 +1,155 @@
+"""Material and colours of all figures, and the figures of scores, controls and sweep."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+from benchmarks.fidelity import scoring
+from benchmarks.fidelity.case import Case
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What figures draw from.
+
+    Attributes:
+        case: What was judged.
+        null: The same with the null tube in its place.
+        report: See `report.content`.
+        controls: Rows of controls; may be empty.
+        sweep: Rows of the sweep; may be empty.
+    """
+
+    case: Case
+    null: Case
+    report: dict[str, Any]
+    controls: list[dict[str, Any]]
+    sweep: list[dict[str, Any]]
+
+    def note(self, n: int | None = None) -> str:
+        """What every caption ends with: samples, seed, split."""
+        hold = self.report["split"]["hold"]
+        split = (
+            f"held out: {hold['file']}" if hold and hold["file"] else "held-out beams" if hold else "nothing held out"
+        )
+        return (
+            f" n = {n:,}." if n is not None else ""
+        ) + f" Seed {self.report['seed']}; {split}; split {self.report['split']['rule']}."
+
+
+Drawn = tuple[Figure, str]
+Draw = Callable[[Sheet], Drawn | None]
+INK, BLUE, ORANGE, GREEN, RED, GREY = "#1b1b1b", "#0072b2", "#e69f00", "#009e73", "#d55e00", "#999999"
+AGREE, ONLY_MESH, ONLY_CLOUD = "#009e73", "#d55e00", "#0072b2"  # the paper's green, red and blue, told apart by anybody
+DIVERGING = LinearSegmentedColormap.from_list("error", ["#0072b2", "#f7f7f7", "#d55e00"])
+
+
+def bin_along(
+    station: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], width: float, statistic
+) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
+    """Middle of each bin along the tunnel and a statistic of the values in it; bins of fewer than 5 are left out."""
+    number = np.floor(station / width).astype(int)
+    order = np.argsort(number, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
+    kept = [group for group in groups if len(group) >= 5]
+    middle = np.array([(number[group[0]] + 0.5) * width for group in kept])
+    return middle, np.array([statistic(values[group]) for group in kept])
+
+
+_KINDS = ("common", "category", "independent", "tolerance", "seed")
+
+
+def draw_categories(sheet: Sheet) -> Drawn:
+    """F13: bars of the categories, sorted, with the null tube and the truth as candidate."""
+    entries = sheet.report["categories"]
+    order = sorted(entries, key=lambda c: -1.0 if entries[c]["score"] is None else entries[c]["score"])
+    failed = {m["category"] for m in sheet.report["metrics"] if m["status"] == "gate failed"}
+    figure, axes = plt.subplots(figsize=(9, 5.6), layout="constrained")
+    for row, name in enumerate(order):
+        score, null, ceiling = (entries[name][key] for key in ("score", "null", "ceiling"))
+        if score is None:
+            axes.text(1, row, "no reference", va="center", color=GREY)
+        else:
+            axes.barh(row, score, height=0.62, color=RED if name in failed else BLUE)
+        if null is not None:
+            axes.plot(null, row, "D", color=GREY, markeredgecolor=INK, ms=6)
+        if ceiling is not None:
+            axes.plot(ceiling, row, "|", color=GREEN, ms=13, mew=2.5)
+    axes.axvline(scoring.PASS_CATEGORY, color=INK, lw=0.8, ls=":")
+    axes.set(
+        yticks=range(len(order)),
+        yticklabels=[f"{c}  {entries[c]['name']}" for c in order],
+        xlim=(0, 103),
+        ylim=(-0.7, len(order) - 0.3),
+        xlabel="score",
+    )
+    line = plt.Line2D
+    marks = [
+        line([], [], color=BLUE, lw=7, label="reconstruction"),
+        line([], [], color=RED, lw=7, label="with a failed gate"),
+        line([], [], marker="D", ls="", color=GREY, markeredgecolor=INK, label="null tube"),
+        line([], [], marker="|", ls="", ms=13, mew=2.5, color=GREEN, label="truth as candidate"),
+    ]
+    axes.legend(handles=marks, loc="upper center", bbox_to_anchor=(0.4, -0.09), ncol=4, frameon=False)
+    scored = sum(m["score"] is not None for m in sheet.report["metrics"])
+    return figure, "Categories, sorted; dotted: least score for PASS." + sheet.note(scored).replace(
+        "n =", "Scored metrics n ="
+    )
+
+
+def draw_controls(sheet: Sheet) -> Drawn | None:
+    """F14: points lost by each category under each control at its bold dose."""
+    rows = [row for row in sheet.controls if row["bold"]]
+    if not rows:
+        return None
+    names = list(sheet.report["categories"])
+    drop = np.array([[np.nan if row["falls"][c] is None else row["falls"][c] for c in names] for row in rows], float)
+    figure, axes = plt.subplots(figsize=(9.5, 1.4 + 0.24 * len(rows)), layout="constrained")
+    picture = axes.imshow(drop, cmap="Blues", vmin=0, vmax=100, aspect="auto")
+    for y, row in enumerate(rows):
+        for x, name in enumerate(names):
+            if name in row.get("short", {}):
+                axes.text(x, y, "x", ha="center", va="center", color=RED, fontsize=12, fontweight="bold")
+            elif np.isfinite(drop[y, x]) and abs(drop[y, x]) >= 0.5:
+                axes.text(
+                    x,
+                    y,
+                    f"{drop[y, x]:.0f}",
+                    ha="center",
+                    va="center",
+                    fontsize=7,
+                    color="white" if drop[y, x] > 45 else INK,
+                )
+    axes.set(xticks=range(len(names)), xticklabels=names, yticks=range(len(rows)))
+    axes.set_yticklabels([f"{row['id']} {row['corruption'][:44]} · {row['dose']:g}" for row in rows], fontsize=7)
+    axes.xaxis.tick_top()
+    figure.colorbar(picture, label="points lost", shrink=0.5)
+    return (
+        figure,
+        "Points that each category loses under each control; x marks a fall that is short of what is asked."
+        + sheet.note(len(rows)),
+    )
+
+
+def draw_sweep(sheet: Sheet) -> Drawn | None:
+    """F15: moves of the global score under thresholds, tolerances and seeds."""
+    if not sheet.sweep:
+        return None
+    figure, axes = plt.subplots(figsize=(8, 3.2), layout="constrained")
+    rng = np.random.default_rng(0)
+    for row, kind in enumerate(_KINDS):
+        delta = np.array([r["delta"] for r in sheet.sweep if r["kind"] == kind])
+        axes.plot(delta, row + rng.uniform(-0.22, 0.22, len(delta)), "o", color=BLUE, ms=4, alpha=0.6)
+    axes.axvline(0, color=INK, lw=0.8)
+    axes.set(yticks=range(len(_KINDS)), yticklabels=_KINDS, xlabel="move of the global score, points")
+    return (
+        figure,
+        "Global score under thresholds ±10 % (common, by category, independent), tolerances ±10 % and other seeds."
+        + sheet.note(len(sheet.sweep)),
+    )

@@ -1,0 +1,237 @@
+"""Figures of the tunnel: axis, beams, degeneracy, free space, persistence."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.patches import Patch
+from scipy.ndimage import distance_transform_edt
+
+from benchmarks.fidelity.derive.axis import reference_curve
+from benchmarks.fidelity.derive.beams import cast_beams, noisy_ranges, returns
+from benchmarks.fidelity.derive.clouds import plane_rows, real_planes, synthetic_planes
+from benchmarks.fidelity.derive.curve import candidate_curve
+from benchmarks.fidelity.derive.degeneracy import real_information, synthetic_information
+from benchmarks.fidelity.derive.mesh import candidate_diagrams, reference_diagrams
+from benchmarks.fidelity.derive.plane import free_plane
+from benchmarks.fidelity.figures.sheet import (
+    AGREE,
+    BLUE,
+    DIVERGING,
+    GREY,
+    INK,
+    ONLY_CLOUD,
+    ONLY_MESH,
+    ORANGE,
+    Drawn,
+    Sheet,
+)
+
+
+def draw_axis(sheet: Sheet) -> Drawn | None:
+    """F16: reconstruction and reference in plan and profile, and the offset along the tunnel."""
+    if sheet.case.hold is None and sheet.case.truth is None:
+        return None
+    ours, reference = candidate_curve(sheet.case), reference_curve(sheet.case)
+    start, chord = reference.position[0], reference.position[-1] - reference.position[0]
+    chord = chord[:2] / np.linalg.norm(chord[:2])
+    turn = np.array([chord, [-chord[1], chord[0]]])
+    figure, (plan, profile, offset) = plt.subplots(3, 1, figsize=(11, 7), layout="constrained")
+    for curve, colour, label, style in ((reference, INK, "reference", "-"), (ours, BLUE, "reconstruction", "--")):
+        along, across = turn @ (curve.position[:, :2] - start[:2]).T
+        plan.plot(along, across, style, color=colour, label=label)
+        profile.plot(along, curve.position[:, 2] - start[2], style, color=colour)
+    ends = reference.position[[0, -1]]
+    plan.plot(*(turn @ (ends[:, :2] - start[:2]).T), "^", color=ORANGE, label="ends of the reference")
+    local = reference.local(ours.position)
+    offset.plot(local[:, 0], 100 * local[:, 1], color=BLUE, label="left")
+    offset.plot(local[:, 0], 100 * local[:, 2], color=ORANGE, label="up")
+    plan.set(ylabel="across, m")
+    profile.set(ylabel="height, m", xlabel="along the chord, m")
+    offset.set(xlabel="station, m", ylabel="offset from the\nreference, cm")
+    plan.legend(frameon=False, ncol=3)
+    offset.legend(frameon=False, ncol=2)
+    return (
+        figure,
+        "Centrelines in plan and profile, and the reconstruction's offset from the reference; no alignment."
+        + sheet.note(len(ours.station)),
+    )
+
+
+def draw_range_image(sheet: Sheet) -> Drawn | None:
+    """F8: ranges of one held-out scan, the same beams in the candidate, and the difference."""
+    if sheet.case.hold is None:
+        return None
+    real, cast = returns(sheet.case), cast_beams(sheet.case)
+    scans = np.unique(real.scan)
+    rows = real.scan == scans[len(scans) // 2]
+    turn = np.degrees(np.arctan2(real.heading[rows, 1], real.heading[rows, 0]))
+    rise = np.degrees(np.arcsin(np.clip(real.heading[rows, 2], -1, 1)))
+    figure, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained", sharey=True)
+    span = dict(vmin=0, vmax=float(np.percentile(real.range[rows], 98)), cmap="viridis")
+    seen = np.where(cast.hit, cast.range, np.nan)
+    pictures = (("recorded", real.range[rows], span), ("in the reconstruction", seen[rows], span),
+                ("difference", 100 * cast.difference[rows], dict(vmin=-20, vmax=20, cmap=DIVERGING)))  # fmt: skip
+    for axis, (name, values, style) in zip(axes, pictures, strict=True):
+        shown = axis.scatter(turn, rise, c=values, s=2.5, lw=0, rasterized=True, **style)
+        axis.set(title=name, xlabel="azimuth from the axis, deg")
+        figure.colorbar(shown, ax=axis, label="cm" if name == "difference" else "m")
+    axes[0].set(ylabel="elevation, deg")
+    return (
+        figure,
+        f"Scan {int(scans[len(scans) // 2])} of the held-out recording and the same beams cast."
+        + sheet.note(int(rows.sum())),
+    )
+
+
+def draw_sensor_distributions(sheet: Sheet) -> Drawn | None:
+    """F9: ranges, incidences and ranges by elevation, real and synthetic."""
+    if sheet.case.hold is None:
+        return None
+    real, synthetic = returns(sheet.case), noisy_ranges(sheet.case, "first")
+    by = {entry["id"]: entry["value"] for entry in sheet.report["metrics"]}
+    figure, (ranges, incidence, elevation) = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained")
+    top = float(np.percentile(real.range, 99.5))
+    for values, colour, label in (
+        (real.range, BLUE, "recorded"),
+        (synthetic[np.isfinite(synthetic)], ORANGE, "in the reconstruction"),
+    ):
+        ranges.hist(np.clip(values, 0, top), bins=120, density=True, histtype="step", color=colour, label=label)
+    ranges.set(
+        xlabel="range, m",
+        ylabel="density, 1/m",
+        title=_statistics_title("KS", by["range_ks"], "W1", by["range_w1"], "m"),
+    )
+    ranges.legend(frameon=False)
+    direction = real.direction[plane_rows(sheet.case)]
+    for planes, colour in ((real_planes(sheet.case), BLUE), (synthetic_planes(sheet.case), ORANGE)):
+        angle = np.degrees(np.arccos(np.clip(np.abs(np.einsum("ij,ij->i", direction, planes.normal)), 0, 1)))
+        incidence.hist(angle[np.isfinite(angle)], bins=60, density=True, histtype="step", color=colour)
+    incidence.set(
+        xlabel="incidence, deg",
+        ylabel="density, 1/deg",
+        title=_statistics_title("W1", by["incidence_w1"], "", None, "deg"),
+    )
+    rise = np.degrees(np.arcsin(np.clip(real.heading[:, 2], -1, 1)))
+    edges = np.linspace(rise.min(), rise.max() + 1e-6, 25)
+    group = np.digitize(rise, edges) - 1
+    for values, colour in ((real.range, BLUE), (synthetic, ORANGE)):
+        medians = [np.median(v) if len(v := values[(group == k) & np.isfinite(values)]) else np.nan for k in range(24)]
+        elevation.step(edges[:-1], medians, where="post", color=colour)
+    elevation.set(
+        xlabel="elevation, deg",
+        ylabel="median range, m",
+        title=_statistics_title("W1", by["elevation_w1"], "", None, "m"),
+    )
+    return figure, "Distributions of held-out beams, recorded and cast with range noise." + sheet.note(len(real.range))
+
+
+def _statistics_title(first: str, a: float | None, second: str, b: float | None, unit: str) -> str:
+    parts = [f"{name} {value:.3g}" for name, value in ((first, a), (second, b)) if value is not None]
+    return ", ".join(parts) + (f" {unit}" if parts else "")
+
+
+def draw_degeneracy(sheet: Sheet) -> Drawn | None:
+    """F12: axial information along the tunnel."""
+    if sheet.case.hold is None:
+        return None
+    frames = (
+        (real_information(sheet.case), BLUE, "recorded"),
+        (synthetic_information(sheet.case), ORANGE, "in the reconstruction"),
+        (synthetic_information(sheet.null), GREY, "in the null tube"),
+    )
+    figure, (axial, strong) = plt.subplots(2, 1, figsize=(12, 4.6), layout="constrained", sharex=True)
+    for found, colour, label in frames:
+        order = np.argsort(found.station)
+        axial.plot(found.station[order], found.axial[order], color=colour, lw=1.2, label=label)
+        strong.plot(found.station[order], 100 * found.strong[order], color=colour, lw=1.2)
+    axial.set(ylabel="axial information a point", yscale="log")
+    axial.legend(frameon=False, ncol=3, loc="upper center", bbox_to_anchor=(0.5, 1.22))
+    strong.set(xlabel="station, m", ylabel="points whose normal lies\nwithin 60° of the axis, %", ylim=(0, None))
+    return figure, "Axial share of the point-to-plane Hessian of each held-out scan." + sheet.note(
+        len(frames[0][0].station)
+    )
+
+
+def draw_free_space(sheet: Sheet) -> Drawn | None:
+    """F11: free cells of both, the way of most clearance, clearance along it."""
+    if sheet.case.hold is None and sheet.case.truth is None:
+        return None
+    found = free_plane(sheet.case)
+    lattice, edge = found.lattice, found.lattice.edge
+    classes = np.where(
+        found.judged & found.reference, 0.0, np.where(found.judged, 1.0, np.where(found.reference, 2.0, np.nan))
+    )
+    classes = np.where(found.known, classes, np.nan)
+    left = lattice.low[1] + edge * (np.arange(lattice.shape[1]) + 0.5)
+    figure, (map_axis, room) = plt.subplots(2, 1, figsize=(12, 5), layout="constrained", sharex=True)
+    extent = [
+        lattice.low[0],
+        lattice.low[0] + edge * lattice.shape[0],
+        lattice.low[1],
+        lattice.low[1] + edge * lattice.shape[1],
+    ]
+    map_axis.imshow(
+        classes.T,
+        origin="lower",
+        extent=extent,
+        aspect="auto",
+        cmap=ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD]),
+        vmin=0,
+        vmax=2,
+        alpha=0.55,
+        interpolation="nearest",
+    )
+    for free, colour, label in ((found.reference, INK, "reference"), (found.judged, BLUE, "reconstruction")):
+        clearance = distance_transform_edt(np.pad(free, ((0, 0), (1, 1))))[:, 1:-1] * edge
+        map_axis.plot(found.station, left[np.argmax(clearance, axis=1)], color=colour, lw=1)
+        room.plot(found.station, clearance.max(axis=1), color=colour, lw=1.2, label=label)
+    names = (
+        ("free in both", AGREE),
+        ("free in the reconstruction only", ONLY_MESH),
+        ("free in the reference only", ONLY_CLOUD),
+    )
+    map_axis.legend(
+        handles=[Patch(color=c, alpha=0.55, label=n) for n, c in names],
+        loc="upper center",
+        bbox_to_anchor=(0.5, 1.2),
+        ncol=3,
+        frameon=False,
+    )
+    map_axis.set(ylabel="left, m")
+    room.set(xlabel="station, m", ylabel="largest clearance, m", ylim=(0, 1.1 * room.dataLim.y1))
+    room.legend(frameon=False, loc="lower right")
+    return (
+        figure,
+        f"Free cells of {edge * 100:.0f} cm at sensor height, places of most clearance (lines), and that clearance."
+        + sheet.note(int(found.known.sum())),
+    )
+
+
+_NAMES = ("components", "loops", "voids")
+
+
+def draw_persistence(sheet: Sheet) -> Drawn | None:
+    """F10: birth and death of components, loops and voids, reconstruction and reference."""
+    if sheet.case.hold is None and sheet.case.truth is None:
+        return None
+    ours, reference = candidate_diagrams(sheet.case), reference_diagrams(sheet.case)
+    figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
+    count = 0
+    for axis, name, mine, theirs in zip(axes, _NAMES, ours, reference, strict=True):
+        for pairs, colour, mark, label in ((theirs, ORANGE, "o", "reference"), (mine, BLUE, "x", "reconstruction")):
+            pairs = np.nan_to_num(np.asarray(pairs, float).reshape(-1, 2), posinf=0.0, neginf=0.0)
+            count += len(pairs)
+            axis.plot(pairs[:, 0], pairs[:, 1], mark, color=colour, ms=5, mfc="none", label=label)
+        if not len(mine) and not len(theirs):
+            axis.text(0.5, 0.5, "none in either", transform=axis.transAxes, ha="center", color=GREY)
+            axis.set(xlim=(-1, 0), ylim=(-1, 0))
+        low, high = min(axis.get_xlim()[0], axis.get_ylim()[0]), max(axis.get_xlim()[1], axis.get_ylim()[1])
+        axis.plot([low, high], [low, high], color=GREY, lw=0.8)
+        axis.set(title=name, xlabel="clearance at birth, m", aspect="equal")
+    axes[0].set(ylabel="clearance at death, m")
+    axes[0].legend(frameon=False)
+    return (
+        figure,
+        "Persistence of free space as the clearance asked falls; far from the diagonal is what lasts."
+        + sheet.note(count),
+    )

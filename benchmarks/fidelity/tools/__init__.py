@@ -1,0 +1,1 @@
+"""Programs that made the frozen data of the suite."""
