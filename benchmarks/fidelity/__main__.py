@@ -7,14 +7,14 @@ import functools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.fidelity import judge, scoring
+from benchmarks.fidelity import judge, outside, scoring
 from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.controls.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, write_json
@@ -38,16 +38,17 @@ from scene.files import require_input, require_output_folder
 CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
 SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
 MIDDLING = (("N02", 2.0), ("N25", 30.0))  # corruptions that the sweep makes where `controls` has not left them
+_PROG = "python -m benchmarks.fidelity"
 
 
 @dataclass(frozen=True)
 class ControlsConfig(Inputs):
-    """Which controls are run.
+    """Controls to run.
 
     Attributes:
-        only: Their ids; all where empty.
-        bold_only: Only the doses that must fail.
-        processes: At a time.
+        only: Ids of the controls; all where empty.
+        bold_only: Run only the doses that must fail.
+        processes: Number of controls at a time.
         foreign: Scene folder of another tunnel of the same class, for N33; made where not given.
     """
 
@@ -59,10 +60,10 @@ class ControlsConfig(Inputs):
 
 @dataclass(frozen=True)
 class SweepConfig(Inputs):
-    """What is swept.
+    """Runs of the sweep that compute all geometry anew.
 
     Attributes:
-        seeds: Of the runs that compute all geometry anew; empty for none.
+        seeds: Seeds of such runs; empty for none.
         tolerances: Factors on the tolerances inside metrics; empty for none.
     """
 
@@ -71,8 +72,23 @@ class SweepConfig(Inputs):
 
 
 @dataclass(frozen=True)
+class SplitCommand:
+    """Cut a recording into fit, val and hold by blocks of time.
+
+    Attributes:
+        recording: Bag to cut.
+        out: Folder to write.
+        rule: Rule of the cut.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    out: Path
+    rule: SplitConfig = field(default_factory=SplitConfig)
+
+
+@dataclass(frozen=True)
 class OpenCase:
-    """A case with its judgement and where results go."""
+    """A case with its inputs, judgement and values."""
 
     inputs: Inputs
     case: Case
@@ -81,8 +97,11 @@ class OpenCase:
 
 
 def open_case(inputs: Inputs) -> OpenCase:
-    """Reads what was given and judges it without controls; values from an earlier command are taken up."""
+    """Reads the inputs and judges the case without controls; values of an earlier command are read again."""
     require_output_folder(inputs.out)
+    outside.clear()
+    if inputs.metrics is not None:
+        outside.load_metrics(inputs.metrics)
     resolved = complete_inputs(inputs)
     case = read_case(resolved)
     judgement = judge.judge_case(case, resolved.out, resolved.strict)
@@ -94,9 +113,7 @@ def run(inputs: Inputs) -> None:
 
     Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held.bag --trajectory poses.tum
     """
-    opened = open_case(inputs)
-    written = _write_report(opened)
-    _print_summary(written)
+    _print_summary(_write_report(open_case(inputs)))
 
 
 def run_controls(config: ControlsConfig) -> None:
@@ -119,7 +136,7 @@ def run_controls(config: ControlsConfig) -> None:
 
 
 def _check_controls(config: ControlsConfig) -> None:
-    """Refuses what cannot be run before the scene is judged, which takes minutes."""
+    """Refuses wrong controls before the scene is judged, which takes minutes."""
     known = {job.control for job in list_jobs()}
     if unknown := [name for name in config.only if name not in known]:
         raise FidelityError(f"no control {unknown[0]!r}; there are {', '.join(sorted(known))}")
@@ -132,7 +149,7 @@ def _check_controls(config: ControlsConfig) -> None:
 def run_sweep(config: SweepConfig) -> None:
     """Moves thresholds, tolerances and seeds, and says how far the scores follow.
 
-    Whatever `controls` has left in `--out` takes part in the order that must be kept.
+    The results of `controls` in `--out` take part in the order that must be kept.
 
     Example: python -m benchmarks.fidelity sweep --seeds 0 1 2 --out out/fidelity
     """
@@ -143,21 +160,29 @@ def run_sweep(config: SweepConfig) -> None:
     opened = open_case(config)
     candidates = dict(opened.values)
     foreign = config.out / FOREIGN
-    known = foreign if foreign.exists() else None
-    bench = Bench(opened.case, candidates["base"], config.out / "controls", known)
+    bench = Bench(opened.case, candidates["base"], config.out / "controls", foreign if foreign.exists() else None)
     run_jobs(bench, [Job(*one) for one in MIDDLING], processes=1)
     candidates |= {outcome.job.name: outcome.values for outcome in bench.kept() if is_ranked(outcome.job)}
     rows = scoring.sweep_thresholds(candidates)
     for kind, runs in _recompute(opened, config).items():
         rows += scoring.compare_runs(kind, runs, candidates["base"])
-    content = {
-        "schema": SWEEP_SCHEMA,
-        "key": case_hash(opened.case),
-        "rows": rows,
-        "summary": scoring.summarise(rows),
-    }
+    content = {"schema": SWEEP_SCHEMA, "key": case_hash(opened.case), "rows": rows,
+               "summary": scoring.summarise(rows)}  # fmt: skip
     write_json(config.out / "sweep.json", content)
     _print_summary(_write_report(opened))
+
+
+def _recompute(opened: OpenCase, config: SweepConfig) -> dict[str, dict[str, dict[str, Value]]]:
+    """Return the values with other tolerances and seeds, by kind and run."""
+    base = opened.values["base"]
+    runs: dict[str, dict[str, dict[str, Value]]] = {"tolerance": {}, "seed": {}}
+    cases = [("tolerance", f"x{k}", replace(opened.case.fresh(), tolerance=k)) for k in config.tolerances]
+    cases += [("seed", str(seed), replace(opened.case.fresh(), seed=seed)) for seed in config.seeds]
+    for kind, name, fresh in cases:
+        same = kind == "seed" and fresh.seed == opened.case.seed
+        runs[kind][name] = base if same else evaluate(fresh, judge.geometry_categories(), base)
+        print(f"{kind} {name}: done", flush=True)
+    return runs
 
 
 def run_report(inputs: Inputs) -> None:
@@ -171,99 +196,67 @@ def run_report(inputs: Inputs) -> None:
     run(inputs)
 
 
-def _recompute(opened: OpenCase, config: SweepConfig) -> dict[str, dict[str, dict[str, Value]]]:
-    base = opened.values["base"]
-    found: dict[str, dict[str, dict[str, Value]]] = {"tolerance": {}, "seed": {}}
-    for kind, name, fresh in _variants(opened.case, config):
-        same = kind == "seed" and fresh.seed == opened.case.seed
-        found[kind][name] = base if same else evaluate(fresh, judge.geometry_categories(), base)
-        print(f"{kind} {name}: done", flush=True)
-    return found
+def run_split(config: SplitCommand) -> None:
+    """Cut a recording into fit, val and hold by blocks of time.
 
-
-def _variants(case: Case, config: SweepConfig) -> Iterator[tuple[str, str, Case]]:
-    """The case with other tolerances and seeds, nothing of it computed."""
-    for factor in config.tolerances:
-        yield "tolerance", f"x{factor}", replace(case.fresh(), tolerance=factor)
-    for seed in config.seeds:
-        yield "seed", str(seed), replace(case.fresh(), seed=seed)
+    Example: python -m benchmarks.fidelity split recording.bag --out build/parts
+    """
+    facts = split_recording(config.recording, config.out, config.rule)
+    print(", ".join(f"{name} {count} messages" for name, count in facts["messages"].items()))
 
 
 def _write_report(opened: OpenCase) -> dict[str, Any]:
-    """Report and verdict over everything that there is for this case in `--out`."""
-    folder = opened.inputs.out
+    """Writes the report over all results for this case in `--out`."""
+    inputs, folder = opened.inputs, opened.inputs.out
     controls = _kept_result(folder / "controls.json", opened.case)
     swept = _kept_result(folder / "sweep.json", opened.case)
     rows = controls["rows"] if controls else None
-    found = judge.find_leaks(opened.case, opened.values["base"])
-    judgement = judge.make_judgement(opened.values, found, rows, opened.inputs.strict)
-    return write_report(folder, opened.case, opened.inputs, judgement, rows, swept)
+    leaks = judge.find_leaks(opened.case, opened.values["base"])
+    judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict)
+    judgement = judge.add_outside(judgement, opened.case, folder, inputs.strict)
+    return write_report(folder, opened.case, inputs, judgement, rows, swept)
 
 
 def _kept_result(path: Path, case: Case) -> dict[str, Any] | None:
-    """What an earlier command left for the same case, else nothing."""
-    if not path.exists():
-        return None
-    content = json.loads(path.read_text())
+    """Return the result of an earlier command for the same case, else nothing."""
+    content = json.loads(path.read_text()) if path.exists() else {}
     return content if content.get("key") == case_hash(case) else None
 
 
-def _print_summary(written: dict[str, Any]) -> None:
-    overall = written["global"]
+def _print_summary(report: dict[str, Any]) -> None:
+    overall = report["global"]
     text = "none" if overall is None else f"{overall:.1f} %"
-    print(f"{written['title']} of {written['name']}: {written['verdict']}, global {text} "
-          f"over {written['categories_evaluated']} of {len(written['categories'])} categories")  # fmt: skip
-    for reason in written["reasons"]:
+    print(f"{report['title']} of {report['name']}: {report['verdict']}, global {text} "
+          f"over {report['categories_evaluated']} of {len(report['categories'])} categories")  # fmt: skip
+    for reason in report["reasons"]:
         print(f"  {reason}")
-
-
-_PROG = "python -m benchmarks.fidelity"
-
-
-@dataclass(frozen=True)
-class SplitCommand:
-    """Cut a recording into fit, val and hold by blocks of time.
-
-    Attributes:
-        recording: A bag.
-        out: Folder to write.
-        rule: How it is cut.
-    """
-
-    recording: tyro.conf.Positional[Path]
-    out: Path
-    rule: SplitConfig = field(default_factory=SplitConfig)
+    if (more := report["outside"]) is not None:
+        overall = more["global"]
+        text = "none" if overall is None else f"{overall:.1f} %"
+        print(f"  {more['count']} of {more['count_with_suite']} metrics from outside ({', '.join(more['files'])}): "
+              f"global with them {text}; the verdict is that of the suite alone")  # fmt: skip
 
 
 def main() -> None:
     """Runs one command; a user's mistake is one sentence and status 2."""
     if len(sys.argv) == 1:
         sys.argv.append("run")
-
-    def cut(config: SplitCommand) -> None:
-        """Cut a recording into fit, val and hold by blocks of time.
-
-        Example: python -m benchmarks.fidelity split recording.bag --out build/parts
-        """
-        facts = split_recording(config.recording, config.out, config.rule)
-        print(", ".join(f"{name} {count} messages" for name, count in facts["messages"].items()))
-
     actions: dict[str, Callable[[Any], None]] = {
         "run": run, "controls": run_controls, "sweep": run_sweep,
-        "calibrate": calibrate.run, "split": cut, "report": run_report,
+        "calibrate": calibrate.run, "split": run_split, "report": run_report,
     }  # fmt: skip
-    wrapped = {name: _without_prefix(action) for name, action in actions.items()}
+    commands = {name: _without_prefix(action) for name, action in actions.items()}
 
     def act() -> None:
         parse(
-            lambda words: tyro.extras.subcommand_cli_from_dict(wrapped, args=words, prog=_PROG, description=__doc__)
+            lambda words: tyro.extras.subcommand_cli_from_dict(commands, args=words, prog=_PROG, description=__doc__)
         )()
 
     command(act)
 
 
 def _without_prefix(action: Callable[[Any], None]) -> Callable[[Any], Callable[[], None]]:
-    """An action, still to be run, whose one configuration's fields are flags without a prefix."""
+    """Return an action, still to be run, whose configuration's fields are flags without a prefix."""
     (name,) = [key for key in action.__annotations__ if key != "return"]
 
     @functools.wraps(action)

@@ -46,7 +46,8 @@ class Inputs:
         hold: How much of a recording is scored.
         seed: Of sampling, noise and bootstrap.
         strict: Count metrics without a reference as 0.
-        out: Folder for everything that is written.
+        metrics: Python file with metrics of your own, see docs/guide/extend.md.
+        out: Folder for all results.
     """
 
     scene: Path | None = None
@@ -58,6 +59,7 @@ class Inputs:
     hold: HoldConfig = field(default_factory=HoldConfig)
     seed: int = 0
     strict: bool = False
+    metrics: Path | None = None
     out: Path = Path("out/fidelity")
 
 

@@ -1,18 +1,15 @@
 """The judgement of a case: values of reconstruction, null tubes and truth, the leak detector, and the verdict."""
 
 import json
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity import scoring, table
+from benchmarks.fidelity import outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash, release_memory
 from benchmarks.fidelity.files import write_json
@@ -21,82 +18,87 @@ from benchmarks.fidelity.references import Hold
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
-from scene.cli import Stage, progress_bar
+from scene.cli import progress_bar
 
 VALUES_SCHEMA = "subterra.fidelity-values/1"
 NOISE_BAND = (0.5, 3.0)  # times the sensor's stated sigma
-MEDIAN_FLOOR = 0.5  # of the recording's own noise that the median distance to the mesh must not undercut
+MEDIAN_FLOOR = 0.5  # of the recording's own noise; the median distance to the mesh must not be smaller
 PATCH_NEIGHBOURS = 12
 PATCH_RADIUS = 0.25  # m within which neighbours must lie to make a plane
 PATCH_SAMPLES = 8_000
 
+Values = dict[str, Value]
+
 
 @dataclass(frozen=True)
 class Base:
-    """What controls are compared with.
+    """The judgement that controls are compared with.
 
     Attributes:
-        scored: The reconstruction.
-        null: The null tube.
-        values: Raw, of reconstruction, null tube and ceiling.
-        reasons: Why the reconstruction itself fails, if it does.
+        scored: Scores of the reconstruction.
+        null: Scores of the null tube.
+        values: Raw values of reconstruction, null tube and truth.
+        reasons: Reasons against the reconstruction itself.
     """
 
     scored: Scored
     null: Scored | None
-    values: dict[str, dict[str, Value]]
+    values: dict[str, Values]
     reasons: list[str]
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Everything known after a run.
+    """The result of a run.
 
     Attributes:
         values: Raw values of `base`, `null`, `null_bare`, and `ceiling` where there is a truth.
         scored: Their scores.
         skill: Median skill over the null tube.
-        leaks: What the leak detector said.
-        reasons: Why the verdict is FAIL; empty for PASS.
+        leaks: Findings of the leak detector.
+        reasons: Reasons for FAIL; empty for PASS.
+        outside: Scores of suite and metrics from outside together, by candidate; empty without such metrics. The
+            verdict does not read them.
     """
 
-    values: dict[str, dict[str, Value]]
+    values: dict[str, Values]
     scored: dict[str, Scored]
     skill: float | None
     leaks: list[str]
     reasons: list[str]
+    outside: dict[str, Scored] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:
-        """`PASS` or `FAIL`."""
+        """`PASS` or `FAIL`, by the suite alone."""
         return "FAIL" if self.reasons else "PASS"
 
     @property
     def base(self) -> Base:
-        """For controls."""
+        """The part that controls are compared with."""
         return Base(self.scored["base"], self.scored["null"], self.values, self.reasons)
 
 
 def judge_case(case: Case, folder: Path, strict: bool = False) -> Judgement:
-    """Values, leaks and the verdict without controls."""
+    """Computes values, leaks and the verdict without controls."""
     values = compute_values(case, folder)
     return make_judgement(values, find_leaks(case, values["base"]), None, strict)
 
 
-def compute_values(case: Case, folder: Path) -> dict[str, dict[str, Value]]:
-    """Raw values of the reconstruction, its null tubes and the ceiling.
+def compute_values(case: Case, folder: Path) -> dict[str, Values]:
+    """Return the raw values of the reconstruction, its null tubes and the truth.
 
     Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
     """
     path, key = folder / "values.json", case_hash(case)
     values = _kept_values(path, key)
-    candidates = _candidates(case)
+    candidates = make_candidates(case)
     with progress_bar() as progress:
         for name in [name for name in candidates if name not in values]:
             stage = progress.start(f"metrics of {name}", table.COUNT)
             one = replace(case, candidate=candidates[name](), cache={})
             chosen = None if name == "base" else geometry_categories()
-            values[name] = evaluate(one, chosen, values.get("base"), partial(_advance, stage))
+            values[name] = evaluate(one, chosen, values.get("base"), lambda id, stage=stage: stage.advance())  # type: ignore[misc]
             dumped = {name: dump_values(entry) for name, entry in values.items()}
             write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
             one.cache.clear()
@@ -104,8 +106,8 @@ def compute_values(case: Case, folder: Path) -> dict[str, dict[str, Value]]:
     return values
 
 
-def _candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
-    """What is scored of a case, the reconstruction first."""
+def make_candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
+    """Return the makers of the candidates to score by name, the reconstruction first."""
     made: dict[str, Callable[[], Candidate]] = {
         "base": lambda: case.candidate,
         "null": lambda: null_tube(case.candidate),
@@ -116,39 +118,42 @@ def _candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
     return made
 
 
-def _kept_values(path: Path, key: str) -> dict[str, dict[str, Value]]:
-    """What an earlier run of the same case left; nothing where there is none."""
+def _kept_values(path: Path, key: str) -> dict[str, Values]:
+    """Return the values of an earlier run of the same case; nothing where there was none."""
     content = json.loads(path.read_text()) if path.exists() else {}
     if content.get("schema") != VALUES_SCHEMA or content.get("key") != key:
         return {}
     return {name: load_values(entry) for name, entry in content["values"].items()}
 
 
-def _advance(stage: Stage, id: str) -> None:
-    stage.advance()
-
-
 def geometry_categories() -> tuple[str, ...]:
-    """The categories that do not read the compiled scene."""
+    """Return the categories that do not read the compiled scene."""
     return tuple(name for name in table.categories() if name not in ("SCN", "PAR"))
 
 
 def make_judgement(
-    values: dict[str, dict[str, Value]],
-    found: list[str],
-    controls: list[dict[str, Any]] | None = None,
-    strict: bool = False,
+    values: dict[str, Values], leaks: list[str], controls: list[dict[str, Any]] | None = None, strict: bool = False
 ) -> Judgement:
-    """The verdict over values, leaks and, where they were run, controls."""
+    """Return the verdict over values, leaks and, where they were run, controls."""
     scored = {name: scoring.score_all(entry, strict=strict) for name, entry in values.items()}
     skill = median_skill(values["base"], values)
     rows = controls or []
-    reasons = scoring.reasons_against(scored["base"], scored["null"], skill, undetected(rows), loud(rows), found)
-    return Judgement(values, scored, skill, found, reasons)
+    reasons = scoring.reasons_against(scored["base"], scored["null"], skill, undetected(rows), loud(rows), leaks)
+    return Judgement(values, scored, skill, leaks, reasons)
 
 
-def median_skill(values: dict[str, Value], base: dict[str, dict[str, Value]]) -> float | None:
-    """Median skill over the null tube of the scored metrics with H or T evidence; `None` without a ceiling."""
+def add_outside(judgement: Judgement, case: Case, folder: Path, strict: bool = False) -> Judgement:
+    """Return the judgement with the metrics from outside computed and scored; its verdict stays the suite's."""
+    more = outside.compute_values(case, make_candidates(case), folder)
+    scored = {
+        name: scoring.score_all(judgement.values[name] | values, strict=strict, rows=outside.rows())
+        for name, values in more.items()
+    }
+    return replace(judgement, outside=scored)
+
+
+def median_skill(values: Values, base: dict[str, Values]) -> float | None:
+    """Return the median skill over the null tube of the scored metrics with H or T evidence; `None` without a truth."""
     if "ceiling" not in base or "null" not in base:
         return None
     skills = []
@@ -162,7 +167,7 @@ def median_skill(values: dict[str, Value], base: dict[str, dict[str, Value]]) ->
 
 
 def _signed_error(metric: Metric, value: float | None) -> float | None:
-    """A value as something of which less is better."""
+    """Return a value turned so that less is better."""
     if value is None:
         return None
     if metric.map.kind == "B":
@@ -171,61 +176,64 @@ def _signed_error(metric: Metric, value: float | None) -> float | None:
 
 
 def undetected(rows: list[dict[str, Any]]) -> list[str]:
-    """Ids of negative controls that went unnoticed at a bold dose."""
+    """Return the ids of negative controls that went unnoticed at a bold dose."""
     return sorted({row["id"] for row in rows if row["kind"] == "negative" and row["bold"] and not row["detected"]})
 
 
 def loud(rows: list[dict[str, Any]]) -> list[str]:
-    """Ids of invariance controls that moved the scores."""
+    """Return the ids of invariance controls that moved the scores."""
     return sorted({row["id"] for row in rows if row["kind"] == "invariance" and not row["quiet"]})
 
 
-def find_leaks(case: Case, values: dict[str, Value], recorded: str | None = None) -> list[str]:
-    """What speaks against a clean split, in sentences; empty where nothing does or nothing is held out.
+# The leak detector: a builder must not know the data that it is judged by, and that data must not come from its mesh.
+
+
+def find_leaks(case: Case, values: Values, recorded: str | None = None) -> list[str]:
+    """Return the findings against a clean split, in sentences; empty where there is none or nothing is held out.
 
     Args:
-        case: With the held-out recording.
-        values: Of the case; `c2m_median` is read.
+        case: Case with the held-out recording.
+        values: Its values; `c2m_median` is read.
         recorded: SHA-256 of the file that was held out, to which the scored points must lead back.
     """
     if case.hold is None:
         return []
-    found = [*provenance_leaks(case, recorded), *noise_leaks(case, values)]
+    leaks = [*provenance_leaks(case, recorded), *noise_leaks(case, values)]
     if case.fit is not None:
         share = duplicate_share(case.hold, case.fit)
         if share > 0.0:
-            found.append(f"{share:.2%} of the held-out points are exact duplicates of points that the builder had")
-    return found
+            leaks.append(f"{share:.2%} of the held-out points are exact duplicates of points that the builder had")
+    return leaks
 
 
 def duplicate_share(hold: Hold, fit: Hold) -> float:
-    """Share of held-out points with an exact duplicate among those of the fit."""
+    """Return the share of held-out points with an exact duplicate among those of the fit."""
     known = {row.tobytes() for row in np.round(fit.points, 6) + 0.0}
     rows = np.round(hold.points, 6) + 0.0
     return float(np.mean([row.tobytes() in known for row in rows])) if len(rows) else 0.0
 
 
-def noise_leaks(case: Case, values: dict[str, Value]) -> list[str]:
-    """A recording without noise of its own is no recording."""
+def noise_leaks(case: Case, values: Values) -> list[str]:
+    """Return the findings against a recording without noise of its own."""
     hold = case.hold
     assert hold is not None
     sigma = plane_noise(hold, case.rng("leaks"))
     low, high = (factor * hold.sigma for factor in NOISE_BAND)
-    found = []
+    leaks = []
     if not low <= sigma <= high:
-        found.append(
+        leaks.append(
             f"the held-out points scatter by {sigma * 100:.2f} cm about local planes, "
             f"outside the sensor's {low * 100:.1f} to {high * 100:.1f} cm"
         )
     median = values.get("c2m_median")
     floor = MEDIAN_FLOOR * 0.6745 * sigma
     if median is not None and median.value is not None and median.value < floor:
-        found.append(f"the median distance of {median.value * 100:.2f} cm undercuts half of the recording's own noise")
-    return found
+        leaks.append(f"the median distance of {median.value * 100:.2f} cm undercuts half of the recording's own noise")
+    return leaks
 
 
 def plane_noise(hold: Hold, rng: np.random.Generator) -> float:
-    """Robust scatter of the returns along their beams about planes through their neighbours, m.
+    """Estimates the scatter of the returns along their beams about planes through their neighbours, m.
 
     The median over patches of the residual scatter, with the three degrees of freedom that a plane takes away; patches
     come from scans near in time, since all scans together also hold the errors of poses.
@@ -248,35 +256,17 @@ def plane_noise(hold: Hold, rng: np.random.Generator) -> float:
 
 
 def provenance_leaks(case: Case, recorded: str | None) -> list[str]:
-    """Hashes: the builder's inputs must not hold the scored recording, which must be what was held out."""
+    """Return the findings of the hashes: the builder must not have read the scored recording."""
     hold, manifest = case.hold, case.candidate.manifest
     assert hold is not None
     inputs: list[dict[str, Any]] = manifest.get("inputs", [])
-    found = [
+    leaks = [
         f"the builder read the held-out recording: {entry.get('file')} of the manifest has its hash"
         for entry in inputs
         if entry.get("sha256") == hold.hash
     ]
     if not all("sha256" in entry for entry in inputs) or not hold.hash:
-        found.append("an input of the builder, or the held-out recording, has no hash")
+        leaks.append("an input of the builder, or the held-out recording, has no hash")
     if recorded is not None and recorded != hold.hash:
-        found.append("the scored points do not come from the recording that was held out: its hash is another")
-    return found
-
-
-@contextmanager
-def opened_files() -> Iterator[set[Path]]:
-    """Collects every file that this process opens while the block runs, seen by the interpreter's audit events."""
-    seen: set[Path] = set()
-    active = [True]
-
-    def hook(event: str, arguments: tuple[Any, ...]) -> None:
-        if active[0] and event == "open" and isinstance(arguments[0], str | bytes):
-            name = arguments[0] if isinstance(arguments[0], str) else arguments[0].decode(errors="replace")
-            seen.add(Path(name).absolute())
-
-    sys.addaudithook(hook)  # cannot be taken away again, hence the switch
-    try:
-        yield seen
-    finally:
-        active[0] = False
+        leaks.append("the scored points do not come from the recording that was held out: its hash is another")
+    return leaks

@@ -1,7 +1,9 @@
 """Scores, categories, the global figure and the verdict; and how far they depend on thresholds, tolerances and seed."""
 
+import json
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -11,27 +13,28 @@ from benchmarks.fidelity import table
 from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.table import Map, Metric
 
-GATE_FLOOR = 50.0
-MOST_MISSING = 0.30
+GATE_FLOOR = 50.0  # points; a gate below it caps its category at it
+MOST_MISSING = 0.30  # share of a category's metrics
 PASS_GLOBAL = 90.0
 PASS_CATEGORY = 70.0
 PASS_LEAD = 10.0  # points above the null tube
 PASS_SKILL = 0.3
-FACTORS = (0.9, 1.1)
+FACTORS = (0.9, 1.1)  # of the thresholds in the sweep
 DRAWS = 128
-COMMON_LIMIT = 2.5
+COMMON_LIMIT = 2.5  # points
 COMMON_CATEGORY_LIMIT = 7.0
 INDEPENDENT_LIMIT = 1.0
 SEED_LIMIT = 0.2
 SEED_CATEGORY_LIMIT = 1.0
 TAU_LIMIT = 0.95
+
 Maps = dict[str, Map]
 Values = dict[str, Value]
 
 
 @dataclass(frozen=True)
 class Score:
-    """One metric, scored.
+    """The score of one metric.
 
     Attributes:
         metric: Its row.
@@ -46,10 +49,10 @@ class Score:
 
 @dataclass(frozen=True)
 class Scored:
-    """All metrics of one candidate.
+    """The scores of one candidate.
 
     Attributes:
-        scores: By id, in the order of the table.
+        scores: Scores by id, in the order of the table.
         categories: Score by category; `None` where too much of it is missing.
         failed_gates: Ids of gates below 50.
         overall: Mean of the categories that have a score; `None` where none has.
@@ -64,23 +67,20 @@ class Scored:
 
     @property
     def evaluated(self) -> int:
-        """Categories with a score."""
+        """Number of categories with a score."""
         return sum(score is not None for score in self.categories.values())
 
     @property
     def evidence(self) -> float | None:
-        """Mean of the categories in which a held-out recording or a truth has a say."""
-        heard = [
-            s.metric.category
-            for s in self.scores.values()
-            if set(s.metric.evidence) & set("HT") and s.score is not None
-        ]
-        values = [self.categories[c] for c in dict.fromkeys(heard) if self.categories[c] is not None]
-        return float(np.mean([v for v in values if v is not None])) if values else None
+        """Mean of the categories with a metric that reads a held-out recording or a truth."""
+        scores = [s for s in self.scores.values() if set(s.metric.evidence) & set("HT") and s.score is not None]
+        values = [self.categories[name] for name in dict.fromkeys(s.metric.category for s in scores)]
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if known else None
 
 
 def score_one(metric: Metric, value: Value, map: Map | None = None) -> Score:
-    """A value through its map; a failed computation scores 0, a missing one nothing."""
+    """Scores a value through its map; a failed computation scores 0, a missing value has no score."""
     if not metric.scored:
         return Score(metric, value, None)
     if value.value is None:
@@ -89,18 +89,15 @@ def score_one(metric: Metric, value: Value, map: Map | None = None) -> Score:
 
 
 def score_all(
-    values: dict[str, Value],
-    maps: dict[str, Map] | None = None,
-    strict: bool = False,
-    rows: dict[str, Metric] | None = None,
+    values: Values, maps: Maps | None = None, strict: bool = False, rows: dict[str, Metric] | None = None
 ) -> Scored:
     """Scores every metric and every category.
 
     Args:
-        values: By id; all 199.
-        maps: In place of the table's, for the sweep.
-        strict: Count what is missing as 0.
-        rows: In place of the table, for calibration.
+        values: Raw values of all rows by id.
+        maps: Maps in place of the table's, for the sweep.
+        strict: Count missing values as 0.
+        rows: Rows in place of the table: of a calibration, or with metrics from outside.
     """
     rows = rows or table.load()
     scores = {id: score_one(rows[id], values[id], (maps or {}).get(id)) for id in rows}
@@ -113,34 +110,24 @@ def score_all(
     )
     known = [value for value in categories.values() if value is not None]
     counted = [s.score for s in scores.values() if s.score is not None]
-    return Scored(
-        scores,
-        categories,
-        gates,
-        float(np.mean(known)) if known else None,
-        float(np.mean([score == 100.0 for score in counted])) if counted else 0.0,
-    )
+    overall = float(np.mean(known)) if known else None
+    saturated = float(np.mean([score == 100.0 for score in counted])) if counted else 0.0
+    return Scored(scores, categories, gates, overall, saturated)
 
 
 def _category_score(scores: list[Score], strict: bool) -> float | None:
-    """Mean of the scored metrics, capped where a gate fails; `None` where over 30 % of them are missing."""
+    """Return the mean of the scored metrics, capped where a gate fails; `None` where over 30 % of them are missing."""
     scored = [s for s in scores if s.metric.scored]
-    known = [s for s in scored if s.score is not None]
-    if strict:
-        return _cap_by_gates(scored)
+    known = scored if strict else [s for s in scored if s.score is not None]
     if len(known) < len(scored) * (1.0 - MOST_MISSING):
         return None
-    return _cap_by_gates(known)
-
-
-def _cap_by_gates(scores: list[Score]) -> float:
-    mean = float(np.mean([s.score or 0.0 for s in scores]))
-    gates = [s.score or 0.0 for s in scores if s.metric.role == "G"]
+    mean = float(np.mean([s.score or 0.0 for s in known]))
+    gates = [s.score or 0.0 for s in known if s.metric.role == "G"]
     return min(mean, GATE_FLOOR) if gates and min(gates) < GATE_FLOOR else mean
 
 
 def skill(value: float | None, null: float | None, ceiling: float | None) -> float | None:
-    """How far from the null tube towards the ceiling: 0 at the one, 1 at the other; `None` where they do not differ."""
+    """Return the way from the null tube (0) towards the truth (1); `None` where the two do not differ."""
     if value is None or null is None or ceiling is None or abs(null - ceiling) < 1e-12:
         return None
     return (value - null) / (ceiling - null)
@@ -154,40 +141,66 @@ def reasons_against(
     loud: list[str],
     leaks: list[str],
 ) -> list[str]:
-    """Why the verdict is FAIL, in sentences; empty for PASS.
+    """Return the reasons for FAIL, in sentences; empty for PASS.
 
     Args:
-        scored: The candidate.
-        null: The null tube on the same references; without any there is nothing that it could be told apart by.
-        median_skill: Over the metrics with H or T evidence.
+        scored: Scores of the candidate.
+        null: Scores of the null tube on the same references; it is not read where there are none.
+        median_skill: Median skill over the metrics with H or T evidence.
         undetected: Negative controls that were not detected; empty also where controls were not run.
         loud: Invariance controls that moved.
-        leaks: What the leak detector found.
+        leaks: Findings of the leak detector.
     """
-    found = []
+    reasons = []
     if scored.overall is None or scored.overall < PASS_GLOBAL:
-        found.append(
-            f"global {scored.overall if scored.overall is None else round(scored.overall, 1)} is below {PASS_GLOBAL:g}"
-        )
-    found += [
+        overall = scored.overall if scored.overall is None else round(scored.overall, 1)
+        reasons.append(f"global {overall} is below {PASS_GLOBAL:g}")
+    reasons += [
         f"category {name} is {value:.1f}, below {PASS_CATEGORY:g}"
         for name, value in scored.categories.items()
         if value is not None and value < PASS_CATEGORY
     ]
-    found += [f"gate {id} failed with {scored.scores[id].value.value}" for id in scored.failed_gates]
+    reasons += [f"gate {id} failed with {scored.scores[id].value.value}" for id in scored.failed_gates]
     if null is not None and scored.overall is not None and null.overall is not None and scored.evidence is not None:
         lead = scored.overall - null.overall
         if lead < PASS_LEAD:
-            found.append(f"only {lead:.1f} points above the null tube; {PASS_LEAD:g} are asked")
+            reasons.append(f"only {lead:.1f} points above the null tube; {PASS_LEAD:g} are asked")
     if median_skill is not None and median_skill < PASS_SKILL:
-        found.append(f"median skill over the null tube is {median_skill:.2f}, below {PASS_SKILL:g}")
-    found += [f"negative control {id} was not detected" for id in undetected]
-    found += [f"invariance control {id} moved the scores" for id in loud]
-    return found + [f"leak: {leak}" for leak in leaks]
+        reasons.append(f"median skill over the null tube is {median_skill:.2f}, below {PASS_SKILL:g}")
+    reasons += [f"negative control {id} was not detected" for id in undetected]
+    reasons += [f"invariance control {id} moved the scores" for id in loud]
+    return reasons + [f"leak: {leak}" for leak in leaks]
+
+
+def constants() -> dict[str, Any]:
+    """Return everything frozen that a verdict depends on: metric table, gates, limits, controls, leak detector."""
+    from benchmarks.fidelity import judge
+    from benchmarks.fidelity.controls import catalogue, runner
+
+    limits = {name: value for name, value in globals().items() if name.isupper()}
+    return {
+        "metrics": [asdict(row) for row in table.load().values()],
+        "scoring": limits,
+        "controls": [asdict(control) for control in catalogue.load_controls().values()],
+        "invariances": {
+            id: [one.category_limit, list(one.exempt)] for id, one in catalogue.INVARIANCES.items()
+        } | {"global": [catalogue.GLOBAL_LIMIT, catalogue.THINNED_LIMIT]},
+        "quiet": [runner.QUIET, runner.MONOTONE, list(runner.KINDS)],
+        "leaks": [list(judge.NOISE_BAND), judge.MEDIAN_FLOOR],
+    }  # fmt: skip
+
+
+def constants_digest() -> str:
+    """Return the SHA-256 of `constants` as canonical JSON; a report with another digest was judged by other rules."""
+    text = json.dumps(constants(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return sha256(text.encode()).hexdigest()
+
+
+# The sweep: other thresholds, tolerances and seeds.
 
 
 def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
-    """Every run of the sweep: kind, name, maps. Common mode, one category at a time, then independent draws."""
+    """Yields kind, name and maps of every run: common mode, one category at a time, then independent draws."""
     rows = table.load()
     for factor in FACTORS:
         yield "common", f"x{factor}", {id: row.map.scaled(factor) for id, row in rows.items()}
@@ -202,7 +215,7 @@ def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
 
 
 def sweepable_share() -> float:
-    """Share of the scored metrics whose map a factor moves at all."""
+    """Return the share of the scored metrics whose map a factor moves at all."""
     rows = [row for row in table.load().values() if row.scored]
     return float(np.mean([row.map.scaled(1.1) != row.map for row in rows]))
 
@@ -222,26 +235,26 @@ def sweep_thresholds(candidates: dict[str, Values]) -> list[dict[str, Any]]:
 
 
 def compare_runs(kind: str, runs: dict[str, Values], base: Values) -> list[dict[str, Any]]:
-    """Rows of runs that computed the reconstruction anew: other tolerances or seeds."""
+    """Return the rows of runs that computed the reconstruction anew, with other tolerances or seeds."""
     before = {"base": score_all(base)}
     return [_sweep_row(kind, name, before, {"base": score_all(values)}) for name, values in runs.items()]
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Largest moves by kind, and whether each keeps its limit."""
-    found: dict[str, Any] = {"sweepable": sweepable_share()}
+    """Return the largest moves by kind, and whether each kind keeps its limit."""
+    kinds: dict[str, Any] = {"sweepable": sweepable_share()}
     for kind in ("common", "category", "independent", "tolerance", "seed"):
         own = [row for row in rows if row["kind"] == kind]
         if not own:
             continue
         moves, worst = [row["delta"] for row in own], max(row["category_delta"] for row in own)
-        found[kind] = {
+        kinds[kind] = {
             "runs": len(own), "least": min(moves), "most": max(moves), "sd": float(np.std(moves)),
             "category": worst, "lower": own[0]["lower"], "order_kept": all(row["order_kept"] for row in own),
             "verdicts": sorted({row["meets"] for row in own}), "least_tau": min(row["tau"] for row in own),
+            "within": _within_limits(kind, own, moves, worst),
         }  # fmt: skip
-        found[kind]["within"] = _within_limits(kind, own, moves, worst)
-    return found
+    return kinds
 
 
 def _within_limits(kind: str, own: list[dict[str, Any]], moves: list[float], worst: float) -> bool:

@@ -70,14 +70,13 @@ class Metric:
         category_name: Name in words.
         id: Unique name.
         definition: Definition in a sentence.
-        unit: Unit of value and thresholds, as the row says: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation),
-            `bool`, `count`; and where practice has its own: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`,
-            `log10`.
+        unit: Unit of value and thresholds. SI: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation), `bool`, `count`.
+            Not SI, as surveyors write them: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`.
         direction: `down`, `up`, `band` or `info`.
         role: `S` scored, `G` scored and a gate, `L` logged.
         map: Map to a score.
         evidence: Letters of H held-out, T truth, K standard, S self-consistency, C true by construction.
-        library: Libraries beside NumPy that its code calls on the way to the value.
+        library: Libraries that its code calls on the way to the value; `numpy` only where there is no other.
     """
 
     number: int

@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks.fidelity import judge, scoring, table
+from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.case import Case, code_hash
 from benchmarks.fidelity.controls.runner import is_bold, list_jobs
 from benchmarks.fidelity.figures import draw_all
@@ -17,14 +17,14 @@ from benchmarks.fidelity.impostors import null_tube
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.report import forms
-from benchmarks.fidelity.scoring import Score
+from benchmarks.fidelity.scoring import Score, Scored
 from benchmarks.fidelity.table import Metric
 
 SOURCE = "Subterra: An Open-Source Validated Benchmark for GNSS-Denied Tunnel Navigation"
 
 
 def paper_rows(judgement: Judgement, controls: list[dict[str, Any]] | None = None) -> list[dict[str, Any]]:
-    """One row a number: what it is, the paper's, ours, unit, evidence class and what it says."""
+    """Return a row per number of the paper: its name, the paper's figure, ours, unit, evidence class and a note."""
     base = judgement.values["base"]
     scored = judgement.scored["base"]
 
@@ -64,6 +64,7 @@ def _score_text(value: float | None) -> str:
 
 
 SCHEMA = "subterra.fidelity/1"
+_CANDIDATES = {"score": "base", "null": "null", "ceiling": "ceiling"}  # columns of a report
 VERSIONS = ("mujoco", "mujoco-mjx", "jax", "numpy", "scipy", "trimesh", "embreex", "shapely", "scikit-image",
             "scikit-learn", "manifold3d", "gudhi", "small-gicp",
             "pymeshlab", "py4dgeo", "connected-components-3d")  # fmt: skip
@@ -76,13 +77,13 @@ def report_content(
     controls: list[dict[str, Any]] | None = None,
     sweep: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Everything that `report.json` holds.
+    """Return the content of `report.json`.
 
     Args:
-        case: What was judged and against what.
-        inputs: As the command resolved them.
-        judgement: Of the case.
-        controls: Rows of `verdicts.rows` where controls were run.
+        case: Candidate and references.
+        inputs: Inputs as the command resolved them.
+        judgement: Judgement of the case.
+        controls: Rows of `judge_outcomes` where controls were run.
         sweep: Summary of the sweep where it was run.
     """
     scored, null = judgement.scored["base"], judgement.scored["null"]
@@ -107,18 +108,16 @@ def report_content(
         "leaks": judgement.leaks,
         "split": _split_entry(case, inputs),
         "seed": inputs.seed,
+        "constants": scoring.constants_digest(),
         "thresholds_hash": table.thresholds_hash(),
         "code_hash": code_hash(),
         "commit": _commit(),
         "versions": _versions(),
         "config": asdict(inputs.hold),
         "paper": paper_rows(judgement),
-        "categories": {
-            name: {"name": words, "score": scored.categories[name], "null": null.categories[name],
-                   "ceiling": _ceiling_score(judgement, name)}
-            for name, words in table.categories().items()
-        },
-        "metrics": [_metric_entry(row, judgement) for row in table.load().values()],
+        "categories": _category_entries(judgement.scored),
+        "metrics": [_metric_entry(row, judgement.scored) for row in table.load().values()],
+        "outside": _outside_entry(judgement),
         "controls": {
             "run": len(rows),
             "complete": _all_bold(rows),
@@ -129,22 +128,21 @@ def report_content(
     }  # fmt: skip
 
 
-def report_title(case: Case) -> str:
-    """`Fidelity` where something was held out or is known, else what it is."""
-    return "Fidelity" if case.hold is not None or case.truth is not None else "Self-consistency"
+def _category_entries(scored: dict[str, Scored]) -> dict[str, dict[str, Any]]:
+    """Return name, score and the scores of null tube and truth of every category."""
+    by = {key: scored[name].categories if name in scored else {} for key, name in _CANDIDATES.items()}
+    return {
+        name: {"name": words} | {key: scores.get(name) for key, scores in by.items()}
+        for name, words in table.categories().items()
+    }
 
 
-def _all_bold(rows: list[dict[str, Any]]) -> bool:
-    """Whether every control was run at every dose that must fail."""
-    asked = {(job.control, job.dose) for job in list_jobs() if is_bold(job)}
-    return asked <= {(row["id"], row["dose"]) for row in rows}
-
-
-def _metric_entry(row: Metric, judgement: Judgement) -> dict[str, Any]:
-    score = judgement.scored["base"].scores[row.id]
+def _metric_entry(row: Metric, scored: dict[str, Scored]) -> dict[str, Any]:
+    """Return value, score, status and the values of null tube and truth of a metric."""
+    score = scored["base"].scores[row.id]
     value = score.value
     null, ceiling = (
-        judgement.values[name][row.id].value if name in judgement.values else None for name in ("null", "ceiling")
+        scored[name].scores[row.id].value.value if name in scored else None for name in ("null", "ceiling")
     )
     return {
         "id": row.id, "category": row.category, "definition": row.definition, "value": value.value, "unit": row.unit,
@@ -152,6 +150,38 @@ def _metric_entry(row: Metric, judgement: Judgement) -> dict[str, Any]:
         "map": table.map_text(row.map), "null_value": null, "ceiling_value": ceiling,
         "skill": scoring.skill(value.value, null, ceiling), "status": _status(row, score), "reason": value.reason,
     }  # fmt: skip
+
+
+def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
+    """Return the metrics from outside, and categories and global figure with them; `None` without such metrics."""
+    if not judgement.outside:
+        return None
+    metrics = outside.metrics()
+    entries = [_metric_entry(one.row, judgement.outside) | {"source": one.source} for one in metrics.values()]
+    return {
+        "files": outside.files(),
+        "count": len(metrics),
+        "count_with_suite": table.COUNT + len(metrics),
+        "metrics": entries,
+        "categories": {
+            name: entry
+            for name, entry in _category_entries(judgement.outside).items()
+            if name in {one.row.category for one in metrics.values()}
+        },
+        "global": judgement.outside["base"].overall,
+        "note": "The verdict and all other figures are those of the suite's 199 metrics alone.",
+    }
+
+
+def report_title(case: Case) -> str:
+    """Return `Fidelity` where there is a held-out recording or a truth, else `Self-consistency`."""
+    return "Fidelity" if case.hold is not None or case.truth is not None else "Self-consistency"
+
+
+def _all_bold(rows: list[dict[str, Any]]) -> bool:
+    """Return True where every control was run at every dose that must fail."""
+    asked = {(job.control, job.dose) for job in list_jobs() if is_bold(job)}
+    return asked <= {(row["id"], row["dose"]) for row in rows}
 
 
 def _status(row: Metric, score: Score) -> str:
@@ -164,10 +194,6 @@ def _status(row: Metric, score: Score) -> str:
     if row.role == "G" and (score.score or 0.0) < scoring.GATE_FLOOR:
         return "gate failed"
     return "scored" if row.scored else "logged"
-
-
-def _ceiling_score(judgement: Judgement, name: str) -> float | None:
-    return judgement.scored["ceiling"].categories[name] if "ceiling" in judgement.scored else None
 
 
 def _split_entry(case: Case, inputs: Inputs) -> dict[str, Any]:
@@ -211,12 +237,12 @@ def write_report(
     """Writes every form of the report and returns its content.
 
     Args:
-        folder: To write to.
-        case: What was judged.
-        inputs: As resolved.
-        judgement: Of the case.
+        folder: Folder to write to.
+        case: Candidate and references.
+        inputs: Inputs as the command resolved them.
+        judgement: Judgement of the case.
         controls: Rows of controls where they were run.
-        swept: What `sweep.json` holds where the sweep was run.
+        swept: Content of `sweep.json` where the sweep was run.
     """
     made = report_content(case, inputs, judgement, controls, swept["summary"] if swept else None)
     rows = controls or []

@@ -9,31 +9,41 @@ from xml.etree import ElementTree
 
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
-from benchmarks.fidelity import table
+from benchmarks.fidelity import scoring, table
 from benchmarks.fidelity.files import write_text
 
+HERE = Path(__file__).parent
 METRIC_COLUMNS = ("id", "category", "value", "unit", "score", "role", "evidence", "status", "ci_low", "ci_high", "n",
                   "null_value", "ceiling_value", "skill", "map", "reason")  # fmt: skip
 
 
 def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
-    """`metrics.csv`: a row a metric, always 199."""
+    """Writes `metrics.csv`: a row per metric of the suite.
+
+    Metrics from outside follow; the column `source`, which is there only then, names the suite or the file.
+    """
+    more = [] if report["outside"] is None else report["outside"]["metrics"]
     rows = []
-    for entry in report["metrics"]:
+    for entry in report["metrics"] + more:
         low, high = entry["ci95"] or (None, None)
-        rows.append({**entry, "ci_low": low, "ci_high": high})
-    assert len(rows) == table.COUNT
-    return write_csv(folder / "metrics.csv", METRIC_COLUMNS, rows)
+        rows.append({"source": "suite", **entry, "ci_low": low, "ci_high": high})
+    columns = METRIC_COLUMNS + (("source",) if more else ())
+    return write_csv(folder / "metrics.csv", columns, rows)
 
 
 def write_categories(folder: Path, report: dict[str, Any]) -> Path:
-    """`categories.csv`: a row a category."""
+    """Writes `categories.csv`: a row per category, with a column for the score with metrics from outside, if any."""
+    columns: tuple[str, ...] = ("category", "name", "score", "null", "ceiling")
     rows = [{"category": id, **entry} for id, entry in report["categories"].items()]
-    return write_csv(folder / "categories.csv", ("category", "name", "score", "null", "ceiling"), rows)
+    if report["outside"] is not None:
+        columns += ("score_with_outside",)
+        for row in rows:
+            row["score_with_outside"] = report["outside"]["categories"].get(row["category"], row)["score"]
+    return write_csv(folder / "categories.csv", columns, rows)
 
 
 def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
-    """`controls.csv`: a row a control and dose."""
+    """Writes `controls.csv`: a row per control and dose."""
     flat = [
         {
             **row,
@@ -52,58 +62,20 @@ def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
 
 
 def write_sweep(folder: Path, rows: list[dict[str, Any]]) -> Path:
-    """`sweep.csv`: a row a run."""
-    columns = (
-        "kind",
-        "run",
-        "global",
-        "delta",
-        "category",
-        "category_delta",
-        "meets",
-        "order_kept",
-        "tau",
-        "saturated",
-    )
+    """Writes `sweep.csv`: a row per run."""
+    columns = ("kind", "run", "global", "delta", "category", "category_delta", "meets", "order_kept", "tau",
+               "saturated")  # fmt: skip
     return write_csv(folder / "sweep.csv", columns, rows)
 
 
 def write_csv(path: Path, columns: tuple[str, ...], rows: list[dict[str, Any]]) -> Path:
-    """A CSV file; numbers with 6 significant digits, nothing for what is missing."""
+    """Writes a CSV file; numbers with 6 significant digits, missing ones empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in rows:
         writer.writerow({column: _csv_cell(row.get(column)) for column in columns})
     return write_text(path, text.getvalue())
-
-
-def write_junit(folder: Path, report: dict[str, Any]) -> Path:
-    """`junit.xml`: a test a gate and one a category, so that a CI shows which failed."""
-    suite = ElementTree.Element("testsuite", name="fidelity")
-    failures = 0
-    cases = [
-        (f"gate.{e['id']}", e["status"] in ("gate failed", "failed"), e["status"] == "missing", e)
-        for e in report["metrics"]
-        if e["role"] == "G"
-    ]
-    cases += [
-        (f"category.{c}", e["score"] is not None and e["score"] < 70.0, e["score"] is None, e)
-        for c, e in report["categories"].items()
-    ]
-    cases.append(("verdict", report["verdict"] != "PASS", False, {"value": "; ".join(report["reasons"])}))
-    for name, failed, skipped, entry in cases:
-        case = ElementTree.SubElement(suite, "testcase", classname="fidelity", name=name)
-        text = str(entry.get("value", entry.get("score")))
-        if failed:
-            failures += 1
-            ElementTree.SubElement(case, "failure", message=text)
-        elif skipped:
-            ElementTree.SubElement(case, "skipped", message=str(entry.get("reason", "no reference")))
-    suite.set("tests", str(len(cases)))
-    suite.set("failures", str(failures))
-    ElementTree.indent(suite)
-    return write_text(folder / "junit.xml", ElementTree.tostring(suite, encoding="unicode") + "\n")
 
 
 def _csv_cell(value: Any) -> Any:
@@ -116,17 +88,50 @@ def _join_pairs(entries: dict[str, str]) -> str:
     return "; ".join(f"{name} {text}" for name, text in entries.items())
 
 
-HERE = Path(__file__).parent
+def write_junit(folder: Path, report: dict[str, Any]) -> Path:
+    """Writes `junit.xml`: a test per gate and category and one for the verdict, so that a CI shows the failed ones.
+
+    Scored metrics from outside are tests of the class `fidelity.outside`; below half marks they fail.
+    """
+    suite = ElementTree.Element("testsuite", name="fidelity")
+    cases = [
+        ("fidelity", f"gate.{e['id']}", e["status"] in ("gate failed", "failed"), e["status"] == "missing", e)
+        for e in report["metrics"]
+        if e["role"] == "G"
+    ]
+    cases += [
+        ("fidelity", f"category.{c}", e["score"] is not None and e["score"] < scoring.PASS_CATEGORY,
+         e["score"] is None, e)
+        for c, e in report["categories"].items()
+    ]  # fmt: skip
+    verdict = {"value": "; ".join(report["reasons"])}
+    cases.append(("fidelity", "verdict", report["verdict"] != "PASS", False, verdict))
+    cases += [
+        ("fidelity.outside", f"metric.{e['id']}", e["score"] is not None and e["score"] < scoring.GATE_FLOOR,
+         e["status"] == "missing", e)
+        for e in (report["outside"] or {"metrics": []})["metrics"]
+        if e["role"] != "L"
+    ]  # fmt: skip
+    for name, test, failed, skipped, entry in cases:
+        case = ElementTree.SubElement(suite, "testcase", classname=name, name=test)
+        if failed:
+            ElementTree.SubElement(case, "failure", message=str(entry.get("value", entry.get("score"))))
+        elif skipped:
+            ElementTree.SubElement(case, "skipped", message=str(entry.get("reason", "no reference")))
+    suite.set("tests", str(len(cases)))
+    suite.set("failures", str(sum(failed for _, _, failed, _, _ in cases)))
+    ElementTree.indent(suite)
+    return write_text(folder / "junit.xml", ElementTree.tostring(suite, encoding="unicode") + "\n")
 
 
 def write_html(
     folder: Path, report: dict[str, Any], figures: dict[str, tuple[Path, str]], controls: list[dict[str, Any]]
 ) -> Path:
-    """One file with everything in it.
+    """Writes `report.html`, one file with everything in it.
 
     Args:
-        folder: To write to.
-        report: See `content.content`.
+        folder: Folder to write to.
+        report: Content of the report.
         figures: PNG file and caption by name, in order.
         controls: Rows of controls; may be empty.
     """
@@ -134,11 +139,12 @@ def write_html(
         {"name": name, "caption": caption, "data": base64.b64encode(path.read_bytes()).decode()}
         for name, (path, caption) in figures.items()
     ]
-    return write_text(folder / "report.html", _render("report.html.j2", report, figures=pictures, controls=controls))
+    text = _render("report.html.j2", report, figures=pictures, controls=controls)
+    return write_text(folder / "report.html", text)
 
 
 def write_markdown(folder: Path, report: dict[str, Any]) -> Path:
-    """The short form, for logs."""
+    """Writes `report.md`, the short form for logs."""
     return write_text(folder / "report.md", _render("report.md.j2", report, figures=[], controls=[]))
 
 
@@ -154,7 +160,7 @@ def _render(template: str, report: dict[str, Any], **more: Any) -> str:
 
 
 def number_text(value: Any, digits: int = 4) -> str:
-    """A value for people; a dash for what is missing."""
+    """Return a value for people; a dash for a missing one."""
     if value is None:
         return "\N{EN DASH}"
     if isinstance(value, float):

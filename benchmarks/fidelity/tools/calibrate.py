@@ -120,14 +120,9 @@ HALF = 0.5  # of the null tube's error
 STEEPEST = 3.0  # times the good end that a bad end is never nearer than
 STILL = 5.0  # times what an invariance control moves a metric: it then costs a tenth of the marks at most
 RESOLVED = {
-    "m": 0.01,
-    "%": 0.3,
-    "1": 0.01,
-    "deg": 0.1,
-    "mm": 0.5,
-    "nat": 0.1,
-    "count": 0.5,
-}  # a third of a LiDAR's range noise
+    "m": 0.01, "m/100 m": 0.01, "%": 0.3, "1": 0.01, "deg": 0.1, "mm": 0.5, "nat": 0.1, "count": 0.5,
+    "1/100 scans": 0.5,
+}  # fmt: skip  # by unit: a third of a LiDAR's range noise
 
 
 def null_rule(row: Metric, surveys: list[Survey]) -> tuple[float, float, str] | None:
