@@ -1,8 +1,7 @@
 """Brax: a `brax.envs.base.Env`, and a wrapper that begins each episode with a fresh draw.
 
-Brax's own `AutoResetWrapper` keeps the first state and puts it back at every reset: whatever is drawn once for an
-episode (the start pose, the odometer's bias, the goal) would be drawn once for ever. Use `wrap` from here instead of
-`brax.envs.training.wrap`; both run.
+Brax's own `AutoResetWrapper` restores the first state at every reset. The draws of an episode (the start pose, the
+odometer's bias, the goal) would then never change. Use `wrap` from here instead of `brax.envs.training.wrap`; both run.
 """
 
 import contextlib
@@ -19,7 +18,7 @@ from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make
 
 try:
-    # Importing Brax loads MuJoCo, which may print what it did not find; stdout belongs to the caller.
+    # Importing Brax loads MuJoCo, which may print to stdout, which belongs to the caller.
     with contextlib.redirect_stdout(io.StringIO()):
         from brax.envs.base import Env, State, Wrapper
         from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
@@ -30,13 +29,13 @@ except ImportError as missing:
 class SubterraBraxEnv(Env):
     """One environment for Brax's trainers and wrappers.
 
-    Observations are flat vectors. `done` is an ending; the horizon is Brax's `episode_length`, which its
-    `EpisodeWrapper` counts, so that `info["truncation"]` is right. Everything of the environment's own info is in
-    `metrics`, as float32. Brax passes no key to a step: each environment's stream of keys is in `info["rng"]`.
+    Observations are flat vectors. `done` marks an end before the horizon; the horizon is Brax's `episode_length`, which
+    its `EpisodeWrapper` counts, so that `info["truncation"]` is right. The environment's own info is in `metrics`, as
+    float32. Brax passes no key to a step: each environment's stream of keys is in `info["rng"]`.
 
     Args:
         task: Id of the task.
-        params: Params to use in place of those that `options` would make.
+        params: Params to use in place of those made from `options`.
         **options: As for `subterra_jax.make`.
     """
 
@@ -51,30 +50,30 @@ class SubterraBraxEnv(Env):
 
     @property
     def action_size(self) -> int:
-        """Numbers in one action; each has its own bounds, see `action_bounds`."""
+        """Numbers in one action; `action_bounds` has their bounds."""
         return self.env.action_size
 
     @property
     def action_bounds(self) -> tuple[jax.Array, jax.Array]:
-        """Least and largest action; `RescaleAction` maps [-1, 1] to them."""
+        """Least and largest action; `RescaleAction` maps [-1, 1] to this range."""
         space = self.env.action_space(self.params)
         return jnp.asarray(space.low), jnp.asarray(space.high)
 
     @property
     def episode_length(self) -> int:
-        """The task's horizon, steps."""
+        """Horizon of the task, steps."""
         return int(self.params.horizon)
 
     @property
     def backend(self) -> str:
-        """No physics engine of Brax's."""
+        """Name of the simulator, which is none of Brax's."""
         return "subterra"
 
     def reset(self, rng: jax.Array) -> State:
         """Begin an episode; `rng` may be a key of either kind."""
         key, stream = take_key(jax.random.bits(rng, (2,)))
         obs, state = self.env.reset(key, self.params)
-        # The metrics of a state that no step led to are 0; their names must be those of every step.
+        # Brax wants the metrics of every step at a reset too: they are 0.
         action = jnp.zeros(self.action_size)
         _, _, _, _, _, info = jax.eval_shape(self.env.step, key, state, action, self.params)
         metrics = {name: jnp.zeros(leaf.shape) for name, leaf in info.items()}
@@ -97,54 +96,54 @@ class SubterraBraxEnv(Env):
 
 
 class RescaleAction(Wrapper):
-    """Actions in [-1, 1], as Brax's policies give them, mapped to the bounds of the task."""
+    """Maps actions in [-1, 1], as of Brax's policies, to the bounds of the task."""
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take one step; beyond [-1, 1] the environment clips."""
+        """Take one step; the environment clips actions beyond [-1, 1]."""
         low, high = self.unwrapped.action_bounds
         return self.env.step(state, low + 0.5 * (action + 1.0) * (high - low))
 
 
 class FreshResetWrapper(Wrapper):
-    """Begins a finished episode anew with a fresh draw, in the place of Brax's `AutoResetWrapper`.
+    """Resets finished episodes with a fresh draw, in place of Brax's `AutoResetWrapper`.
 
-    `info["final_observation"]` is what the episode's own last state looked like.
+    `info["final_observation"]` is the observation of the episode's own last state.
     """
 
     def reset(self, rng: jax.Array) -> State:
         """Begin an episode in each environment, each with its own key of either kind."""
-        # Brax takes the shape of a batch from that of its keys, less one axis, and so knows raw keys alone.
+        # Brax takes the shape of a batch from its keys less one axis, so it accepts raw keys only.
         state = self.env.reset(jax.random.key_data(rng) if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else rng)
         state.info["final_observation"] = state.obs
         return state
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take one step, and begin anew where it was the last; reward, done and metrics are those of the step."""
+        """Take one step and reset finished episodes; reward, done and metrics are those of the step."""
         if "steps" in state.info:
             state.info.update(steps=jnp.where(state.done, jnp.zeros_like(state.info["steps"]), state.info["steps"]))
         stepped = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
 
-        def begin_some() -> Any:
+        def reset_finished() -> Any:
             fresh = self.env.reset(stepped.info["rng"])
             pick = _where(stepped.done)
             now = stepped.pipeline_state, stepped.obs, stepped.info["rng"]
             return jax.tree.map(pick, (fresh.pipeline_state, fresh.obs, fresh.info["rng"]), now)
 
-        def go_on() -> Any:
+        def keep_all() -> Any:
             return stepped.pipeline_state, stepped.obs, stepped.info["rng"]
 
-        # A reset costs a scan of every environment; in most steps nobody needs one.
-        pipeline_state, obs, rng = jax.lax.cond(jnp.any(stepped.done > 0.0), begin_some, go_on)
+        # A reset costs a scan of every environment; most steps need none.
+        pipeline_state, obs, rng = jax.lax.cond(jnp.any(stepped.done > 0.0), reset_finished, keep_all)
         info = {**stepped.info, "rng": rng, "final_observation": stepped.obs}
         return stepped.replace(pipeline_state=pipeline_state, obs=obs, info=info)
 
 
 def wrap(env: SubterraBraxEnv, episode_length: int | None = None, action_repeat: int = 1) -> Wrapper:
-    """What `brax.envs.training.wrap` does, with a fresh draw at each reset.
+    """Wrap an environment as `brax.envs.training.wrap` does, with a fresh draw at each reset.
 
     Args:
         env: One environment, or a wrapper around one.
-        episode_length: Steps after which an episode is truncated; None is the task's horizon.
+        episode_length: Steps after which an episode is truncated; `None` is the task's horizon.
         action_repeat: Steps for which each action is held.
     """
     length = env.unwrapped.episode_length if episode_length is None else episode_length
@@ -152,5 +151,5 @@ def wrap(env: SubterraBraxEnv, episode_length: int | None = None, action_repeat:
 
 
 def _where(done: jax.Array) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """The first where an environment is done, else the second, whatever the rank of either."""
+    """Return a choice of the first argument where an environment is done, else the second, for any rank."""
     return lambda new, old: jnp.where(done.reshape(done.shape + (1,) * (old.ndim - done.ndim)) > 0.0, new, old)

@@ -1,6 +1,6 @@
-"""Gymnax 1.0's interface: `reset(key, params)` and `step(key, state, action, params)` that begins anew by itself.
+"""Gymnax 1.0's interface: `reset(key, params)` and `step(key, state, action, params)`, which resets by itself.
 
-It needs no Gymnax to be installed; Gymnax's wrappers run on it where there is one.
+Gymnax need not be installed; its wrappers run on this environment.
 """
 
 from functools import partial
@@ -16,7 +16,7 @@ from subterra_jax.tasks import make
 
 
 class BoxSpace:
-    """A box with Gymnax's methods, jittable.
+    """A box with Gymnax's methods, which may be jitted.
 
     Args:
         box: The bounds.
@@ -27,7 +27,7 @@ class BoxSpace:
         self.shape, self.dtype = box.shape, jnp.float32
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "n"]:
-        """A uniform draw; standard normal where there are no bounds, exponential beyond the one there is."""
+        """Draw uniformly; standard normal without bounds, exponential beyond a single bound."""
         has_low, has_high = jnp.isfinite(self.low), jnp.isfinite(self.high)
         low, high = jnp.where(has_low, self.low, 0.0), jnp.where(has_high, self.high, 0.0)
         keys = jax.random.split(key, 3)
@@ -37,7 +37,7 @@ class BoxSpace:
         return jnp.where(has_low & has_high, inside, open_ended)
 
     def contains(self, x: Float[Array, "n"]) -> Bool[Array, ""]:
-        """Whether every number lies within its bounds; False where one is NaN."""
+        """Return whether every number lies within its bounds; False for a NaN."""
         return jnp.all((x >= self.low) & (x <= self.high))
 
 
@@ -85,11 +85,11 @@ class SubterraGymnax:
     def step(
         self, key: PRNGKeyArray, state: State, action: Float[Array, "n_action"], params: EnvParams | None = None
     ) -> tuple[Float[Array, "n_obs"], State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
-        """Take one step; where it ends the episode, observation and state are those of the next, freshly drawn.
+        """Take one step; after the end of an episode, observation and state are those of a freshly drawn next one.
 
         Returns:
-            Observation, state, reward, terminated, truncated and info, in which `final_observation` is the step's own
-            observation, and `done` is whether the episode ended.
+            Observation, state, reward, terminated, truncated and info. In info, `final_observation` is the step's own
+            observation, and `done` whether the episode ended.
         """
         params = self._or_default(params)
         step_key, reset_key = jax.random.split(key)

@@ -7,9 +7,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from subterra_jax.adapters.missing import MissingLibraryError
-from subterra_jax.adapters.rows import EnvRow
 from subterra_jax.adapters.spaces import Observation, as_observation
 from subterra_jax.adapters.vector import SubterraVectorEnv
+from subterra_jax.env import TunnelEnv
+from subterra_jax.state import EnvParams, State
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -17,16 +18,68 @@ except ImportError as missing:
     raise MissingLibraryError(__name__, "stable-baselines3") from missing
 
 
-class SubterraVecEnv(VecEnv):
-    """A batch of environments that begin anew by themselves, each with a fresh draw.
-
-    A finished environment's `info` has `terminal_observation`, and `TimeLimit.truncated` tells the horizon from an
-    ending. Environment i seeded with s + i does what a single `SubterraEnv` seeded with s + i does, up to rounding.
+class EnvRow:
+    """Attributes of one environment of a batch; further ones may be set on it.
 
     Args:
-        num_envs: How many.
-        task: Id of the task. One that adds to the paper's observation gives a dict, for `MultiInputPolicy`.
-        flat: Give the bare vector for every task, for `MlpPolicy`.
+        envs: The batch.
+        index: Number of the environment.
+    """
+
+    def __init__(self, envs: SubterraVectorEnv, index: int):
+        self._envs, self._index = envs, index
+        self.render_mode = envs.render_mode
+        self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
+        self.spec = envs.spec
+
+    @property
+    def unwrapped(self) -> "EnvRow":
+        """Itself."""
+        return self
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self.env.id
+
+    @property
+    def env(self) -> TunnelEnv:
+        """The JAX environment, shared by the batch."""
+        return self._envs.batch.env
+
+    @property
+    def params(self) -> EnvParams:
+        """Its params, shared by the batch."""
+        return self._envs.batch.params
+
+    @property
+    def state(self) -> State | None:
+        """State on the host; `None` before the first reset."""
+        return self._envs.batch.state(self._index)
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
+        return None if self.render_mode is None else self._envs.picture(self._index)
+
+    def has_wrapper_attr(self, name: str) -> bool:
+        """Return whether the attribute exists."""
+        return hasattr(self, name)
+
+    def get_wrapper_attr(self, name: str) -> Any:
+        """Return an attribute by its name."""
+        return getattr(self, name)
+
+
+class SubterraVecEnv(VecEnv):
+    """A batch of environments that reset themselves, each with a fresh draw.
+
+    A finished environment's `info` has `terminal_observation`, and `TimeLimit.truncated` marks the horizon. Environment
+    i seeded with s + i does what a single `SubterraEnv` seeded with s + i does, up to rounding.
+
+    Args:
+        num_envs: Number of environments.
+        task: Id of the task. A task that adds to the paper's observation returns a dict, for `MultiInputPolicy`.
+        flat: Return a plain vector for every task, for `MlpPolicy`.
         **options: As for `SubterraEnv`.
     """
 
@@ -50,14 +103,14 @@ class SubterraVecEnv(VecEnv):
         self._action = actions
 
     def step_wait(self) -> tuple[Observation, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations to act on next, rewards (float32), dones and one `info` for each environment."""
-        obs, reward, terminated, truncated, told = self._envs.advance(self._action)
-        columns = {name: values.tolist() for name, values in told.info.items()}
+        """Return observations to act on next, rewards (float32), dones and one `info` for each environment."""
+        obs, reward, terminated, truncated, step = self._envs.advance(self._action)
+        columns = {name: values.tolist() for name, values in step.info.items()}
         columns["TimeLimit.truncated"] = (truncated & ~terminated).tolist()
         infos = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         done = terminated | truncated
         for index in np.flatnonzero(done):
-            infos[index]["terminal_observation"] = as_observation(np.array(told.obs[index]), self._envs.fields)
+            infos[index]["terminal_observation"] = as_observation(np.array(step.obs[index]), self._envs.fields)
         return obs, np.array(reward), done, infos
 
     def close(self) -> None:
@@ -65,15 +118,15 @@ class SubterraVecEnv(VecEnv):
         self._envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture of each environment."""
+        """Return a picture of each environment."""
         return self._envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of each environment: one of `EnvRow`, or one that was set before."""
+        """Return an attribute of each environment: one of `EnvRow`, or one that was set before."""
         return [getattr(self._rows[index], attr_name) for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Keep a value with each environment for `get_attr`; nothing in the simulator changes by it."""
+        """Keep a value with each environment for `get_attr`; the simulator ignores it."""
         for index in self._get_indices(indices):
             setattr(self._rows[index], attr_name, value)
 
@@ -85,5 +138,5 @@ class SubterraVecEnv(VecEnv):
         ]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """No environment is wrapped by itself: the batch as a whole is."""
+        """Return False for each environment: only the batch as a whole is wrapped."""
         return [False for _ in self._get_indices(indices)]

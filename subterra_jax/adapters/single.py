@@ -1,6 +1,10 @@
-"""Gymnasium, one environment: no GL, no GPU, a step in some 50 µs of one core."""
+"""Gymnasium, one environment: no GL, no GPU, a step in some 50 µs of one core.
 
-from collections.abc import Sequence
+A step of one environment is a hundred kernels of under a microsecond. XLA's CPU runtime takes longer to hand each to
+its thread pool than the work takes, so the whole step is compiled as one kernel.
+"""
+
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +14,6 @@ from gymnasium import error
 from gymnasium.core import Env
 
 from subterra_jax.adapters import report, spaces
-from subterra_jax.adapters.one_kernel import compile_as_one_kernel
 from subterra_jax.adapters.packing import pack, unpacker
 from subterra_jax.adapters.spaces import Observation, as_observation
 from subterra_jax.adapters.streams import start_streams, take_key
@@ -18,21 +21,47 @@ from subterra_jax.adapters.views import make_view
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
 
+_MARK = {"xla_cpu_small_call": "true", "inlineable": "false"}
+
+
+def compile_as_one_kernel(function: Callable[..., Any], *examples: Any) -> Callable[..., Any]:
+    """Compile a small function ahead of time as one kernel for the first CPU, whatever the default device.
+
+    Args:
+        function: Pure function of arrays that returns a pytree of arrays.
+        *examples: Arrays, or shapes and dtypes, like its arguments.
+
+    Returns:
+        The compiled function, which takes only such arguments. Operations that cannot be part of one kernel, such as a
+        sort, are compiled in the usual way, along with all others.
+
+    Source: XLA, `ThunkEmitter::EmitCallThunk` and `SmallWhileLoopHoistingPass`. An XLA that does not know the mark
+    ignores it, and the program runs as it would have without.
+    """
+    inner = jax.jit(function)
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        try:
+            from jax.experimental.xla_metadata import set_xla_metadata
+
+            return jax.jit(lambda *args: set_xla_metadata(inner(*args), **_MARK)).lower(*examples).compile()
+        except (ImportError, TypeError, jax.errors.JaxRuntimeError):
+            return inner.lower(*examples).compile()
+
 
 class SubterraEnv(Env[Observation, np.ndarray]):
     """One environment as a `gymnasium.Env`; `info` holds Python floats, ints and bools.
 
-    The observation is the bare vector for the paper's task; a task that adds to it gives a dict of its named parts.
+    The observation is a plain vector for the paper's task, and a dict of named parts for a task that adds to it.
 
     Args:
         task: Id of the task.
-        tunnel: As for `subterra_jax.make`. None is the tunnel of the scene where one is given, else the packaged one.
+        tunnel: As for `subterra_jax.make`. `None` is the scene's tunnel if a scene is given, else the packaged one.
         lining: As for `subterra_jax.make`.
-        flat: Give the bare vector for every task.
-        render_mode: None or `rgb_array`.
-        view: What `render` shows: `top`, the plan from above, drawn without GL; or `mujoco`, the scene as a camera
-            behind the robot sees it.
-        scene: Folder that `scene.build` wrote, or one of its MJCF files; `view="mujoco"` needs it, `top` does not.
+        flat: Return a plain vector for every task.
+        render_mode: `None` or `rgb_array`.
+        view: Picture of `render`: `top`, the plan from above, drawn without GL; or `mujoco`, the scene from a camera
+            behind the robot.
+        scene: Folder of `scene.build`, or one of its MJCF files; `view="mujoco"` needs it, `top` does not.
         **overrides: As for `subterra_jax.make`.
     """
 
@@ -63,12 +92,12 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         self._compile()
 
     def _compile(self) -> None:
-        """Reset and step as functions of two flat arrays: the stream with the state, and the action."""
+        """Compile reset and step as functions of two flat arrays: the stream with the state, and the action."""
         env, params = self._env, self._params
-        state, told = report.shapes(env, params)
+        state, example = report.shapes(env, params)
         stream = jax.ShapeDtypeStruct((2,), np.uint32)
         packed = jax.eval_shape(pack, (stream, state))
-        self._unpack, self._read = unpacker((stream, state)), report.python_reader(told)
+        self._unpack, self._read = unpacker((stream, state)), report.python_reader(example)
         unpack = self._unpack
 
         def reset(stream: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -99,7 +128,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         return as_observation(self._obs, self._fields), {}
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Take one step of 0.1 s; the action is clipped to its space, a NaN read as 0."""
+        """Take one step of 0.1 s; the action is clipped to its space, a NaN counts as 0."""
         if self._packed is None:
             raise error.ResetNeeded("reset() must come before step()")
         action = np.asarray(action, np.float32)
@@ -110,7 +139,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         return as_observation(self._obs, self._fields), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """A picture of the last step, `(480, 480, 3)` uint8; None without `rgb_array`."""
+        """Return a picture of the last step, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
         if self.render_mode is None:
             return None
         if self._packed is None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.evaluation.episodes import SHA256
-from subterra_jax.recorder import inertial, messages, sensing
+from subterra_jax.recorder import messages, poses, sensing
 from subterra_jax.recorder.config import Recording
 from subterra_jax.recorder.drive import Trace
 from subterra_jax.recorder.world import World
@@ -30,7 +30,7 @@ def recording(config: Recording, trace: Trace, world: World, topics: dict[str, A
         sensors |= {"cloud": config.cloud, "columns": config.columns, "every": config.every}
         sensors |= {"cloud_range": sensing.CLOUD_RANGE, "cloud_sigma": sensing.CLOUD_SIGMA}
     if config.imu:
-        sensors["imu_rate"] = inertial.RATE
+        sensors["imu_rate"] = poses.IMU_RATE
     return {
         "schema": RECORDING,
         "task": env.id,

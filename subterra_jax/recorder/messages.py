@@ -1,8 +1,9 @@
-"""ROS 2 messages of standard types, serialised as CDR."""
+"""ROS 2 messages of standard types, serialised as CDR, and their MCAP file in a folder that `ros2 bag play` takes."""
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +11,8 @@ from jaxtyping import Float
 from subterra_jax.adapters.missing import MissingLibraryError
 from subterra_jax.recorder.poses import Poses
 
-EPOCH = 1_700_000_000  # s: stamp of the start, the same for every episode
+_ONCE = "/tf_static"
+EPOCH = 1_700_000_000  # s since 1970, stamp of the start of every episode
 _FIELDS = (("x", 7, 0), ("y", 7, 4), ("z", 7, 8), ("ring", 4, 12))  # name, sensor_msgs/PointField type, byte
 POINT = np.dtype({
     "names": ["x", "y", "z", "ring"], "formats": ["<f4", "<f4", "<f4", "<u2"], "offsets": [0, 4, 8, 12], "itemsize": 16,
@@ -19,7 +21,7 @@ POINT = np.dtype({
 
 @functools.cache
 def store() -> Any:
-    """The message types of ROS 2 Jazzy.
+    """Return the message types of ROS 2 Jazzy.
 
     Raises:
         MissingLibraryError: `rosbags` is not installed.
@@ -32,7 +34,7 @@ def store() -> Any:
 
 
 def nanoseconds(time: float) -> int:
-    """Stamp of a time in s since the start, ns since 1970."""
+    """Convert a time since the start, s, to a stamp, ns since 1970."""
     return EPOCH * 1_000_000_000 + round(time * 1e9)
 
 
@@ -59,7 +61,7 @@ def _twist(linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"]) -> A
 
 
 def laser_scan(time: float, frame: str, ranges: np.ndarray, range_max: float, period: float) -> Any:
-    """`sensor_msgs/LaserScan`; a beam that hit nothing reports exactly `range_max`, as in the task."""
+    """Return a `sensor_msgs/LaserScan`; a beam that hits nothing reports exactly `range_max`, as in the task."""
     step = 2.0 * np.pi / len(ranges)
     return _make("sensor_msgs/msg/LaserScan")(
         header=_header(time, frame), angle_min=0.0, angle_max=float(step * (len(ranges) - 1)), angle_increment=step,
@@ -69,7 +71,7 @@ def laser_scan(time: float, frame: str, ranges: np.ndarray, range_max: float, pe
 
 
 def odometry(poses: Poses, k: int, frame: str) -> Any:
-    """`nav_msgs/Odometry` of `base_link`, its twist from the last pose to this one; covariances are not stated."""
+    """Return a `nav_msgs/Odometry` of `base_link`, its twist since the last pose; covariances are not stated."""
     before, zero = max(k - 1, 0), np.zeros(3)
     linear, angular, rotation = zero, zero, poses.rotation
     if k > 0:
@@ -87,7 +89,7 @@ def odometry(poses: Poses, k: int, frame: str) -> Any:
 
 
 def transform(time: float, parent: str, child: str, position: np.ndarray, quaternion: np.ndarray) -> Any:
-    """`geometry_msgs/TransformStamped`; quaternion x, y, z, w."""
+    """Return a `geometry_msgs/TransformStamped`; quaternion x, y, z, w."""
     move = _make("geometry_msgs/msg/Transform")(translation=_vector(position), rotation=_quaternion(quaternion))
     return _make("geometry_msgs/msg/TransformStamped")(
         header=_header(time, parent), child_frame_id=child, transform=move
@@ -95,18 +97,18 @@ def transform(time: float, parent: str, child: str, position: np.ndarray, quater
 
 
 def transforms(parts: list[Any]) -> Any:
-    """`tf2_msgs/TFMessage`."""
+    """Return a `tf2_msgs/TFMessage`."""
     return _make("tf2_msgs/msg/TFMessage")(transforms=parts)
 
 
 def command(time: float, speed: float, yaw_rate: float) -> Any:
-    """`geometry_msgs/TwistStamped` of a command, m/s and rad/s."""
+    """Return a `geometry_msgs/TwistStamped` of a command, m/s and rad/s."""
     twist = _twist(np.array([speed, 0.0, 0.0]), np.array([0.0, 0.0, yaw_rate]))
     return _make("geometry_msgs/msg/TwistStamped")(header=_header(time, "base_link"), twist=twist)
 
 
 def imu(time: float, gyro: Float[np.ndarray, "3"], accel: Float[np.ndarray, "3"]) -> Any:
-    """`sensor_msgs/Imu` without an orientation, which a covariance of -1 says."""
+    """Return a `sensor_msgs/Imu` without an orientation, which a covariance of -1 marks."""
     unknown = np.zeros(9)
     unknown[0] = -1.0
     return _make("sensor_msgs/msg/Imu")(
@@ -117,7 +119,7 @@ def imu(time: float, gyro: Float[np.ndarray, "3"], accel: Float[np.ndarray, "3"]
 
 
 def point_cloud(time: float, points: Float[np.ndarray, "n 3"], ring: np.ndarray) -> Any:
-    """`sensor_msgs/PointCloud2` of the returns of one sweep: x, y, z (m) and ring."""
+    """Return a `sensor_msgs/PointCloud2` of the returns of one sweep: x, y, z (m) and ring."""
     rows = np.zeros(len(points), POINT)
     rows["x"], rows["y"], rows["z"] = points.T
     rows["ring"] = ring
@@ -128,3 +130,53 @@ def point_cloud(time: float, points: Float[np.ndarray, "n 3"], ring: np.ndarray)
         is_bigendian=False, point_step=POINT.itemsize, row_step=POINT.itemsize * len(rows),
         data=rows.view(np.uint8).reshape(-1), is_dense=True,
     )  # fmt: skip
+
+
+class Message(NamedTuple):
+    """A message of a topic: time since the start (s), topic and content."""
+
+    time: float
+    topic: str
+    content: Any
+
+
+def write_bag(folder: Path, messages: Iterable[Message]) -> dict[str, dict[str, Any]]:
+    """Write messages with the definitions of their types; the same messages give the same bytes.
+
+    Args:
+        folder: Folder to make; the file in it has the same name.
+        messages: Messages in order of time.
+
+    Returns:
+        Type and number of messages of each topic.
+    """
+    from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer
+    from rosbags.rosbag2.enums import CompressionFormat
+
+    types, connections, topics = store(), {}, {}
+    writer = Writer(folder, version=Writer.VERSION_LATEST, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        for message in messages:
+            kind = message.content.__msgtype__
+            if message.topic not in connections:
+                quality = _latched() if message.topic == _ONCE else []
+                connections[message.topic] = writer.add_connection(
+                    message.topic, kind, typestore=types, offered_qos_profiles=quality
+                )
+                topics[message.topic] = {"type": kind, "messages": 0}
+            raw = types.serialize_cdr(message.content, kind)
+            writer.write(connections[message.topic], nanoseconds(message.time), raw)
+            topics[message.topic]["messages"] += 1
+    return dict(sorted(topics.items()))
+
+
+def _latched() -> list[Any]:
+    """Return the quality of service of a message sent once: late subscribers still receive it."""
+    from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+
+    never = QosTime(2147483647, 4294967295)
+    return [Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, never, never,
+        QosLiveliness.AUTOMATIC, never, False,
+    )]  # fmt: skip

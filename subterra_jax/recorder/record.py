@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.lidar3d import Relief
-from subterra_jax.recorder import facts, inertial, messages, sensing, streams
-from subterra_jax.recorder.bag import Message, write_bag
+from subterra_jax.recorder import facts, messages, sensing, streams
 from subterra_jax.recorder.config import Recording, RecordingError, checked
 from subterra_jax.recorder.drive import Trace, drive
-from subterra_jax.recorder.poses import Poses, axis_rows, reckoned_poses, true_poses, tum_rows
+from subterra_jax.recorder.messages import Message, write_bag
+from subterra_jax.recorder.poses import Poses, axis_rows, measure_imu, reckoned_poses, true_poses, tum_rows
 from subterra_jax.recorder.world import World, draw, open_agent, open_world
 
 _POSE_FORMAT = "%.9f"
@@ -66,7 +66,7 @@ def _write_recording(
         dense = sensing.dense_scans(trace, world.params, config.beams, seed)
         found.append(streams.scans("/scan_dense", trace, dense, range_max))
     if config.imu:
-        found.append(streams.inertial(inertial.measure(sensor, seed)))
+        found.append(streams.inertial(measure_imu(sensor, seed)))
     if relief is not None:
         found.append(streams.points(relief, sensor, np.asarray(trace.state.station), config, seed))
     topics = write_bag(folder, streams.merged(found))

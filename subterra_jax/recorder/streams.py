@@ -8,11 +8,10 @@ from jaxtyping import Float
 
 from subterra_jax.lidar3d import Relief
 from subterra_jax.recorder import messages
-from subterra_jax.recorder.bag import Message
 from subterra_jax.recorder.config import Recording
 from subterra_jax.recorder.drive import Trace
-from subterra_jax.recorder.inertial import Inertial
-from subterra_jax.recorder.poses import Poses
+from subterra_jax.recorder.messages import Message
+from subterra_jax.recorder.poses import Inertial, Poses
 from subterra_jax.recorder.sensing import clouds
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])

@@ -14,8 +14,7 @@ from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.lidar3d.surface import Axis, Triangles
 from subterra_jax.recorder.drive import Trace
-from subterra_jax.recorder.inertial import GRAVITY, measure
-from subterra_jax.recorder.poses import Poses, reckoned_poses, true_poses
+from subterra_jax.recorder.poses import GRAVITY, Poses, measure_imu, reckoned_poses, true_poses
 from subterra_jax.recorder.sensing import CLOUD_SIGMA, clouds, dense_scans
 from subterra_jax.state import State
 from tests.subterra_jax import surfaces
@@ -118,14 +117,14 @@ def test_an_imu_on_a_circle_feels_the_turn_the_pull_inwards_and_gravity():
     radius = speed / rate
     position = radius * np.stack([np.sin(rate * time), 1.0 - np.cos(rate * time), 0.0 * time], axis=-1)
     poses = Poses(time, position, Rotation.from_rotvec(rate * time[:, None] * np.array([0.0, 0.0, 1.0])))
-    true = measure(poses, seed=0, noise=0.0)
+    true = measure_imu(poses, seed=0, noise=0.0)
     inner = slice(20, -20)
     np.testing.assert_allclose(true.gyro[inner], np.broadcast_to([0.0, 0.0, rate], true.gyro[inner].shape), atol=1e-6)
     wanted = np.broadcast_to([0.0, speed * rate, GRAVITY], true.accel[inner].shape)
     np.testing.assert_allclose(true.accel[inner], wanted, atol=2e-3)
-    noisy = measure(poses, seed=0)
+    noisy = measure_imu(poses, seed=0)
     assert 0.004 < np.std(noisy.gyro[:, 2] - true.gyro[:, 2]) < 0.006
-    np.testing.assert_array_equal(measure(poses, seed=0).accel, noisy.accel)
+    np.testing.assert_array_equal(measure_imu(poses, seed=0).accel, noisy.accel)
 
 
 def test_a_state_has_all_that_poses_need():
