@@ -81,11 +81,9 @@ def make_axis(station: np.ndarray, position: np.ndarray, tangent: np.ndarray) ->
 
 
 def axis_through(points: Float[np.ndarray, "n 3"], spacing: float) -> Axis:
-    """Return the cubic spline through the points, resampled by arc length from 0, every `spacing` m or slightly less.
+    """Return the cubic spline through points in order, no two alike, m, resampled by arc length from 0.
 
-    Args:
-        points: In order, no two alike, m.
-        spacing: Largest distance of two stations, m.
+    Stations are `spacing` m apart, or slightly less.
     """
     chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     spline = CubicSpline(chord, points)
@@ -197,11 +195,7 @@ class Bore:
 
 
 def load_bore(path: Path) -> Bore:
-    """Reads `bore.npz`.
-
-    Raises:
-        RecordingError: Not such a file, or of another schema.
-    """
+    """Reads `bore.npz`; raises `RecordingError` for any other file and for another schema."""
     try:
         with np.load(path) as data:
             if str(data["schema"]) != SCHEMA:

@@ -30,14 +30,9 @@ class SettingError(SubterraError):
 
 
 def check_settings(config: Any, prefix: str = "") -> None:
-    """Refuses numbers that are negative or not finite, in a tree of dataclasses; some may not be 0 either.
+    """Refuses numbers that are negative or not finite in a tree of dataclasses; some may not be 0 either.
 
-    Args:
-        config: The settings.
-        prefix: Of the options' names, for messages.
-
-    Raises:
-        SettingError: Names the option as it stands on a command line, and its value.
+    `prefix` stands before the options' names. Raises `SettingError`, which names the option and its value.
     """
     for part in fields(config):
         value, name = getattr(config, part.name), f"{prefix}{part.name.replace('_', '-')}"
@@ -49,11 +44,7 @@ def check_settings(config: Any, prefix: str = "") -> None:
 
 
 def check_number(name: str, value: float) -> None:
-    """Refuses one number; `name` says whether it may be 0.
-
-    Raises:
-        SettingError: Names the option and the value.
-    """
+    """Refuses a number that is negative or not finite; `name` tells whether it may be 0. Raises `SettingError`."""
     if not math.isfinite(value):
         raise SettingError(f"--{name} must be a finite number, got {value}")
     if value < 0.0:
@@ -81,7 +72,7 @@ def build(
         source: The input; see `scene.reconstruct`.
         out: Folder to write; a previous one is replaced once the new one is complete.
         trajectory: Poses for a bag, TUM.
-        config: Defaults where not given.
+        config: Settings; the defaults where not given.
         control: Positions for a bag, TUM.
         calibration: See `scene.poses.calibration.find_calibration`.
         partial: Place for partial results; beside `out` where not given.

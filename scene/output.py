@@ -32,19 +32,8 @@ def write_geometry(
 ) -> tuple[dict[str, int], dict[str, str]]:
     """Writes `bore.npz`, `tunnel.npz`, both scenes and the whole meshes.
 
-    Args:
-        folder: Where to.
-        name: Of the tunnel.
-        provenance: Kind of recording that the bore comes from.
-        bore: The bore.
-        track: Its track.
-        config: Cutting and dressing of the scene.
-
-    Returns:
-        How many of each asset there are, and where the furniture comes from.
-
-    Raises:
-        FitError: The bore makes no solid, or has no walls at the LiDAR's height.
+    Returns the number of each asset, and the provenance of the furniture. Raises `FitError` where the bore makes no
+    solid, or has no walls at the LiDAR's height.
     """
     furnished = furnish_bore(bore, track, config.furniture)
     solids = {"smooth": build_solid(bore, pockets=False)}

@@ -57,11 +57,11 @@ def register_recording(
 
     Args:
         path: The recording.
-        known: Of its poses.
-        calibration: Where prism and IMU sit against the LiDAR.
+        known: Poses or control positions, where given.
+        calibration: Mounts of prism and IMU against the LiDAR.
         voxel: Thinning of the cloud, m.
         reading: What the user says instead of having it detected.
-        progress: Where the stages show how far they are.
+        progress: Shows the stages.
         partial: Partial results of an earlier build, and place for those of this one.
 
     Raises:
@@ -90,10 +90,9 @@ def register_recording(
 
 
 def load_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages, partial: Partial) -> Registered:
-    """Reads and thins a cloud that is registered already; arguments as for `from_recording`.
+    """Reads and thins a cloud that is registered already; see `register_recording`.
 
-    Raises:
-        RecordingError: Damaged, empty, or of no usable unit.
+    Raises `RecordingError` for a file that is damaged, empty, or of no usable unit.
     """
     record = hash_inputs([path], progress)
     partial.open(resume_key(record, voxel, reading, own_readers()))
@@ -142,15 +141,15 @@ def reconstruct(
     calibration: Calibration = UNCALIBRATED,
     partial: Partial | None = None,
 ) -> Reconstruction:
-    """Detects what the input is and builds its bore.
+    """Detects the kind of an input and builds its bore.
 
     Args:
         source: A recording, a registered cloud or a ring survey, of any format that `scene.reading.formats` knows.
         trajectory: Poses in TUM form, for a recording.
-        config: See `ReconstructConfig`.
-        progress: Where the stages show how far they are.
+        config: Settings.
+        progress: Shows the stages.
         control: Positions in TUM form, for a recording without a trajectory.
-        calibration: Where prism and IMU sit against the LiDAR.
+        calibration: Mounts of prism and IMU against the LiDAR.
         partial: Partial results of an earlier build, and place for those of this one; none are kept without it.
 
     Raises:

@@ -28,11 +28,8 @@ def total_bytes(paths: list[Path]) -> int:
 def input_record(paths: list[Path], advance: Callable[[int], None] = lambda _: None) -> list[dict[str, Any]]:
     """Return name, size and hash of each input; no folder names, so that the record is the same anywhere.
 
-    A folder of scans counts as one input, whose hash is that of its files' names and hashes.
-
-    Args:
-        paths: Files and folders; each byte is read once.
-        advance: Called with the number of bytes that have been read since.
+    A folder of scans counts as one input, whose hash is that of its files' names and hashes. Each byte is read once,
+    and `advance` is called with the number of bytes read since.
     """
     return [_folder_record(path, advance) if path.is_dir() else _file_record(path, advance) for path in paths]
 
@@ -102,10 +99,9 @@ class Partial:
         self._next = time.monotonic() + every
 
     def open(self, key: str) -> None:
-        """Starts keeping results under a key; what lies there under another one is discarded, which is said.
+        """Starts keeping results under a key; those under another key are discarded, which is said.
 
-        Raises:
-            OutputError: Another build is at work on the same output.
+        Raises `OutputError` where another build is at work on the same output.
         """
         if self.folder is None:
             return

@@ -40,10 +40,7 @@ class TypeFit:
 def find_stretches(bore: Bore, flat_floor: bool, sigma: float) -> Shaped[np.ndarray, " t"]:
     """Finds stretches of one type, of `scene.bore.STRETCH`, that cover the bore from end to end.
 
-    Args:
-        bore: The bore; its own `stretch` is not read.
-        flat_floor: The bore stands on a floor; without one, only a circle or a free profile is tried.
-        sigma: Standard deviation of its walls, m.
+    Its walls have the standard deviation `sigma`, m. Without a flat floor, only circle and free profile are tried.
     """
     count = max(round(bore.length / _WINDOW), 1)
     rows = np.minimum((bore.station / max(bore.length, 1e-9) * count).astype(np.intp), count - 1)
@@ -150,11 +147,7 @@ def measure_extents(angle: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, 
 
 
 def bore_from_sections(axis: Axis, sections: Sections) -> Bore:
-    """Return the bore over the seen span, without lining features; stations start at its first end.
-
-    Raises:
-        FitError: It holds a room.
-    """
+    """Return the bore over the seen span, from station 0, without lining; raises `FitError` where it holds a room."""
     grid = sections.grid
     start, end = grid.start, grid.start + grid.rows * grid.step
     station = uniform_stations(end - start)

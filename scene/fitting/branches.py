@@ -34,10 +34,10 @@ def require_one_bore(
 
     Args:
         nodes: Middles of the surface's voxels, m.
-        along: Of each node, from one end, half the difference of the distances from both ends, m.
-        length: Of a slice, m.
+        along: Half the difference of each node's distances from both ends, from 0, m.
+        length: Length of a slice, m.
         voxel: Edge of a voxel, m.
-        origin: Of the nodes' frame in the input's, m.
+        origin: Origin of the nodes' frame in the input's, m.
 
     Returns:
         Nodes of the bore itself: not of a niche or a passage.
@@ -76,15 +76,9 @@ def require_one_bore(
 
 
 def require_no_fold(axis: Axis, across: float, origin: Float[np.ndarray, "3"]) -> None:
-    """Refuses an axis that turns within the width of its bore: it winds through a room.
+    """Refuses an axis that turns by more than 75° within the width `across`, m: it winds through a room.
 
-    Args:
-        axis: The axis.
-        across: Width of the bore, m.
-        origin: Of the axis' frame in the input's, m.
-
-    Raises:
-        FitError: It turns by more than 75° over one width.
+    `origin` is that of the axis' frame in the input's, m. Raises `FitError`.
     """
     ahead = max(round(across / (axis.station[1] - axis.station[0])), 1)
     if len(axis.station) <= ahead:
@@ -100,14 +94,9 @@ def require_no_fold(axis: Axis, across: float, origin: Float[np.ndarray, "3"]) -
 
 
 def require_no_room(station: Float[np.ndarray, " n"], width: Float[np.ndarray, " n"]) -> None:
-    """Refuses a bore that widens far for some metres and narrows again.
+    """Refuses a bore that is twice as wide as usual over more than 5 m; raises `FitError`.
 
-    Args:
-        station: Uniform, m.
-        width: m. What widens towards an end alone is a portal, within 6 m of it.
-
-    Raises:
-        FitError: More than 5 m in a row are twice as wide as the bore is.
+    Stations are uniform, m. What widens within 6 m of an end is a portal.
     """
     usual = float(np.median(width))
     wide = (width > _ROOM * usual) & (station > _PORTAL) & (station < station[-1] - _PORTAL)

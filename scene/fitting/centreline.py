@@ -30,13 +30,8 @@ def surface_skeleton(
 ) -> Float[np.ndarray, "k 3"]:
     """Return centres of slices across the surface distance, from end to end, m.
 
-    Args:
-        points: Registered cloud, m.
-        min_length: A shorter one is refused, m.
-        origin: Of the points' frame in the input's, m, for the error message.
-
-    Raises:
-        FitError: Too short, without two ends, or with a branch or a room.
+    Raises `FitError` for a cloud shorter than `min_length`, m, without two ends, or with a branch or a room. `origin`
+    is that of the points' frame in the input's, m, for the message.
     """
     cells = np.unique(np.floor(points / SKELETON_VOXEL).astype(np.int64), axis=0)
     nodes = (cells + 0.5) * SKELETON_VOXEL
@@ -130,15 +125,10 @@ class CentrelineConfig:
 def fit_centreline(
     points: Float[np.ndarray, "n 3"], config: CentrelineConfig, origin: Float[np.ndarray, "3"] = _HERE
 ) -> Axis:
-    """Return the axis of the bore, from end to end of the cloud.
+    """Return the axis of the bore, from end to end of a registered cloud, z up, m.
 
-    Args:
-        points: Registered cloud, z up, m.
-        config: See `CentrelineConfig`.
-        origin: Of the points' frame in the input's, m, so that an error can say where in the input.
-
-    Raises:
-        FitError: Too short, nothing like a tunnel, or with a branch or a room.
+    Raises `FitError` for a cloud that is too short, nothing like a tunnel, or with a branch or a room. `origin` is that
+    of the points' frame in the input's, m, so that an error can name the place.
     """
     axis = _smooth_axis(surface_skeleton(points, config.min_length, origin), config.cutoff)
     stride = max(1, int(len(points) / (axis.length * _POINTS_PER_METRE)))

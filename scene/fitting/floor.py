@@ -19,15 +19,7 @@ _BESIDE = 0.5
 
 
 def fit_floor_line(lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, " n"]) -> tuple[float, float] | None:
-    """Fits the floor of one section; `None` where the bottom is not flat.
-
-    Args:
-        lateral: Points of the section about the axis, m.
-        upward: The same.
-
-    Returns:
-        `(a, b)` of `upward = a + b · lateral`.
-    """
+    """Fits `(a, b)` of the floor `upward = a + b · lateral` to one section, m; `None` where the bottom is not flat."""
     if len(lateral) < _MIN_POINTS:
         return None
     half_width = np.percentile(np.abs(lateral), 95)
@@ -115,13 +107,10 @@ def find_floors(
 
 
 def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarray) -> np.ndarray:
-    """Replaces the foot of each wall by the parabola that the wall above it follows, run on to the floor.
+    """Replaces the foot of each wall by the parabola that the wall above it follows, down to the floor.
 
-    Args:
-        wall: Its distance from the axis, m, `(rows, cols)`.
-        grid: Its cells.
-        floors: Where the foot is.
-        seen: The wall without smoothing around, which would round the corner off, m, `(rows, cols)`.
+    `wall` is its distance from the axis, m, and `seen` the same without smoothing around, which would round the corner
+    off.
     """
     lateral, upward = seen * np.cos(grid.angle), seen * np.sin(grid.angle)
     height = np.interp(grid.station, floors.station, floors.height)[:, None]
@@ -149,11 +138,7 @@ def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarr
 
 
 def _fit_parabolas(above: np.ndarray, out: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fits `a + b h + c h²` to the lateral distance of each row's wall; `h` is the height above the floor.
-
-    Returns:
-        Coefficients `(3, rows)`, and the rows in which enough of the wall was seen.
-    """
+    """Fits each row's lateral distance `a + b h + c h²`, `h` m above the floor; also tells which rows could be fitted."""
     known = band.sum(axis=1) >= 3
     weight = band / np.maximum(band.sum(axis=1, keepdims=True), 1)
     h, y = above - _weighted_mean(above, weight), out - _weighted_mean(out, weight)

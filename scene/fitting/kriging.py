@@ -46,10 +46,8 @@ def _correlation(family: str, d: np.ndarray) -> np.ndarray:
 def choose_correlation(station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]) -> Correlation:
     """Return the correlation under which the values are likeliest.
 
-    Args:
-        station: Of each value, growing along the first axis, m.
-        value: m; NaN where nothing was seen. Each window that the likelihood is taken over may lie on a line of
-            its own (restricted likelihood).
+    Stations grow along the first axis, m; values, m, are NaN where nothing was seen. Each window that the likelihood is
+    taken over may lie on a line of its own (restricted likelihood).
     """
     at, y = _samples(station, value)
     seen = np.isfinite(y)
@@ -131,13 +129,10 @@ def predict_wall(
     value: Float[np.ndarray, "n m"],
     at: Float[np.ndarray, " k"],
 ) -> tuple[Float[np.ndarray, "k m"], Float[np.ndarray, "k m"]]:
-    """Return the wall about its trend at other stations, and its standard deviation, m.
+    """Return the wall about its trend at the stations `at`, and its standard deviation, m.
 
-    Args:
-        model: The correlation.
-        station: Of each value, m.
-        value: About their trend, m; NaN where nothing was seen.
-        at: Where to, m. Far from every value the result is 0 with the deviation `model.sigma`.
+    Values are about their trend, m, and NaN where nothing was seen. Far from all of them the result is 0, with the
+    deviation `model.sigma`.
     """
     known, y = station.T, value.T
     seen = np.isfinite(y)
@@ -178,14 +173,7 @@ class Kriged:
 def krige_profiles(
     station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"], radius: Float[np.ndarray, " p"], fine: Grid
 ) -> Kriged:
-    """Return the wall through profiles, followed between them as their own likeness along the bore allows.
-
-    Args:
-        station: Of the points, m.
-        angle: Of the points, rad.
-        radius: Of the points, m.
-        fine: Where the wall is wanted.
-    """
+    """Interpolates the wall between profiles on the cells of `fine`, from points by station, m, angle, rad, radius, m."""
     at, value = _observations(station, angle, radius, fine)
     for last in (False, True):
         about = value - _trend(at, value, at)

@@ -161,13 +161,9 @@ class LiningConfig:
 def add_lining(
     bore: Bore, sections: Sections, cloud: Cloud | None = None, config: LiningConfig | None = None
 ) -> tuple[Bore, dict[str, str]]:
-    """Return the bore with its lining, and where rings, pockets and nails come from.
+    """Return a smooth bore with its lining, and the provenance of rings, pockets and nails.
 
-    Args:
-        bore: Smooth.
-        sections: Sections that the bore was made of.
-        cloud: In which nails are looked for; without it they are by standard.
-        config: See `LiningConfig`.
+    Nails are looked for in the cloud; without one they are by standard.
     """
     config = config or LiningConfig()
     found, joints = find_pockets(sections)
@@ -180,12 +176,9 @@ def add_lining(
 
 
 def add_standard_lining(bore: Bore, config: LiningConfig, flat_floor: bool) -> tuple[Bore, dict[str, str]]:
-    """Return the bore with the lining of the configuration, marked as not measured; ring stations that it has are kept.
+    """Return a smooth bore with the lining of the configuration, marked as not measured; ring stations it has are kept.
 
-    Args:
-        bore: Smooth.
-        config: See `LiningConfig`.
-        flat_floor: The lowest part of the section is a floor, which has no pockets.
+    A flat floor, the lowest part of the section, gets no pockets.
     """
     rings = {"rings": MEASURED} if len(bore.ring_station) else {"rings": STANDARD}
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)

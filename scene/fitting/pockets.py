@@ -33,13 +33,7 @@ class Holes:
 
 
 def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
-    """Return the holes that stand in the rows which the clearest of them form.
-
-    Args:
-        holes: All.
-        columns: Of the unrolled wall.
-        reach: Half the width of a row, in columns.
-    """
+    """Return the holes in the rows that the clearest form; `reach` is half the width of a row, in columns."""
     clear = np.bincount(holes.column[holes.score > CLEAR], minlength=columns).astype(float)
     window = max(int(2 * reach) | 1, 3)
     filled = uniform_filter(clear, window, mode="wrap") * window
@@ -49,16 +43,11 @@ def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
 
 
 def add_pattern(faint: Holes, found: Holes, grid: Grid, reach: float) -> Holes:
-    """Adds the fainter holes that stand where the pattern of the clear ones has a pocket.
+    """Adds the faint holes that stand where the pattern of those clear and in rows, `found`, has a pocket.
 
     Holes faint in themselves, as pockets are that the scanner looks at head on, make a row where most of its places
-    either side of the joints hold one; chance would fill about a quarter of them.
-
-    Args:
-        faint: All holes, however faint.
-        found: Those that are clear, in rows.
-        grid: Of the unrolled wall.
-        reach: Half the width of a row, in columns.
+    either side of the joints hold one; chance would fill about a quarter of them. `reach` is half a row's width,
+    columns.
     """
     station = (found.row + 0.5) * grid.step
     joints = find_ring_joints(station, grid.rows * grid.step)
@@ -167,12 +156,7 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
 
 
 def _drop_overlaps(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:
-    """Pockets to keep so that none overlap; of two that do, the fainter goes.
-
-    Args:
-        pockets: All, with the size of the mould.
-        radius: Of the bore, m.
-    """
+    """Pockets to keep so that none overlap in a bore of a radius, m; of two that do, the fainter goes."""
     length, width = float(pockets["length"][0]) + _RIB, float(pockets["width"][0]) + _RIB
     place = np.column_stack([pockets["station"] / length, pockets["angle"] * radius / width])
     keep = np.ones(len(pockets), bool)

@@ -33,10 +33,9 @@ class RingFit:
 
 
 def fit_rings(survey: RingSurvey) -> RingFit:
-    """Return a circle through each ring's points, in the plane square to the axis through the rings' centres.
+    """Fits a circle to each ring, in the plane square to the axis through the rings' centres.
 
-    Raises:
-        FitError: A ring has too few points, or they lie on no circle.
+    Raises `FitError` where a ring has too few points, or they lie on no circle.
     """
     for name, points in zip(survey.names, survey.points, strict=True):
         if len(points) < _MIN_POINTS:
@@ -63,12 +62,7 @@ def fit_rings(survey: RingSurvey) -> RingFit:
 
 
 def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
-    """Return a round bore through the rings; between rings it is interpolated, and marked as filled.
-
-    Args:
-        fit: The rings, in order along the tunnel.
-        origin: Whole-metre offset to take off, m.
-    """
+    """Return a round bore through the rings, less `origin`, m; between rings it is interpolated and marked as filled."""
     centre = fit.centre - origin
     axis = axis_through(centre, STATION_STEP)
     at = _ring_stations(axis, centre)
@@ -103,12 +97,7 @@ def _round_stretch(axis: Axis, fit: RingFit) -> tuple[float | str, ...]:
 
 
 def compare_with_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:
-    """Compares the rings with the design axis, for the manifest.
-
-    Args:
-        fit: The rings.
-        design: Chainage, easting, northing, elevation, m, in order, `(d, 4)`.
-    """
+    """Compares the rings with the design axis: chainage, easting, northing, elevation, m, in order."""
     axis = make_axis(design[:, 0], design[:, 1:], _tangents(design[:, 1:]))
     chainage, left, up = axis.local(fit.centre)
     return {

@@ -26,11 +26,7 @@ _TRIM_STEP = 0.05
 
 
 def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[float, float]:
-    """Return the first and last station where a fair share of the circumference was seen, m.
-
-    Raises:
-        FitError: No station shows that much.
-    """
+    """Return first and last station where enough of the circumference was seen, m; raises `FitError` without any."""
     grid = Grid.over(-OVERRUN, axis.length + OVERRUN, DENSE_STEP, 24)
     cell = grid.cell(station, angle)
     count = np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns).reshape(grid.rows, grid.columns)
@@ -54,12 +50,9 @@ def _profile_station(station: np.ndarray, outermost: float, inwards: int) -> flo
 
 
 def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
-    """Station where the returns become as many as further inside: noise puts a few beyond a mouth.
+    """Station where returns become as many as in the `behind` m further in: noise puts a few beyond a mouth.
 
-    Args:
-        station: Growing inwards, m.
-        end: Where the first returns are, m.
-        behind: Distance to look inside, m.
+    Stations grow inwards, m; the first returns are at `end`.
     """
     step = _TRIM_STEP
     total = np.histogram(station, np.arange(end - 0.5, end + 2 * behind, step))[0]
@@ -71,8 +64,7 @@ def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
 def profile_spacing(station: np.ndarray, start: float, end: float) -> float:
     """Return the shortest row of which nearly all were seen, m; `DENSE_STEP` for a dense survey.
 
-    Raises:
-        FitError: Profiles further apart than 2 m.
+    Raises `FitError` for profiles further apart than 2 m.
     """
     inside = station[(station >= start) & (station <= end)]
     for step in _STEPS:
@@ -131,14 +123,10 @@ class _Points:
 
 
 def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
-    """Return the sections from one end of the seen bore to the other; stations are those of `axis`.
+    """Fits the sections from one end of the seen bore to the other; stations are those of `axis`.
 
-    Args:
-        cloud: Registered cloud.
-        axis: Its centreline; may stop short of the ends or run over them by 3 m.
-
-    Raises:
-        FitError: Less than half of the bore's surface was seen, or its middle is not open.
+    The axis may stop short of the ends or run over them by 3 m. Raises `FitError` where less than half of the surface
+    was seen, or its middle is not open.
     """
     station, lateral, upward = axis.at(np.arange(-OVERRUN, axis.length + OVERRUN, DENSE_STEP)).local(
         cloud.points.astype(np.float64)

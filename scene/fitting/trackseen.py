@@ -30,12 +30,9 @@ class SeenRails:
 
 
 def find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:
-    """Return the rails among the points low in a bore; `None` where they are seen along too little of it.
+    """Finds both rails among points by station, offset to the left of the axis and height above the bed, m.
 
-    Args:
-        station: Of each point, m.
-        lateral: To the left of the axis, m.
-        height: Above the bed, m.
+    `None` where they are seen along too little of the bore.
     """
     heads = [_find_head(station, side * lateral, height) for side in (1, -1)]
     left, right = heads
@@ -128,12 +125,7 @@ class SeenTrack:
 
 
 def find_track(cloud: Cloud, bore: Bore) -> SeenTrack:
-    """Finds sleepers and rails on the floor of the bore.
-
-    Args:
-        cloud: Registered cloud in the bore's frame.
-        bore: With a flat floor; a track on a round invert is not looked for.
-    """
+    """Finds sleepers and rails on the flat floor of a bore; a track on a round invert is not looked for."""
     station, lateral, height = _above_floor(cloud, bore)
     return SeenTrack(_find_sleepers(station, lateral, height, bore.length), find_rails(station, lateral, height))
 

@@ -95,10 +95,7 @@ def smooth_cells(
 ) -> tuple[Float[np.ndarray, "rows cols"], Float[np.ndarray, "rows cols"]]:
     """Return the Gaussian mean of the weighted cells, and the weight that each result rests on.
 
-    Args:
-        value: Cells; those of weight 0 are not read.
-        weight: Not negative.
-        sigma: Widths in cells along station and around.
+    Weights are not negative; cells of weight 0 are not read. `sigma` is in cells along the station and around.
     """
     modes = ("nearest", "wrap")
     total = gaussian_filter(weight, sigma, mode=modes)
@@ -139,14 +136,8 @@ def estimate_sigma(
 ) -> Float[np.ndarray, "rows cols"]:
     """Estimates the standard deviation of a wall that was interpolated over unseen cells, m.
 
-    It is what the same wall changes by, root mean square, over the distance along the bore to the nearest cell that
-    was seen; where a whole direction was not seen, over the greatest distance that was tried, 8 m. At least
-    2 cm for each metre.
-
-    Args:
-        wall: The wall, m.
-        seen: Cells with returns on it.
-        grid: Its cells.
+    It is the root mean square change of this wall over the distance along the bore to the nearest cell that was seen;
+    where a whole direction was not seen, over 8 m, the greatest distance tried. It is at least 2 cm for each metre.
     """
     near = binary_dilation(seen, np.ones((2 * _AROUND[0] + 1, 2 * _AROUND[1] + 1), bool))
     sampling = (grid.step, 2 * np.pi * float(np.median(wall)) / grid.columns)

@@ -83,13 +83,9 @@ UNCALIBRATED = Calibration("none: the control is taken for the LiDAR's own origi
 
 
 def find_calibration(text: str | None) -> Calibration:
-    """Return a calibration from what a user wrote.
+    """Return a calibration from a user's text: a preset, a YAML file, or the prism's `x,y,z` in LiDAR coordinates, m.
 
-    Args:
-        text: Name of a preset, path of a YAML file, or a lever arm `x,y,z` (the prism in LiDAR coordinates, m).
-
-    Raises:
-        RecordingError: None of the three, or a file that is malformed.
+    Raises `RecordingError` for any other text and for a malformed file.
     """
     if text is None:
         return UNCALIBRATED
@@ -113,10 +109,8 @@ def find_calibration(text: str | None) -> Calibration:
 def load_calibration(path: Path) -> Calibration:
     """Reads `prism: [x, y, z]` (m, LiDAR coordinates) and `imu: {topic: {rotation: 3x3, shift: [x, y, z]}}`.
 
-    An IMU's transform maps LiDAR coordinates to the IMU's. Both keys may be left out; any other is refused.
-
-    Raises:
-        RecordingError: Unreadable, or a key or a shape is wrong; names it.
+    An IMU's transform maps LiDAR coordinates to the IMU's. Both keys may be left out; any other is refused. Raises
+    `RecordingError`, which names the key or shape that is wrong.
     """
     require_input(path)
     try:

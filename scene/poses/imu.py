@@ -42,8 +42,7 @@ def imu_topics(recording: Recording) -> list[str]:
 def imu_samples(recording: Recording, topic: str) -> Iterator[tuple[float, np.ndarray, np.ndarray]]:
     """Yields samples in the order of the bag: time (s, header), rate (rad/s), force (the topic's unit).
 
-    Raises:
-        RecordingError: A message is damaged; says which.
+    Raises `RecordingError`, which says which message is damaged.
     """
     connections = [c for c in recording.reader.connections if c.topic == topic and c.msgtype == IMU_TYPE]
     messages, index = recording.reader.messages(connections=connections), 0
@@ -61,13 +60,10 @@ def imu_samples(recording: Recording, topic: str) -> Iterator[tuple[float, np.nd
 
 
 def read_inertial(recording: Recording, topic: str) -> Inertial | None:
-    """Return a whole IMU topic: sorted, repeated times and samples that are not finite dropped, force in m/s².
+    """Reads a whole IMU topic, sorted, without repeated times or values not finite, force in m/s².
 
-    Returns:
-        `None` where fewer than 50 samples are left.
-
-    Raises:
-        RecordingError: Damaged, or its force is neither in g nor in m/s².
+    `None` where fewer than 50 samples are left. Raises `RecordingError` for damage, or a force neither in g nor in
+    m/s².
     """
     samples = [(time, *turn, *push) for time, turn, push in imu_samples(recording, topic)]
     rows = np.asarray(samples, np.float64).reshape(-1, 7)

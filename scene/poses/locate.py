@@ -55,11 +55,7 @@ def locate_given(trajectory: Trajectory) -> Located:
 
 
 def locate_by_odometry(recording: Recording, calibration: Calibration, progress: Stages, partial: Partial) -> Located:
-    """Locates the LiDAR by odometry, helped by the gyro where there is an IMU.
-
-    Raises:
-        FitError: Too few scans.
-    """
+    """Locates the LiDAR by odometry, helped by the gyro where there is an IMU; raises `FitError` for too few scans."""
     inertial, mount = find_inertial(recording, calibration)
     guide = gyro_guide(inertial, mount) if inertial and mount else None
     trajectory = run_odometry(recording, guide, progress, partial).trajectory

@@ -228,16 +228,13 @@ class Odometry:
 
 
 def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog) -> Odometry:
-    """Estimates one pose for each sweep of at least 100 returns.
+    """Estimates one pose for each sweep of at least 100 returns; raises `FitError` for fewer than two.
 
     Args:
         recording: The recording; each scan is read once.
-        guide: See `Guide`; without one, each sweep is expected to go on as the last did.
+        guide: Known motion; without it, each sweep is expected to go on as the last did.
         stage: Counts the scans.
         log: Sweeps that an earlier build tracked, and place for those of this one.
-
-    Raises:
-        FitError: Fewer than two usable scans.
     """
     tracked = log.read()
     tracker = Tracker()

@@ -42,11 +42,11 @@ def register_scans(
     most_uncovered: float = 0.05,
     partial: Partial | None = None,
 ) -> tuple[Cloud, int]:
-    """Return the registered cloud, and how many scans the trajectory did not cover.
+    """Return the registered cloud, and the number of scans that the trajectory did not cover.
 
     Args:
         recording: The scans.
-        trajectory: Where the sensor was.
+        trajectory: Poses of the sensor.
         voxel: Thinning, m.
         stage: Counts the scans.
         most_uncovered: Share of the scans that may lack a pose; those are left out.

@@ -141,10 +141,7 @@ def level_attitudes(
 ) -> Float[np.ndarray, "n 3 3"]:
     """Return attitudes with roll and pitch from gravity and heading from the gyro, from zero.
 
-    Args:
-        times: Evenly spaced, s.
-        rate: rad/s.
-        force: Any unit.
+    Times are even, s; rates in rad/s; forces in any unit.
     """
     step = float(np.median(np.diff(times)))
     up = gaussian_filter1d(force, _LEVEL_TIME / step, axis=0, mode="nearest")
@@ -162,11 +159,7 @@ def turn_along_track(
 ) -> Float[np.ndarray, "n 3 3"]:
     """Turns attitudes slowly about the vertical until their x axis keeps `yaw` rad left of the motion.
 
-    Args:
-        times: Evenly spaced, s.
-        attitude: Whose heading drifts slowly.
-        velocity: In the fixed frame, m/s; weighs by its size.
-        yaw: Angle of the x axis left of the motion, rad.
+    Times are even, s. The velocity in the fixed frame, m/s, weighs by its size.
     """
     step = float(np.median(np.diff(times)))
     facing = np.arctan2(attitude[:, 1, 0], attitude[:, 0, 0])
@@ -185,13 +178,9 @@ def _rotations_about_z(angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3
 def inertial_problem(
     inertial: Inertial, control: Control, lever: Float[np.ndarray, "3"], noise: Noise
 ) -> tuple[Problem, Chain]:
-    """Return the problem of an IMU that carries a prism, and a first guess with its x axis in the direction of motion.
+    """Return the problem of an IMU with a prism, and a first guess whose x axis points along the motion.
 
-    Args:
-        inertial: The IMU; the body's axes are its own.
-        control: Where the prism was.
-        lever: Of the prism in the IMU's axes, m.
-        noise: See `Noise`.
+    The body's axes are the IMU's, and `lever` is the prism in them, m.
     """
     start = max(inertial.times[0], control.times[0])
     end = min(inertial.times[-1], control.times[-1])
@@ -212,14 +201,8 @@ def odometry_problem(
 ) -> tuple[Problem, Chain]:
     """Return the problem of a LiDAR with a prism: attitude and cross-axis shifts from odometry, else control.
 
-    Args:
-        odometry: One pose a sweep; these are the knots.
-        control: Where the prism was.
-        lever: Of the prism in LiDAR coordinates, m.
-        noise: See `Noise`.
-
-    Raises:
-        FitError: The sweeps and the control share fewer than three of the sweeps' times.
+    Knots are the sweeps' poses; `lever` is the prism in LiDAR coordinates, m. Raises `FitError` where sweeps and
+    control share fewer than three times.
     """
     poses = odometry.trajectory
     shared = np.flatnonzero((poses.times >= control.times[0]) & (poses.times <= control.times[-1]))
@@ -288,11 +271,7 @@ def smooth_control(control: Control, times: Float[np.ndarray, " n"]) -> tuple[np
 def make_sightings(
     control: Control, times: Float[np.ndarray, " n"], lever: Float[np.ndarray, "3"], sigma: float
 ) -> Sightings:
-    """Return the control rows that lie between knots.
-
-    Raises:
-        FitError: None does.
-    """
+    """Return the control rows that lie between knots; raises `FitError` where none does."""
     inside = (control.times >= times[0]) & (control.times <= times[-1])
     if not inside.any():
         raise FitError(f"{control.path}: no row of the control lies within the recording")

@@ -64,10 +64,10 @@ class NormalEquations:
         second: Int[np.ndarray, " m"] | None = None,
         jacobian_second: Float[np.ndarray, "m r s"] | None = None,
     ) -> None:
-        """Adds terms already divided by their standard deviations.
+        """Adds terms that are already divided by their standard deviations.
 
         Args:
-            residual: In standard deviations.
+            residual: Residuals, in standard deviations.
             first: Knot of each term.
             jacobian_first: Derivative of the residual by that knot's unknowns.
             second: A later knot of each term, where it joins two.
@@ -96,13 +96,9 @@ class NormalEquations:
         self._right -= np.bincount(place.ravel(), value.ravel(), len(self._right))
 
     def solve(self, damping: float = 0.0) -> Float[np.ndarray, "n s"]:
-        """Return the step that lowers the cost.
+        """Return the step that lowers the cost; raises `FitError` where some unknown is not determined.
 
-        Args:
-            damping: Share of the diagonal added to it (Levenberg-Marquardt).
-
-        Raises:
-            FitError: Some unknown is not determined.
+        `damping` is the share of the diagonal added to it (Levenberg-Marquardt).
         """
         band = self._band.copy()
         band[0] *= 1.0 + damping
@@ -152,13 +148,9 @@ class Motion:
 
 
 def add_motion(equations: NormalEquations, chain: Chain, motion: Motion, smooth: float) -> None:
-    """Adds what rates and forces say of neighbouring knots.
+    """Adds rates and forces between neighbouring knots, linearised at `chain`.
 
-    Args:
-        equations: Added to.
-        chain: Where to linearise.
-        motion: The measurements.
-        smooth: Standard deviation of a position against the mean of two velocities, m.
+    `smooth` is the standard deviation of a position against the mean of two velocities, m.
     """
     here, after = np.arange(len(chain.times) - 1), np.arange(1, len(chain.times))
     span = np.diff(chain.times)[:, None]

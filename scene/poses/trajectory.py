@@ -51,11 +51,7 @@ def save_tum(trajectory: Trajectory, path: Path) -> None:
 
 
 def read_rows(path: Path, kind: str) -> Float[np.ndarray, "n k"]:
-    """Reads rows of numbers, all of one length; an empty file has none.
-
-    Raises:
-        RecordingError: Missing, or not `kind`.
-    """
+    """Reads rows of numbers of one length, none from an empty file; raises `RecordingError` where it is not `kind`."""
     require_input(path)
     try:
         with warnings.catch_warnings():
@@ -68,8 +64,7 @@ def read_rows(path: Path, kind: str) -> Float[np.ndarray, "n k"]:
 def load_tum(path: Path) -> Trajectory:
     """Reads `t x y z qx qy qz qw` rows; rows out of order are sorted, repeated times dropped.
 
-    Raises:
-        RecordingError: Unreadable, malformed, or positions without orientation.
+    Raises `RecordingError` for a file that is unreadable, malformed, or has positions without orientation.
     """
     rows = read_rows(path, "a TUM trajectory")
     if rows.shape[1:] != (8,) or len(rows) < 2:
@@ -105,15 +100,9 @@ class Control:
     dropped: int  # Rows left out because their time was repeated
 
     def require_overlap(self, start: float, end: float, recording: Path) -> None:
-        """Refuses control that misses much of the recording.
+        """Refuses control that shares less than half of a recording's time, from `start` to `end`, s.
 
-        Args:
-            start: Of the recording, s.
-            end: Of the recording, s.
-            recording: For the message.
-
-        Raises:
-            RecordingError: Less than half of the recording's time lies between the first and the last row.
+        Raises `RecordingError`.
         """
         first, last = float(self.times[0]), float(self.times[-1])
         shared = max(min(end, last) - max(start, first), 0.0)
@@ -127,8 +116,7 @@ class Control:
 def load_control(path: Path) -> Control:
     """Reads TUM rows `t x y z …`; rows out of order are sorted, repeated times dropped, orientations ignored.
 
-    Raises:
-        RecordingError: Unreadable, malformed, too few rows, or all at one place.
+    Raises `RecordingError` for a file that is unreadable or malformed, has too few rows, or all at one place.
     """
     rows = read_rows(path, "position control in TUM form")
     if rows.size and rows.shape[1] not in (4, 8):

@@ -127,11 +127,7 @@ def register_reader(
 def load_readers(source: str) -> None:
     """Runs a user's module, which calls `register_reader`.
 
-    Args:
-        source: Path of a `.py` file, or name of a module that can be imported.
-
-    Raises:
-        RecordingError: There is no such file or module, or it fails.
+    `source` is the path of a `.py` file or the name of an importable module. Raises `RecordingError` where it fails.
     """
     path = Path(source)
     try:
@@ -161,14 +157,9 @@ def own_readers() -> list[str]:
 
 
 def detect(path: Path, name: str | None = None) -> Detected:
-    """Finds the format of an input by its first bytes, then by its name.
+    """Finds the format of an input by its first bytes, then by its name; a format's `name` takes the place of both.
 
-    Args:
-        path: A file or folder that exists.
-        name: A format's name; nothing is detected then.
-
-    Raises:
-        RecordingError: Of no known kind, or `name` is no format.
+    Raises `RecordingError` for an input of no known kind and for the name of no format.
     """
     rows = {row.name: row for row in (*_own.values(), *_TABLE)}
     if name is not None:

@@ -27,11 +27,7 @@ _SAME_FACTOR = 1e-6  # a foot and a US survey foot differ by 2e-6
 
 
 def declared_unit(records: Iterable[Any]) -> str | None:
-    """Return a key of `frame.UNITS`, or what else the coordinates are in, in words; `None` where no record says.
-
-    Args:
-        records: VLRs and EVLRs as `laspy` parsed them.
-    """
+    """Return a key of `UNITS`, or other units in words, from VLRs and EVLRs of `laspy`; `None` where no record says."""
     found = list(records)
     for record in found:
         if isinstance(record, WktCoordinateSystemVlr):
@@ -95,11 +91,7 @@ _LARGEST_CHUNK = 10_000_000  # points; LASzip writes 50,000
 
 
 def open_las(path: Path) -> CloudSource:
-    """Return the points of a LAS or LAZ file.
-
-    Raises:
-        ValueError: Damaged, or with fewer bytes than its header promises.
-    """
+    """Opens a LAS or LAZ file; raises `ValueError` for damage, or fewer bytes than its header promises."""
     _require_sane_header(path)
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
         header = reader.header
@@ -185,11 +177,7 @@ _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
 def open_e57(path: Path) -> CloudSource:
-    """Return the points of every scan of an E57 file, in the frame of the file.
-
-    Raises:
-        ValueError: Damaged, or without coordinates.
-    """
+    """Opens all scans of an E57 file, in the file's frame; raises `ValueError` for damage or missing coordinates."""
     with E57(str(path)) as file:
         scans = file.scan_count
 

@@ -17,11 +17,7 @@ _PLY_BYTES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint
 
 
 def open_ply(path: Path) -> CloudSource:
-    """Return the vertices of a PLY file.
-
-    Raises:
-        ValueError: Damaged, or with fewer bytes than its header promises.
-    """
+    """Opens the vertices of a PLY file; raises `ValueError` for damage, or fewer bytes than its header promises."""
     lines, size = _ply_header(path)
     form = lines[1].split()[1] if len(lines) > 1 and lines[1].startswith("format ") else "unknown"
     count, names, first = _ply_vertices(lines, path.stat().st_size - size, form == "ascii")
@@ -37,11 +33,7 @@ def open_ply(path: Path) -> CloudSource:
 
 
 def read_ply_records(path: Path) -> np.ndarray:
-    """Reads all vertices with all their properties; binary ones stay on disk until they are touched.
-
-    Raises:
-        ValueError: Damaged, or with fewer bytes than its header promises.
-    """
+    """Reads all vertices with all their properties, as `open_ply`; binary ones stay on disk until they are touched."""
     lines, size = _ply_header(path)
     _ply_vertices(lines, path.stat().st_size - size, "format ascii 1.0" in lines)
     return PlyData.read(str(path), mmap="c")["vertex"].data
@@ -89,11 +81,7 @@ _LARGEST_RATIO = 100  # LZF copies at most 264 bytes by 3
 
 
 def open_pcd(path: Path) -> CloudSource:
-    """Return the points of a PCD file.
-
-    Raises:
-        ValueError: Damaged, or with fewer bytes than its header promises.
-    """
+    """Opens the points of a PCD file; raises `ValueError` for damage, or fewer bytes than its header promises."""
     meta, start, line = _pcd_header(path)
     if meta.data is Encoding.ASCII:
         names = _column_names(meta)
@@ -107,11 +95,7 @@ def open_pcd(path: Path) -> CloudSource:
 
 
 def read_pcd_records(path: Path) -> np.ndarray:
-    """Reads all points with all their fields; uncompressed ones stay on disk until they are touched.
-
-    Raises:
-        ValueError: Damaged, or with fewer bytes than its header promises.
-    """
+    """Reads all points with all their fields, as `open_pcd`; uncompressed ones stay on disk until they are touched."""
     meta, start, line = _pcd_header(path)
     kind = meta.build_dtype()
     body = path.stat().st_size - start

@@ -72,11 +72,7 @@ class Recording:
         return self._source.reader
 
     def deserialize(self, raw: bytes, message_type: str) -> Any:
-        """Return a message of a standard type from `reader` as an object, whatever the bag's serialisation.
-
-        Raises:
-            Exception: Whatever the library raises on damage.
-        """
+        """Return a message of a standard type from `reader` as an object; the library raises anything on damage."""
         return self._source.deserialize(raw, message_type)
 
     def __enter__(self) -> "Recording":
@@ -88,15 +84,10 @@ class Recording:
         self._source.close()
 
     def scans(self, after: ReadPosition = START) -> Iterator[Scan]:
-        """Yields the scans in the order of the recording.
+        """Yields the scans in the order of the recording, from the position `after` on.
 
-        A scan whose time does not grow is left out and counted in `facts`.
-
-        Args:
-            after: Position to go on from; the messages before it are not read.
-
-        Raises:
-            RecordingError: A message is damaged, or more than 5 % of the times do not grow; says which.
+        A scan whose time does not grow is left out and counted in `facts`. Raises `RecordingError`, which says which
+        message is damaged, or where more than 5 % of the times do not grow.
         """
         self.position, last, late = after, after.last, after.late
         if late:
@@ -123,8 +114,7 @@ class Recording:
     def peek(self) -> dict[str, Any]:
         """Return `facts` with those that only a scan can tell; reads up to the first scan with a return.
 
-        Raises:
-            RecordingError: There is none, or it is damaged.
+        Raises `RecordingError` where there is none, or it is damaged.
         """
         for scan in self._source.scans():
             if len(scan.points):  # a sensor that is starting up sends empty sweeps
@@ -132,15 +122,10 @@ class Recording:
         raise RecordingError(f"{self.path}: {self.topic} holds no scan with a return in it")
 
     def up_at_start(self, duration: float) -> Float[np.ndarray, "3"] | None:
-        """Return the unit vector against gravity in the LiDAR's frame at the start; `None` without an IMU.
+        """Return the unit vector against gravity in the LiDAR's frame, over the first `duration` s; `None` without IMU.
 
         Reads the IMU beside the LiDAR's topic (`/livox/imu` for `/livox/lidar`), which shares its axes, in any unit.
-
-        Args:
-            duration: Time to average over, s.
-
-        Raises:
-            RecordingError: A message is damaged.
+        Raises `RecordingError` where a message is damaged.
         """
         beside = self.topic.rsplit("/", 1)[0]
         imus = [c for c in self.reader.connections if c.msgtype == _IMU_TYPE and c.topic.rsplit("/", 1)[0] == beside]

@@ -30,11 +30,7 @@ class Sheet:
 
 @contextmanager
 def open_sheets(path: Path) -> Iterator[Iterator[Sheet]]:
-    """Return the tables of a file, each to be read before the next is asked for.
-
-    Raises:
-        Exception: Whatever the library raises on damage.
-    """
+    """Opens the tables of a file, each to be read before the next is taken; the library raises anything on damage."""
     if path.suffix.lower() == ".xlsx":
         with path.open("rb") as file:
             book = openpyxl.load_workbook(file, read_only=True, data_only=True)
@@ -111,14 +107,10 @@ def is_ring_survey(path: Path) -> bool:
 
 
 def read_ring_survey(path: Path, unit: str | None = None) -> RingSurvey:
-    """Reads a ring survey.
+    """Reads a ring survey, CSV or XLSX; `unit`, a key of `UNITS`, overrides the header.
 
-    Args:
-        path: CSV or XLSX. In the layout with `POINT` this must be text, since `0.10` is not `0.1`.
-        unit: A key of `frame.UNITS`, overriding the header.
-
-    Raises:
-        RecordingError: Names the file, and the line or the sheet and row.
+    In the layout with `POINT` this must be text, since `0.10` is not `0.1`. Raises `RecordingError`, which names the
+    file and the line, or the sheet and row.
     """
     if unit not in (None, *UNITS):
         raise RecordingError(f"{path}: unit {unit!r} is none of {UNIT_NAMES}")

@@ -26,11 +26,7 @@ _KNOWN_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
 
 
 def open_mcap(path: Path) -> Any:
-    """Opens a file with the library's reader; types are named as ROS2 names them.
-
-    Raises:
-        Exception: Whatever the library raises on damage.
-    """
+    """Opens a file with the library's reader; types are named as ROS2 names them."""
     reader: Any = Reader2.STORAGE_PLUGINS[".mcap"](_AnyProfile(path))  # type: ignore[arg-type]
     reader.schemas = _Schemas()
     reader.open()
@@ -130,11 +126,7 @@ class RosBag(ScanSource):
     def scans(self, skip: int = 0) -> Iterator[Scan]:
         """Yields the scans in the order of the bag; a header without a stamp takes the time of its message.
 
-        Args:
-            skip: Messages at the start that are not parsed.
-
-        Raises:
-            RecordingError: A message is damaged; says which.
+        The first `skip` messages are not parsed. Raises `RecordingError`, which says which message is damaged.
         """
         index = 0
         messages = self.reader.messages(connections=self._connections)

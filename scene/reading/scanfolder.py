@@ -21,8 +21,7 @@ _KITTI = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"
 def open_folder(path: Path, topic: str | None = None) -> ScanSource:
     """Opens a folder of timed scans, in the order of their names; `topic` is not used.
 
-    Raises:
-        RecordingError: No scans, or no times for them.
+    Raises `RecordingError` where there are no scans, or no times for them.
     """
     files = scan_files(path)
     if not files:

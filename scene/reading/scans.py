@@ -68,9 +68,9 @@ class ScanSource:
         """Describes the recording.
 
         Args:
-            path: See the attributes.
-            scan_count: See the attributes.
-            facts: See the attributes.
+            path: See the attributes, as for `scan_count` and `facts`.
+            scan_count: Number of scans.
+            facts: Detected facts.
             read: Reads the scan of a number from 0, as `make_scan` returns it; may raise anything on damage.
             close: Closes the file.
         """
@@ -78,14 +78,7 @@ class ScanSource:
         self._read, self._close = read, close
 
     def scans(self, skip: int = 0) -> Iterator[Scan]:
-        """Yields the scans in the order of their numbers.
-
-        Args:
-            skip: Scans at the start that are not read.
-
-        Raises:
-            RecordingError: A scan is damaged; says which.
-        """
+        """Yields the scans from number `skip` on; raises `RecordingError`, which says which is damaged."""
         for index in range(skip, self.scan_count):
             try:
                 scan, convention = self._read(index)
@@ -122,10 +115,10 @@ def make_scan(
     Returns at the origin (nothing came back) and those that are not finite, in place or time, are dropped.
 
     Args:
-        stamp: Of the message, s.
-        points: m.
+        stamp: Stamp of the message, s.
+        points: Points in the sensor frame, m.
         values: Point times as stored; `None` where there are none.
-        name: Their field.
+        name: Name of their field.
 
     Raises:
         ValueError: The point times span more than a sweep can last.
@@ -148,8 +141,7 @@ def make_scan(
 def scan_from_records(stamp: float, records: Shaped[np.ndarray, " n"]) -> tuple[Scan, str]:
     """Return a sweep from points with fields x, y, z (m) and perhaps a time, and the convention of its point times.
 
-    Raises:
-        ValueError: A coordinate is missing, or the point times span more than a sweep can last.
+    Raises `ValueError` where a coordinate is missing, or the times span more than a sweep can last.
     """
     name = next((name for name in TIME_FIELDS if name in (records.dtype.names or ())), None)
     points = stack_xyz(records).astype(np.float32)
@@ -205,12 +197,9 @@ _TAG_RETURN_MASK = 0x20
 
 
 def parse_custom_msg(raw: bytes) -> Scan:
-    """Parses a `CustomMsg` as ROS1 serialises it.
+    """Parses a `CustomMsg` as ROS1 serialises it; raises `ValueError` where the bytes are not a whole one.
 
     Points at the origin (no return), not finite, or tagged as noise are dropped.
-
-    Raises:
-        ValueError: The bytes are not a whole `CustomMsg`.
     """
     try:
         _, secs, nsecs, frame_length = struct.unpack_from("<IIII", raw, 0)
@@ -223,11 +212,7 @@ def parse_custom_msg(raw: bytes) -> Scan:
 
 
 def parse_custom_msg_cdr(raw: bytes) -> Scan:
-    """Parses a `CustomMsg` as ROS2 serialises it (CDR, little-endian); else as `parse_custom_msg`.
-
-    Raises:
-        ValueError: The bytes are not a whole `CustomMsg`.
-    """
+    """Parses a `CustomMsg` as ROS2 serialises it (CDR, little-endian); otherwise as `parse_custom_msg`."""
     try:
         if raw[:2] != b"\x00\x01":
             raise ValueError(f"encapsulation {raw[:2].hex()} is not little-endian CDR")
@@ -257,14 +242,9 @@ _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 
 
 def parse_pointcloud2(message: Any, stamp: float) -> tuple[Scan, str]:
-    """Parses one deserialised message; returns the sweep and the convention of its point times.
+    """Parses a deserialised message with the stamp of its header, s; returns the sweep and the convention of its times.
 
-    Args:
-        message: With the fields of `sensor_msgs/PointCloud2`.
-        stamp: Of its header, s.
-
-    Raises:
-        ValueError: Without coordinates, of a layout that contradicts itself, or with times of no sweep.
+    Raises `ValueError` without coordinates, for a layout that contradicts itself, or times of no sweep.
     """
     points = _cloud_records(message)
     names = points.dtype.names or ()

@@ -28,12 +28,9 @@ def cause(error: BaseException) -> str:
 
 @contextmanager
 def refuse_damage(path: Path, what: str, kind: type[SubterraError]) -> Iterator[None]:
-    """Turns whatever the block raises into one sentence about `path`.
+    """Turns whatever the block raises into one sentence about `path`; errors of this project pass as they are.
 
-    Args:
-        path: The file at fault.
-        what: Description that the file does not meet, such as `a readable PLY cloud`.
-        kind: Raised in its place; errors of this project pass as they are.
+    `what` is the description that the file does not meet, such as `a readable PLY cloud`; `kind` is raised.
     """
     try:
         yield
@@ -60,11 +57,7 @@ class CloudSource:
 
 
 def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:
-    """Return x, y and z of structured records as float64.
-
-    Raises:
-        ValueError: A coordinate is missing.
-    """
+    """Return x, y and z of structured records as float64; raises `ValueError` where one is missing."""
     missing = [name for name in "xyz" if name not in (records.dtype.names or ())]
     if missing:
         raise ValueError(f"it has no field {', '.join(missing)}")
@@ -98,11 +91,7 @@ class Lines:
     decimal_comma: bool = False  # True where `1,5` means one and a half
 
     def rows(self) -> Iterator[Float[np.ndarray, "n k"]]:
-        """Return the columns as numbers, block by block.
-
-        Raises:
-            ValueError: A line does not hold them, or there are fewer lines than promised; says which.
-        """
+        """Yields the columns as numbers, block by block; raises `ValueError`, which names the line at fault."""
         line, left = self.line, self.count
         with self.path.open("rb") as file:
             file.seek(self.start)
@@ -127,15 +116,9 @@ class Lines:
             raise ValueError(f"it ends after {(self.count or 0) - left} of {self.count} points")
 
     def parse(self, block: bytes, first: int, limit: int | None = None) -> Float[np.ndarray, "n k"]:
-        """Return the columns of a block of whole lines.
+        """Return the columns of a block of whole lines, at most `limit` rows; `first` is the number of its first line.
 
-        Args:
-            block: The lines.
-            first: Number of the first one, for messages.
-            limit: Largest number of rows.
-
-        Raises:
-            ValueError: A line does not hold them; says which.
+        Raises `ValueError`, which names the line that does not hold them.
         """
         lines = block.decode("utf-8", "replace").splitlines()
         if self.decimal_comma:

@@ -40,8 +40,7 @@ def plain_name(name: str) -> tuple[str, str | None]:
 def find_xyz(names: Sequence[str]) -> tuple[list[int], str | None] | None:
     """Finds the columns of x, y and z, and their declared unit; `None` where one is missing.
 
-    Raises:
-        ValueError: The three columns declare different units.
+    Raises `ValueError` where the three declare different units.
     """
     known = [plain_name(name) for name in names]
     bare = [name for name, _ in known]
@@ -63,10 +62,9 @@ _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
 
 
 def open_table(path: Path) -> CloudSource:
-    """Return the points of a text table: columns by the names of its header, or the first three.
+    """Opens a text table: columns by the names of its header, or the first three.
 
-    Raises:
-        ValueError: No text, or no line with three numbers near its start.
+    Raises `ValueError` where it is no text, or no line near its start holds three numbers.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -131,10 +129,9 @@ def _sample_lines(text: Lines) -> np.ndarray:
 
 
 def open_parquet(path: Path) -> CloudSource:
-    """Return the columns x, y, z (or easting, northing, elevation) of a Parquet file.
+    """Opens the columns x, y, z (or easting, northing, elevation) of a Parquet file.
 
-    Raises:
-        ValueError: Damaged, without such columns, or with columns that hold no numbers.
+    Raises `ValueError` for damage, missing columns, or columns that hold no numbers.
     """
     with pq.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows

@@ -62,14 +62,9 @@ class Elements:
 
 
 def lay_out(rng: np.random.Generator, length: float, elements: Elements) -> Alignment:
-    """Return the centreline of `elements`.
+    """Return the centreline of `elements`, of a length between the mouths, m.
 
     The survey frame has z up; heading and origin in it are drawn, so that no axis of the frame follows the bore.
-
-    Args:
-        rng: Source of randomness.
-        length: Length between the mouths, m.
-        elements: Curvature and grade by station.
     """
     heading = rng.uniform(-np.pi, np.pi)
     origin = np.concatenate([rng.uniform(-2000.0, 2000.0, 2), rng.uniform(-40.0, 40.0, 1)])
@@ -97,12 +92,7 @@ _GRADE_STEP = 25.0  # m between the knots of the grade
 
 
 def draw_railway(rng: np.random.Generator, length: float) -> Elements:
-    """Draws bends of 150 to 400 m radius, to either side in turn, and grades within ±1 %.
-
-    Args:
-        rng: Source of randomness.
-        length: Length between the mouths, m.
-    """
+    """Draws bends of 150 to 400 m radius, to either side in turn, and grades within ±1 %."""
     # Short bores get short elements, so that 15 m bend too.
     scale = float(np.clip(length / 90.0, 0.2, 1.5))
     knots, curvature = [-MARGIN, rng.uniform(8.0, 16.0) * scale], [0.0, 0.0]

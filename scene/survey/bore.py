@@ -91,13 +91,9 @@ def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correla
 def draw_bore(
     seed: np.random.SeedSequence, length: float, truth: TruthName = "paper", correlation: float = 2.0
 ) -> Bore:
-    """Draw a bore.
+    """Draws a bore of a length between the mouths, m, and a class.
 
-    Args:
-        seed: Source of randomness.
-        length: Between the mouths, m.
-        truth: Its class.
-        correlation: Correlation length of the walls of `irregular`, m; the others do not use it.
+    `correlation` is the length in which the walls of `irregular` decorrelate, m; the others do not use it.
     """
     first, second, third = (np.random.default_rng(s) for s in seed.spawn(3))
     kind = _CLASSES[truth]

@@ -150,17 +150,10 @@ class Inertial:
 def measure_inertial(
     rng: np.random.Generator, lidar: Carried, rate: float, mount: Mount, errors: SensorErrors
 ) -> Inertial:
-    """Simulate an IMU.
+    """Simulates an IMU, `mount` against the LiDAR, that samples at `rate`, Hz.
 
     With `imu_noise`, roll and pitch of its orientation are off by 0.2° (1 σ), slowly changing; its heading is
     magnetic, so it has an offset of up to 15° and wanders by 1°.
-
-    Args:
-        rng: Source of randomness.
-        lidar: The LiDAR's motion.
-        rate: Samples per second, Hz.
-        mount: Of the IMU against the LiDAR.
-        errors: `imu_noise` and `imu_bias`.
     """
     time = np.arange(round(lidar.walk.duration * rate)) / rate
     turn = Rotation.from_matrix(mount.rotation.T)

@@ -33,12 +33,7 @@ class Caster:
     """
 
     def __init__(self, mesh: Mesh, behind: float = 20.0) -> None:
-        """Take the mesh.
-
-        Args:
-            mesh: True surfaces.
-            behind: Length of the mesh kept behind the carrier, m.
-        """
+        """Takes the mesh, of which `behind` m are kept behind the carrier."""
         self._mesh = mesh
         self._behind = behind
         self._window: int | None = None
@@ -59,12 +54,7 @@ class Caster:
         self._window = window
 
     def cast_loaded(self, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]) -> Hits:
-        """Return the first surface of the loaded part on each ray.
-
-        Args:
-            origin: Survey frame, m.
-            direction: Unit vectors, survey frame.
-        """
+        """Return the first loaded surface on each ray, of an origin, m, and a unit direction in the survey frame."""
         direction = np.ascontiguousarray(direction, np.float32)
         hit = self._scene.run((origin - self._origin).astype(np.float32), direction, output=True)
         normal, found = hit["Ng"], hit["primID"] >= 0
@@ -92,12 +82,6 @@ def draw_returns(rng: np.random.Generator, lidar: Lidar, errors: SensorErrors, h
     The echo is albedo · cos(incidence) / distance², faded by a log-normal factor; it returns if it exceeds the
     weakest that the LiDAR detects. On a concrete wall beside the track that ends the Avia's view at about 60 to 70 m.
     A surface that is hit from behind never returns.
-
-    Args:
-        rng: Source of randomness.
-        lidar: Its ranges and its weakest echo.
-        errors: `weak_echoes` and `lost`.
-        hits: First surface on each pulse.
     """
     distance, cosine = hits.distance, hits.cosine
     seen = (distance >= lidar.range_min) & (distance <= lidar.range_max) & (cosine > 0.0)
@@ -132,16 +116,7 @@ def mix_pixels(
 
     A beam straddles an edge if a ray from its rim, to a drawn side, meets a surface more than `EDGE_STEP` off the
     plane that its middle meets, and less than `PULSE` further or nearer. Of those, `share` report a distance drawn
-    evenly between the two.
-
-    Args:
-        rng: Source of randomness.
-        lidar: Its divergence.
-        share: Of the beams that straddle an edge.
-        caster: Of the true mesh, loaded about the carrier.
-        origin: Of the rays, survey frame, m.
-        heading: Unit vectors, survey frame.
-        hits: First surface on the middle of each beam.
+    evenly between the two. Rays are in the survey frame, m; `hits` is the first surface on the middle of each.
     """
     chosen = np.flatnonzero((rng.random(len(heading), np.float32) < share) & np.isfinite(hits.distance))
     ray, near, normal = heading[chosen], hits.distance[chosen], hits.normal[chosen]

@@ -73,11 +73,7 @@ class SurveyConfig:
 
 
 def check_survey(config: SurveyConfig) -> None:
-    """Refuse what cannot be simulated.
-
-    Raises:
-        ValueError: A field is out of range, or `out` is a file.
-    """
+    """Refuses what cannot be simulated: raises `ValueError` for a field out of range, or an `out` that is a file."""
     if not 10.0 < config.length <= 2000.0:
         raise ValueError(f"length must be more than 10 m and at most 2000 m, got {config.length:g}")
     if config.truth == "metro" and config.length > METRO_LENGTH:

@@ -57,11 +57,9 @@ def avia_point_times(point_rate: int) -> Int[np.ndarray, "n"]:
 
 
 def avia_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors in the LiDAR frame.
+    """Return unit vectors in the LiDAR frame at times, s, in whole turns of the six lines.
 
-    Args:
-        time: Time of each point, s. Points come in whole turns of the six lines.
-        phase: Angles of the two prisms at time 0, rad.
+    `phase` holds the angles of the two prisms at time 0, rad.
     """
     first, second = (2.0 * np.pi * rate * time + p for rate, p in zip(_AVIA_PRISM_RATE, phase, strict=True))
     line = np.arange(len(time)) % AVIA_LINES - 0.5 * (AVIA_LINES - 1)
@@ -90,12 +88,7 @@ _RING = np.argsort(np.argsort(_FIRED))  # rings count upwards
 
 
 def vlp16_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors in the LiDAR frame.
-
-    Args:
-        time: Time of each beam, s, in whole firings.
-        phase: Azimuth at time 0 in its first entry, rad.
-    """
+    """Return unit vectors in the LiDAR frame at times, s, in whole firings; `phase[0]`: azimuth at time 0, rad."""
     azimuth = phase[0] - 2.0 * np.pi * time / SCAN_PERIOD
     elevation = np.deg2rad(_FIRED)[np.arange(len(time)) % VLP16_RINGS]
     level = np.cos(elevation)
@@ -118,12 +111,7 @@ _OS1_AZIMUTH = np.deg2rad(np.tile([4.22, 1.41, -1.41, -4.22], OS1_RINGS // 4))
 
 
 def os1_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors in the LiDAR frame.
-
-    Args:
-        time: Time of each beam, s, in whole columns.
-        phase: Not used: a sweep begins backwards, where the encoder starts.
-    """
+    """Return unit vectors in the LiDAR frame at times, s, in whole columns; `phase` is not used: a sweep begins behind."""
     ring = np.arange(len(time)) % OS1_RINGS
     azimuth = np.pi - 2.0 * np.pi * time / SCAN_PERIOD + _OS1_AZIMUTH[ring]
     level = np.cos(_OS1_ELEVATION)[ring]

@@ -99,14 +99,10 @@ def imu_messages(
     gyro: Float[np.ndarray, "n 3"],
     accel: Float[np.ndarray, "n 3"],
 ) -> list[bytes]:
-    """Serialises `sensor_msgs/Imu` messages.
+    """Serialises `sensor_msgs/Imu` messages of times since the start of the survey, ns.
 
-    Args:
-        frame: Frame id.
-        nanoseconds: Times since the start of the survey, ns.
-        quaternion: Orientations x, y, z, w; None leaves zeros and says so by a covariance of -1.
-        gyro: rad/s.
-        accel: In the unit in which the topic is published.
+    `quaternion` is x, y, z, w; `None` leaves zeros and a covariance of -1. Rates are in rad/s, accelerations in the
+    topic's own unit.
     """
     layout = np.dtype([
         ("seq", "<u4"), ("sec", "<u4"), ("nsec", "<u4"), ("size", "<u4"), ("frame", f"S{len(frame)}"),

@@ -34,14 +34,10 @@ class Field:
 
 
 def draw_field(rng: np.random.Generator, sigma: float, correlation: float, dims: int = 1, terms: int = 96) -> Field:
-    """Draw a field.
+    """Draws a field of `dims` arguments as a sum of `terms` cosines.
 
-    Args:
-        rng: Source of randomness.
-        sigma: Standard deviation of the values.
-        correlation: Correlation length c, where the correlation has fallen to 1/e, in the unit of the argument.
-        dims: Number of arguments.
-        terms: Number of cosines.
+    `sigma` is the standard deviation of its values. Over `correlation`, in the unit of the argument, the correlation
+    falls to 1/e.
     """
     frequency = rng.normal(0.0, np.sqrt(2.0) / correlation, size=(terms, dims))
     return Field(frequency, rng.uniform(0.0, 2.0 * np.pi, terms), sigma * np.sqrt(2.0 / terms))
@@ -111,11 +107,9 @@ def _arc(centre: tuple[float, float], radius: float, begin: float, end: float) -
 
 
 def _sample_half(half: Float[np.ndarray, "n 2"], breaks: tuple[float, ...] = ()) -> dict[str, object]:
-    """Fields of the shape whose left half, from foot to crown, is the dense outline `half`.
+    """Fields of the shape whose left half, foot to crown, is a dense outline (lateral, above the floor), m.
 
-    Args:
-        half: Along `lateral`, and above the floor, m.
-        breaks: Heights above the floor where a node must lie, m.
+    Nodes lie at the heights `breaks` above the floor, m.
     """
     half = half[np.concatenate([[True], np.linalg.norm(np.diff(half, axis=0), axis=1) > 1e-9])]
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(half, axis=0), axis=1))])

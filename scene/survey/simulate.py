@@ -51,14 +51,7 @@ def make_device(name: LidarName, config: SurveyConfig) -> Device:
 def draw_imu_messages(
     seeds: list[np.random.SeedSequence], name: LidarName, carried: Carried, config: SurveyConfig
 ) -> list[Message]:
-    """Draws the messages of all IMUs of a device, in order of time.
-
-    Args:
-        seeds: One for each IMU.
-        name: Of the device.
-        carried: Motion of its LiDAR.
-        config: Of the survey.
-    """
+    """Draws the messages of all IMUs of a device, in order of time, with a seed for each."""
     out = []
     for seed, one in zip(seeds, IMUS[name], strict=True):
         sample = measure_inertial(np.random.default_rng(seed), carried, one.rate, one.mount, config.errors)
@@ -72,16 +65,10 @@ def draw_imu_messages(
 def write_recording(
     path: Path, device: Device, sweeps: Iterable[Sweep], inertial: list[Message], cloud: CloudWriter | None
 ) -> int:
-    """Write the bag, and the cloud if asked; return the number of returns.
+    """Writes the bag, and the returns to `cloud` if asked; returns the number of returns.
 
-    A message is recorded when it is complete: a sweep one period after its first point.
-
-    Args:
-        path: Bag to write.
-        device: Device that is recorded.
-        sweeps: In order of time.
-        inertial: Messages of the IMUs, in order of time.
-        cloud: Where to put the placed returns too.
+    A message is recorded when it is complete: a sweep one period after its first point. Sweeps and IMU messages come in
+    the order of time.
     """
     returns, waiting = 0, iter([*inertial, (2**62, "", b"")])
     kinds = {topic: (messages.IMU_TYPE, messages.IMU_DEFINITION, messages.IMU_MD5) for _, topic, _ in inertial}

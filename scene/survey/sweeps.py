@@ -23,15 +23,9 @@ def n_sweeps(carried: Carried, every: int) -> int:
 def sweeps(
     rng: np.random.Generator, lidar: Lidar, carried: Carried, caster: Caster, errors: SensorErrors, every: int = 1
 ) -> Iterator[Sweep]:
-    """Yields sweeps in order of time; every point is cast from the pose at its own time.
+    """Yields every `every`-th sweep in order of time; every point is cast from the pose at its own time.
 
-    Args:
-        rng: Source of randomness.
-        lidar: Model of the LiDAR.
-        carried: Its motion.
-        caster: Of the true mesh.
-        errors: Without `distortion`, all points of a sweep are measured at its stamp, and say so.
-        every: Keep every so many sweeps; those left out are not cast.
+    Without `distortion` in `errors`, all points of a sweep are measured at its stamp, and say so.
     """
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     offset = lidar.offset if errors.distortion else np.full_like(lidar.offset, lidar.stamp)

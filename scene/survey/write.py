@@ -51,14 +51,7 @@ def write_tum(
     position: Float[np.ndarray, "n 3"],
     quaternion: Float[np.ndarray, "n 4"] | None,
 ) -> None:
-    """Write rows of `t x y z qx qy qz qw`; the quaternion is all zero where there is none.
-
-    Args:
-        path: File to write.
-        time: s since the start of the survey.
-        position: m.
-        quaternion: x, y, z, w, or None.
-    """
+    """Writes rows of `t x y z qx qy qz qw`, s since the survey's start, m; without a quaternion its part is zero."""
     turns = np.zeros((len(time), 4)) if quaternion is None else quaternion
     with replace_file(path) as part, part.open("w") as file:
         for t, p, q in zip(time, position, turns, strict=True):

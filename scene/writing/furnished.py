@@ -48,8 +48,7 @@ def planar_segments(
 ) -> Float[np.ndarray, "f 4"]:
     """Return outlines of the pieces where a surface `height` m above the track cuts them.
 
-    Returns:
-        Segments `x0, y0, x1, y1`, m; those of one piece follow one another and close.
+    They are segments `x0, y0, x1, y1`, m; those of one piece follow one another and close.
     """
     if not pieces:
         return np.empty((0, 4))

@@ -76,13 +76,13 @@ def add_mesh(
     """Adds a mesh for looks and rays, stored about its own whole-metre origin so that few digits suffice.
 
     Args:
-        asset: Where the mesh is declared.
-        world: Where it is placed.
-        folder: For its file.
-        name: Of mesh, geom and file.
-        mesh: In the tunnel frame, m.
-        material: Of the geom.
-        group: Of the geom.
+        asset: Element that declares the mesh.
+        world: Element that places it.
+        folder: Folder of its file.
+        name: Name of mesh, geom and file.
+        mesh: The mesh in the tunnel frame, m.
+        material: Material of the geom.
+        group: Group of the geom.
         coordinates: Texture coordinates, and which of them each corner of each face has, `(f, 3)`.
         reuse: Take a file of that name that is there already.
     """

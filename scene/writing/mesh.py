@@ -16,12 +16,8 @@ _MOUTH_TOLERANCE = 1e-4
 def build_solid(bore: Bore, pockets: bool) -> Manifold:
     """Builds the air of the bore as one solid, closed at both mouths, of triangles of about 0.2 m.
 
-    Args:
-        bore: The bore.
-        pockets: Make the recesses of the lining part of the air.
-
-    Raises:
-        FitError: The sections fold into each other, so that no solid comes out.
+    With `pockets`, the recesses of the lining are part of the air. Raises `FitError` where sections fold into each
+    other.
     """
     _require_unfolded(bore)
     plane = unrolled.unroll_section(bore)

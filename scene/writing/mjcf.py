@@ -52,21 +52,10 @@ def write_scene(
     config: SceneConfig,
     furnished: Furnished | None = None,
 ) -> dict[str, int]:
-    """Writes `scene.xml` and the meshes it draws.
+    """Writes `scene.xml` and the meshes it draws; returns the number of each asset.
 
-    Args:
-        folder: Where to.
-        name: Of the model.
-        bore: The bore.
-        lining: As it is drawn.
-        walls: At the LiDAR's height.
-        track: The track.
-        config: How the scene is cut and dressed.
-        furnished: Furniture of the bore; with it the file is `scene_furnished.xml`, which shares the meshes that a
-            call without it has written into the same folder.
-
-    Returns:
-        How many of each asset there are.
+    With furniture the file is `scene_furnished.xml`. It shares the meshes that a call without furniture has written
+    into the same folder. `walls` are those at the LiDAR's height.
     """
     meshes = folder / "meshes"
     meshes.mkdir(exist_ok=True)

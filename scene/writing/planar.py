@@ -27,19 +27,10 @@ class Walls:
 
 
 def cut_walls(solid: Manifold, bore: Bore, elevation: Float[np.ndarray, " n"], height: float) -> Walls:
-    """Cuts the solid by a surface `height` above the track.
+    """Cuts the solid by a surface `height` m above the track, whose z at each station is `elevation`, m.
 
     The solid is levelled first (each vertex lowered by the track's elevation at its station), so that the cut follows
-    the grade.
-
-    Args:
-        solid: The bore, closed at its mouths.
-        bore: For the centreline.
-        elevation: z of the track at each station of the bore, m.
-        height: Of the LiDAR plane above it, m.
-
-    Raises:
-        FitError: There is no wall on both sides at that height.
+    the grade. Raises `FitError` where there is no wall on both sides at that height.
     """
     mesh = solid.to_mesh64()
     vertices = np.array(mesh.vert_properties[:, :3])

@@ -85,13 +85,8 @@ class Track:
 def lay_track(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None) -> Track:
     """Lays the track on the flat floor, or on a bed just wide enough where the bore is round.
 
-    Args:
-        bore: The bore.
-        config: By which standard.
-        seen: Sleepers that the survey shows; they are taken as they lie and stand out as far as they do.
-
-    Raises:
-        FitError: A sleeper would come closer to the wall than the margin.
+    Sleepers that the survey shows are taken as they lie, and stand out as far as they do. Raises `FitError` where a
+    sleeper would come closer to the wall than the margin.
     """
     wanted = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]

@@ -132,11 +132,11 @@ def section_corners(bore: Bore) -> Float[np.ndarray, " c"]:
 def triangulate(
     plane: Unrolled, length: float, fold: Float[np.ndarray, " c"], boxes: Float[np.ndarray, "r 4"]
 ) -> Sheet:
-    """Triangulates one turn over the whole length.
+    """Triangulates one turn over the whole length, m.
 
     Args:
-        plane: The section's arc length.
-        length: Of the axis, m.
+        plane: Arc length of the section.
+        length: Length of the axis, m.
         fold: Arc lengths at which edges must run along the axis, m.
         boxes: Recesses as least and greatest arc length, least and greatest station, m; 0.6 grid steps clear of one
             another, of the seam and of the mouths.

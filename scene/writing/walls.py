@@ -168,10 +168,7 @@ def add_low_panels(world: ET.Element, walls: Walls, bore: Bore, track: Track, ni
 def add_niche(world: ET.Element, name: str, corners: Float[np.ndarray, "8 3"]) -> None:
     """Adds boxes behind the five sides of a niche.
 
-    Args:
-        world: Where they go.
-        name: First part of their names.
-        corners: Of the niche: bit 2 of a corner's number along the bore, bit 1 around it, bit 0 into the wall.
+    Bit 2 of a corner's number is along the bore, bit 1 around it, bit 0 into the wall.
     """
     grid = corners.reshape(2, 2, 2, 3)
     edges = [grid[1, 0, 0] - grid[0, 0, 0], grid[0, 1, 0] - grid[0, 0, 0], grid[0, 0, 1] - grid[0, 0, 0]]
