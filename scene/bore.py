@@ -98,44 +98,12 @@ def axis_through(points: Float[np.ndarray, "n 3"], spacing: float) -> Axis:
 SCHEMA = "subterra.bore/1"
 STATION_STEP = 0.25
 
-POCKET = np.dtype(
-    [
-        ("station", "f8"),
-        ("angle", "f8"),
-        ("length", "f8"),
-        ("width", "f8"),
-        ("depth", "f8"),
-        ("confidence", "f8"),
-        ("measured", "?"),
-    ]
-)
-
-NAIL = np.dtype(
-    [
-        ("station", "f8"),
-        ("angle", "f8"),
-        ("length", "f8"),
-        ("diameter", "f8"),
-        ("depth", "f8"),
-        ("confidence", "f8"),
-        ("measured", "?"),
-    ]
-)
-
-STRETCH = np.dtype(
-    [
-        ("start", "f8"),
-        ("end", "f8"),
-        ("type", "U9"),
-        ("width", "f8"),
-        ("height", "f8"),
-        ("crown_radius", "f8"),
-        ("wall_radius", "f8"),
-        ("rms", "f8"),
-        ("rms_free", "f8"),
-        ("confidence", "f8"),
-    ]
-)
+_PATCH = [(name, "f8") for name in ("station", "angle", "length", "width", "depth", "confidence")]
+POCKET = np.dtype([*_PATCH, ("measured", "?")])
+_BOLT = [(name, "f8") for name in ("station", "angle", "length", "diameter", "depth", "confidence")]
+NAIL = np.dtype([*_BOLT, ("measured", "?")])
+_SIZES = [(name, "f8") for name in ("width", "height", "crown_radius", "wall_radius", "rms", "rms_free", "confidence")]
+STRETCH = np.dtype([("start", "f8"), ("end", "f8"), ("type", "U9"), *_SIZES])
 
 
 @dataclass(frozen=True)

@@ -128,14 +128,14 @@ def command(
     Example: python -m scene.build survey.bag --trajectory groundtruth.tum --out build/tunnel
 
     Args:
-        source: A recording (ROS1 or ROS2 bag, MCAP, folder of timed scans), a registered cloud (PLY, PCD, LAS, LAZ,
-            E57, XYZ, CSV, Parquet), or an as-built ring survey (CSV, XLSX).
+        source: A recording (ROS1 or ROS2 bag, MCAP, folder of timed scans), a registered cloud (PLY,
+            PCD, LAS, LAZ, E57, XYZ, CSV, Parquet), or an as-built ring survey (CSV, XLSX).
         out: Folder to write; replaced only once the new scene is complete.
         trajectory: Poses of the LiDAR in TUM form (t x y z qx qy qz qw), for a bag; without it, LiDAR odometry.
         control: Positions of a prism in TUM form (quaternion zero, any order) that fix odometry's length.
-        calibration: Where prism and IMU sit: geode-gamma, geode-beta, …, a YAML file, or the prism's lever arm x,y,z
-            in the LiDAR's axes, m.
-        reader: A Python file or module of your own that registers a reader of another format.
+        calibration: Mounts of prism and IMU: geode-gamma, geode-beta, …, a YAML file, or the prism's
+            x,y,z in the LiDAR's axes, m.
+        reader: Python file or module of your own that registers a reader.
         fresh: Start over, whatever a killed build got done.
         keep_every: Least time between two partial results, s.
         config: Settings.

@@ -60,7 +60,10 @@ class VoxelMean:
         cell = np.floor(local / self.voxel).astype(np.int64)
         key = ((cell[:, 0] + _HALF) << 2 * _BITS) | ((cell[:, 1] + _HALF) << _BITS) | (cell[:, 2] + _HALF)
         sums = np.concatenate([local, np.ones((len(local), 1))], axis=1)
-        self._push(*_merge_cells(key, sums))
+        self._parts.append(_merge_cells(key, sums))
+        self._pending += len(self._parts[-1][0])
+        if self._pending > _MERGE_AT:
+            self._compact()
         self.returns += int(inside.sum())
 
     def cloud(self) -> Cloud:
@@ -93,12 +96,6 @@ class VoxelMean:
         count = sum(name.startswith("key") for name in arrays)
         again._parts = [(arrays[f"key{index}"], arrays[f"sums{index}"]) for index in range(count)]
         return again
-
-    def _push(self, key: np.ndarray, sums: np.ndarray) -> None:
-        self._parts.append((key, sums))
-        self._pending += len(key)
-        if self._pending > _MERGE_AT:
-            self._compact()
 
     def _compact(self) -> None:
         if len(self._parts) > 1:

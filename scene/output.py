@@ -60,22 +60,9 @@ def write_geometry(
 
 MANIFEST_SCHEMA = "subterra.manifest/1"
 _LIBRARIES = (
-    "numpy",
-    "scipy",
-    "trimesh",
-    "manifold3d",
-    "mujoco",
-    "rosbags",
-    "small-gicp",
-    "plyfile",
-    "pypcd4",
-    "laspy",
-    "lazrs",
-    "pye57",
-    "pyarrow",
-    "openpyxl",
-    "shapely",
-)
+    "numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "small-gicp", "plyfile", "pypcd4", "laspy", "lazrs",
+    "pye57", "pyarrow", "openpyxl", "shapely",
+)  # fmt: skip
 
 
 def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
@@ -174,7 +161,10 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
     if result.odometry is not None:
         save_tum(result.odometry, folder / "odometry.tum")
     for scene in SCENES:
-        _require_mujoco_loads(folder / scene)
+        try:
+            mujoco.MjModel.from_xml_path(str(folder / scene))
+        except ValueError as error:
+            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
 
 
 def _track_facts(laid: Track, result: Reconstruction) -> dict[str, Any]:
@@ -198,10 +188,3 @@ def _track_provenance(laid: Track, result: Reconstruction) -> dict[str, str]:
         "rails": "by standard" + (", seen in the survey" if result.seen.rails else ""),
         "fasteners": "by standard",
     }
-
-
-def _require_mujoco_loads(path: Path) -> None:
-    try:
-        mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise FitError(f"{path.name}: MuJoCo refuses the scene ({error})") from error

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scene.bore import Axis, Bore
+from scene.bore import Bore
 from scene.cli import Stages
 from scene.cloud import Cloud
 from scene.errors import FitError, RecordingError
@@ -183,8 +183,10 @@ def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stag
     cloud, located = registered.cloud, registered.located
     stage = progress.start("fitting the bore", 4)
     axis = fit_centreline(cloud.points, config.centreline, cloud.origin)
-    if located is not None and _runs_against(axis, located.trajectory.positions - cloud.origin):
-        axis = axis.reversed()
+    if located is not None:
+        ends = axis.local(located.trajectory.positions[[0, -1]] - cloud.origin)[0]
+        if ends[1] < ends[0]:  # stations grow the way the sensor went
+            axis = axis.reversed()
     stage.advance()
     sections = fit_sections(cloud, axis)
     stage.advance()
@@ -228,8 +230,3 @@ def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) ->
         **({} if survey.design is None else compare_with_design(fit, survey.design)),
     }
     return Reconstruction(bore, origin, hash_inputs([path], progress), facts, provenance)
-
-
-def _runs_against(axis: Axis, positions: np.ndarray) -> bool:
-    """True where the sensor moved mostly towards smaller stations."""
-    return bool(axis.local(positions[[0, -1]])[0] @ [-1.0, 1.0] < 0)

@@ -4,7 +4,6 @@ import dataclasses
 import fcntl
 import hashlib
 import json
-import os
 import shutil
 import time
 from collections.abc import Callable
@@ -114,7 +113,9 @@ class Partial:
                 if known is not None and not self.fresh:
                     print("a partial result of another input, configuration or version was discarded", flush=True)
                 self._clear()
-                _write_text(place, key)
+                fresh = place.with_name(f"{_KEY_FILE}.tmp")
+                fresh.write_text(key)
+                fresh.replace(place)
             self._open = True
         except OSError as error:
             self._give_up(error)
@@ -188,9 +189,3 @@ class Partial:
 def partial_folder(out: Path) -> Path:
     """Return the folder for the partial results of a build that writes `out`."""
     return out.with_name(f".{out.name}.resume")
-
-
-def _write_text(path: Path, text: str) -> None:
-    fresh = path.with_name(f"{path.name}.tmp")
-    fresh.write_text(text)
-    os.replace(fresh, path)

@@ -1,6 +1,7 @@
 """From axis and sections to the bore, with its types of section."""
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -68,29 +69,23 @@ def _mean_radius(radius: list[float]) -> float:
 
 
 def _runs(best: list[str], shortest: int) -> list[tuple[int, int]]:
-    """Runs of windows of one type; a run too short joins its longer neighbour."""
-    edges = [0, *(k for k in range(1, len(best)) if best[k] != best[k - 1]), len(best)]
-    runs = [(a, b, best[a]) for a, b in itertools.pairwise(edges)]
+    """Runs of windows of one type, as first window and the one after; a short run joins its longer neighbour."""
+    runs = _lengths((kind, 1) for kind in best)
     while len(runs) > 1:
-        k = min(range(len(runs)), key=lambda i: runs[i][1] - runs[i][0])
-        if runs[k][1] - runs[k][0] >= shortest:
+        k = min(range(len(runs)), key=lambda i: runs[i][1])
+        if runs[k][1] >= shortest:
             break
-        beside = [i for i in (k - 1, k + 1) if 0 <= i < len(runs)]
-        into = max(beside, key=lambda i: runs[i][1] - runs[i][0])
-        runs[into] = (min(runs[k][0], runs[into][0]), max(runs[k][1], runs[into][1]), runs[into][2])
-        del runs[k]
-        runs = _join_runs(runs)
-    return [(a, b) for a, b, _ in runs]
+        into = max((i for i in (k - 1, k + 1) if 0 <= i < len(runs)), key=lambda i: runs[i][1])
+        runs[k] = (runs[into][0], runs[k][1])
+        runs = _lengths(runs)
+    edges = [0, *itertools.accumulate(length for _, length in runs)]
+    return list(itertools.pairwise(edges))
 
 
-def _join_runs(runs: list[tuple[int, int, str]]) -> list[tuple[int, int, str]]:
-    result = runs[:1]
-    for run in runs[1:]:
-        if run[2] == result[-1][2]:
-            result[-1] = (result[-1][0], run[1], run[2])
-        else:
-            result.append(run)
-    return result
+def _lengths(runs: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Runs of type and length, with neighbours of one type joined."""
+    groups = itertools.groupby(runs, key=lambda run: run[0])
+    return [(kind, sum(length for _, length in group)) for kind, group in groups]
 
 
 def _fit_types(angle: np.ndarray, sections: np.ndarray, flat_floor: bool, noise: float) -> list[TypeFit]:

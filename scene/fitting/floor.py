@@ -138,7 +138,7 @@ def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarr
 
 
 def _fit_parabolas(above: np.ndarray, out: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fits each row's lateral distance `a + b h + c h²`, `h` m above the floor; also tells which rows could be fitted."""
+    """Fits each row's lateral distance `a + b h + c h²`, `h` m above the floor; also returns the rows fitted."""
     known = band.sum(axis=1) >= 3
     weight = band / np.maximum(band.sum(axis=1, keepdims=True), 1)
     h, y = above - _weighted_mean(above, weight), out - _weighted_mean(out, weight)

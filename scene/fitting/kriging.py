@@ -173,7 +173,7 @@ class Kriged:
 def krige_profiles(
     station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"], radius: Float[np.ndarray, " p"], fine: Grid
 ) -> Kriged:
-    """Interpolates the wall between profiles on the cells of `fine`, from points by station, m, angle, rad, radius, m."""
+    """Interpolates the wall on the cells of `fine` from points of profiles by station, m, angle, rad, radius, m."""
     at, value = _observations(station, angle, radius, fine)
     for last in (False, True):
         about = value - _trend(at, value, at)

@@ -32,17 +32,13 @@ def measure_section(angle: Float[np.ndarray, " m"], radius: Float[np.ndarray, " 
     height_grid = np.arange(upward.min(), upward.max(), _HEIGHT_STEP)
     left, right = (_wall_at(side, lateral, upward, height_grid) for side in (1, -1))
     chord = left - right
-    width = float(_average_chords(chord).max())
+    # A maximum of noisy values is too large, so chords are averaged over 0.4 m of height; a circle loses 4 mm.
+    window = min(round(_CHORD_WINDOW / _HEIGHT_STEP), len(chord))
+    width = float(np.convolve(chord, np.full(window, 1 / window), mode="valid").max())
     long = chord >= _LONG_CHORD * width
     across = float(np.mean((left + right)[long]) / 2)
     floor, crown = (_wall_at(side, upward, lateral, np.array([across]))[0] for side in (-1, 1))
     return Extents(width, float(crown - floor), (across, float(crown + floor) / 2))
-
-
-def _average_chords(chord: np.ndarray) -> np.ndarray:
-    """Averages chords over 0.4 m of height: a maximum of noisy values is too large. A circle loses 4 mm."""
-    window = min(round(_CHORD_WINDOW / _HEIGHT_STEP), len(chord))
-    return np.convolve(chord, np.full(window, 1 / window), mode="valid")
 
 
 def _wall_at(side: int, across: np.ndarray, along: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from scene.bore import POCKET, STATION_STEP, STRETCH, Axis, Bore, axis_through, make_axis
+from scene.bore import POCKET, STATION_STEP, STRETCH, Bore, axis_through, make_axis
 from scene.errors import FitError
 from scene.fitting.profile import section_angles
 from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
@@ -62,10 +62,11 @@ def fit_rings(survey: RingSurvey) -> RingFit:
 
 
 def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
-    """Return a round bore through the rings, less `origin`, m; between rings it is interpolated and marked as filled."""
+    """Return a round bore through the rings less `origin`, m; between rings it is interpolated and marked filled."""
     centre = fit.centre - origin
     axis = axis_through(centre, STATION_STEP)
-    at = _ring_stations(axis, centre)
+    at = np.clip(axis.local(centre)[0], 0.0, axis.length)
+    mean, rms = float(fit.radius.mean()), float(np.sqrt(np.mean(fit.rms**2)))
     angle = section_angles()
     radius = np.interp(axis.station, at, fit.radius)
     distance = np.abs(axis.station[:, None] - at[None]).min(axis=1)
@@ -86,14 +87,8 @@ def bore_from_rings(fit: RingFit, origin: Float[np.ndarray, "3"]) -> Bore:
         pocket=np.empty(0, POCKET),
         confidence=np.interp(axis.station, at, fit.seen)
         * probability_known(np.hypot(np.interp(axis.station, at, fit.rms), UNSEEN_GROWTH * distance)),
-        stretch=np.array([_round_stretch(axis, fit)], STRETCH),
+        stretch=np.array([(0.0, axis.length, "circle", *[2 * mean] * 2, mean, mean, rms, np.nan, 1.0)], STRETCH),
     )
-
-
-def _round_stretch(axis: Axis, fit: RingFit) -> tuple[float | str, ...]:
-    """Return the whole bore as one circular stretch; no free profile was measured."""
-    radius, rms = float(fit.radius.mean()), float(np.sqrt(np.mean(fit.rms**2)))
-    return 0.0, axis.length, "circle", 2 * radius, 2 * radius, radius, radius, rms, np.nan, 1.0
 
 
 def compare_with_design(fit: RingFit, design: Float[np.ndarray, "d 4"]) -> dict[str, float]:
@@ -162,7 +157,3 @@ def _fit_circle(
         float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2))),
         float((gap < np.pi / 8).mean()),
     )
-
-
-def _ring_stations(axis: Axis, centre: np.ndarray) -> Float[np.ndarray, " r"]:
-    return np.clip(axis.local(centre)[0], 0.0, axis.length)

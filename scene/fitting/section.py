@@ -140,7 +140,9 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     _require_open_middle(points, fine, wall)
     if step > DENSE_STEP:
         kriged = krige_profiles(points.station, points.angle, points.radius, fine)
-        wall = kriged.wall if floors is None else _stand_wall(kriged.wall, fine, floors)
+        wall = kriged.wall
+        if floors is not None:
+            wall = clip_to_floor(extend_to_floor(wall, fine, floors, wall), fine, floors)
         return _measure_wall(points, wall, kriged.sigma, fine, floors is not None, cloud.voxel, step)
     wall, seen = _follow_wall(points, wall, fine, floors)
     return _measure_wall(
@@ -159,10 +161,6 @@ def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None
         return unroll.resample(wall, coarse, fine)
     # Clipped on the fine grid alone: interpolation between a wall and a floor would cut their corner off.
     return clip_to_floor(unroll.resample(extend_to_floor(wall, coarse, floors, along), coarse, fine), fine, floors)
-
-
-def _stand_wall(wall: np.ndarray, grid: Grid, floors: Floors) -> np.ndarray:
-    return clip_to_floor(extend_to_floor(wall, grid, floors, wall), grid, floors)
 
 
 def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:

@@ -87,8 +87,10 @@ def locate_by_control(
         RecordingError: The control does not overlap the recording.
         FitError: Too few scans, or what was measured does not determine the trajectory.
     """
-    start, end = _recording_span(recording)
-    control.require_overlap(start, end, recording.path)
+    times = [scan.stamp for scan in recording.scans()]
+    if len(times) < 2:
+        raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
+    control.require_overlap(times[0], times[-1], recording.path)
     inertial, mount = find_inertial(recording, calibration)
     if inertial and mount:
         problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress, partial)
@@ -178,11 +180,3 @@ def _load_or_solve(partial: Partial, name: str, solve: Callable[[], Chain], prog
         partial.save(name, **arrays)
     stage.advance()
     return Chain(**arrays)
-
-
-def _recording_span(recording: Recording) -> tuple[float, float]:
-    """Times of the first and the last scan, s."""
-    times = [scan.stamp for scan in recording.scans()]
-    if len(times) < 2:
-        raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
-    return times[0], times[-1]

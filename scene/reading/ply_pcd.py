@@ -27,7 +27,7 @@ def open_ply(path: Path) -> CloudSource:
             raise ValueError(f"it has no field {', '.join(missing)}")
         columns = tuple(names.index(name) for name in "xyz")
         text = Lines(path, columns, start=size, line=len(lines) + 1, count=count)
-        sample = np.concatenate([np.empty((0, 3)), *_first_block(text)])
+        sample = next(text.rows(), np.empty((0, 3)))
         return CloudSource("PLY ascii", text.rows, sample)
     return source_from_records(f"PLY {form}", read_ply_records(path))
 
@@ -71,10 +71,6 @@ def _ply_vertices(lines: list[str], body: int, ascii_form: bool) -> tuple[int, l
     if found is None:
         raise ValueError("it has no element vertex")
     return found[1], [words[-1] for words in found[2]], elements[0][0] == "vertex"
-
-
-def _first_block(text: Lines) -> list[np.ndarray]:
-    return [rows for rows, _ in zip(text.rows(), range(1), strict=False)]
 
 
 _LARGEST_RATIO = 100  # LZF copies at most 264 bytes by 3

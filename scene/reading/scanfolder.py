@@ -45,7 +45,8 @@ def scan_files(path: Path) -> list[Path]:
         return []
     suffixes = [file.suffix.lower() for file in files]
     most = max(_FORMATS, key=suffixes.count)
-    return sorted((f for f in files if f.suffix.lower() == most), key=_order)
+    chosen = [file for file in files if file.suffix.lower() == most]
+    return sorted(chosen, key=lambda file: ([int(digits) for digits in re.findall(r"\d+", file.stem)], file.name))
 
 
 def _find_times(path: Path, files: list[Path]) -> tuple[list[float], str]:
@@ -75,10 +76,6 @@ def _read_list(path: Path, count: int) -> list[float]:
             raise RecordingError(f"{path}: line {index + 1} is no time: {line[:40]!r}")
         times.append(time)
     return times
-
-
-def _order(file: Path) -> tuple[list[int], str]:
-    return [int(digits) for digits in re.findall(r"\d+", file.stem)], file.name
 
 
 def _time_in_name(stem: str) -> float | None:

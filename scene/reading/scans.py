@@ -179,17 +179,10 @@ def _check_span(name: str, times: np.ndarray) -> np.ndarray:
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
 
-_LIVOX_POINT = np.dtype(
-    [
-        ("offset_time", "<u4"),
-        ("x", "<f4"),
-        ("y", "<f4"),
-        ("z", "<f4"),
-        ("reflectivity", "u1"),
-        ("tag", "u1"),
-        ("line", "u1"),
-    ]
-)
+_LIVOX_POINT = np.dtype([
+    ("offset_time", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+    ("reflectivity", "u1"), ("tag", "u1"), ("line", "u1"),
+])  # fmt: skip
 # CDR aligns each point's first word: one byte of padding between points, none after the last.
 _LIVOX_POINT_CDR = np.dtype({"names": ["point"], "formats": [_LIVOX_POINT], "itemsize": _LIVOX_POINT.itemsize + 1})
 # Bits 4-5 of the tag: 0b00 and 0b01 are returns to trust, the others are noise by intensity or by place.

@@ -32,10 +32,6 @@ class Bore:
         return replace(mesh, vertices=np.round(mesh.vertices, 6))
 
 
-def _constant_width(length: float) -> Trend:
-    return Trend()
-
-
 def _wider_middle(length: float) -> Trend:
     """1 m wider over the middle third, with ramps of an eighth of the length, at most 8 m."""
     ramp, third = min(8.0, length / 8.0), length / 3.0
@@ -53,7 +49,7 @@ class _Class:
     section_type: str
     shape: Callable[[], Shape] = d_shape
     elements: Callable[[np.random.Generator, float], Elements] = draw_railway
-    widening: Callable[[float], Trend] = _constant_width
+    widening: Callable[[float], Trend] = lambda length: Trend()
     rough: bool = False
 
 

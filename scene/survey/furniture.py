@@ -30,21 +30,10 @@ GAUGE = 1.435  # m, between the inner faces of the rail heads 14 to 16 mm below 
 
 # Right half of a CHN60 rail without inclination, from the edge of the foot to the middle of the head: across, up, m.
 # Height 176, foot 150, head 73, web 16.5 mm; the head's side is vertical through the gauge plane.
-RAIL_HALF = 1e-3 * np.array(
-    [
-        (75.0, 0.0),
-        (75.0, 12.0),
-        (30.0, 22.0),
-        (8.25, 38.0),
-        (8.25, 120.0),
-        (35.0, 128.0),
-        (36.5, 131.0),
-        (36.5, 164.0),
-        (33.0, 171.0),
-        (22.0, 175.0),
-        (8.0, 175.9),
-    ]
-)
+RAIL_HALF = 1e-3 * np.array([
+    (75.0, 0.0), (75.0, 12.0), (30.0, 22.0), (8.25, 38.0), (8.25, 120.0), (35.0, 128.0), (36.5, 131.0),
+    (36.5, 164.0), (33.0, 171.0), (22.0, 175.0), (8.0, 175.9),
+])  # fmt: skip
 RAIL_HEIGHT = 0.176  # m
 RAIL_AXIS = 0.5 * (GAUGE + 0.073)  # m from the track's axis to the rail's: half the gauge and half a head
 RAIL_TOP = SLEEPER_RISE + PAD[2] + RAIL_HEIGHT  # m above the floor

@@ -111,7 +111,7 @@ _OS1_AZIMUTH = np.deg2rad(np.tile([4.22, 1.41, -1.41, -4.22], OS1_RINGS // 4))
 
 
 def os1_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors in the LiDAR frame at times, s, in whole columns; `phase` is not used: a sweep begins behind."""
+    """Return unit vectors in the LiDAR frame at times, s, in whole columns; `phase` is not used."""
     ring = np.arange(len(time)) % OS1_RINGS
     azimuth = np.pi - 2.0 * np.pi * time / SCAN_PERIOD + _OS1_AZIMUTH[ring]
     level = np.cos(_OS1_ELEVATION)[ring]

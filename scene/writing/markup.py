@@ -73,18 +73,10 @@ def add_mesh(
     coordinates: tuple[Float[np.ndarray, "t 2"], np.ndarray] | None = None,
     reuse: bool = False,
 ) -> None:
-    """Adds a mesh for looks and rays, stored about its own whole-metre origin so that few digits suffice.
+    """Adds a mesh, in the tunnel frame, m, for looks and rays; mesh, geom and file have the same name.
 
-    Args:
-        asset: Element that declares the mesh.
-        world: Element that places it.
-        folder: Folder of its file.
-        name: Name of mesh, geom and file.
-        mesh: The mesh in the tunnel frame, m.
-        material: Material of the geom.
-        group: Group of the geom.
-        coordinates: Texture coordinates, and which of them each corner of each face has, `(f, 3)`.
-        reuse: Take a file of that name that is there already.
+    It is stored about its own whole-metre origin so that few digits suffice. `coordinates` are texture coordinates, and
+    which of them each corner of each face has, `(f, 3)`. With `reuse`, a file that is there already is taken.
     """
     origin = np.floor(mesh.vertices.mean(axis=0))
     path = folder / f"{name}.obj"

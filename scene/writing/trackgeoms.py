@@ -19,18 +19,10 @@ from scene.writing.unrolled import wall_points
 _PAD = (0.18, 0.15)
 _SHOULDER, _SHOULDER_AT = (0.07, 0.055, 0.045), 0.045
 _CLIP_BAR = 0.020
-_CLIP = 0.001 * np.array(
-    [
-        (-50, 45, 12),
-        (35, 45, 12),
-        (58, 36, 16),
-        (62, 15, 24),
-        (45, -4, 30),
-        (10, -14, 26),
-        (-12, -16, 14),
-        (-38, -14, 10),
-    ]
-)
+_CLIP = 0.001 * np.array([
+    (-50, 45, 12), (35, 45, 12), (58, 36, 16), (62, 15, 24), (45, -4, 30), (10, -14, 26),
+    (-12, -16, 14), (-38, -14, 10),
+])  # fmt: skip
 _BAR_SIDES = 6
 _BOLT_SIDES = 6
 
@@ -166,17 +158,12 @@ def add_track(asset: ET.Element, world: ET.Element, meshes: Path, axis: Axis, tr
 
 def add_nails(asset: ET.Element, world: ET.Element, meshes: Path, bore: Bore, chunk: float) -> int:
     """Adds the bolts that bridge pockets, for looks; returns how many there are."""
-    edges = chunk_edges(bore.length, chunk)
+    edges = np.append(np.arange(0.0, bore.length - 1e-6, chunk), bore.length + 1e-6)
     for k in range(len(edges) - 1):
         merged = nail_mesh(bore, edges[k], edges[k + 1])
         if merged is not None:
             markup.add_mesh(asset, world, meshes, f"nails_{k:03d}", merged, "bolt", group="1")
     return len(bore.nail)
-
-
-def chunk_edges(length: float, chunk: float) -> Float[np.ndarray, " k"]:
-    """Return stations from 0 to the length, `chunk` m apart, the last a little beyond."""
-    return np.append(np.arange(0.0, length - 1e-6, chunk), length + 1e-6)
 
 
 def _add_rails(world: ET.Element, axis: Axis, track: Track) -> None:
