@@ -82,10 +82,10 @@ class VoxelMean:
         The parts are kept as they are: merging them now would change the order of later sums, and with it the bytes.
         """
         origin = np.full(3, np.nan) if self._origin is None else self._origin
-        kept = {"origin": origin, "counts": np.array([self.finite, self.returns, self._pending])}
+        result = {"origin": origin, "counts": np.array([self.finite, self.returns, self._pending])}
         for index, (key, sums) in enumerate(self._parts):
-            kept |= {f"key{index}": key, f"sums{index}": sums}
-        return kept
+            result |= {f"key{index}": key, f"sums{index}": sums}
+        return result
 
     @classmethod
     def restored(cls, voxel: float, arrays: dict[str, np.ndarray]) -> "VoxelMean":

@@ -79,11 +79,11 @@ def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
 
 def hash_files(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of each file of a folder by its name, so that a reader can check the scene."""
-    found = {}
+    hashes = {}
     for file in sorted(file for file in folder.rglob("*") if file.is_file()):
         with file.open("rb") as opened:
-            found[file.relative_to(folder).as_posix()] = hashlib.file_digest(opened, "sha256").hexdigest()
-    return found
+            hashes[file.relative_to(folder).as_posix()] = hashlib.file_digest(opened, "sha256").hexdigest()
+    return hashes
 
 
 def _json_value(value: Any) -> Any:
@@ -124,8 +124,8 @@ class BuildConfig:
 def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> None:
     """Writes the six parts of a scene folder and compiles the scene once."""
     bore = result.bore
-    laid = lay_track(bore, config.track, result.seen.sleepers)
-    count, furnished = write_geometry(folder, name, config.provenance, bore, laid, config.scene)
+    track = lay_track(bore, config.track, result.seen.sleepers)
+    count, furnished = write_geometry(folder, name, config.provenance, bore, track, config.scene)
     content = {
         "name": name,
         "inputs": result.inputs,
@@ -145,13 +145,13 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
             "rings": len(bore.ring_station),
             "pockets": len(bore.pocket),
         },
-        "track": _track_facts(laid, result),
+        "track": _track_facts(track, result),
         "provenance": {
             "bore": config.provenance,
             **furnished,
             **{
                 asset: kind.replace("measured", config.provenance)
-                for asset, kind in {**_track_provenance(laid, result), **result.provenance}.items()
+                for asset, kind in {**_track_provenance(track, result), **result.provenance}.items()
             },
         },
     }
@@ -167,24 +167,24 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
             raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
 
 
-def _track_facts(laid: Track, result: Reconstruction) -> dict[str, Any]:
+def _track_facts(track: Track, result: Reconstruction) -> dict[str, Any]:
     rails = result.seen.rails
     return {
-        "least_clearance": float(laid.clearance.min()) if len(laid.clearance) else None,
-        "slab": laid.raised,
-        "sleepers_seen": int(laid.measured.sum()),
-        "protrusion": laid.config.protrusion,
-        "gauge": laid.config.gauge,
+        "least_clearance": float(track.clearance.min()) if len(track.clearance) else None,
+        "slab": track.raised,
+        "sleepers_seen": int(track.measured.sum()),
+        "protrusion": track.config.protrusion,
+        "gauge": track.config.gauge,
         "gauge_seen": rails.gauge if rails else None,
         "rail_top_seen": rails.top if rails else None,
     }
 
 
-def _track_provenance(laid: Track, result: Reconstruction) -> dict[str, str]:
-    if not len(laid.sleeper_station):
+def _track_provenance(track: Track, result: Reconstruction) -> dict[str, str]:
+    if not len(track.sleeper_station):
         return {"track": "none: the bore is too low for it"}
     return {
-        "sleepers": "measured" if laid.measured.any() else "by standard",
+        "sleepers": "measured" if track.measured.any() else "by standard",
         "rails": "by standard" + (", seen in the survey" if result.seen.rails else ""),
         "fasteners": "by standard",
     }

@@ -149,8 +149,8 @@ class Partial:
         if not self._open or self.folder is None:
             return None
         try:
-            with np.load(self.folder / f"{name}.npz", allow_pickle=False) as kept:
-                return dict(kept)  # the archive's checksums are tested on the way
+            with np.load(self.folder / f"{name}.npz", allow_pickle=False) as archive:
+                return dict(archive)  # the archive's checksums are tested on the way
         except Exception:  # absent, or damaged in whatever way: it is computed again
             return None
 

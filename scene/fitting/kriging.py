@@ -222,8 +222,8 @@ def _remove_cables(value: np.ndarray) -> np.ndarray:
 def _trend(at: np.ndarray, value: np.ndarray, where: np.ndarray) -> Float[np.ndarray, "k m"]:
     """Return a line fitted around each place in each direction, so that a flare or a widening is no deviation."""
     seen = np.isfinite(value)
-    known, wanted = np.nanmedian(at, axis=1), np.median(where, axis=1)
-    apart = known[None] - wanted[:, None]
+    known, station = np.nanmedian(at, axis=1), np.median(where, axis=1)
+    apart = known[None] - station[:, None]
     weight = np.exp(-0.5 * (apart / _TREND) ** 2) + 1e-9
     y, mask = np.where(seen, value, 0.0), seen.astype(float)
     s0, s1, s2 = (w @ mask for w in (weight, weight * apart, weight * apart**2))
@@ -231,7 +231,7 @@ def _trend(at: np.ndarray, value: np.ndarray, where: np.ndarray) -> Float[np.nda
     spread = s0 * s2 - s1**2
     lean = np.divide(s0 * t1 - s1 * t0, spread, out=np.zeros_like(s0), where=spread > 0.25 * s0**2)
     middle = np.divide(t0 - lean * s1, s0, out=np.full_like(s0, np.nan), where=s0 > 1e-12)
-    return middle + lean * (where - wanted[:, None])
+    return middle + lean * (where - station[:, None])
 
 
 def _remove_outliers(model: Correlation, at: np.ndarray, about: np.ndarray, value: np.ndarray) -> np.ndarray:

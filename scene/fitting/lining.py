@@ -166,9 +166,9 @@ def add_lining(
     Nails are looked for in the cloud; without one they are by standard.
     """
     config = config or LiningConfig()
-    found, joints = find_pockets(sections)
-    if len(found):
-        bore = replace(bore, pocket=found, ring_station=joints)
+    measured, joints = find_pockets(sections)
+    if len(measured):
+        bore = replace(bore, pocket=measured, ring_station=joints)
         return _add_nails(bore, cloud, config, {"rings": MEASURED, "pockets": MEASURED})
     if could_show_pockets(sections, config.pocket_depth):
         return bore, {"rings": NONE, "pockets": NONE, "nails": NONE}
@@ -184,11 +184,11 @@ def add_standard_lining(bore: Bore, config: LiningConfig, flat_floor: bool) -> t
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)
     types = bore.section_type[np.clip(np.searchsorted(bore.station, joints), 0, len(bore.station) - 1)]
     joints = joints[types != FREE]
-    laid = _standard_pockets(bore, joints, config, flat_floor)
-    if not config.by_standard or not len(laid):
-        kept = rings if len(bore.ring_station) else {"rings": "none"}
-        return bore, {**kept, "pockets": "none: the survey cannot show them", "nails": "none"}
-    bore = replace(bore, pocket=laid, ring_station=bore.ring_station if len(bore.ring_station) else joints)
+    pockets = _standard_pockets(bore, joints, config, flat_floor)
+    if not config.by_standard or not len(pockets):
+        provenance = rings if len(bore.ring_station) else {"rings": "none"}
+        return bore, {**provenance, "pockets": "none: the survey cannot show them", "nails": "none"}
+    bore = replace(bore, pocket=pockets, ring_station=bore.ring_station if len(bore.ring_station) else joints)
     return _add_nails(bore, None, config, {**rings, "pockets": STANDARD})
 
 
@@ -206,10 +206,10 @@ def _standard_pockets(
     keep = (station > length) & (station < bore.length - length)
     if flat_floor:
         keep &= _above_floor(bore, station, angle) > FLOOR_MARGIN
-    laid = np.zeros(int(keep.sum()), POCKET)
-    laid["station"], laid["angle"], laid["depth"] = station[keep], angle[keep], config.pocket_depth
-    laid["length"], laid["width"] = length, width
-    return laid[np.lexsort((laid["angle"], laid["station"]))]
+    pockets = np.zeros(int(keep.sum()), POCKET)
+    pockets["station"], pockets["angle"], pockets["depth"] = station[keep], angle[keep], config.pocket_depth
+    pockets["length"], pockets["width"] = length, width
+    return pockets[np.lexsort((pockets["angle"], pockets["station"]))]
 
 
 def _above_floor(bore: Bore, station: np.ndarray, angle: np.ndarray) -> Float[np.ndarray, " p"]:
@@ -222,14 +222,14 @@ def _above_floor(bore: Bore, station: np.ndarray, angle: np.ndarray) -> Float[np
 
 def _add_nails(bore: Bore, cloud: Cloud | None, config: LiningConfig, provenance: dict[str, str]) -> tuple[Bore, dict]:
     pairs = pair_pockets(bore)
-    found = find_nails(bore, pairs, cloud) if cloud is not None else None
-    if found is None:
+    seen = find_nails(bore, pairs, cloud) if cloud is not None else None
+    if seen is None:
         return replace(bore, nail=make_nails(bore, pairs, config.nail_depth, config.nail_diameter)), {
             **provenance,
             "nails": STANDARD if len(pairs) else NONE,
         }
-    result = make_nails(bore, pairs, found.depth if found.present.any() else config.nail_depth, config.nail_diameter)
-    result["measured"], result["confidence"] = found.present, np.where(found.present, found.confidence, 0.0)
-    if not found.present.any():
+    result = make_nails(bore, pairs, seen.depth if seen.present.any() else config.nail_depth, config.nail_diameter)
+    result["measured"], result["confidence"] = seen.present, np.where(seen.present, seen.confidence, 0.0)
+    if not seen.present.any():
         return bore, {**provenance, "nails": NONE}
-    return replace(bore, nail=result[~found.absent]), {**provenance, "nails": f"{MEASURED}, those not seen {STANDARD}"}
+    return replace(bore, nail=result[~seen.absent]), {**provenance, "nails": f"{MEASURED}, those not seen {STANDARD}"}

@@ -42,17 +42,17 @@ def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
     return holes.where(_near_columns(holes, peaks, columns, reach))
 
 
-def add_pattern(faint: Holes, found: Holes, grid: Grid, reach: float) -> Holes:
-    """Adds the faint holes that stand where the pattern of those clear and in rows, `found`, has a pocket.
+def add_pattern(faint: Holes, clear: Holes, grid: Grid, reach: float) -> Holes:
+    """Adds the faint holes that stand where the pattern of those clear and in rows, `clear`, has a pocket.
 
     Holes faint in themselves, as pockets are that the scanner looks at head on, make a row where most of its places
     either side of the joints hold one; chance would fill about a quarter of them. `reach` is half a row's width,
     columns.
     """
-    station = (found.row + 0.5) * grid.step
+    station = (clear.row + 0.5) * grid.step
     joints = find_ring_joints(station, grid.rows * grid.step)
     if len(joints) < 2:
-        return found
+        return clear
     pitch = float(np.median(np.diff(joints)))
     in_place = faint.where(_stand_in_places(faint, station, joints[0], pitch, grid.step))
     window = max(int(2 * reach) | 1, 3)
@@ -65,9 +65,9 @@ def add_pattern(faint: Holes, found: Holes, grid: Grid, reach: float) -> Holes:
         & (filled > 0.6 * everything)
     )
     more = in_place.where(_near_columns(in_place, peaks, grid.columns, reach))
-    cells = np.concatenate([np.stack([h.row, h.column], axis=1) for h in (found, more)])
+    cells = np.concatenate([np.stack([h.row, h.column], axis=1) for h in (clear, more)])
     _, first = np.unique(cells, axis=0, return_index=True)
-    score = np.concatenate([found.score, more.score])
+    score = np.concatenate([clear.score, more.score])
     return Holes(cells[first, 0], cells[first, 1], score[first])
 
 

@@ -150,9 +150,9 @@ def _fit_circle(
     angle = np.arctan2(y - b, x - a)
     around = section_angles()
     gap = np.abs(np.angle(np.exp(1j * (around[:, None] - angle[None])))).min(axis=1)
-    moved = centre + a * lateral + b * up + ((points - centre) @ tangent).mean() * tangent
+    middle = centre + a * lateral + b * up + ((points - centre) @ tangent).mean() * tangent
     return (
-        moved,
+        middle,
         float(radius),
         float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2))),
         float((gap < np.pi / 8).mean()),

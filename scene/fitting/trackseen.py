@@ -180,12 +180,12 @@ def _sleeper_middles(centre: np.ndarray, station: np.ndarray, height: np.ndarray
     top = (np.abs(height - protrusion) < _TOP_LAYER) & (np.abs(station - centre[owner]) < _WIDTHS[1] / 2)
     order = np.lexsort((station[top], owner[top]))
     at, bounds = station[top][order], np.searchsorted(owner[top][order], np.arange(len(centre) + 1))
-    moved = centre.copy()
+    middles = centre.copy()
     for k in range(len(centre)):
         seen = at[bounds[k] : bounds[k + 1]]
         if len(seen) >= _MIN_TOP:
-            moved[k] = np.mean(np.percentile(seen, [5, 95]))
-    return moved
+            middles[k] = np.mean(np.percentile(seen, [5, 95]))
+    return middles
 
 
 def _complete_sleepers(centre: np.ndarray, spacing: float, length: float) -> tuple[np.ndarray, np.ndarray]:

@@ -142,6 +142,6 @@ def _read_numbers(path: Path, name: str, value: Any, shape: tuple[int, ...]) -> 
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.shape != shape or not np.isfinite(array).all():
-        wanted = " by ".join(str(size) for size in shape)
-        raise RecordingError(f"{path}: {name} must be {wanted} numbers, found {value!r:.80}")
+        expected = " by ".join(str(size) for size in shape)
+        raise RecordingError(f"{path}: {name} must be {expected} numbers, found {value!r:.80}")
     return array

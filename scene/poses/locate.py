@@ -134,11 +134,11 @@ def _solve_without_imu(
 ) -> tuple[Problem, Chain]:
     """Smooths twice: the first result guides the second odometry, which then slips less."""
     guide = None
-    for turn in ("first", "second"):
-        odometry = run_odometry(recording, guide, progress, partial, turn)
+    for pass_name in ("first", "second"):
+        odometry = run_odometry(recording, guide, progress, partial, pass_name)
         problem, guess = odometry_problem(odometry, control, calibration.prism, Noise())
         chain = _load_or_solve(
-            partial, f"smoothed-{turn}", functools.partial(solve_with_heading, problem, guess), progress
+            partial, f"smoothed-{pass_name}", functools.partial(solve_with_heading, problem, guess), progress
         )
         guide = Guide(_lidar_poses(chain, Mount(np.eye(3), np.zeros(3))), True, *_BY_CONTROL_WITHOUT_IMU)
     return problem, chain
@@ -147,8 +147,8 @@ def _solve_without_imu(
 def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str, Any]:
     """Residuals of the control, and the uncertainty of the length that follows (95 %), for the manifest."""
     residual = problem.sightings.residual(chain)
-    kept = np.linalg.norm(residual, axis=1) < _OUTLIER * np.sqrt(3) * problem.sightings.sigma
-    rms = float(np.sqrt(np.mean(residual[kept] ** 2))) if kept.any() else float("inf")
+    inlier = np.linalg.norm(residual, axis=1) < _OUTLIER * np.sqrt(3) * problem.sightings.sigma
+    rms = float(np.sqrt(np.mean(residual[inlier] ** 2))) if inlier.any() else float("inf")
     trusted = max(rms, problem.noise.control)
     return {
         "length_fixed_by": "control",
@@ -156,7 +156,7 @@ def _control_facts(problem: Problem, chain: Chain, control: Control) -> dict[str
         "length_uncertainty_from": "95 %: control residuals, and how well ends are found; not the control's own scale",
         "control_rows": len(residual),
         "control_rows_repeated": control.dropped,
-        "control_outliers": int((~kept).sum()),
+        "control_outliers": int((~inlier).sum()),
         "control_residual_rms": rms,
         "control_longest_gap": float(np.diff(control.times).max()),
     }

@@ -28,10 +28,10 @@ def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
     matrices = rotations.as_matrix()
     points = scan.points.astype(np.float64)
 
-    def moved(knot: np.ndarray) -> np.ndarray:
+    def from_pose(knot: np.ndarray) -> np.ndarray:
         return np.einsum("nij,nj->ni", matrices[knot], points) + positions[knot]
 
-    return (1 - share) * moved(low) + share * moved(low + 1)
+    return (1 - share) * from_pose(low) + share * from_pose(low + 1)
 
 
 def register_scans(

@@ -69,7 +69,7 @@ class Problem:
             else:
                 damping *= 100
                 step = accepted.solve(damping)
-            chain = best.moved(step)
+            chain = best.after(step)
             if np.abs(step[:, :6]).max() < _CONVERGED:
                 break
         return best, cost
@@ -110,9 +110,9 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
     motion, seen, steps = problem.motion, problem.sightings, problem.steps
     near = seen.knot < n - 1
     if steps is not None:
-        kept = steps.second < n
+        inside = steps.second < n
         fields = (steps.first, steps.second, steps.turn, steps.shift, steps.turn_root, steps.shift_root)
-        steps = Steps(*(values[kept] for values in fields))
+        steps = Steps(*(values[inside] for values in fields))
     short = replace(
         problem,
         motion=replace(motion, rate=motion.rate[: n - 1], force=motion.force[: n - 1]),

@@ -86,9 +86,9 @@ class NormalEquations:
         a, b = np.arange(self.size)[:, None], np.arange(self.size)[None, :]
         below = self.size * (row - column)[:, None, None] + a - b
         at = self.size * column[:, None, None] + b
-        kept = below >= 0
-        place = (below * self._band.shape[1] + at)[kept]
-        self._band += np.bincount(place, block[kept], self._band.size).reshape(self._band.shape)
+        lower = below >= 0
+        place = (below * self._band.shape[1] + at)[lower]
+        self._band += np.bincount(place, block[lower], self._band.size).reshape(self._band.shape)
 
     def _gradient(self, knot: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> None:
         place = self.size * knot[:, None] + np.arange(self.size)
@@ -124,7 +124,7 @@ class Chain:
     gyro_bias: Float[np.ndarray, "n 3"]  # rad/s
     accel_bias: Float[np.ndarray, "n 3"]  # m/s²
 
-    def moved(self, step: Float[np.ndarray, "n 15"]) -> "Chain":
+    def after(self, step: Float[np.ndarray, "n 15"]) -> "Chain":
         """Return the chain after a step of the solver."""
         return Chain(
             self.times,

@@ -123,13 +123,13 @@ def load_control(path: Path) -> Control:
         raise RecordingError(f"{path}: control has rows of 4 or 8 numbers (t x y z, TUM), found {rows.shape[1]}")
     if rows.size and not np.isfinite(rows).all():
         raise RecordingError(f"{path}: row {int(np.argmin(np.isfinite(rows).all(axis=1))) + 1} is not finite")
-    kept = rows[np.unique(rows[:, 0], return_index=True)[1]] if rows.size else rows
-    if len(kept) < _MIN_CONTROL_ROWS:
-        raise RecordingError(f"{path}: control needs {_MIN_CONTROL_ROWS} rows at different times, found {len(kept)}")
-    extent = float(np.linalg.norm(np.ptp(kept[:, 1:4], axis=0)))
+    unique = rows[np.unique(rows[:, 0], return_index=True)[1]] if rows.size else rows
+    if len(unique) < _MIN_CONTROL_ROWS:
+        raise RecordingError(f"{path}: control needs {_MIN_CONTROL_ROWS} rows at different times, found {len(unique)}")
+    extent = float(np.linalg.norm(np.ptp(unique[:, 1:4], axis=0)))
     if extent < _MIN_CONTROL_EXTENT:
         raise RecordingError(
             f"{path}: all positions lie within {extent:.2f} m; "
             f"control must move {_MIN_CONTROL_EXTENT:g} m to fix a length"
         )
-    return Control(kept[:, 0], kept[:, 1:4], path, len(rows) - len(kept))
+    return Control(unique[:, 0], unique[:, 1:4], path, len(rows) - len(unique))

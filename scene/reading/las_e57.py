@@ -28,11 +28,11 @@ _SAME_FACTOR = 1e-6  # a foot and a US survey foot differ by 2e-6
 
 def declared_unit(records: Iterable[Any]) -> str | None:
     """Return a key of `UNITS`, or other units in words, from VLRs and EVLRs of `laspy`; `None` where no record says."""
-    found = list(records)
-    for record in found:
+    known = list(records)
+    for record in known:
         if isinstance(record, WktCoordinateSystemVlr):
             return _unit_of_wkt(record.string)
-    for record in found:
+    for record in known:
         if isinstance(record, GeoKeyDirectoryVlr):
             return _unit_of_keys({key.id: key.value_offset for key in record.geo_keys if not key.tiff_tag_location})
     return None

@@ -67,10 +67,10 @@ def _ply_vertices(lines: list[str], body: int, ascii_form: bool) -> tuple[int, l
         total += count * max(least, 1)
         if count < 0 or total - ascii_form > body:
             raise ValueError(f"its header promises {count} of element {name}, but only {body} bytes follow")
-    found = next((element for element in elements if element[0] == "vertex"), None)
-    if found is None:
+    vertex = next((element for element in elements if element[0] == "vertex"), None)
+    if vertex is None:
         raise ValueError("it has no element vertex")
-    return found[1], [words[-1] for words in found[2]], elements[0][0] == "vertex"
+    return vertex[1], [words[-1] for words in vertex[2]], elements[0][0] == "vertex"
 
 
 _LARGEST_RATIO = 100  # LZF copies at most 264 bytes by 3

@@ -136,24 +136,24 @@ def read_ring_survey(path: Path, unit: str | None = None) -> RingSurvey:
 
 def _find_ring_columns(header: tuple[str, ...]) -> _RingColumns | None:
     names = [plain_name(name)[0] for name in header]
-    found = find_xyz(header)
-    if found is None or "chainage" in names or "easting" not in names:
+    columns = find_xyz(header)
+    if columns is None or "chainage" in names or "easting" not in names:
         return None
 
-    def at(*wanted: str) -> int | None:
-        return next((names.index(name) for name in wanted if name in names), None)
+    def at(*options: str) -> int | None:
+        return next((names.index(name) for name in options if name in names), None)
 
     ring, point = at("ring no", "ring", "ring number"), at("point", "point no", "point number")
     if point is None:
         return None
-    return _RingColumns(*found, point, ring, at("offset", "target offset", "prism offset"))
+    return _RingColumns(*columns, point, ring, at("offset", "target offset", "prism offset"))
 
 
 def _find_design_columns(header: tuple[str, ...]) -> list[int] | None:
     names = [plain_name(name)[0] for name in header]
-    found = find_xyz(header)
+    columns = find_xyz(header)
     rings = any(name.startswith("ring") for name in names)
-    return None if found is None or rings or "chainage" not in names else [names.index("chainage"), *found[0]]
+    return None if columns is None or rings or "chainage" not in names else [names.index("chainage"), *columns[0]]
 
 
 def _read_rings(path: Path, sheet: Sheet, columns: _RingColumns, rings: dict[str, list[tuple[float, ...]]]) -> None:

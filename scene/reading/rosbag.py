@@ -169,8 +169,8 @@ class RosBag(ScanSource):
         chosen = [c for c in lidars if topic in (None, c.topic)]
         if not chosen:
             held = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in self.reader.connections)) or "nothing"
-            wanted = f"LiDAR topic {topic}" if topic else "LiDAR topic (livox CustomMsg or sensor_msgs/PointCloud2)"
-            raise RecordingError(f"{self.path}: has no {wanted}; it holds {one_line(held)}")
+            missing = f"LiDAR topic {topic}" if topic else "LiDAR topic (livox CustomMsg or sensor_msgs/PointCloud2)"
+            raise RecordingError(f"{self.path}: has no {missing}; it holds {one_line(held)}")
         best = max(chosen, key=_likelihood)
         same = [c for c in chosen if (c.topic, c.msgtype) == (best.topic, best.msgtype)]
         return same, sorted({c.topic for c in lidars} - {best.topic})

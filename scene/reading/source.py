@@ -194,15 +194,15 @@ def choose_frame(sample: np.ndarray, declared: str | None, unit: str | None, axe
         low, high = np.percentile(finite, [1, 99], axis=0) if len(finite) > 2 else (finite.min(0), finite.max(0))
         extent = high - low
     detected = "mm" if extent.min() > _MM_FROM else "m"
-    found = unit or declared or detected
+    chosen = unit or declared or detected
     how = "by flag" if unit else "declared" if declared else f"detected: least extent {extent.min():.4g}"
-    metres = extent * UNITS[found]
+    metres = extent * UNITS[chosen]
     lying = metres[2] > max(_LYING * metres[:2].max(), _LYING_LENGTH)
     order = axes or (_Y_UP if lying else "xyz")
     why = "by flag" if axes else "detected: longest along z, so y is taken as up" if lying else "by default, z up"
     if np.linalg.det(np.eye(3)[_parse_axes(order)[0]] * _parse_axes(order)[1][:, None]) < 0:
         why += ", mirrored"
-    return Frame(found, order, {"unit": f"{found} ({how})", "axes": f"{order} ({why})"})
+    return Frame(chosen, order, {"unit": f"{chosen} ({how})", "axes": f"{order} ({why})"})
 
 
 def _parse_axes(axes: str) -> tuple[list[int], np.ndarray]:

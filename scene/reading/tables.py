@@ -28,11 +28,11 @@ def plain_name(name: str) -> tuple[str, str | None]:
     """
     text = name.strip().lstrip("/#").strip().strip('"')
     bracketed = re.search(r"[(\[]([^)\]]*)[)\]]", text)
-    found = _COLUMN_UNIT.search(" " + (bracketed.group(1) if bracketed else text.replace("_", " ")))
+    match = _COLUMN_UNIT.search(" " + (bracketed.group(1) if bracketed else text.replace("_", " ")))
     base = re.sub(r"[(\[][^)\]]*[)\]]", "", text).strip() if bracketed else text
     unit = None
-    if found and (bracketed or " " in text.replace("_", " ")):
-        unit = next(unit for start, unit in _UNIT_STARTS if found.group(1).lower().startswith(start))
+    if match and (bracketed or " " in text.replace("_", " ")):
+        unit = next(unit for start, unit in _UNIT_STARTS if match.group(1).lower().startswith(start))
         base = base if bracketed else _COLUMN_UNIT.sub("", " " + base.replace("_", " "))
     return base.strip(" _.").lower(), unit
 
@@ -45,8 +45,8 @@ def find_xyz(names: Sequence[str]) -> tuple[list[int], str | None] | None:
     known = [plain_name(name) for name in names]
     bare = [name for name, _ in known]
     at = []
-    for wanted in _XYZ_NAMES:
-        index = next((bare.index(name) for name in wanted if name in bare), None)
+    for options in _XYZ_NAMES:
+        index = next((bare.index(name) for name in options if name in bare), None)
         if index is None:
             return None
         at.append(index)
@@ -90,17 +90,17 @@ def _find_delimiter(lines: list[str]) -> tuple[str | None, str]:
 
 def _find_columns(lines: list[str], delimiter: str | None, comma: bool) -> tuple[int, list[int], str | None]:
     """Number of lines before the numbers, columns of x, y and z, and the unit that a header declares."""
-    found, unit = None, None
+    columns, unit = None, None
     for index, line in enumerate(lines):
         words = [word.strip() for word in line.split(delimiter)]
-        if _numeric(words[:3], comma) or (found and _numeric([words[i] for i in found if i < len(words)], comma)):
-            return index, found or [0, 1, 2], unit
+        if _numeric(words[:3], comma) or (columns and _numeric([words[i] for i in columns if i < len(words)], comma)):
+            return index, columns or [0, 1, 2], unit
         named = find_xyz(words) if len(words) >= 3 else None
         if named is not None:
-            found, unit = named
-        elif index and not line.startswith(("#", "/")) and line.strip() and found:
-            return index, found, unit  # the reader will name this line
-        elif len(words) > 3 and found is None and not line.startswith(("#", "/")) and not _numeric(words, comma):
+            columns, unit = named
+        elif index and not line.startswith(("#", "/")) and line.strip() and columns:
+            return index, columns, unit  # the reader will name this line
+        elif len(words) > 3 and columns is None and not line.startswith(("#", "/")) and not _numeric(words, comma):
             raise ValueError(f"line {index + 1} has no columns x, y, z: {line[:60]!r}")
     raise ValueError("no line near its start holds three numbers")
 
@@ -135,15 +135,15 @@ def open_parquet(path: Path) -> CloudSource:
     """
     with pq.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
-        found = find_xyz(names)
-        if found is None:
+        xyz = find_xyz(names)
+        if xyz is None:
             raise ValueError(f"no columns x, y, z among {', '.join(names)}")
-        columns = [names[index] for index in found[0]]
+        columns = [names[index] for index in xyz[0]]
         for name in columns:
             kind = file.schema_arrow.field(name).type
             if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
                 raise ValueError(f"column {name} holds {kind}, not numbers")
-        declared = found[1] or _field_unit(file.schema_arrow.field(columns[0]))
+        declared = xyz[1] or _field_unit(file.schema_arrow.field(columns[0]))
         groups = sorted({0, file.num_row_groups // 2, file.num_row_groups - 1}) if file.num_row_groups else []
         sample = [next(_read_batches(file, columns, [group]), np.empty((0, 3)))[::100] for group in groups]
 
@@ -162,5 +162,5 @@ def _read_batches(file: pq.ParquetFile, columns: list[str], groups: list[int]) -
 
 def _field_unit(field: pa.Field) -> str | None:
     """Unit from the column's own metadata, key `unit`."""
-    said = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
-    return said if said in ("m", "mm") else None
+    unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
+    return unit if unit in ("m", "mm") else None

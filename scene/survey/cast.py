@@ -57,12 +57,12 @@ class Caster:
         """Return the first loaded surface on each ray, of an origin, m, and a unit direction in the survey frame."""
         direction = np.ascontiguousarray(direction, np.float32)
         hit = self._scene.run((origin - self._origin).astype(np.float32), direction, output=True)
-        normal, found = hit["Ng"], hit["primID"] >= 0
+        normal, met = hit["Ng"], hit["primID"] >= 0
         size = np.sqrt(np.einsum("ij,ij->i", normal, normal))
-        normal = normal / np.where(found, size, 1.0).astype(np.float32)[:, None]
+        normal = normal / np.where(met, size, 1.0).astype(np.float32)[:, None]
         cosine = -np.einsum("ij,ij->i", normal, direction)
-        distance = np.where(found, hit["tfar"], np.float32(np.inf))
-        return Hits(distance, cosine, self._part[np.where(found, hit["primID"], 0)], normal)
+        distance = np.where(met, hit["tfar"], np.float32(np.inf))
+        return Hits(distance, cosine, self._part[np.where(met, hit["primID"], 0)], normal)
 
 
 FADING = 0.5  # standard deviation of the logarithm of the echo (speckle)

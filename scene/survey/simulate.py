@@ -111,14 +111,14 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     write_json(config.out / "truth.json", describe_truth(bore, config))
     prism = measure_prism(np.random.default_rng(of_prism), walk, config.errors.prism_noise)
     write_tum(config.out / "prism.tum", *prism, None)
-    told = [f"{config.out}: {config.length:g} m"]
+    parts = [f"{config.out}: {config.length:g} m"]
     if config.profiles:
-        told.append(f"{write_profiles(config, bore, Caster(mesh), of_profiles)} points in profiles")
+        parts.append(f"{write_profiles(config, bore, Caster(mesh), of_profiles)} points in profiles")
     # A sensor's noise does not depend on which others are on the rack.
     seeds = dict(zip(LIDARS, of_sensors.spawn(len(LIDARS)), strict=True))
     for name in config.sensors:
-        told.append(_simulate_device(config, name, walk, mesh, seeds[name], console))
-    return ", ".join(told)
+        parts.append(_simulate_device(config, name, walk, mesh, seeds[name], console))
+    return ", ".join(parts)
 
 
 def _simulate_device(

@@ -55,7 +55,7 @@ def planar_segments(
     corners = np.stack([piece.corners() for piece in pieces])
     station = bore.axis.local(corners.reshape(-1, 3))[0]
     level = corners[..., 2] - np.interp(station, bore.station, elevation).reshape(corners.shape[:2]) - height
-    found = []
+    outlines = []
     for corner, over in zip(corners, level, strict=True):
         crossed = _EDGES[(over[_EDGES[:, 0]] < 0) != (over[_EDGES[:, 1]] < 0)]
         if not len(crossed):
@@ -65,14 +65,14 @@ def planar_segments(
         outline = corner[a, :2] + share[:, None] * (corner[b, :2] - corner[a, :2])
         offset = outline - outline.mean(axis=0)
         outline = outline[np.argsort(np.arctan2(offset[:, 1], offset[:, 0]))]
-        found.append(np.hstack([outline, np.roll(outline, -1, axis=0)]))
-    return np.concatenate(found) if found else np.empty((0, 4))
+        outlines.append(np.hstack([outline, np.roll(outline, -1, axis=0)]))
+    return np.concatenate(outlines) if outlines else np.empty((0, 4))
 
 
 def _niche_openings(bore: Bore, track: Track, config: FurnitureConfig) -> list[Opening]:
     """Niches on the grid of the bore, above the walkway (the sleepers, where there is none), on the left."""
     length, height, _ = config.passage_size
-    step, found = bore.station[1], []
+    step, openings = bore.station[1], []
     left = np.flatnonzero(np.cos(bore.angle) > 0.3)
     foot = config.walkway_height if config.walkway else 0.0
     for station in np.arange(config.passage_spacing / 2, bore.length - length, config.passage_spacing):
@@ -81,8 +81,8 @@ def _niche_openings(bore: Bore, track: Track, config: FurnitureConfig) -> list[O
         level = bore.surface()[middle, left, 2] - track.elevation[middle]
         low, high = (int(left[np.argmin(np.abs(level - z))]) for z in (foot, foot + height))
         if first > 1 and low != high:
-            found.append(Opening((first, last), (low, high)))
-    return found
+            openings.append(Opening((first, last), (low, high)))
+    return openings
 
 
 def _niche_pockets(bore: Bore, openings: list[Opening], depth: float) -> np.ndarray:

@@ -88,9 +88,9 @@ def lay_track(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None)
     Sleepers that the survey shows are taken as they lie, and stand out as far as they do. Raises `FitError` where a
     sleeper would come closer to the wall than the margin.
     """
-    wanted = config.sleeper_length / 2 + config.shoulder
+    half_width = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]
-    chord = bore.position[:, 2] + _lowest_chord(bore, wanted)
+    chord = bore.position[:, 2] + _lowest_chord(bore, half_width)
     raised = bool(np.median(chord - floor) > _FLAT)
     bed = chord if raised else floor
     sigma = _SMOOTHING / (bore.station[1] - bore.station[0])

@@ -163,9 +163,9 @@ def _grid(girth: float, length: float, fold: np.ndarray) -> tuple[np.ndarray, np
     station = np.linspace(0.0, length, rows + 1)
     u = (np.arange(columns) + np.where(np.arange(rows + 1) % 2, 0.75, 0.25)[:, None]) * step
     distance = np.abs((u[..., None] - fold + girth / 2) % girth - girth / 2).min(axis=-1, initial=np.inf)
-    kept = distance > _BAND
-    u = np.concatenate([u[kept], np.tile(fold, rows + 1)])
-    s = np.concatenate([np.repeat(station, columns)[kept.ravel()], np.repeat(station, len(fold))])
+    clear = distance > _BAND
+    u = np.concatenate([u[clear], np.tile(fold, rows + 1)])
+    s = np.concatenate([np.repeat(station, columns)[clear.ravel()], np.repeat(station, len(fold))])
     order = np.lexsort([u, s])
     return u[order], s[order]
 

@@ -51,8 +51,8 @@ def wall_panels(bore: Bore, bed: Float[np.ndarray, " n"], openings: list[Opening
     floor = above.mean(axis=0) < _ON_BED
     start = int(np.flatnonzero(floor)[len(np.flatnonzero(floor)) // 2]) if floor.any() else 0
     turn = (start + np.arange(m + 1)) % m
-    kept = np.asarray(LineString(outline[turn]).simplify(_PATCH_TOLERANCE).coords)
-    breaks = {int(np.argmin(np.linalg.norm(outline[turn[:-1]] - point, axis=1))) for point in kept} | {0, m}
+    vertices = np.asarray(LineString(outline[turn]).simplify(_PATCH_TOLERANCE).coords)
+    breaks = {int(np.argmin(np.linalg.norm(outline[turn[:-1]] - point, axis=1))) for point in vertices} | {0, m}
     edge = np.flatnonzero(np.diff(floor[turn].astype(int)))
     breaks |= {int(k) + int(floor[turn[k]]) for k in edge}
     panels: list[Panel] = []
@@ -143,19 +143,19 @@ def add_low_panels(world: ET.Element, walls: Walls, bore: Bore, track: Track, ni
         (-1, "right", walls.right, walls.right_station),
     ):
         line = LineString(wall)
-        kept = np.asarray(line.simplify(_LINE_TOLERANCE).coords)
+        vertices = np.asarray(line.simplify(_LINE_TOLERANCE).coords)
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(wall, axis=0), axis=1))])
-        kept_station = np.interp([line.project(Point(vertex)) for vertex in kept], arc, station)
+        vertex_station = np.interp([line.project(Point(vertex)) for vertex in vertices], arc, station)
         gaps = niches if side == 1 else []
         cut = np.array([end for gap in gaps for end in gap])
         on_line = [line.interpolate(float(at)) for at in np.interp(cut, station, arc)]
-        order = np.argsort(np.append(kept_station, cut), kind="stable")
-        kept = np.concatenate([kept, np.array([(at.x, at.y) for at in on_line]).reshape(-1, 2)])[order]
-        kept_station = np.append(kept_station, cut)[order]
-        middle_height = np.interp(kept_station, bore.station, track.elevation) + _HEIGHT / 2 - _DEPTH
-        ends = np.column_stack([kept, middle_height])
+        order = np.argsort(np.append(vertex_station, cut), kind="stable")
+        vertices = np.concatenate([vertices, np.array([(at.x, at.y) for at in on_line]).reshape(-1, 2)])[order]
+        vertex_station = np.append(vertex_station, cut)[order]
+        middle_height = np.interp(vertex_station, bore.station, track.elevation) + _HEIGHT / 2 - _DEPTH
+        ends = np.column_stack([vertices, middle_height])
         for k in range(len(ends) - 1):
-            if any(first <= kept_station[k : k + 2].mean() <= last for first, last in gaps):
+            if any(first <= vertex_station[k : k + 2].mean() <= last for first, last in gaps):
                 continue
             rotation = rotation_along(ends[k], ends[k + 1])
             middle = (ends[k] + ends[k + 1]) / 2 + rotation.apply([0, side * _THICKNESS / 2, 0])

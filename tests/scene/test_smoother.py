@@ -97,7 +97,7 @@ def test_written_out_derivatives_agree_with_finite_differences(name):
             for term, knot in enumerate(which):
                 step = np.zeros((4, KNOT_SIZE))
                 step[knot, unknown] = h
-                add(moved, chain.moved(step))
+                add(moved, chain.after(step))
                 slope = (moved.residual[term] - here.residual[term]) / h
                 # The turn half way, and the half turn of the force, are linearised to first order in a small angle.
                 np.testing.assert_allclose(slope, jacobian[term][:, unknown], atol=0.02)
