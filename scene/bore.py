@@ -28,7 +28,7 @@ class Axis:
 
     @property
     def length(self) -> float:
-        """From the first to the last station, m."""
+        """Length from the first to the last station, m."""
         return float(self.station[-1] - self.station[0])
 
     @property
@@ -108,7 +108,7 @@ STRETCH = np.dtype([("start", "f8"), ("end", "f8"), ("type", "U9"), *_SIZES])
 
 @dataclass(frozen=True)
 class Bore:
-    """The arrays of `bore.npz`; docs/formats.md says what each means."""
+    """The arrays of `bore.npz`; see docs/formats.md."""
 
     station: Float[np.ndarray, " n"]  # m, from 0, uniform
     position: Float[np.ndarray, "n 3"]  # Centreline, m
@@ -133,7 +133,7 @@ class Bore:
 
     @property
     def length(self) -> float:
-        """Of the centreline, m."""
+        """Length of the centreline, m."""
         return float(self.station[-1])
 
     @property

@@ -36,7 +36,7 @@ class VoxelMean:
     Attributes:
         voxel: Edge length, m.
         finite: Finite points given.
-        returns: Those of them that were kept: all within 2²⁰ voxels of the first.
+        returns: Finite points within 2²⁰ voxels of the first; the others are left out.
     """
 
     def __init__(self, voxel: float) -> None:
@@ -89,7 +89,7 @@ class VoxelMean:
 
     @classmethod
     def restored(cls, voxel: float, arrays: dict[str, np.ndarray]) -> "VoxelMean":
-        """Return the opposite of `arrays`."""
+        """Return the state that `arrays` returned as arrays."""
         again = cls(voxel)
         again._origin = None if np.isnan(arrays["origin"]).any() else arrays["origin"]
         again.finite, again.returns, again._pending = (int(count) for count in arrays["counts"])

@@ -11,8 +11,7 @@ from scene.cli import Stages
 from scene.cloud import Cloud
 from scene.errors import FitError, RecordingError
 from scene.files import require_input
-from scene.fitting.assemble import bore_from_sections
-from scene.fitting.assemble import describe_bore as bore_facts
+from scene.fitting.assemble import bore_from_sections, describe_bore
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
 from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
@@ -31,11 +30,11 @@ from scene.resume import Partial, input_record, resume_key, total_bytes
 
 @dataclass(frozen=True)
 class Registered:
-    """A cloud and where it comes from."""
+    """A registered cloud and its origin."""
 
-    cloud: Cloud  # Thinned
+    cloud: Cloud  # Thinned cloud
     record: list[dict[str, Any]]  # Name, size and hash of each input
-    facts: dict[str, Any]  # For the manifest
+    facts: dict[str, Any]  # Facts for the manifest
     located: Located | None = None  # Poses of the LiDAR, for a recording
 
 
@@ -120,12 +119,12 @@ class ReconstructConfig:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A bore and what there is to say about it."""
+    """A bore, and all that the manifest says about it."""
 
     bore: Bore  # Bore in the tunnel frame
     origin: np.ndarray  # Origin of the tunnel frame in the input's, whole metres
     inputs: list[dict[str, Any]]  # Name, size and hash of each
-    facts: dict[str, Any]  # For the manifest
+    facts: dict[str, Any]  # Facts for the manifest
     provenance: dict[str, str]  # Provenance of lining features, for the manifest
     odometry: Trajectory | None = None  # The estimated poses, where there was no trajectory to be given
     cloud: Cloud | None = None  # The registered cloud, where there was one
@@ -202,7 +201,7 @@ def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stag
         "points": len(cloud.points),
         "flat_floor": sections.flat_floor,
         "profile_spacing": sections.spacing or None,
-        **bore_facts(bore),
+        **describe_bore(bore),
     }
     odometry = located.trajectory if located is not None and located.estimated else None
     return Reconstruction(bore, cloud.origin, registered.record, facts, provenance, odometry, cloud, seen)
@@ -223,7 +222,7 @@ def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) ->
         "length_fixed_by": "total-station survey",
         "radius_mean": float(fit.radius.mean()),
         "radius_sd": float(fit.radius.std()),
-        **bore_facts(bore),
+        **describe_bore(bore),
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
         "largest_target_offset": float(max(offset.max() for offset in survey.offsets)),
         "flat_floor": False,

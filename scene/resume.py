@@ -74,7 +74,6 @@ def _json_value(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else str(value)
 
 
-_KEY_FILE = "key"
 _WRITING_SHARE = 0.02  # of the time, at most, goes into writing partial results
 
 
@@ -85,7 +84,7 @@ class Partial:
     writing of partial results and not the build.
 
     Attributes:
-        folder: Where they lie; `None` keeps nothing.
+        folder: Folder that they lie in; `None` keeps nothing.
         fresh: Start over, whatever lies there.
         every: Least time between two writings of a growing result, s; more where writing takes long. 0 writes at every
             occasion, whatever it costs.
@@ -106,17 +105,22 @@ class Partial:
             return
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._take()
-            place = self.folder / _KEY_FILE
-            known = place.read_text() if place.is_file() else None
+            self._lock = (self.folder / "lock").open("w")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            key_file = self.folder / "key"
+            known = key_file.read_text() if key_file.is_file() else None
             if known != key or self.fresh:
                 if known is not None and not self.fresh:
                     print("a partial result of another input, configuration or version was discarded", flush=True)
-                self._clear()
-                fresh = place.with_name(f"{_KEY_FILE}.tmp")
-                fresh.write_text(key)
-                fresh.replace(place)
+                for entry in self.folder.iterdir():
+                    if entry.name != "lock":
+                        entry.unlink()
+                (self.folder / "key.tmp").write_text(key)
+                (self.folder / "key.tmp").replace(key_file)
             self._open = True
+        except BlockingIOError as error:
+            self.close()
+            raise OutputError(f"{self.folder}: another build is at work on this output") from error
         except OSError as error:
             self._give_up(error)
 
@@ -165,21 +169,6 @@ class Partial:
         if self.folder is not None and self._lock is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
         self.close()
-
-    def _take(self) -> None:
-        assert self.folder is not None
-        self._lock = (self.folder / "lock").open("w")
-        try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            self.close()
-            raise OutputError(f"{self.folder}: another build is at work on this output") from error
-
-    def _clear(self) -> None:
-        assert self.folder is not None
-        for entry in self.folder.iterdir():
-            if entry.name != "lock":
-                entry.unlink()
 
     def _give_up(self, error: OSError) -> None:
         print(f"no partial results are kept ({error.strerror or error}); a killed build starts over", flush=True)

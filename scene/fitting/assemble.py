@@ -1,4 +1,11 @@
-"""From axis and sections to the bore, with its types of section."""
+"""From axis and sections to the bore, with its type of section stretch by stretch: D, horseshoe, circle, or free.
+
+The three parametric types are one family: a semicircular crown on walls that curve inwards with the radius of the
+crown (circle), a larger one (horseshoe) or not at all (D), on a flat floor. Each is fitted to the free radial profile,
+and Akaike's criterion says whether fewer parameters describe it as well.
+
+Source: Akaike 1974, IEEE Trans. Automatic Control 19(6).
+"""
 
 import itertools
 from collections.abc import Iterable

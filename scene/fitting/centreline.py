@@ -1,4 +1,8 @@
-"""From a cloud to the axis of the bore."""
+"""From a cloud to the axis of the bore: through mid-width and mid-height, smooth, with arc length.
+
+The first guess comes from distances *along* the surface, so that no orientation or straightness is assumed. It is then
+pulled to the middle of the sections a few times.
+"""
 
 from dataclasses import dataclass
 

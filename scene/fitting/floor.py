@@ -1,4 +1,4 @@
-"""The floor of a section and of the whole bore."""
+"""The flat floor: a line under sleepers, rails and people in each section, and the walls extended into its corners."""
 
 from dataclasses import dataclass
 

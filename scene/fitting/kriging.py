@@ -1,4 +1,11 @@
-"""The wall between profiles some way apart."""
+"""The wall between profiles some way apart: seen at a few stations, kriged along the station in between.
+
+Each direction of the section is a function of the station. All share one correlation, chosen by its likelihood from
+four families and a range of lengths. The roughest family at a great length is linear interpolation, so that this is
+one of the choices.
+
+Source: Rasmussen and Williams 2006, *Gaussian Processes for Machine Learning*, chapters 2, 4.2 and 5.4.
+"""
 
 from dataclasses import dataclass
 from itertools import product

@@ -1,4 +1,8 @@
-"""The lining of segments."""
+"""Lining of segments: rings, pockets and nails, measured where the survey shows them, by standard where it cannot.
+
+Nails are the bolts across a ring joint. Inside a pocket the nail hangs free between wall and back. Returns from the
+middle of the mouth at that depth come from it or from nothing; the rim, the sides and the back lie elsewhere.
+"""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,9 @@
-"""Bolt pockets and ring joints, found on the wall rolled out flat."""
+"""Bolt pockets and ring joints, found on the wall rolled out flat.
+
+A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
+hidden by its own edge, so that one pocket says little about its depth or size. But the pockets of a lining come from
+one mould, and all of them together say it well. They stand in rows along the bore, either side of every ring joint.
+"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,10 @@
-"""From cloud and axis to the section at every station."""
+"""From cloud and axis to the section at every station, at the half-metre scale.
+
+A coarse grid of medians gives a first wall that pockets, rails and people cannot move. The mean residual of small
+cells against it, cleaned of such things and smoothed over a few decimetres, gives the wall itself. Where the survey
+is profiles some way apart, the wall between them is kriged instead. A flat floor is fitted as a line under the track,
+and the walls are extended into its corners.
+"""
 
 from dataclasses import dataclass
 

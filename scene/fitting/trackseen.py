@@ -1,4 +1,4 @@
-"""Sleepers and rails, where the cloud shows them."""
+"""Sleepers and rails where the cloud shows them: on the floor between the walls, above the ballast."""
 
 from dataclasses import dataclass
 

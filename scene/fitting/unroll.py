@@ -1,4 +1,4 @@
-"""The wall rolled out flat."""
+"""The wall rolled out flat: a grid over station and angle, and the standard deviation of the wall in each cell."""
 
 from dataclasses import dataclass
 

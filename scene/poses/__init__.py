@@ -1,1 +1,1 @@
-"""Where the sensor was: given trajectories, odometry, inertia and control; and the cloud that follows."""
+"""Poses of the sensor: given trajectories, odometry, inertia and control; and the cloud that follows."""

@@ -1,4 +1,9 @@
-"""IMU samples, and the attitude that follows from them."""
+"""Inertial samples beside a LiDAR, and the attitude that follows from them.
+
+The `orientation` field is not read. Where an instrument fills it (`/imu/data` of an Xsens MTi), a filter of its own
+made it from these same rates and forces, with errors that are neither stated nor white, and from a magnetometer that
+steel lining, rails and cables turn.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

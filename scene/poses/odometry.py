@@ -1,4 +1,12 @@
-"""LiDAR odometry."""
+"""LiDAR odometry: each sweep against a map of those before it, by small-gicp, blended with the expected pose.
+
+In a bore a sweep barely constrains its place along the axis, and plain registration then jumps about. Each result is
+therefore blended with the expected pose by the information of both: where the walls say little, the expectation
+stands. It comes from a guide (a gyro, or an earlier trajectory), else from going on as before.
+
+The map of small-gicp cannot be read back, but it follows from the thinned sweeps and their poses. These are kept among
+the partial results, and an odometry that goes on puts them into a new map without registering them again.
+"""
 
 from dataclasses import dataclass, field
 
@@ -39,7 +47,7 @@ class Tracker:
     """The map so far, and the pose of every sweep in it.
 
     Attributes:
-        poses: Sweep to map, `(4, 4)` each.
+        poses: Sweep to map, Pose of each, `(4, 4)`.
         thinned: The last sweep's points as they went into the map, m, `(k, 3)`: what `follow` needs of it.
     """
 
@@ -150,11 +158,11 @@ class TrackedSweeps:
     """Sweeps in the order of time."""
 
     times: list[float] = field(default_factory=list)  # Middle of each, s
-    poses: list[np.ndarray] = field(default_factory=list)  # `(4, 4)` each
-    weakest: list[np.ndarray] = field(default_factory=list)  # See `Odometry`
+    poses: list[np.ndarray] = field(default_factory=list)  # Pose of each, `(4, 4)`
+    weakest: list[np.ndarray] = field(default_factory=list)  # Direction that each says least about; see `Odometry`
     # Points of each as they went into the map, m; only of those that were read back
     thinned: list[np.ndarray] = field(default_factory=list)
-    place: ReadPosition = START  # Position up to which the recording has been read
+    position: ReadPosition = START  # Position up to which the recording has been read
     done: bool = False  # True where the whole recording has been read
 
 
@@ -174,7 +182,7 @@ class OdometryLog:
             tracked.poses.extend(piece["poses"])
             tracked.weakest.extend(piece["weakest"])
             tracked.thinned.extend(np.split(piece["points"], np.cumsum(piece["sizes"])[:-1]))
-            tracked.place = ReadPosition.from_array(piece["place"])
+            tracked.position = ReadPosition.from_array(piece["place"])
             tracked.done = bool(piece["done"])
             self._pieces += 1
         self._written = len(tracked.times)
@@ -194,9 +202,9 @@ class OdometryLog:
         """Return whether it is time to write."""
         return self._partial.due()
 
-    def write(self, tracked: TrackedSweeps, place: ReadPosition, done: bool = False) -> None:
+    def write(self, tracked: TrackedSweeps, position: ReadPosition, done: bool = False) -> None:
         """Writes what has been added since the last piece."""
-        tracked.place, tracked.done = place, done
+        tracked.position, tracked.done = position, done
         if not self._partial.keeps or not tracked.times:
             return
         new = slice(self._written, None)
@@ -208,7 +216,7 @@ class OdometryLog:
             weakest=np.array(tracked.weakest[new]).reshape(-1, 3),
             sizes=np.array([len(points) for points in self._fresh], np.int64),
             points=np.concatenate([np.empty((0, 3)), *self._fresh]),
-            place=place.as_array(),
+            place=position.as_array(),
             done=np.array(done),
         )
         self._pieces, self._written, self._fresh = self._pieces + 1, len(tracked.times), []
@@ -239,7 +247,7 @@ def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, l
     tracked = log.read()
     tracker = Tracker()
     if tracked.times:
-        stage.resume(tracked.place.messages)
+        stage.resume(tracked.position.messages)
     if not tracked.done:
         for thinned, pose, middle in zip(tracked.thinned, tracked.poses, tracked.times, strict=True):
             tracker.follow(thinned, pose, middle)
@@ -256,7 +264,7 @@ def _track_scans(
     recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog, tracker: Tracker, tracked: TrackedSweeps
 ) -> None:
     times = tracked.times
-    for scan in recording.scans(tracked.place):
+    for scan in recording.scans(tracked.position):
         stage.advance()
         span = float(scan.times.max(initial=0.0))
         middle = scan.stamp + 0.5 * span

@@ -22,9 +22,9 @@ def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
     span = float(scan.times.max(initial=0.0))
     knots = np.linspace(0.0, max(span, 1e-9), _KNOTS)
     positions, rotations = trajectory.at(scan.stamp + knots)
-    place = scan.times / knots[-1] * (_KNOTS - 1)
-    low = np.minimum(place.astype(np.intp), _KNOTS - 2)
-    share = (place - low)[:, None]
+    at = scan.times / knots[-1] * (_KNOTS - 1)
+    low = np.minimum(at.astype(np.intp), _KNOTS - 2)
+    share = (at - low)[:, None]
     matrices = rotations.as_matrix()
     points = scan.points.astype(np.float64)
 
@@ -60,9 +60,9 @@ def register_scans(
     state = _Registration(VoxelMean(voxel))
     if (known := partial.load("cloud")) is not None:
         state = _Registration.restored(known, voxel)
-        stage.resume(state.place.messages)
+        stage.resume(state.position.messages)
     batch = []
-    for scan in recording.scans(state.place):
+    for scan in recording.scans(state.position):
         stage.advance()
         end = scan.stamp + float(scan.times.max(initial=0.0))
         state.span = (min(state.span[0], scan.stamp), max(state.span[1], end))
@@ -72,12 +72,12 @@ def register_scans(
             state.uncovered += 1
         if len(batch) == _BATCH:
             state.thinned.add(np.concatenate(batch))
-            batch, state.place = [], recording.position
+            batch, state.position = [], recording.position
             if partial.due():
                 partial.save("cloud", **state.arrays())
     if batch:
         state.thinned.add(np.concatenate(batch))
-    state.place = recording.position
+    state.position = recording.position
     _require_covered(state, recording, trajectory, most_uncovered)
     if partial.due():
         partial.save("cloud", **state.arrays())
@@ -92,18 +92,18 @@ class _Registration:
     """State of a registration between two batches."""
 
     thinned: VoxelMean
-    place: ReadPosition = START
+    position: ReadPosition = START
     uncovered: int = 0
     span: tuple[float, float] = (np.inf, -np.inf)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the state as arrays, for a partial result."""
-        counts = {"place": self.place.as_array(), "uncovered": np.array(self.uncovered), "span": np.array(self.span)}
+        counts = {"place": self.position.as_array(), "uncovered": np.array(self.uncovered), "span": np.array(self.span)}
         return {**counts, **self.thinned.arrays()}
 
     @classmethod
     def restored(cls, arrays: dict[str, np.ndarray], voxel: float) -> "_Registration":
-        """Return the opposite of `arrays`."""
+        """Return the state that `arrays` returned as arrays."""
         start, end = arrays["span"]
         return cls(
             VoxelMean.restored(voxel, arrays),

@@ -19,7 +19,7 @@ _YAWS = np.deg2rad(np.arange(0, 360, 45))
 _TRIAL = 60.0  # s of the recording on which the mounting's heading is tried out
 _TRIAL_ITERATIONS, _ITERATIONS = 8, 25
 _CONVERGED = 1e-6  # rad and m
-_BIAS = (0.02, 0.3)  # rad/s, m/s²: what a MEMS gyro and accelerometer may start with
+_BIAS = (0.02, 0.3)  # rad/s, m/s²: biases that a MEMS gyro and accelerometer may start with
 _NO_BIAS = (1e-6, 1e-6)
 # Standard deviation of a position against the mean of two velocities, m: jerk · step³ / 12 of a walker's stride.
 _SMOOTH, SMOOTH_BETWEEN_SWEEPS = 2e-4, 5e-3
@@ -31,10 +31,11 @@ class Noise:
 
     Attributes:
         control: Standard deviation of a control position in each axis, m.
-        gyro: Of one sample, rad/s. Source: GEODE, device γ.
-        accel: Of one sample, m/s²; the published figure times 3, for scale and alignment errors that nobody models.
-        gyro_walk, accel_walk: Of the biases, per √s.
-        robust: Standard deviations beyond which a measurement counts ever less.
+        gyro: Standard deviation of one rate, rad/s. Source: GEODE, device γ.
+        accel: Standard deviation of one force, m/s²; the published figure times 3, for scale and alignment errors.
+        gyro_walk: Random walk of the gyro's bias, rad/s/√s.
+        accel_walk: Random walk of the accelerometer's bias, m/s²/√s.
+        robust: Number of standard deviations beyond which a measurement counts ever less.
     """
 
     control: float = 0.003
@@ -52,7 +53,7 @@ class Problem:
     motion: Motion  # Rates and forces between knots
     sightings: Sightings  # Sightings of the prism
     steps: Steps | None  # Steps of the odometry, where it ran
-    noise: Noise  # See `Noise`
+    noise: Noise  # Standard deviations of the instruments
     # True where the rates come from an instrument, which has biases; otherwise the motion is only smooth
     inertial: bool = True
 
@@ -124,14 +125,12 @@ def _first_knots(problem: Problem, chain: Chain, n: int) -> tuple[Problem, Chain
 
 
 _KNOT_STEP = 0.025  # s; between two knots a walker's motion is straight to 0.2 mm and 0.005°
-# What one step of the odometry is trusted to: rad, and m across and along the bore. Measured on simulated surveys.
-_STEP_TURN, _STEP_ACROSS, _STEP_ALONG = np.deg2rad(0.1), 0.02, 1.0
-_FREE_TURN, _FREE_SPEED = 3.0, 1.0  # rad/√s and m/s/√s: how fast a carrier may change its mind, nothing measured
-# The same where an IMU guides the odometry: between every fourth knot, 0.1 s, a sweep.
+# Standard deviation of one step of the odometry: rad, m across and m along the bore. Measured on simulated surveys.
+_STEP = (np.deg2rad(0.1), 0.02, 1.0)
+_FREE_TURN, _FREE_SPEED = 3.0, 1.0  # rad/√s and m/s/√s: changes of a carrier whose motion nothing measured
+# The same where an IMU guides the odometry, over one sweep: four knots, 0.1 s.
 _IMU_STEP_KNOTS = 4
-_IMU_STEP_TURN, _IMU_STEP_ACROSS, _IMU_STEP_ALONG = np.deg2rad(0.03), 0.01, 1.0
-
-
+_IMU_STEP = (np.deg2rad(0.03), 0.01, 1.0)
 _LEVEL_TIME = 1.0  # s; over this a walker's accelerations cancel
 _TRACK_TIME = 10.0  # s; over this the carrier faces, on average, the way it goes
 
@@ -209,13 +208,7 @@ def odometry_problem(
     if len(shared) < 3:
         raise FitError(f"{control.path}: only {len(shared)} sweeps lie within the control's time")
     times, turns = poses.times[shared], poses.rotations[shared].as_matrix()
-    back = terms.invert_rotations(turns[:-1])
-    shift = terms.rotate_vectors(back, np.diff(poses.positions[shared], axis=0))
-    along = odometry.weakest[shared[1:], :, None] * odometry.weakest[shared[1:], None, :]
-    n = np.arange(len(times) - 1)
-    turn_root = np.broadcast_to(np.eye(3) / _STEP_TURN, along.shape)
-    shift_root = (np.eye(3) - along) / _STEP_ACROSS + along / _STEP_ALONG
-    steps = Steps(n, n + 1, back @ turns[1:], shift, turn_root, shift_root)
+    steps = _make_steps(np.arange(len(times)), turns, poses.positions[shared], odometry.weakest[shared[1:]], _STEP)
     zero = np.zeros((len(times), 3))
     free = Motion(zero[1:], zero[1:], _FREE_TURN, _FREE_SPEED, False)
     position, velocity = smooth_control(control, times)
@@ -232,18 +225,24 @@ def imu_steps(odometry: Odometry, chain: Chain, mount: Mount) -> Steps:
     places, turns = poses.at(chain.times[knots])
     attitude = turns.as_matrix() @ mount.rotation.T
     places = places + turns.apply(mount.origin)
-    back = terms.invert_rotations(attitude[:-1])
     nearest = np.clip(np.searchsorted(poses.times, chain.times[knots[1:]]), 0, len(poses.times) - 1)
-    weakest = odometry.weakest[nearest] @ mount.rotation.T
+    return _make_steps(knots, attitude, places, odometry.weakest[nearest] @ mount.rotation.T, _IMU_STEP)
+
+
+def _make_steps(
+    knots: np.ndarray,
+    attitude: np.ndarray,
+    position: np.ndarray,
+    weakest: np.ndarray,
+    sigma: tuple[float, float, float],
+) -> Steps:
+    """Steps between neighbouring knots, trusted to `sigma`: rad, m across and m along the weakest direction."""
+    back = terms.invert_rotations(attitude[:-1])
+    shift = terms.rotate_vectors(back, np.diff(position, axis=0))
     along = weakest[:, :, None] * weakest[:, None, :]
-    return Steps(
-        knots[:-1],
-        knots[1:],
-        back @ attitude[1:],
-        terms.rotate_vectors(back, np.diff(places, axis=0)),
-        np.broadcast_to(np.eye(3) / _IMU_STEP_TURN, along.shape),
-        (np.eye(3) - along) / _IMU_STEP_ACROSS + along / _IMU_STEP_ALONG,
-    )
+    turn_root = np.broadcast_to(np.eye(3) / sigma[0], along.shape)
+    shift_root = (np.eye(3) - along) / sigma[1] + along / sigma[2]
+    return Steps(knots[:-1], knots[1:], back @ attitude[1:], shift, turn_root, shift_root)
 
 
 def means_between(

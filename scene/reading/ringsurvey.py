@@ -1,4 +1,9 @@
-"""As-built surveys of rings, from CSV or XLSX."""
+"""As-built surveys of rings, from CSV or XLSX, in either layout that surveyors use, with the design axis where given.
+
+A ring survey has easting, northing and elevation, and names each point by `POINT` (`ring.point`) or by `RING NO.` and
+`POINT NO.`; `OFFSET`, where it is given, is the distance of the target off the wall. A table with `CHAINAGE` instead of
+rings is the design axis.
+"""
 
 import csv
 from collections.abc import Iterator

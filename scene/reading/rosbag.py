@@ -1,4 +1,10 @@
-"""ROS1 bags, ROS2 bags and MCAP files: the scans of their LiDAR topic, one message at a time."""
+"""ROS1 bags, ROS2 bags and MCAP files: the scans of their LiDAR topic, one message at a time.
+
+The library's reader takes MCAP files of the ROS2 profile alone, although the format is the same for all.
+
+Source: MCAP specification, "Header", "Schema"; well-known profiles `ros1` and `ros2`, an empty one for any other
+writer, and well-known encodings `ros1msg`, `ros2msg` (schemas), `ros1`, `cdr` (messages).
+"""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Clouds as tables: text (XYZ, CSV, TXT, ASC, PTS) and Parquet, with x, y, z found by the names of the columns."""
+"""Clouds as tables: text (XYZ, CSV, TXT, ASC, PTS) and Parquet, with x, y, z by the names of their columns."""
 
 import re
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""The true centreline."""
+"""The true centreline by arc length: straights, clothoids and arcs in plan, grades with vertical curves in profile."""
 
 from dataclasses import dataclass
 

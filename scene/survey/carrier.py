@@ -1,4 +1,8 @@
-"""The walk, and what IMUs and total station measure along it."""
+"""The walk of a person who carries the LiDAR through the bore, and what IMUs and total station measure along it.
+
+The Avia looks ahead, and meets the crown only some 6 m in front of itself. The walk therefore starts 10 m before the
+first mouth, outside, so that the section is seen whole from station 0 on; it ends 2 m before the second mouth.
+"""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,17 @@
-"""The LiDARs of the rack."""
+"""The LiDARs of the rack: Livox Avia, Velodyne VLP-16 and Ouster OS1-64.
+
+The Avia's rosette is the sum of two counter-rotating prisms whose speeds have no small common period, so that it does
+not repeat; six lines fire in turn. That is the shape of the instrument's pattern, not a copy of it: Livox does not
+publish the angles.
+
+Source of the VLP-16: Velodyne's user manual: 16 rings from -15° to 15°, ten turns a second; 16 lasers fire in turn,
+2.304 µs apart, every 55.296 µs; 24 firings are a packet; the head turns clockwise seen from above. The lasers' offsets
+of up to 11 mm along the axis are left out.
+
+Source of the OS1-64: Ouster's hardware user manual: 64 beams over 45°, in four columns of beams that look to slightly
+different azimuths, 1024 columns a turn, ten turns a second; the head turns clockwise seen from above. The beams are
+taken as evenly spaced and as starting at the axis.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Triangles of the true bore."""
+"""Triangles of the true bore: lining with pockets, floor, nails, sleepers, rails, pads and clips."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

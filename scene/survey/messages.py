@@ -1,4 +1,4 @@
-"""ROS1 messages."""
+"""ROS1 messages of LiDARs and IMUs, serialised by the message or by the thousand, never point by point."""
 
 import struct
 

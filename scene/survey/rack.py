@@ -1,4 +1,10 @@
-"""The rack."""
+"""One rack with three LiDARs, their IMUs and a prism, after GEODE's devices α, β and γ.
+
+All three devices of GEODE's tunnelling runs hang on one rack, and its scripts place each LiDAR against a common target:
+β and γ against the total station's prism, α and γ against the GNSS antenna. That is where the mounts come from.
+
+Source: PengYu-Team/GEODE_dataset, evaluation scripts and calibration files [geode.md].
+"""
 
 from dataclasses import dataclass
 from typing import Any

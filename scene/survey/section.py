@@ -1,4 +1,4 @@
-"""The true section."""
+"""The true section by station: an outline of varying size, with roughness along its normals, on a straight floor."""
 
 from dataclasses import dataclass, field
 

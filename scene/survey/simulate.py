@@ -1,4 +1,4 @@
-"""One survey from beginning to end."""
+"""One survey from beginning to end: draw the bore, walk through it, write a bag for each device."""
 
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack

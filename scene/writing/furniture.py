@@ -1,4 +1,7 @@
-"""Lineside furniture by standard, as boxes that fit the local bore."""
+"""Lineside furniture by standard, beside the track of a running tunnel, as boxes that fit the local bore.
+
+None of it is read from the survey; each kind can be left out, since each is a landmark along the axis.
+"""
 
 from collections import Counter
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""From the bore to triangles."""
+"""From the bore to triangles: the watertight air volume, the open lining, and the parts in which it is drawn."""
 
 import numpy as np
 import trimesh

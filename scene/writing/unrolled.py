@@ -1,4 +1,9 @@
-"""The wall rolled out flat, with its recesses, as triangles."""
+"""The wall rolled out flat, with its recesses: points a grid apart, and their Delaunay triangles.
+
+In the plane of arc length around the section and station along the axis a recess is a rectangle. Because no other point
+comes near its rim, Delaunay's triangulation holds the rim's edges, so that recesses need no Boolean operation, which
+would leave slivers.
+"""
 
 from dataclasses import dataclass
 
