@@ -117,7 +117,7 @@ class Bore:
     up: Float[np.ndarray, "n 3"]  # Unit vectors
     width: Float[np.ndarray, " n"]  # Largest inner width, m
     height: Float[np.ndarray, " n"]  # Floor to crown on the axis, m
-    angle: Float[np.ndarray, " m"]  # From `lateral` towards `up`, rad
+    angle: Float[np.ndarray, " m"]  # Direction from `lateral` towards `up`, rad
     radius: Float[np.ndarray, "n m"]  # Smooth section about the centreline, m
     residual_rms: Float[np.ndarray, " n"]  # RMS distance of the section's inliers, m
     coverage: Float[np.ndarray, " n"]  # Share of the section's angles seen

@@ -104,21 +104,13 @@ _PREVIEW_VOXEL = 0.06
 
 @dataclass(frozen=True)
 class BuildConfig:
-    """Everything a build depends on beside its input.
+    """Everything a build depends on beside its input."""
 
-    Attributes:
-        name: Name of the tunnel; that of the output folder where not given.
-        provenance: Kind of recording, such as `simulated` for a simulated survey.
-        reconstruct: Steps from the input to a bore.
-        track: Standard by which the track is laid.
-        scene: Cutting and dressing of the scene.
-    """
-
-    name: str = ""
-    provenance: str = "measured"
-    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    track: TrackConfig = field(default_factory=TrackConfig)
-    scene: SceneConfig = field(default_factory=SceneConfig)
+    name: str = ""  # Name of the tunnel; that of the output folder where not given.
+    provenance: str = "measured"  # Kind of recording, such as `simulated` for a simulated survey.
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)  # Steps from the input to a bore.
+    track: TrackConfig = field(default_factory=TrackConfig)  # Standard by which the track is laid.
+    scene: SceneConfig = field(default_factory=SceneConfig)  # Cutting and dressing of the scene.
 
 
 def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> None:

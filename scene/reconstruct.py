@@ -102,19 +102,12 @@ def load_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stage
 
 @dataclass(frozen=True)
 class ReconstructConfig:
-    """Settings of the steps from an input to a bore.
+    """Settings of the steps from an input to a bore."""
 
-    Attributes:
-        voxel: Thinning of the cloud, m.
-        reading: What the user says instead of having it detected.
-        centreline: Search for the axis.
-        lining: Lining by standard, where the survey can show none.
-    """
-
-    voxel: float = 0.04
-    reading: ReadingConfig = field(default_factory=ReadingConfig)
-    centreline: CentrelineConfig = field(default_factory=CentrelineConfig)
-    lining: LiningConfig = field(default_factory=LiningConfig)
+    voxel: float = 0.04  # Thinning of the cloud, m.
+    reading: ReadingConfig = field(default_factory=ReadingConfig)  # What the user says instead of having it detected.
+    centreline: CentrelineConfig = field(default_factory=CentrelineConfig)  # Search for the axis.
+    lining: LiningConfig = field(default_factory=LiningConfig)  # Lining by standard, where the survey can show none.
 
 
 @dataclass(frozen=True)

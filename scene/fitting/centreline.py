@@ -115,15 +115,10 @@ _DOWN, _TRACK = -0.8, 0.5  # directions in which sleepers and rails may hide the
 
 @dataclass(frozen=True)
 class CentrelineConfig:
-    """Settings of the search for the axis.
+    """Settings of the search for the axis."""
 
-    Attributes:
-        min_length: A cloud shorter than this is refused, m.
-        cutoff: Wavelength that smoothing halves, m; shorter waviness is the wall's, not the axis'.
-    """
-
-    min_length: float = 10.0
-    cutoff: float = 12.0
+    min_length: float = 10.0  # A cloud shorter than this is refused, m.
+    cutoff: float = 12.0  # Wavelength that smoothing halves, m; shorter waviness is the wall's, not the axis'.
 
 
 def fit_centreline(

@@ -131,35 +131,25 @@ MEASURED, STANDARD, NONE = "measured", "by standard", "none found"
 
 @dataclass(frozen=True)
 class LiningConfig:
-    """The lining that stands where the survey can show none.
+    """The lining that stands where the survey can show none."""
 
-    Attributes:
-        by_standard: Put such a lining in. It is left out where the survey could have shown one and did
-            not, nor where the walls are no even section.
-        ring_width: m. Source: 1.5 m, Guangzhou line 21; 1.2–1.5 m in use.
-        pockets_per_ring: On each side of a joint, spread evenly over the crown between the lowest two. An assumption:
-            metro rings have 10 to 17 longitudinal bolts, the lowest below the track.
-        pocket_size: Length along and width around, m. An assumption: openings of 0.15–0.25 m are usual.
-        pocket_depth: m. Source: 13 cm, the paper, Sec. II.
-        pocket_offset: Of a pocket's middle from the joint, m. An assumption.
-        clock_angle: Of the lowest pockets below the horizontal, rad. An assumption: where the plane of a robot's LiDAR
-            meets the wall in a section of 5.65 m × 6.36 m. In a round one of 5.8 m that is at 0.61; at 0.70 the plane
-            passes between two rows and the lining is smooth to the robot.
-        stagger: Shift of every second joint's pockets, as a share of their spacing; 0 for straight rows.
-        nail_diameter: m. Source: bolts M24 to M30.
-        nail_depth: Of the nail's axis behind the wall, m. An assumption: about the middle of the pocket.
-    """
-
+    # Put such a lining in, but not where the survey could have shown one, or where the walls are no even section.
     by_standard: bool = True
-    ring_width: float = 1.5
+    ring_width: float = 1.5  # Width of a ring, m. Source: 1.5 m, Guangzhou line 21; 1.2–1.5 m in use.
+    # Pockets on each side of a joint, spread evenly over the crown between the lowest two. An assumption: metro rings
+    # have 10 to 17 longitudinal bolts, the lowest below the track.
     pockets_per_ring: int = 8
+    # Length along and width around, m. An assumption: openings of 0.15–0.25 m are usual.
     pocket_size: tuple[float, float] = (0.20, 0.18)
-    pocket_depth: float = 0.13
-    pocket_offset: float = 0.22
+    pocket_depth: float = 0.13  # Depth of a pocket, m. Source: 13 cm, the paper, Sec. II.
+    pocket_offset: float = 0.22  # Distance of a pocket's middle from the joint, m. An assumption.
+    # Angle of the lowest pockets below the horizontal, rad. An assumption: where the plane of a robot's LiDAR meets the
+    # wall in a section of 5.65 m × 6.36 m. In a round one of 5.8 m that is at 0.61; at 0.70 the plane passes between
+    # two rows and the lining is smooth to the robot.
     clock_angle: float = 0.70
-    stagger: float = 0.0
-    nail_diameter: float = 0.027
-    nail_depth: float = 0.06
+    stagger: float = 0.0  # Shift of every second joint's pockets, as a share of their spacing; 0 for straight rows.
+    nail_diameter: float = 0.027  # Diameter of a nail, m. Source: bolts M24 to M30.
+    nail_depth: float = 0.06  # Depth of its axis behind the wall, m. An assumption: mid-pocket.
 
 
 def add_lining(

@@ -115,7 +115,7 @@ class Sections:
     sigma: Float[np.ndarray, "rows cols"]  # Standard deviation of the wall's radius, m
     flat_floor: bool  # True where the section stands on a flat floor
     voxel: float  # Thinning of the cloud it was fitted to, m
-    spacing: float  # Between the survey's profiles, about, m; 0 where it is a dense cloud
+    spacing: float  # Distance of the survey's profiles, about, m; 0 for a dense cloud
 
 
 @dataclass(frozen=True)

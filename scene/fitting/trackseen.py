@@ -24,9 +24,9 @@ _MIN_RETURNS = 10  # returns a metre
 class SeenRails:
     """Both rails."""
 
-    gauge: float  # Between the inner faces of the heads, 12 to 45 mm below their tops, m
+    gauge: float  # Distance of the heads' inner faces, 12 to 45 mm below their tops, m
     centre: float  # Distance of the track to the left of the axis, m
-    top: float  # Above the bed, m
+    top: float  # Height of the heads' tops above the bed, m
 
 
 def find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:

@@ -27,23 +27,15 @@ _SMOOTH, SMOOTH_BETWEEN_SWEEPS = 2e-4, 5e-3
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations that the instruments are trusted to.
+    """Standard deviations that the instruments are trusted to."""
 
-    Attributes:
-        control: Standard deviation of a control position in each axis, m.
-        gyro: Standard deviation of one rate, rad/s. Source: GEODE, device γ.
-        accel: Standard deviation of one force, m/s²; the published figure times 3, for scale and alignment errors.
-        gyro_walk: Random walk of the gyro's bias, rad/s/√s.
-        accel_walk: Random walk of the accelerometer's bias, m/s²/√s.
-        robust: Number of standard deviations beyond which a measurement counts ever less.
-    """
-
-    control: float = 0.003
-    gyro: float = 5.144e-3
+    control: float = 0.003  # Standard deviation of a control position in each axis, m
+    gyro: float = 5.144e-3  # Standard deviation of one rate, rad/s. Source: GEODE, device γ
+    # Standard deviation of one force, m/s²; the published figure times 3, for scale and alignment errors
     accel: float = 3 * 5.574e-3
-    gyro_walk: float = 1.088e-4
-    accel_walk: float = 1.208e-4
-    robust: float = 4.0
+    gyro_walk: float = 1.088e-4  # Random walk of the gyro's bias, rad/s/√s
+    accel_walk: float = 1.208e-4  # Random walk of the accelerometer's bias, m/s²/√s
+    robust: float = 4.0  # Number of standard deviations beyond which a measurement counts ever less
 
 
 @dataclass(frozen=True)

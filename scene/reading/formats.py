@@ -30,41 +30,29 @@ _FLAG = tyro.conf.arg(prefix_name=False)
 
 @dataclass(frozen=True)
 class ReadingConfig:
-    """What a user says about an input instead of having it detected.
+    """What a user says about an input instead of having it detected."""
 
-    Attributes:
-        topic: LiDAR topic of a bag; found by its type where not given.
-        format: Of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.
-        unit: Of a registered cloud's or a ring survey's coordinates: m, mm, ft or us-ft.
-        axes: Of a registered cloud: which of its axes point east, north and up, such as xyz, xzy or -yxz.
-    """
-
-    topic: Annotated[str | None, _FLAG] = None
+    topic: Annotated[str | None, _FLAG] = None  # LiDAR topic of a bag; found by its type where not given.
+    # Format of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.
     format: Annotated[str | None, _FLAG] = None
+    # Unit of a registered cloud or a ring survey: m, mm, ft or us-ft.
     unit: Annotated[str | None, _FLAG] = None
+    # Axes of a registered cloud that point east, north and up, such as xyz, xzy or -yxz.
     axes: Annotated[str | None, _FLAG] = None
 
 
 @dataclass(frozen=True)
 class Format:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: Word for `--format`.
-        label: Name for people.
-        kind: `recording`, `cloud` or `rings`.
-        open: Opens a file: a recording as `(path, topic) -> ScanSource`, a cloud as `path -> CloudSource`, rings as
-            `(path, unit) -> RingSurvey`.
-        suffixes: Endings of file names, lower case.
-        magic: First bytes of a file, at most 64; any of them.
-    """
-
-    name: str
-    label: str
-    kind: Kind
+    name: str  # Word for `--format`
+    label: str  # Name for people
+    kind: Kind  # `recording`, `cloud` or `rings`
+    # Opens a file: a recording as `(path, topic) -> ScanSource`, a cloud as `path -> CloudSource`, rings as `(path,
+    # unit) -> RingSurvey`
     open: Callable[..., Any]
-    suffixes: tuple[str, ...] = ()
-    magic: tuple[bytes, ...] = ()
+    suffixes: tuple[str, ...] = ()  # Endings of file names, lower case
+    magic: tuple[bytes, ...] = ()  # First bytes of a file, at most 64; any of them
 
 
 _TABLE = (

@@ -84,7 +84,7 @@ class Lines:
 
     path: Path  # The file
     columns: tuple[int, ...]  # Columns to read, in this order
-    delimiter: str | None = None  # Between them; `None` for any white space
+    delimiter: str | None = None  # Delimiter of the columns; `None` for any white space
     start: int = 0  # Byte of the first line of numbers
     line: int = 1  # Its number, from 1, for messages
     count: int | None = None  # Lines to read; all where `None`

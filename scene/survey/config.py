@@ -18,26 +18,19 @@ METRO_LENGTH = 351.0  # m of the real alignment that are at hand
 class SensorErrors:
     """Errors of the instruments. Zero, or the flag's `no-` form, switches a part off."""
 
-    range_noise: float = 0.019
-    """Standard deviation of a range met squarely and near, m."""
-    range_noise_per_metre: float = 1e-4
-    """Standard deviation that each metre of range adds in quadrature, m/m."""
+    range_noise: float = 0.019  # Standard deviation of a range met squarely and near, m.
+    range_noise_per_metre: float = 1e-4  # Standard deviation that each metre of range adds in quadrature, m/m.
+    # Standard deviation added in quadrature per unit tangent of the incidence angle (up to 10), m.
     incidence_noise: float = 0.002
-    """Standard deviation added in quadrature per unit tangent of the incidence angle (up to 10), m."""
-    mixed_pixels: float = 0.1
-    """Share of the beams across a depth edge whose return falls between the two surfaces."""
+    mixed_pixels: float = 0.1  # Share of the beams across a depth edge whose return falls between the two surfaces.
+    # Lose returns whose echo is too weak for the sensor, by range, incidence, material and speckle.
     weak_echoes: bool = True
-    """Lose returns whose echo is too weak for the sensor, by range, incidence, material and speckle."""
-    lost: float = 0.004
-    """Share of returns lost for no reason modelled here."""
+    lost: float = 0.004  # Share of returns lost for no reason modelled here.
+    # Measure each point from the pose of its own time; otherwise whole sweeps from that of their stamp.
     distortion: bool = True
-    """Measure each point from the pose of its own time; otherwise whole sweeps from that of their stamp."""
-    imu_noise: bool = True
-    """White noise of accelerometer and gyroscope, and wander of the orientation."""
-    imu_bias: bool = True
-    """A constant bias and its random walk."""
-    prism_noise: float = 0.0025
-    """Standard deviation of the total station in each axis, m."""
+    imu_noise: bool = True  # White noise of accelerometer and gyroscope, and wander of the orientation.
+    imu_bias: bool = True  # A constant bias and its random walk.
+    prism_noise: float = 0.0025  # Standard deviation of the total station in each axis, m.
 
 
 @dataclass(frozen=True)
@@ -47,28 +40,22 @@ class SurveyConfig:
     Example: python -m scene.survey --truth metro --length 60 --out build/survey
     """
 
-    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder to write to; made if missing."""
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]  # Folder to write to; made if missing.
+    # Kind of bore: the paper's D-section; the same on a real metro's alignment; or one outside that class.
     truth: TruthName = "paper"
-    """Kind of bore: the paper's D-section; the same on a real metro's alignment; or one outside that class."""
-    length: float = 60.0
-    """Length of the bore along its centreline, m."""
-    seed: int = 0
-    """Draws the bore, the walk and all noise. The same seed gives the same bytes."""
-    correlation: float = 2.0
-    """Correlation length of the walls of `irregular`, m."""
+    length: float = 60.0  # Length of the bore along its centreline, m.
+    seed: int = 0  # Draws the bore, the walk and all noise. The same seed gives the same bytes.
+    correlation: float = 2.0  # Correlation length of the walls of `irregular`, m.
+    # LiDARs on the rack, each with its own recording. With none, only truth and clouds are written.
     sensors: tuple[LidarName, ...] = ("avia",)
-    """LiDARs on the rack, each with its own recording. With none, only truth and clouds are written."""
-    scan_every: int = 1
-    """Keep every so many scans of the VLP-16 and the OS1."""
-    speed: float = 1.0
-    """Mean walking speed, m/s."""
-    point_rate: int = 240_000
-    """Points per second of the Avia; less than its own 240,000 thins the survey."""
+    scan_every: int = 1  # Keep every so many scans of the VLP-16 and the OS1.
+    speed: float = 1.0  # Mean walking speed, m/s.
+    point_rate: int = 240_000  # Points per second of the Avia; less than its own 240,000 thins the survey.
+    # Also write `cloud.ply` and `cloud.pcd`, the returns of the first sensor placed by the true poses.
     cloud: bool = False
-    """Also write `cloud.ply` and `cloud.pcd`, the returns of the first sensor placed by the true poses."""
+    # Write `cloud.ply` as thin profiles so many metres apart, and `held_out.ply` with profiles between them.
     profiles: float = 0.0
-    """Write `cloud.ply` as thin profiles so many metres apart, and `held_out.ply` with profiles between them."""
+    # Errors of the instruments. Zero, or the flag's `no-` form, switches a part off.
     errors: SensorErrors = field(default_factory=SensorErrors)
 
 

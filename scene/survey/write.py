@@ -1,4 +1,4 @@
-"""Files of a survey, each written under a temporary name and renamed; `truth.json`, against which a builder is measured."""
+"""Files of a survey, each written under a temporary name and renamed, and its truth for the measuring of builders."""
 
 import json
 from collections.abc import Iterator

@@ -24,54 +24,31 @@ class FurnitureConfig:
 
     Sources: widths of walkways 0.8 m (low) to 1.0 m: metro walkway descriptions; cross-passages 244 m apart: NFPA 130.
     Bracket pitch and tiers, the third rail's offset, plate pitch and all other sizes are engineering defaults.
-
-    Attributes:
-        walkway: Low walkway, on the left.
-        walkway_width: It is less where it would come nearer than 5 cm to the sleepers' ends, none below 0.5 m.
-        walkway_height: Of its top.
-        handrail: Handrail on posts along the walkway's wall.
-        handrail_height: Above the walkway.
-        post_spacing: Of the handrail's posts.
-        post_size: Side of a post's square section.
-        cables: Cables on brackets along the right wall.
-        bracket_spacing: Of the brackets.
-        bracket_length: Out of the wall.
-        tiers: Heights of the brackets' arms.
-        cable_diameter: Of each tier's bundle.
-        third_rail: Third rail, on the right.
-        third_rail_offset: From the running rail, middle to middle.
-        plates: Hectometre plates on the left wall.
-        plate_spacing: Of the plates.
-        passage: Doors of cross-passages, in niches of the left wall.
-        passage_spacing: Of the doors, the first half of that from the start.
-        passage_size: Length, height and depth of a niche.
-        lamps: Lamps at the crown.
-        lamp_spacing: Of the lamps.
-        gauge: Half the width about the axis that nothing may enter up to a robot's height.
     """
 
-    walkway: bool = True
+    walkway: bool = True  # Low walkway, on the left.
+    # Width of the walkway; less where it would come within 5 cm of the sleepers, no walkway below 0.5 m.
     walkway_width: float = 0.8
-    walkway_height: float = 0.30
-    handrail: bool = True
-    handrail_height: float = 1.0
-    post_spacing: float = 2.0
-    post_size: float = 0.05
-    cables: bool = True
-    bracket_spacing: float = 1.0
-    bracket_length: float = 0.25
-    tiers: tuple[float, ...] = (0.55, 0.90, 1.25, 1.60)
-    cable_diameter: float = 0.06
-    third_rail: bool = True
-    third_rail_offset: float = 0.7
-    plates: bool = True
-    plate_spacing: float = 100.0
-    passage: bool = True
-    passage_spacing: float = 244.0
-    passage_size: tuple[float, float, float] = (2.0, 2.1, 0.5)
-    lamps: bool = True
-    lamp_spacing: float = 12.0
-    gauge: float = 0.9
+    walkway_height: float = 0.30  # Height of the walkway's top.
+    handrail: bool = True  # Handrail on posts along the walkway's wall.
+    handrail_height: float = 1.0  # Height of the handrail above the walkway.
+    post_spacing: float = 2.0  # Spacing of the handrail's posts.
+    post_size: float = 0.05  # Side of a post's square section.
+    cables: bool = True  # Cables on brackets along the right wall.
+    bracket_spacing: float = 1.0  # Spacing of the brackets.
+    bracket_length: float = 0.25  # Length of a bracket out of the wall.
+    tiers: tuple[float, ...] = (0.55, 0.90, 1.25, 1.60)  # Heights of the brackets' arms.
+    cable_diameter: float = 0.06  # Diameter of each tier's bundle.
+    third_rail: bool = True  # Third rail, on the right.
+    third_rail_offset: float = 0.7  # Distance from the running rail, middle to middle.
+    plates: bool = True  # Hectometre plates on the left wall.
+    plate_spacing: float = 100.0  # Spacing of the plates.
+    passage: bool = True  # Doors of cross-passages, in niches of the left wall.
+    passage_spacing: float = 244.0  # Spacing of the doors; the first stands half of it from the start.
+    passage_size: tuple[float, float, float] = (2.0, 2.1, 0.5)  # Length, height and depth of a niche.
+    lamps: bool = True  # Lamps at the crown.
+    lamp_spacing: float = 12.0  # Spacing of the lamps.
+    gauge: float = 0.9  # Half the width about the axis that nothing may enter up to a robot's height.
 
 
 @dataclass(frozen=True)

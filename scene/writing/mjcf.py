@@ -27,19 +27,12 @@ _MATERIAL = {"lining": "concrete", "recess": "recess", "floor": "floor"}
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """Cutting and dressing of the scene.
+    """Cutting and dressing of the scene."""
 
-    Attributes:
-        chunk_length: Of one mesh of the lining, m.
-        robot_radius: Of the scout, m.
-        lidar_height: Of its LiDAR above the top of the sleepers, m.
-        furniture: Of the variant `furnished`.
-    """
-
-    chunk_length: float = 20.0
-    robot_radius: float = 0.4
-    lidar_height: float = 0.7
-    furniture: FurnitureConfig = field(default_factory=FurnitureConfig)
+    chunk_length: float = 20.0  # Length of one mesh of the lining, m.
+    robot_radius: float = 0.4  # Radius of the scout, m.
+    lidar_height: float = 0.7  # Height of its LiDAR above the top of the sleepers, m.
+    furniture: FurnitureConfig = field(default_factory=FurnitureConfig)  # Furniture of the variant `furnished`.
 
 
 def write_scene(

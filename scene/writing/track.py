@@ -32,35 +32,20 @@ class RailProfile:
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """Standard-gauge track on concrete monoblock sleepers, m.
+    """Standard-gauge track on concrete monoblock sleepers, m."""
 
-    Attributes:
-        gauge: Between the inner faces of the heads. Source: 1.435 m, the paper and every standard.
-        sleeper_spacing: Source: the paper.
-        sleeper_length: Source: suppliers' tables for standard gauge.
-        sleeper_top: Width of the top; the bottom is `sleeper_bottom` wide.
-        sleeper_bottom: Width of the bottom.
-        sleeper_height: Of the whole sleeper; all but `protrusion` lies in the ballast.
-        protrusion: Height of the sleepers above the bed.
-        pad_thickness: Between sleeper and rail foot.
-        margin: Least distance from the end of a sleeper to the wall.
-        shoulder: Bed left beside the sleepers where the bore is round.
-        min_headroom: No track is laid where less is left between bed and crown.
-        rail: The rail.
-    """
-
-    gauge: float = 1.435
-    sleeper_spacing: float = 0.6
-    sleeper_length: float = 2.5
-    sleeper_top: float = 0.20
-    sleeper_bottom: float = 0.30
-    sleeper_height: float = 0.21
-    protrusion: float = 0.06
-    pad_thickness: float = 0.010
-    margin: float = 0.10
-    shoulder: float = 0.35
-    min_headroom: float = 3.0
-    rail: RailProfile = field(default_factory=RailProfile)
+    gauge: float = 1.435  # Distance of the inner faces of the heads. Source: the paper and every standard.
+    sleeper_spacing: float = 0.6  # Spacing of the sleepers. Source: the paper.
+    sleeper_length: float = 2.5  # Length of a sleeper. Source: suppliers' tables for standard gauge.
+    sleeper_top: float = 0.20  # Width of the top; the bottom is `sleeper_bottom` wide.
+    sleeper_bottom: float = 0.30  # Width of the bottom.
+    sleeper_height: float = 0.21  # Height of a sleeper; all but `protrusion` lies in the ballast.
+    protrusion: float = 0.06  # Height of the sleepers above the bed.
+    pad_thickness: float = 0.010  # Thickness of the pad between sleeper and rail foot.
+    margin: float = 0.10  # Least distance from the end of a sleeper to the wall.
+    shoulder: float = 0.35  # Bed left beside the sleepers where the bore is round.
+    min_headroom: float = 3.0  # No track is laid where less is left between bed and crown.
+    rail: RailProfile = field(default_factory=RailProfile)  # The rail.
 
     @property
     def rail_offset(self) -> float:
@@ -78,7 +63,7 @@ class Track:
     sleeper_station: Float[np.ndarray, " k"]  # m; empty where the bore is too narrow for a track
     # Sleepers that the survey shows; the others lie where the spacing asks for one
     measured: Bool[np.ndarray, " k"]
-    clearance: Float[np.ndarray, " k"]  # From each sleeper's ends to the wall at its top, the smaller side, m
+    clearance: Float[np.ndarray, " k"]  # Distance of each sleeper's nearer end to the wall, m
     raised: bool  # True where the bed is a slab above the floor (a round bore)
 
 
