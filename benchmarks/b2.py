@@ -20,12 +20,11 @@ from rich.console import Console
 from rich.table import Table
 
 import subterra_jax as st
-from benchmarks.command import status
-from scene.arguments import parse
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import WindowConfig
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_file
 
 _COLUMNS = ("variant", "contacts", "rows", "MJX alone, M/s", "environment, M/s", "share", "compile, s", "falls in 20 s")
 VARIANTS: dict[str, Physics] = {
@@ -156,7 +155,7 @@ def _read(words: list[str]) -> Command:
 def main() -> int:
     """Runs the command line; returns 2 for a user's mistake."""
     arguments = parse(_read)
-    return status(lambda: command(arguments))
+    return run_command(lambda: command(arguments), mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,12 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from benchmarks.command import status
-from scene.arguments import parse
 from subterra_jax.b2.film import Driver
 from subterra_jax.b2.gym import B2Env
 from subterra_jax.b2.policy import RELEASED
 from subterra_jax.b2.surrogate import identify
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.errors import SubterraError
 from train import cli
 
 _SPEEDS = (0.0, 0.3, 0.5, 0.8)  # m/s; one is drawn every 2 s
@@ -107,7 +106,7 @@ def _read(words: list[str]) -> Command:
 def main() -> None:
     """Runs the command line."""
     arguments = parse(_read)
-    sys.exit(status(lambda: command(arguments)))
+    sys.exit(run_command(lambda: command(arguments), mistakes=INPUT_ERRORS))
 
 
 if __name__ == "__main__":

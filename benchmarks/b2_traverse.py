@@ -15,13 +15,12 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from benchmarks.command import status
-from scene.arguments import parse
 from subterra_jax import policies
 from subterra_jax.b2 import missions, trial
 from subterra_jax.b2.policy import RELEASED
 from subterra_jax.baselines import registry
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 from train import cli
 from train.evaluate import open_agent
@@ -135,7 +134,7 @@ def _read(words: list[str]) -> Command:
 def main() -> None:
     """Runs the command line."""
     arguments = parse(_read)
-    sys.exit(status(lambda: command(arguments)))
+    sys.exit(run_command(lambda: command(arguments), mistakes=INPUT_ERRORS))
 
 
 if __name__ == "__main__":

@@ -13,12 +13,11 @@ from typing import Any
 
 import tyro
 
-from benchmarks.command import status
 from benchmarks.report import write_report
 from benchmarks.truth import Truth, compare, load_truth, start_placement
-from scene.arguments import parse
 from scene.survey.config import SurveyConfig, check_survey
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_folder
 
 TASK = "Subterra/TraverseShort-v0"
 
@@ -192,4 +191,4 @@ def _odometry_figures(survey: Path, scene: Path, truth: Truth, failure: str | No
 
 if __name__ == "__main__":
     config = parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo"))
-    sys.exit(status(lambda: main(config)))
+    sys.exit(run_command(lambda: main(config), mistakes=INPUT_ERRORS))

@@ -19,14 +19,13 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from benchmarks.command import status
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.derive.surface import Nearest, visible_mesh
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.truth import compare, load_truth
-from scene.arguments import parse
 from scene.survey.config import SurveyConfig, TruthName, check_survey
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_folder
 
 
 @dataclass(frozen=True)
@@ -170,7 +169,7 @@ def main() -> None:
             ReconstructionConfig, args=words, prog="python -m benchmarks.reconstruction", description=__doc__
         )
     )
-    sys.exit(status(lambda: run(config)))
+    sys.exit(run_command(lambda: run(config), mistakes=INPUT_ERRORS))
 
 
 def check(config: ReconstructionConfig) -> None:

@@ -13,9 +13,8 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from benchmarks.command import status
-from scene.arguments import parse
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_file
 
 # MuJoCo chooses its OpenGL backend when it is imported, so each is tried in a process of its own.
 BACKENDS = ("egl", "osmesa", "glfw")
@@ -117,7 +116,7 @@ def render(config: RenderConfig) -> None:
 def command() -> int:
     """Runs the command line; returns 2 for a user's mistake or without OpenGL."""
     config = parse(lambda words: tyro.cli(RenderConfig, args=words, prog="python -m benchmarks.render"))
-    return status(lambda: check_and_render(config))
+    return run_command(lambda: check_and_render(config), mistakes=INPUT_ERRORS)
 
 
 def check_and_render(config: RenderConfig) -> None:

@@ -16,9 +16,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from rich.console import Console
 
 import subterra_jax as st
-from benchmarks.command import status
-from scene.arguments import parse
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.errors import SubterraError
 
 _EXTREMES = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, -0.0, 1e-38)
 _CHUNK = 100
@@ -159,7 +158,7 @@ def main() -> int:
     config = parse(
         lambda words: tyro.cli(SoakConfig, args=words, prog="python -m benchmarks.soak", description=__doc__)
     )
-    return status(lambda: 0 if run(config, Console(highlight=False)) else 1)
+    return run_command(lambda: 0 if run(config, Console(highlight=False)) else 1, mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """`python -m scene.build INPUT --out DIR`: builds a scene folder from a recording."""
 
 import math
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -12,15 +13,16 @@ import mujoco
 import numpy as np
 import tyro
 
-from scene.arguments import parse
-from scene.cli import progress_bar, run
-from scene.errors import FitError, RecordingError, SubterraError
-from scene.files import replace_folder, require_output_folder
+from scene.errors import FitError, RecordingError
 from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
+from scene.progress import progress_bar
 from scene.reading.formats import load_readers
 from scene.reconstruct import Reconstruction, reconstruct
 from scene.resume import Partial, partial_folder
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import replace_folder, require_folder
 
 _POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
 
@@ -82,7 +84,7 @@ def build(
         SubterraError: The input or a setting is at fault, or the output cannot be written.
     """
     config = config or BuildConfig()
-    require_output_folder(out)
+    require_folder(out)
     check_settings(config)
     check_number("keep-every", 0.0 if partial is None else partial.every)
     mounts = find_calibration(calibration)
@@ -144,16 +146,16 @@ def command(
     return partial(build, source, out, trajectory, config, control, calibration, results, reader)
 
 
-def main() -> None:
-    """Runs the command."""
+def main() -> int:
+    """Runs the command and returns its exit status."""
     np.seterr(all="ignore")
     wanted = parse(lambda words: tyro.cli(command, prog="python -m scene.build", args=words))
 
     def act() -> None:
         wanted()
 
-    run(act)
+    return run_command(act, "interrupted; the output is as it was, and the same command goes on from here")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

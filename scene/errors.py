@@ -1,8 +1,8 @@
-"""What a user can get wrong, as exceptions with one clear sentence."""
+"""Errors of a recording, each with one clear sentence."""
 
+from pathlib import Path
 
-class SubterraError(Exception):
-    """Base of every error that a user can cause; the commands print it and exit with status 2."""
+from subterra_jax.host.errors import SubterraError
 
 
 class RecordingError(SubterraError):
@@ -13,5 +13,17 @@ class FitError(SubterraError):
     """The input was read, but no tunnel can be found or measured in it."""
 
 
-class OutputError(SubterraError):
-    """The output cannot be written where it was asked for."""
+def require_input(path: Path) -> Path:
+    """Checks that an input exists and can be read, and returns its path.
+
+    Raises:
+        RecordingError: Nothing is there, or it cannot be opened.
+    """
+    if not path.exists():
+        raise RecordingError(f"{path}: no such file or folder")
+    if path.is_file():
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
+    return path

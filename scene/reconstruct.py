@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 
 from scene.bore import Bore
-from scene.cli import Stages
 from scene.cloud import Cloud
-from scene.errors import FitError, RecordingError
-from scene.files import require_input
+from scene.errors import FitError, RecordingError, require_input
 from scene.fitting.assemble import bore_from_sections, describe_bore
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
@@ -21,6 +19,7 @@ from scene.poses.calibration import UNCALIBRATED, Calibration
 from scene.poses.locate import Located, locate_by_control, locate_by_odometry, locate_given
 from scene.poses.registration import register_scans
 from scene.poses.trajectory import Control, Trajectory, load_control, load_tum
+from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, describe, detect, own_readers
 from scene.reading.recording import Recording

@@ -13,7 +13,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from scene.errors import OutputError
+from subterra_jax.host.errors import OutputError
 
 _CHUNK = 1 << 22
 _LIBRARIES = ("numpy", "scipy", "small-gicp", "rosbags", "laspy", "lazrs", "pye57", "pyarrow", "plyfile", "pypcd4")

@@ -13,6 +13,7 @@ import numpy as np
 from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.env import TunnelEnv
 from subterra_jax.faults import FaultParams
+from subterra_jax.host.versions import no_task
 from subterra_jax.lidar import LidarParams
 from subterra_jax.obstacles import ObstacleParams
 from subterra_jax.odometry import OdometryParams
@@ -24,7 +25,6 @@ from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.tunnel.blocks import LIDAR_GAP
 from subterra_jax.tunnel.sources import Source, resolve
 from subterra_jax.vehicle import VehicleParams
-from subterra_jax.versions import no_task
 from subterra_jax.wander import WanderParams
 
 SHORT_LENGTH = 60.0

@@ -1,5 +1,5 @@
 """Brax-style PPO over batches of tunnels: `python -m train.navigate`, `python -m train.evaluate`."""
 
-from subterra_jax.extras import require
+from subterra_jax.host.command import require_libraries
 
-require("train", "train", "tyro", "rich", "matplotlib", "orbax.checkpoint", "safetensors")
+require_libraries("train", "train", "tyro", "rich", "matplotlib", "orbax.checkpoint", "safetensors")

@@ -1,18 +1,12 @@
-"""What the commands of this room share: one sentence for a user's mistake, exit statuses, interrupts, tables."""
+"""Interrupts and tables of the commands of this room."""
 
 import signal
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
-
-from subterra_jax.errors import SubterraError
-from train.errors import TrainingError
-
-EXIT_FAILED, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 
 
 class Interrupt:
@@ -20,18 +14,6 @@ class Interrupt:
 
     def __init__(self) -> None:
         self.wanted = False
-
-
-def run(command: Callable[[], int | None]) -> None:
-    """Runs a command and exits with its status; a user's mistake ends as one sentence on stderr and status 2."""
-    try:
-        sys.exit(command() or 0)
-    except SubterraError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(EXIT_FAILED if isinstance(error, TrainingError) else EXIT_BAD_INPUT)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
 
 
 @contextmanager

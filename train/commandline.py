@@ -98,7 +98,7 @@ class BeliefCommand(Command):
     )
 
 
-def parse(arguments: list[str]) -> Command:
+def read_command(arguments: list[str]) -> Command:
     """The command line, with the defaults of the task, memory and preset that it names itself.
 
     Raises:

@@ -5,7 +5,7 @@ import math
 from typing import ClassVar
 
 import subterra_jax as st
-from subterra_jax.versions import no_task
+from subterra_jax.host.versions import no_task
 from train.checks import at_least, not_negative, positive, share
 from train.errors import ConfigError
 

@@ -14,9 +14,8 @@ import matplotlib
 import numpy as np
 import tyro
 
-from subterra_jax.arguments import parse
-from subterra_jax.outputs import require_file
-from train import cli
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.files import require_file
 from train.errors import RunFolderError
 from train.run.episodes import WINDOW
 from train.run.log import EPISODES
@@ -153,7 +152,7 @@ def command(arguments: Command) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.curve`."""
-    cli.run(lambda: command(parse(_read, sys.argv[1:])))
+    sys.exit(run_command(lambda: command(parse(_read))))
 
 
 def _read(words: list[str]) -> Command:

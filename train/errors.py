@@ -1,6 +1,7 @@
 """What a user of this room can get wrong, as exceptions with one clear sentence."""
 
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.command import EXIT_FAILED
+from subterra_jax.host.errors import SubterraError
 
 
 class ConfigError(SubterraError, ValueError):
@@ -17,3 +18,5 @@ class RunFolderError(SubterraError):
 
 class TrainingError(SubterraError):
     """Training came to a point from which it cannot go on."""
+
+    exit_status = EXIT_FAILED

@@ -9,11 +9,11 @@ from typing import Any
 import tyro
 
 from subterra_jax import policies as released
-from subterra_jax.arguments import parse
 from subterra_jax.evaluation import Records, listed_episodes
 from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
 from subterra_jax.evaluation.summary import summary
+from subterra_jax.host.command import parse, run_command
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.policies.loading import Agent
 from train import cli, policies
@@ -132,7 +132,7 @@ def command(arguments: Command) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.evaluate`."""
-    cli.run(lambda: command(parse(_read, sys.argv[1:])))
+    sys.exit(run_command(lambda: command(parse(_read))))
 
 
 def _read(words: list[str]) -> Command:

@@ -10,9 +10,9 @@ import time
 
 import jax
 
-from subterra_jax import arguments as reading
+from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from train import cli, policies, ppo, seeds
-from train.commandline import Command, parse
+from train.commandline import Command, read_command
 from train.devices import cluster
 from train.errors import ConfigError
 from train.evaluate import check_episodes
@@ -71,7 +71,7 @@ def _single(session: Session, snapshot: Snapshot | None, arguments: Command) -> 
         session.finish(last)
         if interrupt.wanted:
             print(f"interrupted after {last.iteration} iterations; go on with --resume", file=sys.stderr)
-            return cli.EXIT_INTERRUPTED
+            return EXIT_INTERRUPTED
     if not cluster.leads():
         return 0
     session.score(last, arguments.evaluation_episodes)
@@ -113,7 +113,7 @@ def _tell(snapshot: Snapshot, seconds: float) -> None:
 
 def main() -> None:
     """Entry point of `python -m train.navigate`."""
-    cli.run(lambda: command(reading.parse(parse, sys.argv[1:])))
+    sys.exit(run_command(lambda: command(parse(read_command))))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import subterra_jax as st
+from subterra_jax.host.versions import VERSION, no_task
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel.sources import tunnel_digest
-from subterra_jax.versions import VERSION, no_task
 from train.belief.network import BeliefLayout, BeliefNetworks
 from train.errors import CheckpointError, ConfigError
 from train.feedforward.networks import Layout, Networks

@@ -13,8 +13,8 @@ from typing import Any
 import tyro
 from safetensors.numpy import save
 
-from subterra_jax.arguments import parse
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.files import require_file
 from subterra_jax.policies.files import FACTS, SCHEMA, TENSORS
 from train import cli, policies
 from train.agents import agent_of, tensors_of
@@ -108,7 +108,7 @@ def _world(stored: dict[str, Any], arguments: Command) -> policies.World:
 
 def main() -> None:
     """Entry point of `python -m train.release`."""
-    cli.run(lambda: command(parse(_read, sys.argv[1:])))
+    sys.exit(run_command(lambda: command(parse(_read))))
 
 
 def _read(words: list[str]) -> Command:

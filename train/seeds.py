@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from subterra_jax.host.command import EXIT_INTERRUPTED
 from train import cli, curve
 from train.devices import compiling
 from train.errors import ConfigError
@@ -135,7 +136,7 @@ def run(out: Path, sessions: list[Session], *, resume: bool, overwrite: bool, ep
         curve.write_curve([session.folder.path for session in sessions], out / "curve.png")
         if interrupt.wanted:
             print("interrupted; go on with --resume", file=sys.stderr)
-            return cli.EXIT_INTERRUPTED
+            return EXIT_INTERRUPTED
     found = [session.score(snapshot, episodes) for session, snapshot in zip(sessions, last, strict=True)]
     milestones.tell(out, [session.folder.path for session in sessions], found)
     return 0

@@ -13,9 +13,9 @@ from typing import Annotated
 import jax
 import tyro
 
-from subterra_jax import arguments as reading
 from subterra_jax.b2 import WALK, tasks
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
+from subterra_jax.host.files import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train import cli, ppo, seeds
@@ -59,7 +59,7 @@ class Command:
     config: Annotated[WalkConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=WalkConfig)
 
 
-def parse(arguments: list[str]) -> Command:
+def read_command(arguments: list[str]) -> Command:
     """The command line, with the defaults of the preset that it names itself.
 
     Raises:
@@ -113,7 +113,7 @@ def command(arguments: Command) -> int:
     for seed in arguments.seeds or (arguments.config.seed,):
         out = arguments.out / f"seed-{seed}" if arguments.seeds else arguments.out
         if not _one(arguments, world, dataclasses.replace(arguments.config, seed=seed), out):
-            return cli.EXIT_INTERRUPTED
+            return EXIT_INTERRUPTED
     return 0
 
 
@@ -156,7 +156,7 @@ def _one(arguments: Command, world: World, config: WalkConfig, out: Path) -> boo
 
 def main() -> None:
     """Entry point of `python -m train.walk`."""
-    cli.run(lambda: command(reading.parse(parse, sys.argv[1:])))
+    sys.exit(run_command(lambda: command(parse(read_command))))
 
 
 if __name__ == "__main__":

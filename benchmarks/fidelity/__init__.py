@@ -5,9 +5,9 @@ held-out recording ┐      ├─► case ─► categories/ ─► values ─�
 truth or control   ┴─► references ┘
 """
 
-from scene.extras import require
+from subterra_jax.host.command import require_libraries
 
-require(
+require_libraries(
     "benchmarks.fidelity",
     "fidelity,recordings",
     "sklearn",

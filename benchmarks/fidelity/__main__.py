@@ -31,9 +31,9 @@ from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import Value, evaluate
 from benchmarks.fidelity.report import write_report
 from benchmarks.fidelity.tools import calibrate
-from scene.arguments import parse
-from scene.cli import run as command
-from scene.files import require_input, require_output_folder
+from scene.errors import require_input
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.files import require_folder
 
 CONTROLS_SCHEMA = "subterra.fidelity-controls/1"
 SWEEP_SCHEMA = "subterra.fidelity-sweep/1"
@@ -98,7 +98,7 @@ class OpenCase:
 
 def open_case(inputs: Inputs) -> OpenCase:
     """Reads the inputs and judges the case without controls; values of an earlier command are read again."""
-    require_output_folder(inputs.out)
+    require_folder(inputs.out)
     outside.clear()
     if inputs.metrics is not None:
         outside.load_metrics(inputs.metrics)
@@ -237,7 +237,7 @@ def _print_summary(report: dict[str, Any]) -> None:
               f"global with them {text}; the verdict is that of the suite alone")  # fmt: skip
 
 
-def main() -> None:
+def main() -> int:
     """Runs one command; a user's mistake is one sentence and status 2."""
     if len(sys.argv) == 1:
         sys.argv.append("run")
@@ -247,12 +247,11 @@ def main() -> None:
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}
 
-    def act() -> None:
-        parse(
-            lambda words: tyro.extras.subcommand_cli_from_dict(commands, args=words, prog=_PROG, description=__doc__)
-        )()
-
-    command(act)
+    act = parse(
+        lambda words: tyro.extras.subcommand_cli_from_dict(commands, args=words, prog=_PROG, description=__doc__),
+        groups=("config options",),
+    )
+    return run_command(act, "interrupted; the output is as it was, and the same command goes on from here")
 
 
 def _without_prefix(action: Callable[[Any], None]) -> Callable[[Any], Callable[[], None]]:
@@ -269,4 +268,4 @@ def _without_prefix(action: Callable[[Any], None]) -> Callable[[Any], Callable[[
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

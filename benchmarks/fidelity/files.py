@@ -4,8 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from scene.errors import SubterraError
 from scene.resume import input_record
+from subterra_jax.host.errors import SubterraError
 
 
 class FidelityError(SubterraError):

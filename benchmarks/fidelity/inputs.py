@@ -20,9 +20,10 @@ from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.files import FidelityError, file_hash, write_json
 from benchmarks.fidelity.references import HoldConfig, load_hold, load_truth
-from scene.cli import progress_bar
-from scene.errors import SubterraError
-from scene.files import replace_folder, require_input
+from scene.errors import require_input
+from scene.progress import progress_bar
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import replace_folder
 
 PACKAGED = "subterra-351"
 PACKAGED_LENGTH = 351

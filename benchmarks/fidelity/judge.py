@@ -18,7 +18,7 @@ from benchmarks.fidelity.references import Hold
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
-from scene.cli import progress_bar
+from scene.progress import progress_bar
 
 VALUES_SCHEMA = "subterra.fidelity-values/1"
 NOISE_BAND = (0.5, 3.0)  # times the sensor's stated sigma

@@ -9,12 +9,11 @@ import time
 import tyro
 from rich.console import Console
 
-from benchmarks.command import status
 from benchmarks.leaderboard import report
 from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, check, load_worlds
 from benchmarks.leaderboard.entries import make_entry, write
 from benchmarks.results import constants_facts, environment_facts
-from scene.arguments import parse
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -60,7 +59,7 @@ def main() -> int:
             LeaderboardConfig, args=words, prog="python -m benchmarks.leaderboard", description=__doc__
         )
     )
-    return status(lambda: run(config), "interrupted; the same command goes on")
+    return run_command(lambda: run(config), "interrupted; the same command goes on", mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,12 @@ from typing import Any
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines import registry
-from subterra_jax.errors import SubterraError
 from subterra_jax.evaluation.episodes import N_LISTED
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import require_folder
+from subterra_jax.host.versions import no_task
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.versions import no_task
 
 OWN_POLICY = "released-policy"  # the policy released for the task at hand
 TRAITS = ("uses_lidar", "uses_map", "privileged")

@@ -16,11 +16,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command import status
 from benchmarks.learning.runs import Curve, require_stable_baselines, train_ours, train_stable_baselines
 from benchmarks.results import environment_facts, version, write_file
-from scene.arguments import parse
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_folder
 from train import policies
 from train.curve import GOAL, rolling
 from train.errors import ConfigError
@@ -128,7 +127,7 @@ def main() -> int:
     command = parse(
         lambda words: tyro.cli(Command, args=words, prog="python -m benchmarks.learning", description=__doc__)
     )
-    return status(lambda: run(command))
+    return run_command(lambda: run(command), mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

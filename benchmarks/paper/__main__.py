@@ -12,15 +12,14 @@ from typing import Any
 
 import tyro
 
-from benchmarks.command import status
 from benchmarks.fidelity.files import file_hash
 from benchmarks.paper import figures, learning, sheet, steps
 from benchmarks.paper.errors import PaperError
 from benchmarks.paper.material import Material, read_truth
 from benchmarks.paper.sheet import Drawing
-from scene.arguments import parse
-from scene.files import require_output_folder
 from scene.survey.config import SurveyConfig, check_survey
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_folder
 
 SURVEY_FIGURES: dict[int, Callable[[Material], Drawing]] = {
     1: figures.draw_bore_view,
@@ -83,7 +82,7 @@ def check(config: PaperConfig) -> None:
         steps.require(config.scene, steps.SCENE_FILES)
     if config.runs is not None and LEARNING in config.figures:
         learning.find_runs(config.runs)
-    require_output_folder(config.out)
+    require_folder(config.out)
 
 
 def make(config: PaperConfig) -> None:
@@ -173,7 +172,7 @@ def _hashes(paths: list[Path]) -> dict[str, str]:
 def main(args: list[str] | None = None) -> int:
     """Runs the command line; returns 0 once every figure is there, 2 for a user's mistake, 130 after Ctrl-C."""
     config = parse(lambda words: tyro.cli(PaperConfig, args=words, prog="python -m benchmarks.paper"), args)
-    return status(lambda: make(config), "interrupted; the same command goes on from here")
+    return run_command(lambda: make(config), "interrupted; the same command goes on from here", mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

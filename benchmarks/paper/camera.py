@@ -12,7 +12,7 @@ from PIL import Image
 
 from benchmarks.paper.errors import PaperError
 from benchmarks.render import BACKENDS, light_up, render_in_subprocess
-from scene.arguments import parse
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 
 _NAME = "paper"
 _TIMEOUT = 300.0  # s
@@ -117,8 +117,5 @@ def _words(pose: Pose) -> list[str]:
 
 
 if __name__ == "__main__":
-    try:
-        main(parse(lambda words: tyro.cli(CameraConfig, args=words, prog="python -m benchmarks.paper.camera")))
-    except (OSError, ValueError) as fault:
-        print(f"error: {fault}", file=sys.stderr)
-        sys.exit(2)
+    wanted = parse(lambda words: tyro.cli(CameraConfig, args=words, prog="python -m benchmarks.paper.camera"))
+    sys.exit(run_command(lambda: main(wanted), mistakes=INPUT_ERRORS))

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command import status
 from benchmarks.rays.casting import (
     DEFAULT_SCENE,
     MEDIAN_GOAL,
@@ -32,8 +31,8 @@ from benchmarks.rays.casting import (
 )
 from benchmarks.rays.errors import RaysError
 from benchmarks.results import environment_facts, write_file
-from scene.arguments import parse
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 
 SCHEMA = "subterra.rays/1"
@@ -178,7 +177,7 @@ def command(arguments: list[str] | None = None) -> int:
     config = parse(
         lambda words: tyro.cli(RaysConfig, args=words, prog="python -m benchmarks.rays", description=__doc__), arguments
     )
-    return status(lambda: main(config))
+    return run_command(lambda: main(config), mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

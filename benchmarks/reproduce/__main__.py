@@ -15,12 +15,11 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command import status
 from benchmarks.reproduce.claims import CLAIMS, HEADING, JOBS, Claim, Job, read_result, read_tables
 from benchmarks.reproduce.errors import ReproduceError
 from benchmarks.results import constants_facts, environment_facts
-from scene.arguments import parse
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_folder
 
 ROOT = Path(__file__).parents[2]
 README, MEASUREMENTS = ROOT / "README.md", ROOT / "docs" / "measurements.md"
@@ -144,7 +143,7 @@ def main(args: list[str] | None = None) -> int:
     """Runs the command line; returns 0 where every number is the same, 1 where one differs, 2 for a mistake."""
     prog = "python -m benchmarks.reproduce"
     config = parse(lambda words: tyro.cli(ReproduceConfig, args=words, prog=prog, description=__doc__), args)
-    return status(lambda: run(config))
+    return run_command(lambda: run(config), mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

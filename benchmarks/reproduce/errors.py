@@ -1,6 +1,6 @@
 """Errors of this room."""
 
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 
 
 class ReproduceError(SubterraError):

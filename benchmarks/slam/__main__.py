@@ -10,14 +10,13 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command import status
 from benchmarks.results import environment_facts, write_file
 from benchmarks.slam import report
 from benchmarks.slam.errors import SlamError
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import ProgramScore, ScoreConfig, score_all
-from scene.arguments import parse
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -86,7 +85,7 @@ def _write(config: ScoreConfig, scores: list[ProgramScore]) -> None:
 def command(arguments: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
     config = parse(lambda words: tyro.cli(Command, args=words, prog=_PROG, description=__doc__), arguments)
-    return status(lambda: main(config), "interrupted; the same command goes on")
+    return run_command(lambda: main(config), "interrupted; the same command goes on", mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """What a user of this benchmark can get wrong."""
 
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 
 
 class SlamError(SubterraError):

@@ -16,11 +16,11 @@ from rosbags.typesys import Stores, get_typestore
 from benchmarks.slam.errors import SlamError
 from scene.reading.scans import parse_pointcloud2
 from subterra_jax.evaluation.episodes import N_LISTED
+from subterra_jax.host.versions import no_task
 from subterra_jax.recorder import Recording, record
 from subterra_jax.recorder.config import checked
 from subterra_jax.recorder.world import open_world
 from subterra_jax.tasks import TASKS
-from subterra_jax.versions import no_task
 
 SCHEMA = "subterra.recording-set/1"
 RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"

@@ -9,7 +9,6 @@ import tyro
 from rich.console import Console
 
 import subterra_jax as st
-from benchmarks.command import status
 from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
@@ -17,7 +16,7 @@ from benchmarks.throughput.measure import arithmetic_floor, environment_loop, fl
 from benchmarks.throughput.peers import Route, find_peers, measure_peer
 from benchmarks.throughput.timing import Timing, measure
 from benchmarks.throughput.variants import measure_lengths, measure_linings
-from scene.arguments import parse
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -91,7 +90,7 @@ def main() -> int:
             ThroughputConfig, args=words, prog="python -m benchmarks.throughput", description=__doc__
         )
     )
-    return status(lambda: run_and_report(config))
+    return run_command(lambda: run_and_report(config), mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,7 @@ import yaml
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from scene.errors import RecordingError
-from scene.files import require_input
+from scene.errors import RecordingError, require_input
 
 _ORTHONORMAL = 1e-3  # published matrices are rounded to 6 digits
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scene.cli import Stages
 from scene.errors import RecordingError
 from scene.poses.calibration import Calibration, Mount
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
@@ -16,6 +15,7 @@ from scene.poses.odometry import LIBRARY, Guide, Odometry, OdometryLog, estimate
 from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, odometry_problem, solve_with_heading
 from scene.poses.terms import Chain
 from scene.poses.trajectory import MIN_CONTROL_SHARE, Control, Trajectory
+from scene.progress import Stages
 from scene.reading.recording import Recording
 from scene.resume import Partial
 

@@ -15,10 +15,10 @@ import small_gicp
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from scene.cli import Stage
 from scene.errors import FitError
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
+from scene.progress import Stage
 from scene.reading.recording import START, ReadPosition, Recording
 from scene.reading.scans import Scan
 from scene.resume import Partial

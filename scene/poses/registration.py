@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from scene.cli import Stage
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError, RecordingError
 from scene.poses.trajectory import Trajectory
+from scene.progress import Stage
 from scene.reading.recording import START, ReadPosition, Recording
 from scene.reading.scans import Scan
 from scene.resume import Partial

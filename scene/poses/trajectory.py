@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
-from scene.errors import RecordingError
-from scene.files import require_input
+from scene.errors import RecordingError, require_input
 
 _QUATERNION_TOLERANCE = 0.01
 

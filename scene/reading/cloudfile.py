@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from scene.cli import Stage
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import RecordingError
+from scene.progress import Stage
 from scene.reading.formats import ReadingConfig, detect
 from scene.reading.source import CloudSource, choose_frame, refuse_damage
 from scene.resume import Partial

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from scene.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 
 _LONGEST_CAUSE = 200
 

@@ -5,22 +5,20 @@ import sys
 import tyro
 from rich.console import Console
 
-from scene.arguments import parse
 from scene.survey.config import SurveyConfig, check_survey
 from scene.survey.simulate import simulate
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the command; return its exit status, 2 for what the user can put right."""
+    """Runs the command and returns its exit status."""
     config = parse(lambda words: tyro.cli(SurveyConfig, prog="python -m scene.survey", args=words), args)
-    try:
+
+    def act() -> None:
         check_survey(config)
         print(simulate(config, Console(stderr=True)))
-    except (ValueError, OSError) as error:
-        told = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.strerror else error
-        print(f"error: {told}", file=sys.stderr)
-        return 2
-    return 0
+
+    return run_command(act, mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from subterra_jax.adapters.missing import MissingLibraryError
 from subterra_jax.env import TunnelEnv
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import MissingLibraryError, SubterraError
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_of

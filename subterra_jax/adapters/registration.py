@@ -3,8 +3,27 @@
 from gymnasium.envs import registration
 
 from subterra_jax.b2 import MISSIONS, WALK
-from subterra_jax.tasks import TASKS
 
+# The keys of `subterra_jax.tasks.TASKS`, which loads jax; importing the package registers them and must not.
+PLANAR_TASKS = tuple(
+    f"Subterra/{name}-v0"
+    for name in (
+        "Traverse",
+        "TraverseShort",
+        "StopAt",
+        "StopAtShort",
+        "StopAtOffset",
+        "StopAtOffsetShort",
+        "Return",
+        "ReturnShort",
+        "Obstructed",
+        "ObstructedShort",
+        "Faulted",
+        "FaultedShort",
+        "Relocalise",
+        "RelocaliseShort",
+    )
+)
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
 # MuJoCo is loaded by who makes one.
@@ -13,7 +32,7 @@ _ON_LEGS = dict.fromkeys(MISSIONS, "subterra_jax.b2.gym:B2Env") | {WALK: "subter
 
 def register() -> None:
     """Make every task known to Gymnasium under its id; doing so again changes nothing."""
-    for task in TASKS:
+    for task in PLANAR_TASKS:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
     for task, entry in _ON_LEGS.items():

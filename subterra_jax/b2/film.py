@@ -14,11 +14,10 @@ import jax
 import numpy as np
 
 from subterra_jax import policies
-from subterra_jax.arguments import parse
 from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.registry import make_agent, names
-from subterra_jax.errors import SubterraError
-from subterra_jax.outputs import require_file
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_file
 
 _EVERY = 3  # control periods of 20 ms per picture
 _DURATION = 20 * _EVERY  # time of a picture on screen, ms
@@ -111,7 +110,7 @@ def _check(settings: argparse.Namespace) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the command; returns 0, or 2 for a user's mistake."""
+    """Runs the command and returns its exit status."""
     parser = argparse.ArgumentParser(prog="python -m subterra_jax.b2.film", description=__doc__)
     parser.add_argument("out", type=Path, help="file to write: .webp, .gif or .mp4")
     parser.add_argument("--scene", type=Path, help="built scene folder to walk in; the packaged tunnel if left out")
@@ -121,19 +120,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--height", type=int, default=360)
-    try:
-        settings = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
+    settings = parse(parser.parse_args, arguments)
+
+    def act() -> None:
         _check(settings)
         size = {"width": settings.width, "height": settings.height}
         env = B2Env(scene=settings.scene, policy=settings.policy, render_mode="rgb_array", **size)
         pictures = film(env, Driver(env, settings.agent), settings.seconds, settings.seed)
         write(settings.out, pictures)
         env.close()
-    except (SubterraError, ValueError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    print(f"{settings.out}: {len(pictures)} pictures")
-    return 0
+        print(f"{settings.out}: {len(pictures)} pictures")
+
+    return run_command(act, mistakes=INPUT_ERRORS)
 
 
 if __name__ == "__main__":

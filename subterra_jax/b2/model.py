@@ -8,7 +8,7 @@ import mujoco
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 
 _BOX, _SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 _CAPSULE, _CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import inverse, rotate
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.tunnel.plan import TunnelPlan
 
 # By standard, m. Source: docs/formats.md and the paper (spacing); the scene's builder lays the same.

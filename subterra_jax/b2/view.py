@@ -9,7 +9,7 @@ import numpy as np
 from subterra_jax.b2.engine import MujocoPhysics, SceneSurroundings, rotate_vector
 from subterra_jax.b2.params import Surroundings, WalkParams, WalkState
 from subterra_jax.b2.walk import WalkEnv
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 
 _MOST_LAMPS = 7  # OpenGL has eight lights, one of them the headlight
 _BEHIND, _PITCH_DEG, _ASIDE_DEG, _AHEAD = 2.6, -16.0, 18.0, 0.6  # of the trunk: m, degrees, degrees, m

@@ -14,7 +14,7 @@ from subterra_jax.baselines.scanmatch.odometry import scan_matching
 from subterra_jax.baselines.simple import Random
 from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine, HeadingHold, Pursuit
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
 
 Factory = Callable[[EnvParams], Agent]

@@ -8,8 +8,8 @@ from importlib import resources
 
 import numpy as np
 
-from subterra_jax.errors import SubterraError
 from subterra_jax.faults import N_SEVERITIES
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
 
 SCHEMA = "subterra.evaluation/1"

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.versions import other_schema
 from subterra_jax.tunnel.sources import AGAIN
-from subterra_jax.versions import other_schema
 
 if TYPE_CHECKING:
     import mujoco

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from subterra_jax.errors import SubterraError
-from subterra_jax.versions import other_schema
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.versions import other_schema
 
 SCHEMA = "subterra.policy/1"
 AGAIN = "release it again from its run folder with `python -m train.release`"

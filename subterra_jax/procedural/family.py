@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
 from subterra_jax.procedural import geometry
 from subterra_jax.procedural.geometry import Alignment, ProceduralConfig, wall
 from subterra_jax.tunnel.arrays import cut_pockets

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.tunnel.plan import Wall
 
 Range = tuple[float, float]

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import require_folder
 from subterra_jax.lidar3d import beams
-from subterra_jax.outputs import require_folder
 
 CloudName = Literal["none", "vlp16", "os1"]
 _BEAMS: dict[str, tuple[Callable[[int], np.ndarray], int]] = {"vlp16": (beams.vlp16, 16), "os1": (beams.os1, 64)}

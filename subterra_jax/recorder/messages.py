@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from subterra_jax.adapters.missing import MissingLibraryError
+from subterra_jax.host.errors import MissingLibraryError
 from subterra_jax.recorder.poses import Poses
 
 _ONCE = "/tf_static"

@@ -7,12 +7,12 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.env import TunnelEnv
 from subterra_jax.evaluation import listed_episodes
+from subterra_jax.host.versions import no_task
 from subterra_jax.policies import check_fits, load, told
 from subterra_jax.recorder.config import Recording, RecordingError
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.versions import no_task
 
 
 @dataclasses.dataclass(frozen=True)

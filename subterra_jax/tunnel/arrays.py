@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
 from subterra_jax.tunnel.boxes import distance_to_segment
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
 
 
 @dataclasses.dataclass(frozen=True)

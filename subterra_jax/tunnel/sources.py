@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.versions import other_schema
 from subterra_jax.procedural import expand, generate
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 from subterra_jax.tunnel.tunnel import Tunnel, stack
-from subterra_jax.versions import other_schema
 
 SCHEMA = "subterra.tunnel/1"
 AGAIN = "build the scene again with `python -m scene.build`"

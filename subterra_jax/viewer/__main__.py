@@ -8,9 +8,8 @@ import time
 import warnings
 from pathlib import Path
 
-from subterra_jax.arguments import parse
-from subterra_jax.errors import SubterraError
-from subterra_jax.viewer.config import LOOPBACK, ViewerConfig
+from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.viewer.config import LOOPBACK, ViewerConfig, ViewerError
 
 _EXAMPLE = "example: python -m subterra_jax.viewer --scene build/tunnel --task StopAt --driver particle-filter"
 
@@ -19,8 +18,7 @@ def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
     """Read a command line.
 
     Raises:
-        ArgumentsError: The command line is malformed.
-        SystemExit: Help was shown.
+        SystemExit: The command line is malformed, or help was shown.
     """
     default = ViewerConfig()
     parser = argparse.ArgumentParser(
@@ -49,7 +47,7 @@ def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
         help="address to listen on; the default is this machine alone",
     )
     add("--port", type=int, default=default.port, metavar="N", help="first port to try")
-    given = parse(parser.parse_args, sys.argv[1:] if arguments is None else arguments)
+    given = parse(parser.parse_args, arguments)
     return ViewerConfig(
         scene=given.scene,
         tunnels=tuple(given.tunnel),
@@ -66,24 +64,23 @@ def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the viewer; return 2 for a user's mistake."""
-    try:
-        config = parse_arguments(arguments)
-    except SubterraError as error:
-        return _report(error)
+    """Run the viewer; return the exit status."""
+    config = parse_arguments(arguments)
+    return run_command(lambda: _serve(config), mistakes=INPUT_ERRORS)
+
+
+def _serve(config: ViewerConfig) -> None:
+    """Show episodes until Ctrl-C."""
     # Malformed messages are refused silently: a traceback for each would bury the others.
     for name in ("websockets.server", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")
     try:
         from subterra_jax.viewer.session import Viewer
-
-        _compile_once()
-        viewer = Viewer(config)
     except ModuleNotFoundError as error:
-        return _report(f"{error.name} is not installed: pip install 'subterra-jax[viewer]'")
-    except (SubterraError, ValueError) as error:
-        return _report(error)
+        raise ViewerError(f"{error.name} is not installed: pip install 'subterra-jax[viewer]'") from error
+    _compile_once()
+    viewer = Viewer(config)
     print(f"{viewer.url}  (Ctrl-C ends it)", flush=True)
     if config.host not in (LOOPBACK, "localhost", "::1"):
         print(
@@ -94,13 +91,6 @@ def main(arguments: list[str] | None = None) -> int:
             time.sleep(3600.0)
     except KeyboardInterrupt:
         viewer.stop()
-    return 0
-
-
-def _report(cause: object) -> int:
-    """Print a user's mistake on one line; return the exit status."""
-    print(f"error: {' '.join(str(cause).split())}", file=sys.stderr)
-    return 2
 
 
 def _compile_once() -> None:

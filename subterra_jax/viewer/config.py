@@ -5,10 +5,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from subterra_jax.b2 import MISSIONS
-from subterra_jax.errors import SubterraError
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.files import require_folder
+from subterra_jax.host.versions import no_task
 from subterra_jax.tasks import TASKS
-from subterra_jax.versions import no_task
 
 
 class ViewerError(SubterraError):

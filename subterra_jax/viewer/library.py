@@ -12,7 +12,7 @@ import subterra_jax as st
 from subterra_jax import policies, tasks
 from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines import registry
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.policies.loading import Agent
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest

@@ -5,7 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.viewer.geometry import EpisodeGeometry, Moment
 
 RATE = 40.0  # target, frames/s; a screen shows 60, an episode has 10 rows a second

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from subterra_jax.host.versions import other_schema
 from subterra_jax.tunnel.sources import describe_damage
-from subterra_jax.versions import other_schema
 from subterra_jax.viewer.config import ViewerError
 
 SCHEMA = "subterra.episode/1"

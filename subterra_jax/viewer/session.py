@@ -12,7 +12,7 @@ import numpy as np
 import viser
 
 from subterra_jax import tasks
-from subterra_jax.errors import SubterraError
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.viewer import browsers, recording
 from subterra_jax.viewer.config import ViewerConfig, ViewerError, check_config, free_port
 from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment

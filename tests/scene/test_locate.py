@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scene.cli import progress_bar
 from scene.errors import RecordingError
+from scene.progress import progress_bar
 from scene.reconstruct import ReconstructConfig, reconstruct
 from tests.scene.bags import write_bag, write_tum
 

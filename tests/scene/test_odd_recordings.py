@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from scene.cli import progress_bar
 from scene.errors import FitError, RecordingError
 from scene.poses.imu import read_inertial
+from scene.progress import progress_bar
 from scene.reading.recording import Recording
 from scene.reconstruct import ReconstructConfig, reconstruct
 from tests.scene.bags import custom_msg, write_bag, write_imu_bag, write_tum

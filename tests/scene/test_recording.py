@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
-from scene.cli import progress_bar
 from scene.errors import RecordingError
 from scene.poses.registration import register_scans
 from scene.poses.trajectory import load_tum
+from scene.progress import progress_bar
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag, write_bag_without_lidar, write_tum
 

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene import files
-from scene.cli import progress_bar
 from scene.cloud import VoxelMean
-from scene.errors import OutputError
-from scene.files import replace_folder
 from scene.poses.odometry import OdometryLog, estimate_odometry
 from scene.poses.registration import register_scans
 from scene.poses.trajectory import Trajectory
+from scene.progress import progress_bar
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
 from scene.resume import Partial, input_record, partial_folder, resume_key
+from subterra_jax.host import files
+from subterra_jax.host.errors import OutputError
+from subterra_jax.host.files import replace_folder
 from tests.scene.bags import write_bag
 from tests.scene.clouds import curved_d_bore
 

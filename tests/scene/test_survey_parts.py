@@ -29,8 +29,7 @@ def test_the_survey_imports_nothing_of_the_builder() -> None:
                 names = [alias.name for alias in node.names]
             else:
                 continue
-            own = ("scene.survey.", "scene.arguments.")  # how a command line is read tells nothing of tunnels
-            assert all(n.startswith(own) for n in names if n.split(".")[0] == "scene"), path
+            assert all(n.startswith("scene.survey.") for n in names if n.split(".")[0] == "scene"), path
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Shapes and dtypes in the simulator's annotations are checked while its tests run."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,15 @@ from jaxtyping import install_import_hook
 
 from tests.subterra_jax import checking, tunnels
 
-# A no-op where another room's tests have imported the simulator before.
-with install_import_hook("subterra_jax", f"{checking.__name__}.check_functions"):
+# Nothing is checked where another room's tests have imported the simulator before: half of it would be.
+_FIRST = "subterra_jax.state" not in sys.modules
+with install_import_hook("subterra_jax" if _FIRST else (), f"{checking.__name__}.check_functions"):
+    import subterra_jax
     from subterra_jax.tunnel.plan import TunnelPlan
     from subterra_jax.tunnel.sources import load_tunnel
+
+    for name in subterra_jax.__all__:  # imported at first use, which must happen under the hook
+        getattr(subterra_jax, name)
 
 
 @pytest.fixture(scope="session")

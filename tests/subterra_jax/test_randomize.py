@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.randomize import LogUniform, randomize
+from subterra_jax.randomization import LogUniform, randomize
 
 TASK = "Subterra/TraverseShort-v0"
 RANGES = {"lidar.range_sigma": (0.0, 0.1), "vehicle.speed_max": (1.0, 2.0), "lidar.range_max": (10.0, 30.0)}

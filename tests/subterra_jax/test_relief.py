@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d import relief, surface
 from subterra_jax.lidar3d.relief import Relief
 from tests.subterra_jax import surfaces

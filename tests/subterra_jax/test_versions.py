@@ -14,9 +14,9 @@ import subterra_jax as st
 from scene.bore import load_bore
 from scene.errors import RecordingError as SceneError
 from subterra_jax import policies
+from subterra_jax.host.versions import VERSION, no_task, other_schema
 from subterra_jax.lidar3d.surface import read_axis
 from subterra_jax.policies.files import PolicyError
-from subterra_jax.versions import VERSION, no_task, other_schema
 from subterra_jax.viewer.config import ViewerError
 from subterra_jax.viewer.recording import load as load_episode
 from subterra_jax.viewer.recording import save as save_episode

@@ -1,6 +1,5 @@
 import pytest
 
-from subterra_jax import arguments
 from tests.train.conftest import call
 from train import curve, evaluate, navigate, release
 
@@ -41,7 +40,3 @@ def test_a_mistyped_command_line_is_one_sentence_and_status_2(words, message, ca
     error = capsys.readouterr().err
     assert error.startswith(f"error: {message}")
     assert error.count("\n") == 1
-
-
-def test_what_is_read_is_handed_on_as_it_is():
-    assert arguments.parse(lambda words: [*words, "read"], ["--out", "x"]) == ["--out", "x", "read"]

@@ -11,7 +11,7 @@ from subterra_jax.policies import PolicyError
 from train import navigate
 from train.b2 import embodied
 from train.b2.legs import Legs
-from train.commandline import parse
+from train.commandline import read_command
 from train.errors import ConfigError
 
 SHORT = "Subterra/TraverseShort-v0"
@@ -36,8 +36,8 @@ def test_the_stand_in_is_told_what_the_legs_are_told_and_obeys_as_late(world):
 
 
 def test_the_scout_is_who_drives_unless_told_otherwise():
-    assert parse(["--out", "x"]).embodiment == "scout"
-    asked = parse(["--out", "x", "--embodiment", "b2", "--legs.gait", "trot", "--legs.robots", "3"])
+    assert read_command(["--out", "x"]).embodiment == "scout"
+    asked = read_command(["--out", "x", "--embodiment", "b2", "--legs.gait", "trot", "--legs.robots", "3"])
     assert asked.embodiment == "b2"
     assert asked.legs == Legs(gait="trot", robots=3)
 
@@ -60,7 +60,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(task, tunnel, legs, error, said
 def test_a_policy_learnt_on_the_stand_in_drives_robots_on_legs(tmp_path):
     out = tmp_path / "run"
     words = ["--out", str(out), "--embodiment", "b2", "--task", SHORT, "--steps", "600000"]
-    asked = parse([*words, "--legs.robots", "4", "--legs.engine", "mujoco", "--evaluation-episodes", "50"])
+    asked = read_command([*words, "--legs.robots", "4", "--legs.engine", "mujoco", "--evaluation-episodes", "50"])
     assert navigate.command(asked) == 0
     told = json.loads((out / embodied.ON_LEGS).read_text())
     assert told["robots"] == 4

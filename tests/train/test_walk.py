@@ -10,7 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import policy as gaits
-from subterra_jax.outputs import OutputError
+from subterra_jax.host.errors import OutputError
 from subterra_jax.policies.files import PolicyError
 from train import release, walk
 from train.b2.config import WalkConfig, make_config
@@ -117,7 +117,7 @@ def test_settings_that_make_no_sense_are_refused_before_anything_is_compiled(tmp
     with pytest.raises(ConfigError, match="either a tunnel or a scene"):
         walk.command(walk.Command(out=tmp_path / "run", tunnel=tmp_path / "t.npz", scene=tmp_path))
     with pytest.raises(ConfigError, match="unknown preset 'tpu'"):
-        walk.parse(["--out", str(tmp_path / "run"), "--preset", "tpu"])
+        walk.read_command(["--out", str(tmp_path / "run"), "--preset", "tpu"])
     assert not (tmp_path / "run").exists()
 
 

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from subterra_jax.versions import other_schema
+from subterra_jax.host.versions import other_schema
 from train.errors import CheckpointError
 
 SCHEMA = "subterra.checkpoint/1"

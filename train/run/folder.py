@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from subterra_jax.outputs import require_folder
+from subterra_jax.host.files import require_folder
 from train import policies
 from train.config import TrainConfig
 from train.devices import cluster

@@ -30,7 +30,7 @@ from benchmarks.fidelity.controls.catalogue import (
 from benchmarks.fidelity.files import read_json, write_json
 from benchmarks.fidelity.judge import Base
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
-from scene.cli import progress_bar
+from scene.progress import progress_bar
 
 OUTCOME_SCHEMA = "subterra.fidelity-control/1"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from subterra_jax.errors import TunnelError
+from subterra_jax.host.errors import TunnelError
 from subterra_jax.viewer.shapes import lining_shape, scene_shapes
 
 _SCENE = """<mujoco>

@@ -1,31 +1,13 @@
-"""What every command of this room shares: one sentence for a user's mistake, and bars for long work."""
+"""Progress of long work: bars in a terminal, lines elsewhere."""
 
-import sys
 import time
-from collections.abc import Callable
 from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from scene.errors import SubterraError
-
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
 _LINE_EVERY, _LINE_SHARE = 10.0, 0.1  # s, and share of a stage, between two lines where there is no terminal
-
-
-def run(command: Callable[[], None]) -> None:
-    """Runs a command; a `SubterraError` ends as one sentence on stderr and exit status 2."""
-    try:
-        command()
-    except SubterraError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(EXIT_BAD_INPUT)
-    except KeyboardInterrupt:
-        print("interrupted; the output is as it was, and the same command goes on from here", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
 
 
 class _Rate(ProgressColumn):

@@ -1,0 +1,120 @@
+"""Files and folders that appear whole or not at all, and early checks that they can be written."""
+
+import ctypes
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from subterra_jax.host.errors import OutputError
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Linux, renameat2(2)
+
+
+def require_folder(path: Path) -> Path:
+    """Checks that a folder can be written, without leaving anything behind, and returns its path.
+
+    Raises:
+        OutputError: A file is in the way, at `path` or at a parent, or the disk refuses.
+    """
+    place = next(place for place in (path, *path.absolute().parents) if place.exists())
+    if not place.is_dir():
+        raise OutputError(f"{place}: is a file, so no folder {path} can be written")
+    try:
+        # Permissions do not tell what network and system folders do, so write a file that vanishes at once.
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({place}: {error.strerror})") from error
+    return path
+
+
+def require_file(path: Path, *endings: str) -> Path:
+    """Checks that a file can be written, without leaving anything behind, and returns its path.
+
+    Args:
+        path: The file.
+        *endings: Endings that it may have; any where none is given.
+
+    Raises:
+        OutputError: It is a folder, has another ending, or its folder cannot be written.
+    """
+    if endings and path.suffix.lower() not in endings:
+        raise OutputError(f"{path}: must end in {' or '.join(endings)}")
+    if path.is_dir():
+        raise OutputError(f"{path}: is a folder, not a file")
+    require_folder(path.parent)
+    return path
+
+
+@contextmanager
+def replace_file(path: Path) -> Iterator[Path]:
+    """Yields a temporary path to write, and renames it to `path` once the block ends without an error.
+
+    A previous file at `path` stays whole until then. The folder is made where it is missing. After an error or an
+    interrupt, nothing of the new file is left.
+
+    Raises:
+        OutputError: The disk refuses.
+    """
+    fresh = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh.unlink(missing_ok=True)
+        yield fresh
+        fresh.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        _remove(fresh)
+
+
+@contextmanager
+def replace_folder(path: Path) -> Iterator[Path]:
+    """Yields a temporary folder to write, which takes the place of `path` once the block ends without an error.
+
+    A previous folder at `path` stays whole until then; after an error or an interrupt, nothing of the new one is left.
+    The next call repairs what a killed process left behind.
+
+    Raises:
+        OutputError: `path`, or a parent of it, is a file, or the disk refuses.
+    """
+    require_folder(path)
+    fresh, stale = path.with_name(f".{path.name}.partial"), path.with_name(f".{path.name}.stale")
+    try:
+        _put_back(path, stale)
+        shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir(parents=True)
+        yield fresh
+        if path.exists() and not _exchange(fresh, path):
+            path.rename(stale)
+        if not path.exists():
+            fresh.rename(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+        _put_back(path, stale)
+
+
+def _remove(path: Path) -> None:
+    """Removes a file, whatever the disk says."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
+
+
+def _put_back(path: Path, stale: Path) -> None:
+    """Ends a replacement that stopped between its two renames."""
+    if stale.exists() and not path.exists():
+        stale.rename(path)
+    shutil.rmtree(stale, ignore_errors=True)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swaps two folders in one step, so that neither path is ever empty; `False` where the system cannot."""
+    try:
+        swap = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError):  # no Linux, or one before 2014
+        return False
+    return swap(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0
