@@ -13,7 +13,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial import KDTree
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.tunnel.boxes import distance_to_segment
+from subterra_jax.tunnel.blocks import distance_to_segment
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 ArrayLike = Any  # a number, an array or nested lists of numbers

@@ -18,10 +18,9 @@ from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest
 from subterra_jax.viewer.config import ViewerConfig, ViewerError
 from subterra_jax.viewer.driving import drive
-from subterra_jax.viewer.geometry import Centreline
+from subterra_jax.viewer.geometry import Centreline, lining_shape, planar_shapes, scene_shapes
 from subterra_jax.viewer.recording import EpisodeFileError, Recording, load
 from subterra_jax.viewer.scene import SceneView
-from subterra_jax.viewer.shapes import lining_shape, planar_shapes, scene_shapes
 
 TASKS = (*tasks.TASKS, *MISSIONS)  # tasks that the viewer shows
 

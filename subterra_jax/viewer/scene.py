@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment
-from subterra_jax.viewer.shapes import Shape
+from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment, Shape
 
 if TYPE_CHECKING:
     import trimesh

@@ -5,7 +5,7 @@ import pytest
 
 from subterra_jax import procedural
 from subterra_jax.lidar import reference
-from subterra_jax.tunnel import Tunnel, blocks, boxes
+from subterra_jax.tunnel import Tunnel, blocks
 from subterra_jax.tunnel.blocks import separation, windows
 
 
@@ -13,7 +13,7 @@ def test_the_box_of_a_turned_rectangle_is_that_rectangle():
     direction = np.array([np.cos(0.3), np.sin(0.3)])
     normal = np.array([-direction[1], direction[0]])
     corners = [[7.0, 3.0] + a * 2.0 * direction + b * 0.25 * normal for a, b in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    centre, half, thickness = boxes.thin_boxes(np.array([corners]), np.array([4]))
+    centre, half, thickness = blocks.thin_boxes(np.array([corners]), np.array([4]))
     np.testing.assert_allclose(centre[0], [7.0, 3.0], atol=1e-6)
     # Which of its sides counts as the long axis is left open.
     assert sorted([np.linalg.norm(half[0]), thickness[0]]) == pytest.approx([0.25, 2.0], abs=3e-5)
@@ -23,7 +23,7 @@ def test_the_box_of_a_turned_rectangle_is_that_rectangle():
 def test_a_box_encloses_its_piece_and_lies_along_a_nearly_straight_one():
     rng = np.random.default_rng(1)
     pieces = np.stack([np.linspace(0.0, 2.0, 9) + np.zeros((50, 1)), rng.normal(0.0, 0.01, (50, 9))], axis=-1)
-    centre, half, thickness = boxes.thin_boxes(pieces, np.full(50, 9))
+    centre, half, thickness = blocks.thin_boxes(pieces, np.full(50, 9))
     length = np.linalg.norm(half, axis=1)
     along = half / length[:, None]
     off = pieces - centre[:, None]
@@ -38,11 +38,11 @@ def test_a_piece_is_boxed_as_it_is_alone_and_a_repeated_point_gets_a_box():
     rng = np.random.default_rng(0)
     pieces, count = np.cumsum(rng.normal(0.1, 0.2, (40, 6, 2)), axis=1), rng.integers(2, 7, 40)
     pieces[7] = pieces[7, :1]
-    together = boxes.thin_boxes(pieces, count)
+    together = blocks.thin_boxes(pieces, count)
     for i in range(40):
-        for many, one in zip(together, boxes.thin_boxes(pieces[i : i + 1], count[i : i + 1]), strict=True):
+        for many, one in zip(together, blocks.thin_boxes(pieces[i : i + 1], count[i : i + 1]), strict=True):
             np.testing.assert_array_equal(many[i], one[0])
-    assert together[2][7] == pytest.approx(boxes.BOX_MARGIN, abs=1e-7)
+    assert together[2][7] == pytest.approx(blocks.BOX_MARGIN, abs=1e-7)
 
 
 def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
@@ -50,14 +50,14 @@ def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
         return np.array([[0.0, 0.0], [0.5, 0.0], [0.5, depth], [1.5, depth], [1.5, 0.0], [2.0, 0.0]])
 
     pieces = np.stack([wall(0.13), wall(1.0), wall(0.13)])
-    hull, size = boxes.lidded(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
+    hull, size = blocks.lidded(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
     assert size.tolist() == [2, 6, 6]
     np.testing.assert_array_equal(hull[0, :2], [[0.0, 0.0], [2.0, 0.0]])
 
 
 def test_the_distance_to_a_segment_is_that_to_its_line_or_its_nearer_end():
     point = np.array([[0.0, 2.0], [5.0, 4.0], [-4.0, 0.0]])
-    np.testing.assert_allclose(boxes.distance_to_segment(point, np.zeros(2), np.array([2.0, 0.0])), [2.0, 5.0, 2.0])
+    np.testing.assert_allclose(blocks.distance_to_segment(point, np.zeros(2), np.array([2.0, 0.0])), [2.0, 5.0, 2.0])
 
 
 def test_windows_hold_every_block_within_reach_found_one_by_one():

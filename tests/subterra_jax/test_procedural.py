@@ -8,8 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import procedural
 from subterra_jax.lidar import reference
-from subterra_jax.procedural import geometry
-from subterra_jax.procedural.family import _streams
+from subterra_jax.procedural import _streams, geometry
 from subterra_jax.procedural.geometry import Alignment, wander
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.sources import resolve

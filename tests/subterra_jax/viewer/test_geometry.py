@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, dead_reckon
+from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, dead_reckon, planar_shapes
 from subterra_jax.viewer.panel import error_series, progress_series
 from subterra_jax.viewer.player import Player
-from subterra_jax.viewer.shapes import planar_shapes
 from tests.subterra_jax import tunnels
 from tests.subterra_jax.viewer.episodes import straight
 

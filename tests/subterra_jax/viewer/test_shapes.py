@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.viewer.shapes import lining_shape, scene_shapes
+from subterra_jax.viewer.geometry import lining_shape, scene_shapes
 
 _SCENE = """<mujoco>
   <compiler meshdir="meshes"/>
