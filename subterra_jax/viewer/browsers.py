@@ -7,7 +7,6 @@ against viser 1.1.
 
 import io
 import math
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import viser
 from jaxtyping import Float
 from viser import _messages as messages
 
+from subterra_jax.host.files import replace_file
 from subterra_jax.viewer.config import ViewerError
 from subterra_jax.viewer.geometry import Centreline, Moment
 
@@ -153,7 +153,8 @@ def save_picture(client: viser.ClientHandle, path: Path) -> None:
         path: Path of the PNG.
 
     Raises:
-        ViewerError: The browser sent no picture, or the file cannot be written.
+        ViewerError: The browser sent no picture.
+        OutputError: The file cannot be written.
     """
     camera = client.camera
     try:
@@ -163,11 +164,6 @@ def save_picture(client: viser.ClientHandle, path: Path) -> None:
         raise ViewerError(f"the browser gave no picture ({error})") from error
     buffer = io.BytesIO()
     imageio.imwrite(buffer, pixels[..., :3], extension=".png")
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as partial:
         partial.write_bytes(buffer.getvalue())
-        os.replace(partial, path)
-    except OSError as error:
-        raise ViewerError(f"{path}: cannot be written ({error.strerror})") from error
     client.send_file_download(path.name, buffer.getvalue())

@@ -2,13 +2,13 @@
 
 import dataclasses
 import io
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import other_schema
 from subterra_jax.tunnel.sources import describe_damage
 from subterra_jax.viewer.config import ViewerError
@@ -35,7 +35,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
 
 
 class EpisodeFileError(ViewerError):
-    """A recorded episode cannot be read or written."""
+    """A recorded episode cannot be read, or there is none to save."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,17 +127,12 @@ def save(recording: Recording, path: Path) -> None:
     """Write an episode, under a temporary name first; the same episode gives the same bytes.
 
     Raises:
-        EpisodeFileError: The file cannot be written.
+        OutputError: The file cannot be written.
     """
     buffer = io.BytesIO()
     np.savez_compressed(buffer, schema=np.array(SCHEMA), **vars(recording))
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as partial:
         partial.write_bytes(buffer.getvalue())
-        os.replace(partial, path)
-    except OSError as error:
-        raise EpisodeFileError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def load(path: Path) -> Recording:

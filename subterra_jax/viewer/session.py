@@ -205,7 +205,8 @@ class Session:
         """Save the episode on screen; return its path.
 
         Raises:
-            EpisodeFileError: No episode is finished, or the file cannot be written.
+            EpisodeFileError: No episode is finished.
+            OutputError: The file cannot be written.
         """
         episode = self.view.player.episode
         if episode is None or not episode.finished:
@@ -219,7 +220,8 @@ class Session:
         """Save a browser's picture; return its path.
 
         Raises:
-            ViewerError: The browser sent no picture, the file cannot be written, or another picture is being taken.
+            ViewerError: The browser sent no picture, or another picture is being taken.
+            OutputError: The file cannot be written.
         """
         player = self.view.player
         stem = "tunnel" if player.episode is None else player.episode.recording.file_name.removesuffix(".npz")
