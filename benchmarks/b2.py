@@ -15,15 +15,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import tyro
 from rich.console import Console
 from rich.table import Table
 
 import subterra_jax as st
+from benchmarks.command import require_least, run_main
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import WindowConfig
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.files import require_file
 
 _COLUMNS = ("variant", "contacts", "rows", "MJX alone, M/s", "environment, M/s", "share", "compile, s", "falls in 20 s")
@@ -119,16 +118,14 @@ def command(arguments: Command) -> int:
     """Measures and prints; returns 1 where a number is not finite.
 
     Raises:
-        ValueError: There is no such variant, or a number is out of range.
-        SubterraError: There is no such tunnel, or the output cannot be written.
+        ValueError: There is no such variant.
+        SubterraError: A number is too small, there is no such tunnel, or the output cannot be written.
     """
     names = tuple(VARIANTS) if arguments.variants == ("all",) else arguments.variants
     for name in names:
         if name not in VARIANTS:
             raise ValueError(f"no variant {name!r}; there are {', '.join(VARIANTS)}, all")
-    for name in ("robots", "control_steps", "repeats"):
-        if getattr(arguments, name) < 1:
-            raise ValueError(f"{name} must be at least 1, got {getattr(arguments, name)}")
+    require_least(arguments, robots=1, control_steps=1, repeats=1)
     if arguments.out is not None:
         require_file(arguments.out)
     device = jax.devices()[0]
@@ -148,14 +145,9 @@ def command(arguments: Command) -> int:
     return 0 if all(figures["finite"] for figures in results.values()) else 1
 
 
-def _read(words: list[str]) -> Command:
-    return tyro.cli(Command, args=words, prog="python -m benchmarks.b2")
-
-
-def main() -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
-    arguments = parse(_read)
-    return run_command(lambda: command(arguments), mistakes=INPUT_ERRORS)
+    return run_main("b2", Command, command, words=words)
 
 
 if __name__ == "__main__":

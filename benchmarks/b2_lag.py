@@ -8,23 +8,17 @@ import sys
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 
+from benchmarks.command import BenchmarkError, require_least, run_main
 from subterra_jax.b2.film import Driver
 from subterra_jax.b2.gym import B2Env
 from subterra_jax.b2.policy import RELEASED
 from subterra_jax.b2.surrogate import identify
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
-from subterra_jax.host.errors import SubterraError
 from train import cli
 
 _SPEEDS = (0.0, 0.3, 0.5, 0.8)  # m/s; one is drawn every 2 s
 _TURN = 0.3  # rad/s; largest noise of the yaw rate, drawn every 0.6 s
-
-
-class LagError(SubterraError):
-    """The lags of a gait cannot be identified."""
 
 
 @dataclass(frozen=True)
@@ -80,11 +74,9 @@ def command(arguments: Command) -> None:
     """Walks the robots, fits the lags and prints them.
 
     Raises:
-        LagError: A number is out of range, or the lags cannot be identified.
+        BenchmarkError: A number is out of range, or the lags cannot be identified.
     """
-    for name, least in (("robots", 1), ("steps", 1), ("seed", 0)):
-        if getattr(arguments, name) < least:
-            raise LagError(f"{name} must be at least {least}, got {getattr(arguments, name)}")
+    require_least(arguments, robots=1, steps=1, seed=0)
     env = B2Env(policy=arguments.policy)
     driver = Driver(env, "dead-reckoning")
     walks = [walk(env, driver, arguments.seed + k, arguments.steps) for k in range(arguments.robots)]
@@ -92,22 +84,17 @@ def command(arguments: Command) -> None:
     try:
         lag = identify(commands, motion, float(env.params.vehicle.period))
     except ValueError as cause:
-        raise LagError(f"gait {arguments.policy}: {cause}") from cause
+        raise BenchmarkError(f"gait {arguments.policy}: {cause}") from cause
     ended_early = sum(len(part) < arguments.steps for part, _ in walks)
     cli.table(
         f"gait {arguments.policy}", {**dataclasses.asdict(lag), "steps": len(commands), "ended_early": ended_early}
     )
 
 
-def _read(words: list[str]) -> Command:
-    return tyro.cli(Command, args=words, prog="python -m benchmarks.b2_lag")
-
-
-def main() -> None:
-    """Runs the command line."""
-    arguments = parse(_read)
-    sys.exit(run_command(lambda: command(arguments), mistakes=INPUT_ERRORS))
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 2 for a user's mistake."""
+    return run_main("b2_lag", Command, command, words=words)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

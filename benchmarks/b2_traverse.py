@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 
+from benchmarks.command import require_least, run_main
 from subterra_jax import policies
 from subterra_jax.b2 import missions, trial
 from subterra_jax.b2.policy import RELEASED
 from subterra_jax.baselines import registry
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 from train import cli
@@ -79,15 +78,11 @@ def show_progress(now: trial.Walk) -> None:
 
 
 def _check(arguments: Command) -> None:
-    for name, least in (("robots", 1), ("seed", 0)):
-        if getattr(arguments, name) < least:
-            raise ValueError(f"{name} must be at least {least}, got {getattr(arguments, name)}")
-    for name, most in (("coverage", 1.0), ("speed", math.inf)):
-        value = getattr(arguments, name)
-        if not 0.0 < value <= most or math.isinf(value):
-            raise ValueError(
-                f"{name} must be above 0{'' if math.isinf(most) else f' and at most {most:g}'}, got {value}"
-            )
+    require_least(arguments, robots=1, seed=0)
+    if not 0.0 < arguments.coverage <= 1.0:
+        raise ValueError(f"coverage must be above 0 and at most 1, got {arguments.coverage}")
+    if not 0.0 < arguments.speed < math.inf:
+        raise ValueError(f"speed must be above 0, got {arguments.speed}")
     if not 0.0 <= arguments.length < math.inf:
         raise ValueError(f"length must not be negative, got {arguments.length}")
     if arguments.scene is not None and arguments.tunnel is not None:
@@ -127,15 +122,10 @@ def command(arguments: Command) -> None:
         arguments.out.write_text(json.dumps({**vars(arguments), **figures}, default=str, indent=1) + "\n")
 
 
-def _read(words: list[str]) -> Command:
-    return tyro.cli(Command, args=words, prog="python -m benchmarks.b2_traverse")
-
-
-def main() -> None:
-    """Runs the command line."""
-    arguments = parse(_read)
-    sys.exit(run_command(lambda: command(arguments), mistakes=INPUT_ERRORS))
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 2 for a user's mistake."""
+    return run_main("b2_traverse", Command, command, words=words)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

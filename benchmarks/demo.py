@@ -11,12 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from benchmarks.command import run_main
 from benchmarks.report import write_report
 from benchmarks.truth import Truth, compare, load_truth, start_placement
 from scene.survey.config import SurveyConfig, check_survey
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.files import require_folder
 
 TASK = "Subterra/TraverseShort-v0"
@@ -61,13 +59,18 @@ class Stages:
         print(f"--- {self.seconds[name]:.1f} s", flush=True)
 
 
-def run_module(*arguments: object, may_fail: bool = False) -> str | None:
-    """Runs `python -m ...` as a user would; returns the error sentence of a command that may fail and did.
+def run_module(module: str, *inputs: Path, may_fail: bool = False, **options: object) -> str | None:
+    """Runs `python -m MODULE INPUTS --OPTION VALUE ...` as a user would; an option that is `True` has no value.
+
+    Returns:
+        The error sentence of a command that may fail and did, else `None`.
 
     Raises:
         SystemExit: A command failed that may not fail.
     """
-    words = [str(argument) for argument in arguments]
+    words = [module, *map(str, inputs)]
+    for name, value in options.items():
+        words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     print(f"$ python -m {' '.join(words)}", flush=True)
     done = subprocess.run([sys.executable, "-m", *words], stderr=subprocess.PIPE if may_fail else None, text=True)
     if done.returncode == 0:
@@ -117,41 +120,20 @@ def main(config: DemoConfig) -> None:
     out, stages = config.out, Stages()
     survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))
     with stages.stage("survey", f"1/6 Simulating a survey of {config.length:g} m (a ROS1 bag in GEODE's layout)"):
-        run_module(
-            "scene.survey",
-            "--length",
-            config.length,
-            "--seed",
-            config.seed,
-            "--point-rate",
-            config.point_rate,
-            "--out",
-            survey,
-        )
+        size: dict[str, Any] = {"length": config.length, "seed": config.seed, "point_rate": config.point_rate}
+        run_module("scene.survey", **size, out=survey)
     with stages.stage("build", "2/6 Reconstructing the bore from the bag, poses given"):
-        given = ("--trajectory", survey / "groundtruth.tum")
-        run_module("scene.build", survey / "survey.bag", *given, "--provenance", "simulated", "--out", scene)
+        bag, trajectory = survey / "survey.bag", survey / "groundtruth.tum"
+        run_module("scene.build", bag, trajectory=trajectory, provenance="simulated", out=scene)
     with stages.stage("build_odometry", "3/6 The same without poses: LiDAR odometry alone"):
-        failure = run_module(
-            "scene.build", survey / "survey.bag", "--provenance", "simulated", "--out", blind, may_fail=True
-        )
+        failure = run_module("scene.build", bag, may_fail=True, provenance="simulated", out=blind)
         print(failure or "")
     with stages.stage("load", "4/6 Loading the scene into MuJoCo and MJX"):
         loaded = step_in_mujoco_and_mjx(scene)
         print(", ".join(f"{name} {value}" for name, value in loaded.items()))
     with stages.stage("train", f"5/6 Training on the reconstructed bore ({TASK})"):
-        run_module(
-            "train.navigate",
-            "--task",
-            TASK,
-            "--tunnel",
-            scene / "tunnel.npz",
-            "--seed",
-            config.seed,
-            "--overwrite",
-            "--out",
-            run,
-        )
+        tunnel = scene / "tunnel.npz"
+        run_module("train.navigate", task=TASK, tunnel=tunnel, seed=config.seed, overwrite=True, out=run)
     with stages.stage("report", "6/6 Writing the report"):
         truth = load_truth(survey / "truth.json")
         summary: dict[str, Any] = {
@@ -164,9 +146,9 @@ def main(config: DemoConfig) -> None:
         }
         summary["stage_seconds"] = stages.seconds
         summary["seconds"] = time.monotonic() - started
-        page = write_report(out, summary, truth)
+        report = write_report(out, summary, truth)
         (out / "summary.json").write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n")
-    print(f"\n{len(stages.seconds)} stages in {time.monotonic() - started:.0f} s: {page}")
+    print(f"\n{len(stages.seconds)} stages in {time.monotonic() - started:.0f} s: {report}")
 
 
 def _training_figures(run: Path) -> dict[str, Any]:
@@ -190,5 +172,4 @@ def _odometry_figures(survey: Path, scene: Path, truth: Truth, failure: str | No
 
 
 if __name__ == "__main__":
-    config = parse(lambda words: tyro.cli(DemoConfig, args=words, prog="python -m benchmarks.demo"))
-    sys.exit(run_command(lambda: main(config), mistakes=INPUT_ERRORS))
+    sys.exit(run_main("demo", DemoConfig, main))

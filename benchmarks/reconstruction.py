@@ -13,18 +13,17 @@ from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
-import tyro
 from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
+from benchmarks.command import run_main
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.derive.surface import Nearest, visible_mesh
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.truth import compare, load_truth
 from scene.survey.config import SurveyConfig, TruthName, check_survey
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.files import require_folder
 
 
@@ -77,7 +76,7 @@ GOALS = {
 
 
 def meets_goal(name: str, value: float, poses: str) -> bool:
-    """Return whether a figure meets its goal; signed errors count by their size, NaN meets no goal."""
+    """Returns whether a figure meets its goal; signed errors count by their size, NaN meets no goal."""
     goal = GOALS[name]
     limit = goal.given if poses == "given" else goal.control
     return value >= limit if goal.at_least else abs(value) <= limit
@@ -103,7 +102,7 @@ def build(survey: Path, out: Path, poses: str) -> dict[str, float]:
 
 
 def figures(scene: Path, survey: Path) -> dict[str, float]:
-    """Return all figures of one scene but those of `build`; nothing is aligned, fitted or scaled first."""
+    """Returns all figures of one scene but those of `build`; nothing is aligned, fitted or scaled first."""
     truth = load_truth(survey / "truth.json")
     errors = compare(scene, truth)
     candidate = load_candidate(scene)
@@ -160,16 +159,6 @@ def _run(module: str, *arguments: object) -> float:
     if status:
         sys.exit(os.waitstatus_to_exitcode(status))
     return usage.ru_maxrss / 2**20
-
-
-def main() -> None:
-    """Runs the command line."""
-    config = parse(
-        lambda words: tyro.cli(
-            ReconstructionConfig, args=words, prog="python -m benchmarks.reconstruction", description=__doc__
-        )
-    )
-    sys.exit(run_command(lambda: run(config), mistakes=INPUT_ERRORS))
 
 
 def check(config: ReconstructionConfig) -> None:
@@ -242,12 +231,12 @@ def sleeper_figures(scene: Path, survey: Path) -> dict[str, float]:
 
 
 def f1(hits: int, built: int, true: int) -> float:
-    """Return the harmonic mean of precision and recall; 1 where there is nothing and nothing was found."""
+    """Returns the harmonic mean of precision and recall; 1 where there is nothing and nothing was found."""
     return 2 * hits / (built + true) if built + true else 1.0
 
 
 def one_to_one(built: Float[np.ndarray, "n d"], true: Float[np.ndarray, "m d"]) -> tuple[np.ndarray, np.ndarray]:
-    """Match features within `REACH`, each at most once, nearest pairs first; return the indices of both."""
+    """Matches features within `REACH`, each at most once, nearest pairs first; returns the indices of both."""
     if not len(built) or not len(true):
         return np.empty(0, int), np.empty(0, int)
     near = cKDTree(built).sparse_distance_matrix(cKDTree(true), REACH, output_type="coo_matrix")
@@ -284,4 +273,4 @@ def _pocket_positions(bore: dict[str, np.ndarray]) -> Float[np.ndarray, "p 3"]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run_main("reconstruction", ReconstructionConfig, run, description=__doc__))

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from benchmarks.command import run_main
 from subterra_jax.host.files import require_file
 
 # MuJoCo chooses its OpenGL backend when it is imported, so each is tried in a process of its own.
@@ -113,12 +113,6 @@ def render(config: RenderConfig) -> None:
     renderer.close()
 
 
-def command() -> int:
-    """Runs the command line; returns 2 for a user's mistake or without OpenGL."""
-    config = parse(lambda words: tyro.cli(RenderConfig, args=words, prog="python -m benchmarks.render"))
-    return run_command(lambda: check_and_render(config), mistakes=INPUT_ERRORS)
-
-
 def check_and_render(config: RenderConfig) -> None:
     """Checks the settings, then renders.
 
@@ -139,4 +133,4 @@ def check_and_render(config: RenderConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(command())
+    sys.exit(run_main("render", RenderConfig, check_and_render))

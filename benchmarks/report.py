@@ -41,7 +41,7 @@ tr.missed td { background: color-mix(in srgb, #c1121f 14%, transparent); }
 
 
 def html_page(title: str, parts: Iterable[str]) -> str:
-    """Return a whole HTML page."""
+    """Returns a whole HTML page."""
     body = "\n".join(parts)
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
@@ -51,17 +51,17 @@ def html_page(title: str, parts: Iterable[str]) -> str:
 
 
 def html_heading(text: str, level: int = 2) -> str:
-    """Return a heading; the text is escaped."""
+    """Returns a heading; the text is escaped."""
     return f"<h{level}>{html.escape(text)}</h{level}>"
 
 
 def html_paragraph(text: str, kind: str = "note") -> str:
-    """Return a paragraph; the text is escaped."""
+    """Returns a paragraph; the text is escaped."""
     return f'<p class="{kind}">{html.escape(text)}</p>'
 
 
 def html_figure(content: Figure | np.ndarray | bytes, caption: str) -> str:
-    """Embed a figure, an `(h, w, 3)` picture or PNG bytes."""
+    """Embeds a figure, an `(h, w, 3)` picture or PNG bytes."""
     data = base64.b64encode(_png(content)).decode()
     return (
         f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
@@ -70,7 +70,7 @@ def html_figure(content: Figure | np.ndarray | bytes, caption: str) -> str:
 
 
 def html_table(columns: tuple[str, ...], rows: Iterable[tuple[tuple[str, ...], bool]]) -> str:
-    """Return a table of strings; a row's flag marks a missed goal. The second column is set as numbers."""
+    """Returns a table of strings; a row's flag marks a missed goal. The second column is set as numbers."""
     kinds = ["number" if k == 1 else "text" for k in range(len(columns))]
     head = "".join(f'<th class="{kind}">{html.escape(name)}</th>' for kind, name in zip(kinds, columns, strict=True))
     lines = []
@@ -149,10 +149,7 @@ def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: i
         near = near[np.linalg.norm(near, axis=1) < 2 * bore["radius"][row].max()]
         near = near[:: max(1, len(near) // _MOST_POINTS)]
         panel.plot(near @ bore["lateral"][row], near @ bore["up"][row], ".", ms=0.8, color=_POINTS, rasterized=True)
-        angle, radius = (
-            np.append(bore["angle"], bore["angle"][0]),
-            np.append(bore["radius"][row], bore["radius"][row][0]),
-        )
+        angle, radius = (np.append(values, values[0]) for values in (bore["angle"], bore["radius"][row]))
         panel.plot(radius * np.cos(angle), radius * np.sin(angle), color=_INK, lw=1.2)
         panel.set(title=f"station {bore['station'][row]:.1f} m", xlabel="lateral, m", aspect="equal")
         panel.invert_xaxis()  # looking towards growing station, left is left
@@ -253,7 +250,10 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
         html_heading("The bore"),
         *_bore_parts(out, summary, truth),
         html_heading("The environment and what was learnt in it"),
-        html_figure(_closed(plan_of_walls(out / "scene" / "tunnel.npz")), _caption_walls()),
+        html_figure(
+            _closed(plan_of_walls(out / "scene" / "tunnel.npz")),
+            "The first 20 m as the environment's LiDAR sees them: walls and bolt pockets at its height.",
+        ),
         html_figure(
             (out / "training" / "curve.png").read_bytes(), "Coverage of each training episode and their mean of 100."
         ),
@@ -279,27 +279,20 @@ def _bore_parts(out: Path, summary: dict[str, Any], truth: Truth) -> list[str]:
     else:
         drawn = _closed(bore_in_perspective(scene / "bore.npz"))
         parts.append(html_figure(drawn, "The bore, drawn section by section; without OpenGL nothing can be rendered."))
-    plan = plan_and_profile(truth, given, odometry)
-    sections = section_overlays(scene / "bore.npz", scene_points(scene))
-    errors = section_errors(compare(scene, truth))
+    plan = _closed(plan_and_profile(truth, given, odometry))
+    sections = _closed(section_overlays(scene / "bore.npz", scene_points(scene)))
+    errors = _closed(section_errors(compare(scene, truth)))
     return [
         *parts,
-        html_figure(
-            _closed(plan),
-            "Plan and profile of the centreline. Nothing is aligned: the odometry starts at the true pose.",
-        ),
-        html_figure(_closed(sections), "Sections over the registered points within 15 cm, looking along the tunnel."),
-        html_figure(_closed(errors), "Error of the axis (above) and of the section's size (below) against the truth."),
+        html_figure(plan, "Plan and profile of the centreline. Nothing is aligned: odometry starts at the true pose."),
+        html_figure(sections, "Sections over the registered points within 15 cm, looking along the tunnel."),
+        html_figure(errors, "Error of the axis (above) and of the section's size (below) against the truth."),
     ]
 
 
 def _closed(figure: Any) -> Any:
     plt.close(figure)  # so that figures do not pile up; a closed figure can still be saved
     return figure
-
-
-def _caption_walls() -> str:
-    return "The first 20 m as the environment's LiDAR sees them: walls and bolt pockets at its height."
 
 
 def _odometry_sentence(odometry: dict[str, Any]) -> str:

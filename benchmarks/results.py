@@ -1,5 +1,6 @@
-"""Facts that every result file carries, and files written whole or not at all."""
+"""Facts that every result file carries, figures as PNG, and files written whole or not at all."""
 
+import io
 import os
 import platform
 from datetime import UTC, datetime
@@ -8,14 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
 
 from subterra_jax import tasks
+from subterra_jax.host.files import replace_file
 
 _PACKAGES = ("jax", "jaxlib", "flax", "numpy", "mujoco", "jaxmarl", "gymnax", "subterra-jax")
 
 
 def environment_facts() -> dict[str, Any]:
-    """Return date (UTC), hardware and versions; `None` for a package that is not installed."""
+    """Returns date (UTC), hardware and versions; `None` for a package that is not installed."""
     device = jax.devices()[0]
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -30,13 +37,13 @@ def environment_facts() -> dict[str, Any]:
 
 
 def constants_facts() -> dict[str, str]:
-    """Return the digest of the benchmark's constants; empty where `subterra_jax.tasks` has none to give."""
+    """Returns the digest of the benchmark's constants; empty where `subterra_jax.tasks` has none to give."""
     digest = getattr(tasks, "constants_digest", None)
     return {} if digest is None else {"constants_sha256": str(digest())}
 
 
 def version(package: str) -> str | None:
-    """Return a package's version; `None` where it is not installed, or runs from a checkout that was not."""
+    """Returns a package's version; `None` where it is not installed, or runs from a checkout that was not."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -44,18 +51,25 @@ def version(package: str) -> str | None:
 
 
 def write_file(path: Path, content: bytes) -> None:
-    """Writes a file under a temporary name, then renames it, so that no half-written file is left.
+    """Writes a file whole or not at all, and its folder where it is missing.
 
     Raises:
-        OSError: The file cannot be written.
+        OutputError: The file cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+    with replace_file(path) as fresh:
+        fresh.write_bytes(content)
+
+
+def png_bytes(figure: Figure, dpi: int, **options: Any) -> bytes:
+    """Returns a figure as a PNG file and closes it; `options` go to `savefig`."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, **options)
+    plt.close(figure)
+    return buffer.getvalue()
 
 
 def _processor() -> str:
-    """Return the processor's name, as far as the system gives it."""
+    """Returns the processor's name, as far as the system gives it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

@@ -10,22 +10,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jax.experimental import checkify
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 from rich.console import Console
 
 import subterra_jax as st
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
-from subterra_jax.host.errors import SubterraError
+from benchmarks.command import require_least, run_main
 
 _EXTREMES = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, -0.0, 1e-38)
 _CHUNK = 100
 _CHECKED_ENVS, _CHECKED_STEPS = 8, 50
-
-
-class SoakError(SubterraError):
-    """The settings of a soak are wrong."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +46,7 @@ class SoakConfig:
 
 
 def wild_actions(key: PRNGKeyArray, n_envs: int, low: np.ndarray, high: np.ndarray) -> Float[Array, "n_envs n_action"]:
-    """Draw actions: a third inside the box, a third up to ten times outside it, a third extreme.
+    """Draws actions: a third inside the box, a third up to ten times outside it, a third extreme.
 
     In every eighth environment all actions lie inside, so that some episodes last long.
     """
@@ -68,7 +62,7 @@ def wild_actions(key: PRNGKeyArray, n_envs: int, low: np.ndarray, high: np.ndarr
 def _violations(
     state: Any, obs: Float[Array, "n_envs n_obs"], reward: Float[Array, "n_envs"], low: np.ndarray, high: np.ndarray
 ) -> dict[str, Int[Array, ""]]:
-    """Count wrong numbers by name."""
+    """Counts wrong numbers by name."""
     leaves = jax.tree_util.tree_flatten_with_path(state)[0]
     counts = {
         f"state{jax.tree_util.keystr(path)} not finite": jnp.sum(~jnp.isfinite(leaf))
@@ -83,7 +77,7 @@ def _violations(
 
 
 def soak(env: st.TunnelEnv, params: st.EnvParams, n_envs: int, n_steps: int, seed: int) -> dict[str, int]:
-    """Count violations by name in at least `n_steps` environment steps; empty where there are none."""
+    """Counts violations by name in at least `n_steps` environment steps; empty where there are none."""
     batch, space, actions = st.AutoReset(env), env.observation_space(params), env.action_space(params)
 
     @jax.jit
@@ -109,7 +103,7 @@ def soak(env: st.TunnelEnv, params: st.EnvParams, n_envs: int, n_steps: int, see
 
 
 def first_complaint(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str | None:
-    """Return checkify's first complaint about a reset and some steps: NaN, division by 0 or index out of range."""
+    """Returns checkify's first complaint about a reset and some steps: NaN, division by 0 or index out of range."""
     actions = env.action_space(params)
 
     def drive(key: PRNGKeyArray, params: st.EnvParams) -> Array:
@@ -136,9 +130,7 @@ def run(config: SoakConfig, console: Console) -> bool:
         SubterraError: A number is out of range, or there is no such tunnel.
         ValueError: No such task.
     """
-    for name, least in (("steps", 1), ("n_envs", 1), ("seed", 0)):
-        if getattr(config, name) < least:
-            raise SoakError(f"{name} must be at least {least}, got {getattr(config, name)}")
+    require_least(config, steps=1, n_envs=1, seed=0)
     tasks = config.tasks or tuple(st.TASKS)
     plan = st.load_tunnel(config.tunnel)
     made = [st.make(task, plan, config.lining, estimates=True) for task in tasks]
@@ -153,12 +145,10 @@ def run(config: SoakConfig, console: Console) -> bool:
     return clean
 
 
-def main() -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 0 where everything is clean, 1 where not, 2 for a user's mistake."""
-    config = parse(
-        lambda words: tyro.cli(SoakConfig, args=words, prog="python -m benchmarks.soak", description=__doc__)
-    )
-    return run_command(lambda: 0 if run(config, Console(highlight=False)) else 1, mistakes=INPUT_ERRORS)
+    console = Console(highlight=False)
+    return run_main("soak", SoakConfig, lambda config: int(not run(config, console)), description=__doc__, words=words)
 
 
 if __name__ == "__main__":

@@ -52,14 +52,10 @@ class Comparison:
     length_error: float
 
     def figures(self) -> dict[str, float]:
-        """Return the errors as single numbers, m."""
-        rms = {name: float(np.sqrt(np.mean(getattr(self, name) ** 2))) for name in ("width", "height")}
-        return {
-            "centreline_rmse": float(np.sqrt(np.mean(self.lateral**2 + self.vertical**2))),
-            "width_rmse": rms["width"],
-            "height_rmse": rms["height"],
-            "length_error": self.length_error,
-        }
+        """Returns the errors as single numbers, m."""
+        squares = {"centreline": self.lateral**2 + self.vertical**2, "width": self.width**2, "height": self.height**2}
+        rmse = {f"{name}_rmse": float(np.sqrt(np.mean(values))) for name, values in squares.items()}
+        return {**rmse, "length_error": self.length_error}
 
 
 def load_truth(path: Path) -> Truth:
@@ -86,7 +82,7 @@ SAME_FRAME = Placement(np.eye(3), np.zeros(3))
 
 
 def start_placement(estimated: Path, true: Path) -> Placement:
-    """Return the motion that puts an estimate's first pose on the true pose of that time; nothing else is fitted.
+    """Returns the motion that puts an estimate's first pose on the true pose of that time; nothing else is fitted.
 
     Args:
         estimated: TUM file of the estimate.
@@ -99,7 +95,7 @@ def start_placement(estimated: Path, true: Path) -> Placement:
 
 
 def centreline(scene: Path, placement: Placement = SAME_FRAME) -> tuple[np.ndarray, np.ndarray]:
-    """Return stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of the truth."""
+    """Returns stations (m, `(n,)`) and positions (m, `(n, 3)`) of a scene's bore in the frame of the truth."""
     with np.load(scene / "bore.npz") as bore:
         origin = np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"])
         return bore["station"], (bore["position"] + origin) @ placement.rotation.T + placement.shift

@@ -6,14 +6,12 @@
 import sys
 import time
 
-import tyro
 from rich.console import Console
 
+from benchmarks.command import run_main
 from benchmarks.leaderboard import report
-from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, check, load_worlds
-from benchmarks.leaderboard.entries import make_entry, write
-from benchmarks.results import constants_facts, environment_facts
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from benchmarks.leaderboard.entries import LeaderboardConfig, agents_for, check, load_worlds, make_entry
+from benchmarks.results import constants_facts, environment_facts, write_file
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -27,7 +25,7 @@ def run(config: LeaderboardConfig) -> None:
     """
     if config.redraw is not None:
         rows, facts = report.read_markdown(config.redraw)
-        write(config.redraw.with_suffix(".png"), report.as_png(rows, facts))
+        write_file(config.redraw.with_suffix(".png"), report.as_png(rows, facts))
         return
     config = check(config)
     jobs = [
@@ -46,20 +44,16 @@ def run(config: LeaderboardConfig) -> None:
         _progress.print(f"{number}/{len(jobs)} {task}, {world.title}, {agent}: {success:.1f} % ({duration})")
     facts = {**environment_facts(), **constants_facts(), "episodes": config.episodes}
     rows, overall = report.scores(entries), report.totals(entries)
-    write(config.out / "leaderboard.json", report.as_json(rows, overall, facts).encode())
-    write(config.out / "leaderboard.md", report.as_markdown(rows, overall, facts).encode())
-    write(config.out / "leaderboard.png", report.as_png(rows, facts))
+    write_file(config.out / "leaderboard.json", report.as_json(rows, overall, facts).encode())
+    write_file(config.out / "leaderboard.md", report.as_markdown(rows, overall, facts).encode())
+    write_file(config.out / "leaderboard.png", report.as_png(rows, facts))
     print(config.out / "leaderboard.md")
 
 
-def main() -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake, 130 for an interrupt, after which a run can go on."""
-    config = parse(
-        lambda words: tyro.cli(
-            LeaderboardConfig, args=words, prog="python -m benchmarks.leaderboard", description=__doc__
-        )
-    )
-    return run_command(lambda: run(config), "interrupted; the same command goes on", mistakes=INPUT_ERRORS)
+    again = "interrupted; the same command goes on"
+    return run_main("leaderboard", LeaderboardConfig, run, description=__doc__, words=words, interrupted=again)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""Entries: one agent's episodes of one task in one tunnel, kept in a folder so that a run can be resumed."""
+"""Tasks, agents and tunnels of a leaderboard, and its entries: one agent's episodes of one task, kept in a folder."""
 
+import dataclasses
 import hashlib
+import inspect
 import json
 import re
 from dataclasses import dataclass
@@ -10,15 +12,189 @@ from typing import Any
 import numpy as np
 
 import subterra_jax as st
-from benchmarks.leaderboard.config import OWN_POLICY, TRAITS, LeaderboardError, World, code_digests, make_driver
+from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import constants_facts, version, write_file
 from subterra_jax import policies
+from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation.bounds import stop_bounds
-from subterra_jax.evaluation.episodes import SHA256
+from subterra_jax.evaluation.episodes import N_LISTED, SHA256
+from subterra_jax.host.files import require_folder
+from subterra_jax.host.loading import file_digest, load_file, load_object, source_digest
+from subterra_jax.host.versions import no_task
+from subterra_jax.policies.files import TENSORS
 from subterra_jax.rules import StopAt
+from subterra_jax.tunnel.plan import TunnelPlan
 
 SCHEMA = "subterra.leaderboard-entry/1"
+OWN_POLICY = "released-policy"  # the policy released for the task at hand
+TRAITS = ("uses_lidar", "uses_map", "privileged")
+_digests: dict[str, str] = {}  # SHA-256 of the user's file that registered a task or an agent
+
+
+@dataclass(frozen=True)
+class LeaderboardConfig:
+    """Settings of a leaderboard.
+
+    Attributes:
+        tasks: Task ids, as `Subterra/StopAt-v0` or `StopAt`; all tasks if not given.
+        agents: Agents: a baseline; `policy:NAME` or `policy:FILE`; `released-policy`, the one released for the task;
+            `module:Class` or `FILE.py:Class`. All baselines and `released-policy` if not given.
+        load: Python files to run first; they register tasks or agents of your own.
+        tunnels: Tunnel files, or names of packaged tunnels.
+        linings: Variants of the walls; a tunnel with only one variant, as `control`, is driven with that.
+        episodes: Number of episodes of each task, from the start of its list of 500; faults are spread evenly.
+        batch: Episodes driven at the same time; affects memory and speed only.
+        out: Folder for `leaderboard.md`, `.json`, `.png` and the entries; entries in it are not driven again.
+        redraw: A `leaderboard.md`; its first tunnel is drawn again as a `.png` beside it, and nothing is driven.
+    """
+
+    tasks: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()
+    load: tuple[Path, ...] = ()
+    tunnels: tuple[str, ...] = ("subterra-351",)
+    linings: tuple[str, ...] = ("pockets",)
+    episodes: int = N_LISTED
+    batch: int = N_LISTED
+    out: Path = Path("out/leaderboard")
+    redraw: Path | None = None
+
+
+@dataclass(frozen=True)
+class World:
+    """A tunnel with one lining.
+
+    Attributes:
+        name: Name or file of the tunnel, as given.
+        lining: Variant of the walls.
+        plan: The tunnel.
+    """
+
+    name: str
+    lining: str
+    plan: TunnelPlan
+
+    @property
+    def title(self) -> str:
+        """Title for headings and file names."""
+        return f"{self.plan.name}, {self.lining}"
+
+
+def check(config: LeaderboardConfig) -> LeaderboardConfig:
+    """Runs the user's files and returns the config with full names.
+
+    Raises:
+        BenchmarkError: A task or an agent is unknown, or a number is out of range.
+        UserCodeError: A user's file or class cannot be loaded.
+        OutputError: The folder cannot be written.
+    """
+    require_least(config, episodes=1, batch=1)
+    if config.episodes > N_LISTED:
+        raise BenchmarkError(f"episodes must be at most {N_LISTED}, got {config.episodes}")
+    for name in ("tunnels", "linings"):
+        if not getattr(config, name):
+            raise BenchmarkError(f"{name} must name at least one")
+    require_folder(config.out)
+    policies.register_released()
+    load_files(config.load)
+    tasks = tuple(_full_task(name) for name in config.tasks) or tuple(st.TASKS)
+    for name in config.agents:
+        _require_agent(name)
+    return dataclasses.replace(config, tasks=_unique(tasks), agents=_unique(config.agents))
+
+
+def load_files(paths: tuple[Path, ...]) -> None:
+    """Runs a user's files, which register tasks and agents, and remembers the digest of each.
+
+    Raises:
+        UserCodeError: A file is missing, or raises an error.
+    """
+    for path in paths:
+        known = {*st.TASKS, *registry.names()}
+        load_file(path)
+        _digests.update({name: file_digest(path) for name in (*st.TASKS, *registry.names()) if name not in known})
+
+
+def code_digests(task: str, agent: str) -> dict[str, str]:
+    """Returns the SHA-256 of the user's files that define a task or an agent; empty for those of the package."""
+    digests = {name: _digests[name] for name in (task, agent) if name in _digests}
+    return {**digests, agent: source_digest(load_object(agent))} if _is_object(agent) else digests
+
+
+def make_driver(name: str, params: st.EnvParams) -> Any:
+    """Makes an agent for a task.
+
+    Args:
+        name: A baseline, `policy:NAME`, `policy:FILE`, `module:Class` or `FILE.py:Class`. A class, or a function that
+            makes an agent, is called with the task's params where it has a parameter without a default.
+        params: Params of the task.
+
+    Raises:
+        BenchmarkError: The result is no agent.
+        UserCodeError: The class cannot be loaded.
+    """
+    if name in registry.names():
+        return registry.make_agent(name, params)
+    if name.startswith(policies.PREFIX):
+        agent = policies.told(policies.load(name.removeprefix(policies.PREFIX))[0], params)
+    else:
+        factory = load_object(name)
+        parameters = inspect.signature(factory).parameters.values()
+        needs_params = any(one.default is one.empty for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD)
+        agent = factory(params) if needs_params else factory()
+    if missing := [one for one in (*TRAITS, "begin", "act") if not hasattr(agent, one)]:
+        raise BenchmarkError(f"agent {name!r} has no {', '.join(missing)}")
+    return agent
+
+
+def agents_for(config: LeaderboardConfig, task: str) -> tuple[str, ...]:
+    """Returns the names of the agents that drive a task; `config` is one that `check` has returned."""
+    if config.agents:
+        return config.agents
+    baselines = tuple(name for name in registry.names() if not name.startswith(policies.PREFIX))
+    return baselines + ((OWN_POLICY,) if policies.name_for(task) in policies.released() else ())
+
+
+def load_worlds(config: LeaderboardConfig) -> list[World]:
+    """Loads every tunnel with every lining.
+
+    Raises:
+        TunnelError: A tunnel cannot be read, or has several linings but not this one.
+    """
+    worlds = []
+    for name in config.tunnels:
+        plan = st.load_tunnel(name)
+        linings = tuple(plan.linings) if len(plan.linings) == 1 else config.linings
+        for lining in linings:
+            plan.lining(lining)
+            worlds.append(World(name, lining, plan))
+    return worlds
+
+
+def _require_agent(name: str) -> None:
+    """Refuses an unknown agent, and a class that cannot be loaded."""
+    if name in (*registry.names(), OWN_POLICY) or (name.startswith(policies.PREFIX) and name.endswith(TENSORS)):
+        return
+    if not _is_object(name):
+        known = ", ".join(registry.names())
+        raise BenchmarkError(f"no agent {name!r}; there are {known}; or policy:FILE, module:Class, FILE.py:Class")
+    load_object(name)
+
+
+def _is_object(agent: str) -> bool:
+    """Returns whether an agent is given as `module:Class` or `FILE.py:Class`."""
+    return ":" in agent and agent not in registry.names() and not agent.startswith(policies.PREFIX)
+
+
+def _full_task(name: str) -> str:
+    full = name if name in st.TASKS else f"Subterra/{name}-v0"
+    if full not in st.TASKS:
+        raise BenchmarkError(no_task(name, st.TASKS))
+    return full
+
+
+def _unique(names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))
 
 
 @dataclass(frozen=True)
@@ -57,7 +233,7 @@ def make_entry(folder: Path, task: str, world: World, agent: str, episodes: int,
         The entry, and whether it was read.
 
     Raises:
-        LeaderboardError: The folder cannot be written.
+        OutputError: The folder cannot be written.
         PolicyError: A policy was made for another task.
     """
     name = policies.PREFIX + policies.name_for(task) if agent == OWN_POLICY else agent
@@ -87,21 +263,8 @@ def make_entry(folder: Path, task: str, world: World, agent: str, episodes: int,
     plain = type(env.rule) is StopAt and params.obstacles is None and params.faults is None
     bounds = stop_bounds(params) if plain else None
     content = {"inputs": inputs, "traits": traits, "bounds": bounds, "records": records.as_columns()}
-    write(path, (json.dumps(content, allow_nan=False) + "\n").encode())
+    write_file(path, (json.dumps(content, allow_nan=False) + "\n").encode())
     return Entry(task, world.title, agent, traits, records, bounds), False
-
-
-def write(path: Path, content: bytes) -> None:
-    """Writes a file whole or not at all, and its folder.
-
-    Raises:
-        LeaderboardError: The file cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, content)
-    except OSError as error:
-        raise LeaderboardError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _read(path: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:

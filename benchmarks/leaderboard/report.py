@@ -1,21 +1,18 @@
 """Scores of all entries, and the leaderboard as Markdown, JSON and a figure."""
 
 import hashlib
-import io
 import json
 import re
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.leaderboard.config import LeaderboardError
+from benchmarks.command import BenchmarkError
 from benchmarks.leaderboard.entries import Entry
+from benchmarks.results import png_bytes
 from subterra_jax.baselines.registry import CEILING, DEAD_RECKONING
 from subterra_jax.evaluation.episodes import SHA256
 from subterra_jax.evaluation.summary import grouped, interquartile_mean, interval, normalised, summary
@@ -24,7 +21,7 @@ _SEED = 0  # of the bootstrap
 
 
 def scores(entries: list[Entry]) -> list[dict[str, Any]]:
-    """Return one row for each entry: task, tunnel, agent, its inputs, its summary and its normalised score."""
+    """Returns one row for each entry: task, tunnel, agent, its inputs, its summary and its normalised score."""
     rows = []
     for entry in entries:
         row: dict[str, Any] = {"task": entry.task, "world": entry.world, "agent": entry.agent, **entry.traits}
@@ -38,7 +35,7 @@ def scores(entries: list[Entry]) -> list[dict[str, Any]]:
 
 
 def totals(entries: list[Entry]) -> list[dict[str, Any]]:
-    """Return one row for each agent in each tunnel: inter-quartile mean of its normalised scores over all tasks.
+    """Returns one row for each agent in each tunnel: inter-quartile mean of its normalised scores over all tasks.
 
     Tasks on which dead reckoning does as well as the oracle are left out. Every group of episodes of every task is one
     score; the interval draws groups within tasks.
@@ -51,16 +48,8 @@ def totals(entries: list[Entry]) -> list[dict[str, Any]]:
         size = min(len(g) for g in groups)
         table = np.stack([g[:size] for g in groups])
         low, high = interval(table, _means, _SEED)
-        rows.append(
-            {
-                "world": world,
-                "agent": agent,
-                "tasks": len(table),
-                "normalised_iqm": interquartile_mean(table.ravel()),
-                "low": low,
-                "high": high,
-            }
-        )
+        score = {"normalised_iqm": interquartile_mean(table.ravel()), "low": low, "high": high}
+        rows.append({"world": world, "agent": agent, "tasks": len(table), **score})
     return sorted(rows, key=lambda row: (row["world"], -row["normalised_iqm"]))
 
 
@@ -100,13 +89,13 @@ _DETAILS = (
 
 
 def as_json(rows: list[dict[str, Any]], overall: list[dict[str, Any]], facts: dict[str, Any]) -> str:
-    """Return `leaderboard.json`."""
+    """Returns `leaderboard.json`."""
     content = {"schema": SCHEMA, "evaluation_sha256": SHA256, **facts, "scores": rows, "totals": overall}
     return json.dumps(content, indent=1, allow_nan=False, default=str) + "\n"
 
 
 def as_markdown(rows: list[dict[str, Any]], overall: list[dict[str, Any]], facts: dict[str, Any]) -> str:
-    """Return `leaderboard.md`."""
+    """Returns `leaderboard.md`."""
     parts = [
         "# Leaderboard",
         f"{facts['episodes']} episodes a task of the evaluation list with SHA-256 `{SHA256}`; {facts['device']}, "
@@ -201,16 +190,16 @@ def read_markdown(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Reads the table of success of the first tunnel of a `leaderboard.md`, for `as_png`.
 
     Raises:
-        LeaderboardError: The file cannot be read, or holds no such table.
+        BenchmarkError: The file cannot be read, or holds no such table.
     """
     try:
         text = path.read_text()
     except OSError as error:
-        raise LeaderboardError(f"{path}: cannot be read ({error.strerror})") from error
+        raise BenchmarkError(f"{path}: cannot be read ({error.strerror})") from error
     episodes, world = re.search(r"^(\d+) episodes a task", text, re.M), re.search(r"^## (.+)$", text, re.M)
     table = re.search(r"^\| agent \| sees \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", text, re.M)
     if episodes is None or world is None or table is None:
-        raise LeaderboardError(f"{path}: holds no leaderboard")
+        raise BenchmarkError(f"{path}: holds no leaderboard")
     tasks = [cell.strip() for cell in table[0].splitlines()[0].split("|")[3:-1]]
     rows = []
     for line in table[1].splitlines():
@@ -224,7 +213,7 @@ def read_markdown(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
 
 
 def figure_digest(rows: list[dict[str, Any]]) -> str:
-    """Return the SHA-256 of the numbers in a figure, rounded as in `leaderboard.md`, in any order."""
+    """Returns the SHA-256 of the numbers in a figure, rounded as in `leaderboard.md`, in any order."""
     cells = sorted(f"{row['world']} {row['agent']} {_short(row['task'])} {_success(row)}" for row in rows)
     return hashlib.sha256("\n".join(cells).encode()).hexdigest()
 
@@ -266,8 +255,5 @@ def draw(rows: list[dict[str, Any]], facts: dict[str, Any]) -> Figure:
 
 
 def as_png(rows: list[dict[str, Any]], facts: dict[str, Any]) -> bytes:
-    """Return the figure as a PNG file; its text entry `Source` is the digest of the numbers drawn."""
-    figure, buffer = draw(rows, facts), io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, metadata={"Source": figure_digest(rows)})
-    plt.close(figure)
-    return buffer.getvalue()
+    """Returns the figure as a PNG file; its text entry `Source` is the digest of the numbers drawn."""
+    return png_bytes(draw(rows, facts), dpi=130, metadata={"Source": figure_digest(rows)})

@@ -1,24 +1,19 @@
 """Our PPO beside that of Stable-Baselines3: `python -m benchmarks.learning --out out/learning`."""
 
 import dataclasses
-import io
 import json
 import sys
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import require_least, run_main
 from benchmarks.learning.runs import Curve, require_stable_baselines, train_ours, train_stable_baselines
-from benchmarks.results import environment_facts, version, write_file
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from benchmarks.results import environment_facts, png_bytes, version, write_file
 from subterra_jax.host.files import require_folder
 from train import policies
 from train.curve import GOAL, rolling
@@ -60,9 +55,7 @@ def run(command: Command) -> None:
     policies.known_task(command.task)
     if "Traverse" not in command.task:
         raise ConfigError(f"task {command.task} is not one of coverage")
-    for name, least in (("steps", 1), ("our_steps", 1), ("seed", 0)):
-        if getattr(command, name) < least:
-            raise ConfigError(f"{name} must be at least {least}, got {getattr(command, name)}")
+    require_least(command, steps=1, our_steps=1, seed=0)
     policies.open_world(command.task, command.tunnel)
     require_folder(command.out)
     require_stable_baselines()
@@ -116,18 +109,12 @@ def _draw(curves: list[Curve]) -> bytes:
         axes.grid(alpha=0.3)
     panels[0].set_ylabel(f"coverage, %, mean of the last {WINDOW}")
     panels[0].legend(loc="center left", fontsize=8)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=120, format="png")
-    plt.close(figure)
-    return buffer.getvalue()
+    return png_bytes(figure, dpi=120)
 
 
-def main() -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
-    command = parse(
-        lambda words: tyro.cli(Command, args=words, prog="python -m benchmarks.learning", description=__doc__)
-    )
-    return run_command(lambda: run(command), mistakes=INPUT_ERRORS)
+    return run_main("learning", Command, run, description=__doc__, words=words)
 
 
 if __name__ == "__main__":

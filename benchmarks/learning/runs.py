@@ -39,7 +39,7 @@ class Curve:
     compiling: float = 0.0
 
     def reached(self) -> dict[str, float] | None:
-        """Return episodes, steps and seconds until the last hundred cover 90 % and all succeed; `None` if never."""
+        """Returns episodes, steps and seconds until the last hundred cover 90 % and all succeed; `None` if never."""
         holds = (rolling(self.coverage) >= GOAL) & (rolling(self.success.astype(float)) >= 1.0)
         holds[: WINDOW - 1] = False
         if not holds.any():
@@ -48,7 +48,7 @@ class Curve:
         return {"episodes": first + 1, "steps": int(self.step[first]), "seconds": float(self.seconds[first])}
 
     def rate(self) -> float:
-        """Return steps per second, with learning and without compiling."""
+        """Returns steps per second, with learning and without compiling."""
         return float(self.step[-1] / self.seconds[-1]) if len(self.step) else 0.0
 
 
@@ -129,15 +129,10 @@ def train_stable_baselines(task: str, steps: int, seed: int, tunnel: Any = None)
             return len(self.rows) < WINDOW or self.curve().reached() is None
 
         def curve(self) -> Curve:
-            """Return the episodes so far."""
+            """Returns the episodes so far."""
             step, seconds, coverage, success = zip(*self.rows, strict=True) if self.rows else ((), (), (), ())
-            return Curve(
-                "SB3 PPO, 1 environment",
-                np.array(step, int),
-                np.array(seconds, float),
-                np.array(coverage, float),
-                np.array(success, bool),
-            )
+            numbers = np.array(step, int), np.array(seconds, float), np.array(coverage, float)
+            return Curve("SB3 PPO, 1 environment", *numbers, np.array(success, bool))
 
     envs = DummyVecEnv([lambda: gymnasium.make(f"subterra_jax:{task}", tunnel=tunnel, flat=True)])
     envs.seed(seed)

@@ -10,15 +10,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import tyro
-
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.fidelity.files import file_hash
 from benchmarks.paper import figures, learning, sheet, steps
-from benchmarks.paper.errors import PaperError
 from benchmarks.paper.material import Material, read_truth
 from benchmarks.paper.sheet import Drawing
 from scene.survey.config import SurveyConfig, check_survey
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.files import require_folder
 
 SURVEY_FIGURES: dict[int, Callable[[Material], Drawing]] = {
@@ -61,19 +58,19 @@ def check(config: PaperConfig) -> None:
     """Refuses settings that cannot be drawn.
 
     Raises:
-        PaperError: There is no such figure, or the given folders do not fit together.
+        BenchmarkError: There is no such figure, or the given folders do not fit together.
     """
     known = (*SURVEY_FIGURES, LEARNING)
     if not config.figures:
-        raise PaperError(f"figures must name at least one of {', '.join(map(str, known))}")
+        raise BenchmarkError(f"figures must name at least one of {', '.join(map(str, known))}")
     for number in config.figures:
         if number not in known:
-            raise PaperError(f"no figure {number}; there are {', '.join(map(str, known))}")
+            raise BenchmarkError(f"no figure {number}; there are {', '.join(map(str, known))}")
     if config.scene is not None and config.survey is None:
-        raise PaperError(f"scene {config.scene} needs the survey that it was built from: which of its LiDARs held out?")
+        raise BenchmarkError(f"scene {config.scene} needs the survey that it was built from, for its held-out LiDAR")
     for path in (config.survey, config.scene, config.runs):
         if path is not None and not path.is_dir():
-            raise PaperError(f"{path}: no such folder")
+            raise BenchmarkError(f"{path}: no such folder")
     if config.survey is None:
         check_survey(SurveyConfig(config.out / "survey", truth="metro", length=config.length, seed=config.seed))
     else:
@@ -164,15 +161,15 @@ def _hashes(paths: list[Path]) -> dict[str, str]:
     hashes: dict[str, Any] = {}
     for path in paths:
         if not path.exists():
-            raise PaperError(f"{path}: no such file")
+            raise BenchmarkError(f"{path}: no such file")
         hashes[f"{path.parent.name}/{path.name}"] = file_hash(path)
     return hashes
 
 
-def main(args: list[str] | None = None) -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 0 once every figure is there, 2 for a user's mistake, 130 after Ctrl-C."""
-    config = parse(lambda words: tyro.cli(PaperConfig, args=words, prog="python -m benchmarks.paper"), args)
-    return run_command(lambda: make(config), "interrupted; the same command goes on from here", mistakes=INPUT_ERRORS)
+    again = "interrupted; the same command goes on from here"
+    return run_main("paper", PaperConfig, make, words=words, interrupted=again)
 
 
 if __name__ == "__main__":

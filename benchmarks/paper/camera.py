@@ -10,9 +10,8 @@ import tyro
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from benchmarks.paper.errors import PaperError
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.render import BACKENDS, light_up, render_in_subprocess
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 
 _NAME = "paper"
 _TIMEOUT = 300.0  # s
@@ -78,13 +77,13 @@ def picture(scene: Path, pose: Pose) -> UInt8[np.ndarray, "height width 3"]:
     """Renders a scene from a pose.
 
     Raises:
-        PaperError: MuJoCo can render with none of its OpenGL backends.
+        BenchmarkError: MuJoCo can render with none of its OpenGL backends.
     """
     chosen = os.environ.get("MUJOCO_GL")
     words = ["benchmarks.paper.camera", str(scene), *_words(pose)]
     view, reason = render_in_subprocess(words, (chosen,) if chosen else BACKENDS, _TIMEOUT)
     if view is None:
-        raise PaperError(f"{scene}: cannot be rendered, which figures 1 and 2 need ({reason})")
+        raise BenchmarkError(f"{scene}: cannot be rendered, which figures 1 and 2 need ({reason})")
     return view
 
 
@@ -117,5 +116,4 @@ def _words(pose: Pose) -> list[str]:
 
 
 if __name__ == "__main__":
-    wanted = parse(lambda words: tyro.cli(CameraConfig, args=words, prog="python -m benchmarks.paper.camera"))
-    sys.exit(run_command(lambda: main(wanted), mistakes=INPUT_ERRORS))
+    sys.exit(run_main("paper.camera", CameraConfig, main))

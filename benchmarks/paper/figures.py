@@ -59,7 +59,7 @@ def draw_bore_view(material: Material) -> Drawing:
 
 
 def depth_image(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "height width"]:
-    """Return the depth of the nearest return in each pixel, m; NaN where there is none.
+    """Returns the depth of the nearest return in each pixel, m; NaN where there is none.
 
     Args:
         pose: Camera.
@@ -244,14 +244,14 @@ def draw_occupancy(material: Material) -> Drawing:
 
 
 def grid_corner(case: Case, grids: Occupied) -> Float[np.ndarray, "3"]:
-    """Return the lowest corner of the grid: along the held-out path from the cloud's start, left and up, m."""
+    """Returns the lowest corner of the grid: along the held-out path from the cloud's start, left and up, m."""
     first = np.argwhere(grids.real).min(axis=0)
     cell = np.floor(returns(case).local.min(axis=0) / VOXEL_EDGE)
     return VOXEL_EDGE * np.array([-first[0], *(cell[1:] - first[1:])])
 
 
 def classify_side_view(grids: Occupied) -> Float[np.ndarray, "i k"]:
-    """Return from the side 0 where both surfaces are, 1 for the scene's alone, 2 for the cloud's alone, else NaN."""
+    """Returns from the side 0 where both surfaces are, 1 for the scene's alone, 2 for the cloud's alone, else NaN."""
     real, scene = grids.real.any(axis=1), grids.first.any(axis=1)
     return np.where(real & scene, 0.0, np.where(scene, 1.0, np.where(real, 2.0, np.nan)))
 

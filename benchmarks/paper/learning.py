@@ -8,8 +8,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.figures.sheet import BLUE, INK, ORANGE
-from benchmarks.paper.errors import PaperError
 from benchmarks.paper.sheet import COLUMN, Drawing
 from train.curve import GOAL, read_episodes, rolling
 from train.run.episodes import WINDOW
@@ -19,34 +19,34 @@ _MOST_POINTS = 1500  # points of a line: more than its dots in print
 
 
 def find_runs(folder: Path) -> list[Path]:
-    """Return the run folders `seed-*` of a folder in the order of their number.
+    """Returns the run folders `seed-*` of a folder in the order of their number.
 
     Raises:
-        PaperError: The folder has no run folder.
+        BenchmarkError: The folder has no run folder.
     """
     runs = [path for path in folder.glob("seed-*") if path.name[5:].isdigit() and (path / "config.json").exists()]
     if not runs:
-        raise PaperError(f"{folder}: holds no run folders seed-0, seed-1, ... of train.navigate")
+        raise BenchmarkError(f"{folder}: holds no run folders seed-0, seed-1, ... of train.navigate")
     return sorted(runs, key=lambda path: int(path.name[5:]))
 
 
 def common_task(runs: list[Path]) -> str:
-    """Return the task of all runs.
+    """Returns the task of all runs.
 
     Raises:
-        PaperError: The runs have several tasks, or one whose curve is not coverage.
+        BenchmarkError: The runs have several tasks, or one whose curve is not coverage.
     """
     tasks = [str(read_config(run).get("task")) for run in runs]
     for run, task in zip(runs, tasks, strict=True):
         if task != tasks[0]:
-            raise PaperError(f"{run}: is a run of {task}, but {runs[0].name} of {tasks[0]}")
+            raise BenchmarkError(f"{run}: is a run of {task}, but {runs[0].name} of {tasks[0]}")
     if "Traverse" not in tasks[0]:
-        raise PaperError(f"{runs[0].parent}: its runs are of {tasks[0]}; the figure shows coverage, that is T0")
+        raise BenchmarkError(f"{runs[0].parent}: its runs are of {tasks[0]}; the figure shows coverage, that is T0")
     return tasks[0]
 
 
 def provenance(runs: list[Path]) -> str:
-    """Return one line with task, tunnel, number of seeds and device."""
+    """Returns one line with task, tunnel, number of seeds and device."""
     first = read_config(runs[0])
     tunnel = f"{first.get('tunnel')} ({first.get('tunnel_provenance', 'no')} survey)"
     device = str(first.get("device")).rpartition(": ")[2]
@@ -57,26 +57,26 @@ def read_config(run: Path) -> dict[str, Any]:
     """Reads a run's `config.json`.
 
     Raises:
-        PaperError: The file cannot be read.
+        BenchmarkError: The file cannot be read.
     """
     try:
         return dict(json.loads((run / "config.json").read_text()))
     except (OSError, ValueError, TypeError) as error:
-        raise PaperError(f"{run / 'config.json'}: cannot be read ({error})") from error
+        raise BenchmarkError(f"{run / 'config.json'}: cannot be read ({error})") from error
 
 
 def draw(runs: list[Path]) -> Drawing:
     """Draws a thin line for each seed, their mean, and one standard deviation around it.
 
     Raises:
-        PaperError: The runs have several tasks, the task is not T0, or no episode finished.
+        BenchmarkError: The runs have several tasks, the task is not T0, or no episode finished.
         RunFolderError: A run cannot be read.
     """
     facts: dict[str, Any] = {"task": common_task(runs), "runs": [run.name for run in runs]}
     episodes = [read_episodes(run) for run in runs]
     shortest = min(len(one["episode"]) for one in episodes)
     if not shortest:
-        raise PaperError(f"{runs[0].parent}: one of its runs finished no episode")
+        raise BenchmarkError(f"{runs[0].parent}: one of its runs finished no episode")
     figure, panels = plt.subplots(2, 1, figsize=(COLUMN, 3.3), sharex=True, layout="constrained")
     columns: dict[str, np.ndarray] = {"episode": np.arange(1, shortest + 1)}
     for axes, name in zip(panels, _COLOURS, strict=True):

@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.ndimage import minimum_filter1d
 
+from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.beams import cast_beams
 from benchmarks.fidelity.references import HoldConfig, load_hold
 from benchmarks.paper.camera import Pose, picture
-from benchmarks.paper.errors import PaperError
 from benchmarks.paper.steps import SCENE_FILES, SURVEY_FILES, require
 from benchmarks.report import scene_points
 from scene.poses.trajectory import Trajectory, load_tum
@@ -72,7 +72,7 @@ def load_frame(
         duration: Length of the frame, s.
 
     Raises:
-        PaperError: No scan lies within that time.
+        BenchmarkError: No scan lies within that time.
         RecordingError: The recording or the trajectory cannot be read.
     """
     poses = load_tum(trajectory)
@@ -86,19 +86,15 @@ def load_frame(
                 taken.append(scan)
         topic = opened.topic
     if not taken:
-        raise PaperError(f"{recording}: no scan within {duration:g} s of {middle:.3f} s, when {trajectory} is there")
+        raise BenchmarkError(
+            f"{recording}: no scan within {duration:g} s of {middle:.3f} s, when {trajectory} is there"
+        )
     placed = [_place_scan(scan, poses, origin) for scan in taken]
     half = len(taken) // 2
     first = sum(len(scan.times) for scan in taken[:half])
     position = poses.at(np.array([middle]))[0][0] - origin
-    return Frame(
-        position,
-        np.concatenate([one[0] for one in placed]),
-        np.concatenate([one[1] for one in placed]),
-        slice(first, first + len(taken[half].times)),
-        topic,
-        duration,
-    )
+    sensor, points = (np.concatenate(parts) for parts in zip(*placed, strict=True))
+    return Frame(position, sensor, points, slice(first, first + len(taken[half].times)), topic, duration)
 
 
 def _best_time(
@@ -143,7 +139,7 @@ class Material:
     scene: Path
 
     def check(self) -> None:
-        """Raises `PaperError` naming the first file that is missing."""
+        """Checks the files; raises `BenchmarkError` naming the first file that is missing."""
         require(self.survey, SURVEY_FILES)
         require(self.scene, SCENE_FILES)
 
@@ -154,11 +150,11 @@ class Material:
         try:
             return dict(json.loads(path.read_text()))
         except (OSError, ValueError) as error:
-            raise PaperError(f"{path}: is no manifest ({error})") from error
+            raise BenchmarkError(f"{path}: is no manifest ({error})") from error
 
     @property
     def simulated(self) -> bool:
-        """Whether the survey is simulated."""
+        """True for a simulated survey."""
         return self.manifest.get("input_provenance") == "simulated"
 
     @cached_property
@@ -216,7 +212,7 @@ class Material:
 
 
 def read_truth(survey: Path) -> dict[str, Any]:
-    """Return the settings of a simulated survey; empty where its `truth.json` has none."""
+    """Returns the settings of a simulated survey; empty where its `truth.json` has none."""
     try:
         return dict(json.loads((survey / "truth.json").read_text())["config"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -18,7 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.fidelity.files import round_floats, write_text
-from benchmarks.paper.errors import PaperError
+from subterra_jax.host.files import replace_file
 
 SCHEMA = "subterra.figure/1"
 COLUMN, PAGE = 3.5, 7.16  # in; widths of one and of two columns, IEEE's guide for authors
@@ -65,7 +65,7 @@ def style() -> Iterator[None]:
 
 
 def is_made(folder: Path, name: str, key: str) -> bool:
-    """Return whether a figure is there with all its files, from the same inputs and code."""
+    """Returns whether a figure is there with all its files, from the same inputs and code."""
     if not all((folder / f"{name}.{suffix}").exists() for suffix in _FILES):
         return False
     try:
@@ -84,18 +84,15 @@ def save(drawing: Drawing, folder: Path, name: str, extra: Mapping[str, Any]) ->
         extra: Further entries of the JSON; `provenance` is printed below the figure as well.
 
     Raises:
-        PaperError: A file cannot be written.
+        OutputError: A file cannot be written.
     """
     _print_provenance(drawing.figure, str(extra["provenance"]))
     try:
         for suffix in ("pdf", "png"):
-            fresh = folder / f".{name}.{suffix}.partial"
-            metadata = {"CreationDate": None} if suffix == "pdf" else {}
-            drawing.figure.savefig(fresh, dpi=DPI, format=suffix, metadata=metadata)
-            fresh.replace(folder / f"{name}.{suffix}")
+            with replace_file(folder / f"{name}.{suffix}") as fresh:
+                metadata = {"CreationDate": None} if suffix == "pdf" else {}
+                drawing.figure.savefig(fresh, dpi=DPI, format=suffix, metadata=metadata)
         _write_table(folder / f"{name}.csv", drawing.columns)
-    except OSError as error:
-        raise PaperError(f"{folder / name}: cannot be written ({error.strerror or error})") from error
     finally:
         plt.close(drawing.figure)
     content = {"schema": SCHEMA, "caption": drawing.caption, "facts": drawing.facts, **extra}
@@ -103,7 +100,7 @@ def save(drawing: Drawing, folder: Path, name: str, extra: Mapping[str, Any]) ->
 
 
 def code_hash() -> str:
-    """Return the SHA-256 of this folder's code: a figure drawn by other code is drawn again."""
+    """Returns the SHA-256 of this folder's code: a figure drawn by other code is drawn again."""
     digest = sha256()
     for file in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(file.name.encode() + file.read_bytes())
@@ -117,13 +114,11 @@ def _print_provenance(figure: Figure, provenance: str) -> None:
 
 
 def _write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
-    fresh = path.with_name(f".{path.name}.partial")
-    with fresh.open("w", newline="") as file:
+    texts = [[_cell(value) for value in np.asarray(column).tolist()] for column in columns.values()]
+    with replace_file(path) as fresh, fresh.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        texts = [[_cell(value) for value in np.asarray(column).tolist()] for column in columns.values()]
         writer.writerows(zip(*texts, strict=True))
-    fresh.replace(path)
 
 
 def _cell(value: Any) -> str:

@@ -7,8 +7,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.files import file_hash, write_json
-from benchmarks.paper.errors import PaperError
 
 TASK = "Subterra/TraverseShort-v0"
 SEEDS = (0, 1, 2, 3, 4)
@@ -46,20 +46,20 @@ class Step:
 
 
 def survey_step(out: Path, length: float, seed: int) -> Step:
-    """Return the step that simulates a survey on the real metro's alignment, with an OS1 held out beside the Avia."""
+    """Returns the step that simulates a survey on the real metro's alignment, with an OS1 held out beside the Avia."""
     words = f"scene.survey --truth metro --length {length:g} --seed {seed} --sensors avia os1 --scan-every 10 --out"
     return Step("survey", (*words.split(), str(out)), out, SURVEY_FILES)
 
 
 def scene_step(out: Path, survey: Path, name: str, provenance: str) -> Step:
-    """Return the step that builds the scene from the Avia alone."""
+    """Returns the step that builds the scene from the Avia alone."""
     given = ("--trajectory", str(survey / "groundtruth.tum"), "--provenance", provenance, "--name", name)
     words = ("scene.build", str(survey / "survey.bag"), *given, "--out", str(out))
     return Step("scene", words, out, SCENE_FILES, inputs=(survey / "groundtruth.tum",))
 
 
 def training_step(out: Path, scene: Path) -> Step:
-    """Return the step that trains five seeds of T0 in the reconstructed bore."""
+    """Returns the step that trains five seeds of T0 in the reconstructed bore."""
     seeds = tuple(str(seed) for seed in SEEDS)
     words = ("--task", TASK, "--tunnel", str(scene / "tunnel.npz"), "--seeds", *seeds, "--preset", "cpu")
     files = ("seeds.json", *(f"seed-{seed}/{file}" for seed in SEEDS for file in _RUN_FILES))
@@ -68,14 +68,14 @@ def training_step(out: Path, scene: Path) -> Step:
 
 
 def require(folder: Path, files: tuple[str, ...]) -> None:
-    """Raises `PaperError` naming the first file that is missing in a folder."""
+    """Checks the files; raises `BenchmarkError` naming the first file that is missing in a folder."""
     for file in files:
         if not (folder / file).exists():
-            raise PaperError(f"{folder / file}: no such file")
+            raise BenchmarkError(f"{folder / file}: no such file")
 
 
 def is_done(step: Step) -> bool:
-    """Return whether the step finished with the same words and its files are still there."""
+    """Returns whether the step finished with the same words and its files are still there."""
     return _read_mark(step) == "done" and all((step.out / file).exists() for file in step.files)
 
 
@@ -83,7 +83,7 @@ def make(step: Step) -> None:
     """Runs a step unless it is done; its progress goes to stderr.
 
     Raises:
-        PaperError: It failed.
+        BenchmarkError: It failed.
         KeyboardInterrupt: It was interrupted.
     """
     if is_done(step):
@@ -101,7 +101,7 @@ def make(step: Step) -> None:
     missing = [file for file in step.files if not (step.out / file).exists()]
     if status or missing:
         why = f"ended with status {status}" if status else f"left no {missing[0]}"
-        raise PaperError(f"{step.out}: python -m {words[0]} {why}")
+        raise BenchmarkError(f"{step.out}: python -m {words[0]} {why}")
     _write_mark(step, "done")
     print(f"{step.name}: {time.monotonic() - started:.0f} s", flush=True)
 

@@ -9,16 +9,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import BenchmarkError, require_least, run_main
 from benchmarks.rays.casting import (
     DEFAULT_SCENE,
     MEDIAN_GOAL,
@@ -29,9 +26,7 @@ from benchmarks.rays.casting import (
     meshed_linings,
     require_scene,
 )
-from benchmarks.rays.errors import RaysError
-from benchmarks.results import environment_facts, write_file
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from benchmarks.results import environment_facts, png_bytes, write_file
 from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
 
@@ -68,20 +63,18 @@ def run(config: RaysConfig) -> tuple[list[Agreement], dict[str, float]]:
     Raises:
         SubterraError: A setting is wrong, the folder lacks a scene or a lining, or the output cannot be written.
     """
-    for name, least in (("n", 1), ("seed", 0)):
-        if getattr(config, name) < least:
-            raise RaysError(f"{name} must be at least {least}, got {getattr(config, name)}")
+    require_least(config, n=1, seed=0)
     if config.out is not None:
         require_file(config.out, ".json")
     for kind in config.kinds:
         if kind not in ("planar", "3d"):
-            raise RaysError(f"there is no kind {kind!r}; there are planar and 3d")
+            raise BenchmarkError(f"there is no kind {kind!r}; there are planar and 3d")
     folder = require_scene(config.scene)
     plan = load_tunnel(folder / "tunnel.npz")
     meshed = meshed_linings(folder, plan)
     for lining in config.linings:
         if lining not in meshed:
-            raise RaysError(f"{folder}: has no mesh of lining {lining!r}; it has {', '.join(meshed)}")
+            raise BenchmarkError(f"{folder}: has no mesh of lining {lining!r}; it has {', '.join(meshed)}")
     comparisons: list[Agreement] = []
     rates: dict[str, float] = {}
     for lining in config.linings or meshed:
@@ -96,7 +89,7 @@ def run(config: RaysConfig) -> tuple[list[Agreement], dict[str, float]]:
 
 
 def table(comparisons: list[Agreement]) -> Table:
-    """Return the table of differences, mm."""
+    """Returns the table of differences, mm."""
     shown = Table(title="differences from embree, mm")
     for name in ("comparison", "rays", "median", "99 %", "99.9 %", "max", "< 1 cm", "edges", "< 1 cm without", "goal"):
         shown.add_column(name, justify="left" if name == "comparison" else "right")
@@ -142,7 +135,7 @@ def write(path: Path, config: RaysConfig, comparisons: list[Agreement], rates: d
     """Writes the report as JSON and its figure beside it.
 
     Raises:
-        RaysError: A file cannot be written.
+        OutputError: A file cannot be written.
     """
     content: dict[str, Any] = {
         "schema": SCHEMA,
@@ -151,12 +144,8 @@ def write(path: Path, config: RaysConfig, comparisons: list[Agreement], rates: d
         "comparisons": [one.figures() for one in comparisons],
         "rays_per_second_3d": rates,
     }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
-        histograms(comparisons).savefig(path.with_suffix(".png"), dpi=130)
-    except OSError as error:
-        raise RaysError(f"{path}: cannot be written ({error.strerror})") from error
+    write_file(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
+    write_file(path.with_suffix(".png"), png_bytes(histograms(comparisons), dpi=130))
 
 
 def main(config: RaysConfig) -> int:
@@ -172,12 +161,9 @@ def main(config: RaysConfig) -> int:
     return 0 if all(one.holds for one in comparisons) else 1
 
 
-def command(arguments: list[str] | None = None) -> int:
-    """Runs the command line; returns 2 for a user's mistake."""
-    config = parse(
-        lambda words: tyro.cli(RaysConfig, args=words, prog="python -m benchmarks.rays", description=__doc__), arguments
-    )
-    return run_command(lambda: main(config), mistakes=INPUT_ERRORS)
+def command(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 1 where a goal is missed, 2 for a user's mistake."""
+    return run_main("rays", RaysConfig, main, description=__doc__, words=words)
 
 
 if __name__ == "__main__":

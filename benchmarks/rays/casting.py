@@ -14,8 +14,8 @@ import trimesh
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.derive.surface import Caster
-from benchmarks.rays.errors import RaysError
 from scene.bore import load_bore
 from subterra_jax import lidar, lidar3d
 from subterra_jax.lidar import reference
@@ -30,26 +30,26 @@ _LINING_PARTS = ("lining", "recess", "floor")
 
 
 def require_scene(folder: Path) -> Path:
-    """Return the folder if it holds a built scene.
+    """Returns the folder if it holds a built scene.
 
     Raises:
-        RaysError: A file of a scene is missing.
+        BenchmarkError: A file of a scene is missing.
     """
     for name in ("tunnel.npz", "bore.npz", "scene.xml", "meshes/lining.ply"):
         if not (folder / name).is_file():
-            raise RaysError(f"{folder}: is no built scene: {name} is missing (`python -m scene.build` makes one)")
+            raise BenchmarkError(f"{folder}: is no built scene: {name} is missing (`python -m scene.build` makes one)")
     return folder
 
 
 def meshed_linings(folder: Path, plan: TunnelPlan) -> list[str]:
-    """Return the linings of a plan that have a mesh in the folder."""
+    """Returns the linings of a plan that have a mesh in the folder."""
     meshed = {name: (folder / "meshes" / file).is_file() for name, file in _WHOLE_MESHES.items()}
     meshed["furnished"] = (folder / "scene_furnished.xml").is_file()
     return [name for name in plan.linings if meshed.get(name, False)]
 
 
 def reference_surface(folder: Path, lining: str) -> Triangles:
-    """Return the mesh for embree: the walls of one lining and all else in the scene but bolts and clips."""
+    """Returns the mesh for embree: the walls of one lining and all else in the scene but bolts and clips."""
     if lining not in _WHOLE_MESHES:
         return read_scene(folder, lining)
     walls = read_mesh(folder / "meshes" / _WHOLE_MESHES[lining])
@@ -86,12 +86,12 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """Whether all rays, edges included, meet the goals; true where the goals do not apply."""
+        """True if all rays, edges included, meet the goals, and where the goals do not apply."""
         met = np.median(self.error) < MEDIAN_GOAL and np.mean(self.error < TAIL_GOAL) >= TAIL_SHARE
         return bool(met) or not self.judged
 
     def figures(self) -> dict[str, Any]:
-        """Return the numbers for the report, m; the worst rays are those that pass no edge."""
+        """Returns the numbers for the report, m; the worst rays are those that pass no edge."""
         plain = np.flatnonzero(~self.edge)
         worst = plain[np.argsort(-self.error[plain], kind="stable")[:_WORST]]
         return {
@@ -143,19 +143,13 @@ def compare_planar(folder: Path, plan: TunnelPlan, lining: str, n_rays: int, see
     flat, straight = (Caster(trimesh.Trimesh(v, surface.faces, process=False)) for v in (level, surface.vertices))
     elevation = np.interp(poses.station, plan.station, plan.elevation)
     grade = np.interp(poses.station, plan.station, np.gradient(plan.elevation, plan.station))
-    no_grade, height = np.zeros_like(grade), np.full(len(grade), plan.lidar_height)
+    height = np.full(len(grade), plan.lidar_height)
+    cast_level = partial(_cast, flat, plan, poses, height, np.zeros_like(grade), params)
+    cast_pitched = partial(_cast, straight, plan, poses, elevation + height, grade, params)
     title = f"planar, {lining}"
     return [
-        _agreement(
-            f"{title}, levelled mesh", partial(_cast, flat, plan, poses, height, no_grade, params), ranges, poses
-        ),
-        _agreement(
-            f"{title}, straight rays of a pitched LiDAR",
-            partial(_cast, straight, plan, poses, elevation + height, grade, params),
-            ranges,
-            poses,
-            judged=False,
-        ),
+        _agreement(f"{title}, levelled mesh", cast_level, ranges, poses),
+        _agreement(f"{title}, straight rays of a pitched LiDAR", cast_pitched, ranges, poses, judged=False),
     ]
 
 
@@ -223,7 +217,7 @@ class Scans:
     beam: np.ndarray
 
     def directions(self, turn: float = 0.0) -> np.ndarray:
-        """Return the directions of all beams, each turned about the sensor's z axis by `turn` rad, `(n·m, 3)`."""
+        """Returns the directions of all beams, each turned about the sensor's z axis by `turn` rad, `(n·m, 3)`."""
         beam = Rotation.from_euler("z", turn).apply(self.beam.astype(np.float64))
         turns = Rotation.from_quat(self.orientation[:, [1, 2, 3, 0]]).as_matrix()
         return np.einsum("nij,mj->nmi", turns, beam).reshape(-1, 3)

@@ -11,14 +11,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.reproduce.claims import CLAIMS, HEADING, JOBS, Claim, Job, read_result, read_tables
-from benchmarks.reproduce.errors import ReproduceError
-from benchmarks.results import constants_facts, environment_facts
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from benchmarks.results import constants_facts, environment_facts, write_file
 from subterra_jax.host.files import require_folder
 
 ROOT = Path(__file__).parents[2]
@@ -43,13 +41,13 @@ class ReproduceConfig:
 
 
 def result_rows() -> list[dict[str, str]]:
-    """Return the rows of the README's tables, those of its results first, then of `docs/measurements.md`."""
+    """Returns the rows of the README's tables, those of its results first, then of `docs/measurements.md`."""
     readme = README.read_text()
     return [*read_tables(readme, HEADING), *read_tables(readme), *read_tables(MEASUREMENTS.read_text())]
 
 
 def verdict(claim: Claim, stated: float | None, measured: float | None) -> str:
-    """Return `same`, `differs`, or why neither can be said."""
+    """Returns `same`, `differs`, or why neither can be said."""
     if stated is None:
         return _MISSING
     if measured is None:
@@ -69,7 +67,7 @@ def run_job(job: Job, folder: Path, shared: Path) -> Path | None:
         Its result; `None` where its input is missing.
 
     Raises:
-        ReproduceError: A command failed.
+        BenchmarkError: A command failed.
     """
     result = folder / job.result
     if result.exists():
@@ -83,7 +81,7 @@ def run_job(job: Job, folder: Path, shared: Path) -> Path | None:
         with (folder / "log.txt").open("a") as log:
             code = subprocess.run([sys.executable, "-m", *words], stdout=log, stderr=log, check=False).returncode
         if code and not result.exists():  # a missed goal also ends with a status
-            raise ReproduceError(f"{folder / 'log.txt'}: python -m {words[0]} ended with status {code}")
+            raise BenchmarkError(f"{folder / 'log.txt'}: python -m {words[0]} ended with status {code}")
     return result
 
 
@@ -91,11 +89,11 @@ def reproduce(config: ReproduceConfig, documents: Sequence[dict[str, str]], cons
     """Runs the jobs; returns one row for each number.
 
     Raises:
-        ReproduceError: There is no such job, or one failed.
+        BenchmarkError: There is no such job, or one failed.
     """
     for name in config.jobs:
         if name not in JOBS:
-            raise ReproduceError(f"no job {name!r}; there are {', '.join(JOBS)}")
+            raise BenchmarkError(f"no job {name!r}; there are {', '.join(JOBS)}")
     rows = []
     for name in config.jobs:
         console.print(f"{name}: about {JOBS[name].minutes:g} min on two idle cores")
@@ -133,17 +131,14 @@ def run(config: ReproduceConfig) -> int:
     require_folder(config.out)
     rows = reproduce(config, documents, console)
     content = {"config": asdict(config), "environment": environment_facts(), **constants_facts(), "rows": rows}
-    config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / "reproduce.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
+    write_file(config.out / "reproduce.json", (json.dumps(content, indent=1, default=str) + "\n").encode())
     show(rows, documents, console)
     return int(any(row["verdict"] in ("differs", _MISSING) for row in rows))
 
 
-def main(args: list[str] | None = None) -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 0 where every number is the same, 1 where one differs, 2 for a mistake."""
-    prog = "python -m benchmarks.reproduce"
-    config = parse(lambda words: tyro.cli(ReproduceConfig, args=words, prog=prog, description=__doc__), args)
-    return run_command(lambda: run(config), mistakes=INPUT_ERRORS)
+    return run_main("reproduce", ReproduceConfig, run, description=__doc__, words=words)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ class Claim:
     column: str = ""
 
     def stated(self, rows: Sequence[dict[str, str]]) -> float | None:
-        """Return the number as the documents have it; `None` where it is not there."""
+        """Returns the number as the documents have it; `None` where it is not there."""
         for row in rows:
             key, *_ = row.values()
             cells = [row.get(self.column, "")] if self.column else list(row.values())[1:]
@@ -73,7 +73,7 @@ class Claim:
         return None
 
     def holds(self, stated: float, measured: float) -> bool:
-        """Return whether a measurement agrees with the documents."""
+        """Returns whether a measurement agrees with the documents."""
         difference = measured - stated
         too_large = difference > self.tolerance + 1e-9 and self.bound != "at least"
         too_small = -difference > self.tolerance + 1e-9 and self.bound != "at most"
@@ -81,7 +81,7 @@ class Claim:
 
 
 def read_tables(markdown: str, heading: str = "") -> list[dict[str, str]]:
-    """Return the rows of Markdown tables, each a cell by column heading, without emphasis.
+    """Returns the rows of Markdown tables, each a cell by column heading, without emphasis.
 
     Args:
         markdown: Text of a page.
@@ -105,7 +105,7 @@ def read_tables(markdown: str, heading: str = "") -> list[dict[str, str]]:
 
 
 def unclaimed(row: dict[str, str]) -> str:
-    """Return the rest of a row's cells after the first without its claims, settings and code; no digit may be left."""
+    """Returns the rest of a row's cells after the first without its claims, settings and code; no digit may be left."""
     key, *cells = row.values()
     rest = " | ".join(cells)
     texts = [claim.text for claim in CLAIMS if claim.row in key] + [text for part, text in SETTINGS if part in key]

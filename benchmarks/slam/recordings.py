@@ -13,7 +13,8 @@ from jaxtyping import Float
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from benchmarks.slam.errors import SlamError
+from benchmarks.command import BenchmarkError
+from benchmarks.results import write_file
 from scene.reading.scans import parse_pointcloud2
 from subterra_jax.evaluation.episodes import N_LISTED
 from subterra_jax.host.versions import no_task
@@ -62,22 +63,22 @@ class SetConfig:
 
 
 def plan_set(config: SetConfig) -> list[tuple[str, Recording]]:
-    """Return the recordings of a set with their names, as `StopAt-pockets-000`.
+    """Returns the recordings of a set with their names, as `StopAt-pockets-000`.
 
     Raises:
-        SlamError: There is no such task, nothing to record, or a number is out of range.
+        BenchmarkError: There is no such task, nothing to record, or a number is out of range.
     """
     if config.episodes < 1 or not config.tasks or not config.linings:
-        raise SlamError(f"nothing to record: {config.episodes} episodes of tasks {config.tasks}, {config.linings}")
+        raise BenchmarkError(f"nothing to record: {config.episodes} episodes of tasks {config.tasks}, {config.linings}")
     if config.episodes > N_LISTED and config.secret is None:
-        raise SlamError(f"episodes must be at most {N_LISTED}, the length of the list, got {config.episodes}")
+        raise BenchmarkError(f"episodes must be at most {N_LISTED}, the length of the list, got {config.episodes}")
     if config.secret is not None and config.secret < 0:
-        raise SlamError(f"secret must not be negative, got {config.secret}")
+        raise BenchmarkError(f"secret must not be negative, got {config.secret}")
     plan = []
     for task in config.tasks:
         short = task.removeprefix("Subterra/").removesuffix("-v0")
         if f"Subterra/{short}-v0" not in TASKS:
-            raise SlamError(no_task(task, TASKS))
+            raise BenchmarkError(no_task(task, TASKS))
         for lining in config.linings:
             for episode in range(config.episodes):
                 name = f"{short}-{lining}-{episode:03d}"
@@ -107,7 +108,7 @@ def make_set(config: SetConfig) -> Iterator[tuple[str, bool]]:
     """Records what is missing; yields each name and whether it was there already.
 
     Raises:
-        SlamError: The folder was recorded with other settings or cannot be written.
+        BenchmarkError: The folder was recorded with other settings or cannot be written.
         SubterraError: A recording cannot be made.
     """
     plan = plan_set(config)
@@ -137,25 +138,21 @@ def _check(plan: list[tuple[str, Recording]]) -> None:
 
 def _keep_settings(path: Path, settings: str) -> None:
     """Keeps the settings of a set with the truth; refuses other settings later."""
-    try:
-        if path.is_file() and path.read_text() != settings:
-            raise SlamError(f"{path.parent.parent}: was recorded with other settings; choose another folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(settings)
-    except OSError as error:
-        raise SlamError(f"{path}: cannot be written ({error.strerror})") from error
+    if path.is_file() and path.read_text() != settings:
+        raise BenchmarkError(f"{path.parent.parent}: was recorded with other settings; choose another folder")
+    write_file(path, settings.encode())
 
 
 def recordings_in(folder: Path) -> list[tuple[str, Path]]:
-    """Return names and bags of the recordings in a set or in its `recordings/`.
+    """Returns names and bags of the recordings in a set or in its `recordings/`.
 
     Raises:
-        SlamError: The folder holds no recordings.
+        BenchmarkError: The folder holds no recordings.
     """
     inside = folder / RECORDINGS if (folder / RECORDINGS).is_dir() else folder
     bags = sorted(path.parent for path in inside.glob("*/recording/metadata.yaml")) if inside.is_dir() else []
     if not bags:
-        raise SlamError(f"{folder}: holds no recordings (`python -m benchmarks.slam record` makes some)")
+        raise BenchmarkError(f"{folder}: holds no recordings (`python -m benchmarks.slam record` makes some)")
     return [(bag.parent.name, bag) for bag in bags]
 
 
@@ -171,7 +168,7 @@ def read_clouds(folder: Path, topic: str = CLOUDS) -> Iterator[Sweep]:
         topic: Topic of `sensor_msgs/PointCloud2`.
 
     Raises:
-        SlamError: The folder holds no bag, a damaged one, or one without this topic.
+        BenchmarkError: The folder holds no bag, a damaged one, or one without this topic.
     """
     for message in _messages(folder, topic):
         scan, _ = parse_pointcloud2(message, _stamp(message))
@@ -186,7 +183,7 @@ def read_planar(folder: Path, topic: str = PLANAR) -> Iterator[Sweep]:
         topic: Topic of `sensor_msgs/LaserScan`.
 
     Raises:
-        SlamError: As for `read_clouds`.
+        BenchmarkError: As for `read_clouds`.
     """
     for message in _messages(folder, topic):
         ranges = np.asarray(message.ranges, np.float64)
@@ -197,10 +194,10 @@ def read_planar(folder: Path, topic: str = PLANAR) -> Iterator[Sweep]:
 
 
 def count_messages(folder: Path) -> dict[str, int]:
-    """Return the number of messages of each topic of a bag.
+    """Returns the number of messages of each topic of a bag.
 
     Raises:
-        SlamError: The folder holds no bag or a damaged one.
+        BenchmarkError: The folder holds no bag or a damaged one.
     """
     with closing(_open_bag(folder)) as reader:
         return {connection.topic: connection.msgcount for connection in reader.connections}
@@ -212,19 +209,19 @@ def _messages(folder: Path, topic: str) -> Iterator[Any]:
         some = [connection for connection in reader.connections if connection.topic == topic]
         if not some:
             held = ", ".join(sorted(connection.topic for connection in reader.connections))
-            raise SlamError(f"{folder}: has no topic {topic}; it has {held}")
+            raise BenchmarkError(f"{folder}: has no topic {topic}; it has {held}")
         for connection, _, raw in reader.messages(connections=some):
             yield types.deserialize_cdr(raw, connection.msgtype)
 
 
 def _open_bag(folder: Path) -> Any:
     if not (folder / "metadata.yaml").is_file():
-        raise SlamError(f"{folder}: is no recording: metadata.yaml is missing")
+        raise BenchmarkError(f"{folder}: is no recording: metadata.yaml is missing")
     try:
         reader = Reader(folder)
         reader.open()
     except Exception as error:  # the library raises many kinds of errors for a damaged file
-        raise SlamError(f"{folder}: not a whole recording ({error})") from error
+        raise BenchmarkError(f"{folder}: not a whole recording ({error})") from error
     return reader
 
 

@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from benchmarks.results import environment_facts
-from benchmarks.slam.errors import SlamError
+from benchmarks.command import BenchmarkError
+from benchmarks.results import environment_facts, write_file
 from benchmarks.slam.recordings import CLOUDS, PLANAR, Sweep, count_messages, read_clouds, read_planar, recordings_in
+from subterra_jax.host.files import replace_file
 
 Step = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "4 4"]]
 _PLANAR_VOXEL = 0.3  # m: planar scans reach 30 m where the clouds reach 100 m
@@ -74,18 +75,18 @@ LIBRARIES = {
 
 
 def find_library(name: str) -> tuple[Library, str]:
-    """Return a library by name, and its version.
+    """Returns a library by name, and its version.
 
     Raises:
-        SlamError: There is no such library, or it is not installed.
+        BenchmarkError: There is no such library, or it is not installed.
     """
     if name not in LIBRARIES:
-        raise SlamError(f"no library {name!r}; there are {', '.join(LIBRARIES)}")
+        raise BenchmarkError(f"no library {name!r}; there are {', '.join(LIBRARIES)}")
     library = LIBRARIES[name]
     try:
         return library, version(library.package)
     except PackageNotFoundError as error:
-        raise SlamError(f"{name} needs {library.package}, which is not installed: pip install {library.package}"
+        raise BenchmarkError(f"{name} needs {library.package}, which is not installed: pip install {library.package}"
                         ) from error  # fmt: skip
 
 
@@ -95,21 +96,21 @@ def estimate_poses(
     """Runs a library; returns times, s, and poses of the sensor in the frame of its first sweep.
 
     Raises:
-        SlamError: There is no sweep, a sweep holds no point, or a pose is not finite.
+        BenchmarkError: There is no sweep, a sweep holds no point, or a pose is not finite.
     """
     step = library.make()
     times: list[float] = []
     poses: list[np.ndarray] = []
     for stamp, points in sweeps:
         if not len(points):
-            raise SlamError(f"{library.package}: sweep {len(times)} holds no point")
+            raise BenchmarkError(f"{library.package}: sweep {len(times)} holds no point")
         pose = step(np.ascontiguousarray(points, np.float64))
         if not np.isfinite(pose).all():
-            raise SlamError(f"{library.package}: the pose of sweep {len(times)} is not finite")
+            raise BenchmarkError(f"{library.package}: the pose of sweep {len(times)} is not finite")
         times.append(stamp)
         poses.append(pose)
     if not times:
-        raise SlamError(f"{library.package}: there is no sweep to run on")
+        raise BenchmarkError(f"{library.package}: there is no sweep to run on")
     return np.array(times), np.stack(poses)
 
 
@@ -136,14 +137,10 @@ def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
     """Runs on every recording with the library's topic; yields each name and a line about its result.
 
     Raises:
-        SlamError: The library is unknown or not installed, or no recording has its topic.
+        BenchmarkError: The library is unknown or not installed, or no recording has its topic.
     """
     library, number = (None, "") if config.library == WHEELS else find_library(config.library)
     bags, ran = recordings_in(config.recordings), []
-    try:
-        config.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SlamError(f"{config.out}: cannot be written ({error.strerror})") from error
     for name, bag in bags:
         target = config.out / f"{name}.tum"
         if library is not None and library.topic not in count_messages(bag):
@@ -153,14 +150,15 @@ def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
         if target.is_file():
             yield name, "there already"
         elif library is None:
-            shutil.copyfile(bag / "odometry.tum", target)
+            with replace_file(target) as fresh:
+                shutil.copyfile(bag / "odometry.tum", fresh)
             yield name, "copied"
         else:
             yield name, _run_one(library, bag, target)
     if not ran:
-        raise SlamError(f"{config.recordings}: no recording has what {config.library} reads")
+        raise BenchmarkError(f"{config.recordings}: no recording has what {config.library} reads")
     facts = {"schema": SCHEMA, "library": config.library, "version": number, "recordings": ran, **environment_facts()}
-    (config.out / "run.json").write_text(json.dumps(facts, indent=1, default=str) + "\n")
+    write_file(config.out / "run.json", (json.dumps(facts, indent=1, default=str) + "\n").encode())
 
 
 def _run_one(library: Library, bag: Path, target: Path) -> str:
@@ -175,6 +173,5 @@ def _run_one(library: Library, bag: Path, target: Path) -> str:
 def save_tum(path: Path, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"]) -> None:
     """Writes poses as rows `t x y z qx qy qz qw`."""
     rows = np.column_stack([times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)])
-    partial = path.with_name(f".{path.name}.partial")
-    np.savetxt(partial, rows, fmt="%.9f")
-    partial.replace(path)
+    with replace_file(path) as fresh:
+        np.savetxt(fresh, rows, fmt="%.9f")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from benchmarks.slam.errors import SlamError
+from benchmarks.command import BenchmarkError
 from benchmarks.slam.tracks import Alignment, Axis, Track, axis_from_file, axis_from_path, read_track
 
 
@@ -24,20 +24,20 @@ class Spread:
 
     @classmethod
     def of(cls, errors: Float[np.ndarray, " n"]) -> "Spread":
-        """Return the statistics of at least one error."""
+        """Returns the statistics of at least one error."""
         rmse = float(np.sqrt(np.mean(errors**2)))
         rest = (np.mean(errors), np.median(errors), np.std(errors), np.min(errors), np.max(errors))
         return cls(rmse, *(float(value) for value in rest))
 
 
 def absolute_errors(track: Track) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Return the error of each position (estimate less truth, fixed frame, m) and of each attitude (rad)."""
+    """Returns the error of each position (estimate less truth, fixed frame, m) and of each attitude (rad)."""
     turn = track.true_rotation.inv() * track.rotation
     return track.position - track.true_position, turn.magnitude()
 
 
 def pairs_by_distance(track: Track, delta: float) -> Int[np.ndarray, "k 2"]:
-    """Return consecutive pieces of the true path, each ended by the first pose at least `delta` m on.
+    """Returns consecutive pieces of the true path, each ended by the first pose at least `delta` m on.
 
     Source: evo's RPE with `pairs_from_reference` and without `all_pairs`.
     """
@@ -53,7 +53,7 @@ def pairs_by_distance(track: Track, delta: float) -> Int[np.ndarray, "k 2"]:
 def relative_errors(
     track: Track, pairs: Int[np.ndarray, "k 2"]
 ) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
-    """Return the error of each piece's motion, as seen from its first pose.
+    """Returns the error of each piece's motion, as seen from its first pose.
 
     Args:
         track: Aligned track.
@@ -72,7 +72,7 @@ def relative_errors(
 
 
 def rms(values: Float[np.ndarray, " n"]) -> float:
-    """Return the root mean square."""
+    """Returns the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -126,7 +126,7 @@ class Score:
     ape_turn: Spread
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the score for JSON."""
+        """Returns the score for JSON."""
         return dataclasses.asdict(self)
 
 
@@ -158,10 +158,10 @@ def score_files(
         name: Name of the recording; by default the estimate's file name.
 
     Raises:
-        SlamError: A file is missing or wrong, or the trajectories share no times.
+        BenchmarkError: A file is missing or wrong, or the trajectories share no times.
     """
     if not piece > 0.0:
-        raise SlamError(f"piece must be above 0 m, got {piece}")
+        raise BenchmarkError(f"piece must be above 0 m, got {piece}")
     track = read_track(estimate, truth, alignment)
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
@@ -236,18 +236,17 @@ def score_all(config: ScoreConfig) -> list[ProgramScore]:
     """Scores every given estimate.
 
     Raises:
-        SlamError: No estimate is given, a file is missing or wrong, or a folder holds no estimate of a recording with
-            known truth.
+        BenchmarkError: No estimate is given, a file is missing or wrong, or a folder has no estimate with known truth.
     """
     if not config.estimate:
-        raise SlamError("estimate must name at least one file or folder")
+        raise BenchmarkError("estimate must name at least one file or folder")
     return [score for path in config.estimate for score in _score_path(path, config)]
 
 
 def _score_path(path: Path, config: ScoreConfig) -> list[ProgramScore]:
     """Scores a TUM file, or every TUM file of a folder."""
     if not path.exists():
-        raise SlamError(f"{path}: no such file or folder")
+        raise BenchmarkError(f"{path}: no such file or folder")
     pairs = _pairs(path, config.truth) if path.is_dir() else [(path, _find_truth(path, config.truth))]
     program, scores = path.name if path.is_dir() else path.parent.name, []
     for estimate, truth in pairs:
@@ -265,15 +264,15 @@ def _find_truth(estimate: Path, truth: Path) -> Path:
     places = (truth / estimate.stem / TRUTH_FILE, truth / TRUTH_FILE)
     file = next((place for place in places if place.is_file()), None)
     if file is None:
-        raise SlamError(f"{truth}: holds no truth of {estimate.stem}: neither {places[0]} nor {places[1]} is there")
+        raise BenchmarkError(f"{truth}: holds no truth of {estimate.stem}: neither {places[0]} nor {places[1]}")
     return file
 
 
 def _pairs(folder: Path, truth: Path) -> list[tuple[Path, Path]]:
     if not truth.is_dir():
-        raise SlamError(f"{truth}: is no folder, and {folder} is one")
+        raise BenchmarkError(f"{truth}: is no folder, and {folder} is one")
     pairs = [(path, truth / path.stem / TRUTH_FILE) for path in sorted(folder.glob("*.tum"))]
     known = [(path, true) for path, true in pairs if true.is_file()]
     if not known:
-        raise SlamError(f"{folder}: holds no NAME.tum of a recording whose truth is in {truth}")
+        raise BenchmarkError(f"{folder}: holds no NAME.tum of a recording whose truth is in {truth}")
     return known

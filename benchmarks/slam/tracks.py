@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from benchmarks.slam.errors import SlamError
+from benchmarks.command import BenchmarkError
 from scene.errors import RecordingError
 from scene.poses.trajectory import Trajectory, load_tum
 
@@ -36,13 +36,13 @@ class Axis:
     source: str
 
     def nearest(self, position: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
-        """Return the index of the axis' point nearest to each position."""
+        """Returns the index of the axis' point nearest to each position."""
         parts = np.split(position, range(_ROWS, len(position), _ROWS))
         squares = [np.sum((part[:, None] - self.position) ** 2, axis=2) for part in parts]
         return np.concatenate([np.argmin(square, axis=1) for square in squares])
 
     def coordinates(self, position: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-        """Return station, offset to the left and height over the axis of each position, m."""
+        """Returns station, offset to the left and height over the axis of each position, m."""
         near = self.nearest(position)
         aside = np.einsum("kij,kj->ki", self.frames[near], position - self.position[near])
         curvature = np.sum(np.gradient(self.frames[:, 0], self.station, axis=0) * self.frames[:, 1], axis=1)
@@ -52,7 +52,7 @@ class Axis:
         return np.column_stack([self.station[near] + aside[:, 0] / stretch, aside[:, 1:]])
 
     def resolve(self, vectors: Float[np.ndarray, "k 3"], at: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-        """Resolve vectors of the fixed frame along, left and up of the axis near positions `at`."""
+        """Resolves vectors of the fixed frame along, left and up of the axis near positions `at`."""
         return np.einsum("kij,kj->ki", self.frames[self.nearest(at)], vectors)
 
 
@@ -60,17 +60,17 @@ def axis_from_file(path: Path) -> Axis:
     """Reads the `axis.csv` of a recording's truth.
 
     Raises:
-        SlamError: The file is missing or is no axis.
+        BenchmarkError: The file is missing or is no axis.
     """
     try:
         with path.open() as file:
             if file.readline().strip() != _HEADER:
-                raise SlamError(f"{path}: not an axis: its first line must be {_HEADER!r}")
+                raise BenchmarkError(f"{path}: not an axis: its first line must be {_HEADER!r}")
             rows = np.loadtxt(file, delimiter=",", ndmin=2)
     except (OSError, ValueError) as error:
-        raise SlamError(f"{path}: not a readable axis ({error})") from error
+        raise BenchmarkError(f"{path}: not a readable axis ({error})") from error
     if rows.shape[1:] != (4,) or len(rows) < 2 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0.0).any():
-        raise SlamError(f"{path}: an axis has at least 2 finite rows of 4 numbers with increasing stations")
+        raise BenchmarkError(f"{path}: an axis has at least 2 finite rows of 4 numbers with increasing stations")
     return Axis(rows[:, 0], rows[:, 1:], _frames(rows[:, 1:]), path.name)
 
 
@@ -80,13 +80,13 @@ def axis_from_path(position: Float[np.ndarray, "n 3"]) -> Axis:
     A drive there and back is thus measured along the way there.
 
     Raises:
-        SlamError: The path is shorter than 1 m.
+        BenchmarkError: The path is shorter than 1 m.
     """
     outward = position[: int(np.argmax(np.linalg.norm(position - position[0], axis=1))) + 1]
     steps = np.linalg.norm(np.diff(outward, axis=0), axis=1)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
     if travelled[-1] < 1.0:
-        raise SlamError(
+        raise BenchmarkError(
             f"the true path moves by {travelled[-1]:.2f} m and no axis was given: nothing tells along from across"
         )
     kept = np.concatenate([[True], steps > 0.0])
@@ -152,14 +152,14 @@ def read_track(estimate: Path, truth: Path, alignment: Alignment = "origin") -> 
         alignment: See `align`.
 
     Raises:
-        SlamError: A file is missing or wrong, they share fewer than two times, or there is no such alignment.
+        BenchmarkError: A file is missing or wrong, they share fewer than two times, or there is no such alignment.
     """
     if alignment not in ALIGNMENTS:
-        raise SlamError(f"no alignment {alignment!r}; there are {', '.join(ALIGNMENTS)}")
+        raise BenchmarkError(f"no alignment {alignment!r}; there are {', '.join(ALIGNMENTS)}")
     try:
         estimated, true = load_tum(estimate), load_tum(truth)
     except RecordingError as error:
-        raise SlamError(str(error)) from error
+        raise BenchmarkError(str(error)) from error
     return align(_pair(estimated, true), alignment)
 
 
@@ -167,7 +167,7 @@ def _pair(estimated: Trajectory, true: Trajectory) -> Track:
     begin, end = true.times[0], true.times[-1]
     some = np.flatnonzero((estimated.times >= begin - _SLACK) & (estimated.times <= end + _SLACK))
     if len(some) < 2:
-        raise SlamError(
+        raise BenchmarkError(
             f"{estimated.source}: shares {len(some)} of its {len(estimated.times)} times ({estimated.times[0]:.3f} to "
             f"{estimated.times[-1]:.3f} s) with {true.source} ({begin:.3f} to {end:.3f} s); at least 2 are needed"
         )

@@ -5,10 +5,10 @@
 
 import sys
 
-import tyro
 from rich.console import Console
 
 import subterra_jax as st
+from benchmarks.command import run_main
 from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
@@ -16,7 +16,7 @@ from benchmarks.throughput.measure import arithmetic_floor, environment_loop, fl
 from benchmarks.throughput.peers import Route, find_peers, measure_peer
 from benchmarks.throughput.timing import Timing, measure
 from benchmarks.throughput.variants import measure_lengths, measure_linings
-from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
+from subterra_jax.host.files import require_folder
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -39,7 +39,7 @@ def run(config: ThroughputConfig) -> report.Result:
     for lining in config.linings:
         plan.lining(lining)
     if config.out is not None:
-        report.make_folder(config.out)
+        require_folder(config.out)
     timing = Timing(config.steps, config.repeats, config.seconds, config.seed)
     segments = len(plan.lining(config.lining).segments)
     facts = {"name": plan.name, "length": plan.length, "lining": config.lining, "segments": segments}
@@ -83,14 +83,9 @@ def run_and_report(config: ThroughputConfig) -> int:
     return 0
 
 
-def main() -> int:
+def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 1 if the LiDAR is not exact, 2 for a user's mistake."""
-    config = parse(
-        lambda words: tyro.cli(
-            ThroughputConfig, args=words, prog="python -m benchmarks.throughput", description=__doc__
-        )
-    )
-    return run_command(lambda: run_and_report(config), mistakes=INPUT_ERRORS)
+    return run_main("throughput", ThroughputConfig, run_and_report, description=__doc__, words=words)
 
 
 if __name__ == "__main__":

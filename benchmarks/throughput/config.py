@@ -7,7 +7,7 @@ from typing import Literal
 
 import jax
 
-from benchmarks.throughput.errors import ThroughputError
+from benchmarks.command import BenchmarkError
 
 SIZES = (1, 16, 256, 1024, 4096, 16_384, 65_536, 262_144)
 _MOST_ON_CPU = 4096
@@ -57,13 +57,13 @@ class ThroughputConfig:
     out: Path | None = None
 
     def sizes(self) -> tuple[int, ...]:
-        """Return the batch sizes to measure on this machine, in increasing order."""
+        """Returns the batch sizes to measure on this machine, in increasing order."""
         if self.n:
             return tuple(sorted(set(self.n)))
         return tuple(size for size in SIZES if not _on_cpu() or size <= _MOST_ON_CPU)
 
     def study_size(self) -> int:
-        """Return the batch size at which lengths and linings are compared on this machine."""
+        """Returns the batch size at which lengths and linings are compared on this machine."""
         if self.study_n is not None:
             return self.study_n
         return _STUDY_SIZE_ON_CPU if _on_cpu() else _STUDY_SIZE
@@ -73,19 +73,19 @@ def check(config: ThroughputConfig) -> None:
     """Refuses settings that cannot be measured.
 
     Raises:
-        ThroughputError: An option is out of range; the message names it with its value.
+        BenchmarkError: An option is out of range; the message names it with its value.
     """
     for name, least in (("steps", 1), ("repeats", 1), ("poses", 0), ("seed", 0)):
         if getattr(config, name) < least:
-            raise ThroughputError(f"--{name} must be at least {least}, got {getattr(config, name)}")
+            raise BenchmarkError(f"--{name} must be at least {least}, got {getattr(config, name)}")
     for size in (*config.n, config.study_size()):
         if size < 1:
-            raise ThroughputError(f"a batch holds at least 1 environment, got {size}")
+            raise BenchmarkError(f"a batch holds at least 1 environment, got {size}")
     for name, value in (("seconds", config.seconds), *(("lengths", length) for length in config.lengths)):
         if not 0.0 < value < math.inf:
-            raise ThroughputError(f"--{name} must be positive, got {value}")
+            raise BenchmarkError(f"--{name} must be positive, got {value}")
     if len(config.peers) > 1 and {"auto", "none"} & set(config.peers):
-        raise ThroughputError(f"--peers takes auto, none, or names, got {' '.join(config.peers)}")
+        raise BenchmarkError(f"--peers takes auto, none, or names, got {' '.join(config.peers)}")
 
 
 def _on_cpu() -> bool:

@@ -22,7 +22,7 @@ _LANES = {"NVIDIA H200": 132 * 128 * 1.98e9}
 
 
 def environment_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
-    """Return the loop of `AutoReset` under random actions, with LiDAR, noise, reward, contact and resets."""
+    """Returns the loop of `AutoReset` under random actions, with LiDAR, noise, reward, contact and resets."""
     batch = st.AutoReset(env)
     low, high = (jnp.asarray(bound) for bound in dataclasses.astuple(env.action_space(params)))
 
@@ -40,7 +40,7 @@ def environment_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Lo
 
 
 def spread_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
-    """Return the same loop with robots spread along the tunnel, short of the goal, as a trained policy's would be."""
+    """Returns the same loop with robots spread along the tunnel, short of the goal, as a trained policy's would be."""
     loop = environment_loop(env, params, n_envs)
 
     def reset(key: PRNGKeyArray, params: st.EnvParams) -> Carry:
@@ -57,7 +57,7 @@ def spread_loop(env: st.TunnelEnv, params: st.EnvParams, n_envs: int) -> Loop:
 
 
 def floor_loop(loop: Loop) -> Loop:
-    """Return the least that a batched environment of this shape does: draw actions, read and write its arrays.
+    """Returns the least that a batched environment of this shape does: draw actions, read and write its arrays.
 
     Nothing is simulated. Its speed is the limit that kernel launches and memory set on a machine.
     """
@@ -77,7 +77,7 @@ def floor_loop(loop: Loop) -> Loop:
 
 
 def arithmetic_floor(device: str, n_beams: int) -> float | None:
-    """Return the steps per second at which a brute-force cast of 300 segments a beam fills the device's lanes.
+    """Returns the steps per second at which a brute-force cast of 300 segments a beam fills the device's lanes.
 
     Args:
         device: Device kind, as JAX names it.

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 import subterra_jax as st
-from benchmarks.throughput.errors import ThroughputError
+from benchmarks.command import BenchmarkError
 from benchmarks.throughput.timing import Speed, Timing
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -41,7 +41,7 @@ class Scene:
 
 
 def extrude_walls(plan: TunnelPlan, lining: str) -> Scene:
-    """Return upright walls over every segment of a lining, as one mesh."""
+    """Returns upright walls over every segment of a lining, as one mesh."""
     segments = plan.lining(lining).segments
     segments = segments[np.any(segments[:, :2] != segments[:, 2:], axis=1)]
     low, high = np.full((len(segments), 1), -_HALF_HEIGHT), np.full((len(segments), 1), _HALF_HEIGHT)
@@ -64,15 +64,15 @@ def load_scene(folder: Path, plan: TunnelPlan, lining: str) -> Scene:
         lining: `furnished` loads the furnished scene.
 
     Raises:
-        ThroughputError: The scene is not there, or MuJoCo cannot read it.
+        BenchmarkError: The scene is not there, or MuJoCo cannot read it.
     """
     path = folder / ("scene_furnished.xml" if lining == "furnished" else "scene.xml")
     if not path.is_file():
-        raise ThroughputError(f"{path}: no such scene")
+        raise BenchmarkError(f"{path}: no such scene")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
-        raise ThroughputError(f"{path}: MuJoCo cannot read it ({str(error).splitlines()[0]})") from error
+        raise BenchmarkError(f"{path}: MuJoCo cannot read it ({str(error).splitlines()[0]})") from error
     return _make_scene(model, plan.elevation + plan.lidar_height, str(path))
 
 
@@ -156,7 +156,7 @@ class MujocoTunnel:
         return self._observation(noise[2:]), reward, terminated, truncated, info
 
     def ranges(self) -> np.ndarray:
-        """Return the true ranges at the current pose, m, `(n_beams,)`."""
+        """Returns the true ranges at the current pose, m, `(n_beams,)`."""
         c, s = cos(self.heading), sin(self.heading)
         self._way[:, 0], self._way[:, 1] = c * self._along - s * self._across, s * self._along + c * self._across
         origin, reach = np.array([self.x, self.y, self._at(self.station)[5]]), self.lidar["range_max"]
@@ -194,7 +194,7 @@ class MujocoTunnel:
         self.turned = _wrap(self.turned + (yaw_rate + self.heading_bias) * period + sigma["heading_sigma"] * noise[1])
 
     def _at(self, station: float) -> tuple[float, ...]:
-        """Return centre x, y, unit tangent x, y, half-width and LiDAR height at a station; extrapolates straight."""
+        """Returns centre x, y, unit tangent x, y, half-width and LiDAR height at a station; extrapolates straight."""
         node = station / self._spacing
         index = min(max(int(node), 0), len(self._grid) - 2)
         share = node - index
@@ -226,7 +226,7 @@ def measure(env: MujocoTunnel, timing: Timing) -> Speed:
 
 
 def _numbers(part: Any, *names: str) -> dict[str, float]:
-    """Return some fields of a part of the params as Python numbers."""
+    """Returns some fields of a part of the params as Python numbers."""
     return {name: float(getattr(part, name)) for name in names}
 
 

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
 import subterra_jax as st
+from benchmarks.command import BenchmarkError
 from benchmarks.results import version
-from benchmarks.throughput.errors import ThroughputError
 from benchmarks.throughput.timing import Carry, Loop, Speed, Timing, digest, measure
 
 ROUTE = "mujoco"
@@ -78,7 +78,7 @@ class Route:
 
 
 def jaxnav_loop(n_envs: int) -> Loop:
-    """Return JaxNav with one agent and as many beams as ours; all else at its defaults."""
+    """Returns JaxNav with one agent and as many beams as ours; all else at its defaults."""
     # Unused here: it imports all of brax and redirects standard output.
     sys.modules.setdefault("jaxmarl.environments.mabrax", None)  # type: ignore[arg-type]
     with _quiet():
@@ -102,7 +102,7 @@ def jaxnav_loop(n_envs: int) -> Loop:
 
 
 def pendulum_loop(n_envs: int) -> Loop:
-    """Return gymnax' Pendulum with default parameters."""
+    """Returns gymnax' Pendulum with default parameters."""
     import gymnax
 
     env, params = gymnax.make("Pendulum-v1")
@@ -136,10 +136,10 @@ BATCHED = {
 
 
 def find_peers(choice: Sequence[str]) -> dict[str, BatchedPeer | str | None]:
-    """Return the chosen peers by name: the peer (`None` for the paper's route), or why it cannot be measured.
+    """Returns the chosen peers by name: the peer (`None` for the paper's route), or why it cannot be measured.
 
     Raises:
-        ThroughputError: A peer chosen by name is not installed.
+        BenchmarkError: A peer chosen by name is not installed.
     """
     every = (*BATCHED, ROUTE)
     names = [] if "none" in choice else every if "auto" in choice else [name for name in every if name in choice]
@@ -153,7 +153,7 @@ def find_peers(choice: Sequence[str]) -> dict[str, BatchedPeer | str | None]:
             peers[name] = BATCHED.get(name)
         except ImportError as error:
             if "auto" not in choice:
-                raise ThroughputError(f"peer {name!r} cannot be imported ({error}); see the extra `peers`") from error
+                raise BenchmarkError(f"peer {name!r} cannot be imported ({error}); see the extra `peers`") from error
             peers[name] = f"cannot be imported ({error})"
     return peers
 

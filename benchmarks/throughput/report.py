@@ -1,16 +1,11 @@
 """One run's results: tables on a terminal, `throughput.json` and the figure."""
 
 import dataclasses
-import io
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,9 +13,8 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.results import constants_facts
+from benchmarks.results import constants_facts, png_bytes
 from benchmarks.throughput.config import ThroughputConfig
-from benchmarks.throughput.errors import ThroughputError
 from benchmarks.throughput.peers import ROUTE, Peer
 from benchmarks.throughput.timing import Speed
 from benchmarks.throughput.variants import Variant
@@ -61,12 +55,12 @@ class Result:
 
     @property
     def gates(self) -> list[Agreement]:
-        """Return every comparison of the LiDAR with the reference."""
+        """Returns every comparison of the LiDAR with the reference."""
         every = [self.exactness, *(variant.exactness for variant in (*self.lengths, *self.linings))]
         return [gate for gate in every if gate is not None]
 
     def ratios(self, peer: Peer) -> dict[int, float]:
-        """Return our median over a peer's by batch size: at the same size, or over the route's only environment."""
+        """Returns our median over a peer's by batch size: at the same size, or over the route's only environment."""
         theirs = {speed.n_envs: speed.quartiles[1] for speed in peer.speeds}
         if peer.name == ROUTE:
             theirs = {speed.n_envs: theirs[1] for speed in self.speeds}
@@ -74,7 +68,7 @@ class Result:
 
 
 def as_json(result: Result) -> str:
-    """Return the content of `throughput.json`."""
+    """Returns the content of `throughput.json`."""
     content = {
         "schema": SCHEMA,
         "config": dataclasses.asdict(result.config),
@@ -92,28 +86,10 @@ def as_json(result: Result) -> str:
     return json.dumps(content, indent=2, default=str, allow_nan=False) + "\n"
 
 
-def make_folder(folder: Path) -> None:
-    """Makes the output folder before anything is measured.
-
-    Raises:
-        ThroughputError: The folder cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ThroughputError(f"{folder}: cannot be written ({error.strerror})") from error
-
-
 def _speed(speed: Speed, n_beams: int) -> dict[str, Any]:
     lower, median, upper = speed.quartiles
-    rates = {
-        "q1": lower,
-        "median": median,
-        "q3": upper,
-        "ns_per_step": 1e9 / median,
-        "rays_per_second": n_beams * median,
-    }
-    return dataclasses.asdict(speed) | rates
+    rates = {"q1": lower, "median": median, "q3": upper}
+    return {**dataclasses.asdict(speed), **rates, "ns_per_step": 1e9 / median, "rays_per_second": n_beams * median}
 
 
 def _peer(peer: Peer, result: Result) -> dict[str, Any]:
@@ -155,7 +131,7 @@ def show(result: Result, console: Console) -> None:
 
 
 def gate_line(gate: Agreement) -> str:
-    """Return the comparison with the reference in one line."""
+    """Returns the comparison with the reference in one line."""
     return (
         f"LiDAR against float64 brute force, {gate.n_rays:,} rays: largest error {gate.max_error * 1e3:.3f} mm, "
         f"{gate.n_ambiguous} at an edge within rounding, {gate.n_wrong} wrong"
@@ -217,7 +193,7 @@ def _quartiles(speed: Speed) -> str:
 
 
 def format_rate(value: float) -> str:
-    """Return a rate with four digits, in thousands or millions if it is large."""
+    """Returns a rate with four digits, in thousands or millions if it is large."""
     for unit, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
         if value >= unit:
             return f"{value / unit:.4g}{suffix}"
@@ -263,11 +239,8 @@ def draw(result: Result) -> Figure:
 
 
 def as_png(result: Result) -> bytes:
-    """Return the figure as a PNG file."""
-    figure, buffer = draw(result), io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150)
-    plt.close(figure)
-    return buffer.getvalue()
+    """Returns the figure as a PNG file."""
+    return png_bytes(draw(result), dpi=150)
 
 
 def _line(

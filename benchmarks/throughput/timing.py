@@ -72,7 +72,7 @@ class Speed:
 
     @property
     def quartiles(self) -> tuple[float, float, float]:
-        """Return lower quartile, median and upper quartile of the steps per second."""
+        """Returns lower quartile, median and upper quartile of the steps per second."""
         lower, median, upper = np.percentile(self.steps_per_second, [25, 50, 75])
         return float(lower), float(median), float(upper)
 
@@ -120,7 +120,7 @@ class Program:
         return elapsed
 
     def speed(self) -> Speed:
-        """Return the measurements of all its calls."""
+        """Returns the measurements of all its calls."""
         share, total = float(np.mean(self._done)), float(np.sum(self.totals))
         return Speed(self.n_envs, self.steps, self.compile_seconds, list(self._rates), share, total)
 
@@ -179,5 +179,5 @@ def _many_steps(loop: Loop, steps: int) -> Callable[..., Any]:
 
 
 def digest(tree: Any) -> Float[Array, ""]:
-    """Return the sum of the means of all leaves: one number that depends on every number."""
+    """Returns the sum of the means of all leaves: one number that depends on every number."""
     return sum((jnp.mean(leaf, dtype=jnp.float32) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))

@@ -82,16 +82,16 @@ class _Pose:
     mirrored: bool
 
     def point(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Return points of the plan at their place in this copy, m."""
+        """Returns points of the plan at their place in this copy, m."""
         return self.start + (points - self.origin) @ self.turn.T
 
     def segments(self, segments: Float[np.ndarray, "f 4"]) -> Float[np.ndarray, "f 4"]:
-        """Return segments of the plan at their place in this copy, m."""
+        """Returns segments of the plan at their place in this copy, m."""
         return np.hstack([self.point(segments[:, :2]), self.point(segments[:, 2:])])
 
 
 def extend_tunnel(plan: TunnelPlan, length: float) -> TunnelPlan:
-    """Return the first metres of a tunnel, continued by copies of itself where it is too short.
+    """Returns the first metres of a tunnel, continued by copies of itself where it is too short.
 
     Every second copy is mirrored, so that bends cancel and the tunnel does not meet itself. Between two copies the
     walls run straight and the centreline has no kink.
@@ -127,7 +127,7 @@ def _join_copies(plan: TunnelPlan, n_copies: int) -> TunnelPlan:
 
 
 def _poses(plan: TunnelPlan, n_copies: int) -> list[_Pose]:
-    """Return the pose of each copy; it starts at the end of the last one, in the same direction."""
+    """Returns the pose of each copy; it starts at the end of the last one, in the same direction."""
     point, tangent = plan.centre[0], plan.tangent[0]
     poses = []
     for k in range(n_copies):
@@ -139,7 +139,7 @@ def _poses(plan: TunnelPlan, n_copies: int) -> list[_Pose]:
 
 
 def _frame(tangent: Float[np.ndarray, "2"], mirrored: bool) -> Float[np.ndarray, "2 2"]:
-    """Return unit vectors along and to the left of a direction as columns; to its right if mirrored."""
+    """Returns unit vectors along and to the left of a direction as columns; to its right if mirrored."""
     left = np.array([-tangent[1], tangent[0]]) * (-1.0 if mirrored else 1.0)
     return np.column_stack([tangent, left])
 

@@ -6,9 +6,9 @@ import re
 
 import pytest
 
+from benchmarks.command import BenchmarkError
 from benchmarks.reproduce.__main__ import MEASUREMENTS, README, main, result_rows, run_job, verdict
 from benchmarks.reproduce.claims import CLAIMS, HEADING, JOBS, Claim, Job, read_result, read_tables, unclaimed
-from benchmarks.reproduce.errors import ReproduceError
 
 RESULTS = read_tables(README.read_text(), HEADING)
 DOCUMENTS = result_rows()
@@ -107,7 +107,7 @@ def test_seeds_that_learnt_are_counted(tmp_path):
 
 
 def test_a_job_that_fails_names_its_log_and_one_without_its_input_is_left_out(tmp_path):
-    with pytest.raises(ReproduceError, match=r"log.txt: python -m json.tool ended with status"):
+    with pytest.raises(BenchmarkError, match=r"log.txt: python -m json.tool ended with status"):
         run_job(Job("none", ("json.tool {out}/no.json",), "none.json", 0.1), tmp_path / "none", tmp_path)
     assert run_job(JOBS["metro"], tmp_path / "metro", tmp_path / "nowhere") is None
 

@@ -16,8 +16,7 @@ from PIL import Image
 from benchmarks.leaderboard import __main__ as command
 from benchmarks.leaderboard import entries as entry_module
 from benchmarks.leaderboard import report
-from benchmarks.leaderboard.config import LeaderboardConfig, agents_for, check
-from benchmarks.leaderboard.entries import Entry
+from benchmarks.leaderboard.entries import Entry, LeaderboardConfig, agents_for, check
 from benchmarks.leaderboard.report import scores, totals
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Records
@@ -43,8 +42,8 @@ def run(monkeypatch, *arguments: str) -> int:
         (("--tasks", "Relocalise", "--agents", "policy:StopAt-v0"), "error: policy:StopAt-v0: a policy that drives to"),
         (("--agents", "policy:mine.safetensors"), "error: mine.safetensors: no such policy"),
         (("--agents", "no.py:Mine"), "error: no.py: cannot be read (No such file or directory)"),
-        (("--agents", "nowhere:Mine"), "error: agent 'nowhere:Mine': No module named 'nowhere'"),
-        (("--agents", "json:Mine"), "error: agent 'json:Mine': json has no 'Mine'"),
+        (("--agents", "nowhere:Mine"), "error: nowhere:Mine: No module named 'nowhere'"),
+        (("--agents", "json:Mine"), "error: json:Mine: json has no 'Mine'"),
         (("--agents", "pathlib:Path", "--tasks", "TraverseShort"), "error: agent 'pathlib:Path' has no uses_lidar"),
         (("--load", "no.py"), "error: no.py: cannot be read (No such file or directory)"),
         (("--redraw", "no.md"), "error: no.md: cannot be read (No such file or directory)"),

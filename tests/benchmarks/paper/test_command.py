@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks.command import BenchmarkError
 from benchmarks.paper.__main__ import main
-from benchmarks.paper.errors import PaperError
 from benchmarks.paper.learning import find_runs
 from benchmarks.paper.steps import Step, is_done, make, scene_step, survey_step, training_step
 
@@ -130,7 +130,7 @@ def test_a_step_is_done_once_and_again_when_its_words_or_inputs_change(tmp_path,
 
 def test_a_step_that_fails_names_its_command_and_is_not_done(tmp_path):
     step = Step("copy", ("json.tool", str(tmp_path / "none.json")), tmp_path / "out", ("copy.json",))
-    with pytest.raises(PaperError, match=r"out: python -m json\.tool ended with status"):
+    with pytest.raises(BenchmarkError, match=r"out: python -m json\.tool ended with status"):
         make(step)
     assert not is_done(step)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.derive.distances import Occupied
 from benchmarks.paper.camera import Pose
-from benchmarks.paper.errors import PaperError
 from benchmarks.paper.figures import classify_side_view, depth_image
 from benchmarks.paper.material import Stretch, load_frame
 from tests.scene.bags import write_bag, write_tum
@@ -58,7 +58,7 @@ def test_a_frame_is_taken_when_the_lidar_looked_along_the_bore(recorded):
 
 def test_a_frame_where_nothing_was_recorded_is_one_sentence(recorded, tmp_path):
     late = write_bag(tmp_path / "late.bag", [(50.0, np.ones((3, 3)))])
-    with pytest.raises(PaperError, match=r"late\.bag: no scan within 1 s of "):
+    with pytest.raises(BenchmarkError, match=r"late\.bag: no scan within 1 s of "):
         load_frame(late, recorded[1], np.zeros(3), Stretch(np.zeros(3), np.array([1.0, 0.0, 0.0]), 4.0), 1.0)
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.derive.surface import Caster
 from benchmarks.slam import recordings
 from benchmarks.slam import run as libraries
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.errors import SlamError
 from benchmarks.slam.recordings import SetConfig, plan_set
 from scene.output import write_geometry
 from scene.poses.trajectory import load_tum
@@ -53,15 +53,15 @@ def test_an_odometry_that_is_right_among_landmarks_does_not_move_along_a_bare_bo
 
 
 def test_unknown_and_missing_libraries_are_named(monkeypatch):
-    with pytest.raises(SlamError, match="no library 'fast'; there are kiss-icp, genz-icp"):
+    with pytest.raises(BenchmarkError, match="no library 'fast'; there are kiss-icp, genz-icp"):
         libraries.find_library("fast")
     missing = libraries.Library("no-such-package", recordings.CLOUDS, lambda: None)
     monkeypatch.setitem(libraries.LIBRARIES, "absent", missing)
-    with pytest.raises(SlamError, match="sweep 0 holds no point"):
+    with pytest.raises(BenchmarkError, match="sweep 0 holds no point"):
         libraries.estimate_poses(missing._replace(make=lambda: np.eye), [(EPOCH, np.zeros((0, 3)))])
-    with pytest.raises(SlamError, match="there is no sweep"):
+    with pytest.raises(BenchmarkError, match="there is no sweep"):
         libraries.estimate_poses(missing, [])
-    with pytest.raises(SlamError, match="absent needs no-such-package, which is not installed"):
+    with pytest.raises(BenchmarkError, match="absent needs no-such-package, which is not installed"):
         libraries.find_library("absent")
 
 
@@ -131,7 +131,7 @@ def test_what_is_there_is_not_done_again(made, capsys):
 def test_a_truncated_or_foreign_recording_is_one_sentence(made, tmp_path, capsys):
     bag = tmp_path / "recordings" / "one" / "recording"
     shutil.copytree(made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording", bag)
-    with pytest.raises(SlamError, match=r"has no topic /other; it has /cmd_vel, /imu"):
+    with pytest.raises(BenchmarkError, match=r"has no topic /other; it has /cmd_vel, /imu"):
         next(recordings.read_clouds(bag, "/other"))
     data = (bag / "recording.mcap").read_bytes()
     (bag / "recording.mcap").write_bytes(data[: len(data) // 2])
@@ -154,7 +154,7 @@ def test_boxes_and_faults_are_recorded_without_clouds_and_a_driver_knows_the_way
     assert found["StopAt-pockets-000"].cloud == "vlp16"
     assert found["Obstructed-pockets-001"].cloud == "none"
     assert found["Relocalise-pockets-000"].agent == "particle-filter"
-    with pytest.raises(SlamError, match="no task 'Fly'"):
+    with pytest.raises(BenchmarkError, match="no task 'Fly'"):
         plan_set(SetConfig(tmp_path, tasks=("Fly",)))
 
 

@@ -9,8 +9,8 @@ from evo.core import sync, units
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
+from benchmarks.command import BenchmarkError
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.errors import SlamError
 from benchmarks.slam.score import score_files
 from tests.benchmarks.slam.tracks import bend, line, write_axis, write_tum
 
@@ -159,13 +159,13 @@ def test_a_bad_axis_piece_or_standstill_is_refused(tmp_path):
     truth = write_tum(tmp_path / "truth.tum", *line())
     axis = tmp_path / "other.csv"
     axis.write_text("a,b\n1,2\n")
-    with pytest.raises(SlamError, match=r"other\.csv: not an axis"):
+    with pytest.raises(BenchmarkError, match=r"other\.csv: not an axis"):
         score_files(truth, truth, axis=axis)
-    with pytest.raises(SlamError, match="piece must be above 0 m, got 0"):
+    with pytest.raises(BenchmarkError, match="piece must be above 0 m, got 0"):
         score_files(truth, truth, piece=0.0)
     time, position, rotation = line(20, step=0.0)
     still = write_tum(tmp_path / "still.tum", time, position, rotation)
-    with pytest.raises(SlamError, match="nothing tells along from across"):
+    with pytest.raises(BenchmarkError, match="nothing tells along from across"):
         score_files(still, still)
-    with pytest.raises(SlamError, match="no alignment 'scale'"):
+    with pytest.raises(BenchmarkError, match="no alignment 'scale'"):
         score_files(truth, truth, alignment="scale")
