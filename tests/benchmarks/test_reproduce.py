@@ -3,12 +3,14 @@
 import importlib.util
 import json
 import re
+import shlex
 
 import pytest
 
 from benchmarks.command import BenchmarkError
 from benchmarks.reproduce.__main__ import MEASUREMENTS, README, main, result_rows, run_job, verdict
 from benchmarks.reproduce.claims import CLAIMS, HEADING, JOBS, Claim, Job, read_result, read_tables, unclaimed
+from tests.test_docs import command_line  # noqa: F401 (a fixture)
 
 RESULTS = read_tables(README.read_text(), HEADING)
 DOCUMENTS = result_rows()
@@ -45,6 +47,15 @@ def test_every_claim_stands_in_the_documents_and_can_fail(claim):
     worse = {"at least": 0.0, "at most": 1e3 * (stated + 1.0)}.get(claim.bound, stated + 1.1 * claim.tolerance + 1e-3)
     assert verdict(claim, stated, stated) == "same"
     assert verdict(claim, stated, worse) == "differs"
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of runpy: the tests have imported the module before
+def test_every_command_of_jobs_and_claims_is_understood_by_its_module(command_line):  # noqa: F811
+    of_jobs = {words.format(out="out", shared="shared") for job in JOBS.values() for words in job.commands}
+    of_claims = {claim.command.split(" (")[0] for claim in CLAIMS if claim.command}
+    for words in sorted(of_jobs | of_claims):
+        if words.split()[0] not in ("timeit", "pytest"):
+            command_line(shlex.split(words))
 
 
 def test_a_number_is_found_in_its_row_over_thousands_and_columns():
