@@ -81,6 +81,6 @@ def __dir__() -> list[str]:
 
 
 if importlib.util.find_spec("gymnasium") is not None:
-    from subterra_jax.adapters.registration import register
+    from subterra_jax.adapters import register
 
     register()

@@ -1,4 +1,43 @@
 """Subterra through other libraries' interfaces: Gymnasium (single and vector), Stable-Baselines3, Brax, Gymnax.
 
-Each file needs its own library, and nothing here is imported until it is asked for.
+Each file needs its own library, and none is imported before its first use.
 """
+
+from subterra_jax.b2 import MISSIONS, WALK
+
+# The keys of `subterra_jax.tasks.TASKS`, which loads jax; importing the package registers them and must not.
+PLANAR_TASKS = tuple(
+    f"Subterra/{name}-v0"
+    for name in (
+        "Traverse",
+        "TraverseShort",
+        "StopAt",
+        "StopAtShort",
+        "StopAtOffset",
+        "StopAtOffsetShort",
+        "Return",
+        "ReturnShort",
+        "Obstructed",
+        "ObstructedShort",
+        "Faulted",
+        "FaultedShort",
+        "Relocalise",
+        "RelocaliseShort",
+    )
+)
+_SINGLE = "subterra_jax.adapters.single:SubterraEnv"
+_VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
+# MuJoCo is loaded only where one of these is made.
+_ON_LEGS = dict.fromkeys(MISSIONS, "subterra_jax.b2.gym:B2Env") | {WALK: "subterra_jax.b2.gym:B2WalkEnv"}
+
+
+def register() -> None:
+    """Make every task known to Gymnasium under its id; doing so again changes nothing."""
+    from gymnasium.envs import registration  # optional
+
+    for task in PLANAR_TASKS:
+        if task not in registration.registry:
+            registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
+    for task, entry in _ON_LEGS.items():
+        if task not in registration.registry:
+            registration.register(id=task, entry_point=entry, kwargs={"task": task})

@@ -10,7 +10,7 @@ import tyro
 import subterra_jax as st
 from scene.build import command as build_command
 from scene.survey.config import SurveyConfig
-from subterra_jax.adapters.registration import PLANAR_TASKS
+from subterra_jax.adapters import PLANAR_TASKS
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.errors import OutputError, SubterraError
 from subterra_jax.host.files import replace_file

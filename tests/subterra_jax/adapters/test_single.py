@@ -14,7 +14,7 @@ from gymnasium import error, spaces
 from gymnasium.utils.env_checker import check_env
 
 import subterra_jax as st
-from subterra_jax.adapters.registration import register
+from subterra_jax.adapters import register
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.streams import start_streams, take_key
 
