@@ -20,7 +20,7 @@ from scene.bore import load_bore
 from subterra_jax import lidar, lidar3d
 from subterra_jax.lidar import reference
 from subterra_jax.lidar3d.relief import Relief
-from subterra_jax.lidar3d.surface import SMALL, Triangles, joined, read_mesh, read_scene
+from subterra_jax.lidar3d.surface import SMALL, Triangles, join_surfaces, read_mesh, read_scene
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -53,7 +53,7 @@ def reference_surface(folder: Path, lining: str) -> Triangles:
     if lining not in _WHOLE_MESHES:
         return read_scene(folder, lining)
     walls = read_mesh(folder / "meshes" / _WHOLE_MESHES[lining])
-    return joined([walls, read_scene(folder, "pockets", (*SMALL, *_LINING_PARTS))])
+    return join_surfaces([walls, read_scene(folder, "pockets", (*SMALL, *_LINING_PARTS))])
 
 
 # Goals: half of all rays within the first, 99.9 % within the second, m.

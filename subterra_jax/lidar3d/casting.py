@@ -84,7 +84,7 @@ def sweep(relief: Relief, rays: Ray, origins: Array, directions: Array, limits: 
 def _enter(relief: Relief, origin: Array, direction: Array, block: Array) -> Frame:
     """Transform a ray into the frame of its block."""
     row = relief.frame[block]
-    o, d = turned(row, origin - row[:3]), turned(row, direction)
+    o, d = rotate_into_frame(row, origin - row[:3]), rotate_into_frame(row, direction)
     back, front = _crossing(row[12:16], o, d, -1.0), _crossing(row[16:20], o, d, 1.0)
     return Frame(block, o, d, jnp.minimum(back, front), block + jnp.where(front <= back, 1, -1))
 
@@ -100,7 +100,7 @@ def _leap(relief: Relief, frame: Frame, ray: Ray, limit: Array) -> Ray:
     """Move a ray to the end of the empty voxels around it; leave it where there are triangles, or out of the frame."""
     code, end = _look(relief, frame, ray)
     goes = (code < 0) & (ray.block == frame.block) & goes_on(ray, limit)
-    return _where(goes, _moved(relief, frame, ray, end), ray)
+    return _where(goes, _advance(relief, frame, ray, end), ray)
 
 
 def _meet(relief: Relief, frame: Frame, ray: Ray, limit: Array) -> Ray:
@@ -118,7 +118,7 @@ def _meet(relief: Relief, frame: Frame, ray: Ray, limit: Array) -> Ray:
     more = (number[-1] + 1 < stop) & (code >= 0)
     # A hit in this voxel is final; before a hit further on there may be a triangle of the next voxels.
     final = (hit <= jnp.minimum(end, frame.leave) + _PAST) & ~more
-    moved = _moved(relief, frame, ray.replace(hit=hit), end)  # type: ignore[attr-defined]
+    moved = _advance(relief, frame, ray.replace(hit=hit), end)  # type: ignore[attr-defined]
     after = _where(more, ray.replace(hit=hit, skip=ray.skip + N_TESTED), moved)  # type: ignore[attr-defined]
     after = _where(final, ray.replace(hit=hit, reached=hit), after)  # type: ignore[attr-defined]
     return _where((ray.block == frame.block) & goes_on(ray, limit), after, ray)
@@ -140,7 +140,7 @@ def _look(relief: Relief, frame: Frame, ray: Ray) -> tuple[Int[Array, ""], Float
     return code, jnp.min(jnp.where(level, jnp.inf, exits))
 
 
-def _moved(relief: Relief, frame: Frame, ray: Ray, end: Array) -> Ray:
+def _advance(relief: Relief, frame: Frame, ray: Ray, end: Array) -> Ray:
     """Move a ray past its voxels, into the next block, or out of the bore."""
     leaves = frame.leave <= end
     out = leaves & ((frame.following < 0) | (frame.following >= relief.n_blocks))
@@ -176,7 +176,7 @@ def _distances(triangle: Float[Array, "k 9"], origin: Array, direction: Array) -
     return jnp.where(meets & (jnp.abs(det) >= 1e-12), t, jnp.inf)
 
 
-def turned(row: Float[Array, "20"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
+def rotate_into_frame(row: Float[Array, "20"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """Turn a vector into a block's frame."""
     return jnp.stack([dot(row[3:6], vector), dot(row[6:9], vector), dot(row[9:12], vector)])
 
@@ -252,7 +252,7 @@ def block_at(relief: Relief, origin: Float[Array, "3"], station: Float[Array, ""
     guess = jnp.floor(station / relief.length * relief.n_blocks)
     block = jnp.clip(guess, 0, last).astype(jnp.int32)
     row = relief.frame[block]
-    local = turned(row, origin - row[:3])
+    local = rotate_into_frame(row, origin - row[:3])
     ahead, behind = dot(row[16:19], local) > row[19], dot(row[12:15], local) < row[15]
     return jnp.clip(block + ahead.astype(jnp.int32) - behind.astype(jnp.int32), 0, last)
 
@@ -309,7 +309,7 @@ def _sweep_until(
 ) -> Ray:
     """Sweep `size` unfinished rays at a time until no more than `enough` are left."""
 
-    def unfinished(carry: tuple[Array, Ray]) -> Array:
+    def too_many_left(carry: tuple[Array, Ray]) -> Array:
         return (jnp.sum(goes_on(carry[1], limits)) > enough) & (carry[0] < N_SWEEPS)
 
     def sweep_some(carry: tuple[Array, Ray]) -> tuple[Array, Ray]:
@@ -320,7 +320,7 @@ def _sweep_until(
         part = sweep(relief, part, origins[some], directions[some], limits[some])
         return count + 1, jax.tree.map(lambda leaf, new: leaf.at[which].set(new, mode="drop"), rays, part)
 
-    return lax.while_loop(unfinished, sweep_some, (jnp.int32(0), rays))[1]
+    return lax.while_loop(too_many_left, sweep_some, (jnp.int32(0), rays))[1]
 
 
 @_cast_rays.def_vmap

@@ -140,10 +140,10 @@ def fill_voxels(
     low[0], high[0] = -half, half
     count = np.maximum(np.ceil((high - low) / np.asarray(cell)), 1).astype(int)
     size = (high - low) / count
-    return _listed(parts, low, size, count)
+    return _list_triangles(parts, low, size, count)
 
 
-def _listed(parts: list[np.ndarray], low: np.ndarray, cell: np.ndarray, count: np.ndarray) -> Voxels:
+def _list_triangles(parts: list[np.ndarray], low: np.ndarray, cell: np.ndarray, count: np.ndarray) -> Voxels:
     """List the triangles of every voxel of all blocks."""
     code, lengths, members = np.empty((len(parts), *count), np.int32), [], []
     lists = triangles = 0
@@ -219,7 +219,7 @@ def _meets(
 class Relief:
     """Every triangle of a bore's surface, in voxels that follow its axis.
 
-    Two reliefs whose arrays have the same shapes share one compiled program; see `Relief.padded`.
+    Two reliefs whose arrays have the same shapes share one compiled program; see `Relief.pad_to`.
 
     Attributes:
         length: Length of the axis, m.
@@ -289,7 +289,7 @@ class Relief:
             **_arrays(voxels),
         )
 
-    def padded(self, other: "Relief") -> "Relief":
+    def pad_to(self, other: "Relief") -> "Relief":
         """Pad the arrays to at least another relief's sizes; two reliefs padded by each other agree in shape."""
 
         def grown(mine: Array, theirs: Array, fill: int | None) -> Array:

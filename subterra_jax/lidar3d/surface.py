@@ -65,7 +65,7 @@ class ScenePart(NamedTuple):
     triangles: Triangles
 
 
-def joined(parts: list[Triangles]) -> Triangles:
+def join_surfaces(parts: list[Triangles]) -> Triangles:
     """Join several surfaces into one."""
     before = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + offset for part, offset in zip(parts, before, strict=False)]
@@ -125,7 +125,7 @@ def read_scene(folder: Path, lining: str = "pockets", leave_out: tuple[str, ...]
     smooth = lining == "smooth"
     parts = scene_parts(folder / SCENES[lining], (*leave_out, *(LINING_KINDS if smooth else ())))
     meshes = [part.triangles for part in parts]
-    return joined([*meshes, read_mesh(folder / "meshes" / "lining_smooth.ply")] if smooth else meshes)
+    return join_surfaces([*meshes, read_mesh(folder / "meshes" / "lining_smooth.ply")] if smooth else meshes)
 
 
 def scene_parts(path: Path, leave_out: tuple[str, ...] = ()) -> list[ScenePart]:

@@ -15,11 +15,11 @@ from subterra_jax.native.lanes import (
     bits,
     following,
     from_bits,
+    lane_numbers,
     least,
     load,
     load_some,
     magnitude,
-    numbered,
     root,
     store,
     where,
@@ -63,7 +63,7 @@ def look_around(box, first, n_scan, x, y, near, width, bound):
     pad = (width - n_scan) // 2
     for group in range(width // N_LANES):
         number = group * N_LANES - pad
-        there = (numbered() >= _I(-number)) & (numbered() < _I(n_scan - number))
+        there = (lane_numbers() >= _I(-number)) & (lane_numbers() < _I(n_scan - number))
         block, lane = first + number, group * N_LANES
         m_x = where(there, load_some(box, block, there) - x, _FAR)
         m_y = where(there, load_some(box, n_blocks + block, there) - y, _FAR)
@@ -111,14 +111,14 @@ def meet(wall, n_vertices, block, d_x, d_y, m_x, m_y):
     joint = _JOINT * (_ONE + abs(middle_ahead))
     nearest = _NOTHING
     for vertex in range(0, n_vertices - 1, N_LANES - 1):
-        there = numbered() < _I(n_vertices - vertex)
+        there = lane_numbers() < _I(n_vertices - vertex)
         x = load_some(wall, start + vertex, there)
         y = load_some(wall, start + n_vertices + vertex, there)
         a, a_ahead = middle_left + (d_x * y - d_y * x), middle_ahead + (d_x * x + d_y * y)
         b, b_ahead = following(a), following(a_ahead)
         rises = a < b
         low, high = where(rises, a, b), where(rises, b, a)
-        meets = (low <= joint) & (high >= -joint) & (numbered() < _I(min(n_vertices - vertex, N_LANES) - 1))
+        meets = (low <= joint) & (high >= -joint) & (lane_numbers() < _I(min(n_vertices - vertex, N_LANES) - 1))
         share = a / where(a == b, _ONE, a - b)
         share = where(share < _ZERO, _ZERO, share)
         share = where(share > _ONE, _ONE, share)
@@ -178,7 +178,7 @@ def cast_line(d_x, d_y, limit, both, origin, near, width, bound, wall, n_vertice
         crosses = beside <= size + load(near, 4 * width + lane)
         between = to_face <= _ZERO
         distance = where(between, _ZERO, to_face) * _LESS / (size + _TINY)
-        key = (bits(distance) & _I(-N_LANES)) | numbered()
+        key = (bits(distance) & _I(-N_LANES)) | lane_numbers()
         key = where(crosses, key, _NOTHING)
         keys = where((facing > _ZERO) | between, key, _NOTHING)
         ahead = nearest_hit(keys, ahead, lane, block, near, width, wall, n_vertices, d_x, d_y)
@@ -236,7 +236,7 @@ def distance_squared(wall, n_vertices, block, m_x, m_y):
     """Return the bits of the squared distance to a block's nearest segment, m²; its middle is at `m_x`, `m_y`."""
     start, nearest = block * 2 * n_vertices, _NOTHING
     for vertex in range(0, n_vertices - 1, N_LANES - 1):
-        there = numbered() < _I(n_vertices - vertex)
+        there = lane_numbers() < _I(n_vertices - vertex)
         x = m_x + load_some(wall, start + vertex, there)
         y = m_y + load_some(wall, start + n_vertices + vertex, there)
         edge_x, edge_y = following(x) - x, following(y) - y
@@ -246,7 +246,7 @@ def distance_squared(wall, n_vertices, block, m_x, m_y):
         share = where(share < _ZERO, _ZERO, share)
         share = where(share > _ONE, _ONE, share)
         near_x, near_y = x + share * edge_x, y + share * edge_y
-        is_segment = numbered() < _I(min(n_vertices - vertex, N_LANES) - 1)
+        is_segment = lane_numbers() < _I(min(n_vertices - vertex, N_LANES) - 1)
         nearest = min(nearest, least(where(is_segment, bits(near_x * near_x + near_y * near_y), _NOTHING)))
     return nearest
 
@@ -272,14 +272,14 @@ def clearance_rows(begin, end, first, position, box, wall, n_vertices, reach, n_
     for row in range(begin, end):
         best = bits(reach * reach)
         for number in range(0, n_contact, N_LANES):
-            there = numbered() < _I(n_contact - number)
+            there = lane_numbers() < _I(n_contact - number)
             block = np.intp(first[row]) + number
             m_x = load_some(box, block, there) - position[2 * row]
             m_y = load_some(box, n_blocks + block, there) - position[2 * row + 1]
             thickness, length = load_some(box, 4 * n_blocks + block, there), load_some(box, 5 * n_blocks + block, there)
             gap = root(m_x * m_x + m_y * m_y) * _LESS - length - thickness - _MARGIN
             gap = where(gap > _ZERO, gap, _ZERO)
-            keys = where(there, (bits(gap * gap) & _I(-N_LANES)) | numbered(), _NOTHING)
+            keys = where(there, (bits(gap * gap) & _I(-N_LANES)) | lane_numbers(), _NOTHING)
             while True:
                 key = least(keys)
                 if (key & _I(-N_LANES)) >= best:

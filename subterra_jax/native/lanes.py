@@ -132,7 +132,7 @@ def least(typing: Any, values: Any) -> Any:
 
 
 @intrinsic
-def numbered(typing: Any) -> Any:
+def lane_numbers(typing: Any) -> Any:
     """Return the number of each lane, 0 to 15."""
     return signature(INTS), lambda context, builder, sig, args: ir.Constant(INTS.vector, list(range(N_LANES)))
 

@@ -93,7 +93,7 @@ def plan(
     common = 0.5 * drawn.width + 0.5 * geometry.wander(wall_rng, at, drawn.width_sd, drawn.width_wave)
     distance = {side: common + geometry.wander(wall_rng, at, drawn.roughness, drawn.correlation) for side in _SIDES}
     smooth = {side: geometry.wall(alignment, sign, at, distance[side]) for side, sign in _SIDES.items()}
-    recessed = _recessed(alignment, drawn, at, distance, pocket_rng)
+    recessed = _cut_recesses(alignment, drawn, at, distance, pocket_rng)
     nothing = np.zeros((0, 4))
     variants = {
         "smooth": lambda: Lining(smooth["left"], smooth["right"], nothing),
@@ -123,7 +123,7 @@ def _streams(seed: int) -> list[np.random.Generator]:
     return [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(5)]
 
 
-def _recessed(
+def _cut_recesses(
     alignment: Alignment, drawn: Draw, at: np.ndarray, distance: dict[str, np.ndarray], rng: np.random.Generator
 ) -> dict[str, Wall]:
     """Cut the recesses into both walls."""

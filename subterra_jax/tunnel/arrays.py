@@ -69,7 +69,7 @@ def from_centreline(
             cut[side] = cut_pockets(plan.station, plan.half_width, middle - 0.5 * length, length, depth)
         linings["pockets"] = _offset_lining(plan, cut)
     plan.linings.update(linings)
-    return _checked(plan)
+    return _check_drivable(plan)
 
 
 def from_polylines(
@@ -124,7 +124,7 @@ def from_polylines(
                 f"{plan.half_width[at]:.2f} m, and the walls are {measured[at]:.2f} m from the centreline"
             )
     plan.linings[lining] = Lining(_wall(plan, "left", walls["left"]), _wall(plan, "right", walls["right"]), extra)
-    return _checked(plan)
+    return _check_drivable(plan)
 
 
 def cut_pockets(
@@ -295,7 +295,7 @@ def _crossings(
     return distance
 
 
-def _smoothed(values: Float[np.ndarray, " n"], spacing: float) -> Float[np.ndarray, " n"]:
+def _smooth(values: Float[np.ndarray, " n"], spacing: float) -> Float[np.ndarray, " n"]:
     """Return the median over `_UNEVEN` metres; values that are not finite are filled from their neighbours."""
     known = np.flatnonzero(np.isfinite(values))
     filled = np.interp(np.arange(len(values)), known, values[known])
@@ -325,7 +325,7 @@ def _midline(left: Float[np.ndarray, "k 2"], right: Float[np.ndarray, "m 2"]) ->
         tangent = np.gradient(line, axis=0)
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1) / np.linalg.norm(tangent, axis=1, keepdims=True)
         to_left, to_right = _reaches(line, normal, left, right)
-        line = line + _smoothed(0.5 * (to_left - to_right), spacing)[:, None] * normal
+        line = line + _smooth(0.5 * (to_left - to_right), spacing)[:, None] * normal
     return line
 
 
@@ -333,7 +333,7 @@ def _half_widths(plan: TunnelPlan, walls: dict[str, np.ndarray]) -> Float[np.nda
     """Return half the distance between two walls across the tunnel, m, with pockets smoothed out."""
     normal = np.stack([-plan.tangent[:, 1], plan.tangent[:, 0]], axis=-1)
     to_left, to_right = _reaches(plan.centre, normal, walls["left"], walls["right"])
-    return _smoothed(0.5 * (to_left + to_right), plan.station[1])
+    return _smooth(0.5 * (to_left + to_right), plan.station[1])
 
 
 def _reaches(
@@ -361,7 +361,7 @@ def _wall(plan: TunnelPlan, name: str, vertex: Float[np.ndarray, "k 2"]) -> Wall
     return Wall(vertex, np.maximum.accumulate(station))
 
 
-def _checked(plan: TunnelPlan) -> TunnelPlan:
+def _check_drivable(plan: TunnelPlan) -> TunnelPlan:
     """Return the plan itself if a robot can drive along it.
 
     Raises:

@@ -22,7 +22,7 @@ _REPEATED = 1e-9  # m between vertices that are one
 _CHUNK = 256  # pieces at a time, so that intermediates stay in the cache
 
 
-def lidded(
+def add_lids(
     vertex: Float[np.ndarray, "n k 2"], count: Int[np.ndarray, " n"], inward: Float[np.ndarray, " n"]
 ) -> tuple[Float[np.ndarray, "n k 2"], Int[np.ndarray, " n"]]:
     """Return the inner hulls of pieces of wall, with pockets and hollows closed by lids.
@@ -187,7 +187,7 @@ class _Pieces:
     inward: Float[np.ndarray, " n"]
 
 
-def _joined(parts: list[_Pieces]) -> _Pieces:
+def _join(parts: list[_Pieces]) -> _Pieces:
     """Join the pieces of several polylines in order of station."""
     shift = np.cumsum([0, *(len(part.vertex) for part in parts)])
     station = np.concatenate([part.station for part in parts])
@@ -268,15 +268,15 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
     ]
     if len(lining.furniture):
         parts.append(_furniture_pieces(plan, lining.furniture, max_segments))
-    pieces = _joined(parts)
+    pieces = _join(parts)
     count = pieces.last - pieces.first + 1
     place = np.minimum(pieces.first[:, None] + np.arange(count.max()), pieces.last[:, None])
     vertex = pieces.vertex[place]
-    centre, half, thickness = thin_boxes(*lidded(vertex, count, pieces.inward))
+    centre, half, thickness = thin_boxes(*add_lids(vertex, count, pieces.inward))
     return Blocks(centre, half, thickness, offset=vertex - centre[:, None, :], station=pieces.station)
 
 
-def padded(blocks: Blocks, count: int) -> Blocks:
+def pad(blocks: Blocks, count: int) -> Blocks:
     """Pad to at least `count` blocks with points too far away to be seen, in boxes that nothing enters."""
     missing = max(0, count - len(blocks.centre))
     return Blocks(

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, padded, separation, windows
+from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, separation, windows
 from subterra_jax.tunnel.plan import TunnelPlan
 
 CONTACT_REACH = 0.8
@@ -126,7 +126,7 @@ class Tunnel:
         scan_first, n_scan = windows(plan, blocks, reach)
         n_scan = 2 * max(-(-n_scan // 2), separation(blocks, reach))
         # A slice beyond the end would start earlier than asked for.
-        blocks = padded(blocks, int(scan_first.max()) + n_scan)
+        blocks = pad(blocks, int(scan_first.max()) + n_scan)
         contact_first, n_contact = windows(plan, blocks, CONTACT_REACH)
         half_length = np.linalg.norm(blocks.half, axis=1)
         grid = np.concatenate([plan.centre, plan.tangent, plan.half_width[:, None]], axis=1)
@@ -237,7 +237,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         return tunnels[0]
     n_scan, n_contact = max(t.n_scan for t in tunnels), max(t.n_contact for t in tunnels)
     n_vertices = max(t.wall.shape[2] for t in tunnels)
-    parts = [_padded(t, n_scan, n_contact, n_vertices) for t in tunnels]
+    parts = [_pad(t, n_scan, n_contact, n_vertices) for t in tunnels]
     n_blocks, n_nodes = np.array([box.shape[1] for box, _ in parts]), np.array([t.grid.shape[0] for t in tunnels])
     first_block, first_node = (np.concatenate([[0], np.cumsum(n)[:-1]]).astype(np.int32) for n in (n_blocks, n_nodes))
     put = jax.device_put  # `jnp.asarray` would compile a program for each new shape
@@ -263,7 +263,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     )
 
 
-def _padded(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
     """Return box and wall of a tunnel, padded so that none of its windows reaches beyond them."""
     box, wall = np.asarray(tunnel.box), np.asarray(tunnel.wall)
     # A beam that enters no box reads the block whose number has all bits set.

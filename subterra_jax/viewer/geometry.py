@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from subterra_jax.lidar3d.surface import LINING_KINDS, SCENES, ScenePart, joined, read_mesh, scene_parts
+from subterra_jax.lidar3d.surface import LINING_KINDS, SCENES, ScenePart, join_surfaces, read_mesh, scene_parts
 from subterra_jax.tunnel.plan import TunnelPlan, Wall
 from subterra_jax.viewer.recording import Recording
 
@@ -324,7 +324,7 @@ def scene_shapes(folder: Path, lining: str) -> list[Shape]:
         groups.setdefault((group, part.material), []).append(part)
     shapes = []
     for (group, material), parts in groups.items():
-        surface = joined([part.triangles for part in parts])
+        surface = join_surfaces([part.triangles for part in parts])
         colour = _colour(parts[0])
         shapes.append(Shape(f"{group} {material}", surface.vertices, surface.faces, colour, group != "lining", group))
     return shapes

@@ -50,7 +50,7 @@ def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
         return np.array([[0.0, 0.0], [0.5, 0.0], [0.5, depth], [1.5, depth], [1.5, 0.0], [2.0, 0.0]])
 
     pieces = np.stack([wall(0.13), wall(1.0), wall(0.13)])
-    hull, size = blocks.lidded(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
+    hull, size = blocks.add_lids(pieces, np.full(3, 6), np.array([-1.0, -1.0, 0.0]))
     assert size.tolist() == [2, 6, 6]
     np.testing.assert_array_equal(hull[0, :2], [[0.0, 0.0], [2.0, 0.0]])
 

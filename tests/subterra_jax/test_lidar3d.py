@@ -53,11 +53,11 @@ def reliefs(bend):
     things = (surfaces.box((20.0, 0.5, -1.0), (0.25, 0.2, 0.3)), surfaces.box((35.0, 0.0, 0.0), (0.02, 0.02, 1.9)))
     made = [relief_of(axis, round_tube), relief_of(axis, surfaces.together(round_tube, *things)), relief_of(*bend)]
     for _ in range(2):
-        made = [one.padded(other) for one in made for other in [max(made, key=lambda r: r.n_bytes)]]
+        made = [one.pad_to(other) for one in made for other in [max(made, key=lambda r: r.n_bytes)]]
     sizes = made[0]
     for other in made[1:]:
-        sizes = sizes.padded(other)
-    return dict(zip(("tube", "things", "bend"), (one.padded(sizes) for one in made), strict=True))
+        sizes = sizes.pad_to(other)
+    return dict(zip(("tube", "things", "bend"), (one.pad_to(sizes) for one in made), strict=True))
 
 
 def random_directions(rng: np.random.Generator, *shape: int) -> np.ndarray:
