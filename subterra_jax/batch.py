@@ -8,11 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax import lidar
-from subterra_jax.env import Info
+from subterra_jax.env import Env, Info
 
-# `TunnelEnv` and what belongs to it, or another environment with the same parts: the walking robot's, say.
-Env: TypeAlias = Any
+# Those of a `TunnelEnv`, or of another `Env`: the walking robot's, say.
 EnvParams: TypeAlias = Any
 State: TypeAlias = Any
 StepNoise: TypeAlias = Any
@@ -90,7 +88,7 @@ class AutoReset:
         The fused kernels take all scans in one go and skip those that nobody wants, of environments that have not
         finished.
         """
-        if hasattr(params, "lidar") and lidar.skips_unwanted(params.lidar):
+        if self.env.skips_unwanted(params):
             twice = lambda one, other: jnp.concatenate([one, other])  # noqa: E731
             both_states, both_noises = jax.tree.map(twice, (merged, noise), (stepped, noise))
             both_params = self._of_batched(params, lambda leaf: twice(leaf, leaf))

@@ -1,8 +1,10 @@
 """A plain picture of a robot in its tunnel, drawn with NumPy: no display, no GL."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from subterra_jax.obstacles import Boxes
+from subterra_jax.parts.boxes import Boxes
 from subterra_jax.tunnel import Tunnel
 
 BACKGROUND = (250, 250, 248)
@@ -39,10 +41,10 @@ def _along(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
     return start[owner] + share * (end[owner] - start[owner])
 
 
-def _filled(boxes: Boxes, position: np.ndarray, view: float, step: float) -> np.ndarray:
+def _filled(boxes: Sequence[Boxes], position: np.ndarray, view: float, step: float) -> np.ndarray:
     """Points all over the boxes that may be seen."""
     points = [np.zeros((0, 2))]
-    for centre, axis, half in zip(boxes.centre, boxes.axis, boxes.half, strict=True):
+    for centre, axis, half in (side for of in boxes for side in zip(of.centre, of.axis, of.half, strict=True)):
         if np.abs(centre - position).max() < view:
             along, across = (np.arange(-side, side, step) for side in half)
             u, v = (part.reshape(-1, 1) for part in np.meshgrid(along, across))
@@ -59,7 +61,7 @@ def top_down(
     view: float = 24.0,
     size: int = 480,
     goal: np.ndarray | None = None,
-    boxes: Boxes | None = None,
+    boxes: Sequence[Boxes] = (),
 ) -> np.ndarray:
     """The robot from above, in the middle of the picture, x to the right and y up.
 
@@ -92,7 +94,7 @@ def top_down(
     if goal is not None and len(goal):
         for shift in (0.0, 1.0 / scale):
             paint(_along(goal[:1] + shift, goal[1:] + shift, 0.5 / scale), GOAL)
-    if boxes is not None:
+    if boxes:
         paint(_filled(boxes, position, view, 0.5 / scale), BOX)
     # Twice, half a pixel apart, so that walls are two pixels wide.
     for shift in (0.0, 0.6 / scale):

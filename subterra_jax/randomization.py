@@ -81,17 +81,26 @@ def _find(params: EnvParams, name: str) -> Array:
         here = ".".join(path[:depth]) or "the params"
         if node is None:
             raise ValueError(f"no {name!r} to randomise: this task has no {here}")
-        fields = {f.name: f for f in dataclasses.fields(node)} if dataclasses.is_dataclass(node) else {}
+        fields = _fields(node)
         if part not in fields:
             raise ValueError(f"no {name!r} to randomise: {here} has {', '.join(fields) or 'no parts'}")
         if depth == 0 and part == "tunnel":
             raise ValueError(f"{name!r} cannot be randomised: the tunnel is one for all; stack several instead")
-        if not fields[part].metadata.get("pytree_node", True):
+        if not fields[part]:
             raise ValueError(f"{name!r} cannot be randomised: it is static, because the shape of arrays depends on it")
         node = getattr(node, part)
     if node is None or dataclasses.is_dataclass(node):
         raise ValueError(f"{name!r} is no number" if node is not None else f"this task has no {name!r} to randomise")
     return jnp.asarray(node)
+
+
+def _fields(node: Any) -> dict[str, bool]:
+    """Names in a part of the params, and whether each is data; a static one fixes the shape of arrays."""
+    if isinstance(node, EnvParams):
+        return dict.fromkeys(("tunnel", "horizon", *node.parts), True)
+    if not dataclasses.is_dataclass(node):
+        return {}
+    return {field.name: field.metadata.get("pytree_node", True) for field in dataclasses.fields(node)}
 
 
 def _bounds(name: str, wanted: Range, leaf: Array) -> tuple[int | float, int | float]:
@@ -144,4 +153,4 @@ def _replaced(node: Any, path: list[str], value: Any) -> Any:
     """A tree of dataclasses with one part exchanged."""
     if len(path) > 1:
         value = _replaced(getattr(node, path[0]), path[1:], value)
-    return dataclasses.replace(node, **{path[0]: value})
+    return node.replace(**{path[0]: value})

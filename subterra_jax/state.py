@@ -1,120 +1,77 @@
-"""What describes an environment: params (what the task is), state (what changes) and the random numbers of a call.
+"""Params (what a task is) and state (what changes) of an environment: a few fields of its own, and those of its parts.
 
-A part that a task does not have is None in params, state and noise alike, and costs nothing.
+`params.lidar`, `state.odometry`: what a part has is read by its name, like a field.
 """
 
-from flax import struct
-from jaxtyping import Array, Float, Int, UInt32
+from __future__ import annotations
 
-from subterra_jax.faults import FaultParams, FaultState
-from subterra_jax.lidar import LidarParams
-from subterra_jax.obstacles import ObstacleParams
-from subterra_jax.odometry import OdometryParams, OdometryState
-from subterra_jax.reward import GoalRewardParams, RewardParams
-from subterra_jax.slip import SlipParams, SlipState
+import dataclasses
+from functools import partial
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float, Int
+
 from subterra_jax.tunnel import Tunnel
-from subterra_jax.vehicle import VehicleParams
 
 
-@struct.dataclass
-class StartParams:
-    """Where an episode begins.
+class _Named:
+    """Fields, and named parts in the field `parts` that are read like fields."""
 
-    Attributes:
-        station: Station of the start, m; 0 is the mouth.
-        lateral: Largest offset from the centreline to either side, m; drawn uniformly.
-        heading: Largest angle to the centreline to either side, rad; drawn uniformly.
-        station_sigma: Standard deviation of the true start about `station`, m, cut off at three of them. Only tasks
-            with a goal draw it; `odometry` reads 0 there all the same.
-    """
+    parts: dict[str, Any]
 
-    station: float = 0.0
-    lateral: float = 0.5
-    heading: float = 0.1
-    station_sigma: float = 0.0
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "parts":
+            raise AttributeError(name)
+        try:
+            return self.parts[name]
+        except KeyError:
+            raise AttributeError(f"{type(self).__name__} has no {name!r}; its parts are {sorted(self.parts)}") from None
 
+    def replace(self, **updates: Any) -> Any:
+        """Return a copy with other fields, or other parts of names that are there.
 
-@struct.dataclass
-class GoalParams:
-    """What is to be reached, and what counts as having reached it.
-
-    Attributes:
-        low: Least chainage of a goal, m.
-        high: Largest chainage of a goal, m.
-        margin: Goals, and starts anywhere, keep this far from the ends of the tunnel, m; it comes before `low`.
-        tolerance: Largest error of success, m.
-        still_speed: A robot slower than this stands, m/s,
-        still_yaw: unless it turns faster than this, rad/s: to turn on the spot is not to stop.
-        still_steps: Standing for so many steps is a stop, which ends the episode.
-        flag_reach: The flag is raised within this distance of the goal, m.
-        travel_max: Distance after which a robot that has not reported has failed, m.
-    """
-
-    low: float = 60.0
-    high: float = 320.0
-    margin: float = 5.0
-    tolerance: float = 1.0
-    still_speed: float = 0.05
-    still_yaw: float = 0.5
-    still_steps: int = 10
-    flag_reach: float = 2.0
-    travel_max: float = 120.0
+        Raises:
+            ValueError: There is no such field or part.
+        """
+        own = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
+        if unknown := set(updates) - own - set(self.parts):
+            raise ValueError(
+                f"no {sorted(unknown)} in {type(self).__name__}; there are {sorted(own | set(self.parts))}"
+            )
+        fields = {name: value for name, value in updates.items() if name in own}
+        parts = {name: value for name, value in updates.items() if name not in own}
+        if parts:
+            fields["parts"] = {**fields.get("parts", self.parts), **parts}
+        return dataclasses.replace(self, **fields)  # type: ignore[type-var]
 
 
-@struct.dataclass
-class GoalState:
-    """The goal of one episode, and how far it has come.
-
-    Attributes:
-        station: Chainage of the goal, m.
-        still: Steps that the robot has stood.
-        start: True chainage of the start, m, where one is to return to it.
-        flag: 1 once the goal has been reached, else 0, where one is to return.
-        travelled: True distance driven, m, where that is limited.
-    """
-
-    station: Float[Array, ""]
-    still: Int[Array, ""]
-    start: Float[Array, ""] | None = None
-    flag: Float[Array, ""] | None = None
-    travelled: Float[Array, ""] | None = None
-
-
-@struct.dataclass
-class EnvParams:
+@partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["errand"])
+@dataclasses.dataclass(frozen=True)
+class EnvParams(_Named):
     """Everything about a task that is data. Every leaf may be vmapped.
 
     Attributes:
-        tunnel: The tunnel, or several of which each episode draws one.
-        vehicle: The robot.
-        lidar: The LiDAR.
-        odometry: The odometer.
-        reward: Weights of the reward's terms.
-        start: Where an episode begins.
-        goal_coverage: Share of the tunnel to cover for success, where coverage is the task.
+        tunnel: Tunnel, or a stack of tunnels of which each episode draws one.
         horizon: Steps after which an episode is truncated.
-        slip: Slip of the plant.
-        goal: What is to be reached.
-        obstacles: Boxes on the way.
-        faults: Faults that come and go.
+        parts: Params of the robot, of each part and of the rule, by name: `vehicle`, `lidar`, `odometry`, `start`,
+            `reward` and what the task adds.
+        errand: What an agent is asked to do: `cover`, `stop`, `return` or `report`. Static.
     """
 
     tunnel: Tunnel
-    vehicle: VehicleParams
-    lidar: LidarParams
-    odometry: OdometryParams
-    reward: RewardParams | GoalRewardParams
-    start: StartParams
-    goal_coverage: float = 0.9
-    horizon: int = 3000
-    slip: SlipParams | None = None
-    goal: GoalParams | None = None
-    obstacles: ObstacleParams | None = None
-    faults: FaultParams | None = None
+    horizon: Any
+    parts: dict[str, Any]
+    errand: str = "cover"
 
 
-@struct.dataclass
-class State:
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["position", "heading", "station", "lateral", "furthest", "command", "steps", "tunnel", "parts"],
+    meta_fields=[],
+)
+@dataclasses.dataclass(frozen=True)
+class State(_Named):
     """State of one environment. It holds no key: randomness comes with each call.
 
     Attributes:
@@ -122,69 +79,19 @@ class State:
         heading: Heading in the tunnel frame, rad, in [-π, π].
         station: Station, m.
         lateral: Distance to the left of the centreline, m.
-        furthest: Furthest station reached so far, m.
+        furthest: Furthest station so far, m.
         command: Last command obeyed, m/s and rad/s.
-        odometry: The odometer.
         steps: Steps taken in this episode.
-        tunnel: Which tunnel, where there are several.
-        slip: Slip of the plant.
-        goal: The goal.
-        obstacles: Seed of the boxes.
-        faults: Faults.
+        tunnel: Number of the tunnel in a stack; 0 where there is one.
+        parts: States of the parts and, as `goal`, of the rule, by name.
     """
 
-    position: Float[Array, "2"]
+    position: Float[Array, 2]
     heading: Float[Array, ""]
     station: Float[Array, ""]
     lateral: Float[Array, ""]
     furthest: Float[Array, ""]
-    command: Float[Array, "2"]
-    odometry: OdometryState
+    command: Float[Array, 2]
     steps: Int[Array, ""]
-    tunnel: Int[Array, ""] | None = None
-    slip: SlipState | None = None
-    goal: GoalState | None = None
-    obstacles: UInt32[Array, ""] | None = None
-    faults: FaultState | None = None
-
-
-@struct.dataclass
-class ResetNoise:
-    """Random numbers of one reset.
-
-    Attributes:
-        start: Uniform in [-1, 1], for the lateral offset and the heading.
-        bias: Standard normal, for the odometer's biases.
-        tunnel: Uniform in [0, 1), where there are several tunnels.
-        slip: Standard normal, for the slip of the plant.
-        goal: Uniform in [0, 1), for the goal, the place and the direction of the start.
-        station: Standard normal, for the true start.
-        seed: Random bits: `obstacles`, then `faults`.
-        severity: Uniform in [0, 1).
-    """
-
-    start: Float[Array, "*batch 2"]
-    bias: Float[Array, "*batch n_bias"]
-    tunnel: Float[Array, "*batch"] | None = None
-    slip: Float[Array, "*batch 3"] | None = None
-    goal: Float[Array, "*batch 3"] | None = None
-    station: Float[Array, "*batch"] | None = None
-    seed: UInt32[Array, "*batch 2"] | None = None
-    severity: Float[Array, "*batch"] | None = None
-
-
-@struct.dataclass
-class StepNoise:
-    """Random numbers of one step.
-
-    Attributes:
-        odometry: Standard normal, for the odometer.
-        ranges: Standard normal, for the LiDAR.
-        slip: Standard normal, for the slip of the plant.
-        faults: Uniform in [0, 1), for what fails.
-    """
-
-    odometry: Float[Array, "*batch n_odometry"]
-    ranges: Float[Array, "*batch n_beams"]
-    slip: Float[Array, "*batch 1"] | None = None
-    faults: Float[Array, "*batch n_faults"] | None = None
+    tunnel: Int[Array, ""]
+    parts: dict[str, Any]

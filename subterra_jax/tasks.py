@@ -1,34 +1,34 @@
-"""The task table: a Gymnasium id gives an environment and its params."""
+"""The task table: a Gymnasium id gives an environment and its params; `register` adds a task of one's own."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import functools
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from subterra_jax import constants as c
 from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.env import TunnelEnv
-from subterra_jax.faults import FaultParams
 from subterra_jax.host.versions import no_task
-from subterra_jax.lidar import LidarParams
-from subterra_jax.obstacles import ObstacleParams
-from subterra_jax.odometry import OdometryParams
-from subterra_jax.reward import GoalRewardParams, RewardParams
-from subterra_jax.rules import Relocalise, Rule, StopAt, Traverse, TurnBack
-from subterra_jax.slip import SlipParams
-from subterra_jax.state import EnvParams, GoalParams, StartParams
+from subterra_jax.parts import Faults, Obstacles, Odometer, Part, PlanarLidar, Slip
+from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.wander import WanderParams
+from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
+from subterra_jax.rules.rule import ERRANDS
+from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.tunnel.blocks import LIDAR_GAP
 from subterra_jax.tunnel.sources import Source, resolve
-from subterra_jax.vehicle import VehicleParams
-from subterra_jax.wander import WanderParams
 
-SHORT_LENGTH = 60.0
-_SHORT_GOALS = {"low": 10.0, "high": 60.0, "margin": 5.0, "tolerance": 0.25}
+PLAIN: tuple[Part, ...] = (Odometer(), PlanarLidar())
+SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,52 +36,97 @@ class Task:
     """One row of the task table.
 
     Attributes:
-        rule: What it asks.
+        rule: Rule of the task.
         horizon: Steps after which an episode is truncated.
-        piece: Start and length of the piece of tunnel it happens in, m; None is the whole tunnel.
-        parts: Fields of `EnvParams` beside those that every task has.
+        piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
+        parts: Sensors, errors and obstacles, in the order in which they act.
+        params: Entries of `EnvParams` that differ from the defaults of parts and rule.
     """
 
     rule: Rule
     horizon: int
     piece: tuple[float, float] | None = None
-    parts: dict[str, Any] = dataclasses.field(default_factory=dict)
+    parts: tuple[Part, ...] = PLAIN
+    params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
-def _parts(start: StartParams | None = None, goal: dict[str, Any] | None = None, **further: Any) -> dict[str, Any]:
-    """What every task from T1 on has: slip, odometry that wanders, a goal and its reward."""
-    return {
-        "odometry": OdometryParams(wander=WanderParams(sigma=0.01), backward_bias_sigma=0.02),
-        "reward": GoalRewardParams(),
-        "slip": SlipParams(),
-        "goal": GoalParams(**(goal or {})),
-        **({} if start is None else {"start": start}),
-        **further,
-    }
+def _drifting(**params: Any) -> dict[str, Any]:
+    """Params of every task from T1 on: an odometer whose error wanders and depends on the direction."""
+    wander = WanderParams(sigma=c.ODOMETER_WANDER_SIGMA)
+    return {"odometry": OdometryParams(wander=wander, backward_bias_sigma=c.BACKWARD_BIAS_SIGMA), **params}
 
 
-# A goal of 60 m needs some tunnel behind it, and one who returns some behind the start.
-_SHORT = (0.0, SHORT_LENGTH + 5.0)
-_RETURN, _OFFSET = StartParams(station=5.0), StartParams(station=9.0, station_sigma=3.0)
+# A goal of 60 m needs some tunnel behind it; a return needs some behind the start.
+_SHORT = (0.0, c.SHORT_LENGTH + c.GOAL_MARGIN)
+_RETURN = StartParams(station=c.RETURN_START)
+_OFFSET = StartParams(station=c.OFFSET_START, station_sigma=c.OFFSET_SIGMA)
+_NEAR = GoalParams(low=c.SHORT_GOAL_LOW, high=c.SHORT_GOAL_HIGH, tolerance=c.SHORT_TOLERANCE)
+_NEAR_OFFSET = _NEAR.replace(low=c.SHORT_OFFSET_GOAL_LOW)  # type: ignore[attr-defined]
+_NEAR_REPORT = GoalParams(tolerance=c.SHORT_TOLERANCE, travel_max=c.SHORT_TRAVEL_MAX)
+_AMONG_BOXES, _FAULTED = (*SLIPPING, Obstacles()), (*SLIPPING, Faults())
 
 TASKS: dict[str, Task] = {
-    "Subterra/Traverse-v0": Task(Traverse(), 3000),
-    "Subterra/TraverseShort-v0": Task(Traverse(), 600, (0.0, SHORT_LENGTH)),
-    "Subterra/StopAt-v0": Task(StopAt(), 4000, parts=_parts()),
-    "Subterra/StopAtShort-v0": Task(StopAt(), 1000, _SHORT, _parts(goal=_SHORT_GOALS)),
-    "Subterra/StopAtOffset-v0": Task(StopAt(), 4000, parts=_parts(_OFFSET)),
-    "Subterra/StopAtOffsetShort-v0": Task(StopAt(), 1000, _SHORT, _parts(_OFFSET, {**_SHORT_GOALS, "low": 20.0})),
-    "Subterra/Return-v0": Task(TurnBack(), 8000, parts=_parts(_RETURN)),
-    "Subterra/ReturnShort-v0": Task(TurnBack(), 2000, _SHORT, _parts(_RETURN, _SHORT_GOALS)),
-    "Subterra/Obstructed-v0": Task(StopAt(), 4000, parts=_parts(obstacles=ObstacleParams())),
-    "Subterra/ObstructedShort-v0": Task(StopAt(), 1000, _SHORT, _parts(goal=_SHORT_GOALS, obstacles=ObstacleParams())),
-    "Subterra/Faulted-v0": Task(StopAt(), 4000, parts=_parts(faults=FaultParams())),
-    "Subterra/FaultedShort-v0": Task(StopAt(), 1000, _SHORT, _parts(goal=_SHORT_GOALS, faults=FaultParams())),
-    "Subterra/Relocalise-v0": Task(Relocalise(), 2000, parts=_parts()),
+    "Subterra/Traverse-v0": Task(Traverse(), c.HORIZON_TRAVERSE),
+    "Subterra/TraverseShort-v0": Task(Traverse(), c.HORIZON_TRAVERSE_SHORT, (0.0, c.SHORT_LENGTH)),
+    "Subterra/StopAt-v0": Task(StopAt(), c.HORIZON_STOP, None, SLIPPING, _drifting()),
+    "Subterra/StopAtShort-v0": Task(StopAt(), c.HORIZON_STOP_SHORT, _SHORT, SLIPPING, _drifting(goal=_NEAR)),
+    "Subterra/StopAtOffset-v0": Task(StopAt(), c.HORIZON_STOP, None, SLIPPING, _drifting(start=_OFFSET)),
+    "Subterra/StopAtOffsetShort-v0": Task(
+        StopAt(), c.HORIZON_STOP_SHORT, _SHORT, SLIPPING, _drifting(start=_OFFSET, goal=_NEAR_OFFSET)
+    ),
+    "Subterra/Return-v0": Task(TurnBack(), c.HORIZON_RETURN, None, SLIPPING, _drifting(start=_RETURN)),
+    "Subterra/ReturnShort-v0": Task(
+        TurnBack(), c.HORIZON_RETURN_SHORT, _SHORT, SLIPPING, _drifting(start=_RETURN, goal=_NEAR)
+    ),
+    "Subterra/Obstructed-v0": Task(StopAt(), c.HORIZON_STOP, None, _AMONG_BOXES, _drifting()),
+    "Subterra/ObstructedShort-v0": Task(StopAt(), c.HORIZON_STOP_SHORT, _SHORT, _AMONG_BOXES, _drifting(goal=_NEAR)),
+    "Subterra/Faulted-v0": Task(StopAt(), c.HORIZON_STOP, None, _FAULTED, _drifting()),
+    "Subterra/FaultedShort-v0": Task(StopAt(), c.HORIZON_STOP_SHORT, _SHORT, _FAULTED, _drifting(goal=_NEAR)),
+    "Subterra/Relocalise-v0": Task(Relocalise(), c.HORIZON_RELOCALISE, None, SLIPPING, _drifting()),
     "Subterra/RelocaliseShort-v0": Task(
-        Relocalise(), 1000, _SHORT, _parts(goal={"tolerance": 0.25, "travel_max": 40.0})
+        Relocalise(), c.HORIZON_RELOCALISE_SHORT, _SHORT, SLIPPING, _drifting(goal=_NEAR_REPORT)
     ),
 }
+BUILT_IN = tuple(TASKS)
+
+
+def register(
+    id: str,
+    rule: Rule,
+    *,
+    horizon: int,
+    piece: tuple[float, float] | None = None,
+    parts: Sequence[Part] = PLAIN,
+    params: Mapping[str, Any] | None = None,
+) -> None:
+    """Add a task, here and in Gymnasium. Adding it again under the same id replaces it.
+
+    Args:
+        id: Gymnasium id, `Namespace/Name-v0`.
+        rule: Rule of the task.
+        horizon: Steps after which an episode is truncated.
+        piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
+        parts: Parts in the order in which they act: `PLAIN`, `SLIPPING`, or parts of one's own.
+        params: Entries of `EnvParams` that differ from the defaults of parts and rule.
+
+    Raises:
+        ValueError: The id belongs to the benchmark, has another form, or the rule's errand is unknown.
+    """
+    if id in BUILT_IN or id in (WALK, *MISSIONS):
+        raise ValueError(f"{id} is a task of the benchmark; register yours under another id")
+    namespace, _, rest = id.partition("/")
+    if not (namespace and "-v" in rest and rest.rpartition("-v")[2].isdigit()):
+        raise ValueError(f"a task's id must read Namespace/Name-v0, got {id!r}")
+    if not isinstance(rule, Rule):
+        raise ValueError(f"{id}: rule must be a subterra_jax.rules.Rule, got {type(rule).__name__}")
+    if rule.errand not in ERRANDS:
+        raise ValueError(f"{id}: errand must be one of {', '.join(ERRANDS)}, {type(rule).__name__} has {rule.errand!r}")
+    TASKS[id] = Task(rule, horizon, piece, tuple(parts), dict(params or {}))
+    try:
+        from subterra_jax.adapters import registration
+    except ImportError:  # Gymnasium is not installed
+        return
+    registration.register()
 
 
 def make(
@@ -89,6 +134,7 @@ def make(
     tunnel: Source | Sequence[Source] = None,
     lining: str | None = None,
     estimates: bool = False,
+    parts: Sequence[Part] = (),
     **overrides: Any,
 ) -> tuple[Any, Any]:
     """Make an environment and its params.
@@ -103,13 +149,15 @@ def make(
             or the first where a tunnel has none.
         estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
             estimation track. It does not move the robot; `info` tells its error.
-        **overrides: Fields of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`.
+        parts: Further parts, as sensors of one's own; their entries stand at the end of the observation.
+        **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`.
 
     Returns:
         The static environment (a `TunnelEnv`), and params whose every leaf is an array (`EnvParams`).
 
     Raises:
-        ValueError: No such task, no such field, or a value that the simulator cannot honour.
+        ValueError: No such task, no such entry, parts that do not go together, or a value that the simulator cannot
+            honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
     if id == WALK:
@@ -123,35 +171,93 @@ def make(
     if id not in TASKS:
         raise ValueError(no_task(id, (*TASKS, WALK, *MISSIONS)))
     task = TASKS[id]
-    fields: dict[str, Any] = {
-        "vehicle": VehicleParams(),
-        "lidar": LidarParams(),
-        "odometry": OdometryParams(),
-        "reward": RewardParams(),
-        "start": StartParams(),
-        "horizon": task.horizon,
-        **task.parts,
+    env = TunnelEnv(id=id, rule=task.rule, parts=(*task.parts, *parts), estimates=estimates)
+    horizon = overrides.pop("horizon", task.horizon)
+    entries = collect_entries(env, {**task.params, **overrides})
+    _check_robot(entries)
+    reach = float(np.max(entries["lidar"].range_max))
+    params = make_params(env, resolve(tunnel, lining, task.piece, reach), horizon, entries)
+    env.check(params)
+    check_length(env, params)
+    return env, params
+
+
+def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """Gather the entries of `EnvParams` that motion, parts and rule of an environment read.
+
+    Args:
+        env: The environment.
+        overrides: Entries in place of the defaults.
+
+    Raises:
+        ValueError: An override names no entry, or is of another type than the entry.
+    """
+    entries: dict[str, Any] = {}
+    sources: list[Part | Rule] = [env.motion, *env.parts, env.rule]
+    for source in sources:
+        entries |= source.defaults()
+    if unknown := set(overrides) - set(entries):
+        raise ValueError(f"{env.id} has no {sorted(unknown)}; there are {sorted([*entries, 'horizon'])}")
+    for name, value in overrides.items():
+        wanted = type(entries[name])
+        if dataclasses.is_dataclass(entries[name]) and not isinstance(value, wanted):
+            raise ValueError(f"{name} must be {wanted.__name__} for {env.id}, got {type(value).__name__}")
+    return {**entries, **overrides}
+
+
+def make_params(env: TunnelEnv, tunnel: Any, horizon: Any, entries: Mapping[str, Any]) -> EnvParams:
+    """Make params whose every leaf is a 32-bit array; a weakly typed one would compile each function a second time."""
+    params = EnvParams(tunnel=tunnel, horizon=horizon, parts=dict(entries), errand=env.rule.errand)
+    return jax.tree.map(_as_array, params, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
+
+
+def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None) -> str:
+    """SHA-256 of the numbers that define the benchmark, or one task of it, whatever the tunnel.
+
+    Args:
+        env: An environment; None for all tasks of the benchmark with their default params.
+        params: Its params.
+    """
+    if env is None or params is None:
+        return _benchmark_digest()
+    return _digest(_figures(env, params))
+
+
+@functools.cache
+def _benchmark_digest() -> str:
+    return _digest({id: _figures(*_without_tunnel(id, TASKS[id])) for id in BUILT_IN})
+
+
+def _without_tunnel(id: str, task: Task) -> tuple[TunnelEnv, EnvParams]:
+    """Environment and params of a task in no tunnel."""
+    env = TunnelEnv(id=id, rule=task.rule, parts=task.parts)
+    return env, make_params(env, (), task.horizon, collect_entries(env, task.params))
+
+
+def _figures(env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
+    """The numbers of a task, and the names of what they belong to."""
+    leaves = jax.tree_util.tree_flatten_with_path({"horizon": params.horizon, **params.parts})[0]
+    numbers = {jax.tree_util.keystr(path): np.round(np.asarray(leaf, np.float64), 9).tolist() for path, leaf in leaves}
+    return {
+        "rule": type(env.rule).__name__,
+        "parts": [part.name for part in (env.motion, *env.parts)],
+        "beams": params.lidar.n_beams,
+        "numbers": numbers,
     }
-    known = {field.name for field in dataclasses.fields(EnvParams)} - {"tunnel"}
-    if unknown := set(overrides) - known:
-        raise ValueError(f"no field {sorted(unknown)} in EnvParams; there are {sorted(known)}")
-    fields.update(overrides)
-    _check(task.rule, fields)
-    reach = float(np.max(fields["lidar"].range_max))
-    params = EnvParams(tunnel=resolve(tunnel, lining, task.piece, reach), **fields)
-    _check_length(id, params)
-    return TunnelEnv(id=id, rule=task.rule, estimates=estimates), jax.tree.map(_as_array, params)
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _as_array(leaf: Any) -> jax.Array:
-    """A leaf of the params as a 32-bit array; a weakly typed one would compile each function a second time."""
     leaf = jnp.asarray(leaf)
     return leaf.astype(jnp.int32 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.float32)
 
 
-def _check(rule: Rule, fields: dict[str, Any]) -> None:
+def _check_robot(entries: Mapping[str, Any]) -> None:
     """Refuse, with the value, what the simulator would otherwise get silently wrong."""
-    n_beams, robot = fields["lidar"].n_beams, fields["vehicle"]
+    n_beams, robot = entries["lidar"].n_beams, entries["vehicle"]
     if n_beams < 1:
         raise ValueError(f"n_beams must be at least 1, got {n_beams}")
     if not np.all((np.asarray(robot.radius) > 0.0) & (np.asarray(robot.radius) <= CONTACT_REACH)):
@@ -161,16 +267,14 @@ def _check(rule: Rule, fields: dict[str, Any]) -> None:
             f"radius {robot.radius} m less one step of {robot.speed_max} m/s for {robot.period} s must leave "
             f"{LIDAR_GAP} m between LiDAR and walls"
         )
-    if rule.has_goal != (fields.get("goal") is not None):
-        raise ValueError(f"goal must {'be' if rule.has_goal else 'not be'} GoalParams for this task")
-    wanted = GoalRewardParams if rule.has_goal else RewardParams
-    if not isinstance(fields["reward"], wanted):
-        raise ValueError(f"reward must be {wanted.__name__} for this task, got {type(fields['reward']).__name__}")
 
 
-def _check_length(id: str, params: EnvParams) -> None:
-    """Refuse a tunnel in which the task has no room."""
-    shortest = float(np.min(np.asarray(params.tunnel.length)))
-    needed = 0.0 if params.goal is None else float(np.max(params.goal.low) + np.max(params.goal.margin))
+def check_length(env: TunnelEnv, params: EnvParams) -> None:
+    """Refuse a tunnel in which the task has no room.
+
+    Raises:
+        ValueError: The tunnel is too short.
+    """
+    shortest, needed = float(np.min(np.asarray(params.tunnel.length))), env.rule.least_length(params)
     if shortest < needed:
-        raise ValueError(f"{id} needs a tunnel of {needed:g} m, this one has {shortest:.1f} m")
+        raise ValueError(f"{env.id} needs a tunnel of {needed:g} m, this one has {shortest:.1f} m")

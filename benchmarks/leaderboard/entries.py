@@ -23,7 +23,6 @@ from subterra_jax.host.files import require_folder
 from subterra_jax.host.loading import file_digest, load_file, load_object, source_digest
 from subterra_jax.host.versions import no_task
 from subterra_jax.policies.files import TENSORS
-from subterra_jax.rules import StopAt
 from subterra_jax.tunnel.plan import TunnelPlan
 
 SCHEMA = "subterra.leaderboard-entry/1"
@@ -259,8 +258,8 @@ def make_entry(folder: Path, task: str, world: World, agent: str, episodes: int,
     if name.startswith(policies.PREFIX):
         policies.check_fits(driver, env, params, name)
     traits = {trait: bool(getattr(driver, trait)) for trait in TRAITS}
-    records = evaluate(env, params, driver, listed_episodes(task, params, episodes), batch)
-    plain = type(env.rule) is StopAt and params.obstacles is None and params.faults is None
+    records = evaluate(env, params, driver, listed_episodes(env, params, episodes), batch)
+    plain = env.rule.errand == "stop" and not {"obstacles", "faults"} & set(params.parts)
     bounds = stop_bounds(params) if plain else None
     content = {"inputs": inputs, "traits": traits, "bounds": bounds, "records": records.as_columns()}
     write_file(path, (json.dumps(content, allow_nan=False) + "\n").encode())

@@ -1,16 +1,15 @@
 """What `render` shows: the plan from above, or the scene through MuJoCo."""
 
+import functools
 from pathlib import Path
 from typing import Protocol
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
-from subterra_jax import obstacles
 from subterra_jax.drawing import top_down, wall_points
 from subterra_jax.env import TunnelEnv
+from subterra_jax.parts.boxes import Boxes
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.sources import tunnel_of
@@ -62,28 +61,25 @@ class TopView:
 
     def picture(self, env: TunnelEnv, params: EnvParams, state: State, obs: np.ndarray) -> np.ndarray:
         """See `View`."""
-        tunnel = params.tunnel if state.tunnel is None else params.tunnel.pick(int(state.tunnel))
-        boxes = None
-        if state.obstacles is not None:
-            seed, station = jnp.asarray(state.obstacles), jnp.asarray(state.station)
-            boxes = jax.device_get(_boxes_near(seed, station, tunnel, params.obstacles))
+        tunnel, fields = params.tunnel.pick(int(state.tunnel)), env.fields(params)
+        goal = float(obs[fields["goal"]][0]) if "goal" in fields else None
         return top_down(
             wall_points(tunnel, int(tunnel.scan_first[_node(tunnel, float(state.station))])),
             np.asarray(state.position, np.float64),
             float(state.heading),
             float(params.vehicle.radius),
-            obs[env.fields(params)["ranges"]],
-            goal=None if state.goal is None else _line_across(tunnel, float(state.goal.station)),
-            boxes=boxes,
+            obs[fields["ranges"]],
+            goal=None if goal is None else _line_across(tunnel, goal),
+            boxes=jax.device_get(_boxes_near(env, state, params)),
         )
 
     def close(self) -> None:
         """Nothing is held."""
 
 
-@jax.jit
-def _boxes_near(seed: Array, station: Array, tunnel: Tunnel, params: obstacles.ObstacleParams) -> obstacles.Boxes:
-    return obstacles.boxes_near(seed, station, obstacles.REACH, obstacles.N_SLOTS, tunnel, params)
+@functools.partial(jax.jit, static_argnums=0)
+def _boxes_near(env: TunnelEnv, state: State, params: EnvParams) -> list[Boxes]:
+    return env.boxes(state, params)
 
 
 def _node(tunnel: Tunnel, station: float) -> int:

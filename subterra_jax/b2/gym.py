@@ -56,12 +56,12 @@ class B2Env(SingleB2):
             self.env, self.params = missions.make(
                 task, tunnel, lining, scene=scene, policy=policy, odometer=odometer, engine="mujoco", **overrides
             )
-        self.walk = self.env.walk
+        self.walk = self.env.motion.walk
         self._ready()
 
     def walking(self) -> tuple[WalkState, WalkParams]:
         """State and parameters of the walking part."""
-        return self.state.walk, self.params.walk
+        return self.state.legs.walk, self.params.walk
 
 
 class B2WalkEnv(SingleB2):

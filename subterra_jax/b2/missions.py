@@ -1,6 +1,5 @@
 """The tasks that the B2 does on its legs, by id: an environment and its params."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,21 +8,21 @@ import jax.numpy as jnp
 from subterra_jax.b2 import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2 import policy as gaits
 from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
-from subterra_jax.b2.hierarchy import PERIODS, MissionEnv
-from subterra_jax.b2.mission import MissionParams
+from subterra_jax.b2.mission import PERIODS, LegOdometer, Legs, TrunkLidar
 from subterra_jax.b2.params import RandomisationParams, SensorParams
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.policy import WalkPolicy
-from subterra_jax.b2.tasks import as_arrays
 from subterra_jax.b2.tasks import make as make_walk
-from subterra_jax.lidar import LidarParams
+from subterra_jax.constants import DISTANCE_BIAS_SIGMA
+from subterra_jax.env import TunnelEnv
 from subterra_jax.lidar3d.relief import Relief
-from subterra_jax.odometry import OdometryParams
-from subterra_jax.reward import RewardParams
-from subterra_jax.rules import Traverse
-from subterra_jax.state import EnvParams, StartParams
+from subterra_jax.parts import Odometer
+from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.unicycle import VehicleParams
+from subterra_jax.rules import StartParams, Traverse
+from subterra_jax.state import EnvParams
+from subterra_jax.tasks import collect_entries, make_params
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.vehicle import VehicleParams
 
 TROT = "trot"  # the gait as it is written down, without a trained policy
 ENGINES = ("mjx", "mujoco")
@@ -47,7 +46,7 @@ def make(
     relief: Relief | None = None,
     walk: dict[str, Any] | None = None,
     **overrides: Any,
-) -> tuple[MissionEnv, MissionParams]:
+) -> tuple[TunnelEnv, EnvParams]:
     """Make a task of the B2 and its params.
 
     Args:
@@ -58,7 +57,7 @@ def make(
             `engine="mujoco"` the robot walks in `scene.xml` itself; the LiDAR sees all of its triangles.
         policy: The gait: a policy, its file or name, or `trot`.
         engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few.
-        odometer: As for `MissionEnv`.
+        odometer: `legs`, the robot's own; or `drift`, the model of the planar tasks applied to its true motion.
         relief: What the LiDAR sees; that of the scene where there is one, if left out.
         walk: Fields of `WalkParams` to replace.
         **overrides: Fields of `EnvParams` to replace.
@@ -83,23 +82,27 @@ def make(
         relief = relief or Relief.from_scene(scene, lining or "pockets")
         if engine == "mujoco":
             walker = SceneWalk.of(walker, Path(scene), lining)
+    trained = _gait(policy, walker.observation_size(walking))
+    own = {"walk": walking, "policy": trained, "relief": relief}
+    env = TunnelEnv(
+        id=id,
+        rule=Traverse(),
+        parts=(LegOdometer() if odometer == "legs" else Odometer(), TrunkLidar()),
+        motion=Legs(walker),
+    )
     fields: dict[str, Any] = {
         "vehicle": VEHICLE,
-        "lidar": LidarParams(fused=False),  # the kernels cast level beams only
-        "odometry": OdometryParams(distance_bias_sigma=0.0 if odometer == "legs" else 0.02),
-        "reward": RewardParams(),
+        "odometry": OdometryParams(distance_bias_sigma=0.0 if odometer == "legs" else DISTANCE_BIAS_SIGMA),
         "start": START,
-        "horizon": HORIZON,
     }
-    known_fields = {field.name for field in dataclasses.fields(EnvParams)} - {"tunnel", "slip", "obstacles", "faults"}
-    if unknown := set(overrides) - known_fields:
-        raise ValueError(f"no field {sorted(unknown)} in a task of the B2; there are {sorted(known_fields)}")
-    trained = _gait(policy, walker.observation_size(walking))
-    params = MissionParams(tunnel=walking.tunnel, **(fields | overrides), walk=walking, policy=trained, relief=relief)
-    told, period = PERIODS * physics.period, float(jnp.asarray(params.vehicle.period))
-    if abs(period - told) > 1e-6:
-        raise ValueError(f"the B2 is told every {told:g} s where to go, got period={period:g}")
-    return MissionEnv(id=id, rule=Traverse(), walk=walker, odometer=odometer), as_arrays(params)
+    if given := set(own) & set(overrides):
+        raise ValueError(f"{env.id} has no {sorted(given)} to replace; `walk=`, `policy=` and `relief=` make them")
+    horizon = overrides.pop("horizon", HORIZON)
+    params = make_params(env, walking.tunnel, horizon, collect_entries(env, {**fields, **own, **overrides}))
+    commanded, period = PERIODS * physics.period, float(jnp.asarray(params.vehicle.period))
+    if abs(period - commanded) > 1e-6:
+        raise ValueError(f"the B2 is told every {commanded:g} s where to go, got period={period:g}")
+    return env, params
 
 
 def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:

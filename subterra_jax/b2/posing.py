@@ -8,21 +8,20 @@ from jaxtyping import Array, Float
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import draws, observation
 from subterra_jax.b2.kinematics import compose, rotate, standing_pose, yaw_quaternion
-from subterra_jax.b2.mission import MissionParams
 from subterra_jax.b2.params import Body, WalkParams, WalkResetNoise, WalkState
+from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import State
-from subterra_jax.vehicle import wrap
 
 
-def stand(plane: State, noise: WalkResetNoise, params: MissionParams) -> WalkState:
-    """A robot that stands where a planar state says, on the sleepers, with no command.
+def stand(plane: State, noise: WalkResetNoise, walk: WalkParams) -> WalkState:
+    """Make a robot that stands where a planar state says, on the sleepers, with no command.
 
     Args:
         plane: Position, heading, station and lateral offset.
         noise: What else is drawn of the robot: how it is built, the clock of its gait, its first readings.
-        params: The task.
+        walk: The robot and its track.
     """
-    walk, track = params.walk, params.walk.track
+    track = walk.track
     anchor = jnp.argmin(jnp.abs(track.station - plane.station)).astype(jnp.int32)
     turned = track.quaternion[anchor]
     ahead = plane.station - track.station[anchor]

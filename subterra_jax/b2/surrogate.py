@@ -1,17 +1,17 @@
 """The walking robot as seen by who steers it: a planar one that obeys late and nods. Cheap enough to learn on."""
 
 import dataclasses
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
-from subterra_jax import vehicle
-from subterra_jax.env import Info, TunnelEnv
+from subterra_jax.env import TunnelEnv
 from subterra_jax.lidar import bearings
-from subterra_jax.state import EnvParams, State, StepNoise
+from subterra_jax.parts import Noise, PlanarLidar, Sight, Unicycle
+from subterra_jax.parts.unicycle import clip_action
+from subterra_jax.state import EnvParams, State
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,59 +51,62 @@ class Nod:
     height: float = 0.75
 
 
-@struct.dataclass(kw_only=True)
-class NodNoise(StepNoise):
-    """Random numbers of one step.
-
-    Attributes:
-        lean: Standard normal, for pitch and roll.
-    """
-
-    lean: Float[Array, "*batch 2"]
-
-
 @dataclasses.dataclass(frozen=True)
-class LaggedEnv(TunnelEnv):
-    """`TunnelEnv` whose robot follows its commands through two first-order lags, and whose LiDAR leans with its trunk.
+class LaggedWheels(Unicycle):
+    """A robot that follows its commands through two first-order lags.
 
-    `State.command` is what the robot is doing, so that the reward's jerk is that of its motion.
+    `State.command` is the motion of the robot, so that the reward's jerk is that of its motion.
 
     Attributes:
-        lag: Of the robot.
-        nod: Of its trunk.
+        lag: The lags.
     """
 
     lag: Lag = Lag()
+
+    def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
+        """Follow the clipped command, late."""
+        lag, period = self.lag, jnp.asarray(params.vehicle.period)
+        target = clip_action(action[:2], params.vehicle) * jnp.array([lag.speed_gain, lag.yaw_rate_gain])
+        share = 1.0 - jnp.exp(-period / jnp.array([lag.speed, lag.yaw_rate]))
+        return clip_action(state.command + share * (target - state.command), params.vehicle)
+
+
+@dataclasses.dataclass(frozen=True)
+class NoddingLidar(PlanarLidar):
+    """A planar LiDAR that leans with the trunk: beams that point down end on the ballast.
+
+    Attributes:
+        nod: How the trunk leans.
+    """
+
     nod: Nod = Nod()
 
-    def draw_step(self, key: PRNGKeyArray, batch: tuple[int, ...], params: EnvParams) -> NodNoise:
-        """Random numbers for one step of a batch; row i does not depend on the size of the batch."""
-        noise = super().draw_step(key, batch, params)
-        return NodNoise(**vars(noise), lean=jax.random.normal(jax.random.fold_in(key, 3), (*batch, 2)))
+    def normals(self, params: EnvParams) -> int:
+        """One for each beam, then pitch and roll."""
+        return super().normals(params) + 2
 
-    def observe(
-        self, state: State, noise: StepNoise, params: EnvParams, wanted: Bool[Array, ""] | bool = True
-    ) -> Float[Array, "n_obs"]:
-        """The observation of a state, in which beams that point down end on the ballast."""
-        assert isinstance(noise, NodNoise)
-        seen = super().observe(state, noise, params, wanted)
-        n_beams = params.lidar.n_beams
+    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        """Return noisy `ranges`, m."""
+        n_beams, nod = params.lidar.n_beams, self.nod
+        seen = super().observe(own, sight, Noise(noise.normal[:n_beams]), params)["ranges"]
         bearing = jnp.asarray(bearings(n_beams), jnp.float32)
-        pitch = self.nod.pitch + self.nod.pitch_sigma * noise.lean[0]
-        roll = self.nod.roll_sigma * noise.lean[1]
+        pitch = nod.pitch + nod.pitch_sigma * noise.normal[n_beams]
+        roll = nod.roll_sigma * noise.normal[n_beams + 1]
         sinking = jnp.sin(pitch) * jnp.cos(bearing) - jnp.sin(roll) * jnp.sin(bearing)
-        ground = jnp.where(sinking > 1e-3, self.nod.height / jnp.maximum(sinking, 1e-3), jnp.inf)
-        return seen.at[:n_beams].min(ground)
+        ground = jnp.where(sinking > 1e-3, nod.height / jnp.maximum(sinking, 1e-3), jnp.inf)
+        return {"ranges": jnp.minimum(seen, ground)}
 
-    def advance(
-        self, state: State, action: Float[Array, "n_action"], noise: StepNoise, params: EnvParams
-    ) -> tuple[State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
-        """Everything of a step but the scan; see `TunnelEnv.advance`."""
-        lag, period = self.lag, jnp.asarray(params.vehicle.period)
-        wanted = vehicle.clip_action(action[:2], params.vehicle) * jnp.array([lag.speed_gain, lag.yaw_rate_gain])
-        share = 1.0 - jnp.exp(-period / jnp.array([lag.speed, lag.yaw_rate]))
-        moving = state.command + share * (wanted - state.command)
-        return super().advance(state, jnp.concatenate([moving, action[2:]]), noise, params)
+
+def stand_in(env: TunnelEnv, lag: Lag = Lag(), nod: Nod = Nod()) -> TunnelEnv:
+    """Make the planar stand-in of the walking robot: the same task on wheels that lag, with a LiDAR that nods.
+
+    Args:
+        env: A planar task.
+        lag: Lags of the robot.
+        nod: How its trunk leans.
+    """
+    parts = tuple(NoddingLidar(nod) if part.name == PlanarLidar.name else part for part in env.parts)
+    return dataclasses.replace(env, motion=LaggedWheels(lag), parts=parts)
 
 
 def identify(commands: Float[np.ndarray, "n 2"], motions: Float[np.ndarray, "n 2"], period: float) -> Lag:

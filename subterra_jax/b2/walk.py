@@ -21,8 +21,8 @@ from subterra_jax.b2.params import (
 )
 from subterra_jax.b2.physics import BUMPER_RADIUS, BUMPERS, Physics
 from subterra_jax.env import Box, Info
+from subterra_jax.parts.unicycle import clearance
 from subterra_jax.tunnel import at_station
-from subterra_jax.vehicle import clearance
 
 N_ACTION = 12
 _STIFFNESS = np.tile(np.array([b2.JOINT[part].stiffness for part in b2.PARTS], np.float32), 4)
@@ -62,6 +62,11 @@ class WalkEnv:
         sizes = observation.field_sizes(self.privileged)
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
+    def skips_unwanted(self, params: WalkParams) -> bool:
+        """Tell that every observation is made."""
+        del params
+        return False
 
     def observation_space(self, params: WalkParams) -> Box:
         """Return the bounds of an observation: none."""

@@ -1,4 +1,4 @@
-"""What an agent is to the evaluation: how it remembers, what it sees, what it answers."""
+"""The contract of an agent: its memory, its inputs and its answer."""
 
 import dataclasses
 from typing import Any, Protocol
@@ -17,33 +17,35 @@ Action = Float[Array, "5"]
 
 @struct.dataclass
 class Observed:
-    """One observation, taken apart. A field that the task does not observe is None, which tells the tasks apart.
+    """One observation, taken apart. An entry that the task does not observe is 0; `params.errand` tells tasks apart.
 
     Attributes:
         flat: The observation itself.
         ranges: LiDAR ranges, m, the first straight ahead, the others counter-clockwise.
         distance: Dead-reckoned distance, m.
         heading: Dead-reckoned heading, rad, in [-π, π]; 0 at the start.
-        goal: Chainage of the goal, m.
+        goal: Station of the goal, m.
         ring_pitch: Distance between rings of the lining, m; 0 where there are none.
         flag: 1 once the goal has been reached, else 0.
+        entries: Every entry of the observation by name, those of parts from outside included.
     """
 
     flat: Float[Array, "n_obs"]
     ranges: Float[Array, "n_beams"]
     distance: Float[Array, ""]
     heading: Float[Array, ""]
-    goal: Float[Array, ""] | None = None
-    ring_pitch: Float[Array, ""] | None = None
-    flag: Float[Array, ""] | None = None
+    goal: Float[Array, ""] | float = 0.0
+    ring_pitch: Float[Array, ""] | float = 0.0
+    flag: Float[Array, ""] | float = 0.0
+    entries: dict[str, Array] = struct.field(default_factory=dict)
 
 
 class Agent(Protocol):
     """An agent: a `flax.struct.dataclass` without state, whose leaves are numbers and arrays (gains, a map, weights).
 
-    It is asked about one environment at a time, in pure JAX; the harness vmaps it. What it says it does not use it
-    does not get: without `uses_lidar` the ranges are NaN, without `uses_map` everything in `params.tunnel` but its
-    length and ring pitch is NaN, and only with `privileged` is `known` not None.
+    It is asked about one environment at a time, in pure JAX; whoever drives it vmaps it. An agent receives only the
+    inputs that it declares: without `uses_lidar` the ranges are NaN, without `uses_map` everything in `params.tunnel`
+    but its length and ring pitch is NaN, and only with `privileged` is `known` not None.
     """
 
     @property
@@ -91,26 +93,27 @@ class Agent(Protocol):
 
 
 def observed(env: TunnelEnv, params: EnvParams, flat: Float[Array, "n_obs"], sees: bool = True) -> Observed:
-    """An observation taken apart.
+    """Take an observation apart.
 
     Args:
         env: The environment that made it.
         params: The task.
         flat: The observation.
-        sees: Whether the ranges are shown; NaN otherwise.
+        sees: Show the ranges; NaN otherwise.
     """
-    parts = env.fields(params)
+    fields = env.fields(params)
     if not sees:
-        flat = flat.at[parts["ranges"]].set(jnp.nan)
-    further = {name: flat[parts[name]][0] for name in ("goal", "ring_pitch", "flag") if name in parts}
-    distance, heading = flat[parts["odometry"]]
-    return Observed(flat=flat, ranges=flat[parts["ranges"]], distance=distance, heading=heading, **further)
+        flat = flat.at[fields["ranges"]].set(jnp.nan)
+    entries = {name: flat[where] for name, where in fields.items()}
+    distance, heading = entries["odometry"]
+    further = {name: entries[name][0] for name in ("goal", "ring_pitch", "flag") if name in entries}
+    return Observed(flat, entries["ranges"], distance, heading, **further, entries=entries)
 
 
 def shown(params: EnvParams, sees_map: bool) -> EnvParams:
-    """The params as an agent gets them: without the map, every shape of the tunnel is NaN."""
+    """Return the params as an agent gets them: without the map, every shape of the tunnel is NaN."""
     if sees_map:
         return params
     tunnel = params.tunnel
     hidden: dict[str, Any] = {name: jnp.full_like(getattr(tunnel, name), jnp.nan) for name in ("grid", "box", "wall")}
-    return dataclasses.replace(params, tunnel=dataclasses.replace(tunnel, **hidden))
+    return params.replace(tunnel=dataclasses.replace(tunnel, **hidden))

@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax.lidar import LidarParams, bearings
-from subterra_jax.vehicle import VehicleParams, wrap
+from subterra_jax.parts.unicycle import VehicleParams, wrap
 
 _SIDEWAYS = 0.65  # beams whose sine is larger look at a wall, not along it
 _GATE = 0.5  # m; a hit further than this from where the wall is expected is not the wall

@@ -7,10 +7,10 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed
-from subterra_jax.baselines.drift import believed_start
+from subterra_jax.baselines.drift import believed_start, slip_sizes
 from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
-from subterra_jax.wander import WanderParams
 
 _S, _GAIN, _SLIP, _BIAS, _SCALE = range(5)
 _LEAST_STEP = 1e-3  # m; a shorter step tells nothing about scales
@@ -44,10 +44,10 @@ class FusedCount:
 
     def begin(self, obs: Observed, params: EnvParams) -> Belief:
         """The priors that the task states."""
-        start, start_sigma = believed_start(obs, params)
+        start, start_sigma = believed_start(params)
         sigmas = jnp.zeros(5).at[_S].set(start_sigma)
-        if params.slip is not None:
-            sigmas = sigmas.at[_GAIN].set(params.slip.gain_sigma).at[_SLIP].set(params.slip.wander.sigma)
+        slip = slip_sizes(params)
+        sigmas = sigmas.at[_GAIN].set(slip.gain_sigma).at[_SLIP].set(slip.wander.sigma)
         sigmas = sigmas.at[_BIAS].set(params.odometry.distance_bias_sigma)
         if params.odometry.wander is not None:
             sigmas = sigmas.at[_SCALE].set(params.odometry.wander.sigma)
@@ -68,7 +68,7 @@ class FusedCount:
         corrected = _corrected(belief, row, read, jnp.maximum(noise, 1e-10))
         belief = _where(step > _LEAST_STEP, corrected, belief)
         belief = _wandered(belief, step, params)
-        if obs.goal is not None and obs.flag is not None and params.goal is not None:
+        if params.errand == "return":
             at = obs.goal - driven.direction * params.goal.flag_reach
             fix = _corrected(belief, jnp.eye(5)[_S], at - belief.mean[_S], jnp.asarray(_FLAG_SIGMA**2))
             belief = _where(driven.flagged, fix, belief)
@@ -107,8 +107,7 @@ def _corrected(belief: Belief, row: Float[Array, "5"], innovation: Float[Array, 
 def _wandered(belief: Belief, step: Float[Array, ""], params: EnvParams) -> Belief:
     """After the wandering errors have gone on over a distance, m."""
     keep, added = jnp.ones(5), jnp.zeros(5)
-    slip = None if params.slip is None else params.slip.wander
-    for index, wander in ((_SLIP, slip), (_SCALE, params.odometry.wander)):
+    for index, wander in ((_SLIP, slip_sizes(params).wander), (_SCALE, params.odometry.wander)):
         if wander is not None:
             ratio, variance = _process(wander, step)
             keep, added = keep.at[index].set(ratio), added.at[index].set(variance)

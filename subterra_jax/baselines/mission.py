@@ -53,15 +53,16 @@ def wanted_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
     Args:
         mission: Where in the task.
         estimate: Where along the tunnel.
-        obs: The observation, which tells the tasks apart.
+        obs: The observation.
         params: The task.
     """
     speed_max = jnp.asarray(params.vehicle.speed_max)
-    if obs.goal is None:
-        # Coverage: go on. Relocalisation: stand and report.
-        return speed_max if obs.ring_pitch is None else jnp.zeros(())
+    if params.errand == "cover":
+        return speed_max
+    if params.errand == "report":
+        return jnp.zeros(())  # stand and report
     target = obs.goal
-    if obs.flag is not None:
+    if params.errand == "return":
         home = jnp.asarray(params.start.station, jnp.float32)
         # Out to the flag, wherever one believes the goal to be.
         target = jnp.where(mission.direction > 0.0, _FAR, home)
@@ -71,19 +72,19 @@ def wanted_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
 
 def arrived(mission: Mission, wanted: Float[Array, ""], driven: Float[Array, ""], params: EnvParams) -> Mission:
     """The mission after a command: the last period's command, if it is obeyed in full, is the arrival."""
-    if params.goal is None:
+    if params.errand == "cover":
         return mission
     there = (wanted < params.vehicle.speed_max) & (driven >= wanted) & ~turning(mission)
     return dataclasses.replace(mission, stopped=mission.stopped | there)
 
 
-def watch(mission: Mission, obs: Observed) -> tuple[Mission, Bool[Array, ""], Bool[Array, ""]]:
+def watch(mission: Mission, obs: Observed, params: EnvParams) -> tuple[Mission, Bool[Array, ""], Bool[Array, ""]]:
     """Look at the flag and at how far one has turned.
 
     Returns:
         The mission, whether the flag has just been raised, and whether the turn has just been finished.
     """
-    if obs.flag is None:
+    if params.errand != "return":
         no = jnp.zeros((), bool)
         return mission, no, no
     raised = (obs.flag > 0.5) & ~mission.flagged

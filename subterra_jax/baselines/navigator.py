@@ -73,7 +73,7 @@ class Navigator:
         """One control period."""
         del key
         steering = self.steering.look(memory.steering, obs, memory.command, params)
-        now, raised, done = mission.watch(memory.mission, obs)
+        now, raised, done = mission.watch(memory.mission, obs, params)
         driven = Driven(memory.command[0], self.steering.cosine(steering), memory.mission.direction, raised)
         steering = jax.tree.map(lambda new, old: jnp.where(done, new, old), self.steering.turned(steering), steering)
         estimate, localiser = self.localiser.update(memory.localiser, obs, driven, params, known)

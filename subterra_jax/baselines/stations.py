@@ -90,7 +90,7 @@ def _counted(memory: Count, step: Float[Array, ""], driven: Driven, reading: Flo
 
 def _start(obs: Observed, params: EnvParams) -> Count:
     zero = jnp.zeros(())
-    return Count(*drift.believed_start(obs, params), zero, zero, obs.distance)
+    return Count(*drift.believed_start(params), zero, zero, obs.distance)
 
 
 def _station(memory: Count, sigma: Float[Array, ""], driven: Driven) -> Station:

@@ -9,8 +9,8 @@ from jaxtyping import Array, Float
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.corridor import Corridor, first_look, look, moved, turned
 from subterra_jax.lidar import bearings
+from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
-from subterra_jax.vehicle import wrap
 
 
 class Steering(Protocol):

@@ -8,8 +8,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
-from subterra_jax.wander import WanderParams
 
 _STRETCH = 0.5  # m over which a wandering error is taken to be constant
 _GOALS = 200
@@ -25,8 +25,6 @@ def stop_bounds(params: EnvParams) -> dict[str, float]:
         `command`, `odometry` and `fused`, to the first order in the errors. `fused` is the most that anybody can have
         who knows the task's priors and sees no walls.
     """
-    assert params.goal is not None
-    assert params.slip is not None
     low = float(params.goal.low)
     high = max(low, min(float(params.goal.high), float(np.min(params.tunnel.length)) - float(params.goal.margin)))
     distance = low + (high - low) * (np.arange(_GOALS) + 0.5) / _GOALS - float(params.start.station)
@@ -65,7 +63,6 @@ def _fused(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.nda
 
     Its state is the station, the constant and the wandering slip, the constant and the wandering scale error.
     """
-    assert params.slip is not None
     slip, odometry = params.slip, params.odometry
     wanders = (None, None, slip.wander, None, odometry.wander)
     sigma = np.array([0.0, slip.gain_sigma, 0.0, odometry.distance_bias_sigma, 0.0])

@@ -8,9 +8,11 @@ from importlib import resources
 
 import numpy as np
 
-from subterra_jax.faults import N_SEVERITIES
+from subterra_jax.b2 import MISSIONS
+from subterra_jax.env import TunnelEnv
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
+from subterra_jax.tasks import TASKS
 
 SCHEMA = "subterra.evaluation/1"
 SHA256 = "4ec196147f6aa4d6f4b3c656cf6d169295718eff9c50046f31743f6de138baa2"
@@ -24,11 +26,11 @@ class EvaluationError(SubterraError):
 
 @dataclasses.dataclass(frozen=True)
 class Episodes:
-    """Episodes to drive. Everything random in one of them comes from its seed alone.
+    """Episodes to drive. Everything random in an episode comes from its seed alone.
 
     Attributes:
-        seed: One for each, `(n,)`.
-        tunnel: Which tunnel of a stack, `(n,)`; 0 where there is one.
+        seed: Seeds, `(n,)`.
+        tunnel: Number of the tunnel in a stack, `(n,)`; 0 where there is one.
         severity: Severity of the faults, `(n,)`; 0 where there are none.
         group: Stratum of the bootstrap, `(n,)`.
     """
@@ -43,15 +45,17 @@ class Episodes:
 
 
 def listed_seeds(task: str) -> np.ndarray:
-    """The 500 seeds of a task, `(500,)`.
+    """Return the 500 seeds of a task, `(500,)`; a task from outside the benchmark gets seeds by the same rule.
 
     Raises:
-        EvaluationError: The packaged list is not the one this code belongs to, or has no such task.
+        EvaluationError: The packaged list is not the one this code belongs to, or there is no such task.
     """
-    tasks = _listed()
-    if task not in tasks:
-        raise EvaluationError(f"the evaluation list has no task {task!r}; it has {', '.join(tasks)}")
-    return np.asarray(tasks[task], np.uint32)
+    listed = _listed()
+    if task in listed:
+        return np.asarray(listed[task], np.uint32)
+    if task not in TASKS and task not in MISSIONS:
+        raise EvaluationError(f"no task {task!r}; there are {', '.join(TASKS)}")
+    return draw_seeds(task)
 
 
 @functools.cache
@@ -63,13 +67,13 @@ def _listed() -> dict[str, list[int]]:
     return json.loads(data)["tasks"]
 
 
-def listed_episodes(task: str, params: EnvParams, n: int = N_LISTED) -> Episodes:
-    """The first `n` episodes of a task, evenly over severities and tunnels.
+def listed_episodes(env: TunnelEnv, params: EnvParams, n: int = N_LISTED) -> Episodes:
+    """Return the first `n` episodes of a task, evenly over severities and tunnels.
 
     Args:
-        task: Id of the task.
-        params: Its params: whether there are faults, and how many tunnels.
-        n: How many, 1 to 500.
+        env: The environment.
+        params: The task.
+        n: Number of episodes, 1 to 500.
 
     Returns:
         Episodes in `N_GROUPS` groups of neighbours (fewer where `n` is smaller), each of which has all severities
@@ -80,35 +84,28 @@ def listed_episodes(task: str, params: EnvParams, n: int = N_LISTED) -> Episodes
     """
     if not 1 <= n <= N_LISTED:
         raise EvaluationError(f"episodes must be 1 to {N_LISTED}, got {n}")
-    index = np.arange(n)
-    low, high = 0, 0
-    if params.faults is not None:
-        low, high = int(np.min(params.faults.severity_low)), int(np.max(params.faults.severity_high))
-        assert 0 <= low <= high < N_SEVERITIES
-    n_severities = high - low + 1
+    index, levels = np.arange(n), np.asarray(env.levels(params))
     return Episodes(
-        seed=listed_seeds(task)[:n],
-        tunnel=(index // n_severities % params.tunnel.count).astype(np.int32),
-        severity=(low + index % n_severities).astype(np.int32),
+        seed=listed_seeds(env.id)[:n],
+        tunnel=(index // len(levels) % params.tunnel.count).astype(np.int32),
+        severity=levels[index % len(levels)].astype(np.int32),
         group=(index * N_GROUPS // max(n, N_GROUPS)).astype(np.int32),
     )
 
 
-def draw_list(tasks: tuple[str, ...]) -> bytes:
-    """The list as its file holds it; a task's seeds depend on its name alone.
+def draw_seeds(task: str) -> np.ndarray:
+    """Draw the seeds of a task, `(500,)`; they depend on its name alone.
 
-    The seeds lie above 2³⁰, far from the small numbers that people train with.
+    They lie above 2³⁰, far from the small numbers that people train with.
     """
-    seeds = {
-        task: (2**30 + _hashed(task).choice(2**30, N_LISTED, replace=False, shuffle=True)).tolist() for task in tasks
-    }
+    digest = hashlib.sha256(f"{SCHEMA} {task}".encode()).digest()
+    generator = np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))
+    return (2**30 + generator.choice(2**30, N_LISTED, replace=False, shuffle=True)).astype(np.uint32)
+
+
+def draw_list(tasks: tuple[str, ...]) -> bytes:
+    """Write the list as its file holds it."""
     lines = ",\n".join(
-        f" {json.dumps(task)}: {json.dumps(of_task, separators=(',', ':'))}" for task, of_task in seeds.items()
+        f" {json.dumps(task)}: {json.dumps(draw_seeds(task).tolist(), separators=(',', ':'))}" for task in tasks
     )
     return f'{{"schema": "{SCHEMA}", "tasks": {{\n{lines}\n}}}}\n'.encode()
-
-
-def _hashed(task: str) -> np.random.Generator:
-    """A generator that belongs to a name."""
-    digest = hashlib.sha256(f"{SCHEMA} {task}".encode()).digest()
-    return np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from subterra_jax.env import TunnelEnv
 from subterra_jax.evaluation.episodes import Episodes
 from subterra_jax.state import EnvParams
 
@@ -93,13 +94,13 @@ class Records:
         return cls(**{name: np.array(values, kinds.get(name, float)) for name, values in columns.items()})
 
 
-def finished(tally: Any, episodes: Episodes, params: EnvParams) -> Records:
-    """Records from the `Tally` of finished episodes, fetched to the host."""
+def finished(tally: Any, episodes: Episodes, env: TunnelEnv, params: EnvParams) -> Records:
+    """Make records of the `Tally` of finished episodes, fetched to the host."""
     steps, period = np.maximum(tally.steps, 1), float(np.max(params.vehicle.period))
     travelled, found = tally.travelled.astype(float), tally.estimates
     per_metre = _over(np.ones(len(episodes)), travelled)
     pitch = np.broadcast_to(np.asarray(params.tunnel.ring_pitch), params.tunnel.count)[episodes.tunnel]
-    no_goal = params.goal is None
+    covers = env.rule.errand == "cover"
     error = found.error.astype(float)
     estimated = ~np.isnan(found.square)
     locked = estimated & (found.unlocked < tally.steps)
@@ -108,8 +109,8 @@ def finished(tally: Any, episodes: Episodes, params: EnvParams) -> Records:
         **dataclasses.asdict(episodes),
         success=tally.success,
         contact=tally.contact,
-        coverage=tally.coverage.astype(float) if no_goal else nothing,
-        progress=tally.progress.astype(float) if no_goal else nothing,
+        coverage=tally.coverage.astype(float) if covers else nothing,
+        progress=tally.progress.astype(float) if covers else nothing,
         spl=np.where(np.isnan(tally.way), np.nan, tally.success * _over(tally.way, np.maximum(tally.way, travelled))),
         travelled=travelled,
         contacts_per_100m=100.0 * tally.contact * per_metre,

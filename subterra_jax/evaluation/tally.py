@@ -1,4 +1,4 @@
-"""What the evaluation counts while an episode is driven, and what becomes of it at the end."""
+"""Running sums of an episode under evaluation."""
 
 import dataclasses
 
@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.env import Info, TunnelEnv
+from subterra_jax.env import TunnelEnv
+from subterra_jax.episode import Taken
 from subterra_jax.evaluation.estimates import EstimateTally, add_estimate, start_estimates
-from subterra_jax.rules import Relocalise, TurnBack
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import CONTACT_REACH
 
@@ -29,7 +29,8 @@ class Tally:
         contact: It ended at a wall or an obstacle.
         goal_error: Where it stood less where it should have (of what it reported less where it stood), m.
         coverage: Share of the tunnel covered when the episode was over.
-        progress: The same had it gone on to the far mouth.
+        progress: Share covered had the robot gone on to the far mouth.
+        over: The episode is over as published; what comes after only counts as progress.
         estimates: Scores of its estimate.
     """
 
@@ -45,16 +46,17 @@ class Tally:
     goal_error: Float[Array, ""]
     coverage: Float[Array, ""]
     progress: Float[Array, ""]
+    over: Bool[Array, ""]
     estimates: EstimateTally
 
 
-def start_tally(env: TunnelEnv, state: State, params: EnvParams) -> Tally:
-    """An episode before its first step."""
+def start_tally(env: TunnelEnv, state: State, here: EnvParams) -> Tally:
+    """Begin the sums of an episode; `here` are the params of its tunnel and severity."""
     zero, no = jnp.zeros(()), jnp.zeros((), bool)
     return Tally(
         steps=jnp.zeros((), jnp.int32),
         travelled=zero,
-        way=_way(env, state, params),
+        way=jnp.asarray(env.rule.shortest_way(state, here.tunnel, here), jnp.float32),
         offset=zero,
         lateral_square=zero,
         jerk=zero,
@@ -64,32 +66,24 @@ def start_tally(env: TunnelEnv, state: State, params: EnvParams) -> Tally:
         goal_error=jnp.full((), jnp.nan),
         coverage=zero,
         progress=zero,
+        over=no,
         estimates=start_estimates(),
     )
 
 
-def add_step(
-    tally: Tally,
-    before: State,
-    after: State,
-    estimate: Float[Array, "2"],
-    info: Info,
-    params: EnvParams,
-) -> Tally:
-    """One step more.
+def add_step(tally: Tally, taken: Taken, tolerance: Float[Array, ""], ring_pitch: Float[Array, ""]) -> Tally:
+    """Add one step.
 
     Args:
-        tally: So far.
-        before: State before the step.
-        after: State after it.
-        estimate: Estimated station (m; NaN from one who has none) and log of its standard deviation, as the agent said.
-        info: The step's info.
-        params: The task, in the tunnel that the robot is in.
+        tally: Sums so far.
+        taken: The step.
+        tolerance: Error up to which an estimate counts as right, m.
+        ring_pitch: Distance between rings, m; 0 where there are none.
     """
-    moved = after.position - before.position
-    change = jnp.abs(after.command - before.command)
+    info, estimate = taken.info, taken.action[2:4]
+    moved = taken.after.position - taken.before.position
+    change = jnp.abs(taken.after.command - taken.before.command)
     steps = tally.steps + 1
-    tolerance = jnp.asarray(1.0 if params.goal is None else params.goal.tolerance)
     error = jnp.where(jnp.isnan(estimate[0]), jnp.nan, info["estimate_error"])
     return dataclasses.replace(
         tally,
@@ -104,16 +98,6 @@ def add_step(
         goal_error=info.get("goal_error", tally.goal_error),
         coverage=info["coverage"],
         estimates=add_estimate(
-            tally.estimates, error, info["estimate_log_sigma"], steps, tolerance, params.tunnel.ring_pitch
+            tally.estimates, error, info["estimate_log_sigma"], steps, jnp.asarray(tolerance), ring_pitch
         ),
     )
-
-
-def _way(env: TunnelEnv, state: State, params: EnvParams) -> Float[Array, ""]:
-    """Shortest way to success, m: along the centreline."""
-    if state.goal is None:
-        return params.goal_coverage * params.tunnel.length - state.station
-    if isinstance(env.rule, Relocalise):
-        return jnp.full((), jnp.nan)
-    there = jnp.abs(state.goal.station - state.station)
-    return 2.0 * there if isinstance(env.rule, TurnBack) else there

@@ -10,7 +10,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax import native
+from subterra_jax import constants, native
 from subterra_jax.lidar import cast, fused
 from subterra_jax.rows import rowwise
 from subterra_jax.tunnel import Tunnel, node_at
@@ -27,9 +27,9 @@ class LidarParams:
         fused: Use kernels where there are any, for NVIDIA GPUs and for CPUs with numba; off, XLA does it everywhere.
     """
 
-    range_max: float = 30.0
-    range_sigma: float = 0.05
-    n_beams: int = struct.field(pytree_node=False, default=16)
+    range_max: float = constants.RANGE_MAX
+    range_sigma: float = constants.RANGE_SIGMA
+    n_beams: int = struct.field(pytree_node=False, default=constants.N_BEAMS)
     fused: bool = struct.field(pytree_node=False, default=True)
 
 

@@ -14,7 +14,7 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.avoidance import N_LANES, N_SCANS, Avoidance, Surroundings
 from subterra_jax.baselines.corridor import Corridor
 from subterra_jax.lidar import LidarParams
-from subterra_jax.vehicle import VehicleParams
+from subterra_jax.parts.unicycle import VehicleParams
 
 N_FEATURES = N_LANES + 7
 

@@ -18,7 +18,6 @@ from subterra_jax.policies.belief.memory import Habits
 from subterra_jax.policies.feedforward import FeedForward
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.recurrent import Recurrent
-from subterra_jax.rules import Relocalise, StopAt
 from subterra_jax.state import EnvParams
 
 Agent = FeedForward | Recurrent | Belief
@@ -83,13 +82,13 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
     """
     size, bounds = env.observation_size(params), env.action_space(params)
     if isinstance(agent, Recurrent):
-        if not isinstance(env.rule, StopAt):
+        if env.rule.errand not in ("stop", "return"):
             raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
         wanted, made_for = params.lidar.n_beams, agent.n_beams
         if wanted != made_for:
             raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
     elif isinstance(agent, Belief):
-        if not isinstance(env.rule, Relocalise):
+        if not env.rule.errand == "report":
             raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
     elif agent.n_observation != size:
         raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")

@@ -77,14 +77,12 @@ class Recurrent:
 
     def answer(self, memory: Memory, obs: Observed, start: Float[Array, ""]) -> tuple[Action, Memory]:
         """Action and memory, from the observation and the believed start (m)."""
-        assert obs.goal is not None
-        assert obs.ring_pitch is not None
         part = {
             "ranges": obs.ranges,
             "odometry": jnp.stack([obs.distance, obs.heading]),
-            "goal": obs.goal[None],
-            "ring_pitch": obs.ring_pitch[None],
-            **({} if obs.flag is None else {"flag": obs.flag[None]}),
+            "goal": jnp.atleast_1d(obs.goal),
+            "ring_pitch": jnp.atleast_1d(obs.ring_pitch),
+            "flag": jnp.atleast_1d(obs.flag),
         }
         seen = senses.look(part, start, memory.reckoning)
         hidden = self._remember(memory.hidden, seen.features)

@@ -63,7 +63,7 @@ def _write_recording(
         streams.scans("/scan", trace, trace.observation[:, parts["ranges"]], range_max),
     ]
     if config.beams:
-        dense = sensing.dense_scans(trace, world.params, config.beams, seed)
+        dense = sensing.dense_scans(trace, world.env, world.params, config.beams, seed)
         found.append(streams.scans("/scan_dense", trace, dense, range_max))
     if config.imu:
         found.append(streams.inertial(measure_imu(sensor, seed)))

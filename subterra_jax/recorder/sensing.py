@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from subterra_jax import draws, lidar3d, sensing
+from subterra_jax import lidar3d
+from subterra_jax.env import TunnelEnv
 from subterra_jax.lidar3d import Relief
 from subterra_jax.recorder.drive import Trace
 from subterra_jax.recorder.poses import Poses
@@ -23,35 +24,36 @@ _RAYS = 200_000  # of clouds in one go
 _DENSE_STREAM = 0x5CA7  # a key of its own: the episode's draws are not touched
 
 
-def dense_scans(trace: Trace, params: EnvParams, n_beams: int, seed: int) -> Float[np.ndarray, "n n_beams"]:
+def dense_scans(
+    trace: Trace, env: TunnelEnv, params: EnvParams, n_beams: int, seed: int
+) -> Float[np.ndarray, "n n_beams"]:
     """Planar scans of more beams, with the same range, noise, boxes and faults as the task's own.
 
     A sector that drops out is as wide as that of the task's LiDAR.
 
     Args:
         trace: The episode.
+        env: Its environment.
         params: Its task.
         n_beams: Beams, the first straight ahead, the others counter-clockwise.
         seed: Of the episode.
     """
     n, wider = len(trace.observation), n_beams / params.lidar.n_beams
-    dense = dataclasses.replace(params, lidar=dataclasses.replace(params.lidar, n_beams=n_beams))
-    state = trace.state
-    if state.faults is not None:
-        first, count = state.faults.dropout_first * wider, state.faults.dropout_count * wider
-        state = _with(state, faults=_with(state.faults, dropout_first=first, dropout_count=count))
+    dense = params.replace(lidar=dataclasses.replace(params.lidar, n_beams=n_beams))
+    state = trace.state.replace(
+        **{part.name: part.with_beams(trace.state.parts[part.name], wider) for part in env.parts}
+    )
     key = jax.random.fold_in(jax.random.key(jnp.uint32(seed)), _DENSE_STREAM)
     rows = np.minimum(np.arange(-(-n // _SCANS) * _SCANS), n - 1).reshape(-1, _SCANS)
-    parts = [_perceive(jax.tree.map(lambda leaf, some=some: leaf[some], state), key, some, dense) for some in rows]
+    parts = [_perceive(env, jax.tree.map(lambda leaf, some=some: leaf[some], state), key, some, dense) for some in rows]
     return np.concatenate([np.asarray(part) for part in parts])[:n]
 
 
-@jax.jit
-def _perceive(state: State, key: Array, index: Array, params: EnvParams) -> Float[Array, "n n_beams"]:
+@functools.partial(jax.jit, static_argnums=0)
+def _perceive(env: TunnelEnv, state: State, key: Array, index: Array, params: EnvParams) -> Float[Array, "n n_beams"]:
     def one(state: State, index: Array) -> Array:
-        noise = draws.draw_step(jax.random.fold_in(key, index), (), params)
-        tunnel = params.tunnel.pick(0)
-        return sensing.perceive(state, tunnel, noise, params, True)[: params.lidar.n_beams]
+        noise = env.draw_step(jax.random.fold_in(key, index), (), params)
+        return env.observe(state, noise, params)[env.fields(params)["ranges"]]
 
     return jax.vmap(one)(state, index)
 
@@ -87,7 +89,3 @@ def clouds(
 @functools.cache
 def _cast() -> Any:
     return jax.jit(jax.vmap(lidar3d.scan, in_axes=(None, 0, 0, 0, None, None)))
-
-
-def _with(part: Any, **leaves: Any) -> Any:
-    return dataclasses.replace(part, **leaves)

@@ -45,7 +45,7 @@ def open_world(config: Recording) -> World:
         env, params = st.make(name, plan, config.lining)
     except ValueError as error:
         raise RecordingError(str(error)) from error
-    unseen = [part for part in ("obstacles", "faults") if getattr(params, part) is not None]
+    unseen = [part for part in ("obstacles", "faults") if part in params.parts]
     if unseen and config.cloud != "none":
         raise RecordingError(f"the {config.cloud} sees none of the {unseen[0]} of {name}: leave out the cloud")
     piece = TASKS[name].piece
@@ -75,5 +75,5 @@ def draw(config: Recording, world: World) -> tuple[int, int | None]:
     """
     if config.episode is None:
         return config.seed, None
-    listed = listed_episodes(world.env.id, world.params, config.episode + 1)
+    listed = listed_episodes(world.env, world.params, config.episode + 1)
     return int(listed.seed[-1]), int(listed.severity[-1])

@@ -1,51 +1,60 @@
-"""T5: put down anywhere with a map, find out where one is and which way one faces, stop and say so."""
+"""T5: placed anywhere with a map, find the station and the direction faced, stop and report them."""
 
 import dataclasses
 from typing import ClassVar
 
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.rules.rule import Bounds, Rule, Step, Verdict
-from subterra_jax.rules.stop import pay, stood
-from subterra_jax.state import EnvParams, GoalState, ResetNoise, State
+from subterra_jax.parts.part import Bounds, Step
+from subterra_jax.rules.rule import Start, Verdict, spread
+from subterra_jax.rules.stop import GoalState, StopAt, count_still, goal_terms
+from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
 
-@dataclasses.dataclass(frozen=True)
-class Relocalise(Rule):
-    """Success is a right report at the stop; the report is the one in the action of the step that makes it a stop."""
+@struct.dataclass
+class RelocaliseState(GoalState):
+    """Start of one episode, and the distance driven since.
 
-    has_goal: ClassVar[bool] = True
+    Attributes:
+        travelled: True distance driven, m.
+    """
+
+    travelled: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class Relocalise(StopAt):
+    """Success is a right report at the stop: the one in the action of the step that makes it a stop."""
+
+    errand: ClassVar[str] = "report"
     reports: ClassVar[bool] = True
 
-    def begin(self, noise: ResetNoise, tunnel: Tunnel, params: EnvParams) -> tuple[Array, Array, GoalState]:
-        """Anywhere but at the ends, facing either way."""
-        assert params.goal is not None
-        assert noise.goal is not None
+    def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
+        """Start anywhere but at the ends, facing either way."""
         room = jnp.maximum(tunnel.length - 2.0 * params.goal.margin, 0.0)
-        start = params.goal.margin + room * noise.goal[1]
-        backwards = (noise.goal[2] < 0.5).astype(jnp.float32)
-        return start, backwards, GoalState(start, jnp.zeros((), jnp.int32), travelled=jnp.zeros(()))
+        station = params.goal.margin + room * draw[1][1]
+        backwards = (draw[1][2] < 0.5).astype(jnp.float32)
+        goal = RelocaliseState(station, jnp.zeros((), jnp.int32), jnp.zeros(()))
+        return Start(station, **spread(draw[0], params), backwards=backwards, own=goal)
 
-    def fields(self, params: EnvParams) -> dict[str, Bounds]:
+    def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Distance between rings of the lining, m; 0 where there are none."""
         del params
         return {"ring_pitch": (0.0, np.inf)}
 
-    def observe(self, state: State, tunnel: Tunnel) -> list[Float[Array, ""]]:
-        """The same."""
+    def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
+        """Return the number that `space` names."""
         del state
-        return [tunnel.ring_pitch]
+        return {"ring_pitch": tunnel.ring_pitch}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """What was reported against where the robot stands."""
-        assert params.goal is not None
-        assert step.before.goal is not None
+        """Judge the report against the place where the robot stands."""
         goal = step.before.goal
-        assert goal.travelled is not None
-        still, stopped = stood(step, params.goal)
+        still, stopped = count_still(step, params.goal)
         along = step.place.tangent
         forward = jnp.cos(step.heading) * along[0] + jnp.sin(step.heading) * along[1] > 0.0
         error = step.report[0] - step.place.station
@@ -53,7 +62,7 @@ class Relocalise(Rule):
         success = stopped & direction_right & (jnp.abs(error) <= params.goal.tolerance)
         travelled = goal.travelled + step.moved
         overdue = (travelled > params.goal.travel_max) & ~stopped
-        terms = pay(
+        terms = goal_terms(
             step,
             params,
             success=success,
@@ -63,5 +72,10 @@ class Relocalise(Rule):
             nearer=jnp.zeros(()),
         )
         after = dataclasses.replace(goal, still=still, travelled=travelled)
-        told = {"goal_error": error, "stopped": stopped, "direction_right": direction_right}
-        return Verdict(success, stopped | overdue, terms, after, told)
+        info = {"goal_error": error, "stopped": stopped, "direction_right": direction_right}
+        return Verdict(success, stopped | overdue, terms, after, info)
+
+    def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
+        """Return NaN: how far one has to drive depends on what there is to be seen."""
+        del state, tunnel, params
+        return jnp.full((), jnp.nan)

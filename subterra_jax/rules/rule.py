@@ -1,92 +1,154 @@
-"""What a rule is given and what it decides."""
+"""The contract of a rule: what a task asks, how its episodes start, when they end and what they are worth."""
 
 import abc
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import numpy as np
-from jaxtyping import Array, Bool, Float
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.state import EnvParams, GoalState, ResetNoise, State
-from subterra_jax.tunnel import Foot, Tunnel
+from subterra_jax import constants
+from subterra_jax.parts.part import Batch, Bounds, Step
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel import Tunnel
 
-Bounds = tuple[float | np.ndarray, float | np.ndarray]
+Terms = dict[str, Float[Array, ""]]
+ERRANDS = ("cover", "stop", "return", "report")
+
+
+@struct.dataclass
+class StartParams:
+    """Start of an episode.
+
+    Attributes:
+        station: Station of the start as agents believe it, m; 0 is the mouth.
+        lateral: Largest offset from the centreline to either side, m; drawn uniformly.
+        heading: Largest angle to the centreline to either side, rad; drawn uniformly.
+        station_sigma: Standard deviation of the true start about `station`, m, cut off at three of them. Only tasks
+            with a goal draw it; the odometer reads 0 there all the same.
+    """
+
+    station: float = 0.0
+    lateral: float = constants.START_LATERAL
+    heading: float = constants.START_HEADING
+    station_sigma: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
-    """One step, after the motion.
+class Start:
+    """A start.
 
     Attributes:
-        before: State before the step.
-        tunnel: The tunnel the robot is in.
-        place: Where along the tunnel it has come to.
-        heading: Its heading, tunnel frame, rad.
-        furthest: Furthest station so far, m.
-        contact: Whether it touches a wall or an obstacle.
-        command: The command it obeyed, m/s and rad/s.
-        motion: What it really did, m/s and rad/s.
-        moved: True distance of this step, m.
-        report: Estimated station (m), log of its standard deviation, direction (of growing station: above 0); zeros
-            where the action has none.
+        station: Station, m.
+        lateral: Distance to the left of the centreline, m.
+        heading: Angle to the centreline, rad.
+        backwards: 0 for a robot that faces growing stations, 1 for the other way.
+        own: State of the rule, any pytree of arrays.
     """
 
-    before: State
-    tunnel: Tunnel
-    place: Foot
-    heading: Float[Array, ""]
-    furthest: Float[Array, ""]
-    contact: Bool[Array, ""]
-    command: Float[Array, "2"]
-    motion: Float[Array, "2"]
-    moved: Float[Array, ""]
-    report: Float[Array, "3"]
+    station: Any
+    lateral: Any = 0.0
+    heading: Any = 0.0
+    backwards: Any = 0.0
+    own: Any = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What a rule makes of a step.
+    """A rule's judgement of a step.
 
     Attributes:
         success: The task was achieved at this step.
         ended: The episode is over for good, for a reason other than contact.
-        terms: Named terms of the reward.
-        goal: State of the goal afterwards.
-        told: Further entries of `info`.
+        terms: Terms of the reward by name, each beginning with `reward_`; the reward is their sum.
+        own: State of the rule afterwards.
+        info: Further entries of `info`.
     """
 
     success: Bool[Array, ""]
     ended: Bool[Array, ""]
-    terms: dict[str, Float[Array, ""]]
-    goal: GoalState | None
-    told: dict[str, Array]
+    terms: Terms
+    own: Any = ()
+    info: dict[str, Array] = dataclasses.field(default_factory=dict)
 
 
 class Rule(abc.ABC):
-    """One task's rule: static, hashable, without state of its own.
+    """The rule of one task: static and hashable, a frozen dataclass without state of its own.
+
+    Its state is the entry `goal` of `State.parts`, its params are entries of `EnvParams.parts`.
 
     Attributes:
-        has_goal: Params, state and noise have the parts that belong to a goal.
+        errand: What agents are asked to do: `cover` (drive on), `stop` (at the observed `goal`), `return` (to the start
+            once the observed `flag` is raised) or `report` (stop and say where).
         reports: The action holds an estimate that counts.
+        covers: Success is coverage. An evaluation then drives on after success, and counts how far the robot comes.
+        needs: Names of the parts that the rule cannot do without.
+        streams: Numbers of its random streams at a reset, one key each.
     """
 
-    has_goal: ClassVar[bool] = False
+    errand: ClassVar[str] = "cover"
     reports: ClassVar[bool] = False
+    covers: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ()
+    streams: ClassVar[tuple[int, ...]] = (0,)
 
-    @abc.abstractmethod
-    def begin(self, noise: ResetNoise, tunnel: Tunnel, params: EnvParams) -> tuple[Array, Array, GoalState | None]:
-        """Station of the start (m), 0 or 1 for a robot facing backwards, and the goal."""
+    def defaults(self) -> dict[str, Any]:
+        """Entries of `EnvParams` that the rule reads, by name, with their default values; `start` at least."""
+        return {"start": StartParams()}
 
-    def fields(self, params: EnvParams) -> dict[str, Bounds]:
-        """Names and bounds of the numbers that are observed beside ranges and odometry; none unless a rule says so."""
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Any:
+        """Draw what a start needs, for a whole batch at once; by default two numbers in [-1, 1] for `spread`."""
+        del params
+        return jax.random.uniform(key, (*batch, 2), minval=-1.0)
+
+    def start(self, draw: Any, tunnel: Tunnel, params: EnvParams) -> Start:
+        """Choose the start of an episode; by default `params.start`, facing growing stations."""
+        del tunnel
+        return Start(jnp.asarray(params.start.station, jnp.float32), **spread(draw, params))
+
+    def space(self, params: EnvParams) -> dict[str, Bounds]:
+        """Names and bounds of the numbers that the rule adds to the observation."""
         del params
         return {}
 
-    def observe(self, state: State, tunnel: Tunnel) -> list[Float[Array, ""]]:
-        """Those numbers, in the order of `fields`."""
+    def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
+        """Return those numbers, in the order of `space`."""
         del state, tunnel
-        return []
+        return {}
 
     @abc.abstractmethod
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Success, end, reward."""
+        """Judge a step: success, end, reward."""
+
+    def privileged(self, state: State) -> dict[str, Array]:
+        """Return what a teacher or a critic may know of the rule's state, and an agent may not."""
+        del state
+        return {}
+
+    def tolerance(self, params: EnvParams) -> Any:
+        """Return the error up to which an estimate of the station counts as right, m."""
+        del params
+        return constants.TOLERANCE
+
+    def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Any:
+        """Return the length of the shortest way from the start to success, m; NaN where there is no such thing."""
+        del state, tunnel, params
+        return jnp.nan
+
+    def least_length(self, params: EnvParams) -> float:
+        """Return the length of the shortest tunnel that has room for the task, m."""
+        del params
+        return 0.0
+
+
+def spread(draw: Float[Array, "2"], params: EnvParams) -> dict[str, Array]:
+    """Offset and angle of a start, from two numbers in [-1, 1] and `params.start`."""
+    return {"lateral": params.start.lateral * draw[0], "heading": params.start.heading * draw[1]}
+
+
+def jerk(command: Float[Array, "2"], previous: Float[Array, "2"]) -> Float[Array, ""]:
+    """Return the change of the command in a step, m/s and rad/s alike."""
+    change = jnp.abs(command - previous)
+    return change[0] + change[1]

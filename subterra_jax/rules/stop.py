@@ -1,42 +1,168 @@
-"""T1: stop at a chainage. T3 and T4 ask the same, among obstacles and under faults."""
+"""T1: stop at a station. T3 and T4 ask the same, among boxes and under faults."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from subterra_jax import reward
-from subterra_jax.rules.rule import Bounds, Rule, Step, Verdict
-from subterra_jax.state import EnvParams, GoalParams, GoalState, ResetNoise, State
+from subterra_jax import constants
+from subterra_jax.parts.part import Batch, Bounds, Step
+from subterra_jax.rules.rule import Rule, Start, Terms, Verdict, jerk, spread
+from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
 
-def drawn_start(noise: ResetNoise, params: EnvParams) -> Float[Array, ""]:
-    """The true start about the station that the robot believes in, m; not outside of the mouth."""
-    assert noise.station is not None
-    offset = params.start.station_sigma * jnp.clip(noise.station, -3.0, 3.0)
-    return jnp.maximum(params.start.station + offset, 0.0)
+@struct.dataclass
+class GoalParams:
+    """Goals, and what counts as having reached one.
+
+    Attributes:
+        low: Least station of a goal, m.
+        high: Largest station of a goal, m.
+        margin: Least distance of goals, and of starts anywhere, from the ends of the tunnel, m; it comes before `low`.
+        tolerance: Largest error of success, m.
+        still_speed: Speed below which a robot stands, m/s.
+        still_yaw: Yaw rate from which it does not stand, rad/s: to turn on the spot is not to stop.
+        still_steps: Steps of standing that make a stop, which ends the episode.
+        flag_reach: Distance to the goal at which the flag is raised, m.
+        travel_max: Distance after which a robot that has not reported has failed, m.
+    """
+
+    low: float = constants.GOAL_LOW
+    high: float = constants.GOAL_HIGH
+    margin: float = constants.GOAL_MARGIN
+    tolerance: float = constants.TOLERANCE
+    still_speed: float = constants.STILL_SPEED
+    still_yaw: float = constants.STILL_YAW
+    still_steps: int = constants.STILL_STEPS
+    flag_reach: float = constants.FLAG_REACH
+    travel_max: float = constants.TRAVEL_MAX
 
 
-def drawn_goal(noise: ResetNoise, tunnel: Tunnel, goal: GoalParams) -> Float[Array, ""]:
-    """A chainage between the bounds, m, as far as the tunnel has them."""
-    assert noise.goal is not None
+@struct.dataclass
+class GoalRewardParams:
+    """Weights of the reward of tasks with a goal.
+
+    Attributes:
+        terminal: Reward of success, once.
+        precision: Reward at a stop, times exp(-error / tolerance).
+        miss: Cost of each metre of error, at a stop or a contact.
+        crash: Cost of a contact, and of not reporting in time.
+        progress: Reward of each metre by which the way to go has become shorter.
+        time: Cost of every step.
+        lateral: Cost of the distance from the centreline over the half-width.
+        jerk: Cost of the change of command, m/s and rad/s alike.
+    """
+
+    terminal: float = constants.GOAL_TERMINAL
+    precision: float = constants.GOAL_PRECISION
+    miss: float = constants.GOAL_MISS
+    crash: float = constants.GOAL_CRASH
+    progress: float = constants.GOAL_PROGRESS
+    time: float = constants.GOAL_TIME
+    lateral: float = constants.GOAL_LATERAL
+    jerk: float = constants.GOAL_JERK
+
+
+@struct.dataclass
+class GoalState:
+    """Goal of one episode.
+
+    Attributes:
+        station: Station of the goal, m.
+        still: Steps that the robot has stood.
+    """
+
+    station: Float[Array, ""]
+    still: Int[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class StopAt(Rule):
+    """Success is a stop within the tolerance of the goal; any stop ends the episode."""
+
+    errand: ClassVar[str] = "stop"
+    streams: ClassVar[tuple[int, ...]] = (0, 4, 5)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `start`, `goal` and `reward`."""
+        return {**super().defaults(), "goal": GoalParams(), "reward": GoalRewardParams()}
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> tuple[Array, Array, Array]:
+        """Draw numbers for `spread`, three in [0, 1) for goal, place and direction, and a normal one for the start."""
+        return (
+            super().draw_reset(key[0], batch, params),
+            jax.random.uniform(key[1], (*batch, 3)),
+            jax.random.normal(key[2], batch),
+        )
+
+    def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
+        """Start near the mouth, facing forward, with a goal ahead."""
+        goal = GoalState(draw_goal(draw[1][0], tunnel, params.goal), jnp.zeros((), jnp.int32))
+        offset = params.start.station_sigma * jnp.clip(draw[2], -3.0, 3.0)
+        # Not outside of the mouth.
+        return Start(jnp.maximum(params.start.station + offset, 0.0), **spread(draw[0], params), own=goal)
+
+    def space(self, params: EnvParams) -> dict[str, Bounds]:
+        """Station of the goal (m), and distance between rings of the lining (m; 0 where there are none)."""
+        del params
+        return {"goal": (0.0, np.inf), "ring_pitch": (0.0, np.inf)}
+
+    def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
+        """Return the numbers that `space` names."""
+        return {"goal": state.goal.station, "ring_pitch": tunnel.ring_pitch}
+
+    def judge(self, step: Step, params: EnvParams) -> Verdict:
+        """Judge a stop by its distance from the goal."""
+        goal = step.before.goal
+        still, stopped = count_still(step, params.goal)
+        error = step.place.station - goal.station
+        success = stopped & (jnp.abs(error) <= params.goal.tolerance)
+        nearer = jnp.abs(step.before.station - goal.station) - jnp.abs(error)
+        terms = goal_terms(
+            step, params, success=success, stopped=stopped, failed=step.contact, error=error, nearer=nearer
+        )
+        after = dataclasses.replace(goal, still=still)
+        return Verdict(success, stopped, terms, after, {"goal_error": error, "stopped": stopped})
+
+    def privileged(self, state: State) -> dict[str, Array]:
+        """Return the way to the goal, m, and how long the robot has stood, as a share of a stop."""
+        return {"to_goal": state.goal.station - state.station, "still": state.goal.still}
+
+    def tolerance(self, params: EnvParams) -> Any:
+        """Return the tolerance of the goal, m."""
+        return params.goal.tolerance
+
+    def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
+        """Return the distance to the goal, m."""
+        del tunnel, params
+        return jnp.abs(state.goal.station - state.station)
+
+    def least_length(self, params: EnvParams) -> float:
+        """Return the nearest goal and the margin behind it, m."""
+        return float(np.max(params.goal.low) + np.max(params.goal.margin))
+
+
+def draw_goal(draw: Float[Array, ""], tunnel: Tunnel, goal: GoalParams) -> Float[Array, ""]:
+    """Draw a station between the bounds, m, as far as the tunnel has them; `draw` is uniform in [0, 1)."""
     high = jnp.maximum(jnp.minimum(goal.high, tunnel.length - goal.margin), goal.margin)
     low = jnp.minimum(goal.low, high)
-    return low + (high - low) * noise.goal[0]
+    return low + (high - low) * draw
 
 
-def stood(step: Step, goal: GoalParams) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """Steps that the robot has stood, and whether that is a stop."""
-    assert step.before.goal is not None
-    stands = (step.motion[0] < goal.still_speed) & (jnp.abs(step.motion[1]) < goal.still_yaw)
+def count_still(step: Step, goal: GoalParams) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """Count the steps that the robot has stood, and tell whether that is a stop."""
+    speed, yaw_rate = step.drive.motion
+    stands = (speed < goal.still_speed) & (jnp.abs(yaw_rate) < goal.still_yaw)
     still = jnp.where(stands, step.before.goal.still + 1, 0).astype(jnp.int32)
     return still, (still >= goal.still_steps) & ~step.contact
 
 
-def pay(
+def goal_terms(
     step: Step,
     params: EnvParams,
     *,
@@ -45,56 +171,26 @@ def pay(
     failed: Bool[Array, ""],
     error: Float[Array, ""],
     nearer: Float[Array, ""],
-) -> reward.Terms:
-    """The terms of `reward.goal_terms` for a step."""
-    assert isinstance(params.reward, reward.GoalRewardParams)
-    assert params.goal is not None
-    return reward.goal_terms(
-        success=success,
-        stopped=stopped,
-        failed=failed,
-        error=error,
-        tolerance=jnp.asarray(params.goal.tolerance),
-        nearer=nearer,
-        lateral=step.place.lateral,
-        half_width=step.place.half_width,
-        command=step.command,
-        previous=step.before.command,
-        params=params.reward,
-    )
+) -> Terms:
+    """Return the terms of one step's reward in a task with a goal.
 
-
-@dataclasses.dataclass(frozen=True)
-class StopAt(Rule):
-    """Success is a stop within the tolerance of the goal; any stop ends the episode."""
-
-    has_goal: ClassVar[bool] = True
-
-    def begin(self, noise: ResetNoise, tunnel: Tunnel, params: EnvParams) -> tuple[Array, Array, GoalState]:
-        """Near the mouth, facing forward, with a goal ahead."""
-        assert params.goal is not None
-        goal = GoalState(drawn_goal(noise, tunnel, params.goal), jnp.zeros((), jnp.int32))
-        return drawn_start(noise, params), jnp.zeros(()), goal
-
-    def fields(self, params: EnvParams) -> dict[str, Bounds]:
-        """Chainage of the goal (m) and distance between rings of the lining (m; 0 where there are none)."""
-        del params
-        return {"goal": (0.0, np.inf), "ring_pitch": (0.0, np.inf)}
-
-    def observe(self, state: State, tunnel: Tunnel) -> list[Float[Array, ""]]:
-        """The same in the order of `fields`."""
-        assert state.goal is not None
-        return [state.goal.station, tunnel.ring_pitch]
-
-    def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Stopped, and how far from the goal."""
-        assert params.goal is not None
-        assert step.before.goal is not None
-        goal = step.before.goal
-        still, stopped = stood(step, params.goal)
-        error = step.place.station - goal.station
-        success = stopped & (jnp.abs(error) <= params.goal.tolerance)
-        nearer = jnp.abs(step.before.station - goal.station) - jnp.abs(error)
-        terms = pay(step, params, success=success, stopped=stopped, failed=step.contact, error=error, nearer=nearer)
-        after = dataclasses.replace(goal, still=still)
-        return Verdict(success, stopped, terms, after, {"goal_error": error, "stopped": stopped})
+    Args:
+        step: The step.
+        params: The task, with the weights.
+        success: The task was achieved at this step.
+        stopped: The robot has come to a stop, right or wrong.
+        failed: The robot touched something, or did not report in time.
+        error: Error of a stop, m.
+        nearer: Length by which the way to go has become shorter, m.
+    """
+    weights, size = params.reward, jnp.abs(error)
+    return {
+        "reward_terminal": weights.terminal * success,
+        "reward_precision": weights.precision * stopped * jnp.exp(-size / jnp.asarray(params.goal.tolerance)),
+        "reward_miss": -weights.miss * (stopped | failed) * size,
+        "reward_crash": -weights.crash * failed,
+        "reward_progress": weights.progress * nearer,
+        "reward_time": -weights.time * jnp.ones_like(size),
+        "reward_lateral": -weights.lateral * jnp.abs(step.place.lateral) / step.place.half_width,
+        "reward_jerk": -weights.jerk * jerk(step.command, step.before.command),
+    }

@@ -1,31 +1,51 @@
 """T0, the paper's task: cover nine tenths of the tunnel without touching it."""
 
 import dataclasses
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array
+from flax import struct
+from jaxtyping import Array, Bool, Float
 
-from subterra_jax import reward
-from subterra_jax.rules.rule import Rule, Step, Verdict
-from subterra_jax.state import EnvParams, ResetNoise
+from subterra_jax import constants
+from subterra_jax.parts.part import Step
+from subterra_jax.rules.rule import Rule, Terms, Verdict, jerk
+from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
+
+
+@struct.dataclass
+class RewardParams:
+    """Weights of the paper's reward, Eq. 1. The paper prints none; with these PPO learns the task.
+
+    Attributes:
+        terminal: Reward of success, once.
+        coverage: g, reward of the share of the tunnel newly covered.
+        lateral: c_d, cost of the distance from the centreline over the half-width.
+        jerk: c_s, cost of the change of command, m/s and rad/s alike.
+    """
+
+    terminal: float = constants.REWARD_TERMINAL
+    coverage: float = constants.REWARD_COVERAGE
+    lateral: float = constants.REWARD_LATERAL
+    jerk: float = constants.REWARD_JERK
 
 
 @dataclasses.dataclass(frozen=True)
 class Traverse(Rule):
     """Success is coverage."""
 
-    def begin(self, noise: ResetNoise, tunnel: Tunnel, params: EnvParams) -> tuple[Array, Array, None]:
-        """Always the same station, facing forward."""
-        del noise, tunnel
-        return jnp.asarray(params.start.station, jnp.float32), jnp.zeros(()), None
+    covers: ClassVar[bool] = True
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `start`, `reward` and `goal_coverage`, the share of the tunnel to cover."""
+        return {**super().defaults(), "reward": RewardParams(), "goal_coverage": constants.GOAL_COVERAGE}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
-        """Coverage reached, the paper's reward."""
-        assert isinstance(params.reward, reward.RewardParams)
+        """Judge coverage."""
         coverage = jnp.clip(step.furthest / step.tunnel.length, 0.0, 1.0)
         success = (coverage >= params.goal_coverage) & ~step.contact
-        terms = reward.reward_terms(
+        terms = reward_terms(
             success=success,
             newly_covered=step.furthest - step.before.furthest,
             length=step.tunnel.length,
@@ -35,4 +55,41 @@ class Traverse(Rule):
             previous=step.before.command,
             params=params.reward,
         )
-        return Verdict(success, success, terms, None, {})
+        return Verdict(success, success, terms)
+
+    def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
+        """Return the way to the share that is asked for, m."""
+        return params.goal_coverage * tunnel.length - state.station
+
+
+def reward_terms(
+    *,
+    success: Bool[Array, ""],
+    newly_covered: Float[Array, ""],
+    length: Float[Array, ""],
+    lateral: Float[Array, ""],
+    half_width: Float[Array, ""],
+    command: Float[Array, "2"],
+    previous: Float[Array, "2"],
+    params: RewardParams,
+) -> Terms:
+    """Return the terms of one step's reward; the reward is their sum.
+
+    Args:
+        success: The task was achieved at this step.
+        newly_covered: Arc length beyond the furthest station so far, m; 0 on ground covered before.
+        length: Length of the tunnel, m.
+        lateral: Distance to the left of the centreline, m.
+        half_width: Half the local width, m.
+        command: Speed (m/s) and yaw rate (rad/s) of this step, after clipping.
+        previous: Command of the step before; zeros at the start of an episode.
+        params: Weights.
+
+    Source: paper, Eq. 1.
+    """
+    return {
+        "reward_terminal": params.terminal * success,
+        "reward_coverage": params.coverage * newly_covered / length,
+        "reward_lateral": -params.lateral * jnp.abs(lateral) / half_width,
+        "reward_jerk": -params.jerk * jerk(command, previous),
+    }

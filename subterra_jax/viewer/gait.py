@@ -20,7 +20,7 @@ class Gait:
     """
 
     def __init__(self, env: TunnelEnv):
-        walk: Any = getattr(env, "walk", None)
+        walk: Any = getattr(env.motion, "walk", None)
         self.walks = walk is not None
         self._poses: list[np.ndarray] = []
         if walk is not None:
@@ -30,8 +30,8 @@ class Gait:
         """Before the first step."""
         if not self.walks:
             return np.zeros((0, N_POSE), np.float32)
-        from subterra_jax.b2.hierarchy import PERIODS
         from subterra_jax.b2.kinematics import standing_pose
+        from subterra_jax.b2.mission import PERIODS
 
         pose = np.concatenate([[1.0, 0.0, 0.0, 0.0], np.asarray(standing_pose()[0], np.float64)])
         return np.tile(pose.astype(np.float32), (PERIODS, 1))

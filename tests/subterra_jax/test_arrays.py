@@ -8,8 +8,8 @@ import pytest
 import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.lidar import reference
+from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS
-from subterra_jax.vehicle import VehicleParams
 
 LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
 ASIDE = np.array([0.0, 2.5])

@@ -14,7 +14,7 @@ from subterra_jax.baselines.avoidance import Avoidance
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.stations import Station
 from subterra_jax.evaluation import evaluate, listed_episodes
-from subterra_jax.wander import WanderParams
+from subterra_jax.parts.wander import WanderParams
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +142,7 @@ def test_where_a_corner_is_near_it_turns_steeper_to_its_lane_than_where_the_way_
 
 def test_who_knows_the_truth_comes_back_always():
     env, params = st.make("Subterra/ReturnShort-v0")
-    records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env.id, params, 50))
+    records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env, params, 50))
     assert records.success.all()
     assert (np.abs(records.goal_error) < 0.05).all()
 
@@ -153,7 +153,7 @@ def test_who_knows_the_truth_comes_back_always():
 )
 def test_over_the_whole_list_knowing_the_truth_is_all_that_is_missing(task, least):
     env, params = st.make(f"Subterra/{task}-v0")
-    records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env.id, params))
+    records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env, params))
     assert records.success.mean() >= least
 
 
@@ -161,5 +161,5 @@ def test_over_the_whole_list_knowing_the_truth_is_all_that_is_missing(task, leas
 def test_dead_reckoning_knows_how_well_it_knows():
     env, params = st.make("Subterra/StopAt-v0")
     for name in ("command-integrator", "dead-reckoning", "fused"):
-        records = evaluate(env, params, make_agent(name, params), listed_episodes(env.id, params))
+        records = evaluate(env, params, make_agent(name, params), listed_episodes(env, params))
         assert 0.85 < records.nees.mean() < 1.15, name

@@ -9,10 +9,10 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.lidar import LidarParams
-from subterra_jax.obstacles import ObstacleParams
-from subterra_jax.odometry import OdometryParams
-from subterra_jax.state import StartParams
-from subterra_jax.vehicle import VehicleParams
+from subterra_jax.parts.boxes import ObstacleParams
+from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.unicycle import VehicleParams
+from subterra_jax.rules import StartParams
 
 INFO = {"coverage", "station", "lateral", "half_width", "clearance", "contact", "success"}
 # Between them they have every part that a task can have.

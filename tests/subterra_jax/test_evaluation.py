@@ -81,7 +81,7 @@ def test_an_episode_depends_on_its_seed_and_its_tunnel_and_not_on_the_others_dri
     plans = [plan_of(tunnels.tunnel_arrays(pieces)) for pieces in (tunnels.straight(70.0), tunnels.arc(80.0, 60.0))]
     stacked = st.stack([st.Tunnel.from_plan(plan, "pockets") for plan in plans])
     env, params = st.make("Subterra/StopAtShort-v0", tunnel=stacked)
-    agent, episodes = make_agent("dead-reckoning", params), listed_episodes(env.id, params, 5)
+    agent, episodes = make_agent("dead-reckoning", params), listed_episodes(env, params, 5)
     together = evaluate(env, params, agent, episodes)
     apart = evaluate(env, params, agent, episodes, batch=3)
     for name, values in vars(together).items():
@@ -95,7 +95,7 @@ def test_an_episode_depends_on_its_seed_and_its_tunnel_and_not_on_the_others_dri
 
 def test_coverage_ends_at_nine_tenths_as_published_and_progress_goes_on_to_the_mouth():
     env, params = st.make("Subterra/TraverseShort-v0")
-    episodes = listed_episodes(env.id, params, 3)
+    episodes = listed_episodes(env, params, 3)
     through = evaluate(env, params, Dawdler(), episodes)
     assert through.success.all()
     assert ((through.coverage >= 0.9) & (through.coverage < 0.905)).all()

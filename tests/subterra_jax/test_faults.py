@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import faults
+from subterra_jax.parts import faults
 
 N, BEAMS = 4000, 16
 ZERO = faults.FaultParams(

@@ -26,7 +26,7 @@ def control():
     """The short stop where no wall tells a station, a way to drive it, and its bounds."""
     env, params = st.make("Subterra/StopAtShort-v0", tunnel=st.load_tunnel("control").slice(0.0, 65.0), lining="smooth")
     agents = [make_agent(name, params) for name in STOPPING + BLIND]
-    episodes = listed_episodes(env.id, params, N)
+    episodes = listed_episodes(env, params, N)
 
     def success(name, **spoilt):
         return evaluate(env, params, panel(agents, (STOPPING + BLIND).index(name), **spoilt), episodes).success.mean()
@@ -69,7 +69,7 @@ def test_who_is_always_told_the_same_goal_stops_as_often_as_chance_has_it(contro
 
 def test_who_gets_the_beams_in_the_wrong_order_cannot_traverse():
     env, params = st.make("Subterra/TraverseShort-v0")
-    agents, episodes = [make_agent("dead-reckoning", params)], listed_episodes(env.id, params, 50)
+    agents, episodes = [make_agent("dead-reckoning", params)], listed_episodes(env, params, 50)
     order = np.random.default_rng(0).permutation(16)
     assert evaluate(env, params, panel(agents), episodes).success.all()
     assert evaluate(env, params, panel(agents, order=order), episodes).success.mean() < 0.1
@@ -95,7 +95,7 @@ def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points
     env, params = st.make("Subterra/StopAt-v0", tunnel="control", lining="smooth")
     bound = stop_bounds(params)["fused"]
     agent = make_agent(name, params)
-    success = evaluate(env, params, agent, listed_episodes(env.id, params)).success.mean()
+    success = evaluate(env, params, agent, listed_episodes(env, params)).success.mean()
     print(f"{name}: {100 * success:.1f} %, bound {100 * bound:.1f} %")
     # Three points, and the error of 500 episodes.
     assert success <= bound + 0.03 + three_errors(bound, 500)
@@ -108,7 +108,7 @@ def test_on_the_control_tunnel_nobody_beats_fused_dead_reckoning_by_three_points
 def test_over_the_whole_list_dead_reckoning_lands_at_its_bounds(name, bound):
     env, params = st.make("Subterra/StopAt-v0")
     expected = stop_bounds(params)[bound]
-    success = evaluate(env, params, make_agent(name, params), listed_episodes(env.id, params)).success.mean()
+    success = evaluate(env, params, make_agent(name, params), listed_episodes(env, params)).success.mean()
     print(f"{name}: {100 * success:.1f} %, bound {100 * expected:.1f} %")
     assert abs(success - expected) < three_errors(expected, 500)
 
@@ -116,5 +116,5 @@ def test_over_the_whole_list_dead_reckoning_lands_at_its_bounds(name, bound):
 @pytest.mark.slow
 def test_over_the_whole_list_the_middle_line_traverses_always():
     env, params = st.make("Subterra/Traverse-v0")
-    records = evaluate(env, params, make_agent("dead-reckoning", params), listed_episodes(env.id, params))
+    records = evaluate(env, params, make_agent("dead-reckoning", params), listed_episodes(env, params))
     assert records.success.all()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import hashing, obstacles
 from subterra_jax.lidar import reference
+from subterra_jax.parts import boxes as obstacles
+from subterra_jax.parts import hashing
 from subterra_jax.tunnel import Tunnel
 
 PARAMS = jax.tree.map(jnp.float32, obstacles.ObstacleParams())

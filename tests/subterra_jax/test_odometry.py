@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import odometry
+from subterra_jax.parts import odometer as odometry
 
 TASK = "Subterra/TraverseShort-v0"
 N, T = 4000, 50

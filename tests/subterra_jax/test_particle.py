@@ -18,7 +18,7 @@ from subterra_jax.baselines.particle.scan import Place
 from subterra_jax.baselines.particle.wallmap import wall_map
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import evaluate, listed_episodes
-from subterra_jax.wander import WanderParams
+from subterra_jax.parts.wander import WanderParams
 from tests.subterra_jax import tunnels
 
 moved, resampled = jax.jit(particle_cloud.moved), jax.jit(particle_cloud.resampled)
@@ -127,7 +127,7 @@ def test_a_cloud_speaks_for_its_heaviest_cluster_and_admits_the_other():
 def pockets():
     """The short stop between pockets, cut to 400 steps, and the filter's records of a few episodes."""
     env, params = st.make("Subterra/StopAtShort-v0", horizon=400)
-    episodes = listed_episodes(env.id, params, 12)
+    episodes = listed_episodes(env, params, 12)
     return env, params, episodes, evaluate(env, params, particle_filter(params, 128), episodes)
 
 
@@ -152,7 +152,7 @@ def test_the_filter_is_deterministic(pockets):
 @pytest.mark.slow
 def test_between_smooth_walls_of_one_curvature_the_filter_is_no_better_than_dead_reckoning():
     env, params = st.make("Subterra/StopAt-v0", tunnel="control", lining="smooth")
-    episodes = listed_episodes(env.id, params, 100)
+    episodes = listed_episodes(env, params, 100)
     filtered = evaluate(env, params, particle_filter(params), episodes)
     fused = evaluate(env, params, make_agent("fused", params), episodes)
     # Three standard errors of a difference of two rates near a third.
@@ -163,5 +163,5 @@ def test_between_smooth_walls_of_one_curvature_the_filter_is_no_better_than_dead
 @pytest.mark.slow
 def test_relocalisation_finds_place_and_direction():
     env, params = st.make("Subterra/Relocalise-v0")
-    found = evaluate(env, params, make_agent("particle-filter", params), listed_episodes(env.id, params, 20))
+    found = evaluate(env, params, make_agent("particle-filter", params), listed_episodes(env, params, 20))
     assert found.success.mean() >= 0.7

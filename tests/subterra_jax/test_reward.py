@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.reward import RewardParams, reward_terms
+from subterra_jax.rules.traverse import RewardParams, reward_terms
 
 TASK = "Subterra/TraverseShort-v0"
 

@@ -156,6 +156,6 @@ def test_most_goals_are_found_under_faults_without_a_map():
     env, params = st.make("Subterra/Faulted-v0", estimates=True)
     agent = make_agent("ring-filter", params)
     assert not agent.uses_map
-    records = evaluate(env, params, agent, listed_episodes(env.id, params, 25), 25)
+    records = evaluate(env, params, agent, listed_episodes(env, params, 25), 25)
     assert np.mean(records.success) >= 0.84
     assert not np.any(records.contact)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.odometry import OdometryParams
-from subterra_jax.slip import SlipParams
-from subterra_jax.state import GoalParams, StartParams
-from subterra_jax.wander import WanderParams
+from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.slip import SlipParams
+from subterra_jax.parts.wander import WanderParams
+from subterra_jax.rules import GoalParams, RewardParams, StartParams
 
 EXACT = {
     "slip": SlipParams(0.0, 0.0, WanderParams(0.0)),
@@ -179,7 +179,7 @@ def test_privileged_state_tells_what_observations_do_not():
     ("arguments", "message"),
     [
         ({"goal": None}, "goal must be GoalParams"),
-        ({"reward": st.reward.RewardParams()}, "reward must be GoalRewardParams"),
+        ({"reward": RewardParams()}, "reward must be GoalRewardParams"),
         ({"tunnel": st.Tunnel.from_plan(st.load_tunnel().slice(0.0, 12.0), "smooth")}, "needs a tunnel of 15 m"),
     ],
 )

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax import odometry, slip, wander
+from subterra_jax.parts import odometer as odometry
+from subterra_jax.parts import slip, wander
 
 N = 20_000
 PARAMS = wander.WanderParams(sigma=0.02, length=30.0)

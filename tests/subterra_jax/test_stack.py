@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import lidar, vehicle
+from subterra_jax import lidar
 from subterra_jax.lidar import fused, planar, reference
+from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.tunnel import Tunnel, foot, node_at
 from subterra_jax.tunnel.tunnel import stack
 from tests.subterra_jax import tunnels

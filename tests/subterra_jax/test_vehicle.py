@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax import vehicle
 from subterra_jax.lidar import reference
+from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.tunnel import Tunnel, foot
 from subterra_jax.tunnel.sources import load_tunnel
 from tests.subterra_jax import tunnels
@@ -25,7 +25,7 @@ def test_a_constant_command_is_followed_along_its_exact_arc(command):
     v, w = command
     position, heading = jnp.array([3.0, -1.0]), jnp.float32(0.5)
     for _ in range(10):
-        position, heading = vehicle.drive(position, heading, jnp.array(command), PARAMS.period)
+        position, heading = vehicle.follow_arc(position, heading, jnp.array(command), PARAMS.period)
     if w == 0.0:
         expected = np.array([3.0, -1.0]) + v * np.array([np.cos(0.5), np.sin(0.5)])
     else:
@@ -39,7 +39,7 @@ def test_a_constant_command_is_followed_along_its_exact_arc(command):
 def test_headings_stay_within_half_a_turn():
     heading = jnp.float32(0.0)
     for _ in range(100):
-        _, heading = vehicle.drive(jnp.zeros(2), heading, jnp.array([0.0, 1.5]), PARAMS.period)
+        _, heading = vehicle.follow_arc(jnp.zeros(2), heading, jnp.array([0.0, 1.5]), PARAMS.period)
         assert abs(float(heading)) <= np.float32(np.pi)
     assert float(heading) == pytest.approx((15.0 + np.pi) % (2 * np.pi) - np.pi, abs=1e-4)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from subterra_jax.b2 import missions
-from subterra_jax.b2.surrogate import Lag, LaggedEnv
+from subterra_jax.b2.surrogate import Lag, LaggedWheels
 from subterra_jax.policies import PolicyError
 from train import navigate
 from train.b2 import embodied
@@ -25,8 +25,8 @@ def world():
 
 def test_the_stand_in_is_told_what_the_legs_are_told_and_obeys_as_late(world):
     mission, params = missions.make(policy="trot")
-    assert isinstance(world.env, LaggedEnv)
-    assert world.env.lag == Lag()
+    assert isinstance(world.env.motion, LaggedWheels)
+    assert world.env.motion.lag == Lag()
     assert world.facts["embodiment"] == "b2"
     bounds, legs = world.env.action_space(world.params), mission.action_space(params)
     np.testing.assert_array_equal(bounds.high, legs.high)

@@ -8,7 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation import listed_episodes
-from subterra_jax.state import StartParams
+from subterra_jax.rules import StartParams
 from tests.train.conftest import TASK, call
 from train import evaluate
 from train.agents import agent_of

@@ -6,8 +6,8 @@ from typing import Any
 
 import subterra_jax as st
 from subterra_jax.b2 import missions, trial
-from subterra_jax.b2.surrogate import LaggedEnv
-from subterra_jax.slip import SlipParams
+from subterra_jax.b2.surrogate import stand_in
+from subterra_jax.parts.slip import Slip, SlipParams
 from subterra_jax.tunnel.sources import load_tunnel
 from train import cli, policies
 from train.agents import agent_of
@@ -39,11 +39,10 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
     if planar.params.tunnel.count > 1:
         raise ConfigError(f"tunnel = {tunnel} is more than one; the B2 walks one")
     fields: dict[str, Any] = {"vehicle": missions.VEHICLE, "start": missions.START, "slip": _SLIP}
-    _, params = st.make(task, tunnel, planar.facts["lining"], **fields)
+    env, params = st.make(task, tunnel, planar.facts["lining"], parts=(Slip(),), **fields)
     if legs.robots:
         _mission(planar, tunnel, legs)
-    env = LaggedEnv(id=task, rule=planar.env.rule)
-    return World(task, env, params, {**planar.facts, "embodiment": B2})
+    return World(task, stand_in(env), params, {**planar.facts, "embodiment": B2})
 
 
 def score(session: Session, snapshot: Snapshot, tunnel: Path | str | None, legs: Legs) -> dict[str, float]:

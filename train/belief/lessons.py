@@ -91,13 +91,12 @@ def collect(env: Any, params: Any, drive: Drive, key: PRNGKeyArray, n_steps: int
         command = jax.vmap(lambda w: CentreLine().steer(w, jnp.asarray(params.vehicle.speed_max), params))(walls)
         action = jnp.pad(command, ((0, 0), (0, env.env.action_size - 2)))
         known = jax.vmap(env.env.privileged, (0, None))(now.env_state, params)
-        tunnel = now.env_state.tunnel
         stored = Stretch(
             ranges=now.observation[:, env.env.fields(params)["ranges"]],
             walls=walls,
             station=now.env_state.station,
             forward=jnp.where(known["heading_cos"] > 0.0, 1.0, -1.0),
-            tunnel=jnp.zeros(len(same), jnp.int32) if tunnel is None else tunnel,
+            tunnel=now.env_state.tunnel,
             same=same,
         )
         observation, state, _, terminated, truncated, _ = env.step(key_now, now.env_state, action, params)

@@ -91,7 +91,7 @@ def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Ar
         jnp.tanh(wrong),
         wrong / 5.0,
         10.0 * known["slip"],
-        state.goal.still / 10.0,
+        known["still"] / 10.0,
         *jnp.moveaxis(state.command, -1, 0),
     ]
     return jnp.stack(parts, axis=-1)

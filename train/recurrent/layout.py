@@ -8,7 +8,6 @@ from jaxtyping import Array
 
 import subterra_jax as st
 from subterra_jax.policies import senses
-from subterra_jax.rules import StopAt
 from train.errors import ConfigError
 from train.recurrent import drive as driving
 from train.recurrent.config import RecurrentConfig
@@ -23,7 +22,7 @@ def require_goal(env: Any) -> None:
     Raises:
         ConfigError: The task has no goal.
     """
-    if not isinstance(env.rule, StopAt):
+    if env.rule.errand not in ("stop", "return"):
         raise ConfigError(f"memory = gru learns to drive to a goal and stop, which {env.id} does not ask for")
 
 
@@ -51,7 +50,7 @@ def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayo
 
 def senses_of(params: Any, config: RecurrentConfig) -> senses.Senses:
     """What the network is shown: what the config says, and else what the task is about."""
-    among_boxes = params.obstacles is not None
+    among_boxes = "obstacles" in params.parts
     return senses.Senses(config.tracker or ("careful" if among_boxes else senses.PLAIN.tracker), among_boxes)
 
 

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.baselines import navigator
-from subterra_jax.baselines.agent import Agent, observed, shown
+from subterra_jax.baselines.agent import Agent, shown
+from subterra_jax.episode import ask, in_tunnel, look
 from subterra_jax.policies import recurrent, senses
 
 
@@ -48,12 +49,10 @@ def advise(
     """
 
     def one(key: PRNGKeyArray, memory: Any, flat: Array, state: Any, first: Array) -> tuple[Array, Any]:
-        here = params if state.tunnel is None else dataclasses.replace(params, tunnel=params.tunnel.pick(state.tunnel))
-        here = shown(here, agent.uses_map)
+        here = in_tunnel(env, params, state.tunnel)
         key_begin, key_act = jax.random.split(key)
         memory = _where(first, _begin(env, agent, key_begin, flat, here), memory)
-        truth = env.privileged(state, params) if agent.privileged else None
-        action, after = agent.act(key_act, memory, observed(env, params, flat, agent.uses_lidar), here, truth)
+        action, after = ask(env, agent, key_act, memory, look(env, agent, here, flat), state, here)
         return action, _where(jnp.ones((), bool), after, memory)
 
     return jax.vmap(one)(jax.random.split(key, len(first)), memory, observation, state, first)
@@ -80,7 +79,7 @@ def driven(before: Any, after: Any, action: Float[Array, "env 2"]) -> Any:
 
 def _begin(env: Any, agent: Agent, key: PRNGKeyArray, flat: Float[Array, "obs"], params: Any) -> Any:
     """The memory at the start of an episode."""
-    return agent.begin(key, observed(env, params, flat, agent.uses_lidar), params)
+    return agent.begin(key, look(env, agent, params, flat), shown(params, agent.uses_map))
 
 
 def _where(condition: Bool[Array, ""], one: Any, other: Any) -> Any:

@@ -13,8 +13,9 @@ import subterra_jax as st
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.scene import lidar_elevation, per_release, random_stations, scene_model, scene_ranges
 from benchmarks.fidelity.derive.surface import surface_caster
-from subterra_jax import lidar, odometry
-from subterra_jax.state import EnvParams, State, StepNoise
+from subterra_jax import lidar
+from subterra_jax.parts import Noise, odometer
+from subterra_jax.state import EnvParams, State
 
 TASK = "Subterra/Traverse-v0"
 PLAN_LINING = "pockets"
@@ -82,10 +83,9 @@ def compile_observer(case: Case) -> Callable[[LidarPoses, jax.Array], np.ndarray
     env, params = make_environment(case)
 
     def look(xy: jax.Array, heading: jax.Array, station: jax.Array, normal: jax.Array) -> jax.Array:
-        zero = jnp.zeros(2)
-        odometer = odometry.start_odometry(zero, params.odometry)
-        state = State(xy, heading, station, zero[0], station, zero, odometer, jnp.zeros((), jnp.int32))
-        return env.observe(state, StepNoise(zero, normal), params)[: params.lidar.n_beams]
+        begun = env.begin(env.draw_reset(jax.random.key(0), (), params), params)
+        state = begun.replace(position=xy, heading=heading, station=station)
+        return env.observe(state, {"lidar": Noise(normal)}, params)[: params.lidar.n_beams]
 
     compiled = jax.jit(jax.vmap(look))
     return lambda at, normal: np.asarray(compiled(*_plan_arrays(at), normal), float)
@@ -129,7 +129,7 @@ def range_noise(case: Case) -> Float[np.ndarray, " n"]:
         raise ValueError("no beam of the environment has a hit well within reach")
     found: list[np.ndarray] = []
     for key in jax.random.split(jax.random.key(case.seed), -(-_NOISE_DRAWS // int(inside.sum()))):
-        drawn = env.draw_step(key, (len(at.station),), params).ranges
+        drawn = env.draw_step(key, (len(at.station),), params)["lidar"].normal
         found.append((compile_observer(case)(at, drawn) - clean)[inside])
     return np.concatenate(found)[:_NOISE_DRAWS]
 
@@ -177,9 +177,9 @@ def odometry_drift(case: Case) -> float:
     def episode(key: jax.Array) -> jax.Array:
         begin, go = jax.random.split(key)
         start = env.begin(env.draw_reset(begin, (), params), params).odometry
-        drawn = env.draw_step(go, (steps,), params).odometry
+        drawn = env.draw_step(go, (steps,), params)["odometry"].normal
         motion = jnp.array([speed, 0.0])
-        advance = odometry.advance_odometry
+        advance = odometer.advance_odometry
         last = jax.lax.scan(lambda s, n: (advance(s, motion, interval, n, params.odometry), None), start, drawn)[0]
         return last.distance - steps * speed * period
 

@@ -14,7 +14,7 @@ from subterra_jax.state import EnvParams
 
 @struct.dataclass
 class ParticleAgent:
-    """A filter that is told the start, and one that is not; which of them drives, the first observation tells.
+    """A filter that is told the start, and one that is not; the errand of the task chooses between them.
 
     Attributes:
         told: For tasks that begin at a known station.
@@ -35,12 +35,11 @@ class ParticleAgent:
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Any:
         """Memory of the one that drives."""
-        return self._driver(obs).begin(key, obs, params)
+        return self._driver(params).begin(key, obs, params)
 
     def act(self, key: PRNGKeyArray, memory: Any, obs: Observed, params: EnvParams, known: Known) -> tuple[Action, Any]:
         """What it does."""
-        return self._driver(obs).act(key, memory, obs, params, known)
+        return self._driver(params).act(key, memory, obs, params, known)
 
-    def _driver(self, obs: Observed) -> Navigator | Relocaliser:
-        """Relocalisation observes the pitch of the rings and no goal."""
-        return self.lost if obs.goal is None and obs.ring_pitch is not None else self.told
+    def _driver(self, params: EnvParams) -> Navigator | Relocaliser:
+        return self.lost if params.errand == "report" else self.told

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from subterra_jax.baselines.particle.likelihood import fit
 from subterra_jax.baselines.particle.scan import Place, ScanModel
 from subterra_jax.baselines.particle.wallmap import WallMap
-from subterra_jax.wander import WanderParams, advance_wander
+from subterra_jax.parts.wander import WanderParams, advance_wander
 
 _POWERS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of a likelihood that may be flattened
 

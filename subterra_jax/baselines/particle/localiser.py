@@ -115,6 +115,6 @@ def particle_filter(params: EnvParams, n_particles: int | None = None) -> Naviga
     """
     if n_particles is None:
         uncertain = float(np.max(np.asarray(params.start.station_sigma))) > 0.0
-        n_particles = 1024 if uncertain else 256 if params.faults is None else 512
+        n_particles = 1024 if uncertain else 512 if "faults" in params.parts else 256
     localiser = ParticleLocaliser.of(params, n_particles)
     return Navigator(localiser, steering_of(params, CentreLine()), name="particle-filter", uses_map=True)

@@ -6,11 +6,12 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.drift import fault_sizes, slip_sizes
 from subterra_jax.baselines.particle.cloud import CloudParams
-from subterra_jax.faults import MAX_DELAY
+from subterra_jax.parts.faults import MAX_DELAY
+from subterra_jax.parts.unicycle import wrap
+from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
-from subterra_jax.vehicle import wrap
-from subterra_jax.wander import WanderParams
 
 # As often as 10 m patches change, 1/m, in a cloud of which some particles must be right at once.
 _SLIP_RATE = 0.1
@@ -91,13 +92,13 @@ def cloud_params(params: EnvParams) -> CloudParams:
     share = odometer_share(params)
     (lasting, changing), (plant_lasting, plant_changing) = _odometer(params), _plant(params)
     fused = lambda a, b: float(np.hypot(share * a, (1.0 - share) * b))  # noqa: E731
-    wander = params.odometry.wander if params.slip is None else params.slip.wander
+    wander = params.slip.wander if "slip" in params.parts else params.odometry.wander
     return CloudParams(
         scale_sigma=fused(lasting, plant_lasting),
         wander=WanderParams(fused(changing, plant_changing), 30.0 if wander is None else float(wander.length)),
         step_sigma=max(0.005, share * float(params.odometry.distance_sigma)),
-        slip_rate=0.0 if params.faults is None else _SLIP_RATE,
-        slip_loss=0.0 if params.faults is None else float(params.faults.wet_loss),
+        slip_rate=_SLIP_RATE if "faults" in params.parts else 0.0,
+        slip_loss=float(fault_sizes(params).wet_loss),
     )
 
 
@@ -109,4 +110,5 @@ def _odometer(params: EnvParams) -> tuple[float, float]:
 
 def _plant(params: EnvParams) -> tuple[float, float]:
     """Nominal lasting and changing error of the command's scale, 1."""
-    return (0.0, 0.0) if params.slip is None else (float(params.slip.gain_sigma), float(params.slip.wander.sigma))
+    slip = slip_sizes(params)
+    return float(slip.gain_sigma), float(slip.wander.sigma)

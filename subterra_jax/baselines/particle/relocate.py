@@ -71,7 +71,7 @@ class Relocaliser:
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
         """Particles evenly along the tunnel, alternately facing either way."""
         del key
-        n, margin = self.filter.n_particles, 0.0 if params.goal is None else params.goal.margin
+        n, margin = self.filter.n_particles, params.goal.margin
         share = (jnp.arange(n) + 0.5) / n
         heading = jnp.where(jnp.arange(n) % 2 == 0, 0.0, jnp.pi)
         place = Place(margin + (params.tunnel.length - 2.0 * margin) * share, jnp.zeros(n), heading)
@@ -103,7 +103,7 @@ class Relocaliser:
         sure = jnp.where(is_sure, memory.sure + moved, 0.0)
         ahead = obs.ranges[jnp.asarray(_MOUTH_BEAMS)]
         mouth = jnp.all(ahead >= params.lidar.range_max)
-        allowed = jnp.inf if params.goal is None else self.furthest * params.goal.travel_max
+        allowed = self.furthest * params.goal.travel_max
         stopped = memory.stopped | (sure >= self.sure_for) | (travelled >= allowed) | mouth
         speed = jnp.where(stopped, 0.0, params.vehicle.speed_max)
         command = jnp.where(stopped, 0.0, self.steering.steer(steering, speed, params))
@@ -114,4 +114,4 @@ class Relocaliser:
 
     def sure_sigma(self, params: EnvParams) -> Float[Array, ""]:
         """Standard deviation up to which it calls itself sure, m: half the task's tolerance."""
-        return jnp.asarray(0.5 if params.goal is None else 0.5 * params.goal.tolerance)
+        return jnp.asarray(0.5 * params.goal.tolerance)

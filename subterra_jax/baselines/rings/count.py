@@ -39,7 +39,7 @@ class RingCount:
 
     def begin(self, obs: Observed, params: EnvParams) -> Count:
         """At the believed start."""
-        start = jnp.stack([jnp.asarray(value, jnp.float32) for value in drift.believed_start(obs, params)])
+        start = jnp.stack([jnp.asarray(value, jnp.float32) for value in drift.believed_start(params)])
         return Count(start, rings.start((), obs.ranges.shape[-1]), FusedCount().begin(obs, params))
 
     def update(
@@ -50,8 +50,9 @@ class RingCount:
         # Not the filter's own step, in which the flag is a fix of the filter's own error.
         commanded = driven.speed * params.vehicle.period
         moved = driven.cosine * rings.moved(commanded, obs.distance - memory.reckoning.reading)
-        pitch = jnp.zeros(()) if obs.ring_pitch is None else obs.ring_pitch
-        track = rings.advance(memory.track, obs.ranges, moved, driven.direction, pitch, careful=True)
+        track = rings.advance(
+            memory.track, obs.ranges, moved, driven.direction, jnp.asarray(obs.ring_pitch), careful=True
+        )
         lost = jnp.exp(fused.log_sigma)
         sigma = jnp.hypot(track.strength * _LOCKED + (1.0 - track.strength) * lost, memory.start[1])
         estimate = Station(memory.start[0] + track.station, jnp.log(sigma), driven.direction)

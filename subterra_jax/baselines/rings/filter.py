@@ -51,7 +51,7 @@ class RingFilter:
 
     def begin(self, obs: Observed, params: EnvParams) -> Counted:
         """At the believed start."""
-        start = jnp.stack([jnp.asarray(value, jnp.float32) for value in drift.believed_start(obs, params)])
+        start = jnp.stack([jnp.asarray(value, jnp.float32) for value in drift.believed_start(params)])
         track = ringgrid.start((), obs.ranges.shape[-1], self.wet)
         return Counted(start, track, FusedCount().begin(obs, params))
 
@@ -62,9 +62,8 @@ class RingFilter:
         fused, reckoning = FusedCount().update(memory.reckoning, obs, driven, params, known)
         commanded = driven.speed * params.vehicle.period
         moved = ringgrid.moved(commanded, obs.distance - memory.reckoning.reading) * driven.cosine
-        pitch = jnp.zeros(()) if obs.ring_pitch is None else obs.ring_pitch
-        loss = params.faults.wet_loss if self.wet and params.faults is not None else 0.0
-        track = ringgrid.advance(memory.track, obs.ranges, moved, driven.direction, pitch, loss)
+        loss = drift.fault_sizes(params).wet_loss if self.wet else 0.0
+        track = ringgrid.advance(memory.track, obs.ranges, moved, driven.direction, jnp.asarray(obs.ring_pitch), loss)
         heard, lost = jnp.hypot(track.spread, _LOCKED), jnp.exp(fused.log_sigma)
         sigma = jnp.hypot(track.strength * heard + (1.0 - track.strength) * lost, memory.start[1])
         estimate = Station(memory.start[0] + track.station, jnp.log(sigma), driven.direction)
@@ -117,7 +116,7 @@ class Unhurried:
 
     def steer(self, memory: Driving, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
         """As the steering, no faster."""
-        if params.goal is not None:
+        if params.errand != "cover":
             speed = jnp.minimum(speed, jnp.where(memory.driven < self.learning, self.slow, self.cruise))
         return self.steering.steer(memory.steering, speed, params)
 
@@ -129,4 +128,4 @@ class Unhurried:
 def ring_filter(params: EnvParams) -> Navigator:
     """The agent for a task."""
     steering = Unhurried(steering_of(params, CentreLine()))
-    return Navigator(RingFilter(wet=params.faults is not None), steering, name="ring-filter")
+    return Navigator(RingFilter(wet="faults" in params.parts), steering, name="ring-filter")

@@ -26,7 +26,7 @@ from subterra_jax.baselines.rings import pattern as ringpattern
 from subterra_jax.baselines.rings import walls as wallfit
 from subterra_jax.baselines.rings.lag import Moved
 from subterra_jax.baselines.rings.track import GridTrack, anew, start
-from subterra_jax.faults import FaultParams
+from subterra_jax.parts.faults import FaultParams
 
 __all__ = ["WET_LOSS", "GridTrack", "advance", "anew", "moved", "start"]
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.faults import MAX_DELAY
+from subterra_jax.parts.faults import MAX_DELAY
 
 # Command and odometry err independently; this is the weight of the second, for slips of 2 % + 2 % and 2 % + 1 %.
 ODOMETER_SHARE = 0.6

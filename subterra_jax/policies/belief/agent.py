@@ -75,7 +75,7 @@ class Belief:
         del key
         if self.map is None:
             raise PolicyError(f"{self.name}: has no map yet; `told(params)` gives it that of a task")
-        margin = jnp.asarray(0.0 if params.goal is None else params.goal.margin)
+        margin = jnp.asarray(params.goal.margin)
         zero = jnp.zeros(())
         return Memory(
             log_mass=grid.evenly(jnp.asarray(self._tape), jnp.asarray(params.tunnel.length), margin),
@@ -98,7 +98,7 @@ class Belief:
         walls = CentreLine().look(memory.walls, obs, memory.command, params)
         walls = jax.tree.map(lambda new, old: jnp.where(done, new, old), CentreLine().turned(walls), walls)
         now = self._believed(dataclasses.replace(memory, walls=walls, turn=turn), obs, params, done)
-        length, tolerance = jnp.asarray(params.tunnel.length), jnp.asarray(_tolerance(params))
+        length, tolerance = jnp.asarray(params.tunnel.length), jnp.asarray(params.goal.tolerance)
         station = grid.stations(jnp.asarray(self._tape), now.track.station, length)
         told = grid.summary(now.log_mass, station, _CLUSTER * tolerance, self.habits.cell)
         now = self._decided(now, told, obs, params)
@@ -119,8 +119,7 @@ class Belief:
         habits, length = self.habits, jnp.asarray(params.tunnel.length)
         moved = rings.moved(memory.command[0] * params.vehicle.period, obs.distance - memory.reading)
         busy = belief_turn.turning(memory.turn) | done
-        pitch = jnp.zeros(()) if obs.ring_pitch is None else obs.ring_pitch
-        track = rings.advance(memory.track, obs.ranges, moved, jnp.ones(()), pitch)
+        track = rings.advance(memory.track, obs.ranges, moved, jnp.ones(()), jnp.asarray(obs.ring_pitch))
         # What is driven while it turns leads nowhere in particular: a belief that spreads by as much.
         track = jax.tree.map(lambda old, new: jnp.where(busy, old, new), memory.track, track)
         variance = jnp.abs(moved) * (habits.lost_drift + track.strength * (habits.drift - habits.lost_drift))
@@ -157,16 +156,12 @@ class Belief:
         habits, busy = self.habits, belief_turn.turning(now.turn)
         sure = told.mass >= habits.sure_mass
         sure_for = jnp.where(sure, now.sure + now.command[0] * params.vehicle.period, 0.0)
-        allowed = jnp.inf if params.goal is None else habits.furthest * params.goal.travel_max
+        allowed = habits.furthest * params.goal.travel_max
         mouth = jnp.all(obs.ranges[jnp.asarray(_MOUTH_BEAMS)] >= params.lidar.range_max) & ~busy
         spent = now.travelled + now.track.station >= allowed
         stopped = now.stopped | (sure_for >= habits.sure_for) | spent
         turn = belief_turn.begun(now.turn, mouth & ~stopped)
         return dataclasses.replace(now, sure=sure_for, stopped=stopped, turn=turn)
-
-
-def _tolerance(params: EnvParams) -> Float[Array, ""] | float:
-    return 1.0 if params.goal is None else params.goal.tolerance
 
 
 def try_scan(tensors: Tensors) -> Float[Array, "2"]:

@@ -7,8 +7,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.mission import TURN_SPEED
+from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams
-from subterra_jax.vehicle import wrap
 
 _TURNED = 0.1  # rad; what is left is for the steering
 

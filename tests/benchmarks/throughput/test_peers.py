@@ -12,7 +12,7 @@ from benchmarks.throughput import mujoco_route
 from benchmarks.throughput.peers import BatchedPeer, Route, find_peers, jaxnav_loop, measure_peer, pendulum_loop
 from benchmarks.throughput.timing import Loop, Timing
 from subterra_jax.lidar import reference
-from subterra_jax.odometry import OdometryParams
+from subterra_jax.parts.odometer import OdometryParams
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import drawing
 from subterra_jax.adapters.views import make_view
-from subterra_jax.obstacles import Boxes
+from subterra_jax.parts.boxes import Boxes
 
 
 def colours(picture):

@@ -27,8 +27,6 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
     )
     walk = trial.Walk(
         state=state,
-        noise=None,
-        memory=None,
         over=np.ones(4, bool),
         success=np.array([True, True, False, False]),
         contact=np.array([False, False, False, True]),

@@ -4,6 +4,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
+from subterra_jax import constants
+
 
 @struct.dataclass
 class WanderParams:
@@ -15,18 +17,18 @@ class WanderParams:
     """
 
     sigma: float
-    length: float = 30.0
+    length: float = constants.WANDER_LENGTH
 
 
 def start_wander(noise: Float[Array, ""], params: WanderParams) -> Float[Array, ""]:
-    """A value from the stationary distribution; `noise` is standard normal."""
+    """Draw a value from the stationary distribution; `noise` is standard normal."""
     return params.sigma * noise
 
 
 def advance_wander(
     value: Float[Array, ""], travelled: Float[Array, ""], noise: Float[Array, ""], params: WanderParams
 ) -> Float[Array, ""]:
-    """The value a distance further on; unchanged where nothing was travelled.
+    """Return the value a distance further on; unchanged where nothing was travelled.
 
     Args:
         value: The value before.

@@ -1,6 +1,8 @@
-"""The robot: a unicycle that does exactly what it is told, and the walls it must not touch."""
+"""The robot: a unicycle that moves along exact arcs, and its distance to the walls."""
 
+import dataclasses
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,10 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax import native
+from subterra_jax import constants, native
+from subterra_jax.parts.part import Drive, Motion, Moved
 from subterra_jax.rows import rowwise
+from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at
 
 
@@ -25,14 +29,14 @@ class VehicleParams:
         period: Control period, s.
     """
 
-    speed_max: float = 2.0
-    yaw_rate_max: float = 1.5
-    radius: float = 0.4
-    period: float = 0.1
+    speed_max: float = constants.SPEED_MAX
+    yaw_rate_max: float = constants.YAW_RATE_MAX
+    radius: float = constants.RADIUS
+    period: float = constants.PERIOD
 
 
 def clip_action(action: Float[Array, "2"], params: VehicleParams) -> Float[Array, "2"]:
-    """The command that the robot obeys: `[v, ω]` clipped to its limits, a NaN read as 0.
+    """Clip a command `[v, ω]` to the robot's limits; a NaN is read as 0.
 
     Args:
         action: Wanted forward speed (m/s) and yaw rate (rad/s, counter-clockwise); anything at all.
@@ -44,12 +48,12 @@ def clip_action(action: Float[Array, "2"], params: VehicleParams) -> Float[Array
 
 
 def wrap(angle: Float[Array, ""]) -> Float[Array, ""]:
-    """An angle brought into [-π, π], rad, for angles less than a turn outside."""
+    """Bring an angle into [-π, π], rad, for angles less than a turn outside."""
     turn = 2.0 * jnp.pi
     return jnp.where(angle > jnp.pi, angle - turn, jnp.where(angle < -jnp.pi, angle + turn, angle))
 
 
-def drive(
+def follow_arc(
     position: Float[Array, "2"], heading: Float[Array, ""], command: Float[Array, "2"], period: Float[Array, ""]
 ) -> tuple[Float[Array, "2"], Float[Array, ""]]:
     """Move along the exact arc of a constant command.
@@ -58,7 +62,7 @@ def drive(
         position: Position, tunnel frame, m.
         heading: Heading, rad.
         command: Speed (m/s) and yaw rate (rad/s).
-        period: How long it is held, s.
+        period: Duration, s.
 
     Returns:
         Position and heading afterwards. Speed 0 turns on the spot; yaw rate 0 is a straight line, not a division by 0.
@@ -73,7 +77,7 @@ def drive(
 
 
 def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array, ""]) -> Float[Array, ""]:
-    """Distance from a point to the nearest wall or furniture segment.
+    """Measure the distance from a point to the nearest wall or furniture segment.
 
     Args:
         tunnel: The tunnel.
@@ -89,7 +93,7 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
 
 
 def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> Float[Array, ""]:
-    """`clearance` in a known window, by XLA."""
+    """Compute `clearance` in a known window, by XLA."""
     window = first + jnp.arange(tunnel.n_contact)
     vertex = (tunnel.box[:2, window].T - position)[:, :, None] + tunnel.wall[window]
     x0, y0, x1, y1 = vertex[:, 0, :-1], vertex[:, 1, :-1], vertex[:, 0, 1:], vertex[:, 1, 1:]
@@ -102,7 +106,7 @@ def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> 
 
 
 def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
-    """Many points in one tunnel."""
+    """Compute `clearance` of many points in one tunnel."""
     from subterra_jax.native import calls  # numba is optional
 
     by_xla: Callable[..., Array] = jax.vmap(_gap, in_axes=(None, 0, 0))
@@ -115,16 +119,38 @@ _gap_by_kernel = rowwise(_gap, _gap_rows)
 def in_contact(
     tunnel: Tunnel, clear: Float[Array, ""], station: Float[Array, ""], params: VehicleParams
 ) -> Bool[Array, ""]:
-    """Whether the footprint touches anything, or lies wholly outside one of the mouths.
+    """Tell whether the footprint touches anything, or lies wholly outside one of the mouths.
 
-    It is looked at at the end of each control period; in one period the robot moves at most half its radius, so that
-    it cannot pass through a wall unseen. Leaving through a mouth counts as contact, because no wall goes on there.
+    Contact is judged at the end of each control period. In one period the robot moves at most half its radius, so it
+    cannot pass through a wall unseen. Leaving through a mouth counts as contact, because no wall goes on there.
 
     Args:
         tunnel: The tunnel.
-        clear: Distance from the middle of the robot to the nearest thing, m.
+        clear: Distance from the middle of the robot to the nearest obstacle, m.
         station: Station of the robot, m.
         params: The robot.
     """
     outside = (station < -params.radius) | (station > tunnel.length + params.radius)
     return (clear < params.radius) | outside
+
+
+@dataclasses.dataclass(frozen=True)
+class Unicycle(Motion):
+    """A robot on wheels that does what its wheels do."""
+
+    name: ClassVar[str] = "vehicle"
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `vehicle`."""
+        return {"vehicle": VehicleParams()}
+
+    def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
+        """Clip the action."""
+        del state
+        return clip_action(action[:2], params.vehicle)
+
+    def move(self, state: State, drive: Drive, noise: Any, tunnel: Tunnel, params: EnvParams) -> Moved:
+        """Move along the arc of the true motion; see `Motion.move`."""
+        del noise, tunnel
+        position, heading = follow_arc(state.position, state.heading, drive.motion, jnp.asarray(params.vehicle.period))
+        return Moved(position, heading, drive, (), jnp.inf, False, False, {})

@@ -1,14 +1,20 @@
-"""Boxes on the way: where they stand, how far beams see them, how near the robot comes."""
+"""Boxes in the tunnel: their places, the ranges to them, and the robot's distance from them."""
+
+import dataclasses
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
 
-from subterra_jax.hashing import uniform
+from subterra_jax import constants
+from subterra_jax.parts.hashing import uniform
+from subterra_jax.parts.part import Batch, Part, Sight
+from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel, at_station
 
-PITCH = 15.0  # m of tunnel for each box
+PITCH = constants.BOX_PITCH  # m of tunnel for each box
 REACH = 33.0  # m of arc on which anything within 30 m lies
 N_SLOTS = 6  # cover twice the reach, wherever it begins
 _N_NEAR = 2  # slots next to a point on either side of it, for contact
@@ -21,18 +27,18 @@ class ObstacleParams:
     Attributes:
         size_min: Least side of a box, m.
         size_max: Largest side of a box, m.
-        gap: Free width that is always left on one side, m.
+        gap: Free width left on one side of each box, m.
         first: No obstacle stands before this station, m.
         trolley_length: Length of the trolley, along the tunnel, m.
         trolley_width: Its width, m.
     """
 
-    size_min: float = 0.3
-    size_max: float = 0.8
-    gap: float = 1.2
-    first: float = 8.0
-    trolley_length: float = 2.4
-    trolley_width: float = 1.2
+    size_min: float = constants.BOX_SIZE_MIN
+    size_max: float = constants.BOX_SIZE_MAX
+    gap: float = constants.BOX_GAP
+    first: float = constants.BOX_FIRST
+    trolley_length: float = constants.TROLLEY_LENGTH
+    trolley_width: float = constants.TROLLEY_WIDTH
 
 
 @struct.dataclass
@@ -53,13 +59,13 @@ class Boxes:
 def boxes_near(
     seed: UInt32[Array, ""], station: Float[Array, ""], reach: float, n: int, tunnel: Tunnel, params: ObstacleParams
 ) -> Boxes:
-    """The boxes of the slots from `reach` before a station on.
+    """Return the boxes of `n` slots, from `reach` before a station on.
 
     Args:
-        seed: Of the episode: the same seed gives the same boxes.
-        station: Where one looks from, m.
-        reach: How far back the first slot lies, m.
-        n: How many slots.
+        seed: Seed of the episode; equal seeds give equal boxes.
+        station: Station of the observer, m.
+        reach: Distance back to the first slot, m.
+        n: Number of slots.
         tunnel: The tunnel they stand in.
         params: Their sizes.
     """
@@ -68,7 +74,7 @@ def boxes_near(
 
 
 def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, params: ObstacleParams) -> Boxes:
-    """The boxes of given slots, slot k being the stations from 15 k to 15 (k + 1) m."""
+    """Return the boxes of given slots; slot k has the stations from 15 k to 15 (k + 1) m."""
     u = lambda index: uniform(seed, slot, index)  # noqa: E731
     n_slots = jnp.maximum(jnp.floor(tunnel.length / PITCH), 2.0)
     trolley = slot == 1 + jnp.floor(uniform(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
@@ -95,7 +101,7 @@ def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, par
 def distance_along(
     boxes: Boxes, position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
 ) -> Float[Array, "n_beams"]:
-    """Distance at which each beam first meets a box, m; `inf` where it meets none, 0 from inside of one."""
+    """Measure where each beam first meets a box, m; `inf` where it meets none, 0 from inside one."""
     p_x, p_y = _in_frame(boxes, position - boxes.centre)
     axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
     d_x, d_y = direction[:, 0, None], direction[:, 1, None]
@@ -114,7 +120,7 @@ def clearance(
     tunnel: Tunnel,
     params: ObstacleParams,
 ) -> Float[Array, ""]:
-    """Distance from a point to the nearest box, m; 0 inside; exact up to 0.8 m."""
+    """Measure the distance from a point to the nearest box, m; 0 inside; exact up to 0.8 m."""
     boxes = boxes_near(seed, station, 3.0, _N_NEAR, tunnel, params)
     p_x, p_y = _in_frame(boxes, position - boxes.centre)
     out_x, out_y = (jnp.maximum(jnp.abs(p) - boxes.half[:, i], 0.0) for i, p in enumerate((p_x, p_y)))
@@ -122,7 +128,7 @@ def clearance(
 
 
 def segments(boxes: Boxes) -> Float[Array, "n 4 4"]:
-    """The sides of boxes as segments `x0, y0, x1, y1`, m, four to a box."""
+    """Return the sides of boxes as segments `x0, y0, x1, y1`, m, four to a box."""
     long = boxes.axis * boxes.half[:, :1]
     wide = jnp.stack([-boxes.axis[:, 1], boxes.axis[:, 0]], axis=-1) * boxes.half[:, 1:]
     corner = jnp.stack([long + wide, wide - long, -long - wide, long - wide], axis=1) + boxes.centre[:, None]
@@ -130,7 +136,7 @@ def segments(boxes: Boxes) -> Float[Array, "n 4 4"]:
 
 
 def _in_frame(boxes: Boxes, vector: Float[Array, "n 2"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
-    """Components of vectors along and across the boxes."""
+    """Return the components of vectors along and across the boxes."""
     axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
     return vector[:, 0] * axis_x + vector[:, 1] * axis_y, vector[:, 1] * axis_x - vector[:, 0] * axis_y
 
@@ -138,8 +144,45 @@ def _in_frame(boxes: Boxes, vector: Float[Array, "n 2"]) -> tuple[Float[Array, "
 def _slab(
     origin: Float[Array, "n"], ahead: Float[Array, "n_beams n"], half: Float[Array, "n"]
 ) -> tuple[Float[Array, "n_beams n"], Float[Array, "n_beams n"]]:
-    """Distances at which beams enter and leave the strip |x| ≤ half."""
+    """Return where beams enter and leave the strip |x| ≤ half."""
     tiny = jnp.where(ahead < 0.0, -1e-12, 1e-12)
     inverse = 1.0 / jnp.where(jnp.abs(ahead) < 1e-12, tiny, ahead)
     a, b = (-half - origin) * inverse, (half - origin) * inverse
     return jnp.minimum(a, b), jnp.maximum(a, b)
+
+
+@dataclasses.dataclass(frozen=True)
+class Obstacles(Part):
+    """Boxes that stand in the way; its state is the seed of the episode's boxes."""
+
+    name: ClassVar[str] = "obstacles"
+    streams: ClassVar[tuple[int, ...]] = (6,)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `obstacles`."""
+        return {"obstacles": ObstacleParams()}
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
+        """Draw random bits, the first of two words: the second is that of the faults."""
+        del params
+        return jax.random.bits(key, (*batch, 2))
+
+    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> UInt32[Array, ""]:
+        """Return the seed."""
+        del state, params
+        return draw[0]
+
+    def clearance(self, own: Array, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Array:
+        """Measure the distance to the nearest box, m."""
+        return clearance(own, station, position, tunnel, params.obstacles)
+
+    def hits(
+        self, own: Array, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
+    ) -> Float[Array, "n_beams"]:
+        """Measure where beams meet boxes, m."""
+        boxes = boxes_near(own, sight.station, REACH, N_SLOTS, sight.tunnel, params.obstacles)
+        return distance_along(boxes, sight.position, directions)
+
+    def boxes(self, own: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
+        """Return the boxes within a LiDAR's reach."""
+        return [boxes_near(own, station, REACH, N_SLOTS, tunnel, params.obstacles)]

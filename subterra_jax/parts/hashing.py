@@ -1,16 +1,16 @@
-"""Random numbers that belong to a place: the same for the same seed and slot, without being stored."""
+"""Random numbers of a place: equal for equal seed and slot, and never stored."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
 
 def uniform(seed: UInt32[Array, ""], slot: Int[Array, "*n"], index: int) -> Float[Array, "*n"]:
-    """Uniform numbers in [0, 1).
+    """Return uniform numbers in [0, 1).
 
     Args:
-        seed: Of the episode.
-        slot: Which places.
-        index: Which of the numbers of a place; any small constant.
+        seed: Seed of the episode.
+        slot: Places.
+        index: Number of the draw at a place; any small constant.
 
     Source: the finaliser of MurmurHash3 (Appleby), twice, because slots are consecutive.
     """

@@ -1,13 +1,19 @@
 """Dead reckoning that drifts: noise at every step, a bias that lasts an episode, and an error that wanders."""
 
 import dataclasses
+from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.vehicle import wrap
-from subterra_jax.wander import WanderParams, advance_wander, start_wander
+from subterra_jax import constants
+from subterra_jax.parts.part import Batch, Bounds, Noise, Part, Sight, Step
+from subterra_jax.parts.unicycle import wrap
+from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
+from subterra_jax.state import EnvParams, State
 
 
 @struct.dataclass
@@ -19,32 +25,33 @@ class OdometryParams:
         distance_bias_sigma: Standard deviation over episodes of the relative error of distance, 1.
         heading_sigma: Standard deviation of the heading noise of one step, rad.
         heading_bias_sigma: Standard deviation over episodes of the yaw-rate error, rad/s.
-        wander: Relative error of distance that changes along the way, 1; None, as in the paper's task, is none at all.
+        wander: Relative error of distance that changes along the way, 1; None for no such error, as in T0.
         backward_bias_sigma: Standard deviation over episodes of the relative error of distance that is added while the
-            robot faces falling stations, 1. Without it a constant bias cancels out and back. None is none at all.
+            robot faces falling stations, 1. Without it, a constant bias would cancel on the way back. None for no such
+            error.
     """
 
-    distance_sigma: float = 0.01
-    distance_bias_sigma: float = 0.02
-    heading_sigma: float = 0.001
-    heading_bias_sigma: float = 0.002
+    distance_sigma: float = constants.DISTANCE_SIGMA
+    distance_bias_sigma: float = constants.DISTANCE_BIAS_SIGMA
+    heading_sigma: float = constants.HEADING_SIGMA
+    heading_bias_sigma: float = constants.HEADING_BIAS_SIGMA
     wander: WanderParams | None = None
     backward_bias_sigma: float | None = None
 
     @property
     def n_reset_noise(self) -> int:
-        """Standard normal numbers that the start of an episode needs."""
+        """Standard normal numbers at the start of an episode."""
         return 2 + (self.wander is not None) + (self.backward_bias_sigma is not None)
 
     @property
     def n_step_noise(self) -> int:
-        """Standard normal numbers that a step needs."""
+        """Standard normal numbers of a step."""
         return 2 if self.wander is None else 3
 
 
 @struct.dataclass
 class OdometryState:
-    """What the odometer says, and the bias it has this episode.
+    """Readings of the odometer, and its errors in this episode.
 
     Attributes:
         distance: Dead-reckoned distance travelled, m; may fall when the noise exceeds the motion.
@@ -64,10 +71,10 @@ class OdometryState:
 
 
 def start_odometry(noise: Float[Array, "n"], params: OdometryParams) -> OdometryState:
-    """An odometer at 0 with a fresh bias.
+    """Set the odometer to 0 and draw its errors.
 
     Args:
-        noise: Standard normal numbers, for the bias of distance and of heading, and for the other errors if any.
+        noise: Standard normal numbers: bias of distance, bias of heading, then the other errors if any.
         params: Sizes of the errors.
     """
     zero = jnp.zeros_like(noise[0])
@@ -89,15 +96,15 @@ def advance_odometry(
     params: OdometryParams,
     backward: Bool[Array, ""] | bool = False,
 ) -> OdometryState:
-    """Add one step's measured motion.
+    """Add the measured motion of one step.
 
     Args:
         state: The odometer before.
         motion: True speed (m/s) and yaw rate (rad/s) during the step.
         period: Duration of the step, s.
-        noise: Standard normal numbers, for distance, heading, and the wandering error if there is one.
+        noise: Standard normal numbers: distance, heading, then the wandering error if any.
         params: Sizes of the errors. All zero gives the truth.
-        backward: Whether the robot faces falling stations.
+        backward: The robot faces falling stations.
     """
     moved, scale, wander = motion[0] * period, 1.0 + state.distance_bias, state.wander
     if params.wander is not None and wander is not None:
@@ -110,3 +117,51 @@ def advance_odometry(
     return dataclasses.replace(
         state, distance=state.distance + travelled, heading=wrap(state.heading + turned), wander=wander
     )
+
+
+@dataclasses.dataclass(frozen=True)
+class Odometer(Part):
+    """Distance and heading counted from the wheels."""
+
+    name: ClassVar[str] = "odometry"
+    place: ClassVar[int] = 1
+    streams: ClassVar[tuple[int, ...]] = (1,)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `odometry`."""
+        return {"odometry": OdometryParams()}
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Float[Array, "*batch n"]:
+        """Draw standard normal numbers."""
+        return jax.random.normal(key, (*batch, params.odometry.n_reset_noise))
+
+    def normals(self, params: EnvParams) -> int:
+        """Two or three, as `OdometryParams` says."""
+        return params.odometry.n_step_noise
+
+    def begin(self, draw: Float[Array, "n"], state: State, params: EnvParams) -> OdometryState:
+        """Set the odometer to 0 and draw its errors."""
+        del state
+        return start_odometry(draw, params.odometry)
+
+    def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
+        """Count the wheels' motion."""
+        facing, along = step.before.heading, step.place.tangent
+        backward = jnp.cos(facing) * along[0] + jnp.sin(facing) * along[1] < 0.0
+        period = jnp.asarray(params.vehicle.period)
+        return advance_odometry(own, step.drive.wheels, period, noise.normal, params.odometry, backward)
+
+    def observe(self, own: OdometryState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        """Return the readings as `odometry`."""
+        del own, noise, params
+        seen = sight.parts[self.name]
+        return {"odometry": jnp.stack([seen.distance, seen.heading])}
+
+    def space(self, params: EnvParams) -> dict[str, Bounds]:
+        """Return the bounds: a dead-reckoned distance has none."""
+        del params
+        return {"odometry": (np.array([-np.inf, -np.pi]), np.array([np.inf, np.pi]))}
+
+    def privileged(self, own: OdometryState) -> dict[str, Array]:
+        """Return the biases of distance (1) and heading (rad/s)."""
+        return {"distance_bias": own.distance_bias, "heading_bias": own.heading_bias}

@@ -1,0 +1,65 @@
+"""The numbers that define the benchmark, in one place.
+
+Params take their defaults from here, and `subterra_jax.tasks` the tasks' own figures. Whoever changes one makes another
+benchmark: `tasks.constants_digest` changes with it, stands in every result, and is pinned by a test.
+
+Sources: the paper gives the robot, the LiDAR, the share to cover and the horizon of T0, and names the odometer's errors
+without sizes. The other figures are ours, chosen so that dead reckoning alone fails.
+"""
+
+# Robot: a round unicycle.
+SPEED_MAX, YAW_RATE_MAX = 2.0, 1.5  # m/s, rad/s
+RADIUS = 0.4  # m
+PERIOD = 0.1  # s, of control
+
+# Planar LiDAR.
+RANGE_MAX, RANGE_SIGMA, N_BEAMS = 30.0, 0.05, 16  # m, m, 1
+
+# Odometer: noise of one step, error that lasts an episode, error that wanders over the distance.
+DISTANCE_SIGMA, DISTANCE_BIAS_SIGMA = 0.01, 0.02  # m, 1
+HEADING_SIGMA, HEADING_BIAS_SIGMA = 0.001, 0.002  # rad, rad/s
+ODOMETER_WANDER_SIGMA, WANDER_LENGTH = 0.01, 30.0  # 1, m; from T1 on
+BACKWARD_BIAS_SIGMA = 0.02  # 1; from T1 on
+
+# Slip between command and motion, from T1 on.
+SLIP_GAIN_SIGMA, SLIP_YAW_SIGMA, SLIP_WANDER_SIGMA = 0.02, 0.002, 0.02  # 1, rad/s, 1
+
+# Start of an episode.
+START_LATERAL, START_HEADING = 0.5, 0.1  # m, rad; uniform to either side
+RETURN_START, OFFSET_START, OFFSET_SIGMA = 5.0, 9.0, 3.0  # m
+
+# Success.
+GOAL_COVERAGE = 0.9  # of the tunnel; T0
+GOAL_LOW, GOAL_HIGH, GOAL_MARGIN = 60.0, 320.0, 5.0  # m
+TOLERANCE, SHORT_TOLERANCE = 1.0, 0.25  # m
+STILL_SPEED, STILL_YAW, STILL_STEPS = 0.05, 0.5, 10  # m/s, rad/s, steps
+FLAG_REACH = 2.0  # m; T2
+TRAVEL_MAX, SHORT_TRAVEL_MAX = 120.0, 40.0  # m; T5
+
+# Short variants.
+SHORT_LENGTH, SHORT_GOAL_LOW, SHORT_GOAL_HIGH, SHORT_OFFSET_GOAL_LOW = 60.0, 10.0, 60.0, 20.0  # m
+
+# Horizons, steps.
+HORIZON_TRAVERSE, HORIZON_STOP, HORIZON_RETURN, HORIZON_RELOCALISE = 3000, 4000, 8000, 2000
+HORIZON_TRAVERSE_SHORT, HORIZON_STOP_SHORT, HORIZON_RETURN_SHORT, HORIZON_RELOCALISE_SHORT = 600, 1000, 2000, 1000
+
+# Reward of T0, the paper's Eq. 1.
+REWARD_TERMINAL, REWARD_COVERAGE, REWARD_LATERAL, REWARD_JERK = 1.0, 100.0, 0.1, 0.01
+
+# Reward of the tasks with a goal.
+GOAL_TERMINAL, GOAL_PRECISION, GOAL_MISS, GOAL_CRASH = 4.0, 4.0, 0.05, 1.0
+GOAL_PROGRESS, GOAL_TIME, GOAL_LATERAL, GOAL_JERK = 0.05, 0.002, 0.01, 0.003
+
+# Boxes of T3.
+BOX_PITCH = 15.0  # m of tunnel for each box
+BOX_SIZE_MIN, BOX_SIZE_MAX = 0.3, 0.8  # m
+BOX_GAP, BOX_FIRST = 1.2, 8.0  # m
+TROLLEY_LENGTH, TROLLEY_WIDTH = 2.4, 1.2  # m
+
+# Faults of T4 at the highest severity.
+SEVERITY_LOW, SEVERITY_HIGH = 0, 4
+DROPOUT_RATE, DROPOUT_SHARE, DROPOUT_STEPS = 0.02, 0.75, 40.0  # per step, of the beams, steps
+DUST_RATE = 0.15  # per beam
+FREEZE_RATE, FREEZE_STEPS = 0.01, 30.0  # per step, steps
+DELAY = 4.0  # steps
+WET_PATCH, WET_SHARE, WET_LOSS = 10.0, 0.3, 0.3  # m, of the patches, of the speed

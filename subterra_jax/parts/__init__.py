@@ -1,0 +1,25 @@
+"""The parts of an environment, one file each; `part.py` is their contract."""
+
+from subterra_jax.parts.boxes import Obstacles
+from subterra_jax.parts.faults import Faults
+from subterra_jax.parts.odometer import Odometer
+from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, Sight, Step
+from subterra_jax.parts.planar_lidar import PlanarLidar
+from subterra_jax.parts.slip import Slip
+from subterra_jax.parts.unicycle import Unicycle
+
+__all__ = [
+    "Drive",
+    "Faults",
+    "Motion",
+    "Moved",
+    "Noise",
+    "Obstacles",
+    "Odometer",
+    "Part",
+    "PlanarLidar",
+    "Sight",
+    "Slip",
+    "Step",
+    "Unicycle",
+]

@@ -1,0 +1,249 @@
+"""Faults that come and go: beams that drop out, dust, an odometer that freezes, stale data, wet rails."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
+
+from subterra_jax import constants
+from subterra_jax.parts.hashing import uniform
+from subterra_jax.parts.odometer import OdometryState
+from subterra_jax.parts.part import Batch, Drive, Noise, Part, Sight, Step
+from subterra_jax.state import EnvParams, State
+
+N_SEVERITIES = 5
+MAX_DELAY = 4  # steps
+PATCH = constants.WET_PATCH  # m of rail that are wet or dry as a whole
+_WET = 17  # number of the draw that makes a patch wet
+
+
+@struct.dataclass
+class FaultParams:
+    """Faults at severity 4. There are none at severity 0, and proportionally fewer in between.
+
+    Attributes:
+        severity_low: Least severity of an episode, 0 to 4.
+        severity_high: Largest severity; the whole numbers in between are equally likely.
+        dropout_rate: Probability per step that a sector of beams drops out for a while.
+        dropout_share: Largest share of the beams that drop out together.
+        dropout_steps: Longest drop-out, steps.
+        dust_rate: Probability that a beam is reflected by dust before it meets the wall.
+        freeze_rate: Probability per step that the odometer stops counting for a while.
+        freeze_steps: Longest freeze, steps.
+        delay: Age of the observation, steps; at most 4.
+        wet_share: Share of the 10 m patches of rail that are wet.
+        wet_loss: Share of the speed lost on wet rail, while the wheels turn as before.
+    """
+
+    severity_low: int = constants.SEVERITY_LOW
+    severity_high: int = constants.SEVERITY_HIGH
+    dropout_rate: float = constants.DROPOUT_RATE
+    dropout_share: float = constants.DROPOUT_SHARE
+    dropout_steps: float = constants.DROPOUT_STEPS
+    dust_rate: float = constants.DUST_RATE
+    freeze_rate: float = constants.FREEZE_RATE
+    freeze_steps: float = constants.FREEZE_STEPS
+    delay: float = constants.DELAY
+    wet_share: float = constants.WET_SHARE
+    wet_loss: float = constants.WET_LOSS
+
+
+@struct.dataclass
+class FaultState:
+    """Faults of one episode.
+
+    Attributes:
+        severity: 0 to 4.
+        seed: Seed of the wet patches.
+        seen: Position x, y (m), heading (rad), station (m) and odometer readings (m, rad) of the last steps, newest
+            first. The observation shows one of them.
+        dropout_left: Steps until the lost sector is back.
+        dropout_first: First beam of that sector.
+        dropout_count: Beams of that sector.
+        freeze_left: Steps until the odometer counts again.
+    """
+
+    severity: Float[Array, ""]
+    seed: UInt32[Array, ""]
+    seen: Float[Array, "5 6"]
+    dropout_left: Float[Array, ""]
+    dropout_first: Float[Array, ""]
+    dropout_count: Float[Array, ""]
+    freeze_left: Float[Array, ""]
+
+
+def sight(
+    position: Float[Array, "2"], heading: Float[Array, ""], station: Float[Array, ""], reading: OdometryState
+) -> Float[Array, "6"]:
+    """Make a row of `FaultState.seen`."""
+    return jnp.concatenate([position, jnp.stack([heading, station, reading.distance, reading.heading])])
+
+
+def n_step_noise(n_beams: int) -> int:
+    """Count the uniform numbers of one step."""
+    return 5 + n_beams
+
+
+def start_faults(
+    draw: Float[Array, ""], seed: UInt32[Array, ""], seen: Float[Array, "6"], params: FaultParams
+) -> FaultState:
+    """Begin an episode without faults; `draw` is uniform in [0, 1) and gives the severity."""
+    low, high = jnp.asarray(params.severity_low), jnp.asarray(params.severity_high)
+    zero = jnp.zeros(())
+    return FaultState(
+        severity=jnp.minimum(low + jnp.floor(draw * (high - low + 1)), high).astype(jnp.float32),
+        seed=seed,
+        seen=jnp.broadcast_to(seen, (MAX_DELAY + 1, 6)),
+        dropout_left=zero,
+        dropout_first=zero,
+        dropout_count=zero,
+        freeze_left=zero,
+    )
+
+
+def grip(state: FaultState, station: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
+    """Return true speed over wheel speed at a station: 1 on dry rail."""
+    patch = jnp.floor(station / PATCH).astype(jnp.int32)
+    wet = uniform(state.seed, patch, _WET) < params.wet_share * _share(state)
+    return jnp.where(wet, 1.0 - params.wet_loss, 1.0)
+
+
+def frozen(state: FaultState) -> Bool[Array, ""]:
+    """Tell whether the odometer does not count at this step."""
+    return state.freeze_left > 0.0
+
+
+def advance_faults(
+    state: FaultState, seen: Float[Array, "6"], draw: Float[Array, "k"], n_beams: int, params: FaultParams
+) -> FaultState:
+    """Go one step on: the history moves back by one, faults end or begin; `draw` is uniform in [0, 1)."""
+    share = _share(state)
+    drops = (state.dropout_left <= 0.0) & (draw[0] < params.dropout_rate * share)
+    freezes = (state.freeze_left <= 0.0) & (draw[3] < params.freeze_rate * share)
+    left = jnp.maximum(state.dropout_left - 1.0, 0.0)
+    return dataclasses.replace(
+        state,
+        seen=jnp.concatenate([seen[None], state.seen[:-1]]),
+        dropout_left=jnp.where(
+            drops, jnp.ceil(params.dropout_steps * _again(draw[0], params.dropout_rate * share)), left
+        ),
+        dropout_first=jnp.where(drops, jnp.floor(draw[1] * n_beams), state.dropout_first),
+        dropout_count=jnp.where(drops, jnp.ceil(draw[2] * params.dropout_share * n_beams), state.dropout_count),
+        freeze_left=jnp.where(
+            freezes, jnp.ceil(params.freeze_steps * draw[4]), jnp.maximum(state.freeze_left - 1.0, 0.0)
+        ),
+    )
+
+
+def observed(state: FaultState, params: FaultParams) -> Float[Array, "6"]:
+    """Return the row of `FaultState.seen` that is observed: the newest, or a late one."""
+    delay = jnp.clip(jnp.round(params.delay * _share(state)), 0, MAX_DELAY).astype(jnp.int32)
+    return state.seen[delay]
+
+
+def spoil(
+    ranges: Float[Array, "n_beams"],
+    state: FaultState,
+    draw: Float[Array, "k"],
+    range_max: Float[Array, ""],
+    params: FaultParams,
+) -> Float[Array, "n_beams"]:
+    """Apply dust and drop-outs to true ranges; a lost beam reports exactly `range_max`."""
+    n_beams = ranges.shape[0]
+    rate = params.dust_rate * _share(state)
+    dust = draw[5 : 5 + n_beams]
+    dusty = jnp.where(dust < rate, ranges * _again(dust, rate), ranges)
+    return jnp.where(_dropped(state, n_beams), range_max, dusty)
+
+
+def _dropped(state: FaultState, n_beams: int) -> Bool[Array, "n_beams"]:
+    beam: Int[Array, n_beams] = jnp.arange(n_beams)
+    behind = jnp.mod(beam - state.dropout_first, n_beams)
+    return (state.dropout_left > 0.0) & (behind < state.dropout_count)
+
+
+def _share(state: FaultState) -> Float[Array, ""]:
+    return state.severity / (N_SEVERITIES - 1)
+
+
+def _again(draw: Float[Array, "*n"], rate: Float[Array, ""]) -> Float[Array, "*n"]:
+    """Use a uniform number again: one that fell below a rate is uniform below it."""
+    return draw / jnp.maximum(rate, 1e-9)
+
+
+@dataclasses.dataclass(frozen=True)
+class Faults(Part):
+    """Lost beams, dust, a frozen odometer, late observations and wet rail, all of one severity."""
+
+    name: ClassVar[str] = "faults"
+    streams: ClassVar[tuple[int, ...]] = (6, 7)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `faults`."""
+        return {"faults": FaultParams()}
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> tuple[Array, Array]:
+        """Draw random bits `(*batch, 2)`, of which the second word counts, and a uniform number `(*batch,)`."""
+        del params
+        return jax.random.bits(key[0], (*batch, 2)), jax.random.uniform(key[1], batch)
+
+    def uniforms(self, params: EnvParams) -> int:
+        """Count the numbers of a step."""
+        return n_step_noise(params.lidar.n_beams)
+
+    def begin(self, draw: tuple[Array, Array], state: State, params: EnvParams) -> FaultState:
+        """Begin an episode without faults."""
+        seen = sight(state.position, state.heading, state.station, state.odometry)
+        return start_faults(draw[1], draw[0][1], seen, params.faults)
+
+    def drive(self, own: FaultState, drive: Drive, state: State, params: EnvParams) -> Drive:
+        """Take speed from the robot on wet rail, and none from its wheels."""
+        wheels = drive.wheels
+        share = grip(own, state.station, params.faults)
+        return Drive(wheels, jnp.stack([drive.motion[0] * share, drive.motion[1]]))
+
+    def holds_odometer(self, own: FaultState) -> Bool[Array, ""]:
+        """Freeze the odometer."""
+        return frozen(own)
+
+    def advance(self, own: FaultState, step: Step, noise: Noise, params: EnvParams) -> FaultState:
+        """Remember the step, and let faults end or begin."""
+        seen = sight(step.position, step.heading, step.place.station, step.after["odometry"])
+        return advance_faults(own, seen, noise.uniform, params.lidar.n_beams, params.faults)
+
+    def look_from(self, own: FaultState, sight: Sight, params: EnvParams) -> Sight:
+        """Show an earlier moment."""
+        seen = observed(own, params.faults)
+        reading = dataclasses.replace(sight.parts["odometry"], distance=seen[4], heading=seen[5])
+        parts = {**sight.parts, "odometry": reading}
+        return dataclasses.replace(sight, position=seen[:2], heading=seen[2], station=seen[3], parts=parts)
+
+    def spoil(self, own: FaultState, ranges: Array, noise: Noise, params: EnvParams) -> Array:
+        """Apply dust and drop-outs."""
+        return spoil(ranges, own, noise.uniform, jnp.asarray(params.lidar.range_max), params.faults)
+
+    def privileged(self, own: FaultState) -> dict[str, Array]:
+        """Return the severity."""
+        return {"severity": own.severity}
+
+    def info(self, own: FaultState) -> dict[str, Array]:
+        """Return the severity."""
+        return {"severity": own.severity}
+
+    def with_beams(self, own: FaultState, share: float) -> FaultState:
+        """Keep the lost sector as wide as it was."""
+        return dataclasses.replace(
+            own, dropout_first=own.dropout_first * share, dropout_count=own.dropout_count * share
+        )
+
+    def levels(self, params: EnvParams) -> range:
+        """Return the severities."""
+        return range(int(np.min(params.faults.severity_low)), int(np.max(params.faults.severity_high)) + 1)
+
+    def at_level(self, params: EnvParams, level: Any) -> EnvParams:
+        """Return the params with one severity."""
+        return params.replace(faults=params.faults.replace(severity_low=level, severity_high=level))

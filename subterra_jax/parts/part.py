@@ -1,0 +1,312 @@
+"""The contract of a part, and what the environment hands to parts and rules during a step.
+
+reset:  draw_reset ─► begin
+step:   draw_step ─► drive ─► clearance ─► advance ─► (rule) judge
+scan:   look_from ─► hits, spoil ─► observe
+"""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import zlib
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+if TYPE_CHECKING:
+    from subterra_jax.parts.boxes import Boxes
+    from subterra_jax.state import EnvParams, State
+    from subterra_jax.tunnel import Foot, Tunnel
+
+Bounds = tuple[Any, Any]  # lowest and highest values: two numbers, or two arrays of the entry's shape
+Batch = tuple[int, ...]
+
+
+@struct.dataclass
+class Noise:
+    """Random numbers of one part for one step; `()` where it asked for none.
+
+    Attributes:
+        normal: Standard normal numbers, `(normals,)`.
+        uniform: Uniform numbers in [0, 1), `(uniforms,)`.
+    """
+
+    normal: Any = ()
+    uniform: Any = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """Motion of one step, between the command and the ground.
+
+    Attributes:
+        wheels: Speed (m/s) and yaw rate (rad/s) of the wheels, which the odometer counts.
+        motion: Speed and yaw rate of the robot itself.
+    """
+
+    wheels: Float[Array, 2]
+    motion: Float[Array, 2]
+
+
+@dataclasses.dataclass(frozen=True)
+class Moved:
+    """Result of a motion.
+
+    Attributes:
+        position: Position afterwards, tunnel frame, m.
+        heading: Heading afterwards, rad, in [-π, π].
+        drive: Mean motion during the step.
+        own: State of the motion part afterwards.
+        clearance: Least distance to a wall during the step, m; read only where the motion is not `on_the_plan`.
+        contact: The motion itself met an obstacle.
+        fallen: The robot can go on no further; ends the episode.
+        info: Further entries of `info`.
+    """
+
+    position: Float[Array, 2]
+    heading: Float[Array, ""]
+    drive: Drive
+    own: Any
+    clearance: Any
+    contact: Any
+    fallen: Any
+    info: dict[str, Array]
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One step after the motion, as parts and the rule see it.
+
+    Attributes:
+        before: State before the step.
+        tunnel: Tunnel that the robot is in.
+        place: Foot of the new position on the centreline.
+        position: New position, tunnel frame, m.
+        heading: New heading, rad.
+        furthest: Furthest station of the episode, m.
+        contact: The robot touches a wall or an obstacle, or has fallen.
+        command: Command obeyed, m/s and rad/s.
+        drive: Motion of the wheels and of the robot.
+        moved: True distance of this step, m.
+        report: Estimated station (m), log of its standard deviation, direction (above 0: growing station); zeros where
+            the action has none.
+        after: States of the parts that have advanced already, by name.
+    """
+
+    before: State
+    tunnel: Tunnel
+    place: Foot
+    position: Float[Array, 2]
+    heading: Float[Array, ""]
+    furthest: Float[Array, ""]
+    contact: Bool[Array, ""]
+    command: Float[Array, 2]
+    drive: Drive
+    moved: Float[Array, ""]
+    report: Float[Array, 3]
+    after: Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Sight:
+    """The moment that sensors show: the present one, or an earlier one where observations are late.
+
+    Attributes:
+        tunnel: Tunnel that the robot is in.
+        position: Position, tunnel frame, m.
+        heading: Heading, rad.
+        station: Station, m.
+        parts: States of the parts, by name.
+        wanted: Someone will read the observation; where not, ranges may be anything.
+        hits: From beam directions `(n_beams, 2)` to distances to obstacles, m; `inf` where there are none.
+        spoil: From true ranges to ranges with dust and lost beams, m.
+    """
+
+    tunnel: Tunnel
+    position: Float[Array, 2]
+    heading: Float[Array, ""]
+    station: Float[Array, ""]
+    parts: Mapping[str, Any]
+    wanted: Any = True
+    hits: Callable[[Array], Any] = lambda directions: np.inf
+    spoil: Callable[[Array], Array] = lambda ranges: ranges
+
+
+class Part(abc.ABC):
+    """One part of an environment: a sensor, an error, an obstacle. Static and hashable; a frozen dataclass.
+
+    Numbers that may be randomised live in its params, what changes lives in its state. Every method has a default that
+    does nothing, so a part writes only what it needs. All functions are of one environment; batches come by `vmap`.
+
+    Attributes:
+        name: Name of its state, and of its random numbers.
+        place: Place of its entries in the observation, lowest first: LiDAR 0, odometer 1, rule 2, others 3.
+        streams: Numbers of its random streams at a reset; by default one, made from the name.
+    """
+
+    name: ClassVar[str]
+    place: ClassVar[int] = 3
+    streams: ClassVar[tuple[int, ...]] = ()
+
+    def defaults(self) -> dict[str, Any]:
+        """Entries of `EnvParams` that the part reads, by name, with their default values."""
+        return {}
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Any:
+        """Draw what an episode needs, for a whole batch at once.
+
+        Args:
+            key: A key of the part's own; `(len(streams),)` keys where it has several streams.
+            batch: Leading axes of every array returned.
+            params: The task.
+        """
+        del key, batch, params
+        return ()
+
+    def normals(self, params: EnvParams) -> int:
+        """Count the standard normal numbers that one step takes."""
+        del params
+        return 0
+
+    def uniforms(self, params: EnvParams) -> int:
+        """Count the uniform numbers that one step takes."""
+        del params
+        return 0
+
+    def begin(self, draw: Any, state: State, params: EnvParams) -> Any:
+        """Make the part's state at the start of an episode.
+
+        Args:
+            draw: Its numbers from `draw_reset`.
+            state: The robot at its start, with the states of the parts before this one.
+            params: The task.
+        """
+        del draw, state, params
+        return ()
+
+    def drive(self, own: Any, drive: Drive, state: State, params: EnvParams) -> Drive:
+        """Change the motion between command and ground, as slip does."""
+        del own, state, params
+        return drive
+
+    def clearance(self, own: Any, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Any:
+        """Measure the distance from a point to what the part puts into the tunnel, m; `inf` for nothing."""
+        del own, position, station, tunnel, params
+        return np.inf
+
+    def holds_odometer(self, own: Any) -> Any:
+        """Tell whether the odometer does not count in this step."""
+        del own
+        return False
+
+    def advance(self, own: Any, step: Step, noise: Noise, params: EnvParams) -> Any:
+        """Return the part's state after a step."""
+        del step, noise, params
+        return own
+
+    def look_from(self, own: Any, sight: Sight, params: EnvParams) -> Sight:
+        """Change the moment that sensors show, as a delay does."""
+        del own, params
+        return sight
+
+    def hits(self, own: Any, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams) -> Any:
+        """Measure how far along each beam the part's obstacles are met, m; `inf` for none."""
+        del own, sight, directions, params
+        return np.inf
+
+    def spoil(self, own: Any, ranges: Float[Array, n_beams], noise: Noise, params: EnvParams) -> Array:
+        """Change true ranges, as dust does."""
+        del own, noise, params
+        return ranges
+
+    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        """Return the part's entries of the observation by name, each `(n,)` or a single number."""
+        del own, sight, noise, params
+        return {}
+
+    def space(self, params: EnvParams) -> dict[str, Bounds]:
+        """Return lowest and highest values of each entry of `observe`, in the same order."""
+        del params
+        return {}
+
+    def privileged(self, own: Any) -> dict[str, Array]:
+        """Return what a teacher or a critic may know of the part, and an agent may not."""
+        del own
+        return {}
+
+    def info(self, own: Any) -> dict[str, Array]:
+        """Return the part's entries of `info`."""
+        del own
+        return {}
+
+    def levels(self, params: EnvParams) -> range:
+        """Return the levels of difficulty that an evaluation goes through evenly; empty for a part without."""
+        del params
+        return range(0)
+
+    def at_level(self, params: EnvParams, level: Any) -> EnvParams:
+        """Return the params with one level of difficulty."""
+        del level
+        return params
+
+    def with_beams(self, own: Any, share: float) -> Any:
+        """Return the state for a LiDAR of `share` times as many beams."""
+        del share
+        return own
+
+    def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
+        """Return boxes near a station, for pictures."""
+        del own, station, tunnel, params
+        return []
+
+    def skips_unwanted(self, params: EnvParams) -> bool:
+        """Tell whether a batch of observations costs little for those that nobody wants."""
+        del params
+        return False
+
+    @classmethod
+    def random_streams(cls) -> tuple[int, ...]:
+        """Return the numbers of the part's random streams."""
+        return cls.streams or (zlib.crc32(cls.name.encode()) | 1 << 31,)
+
+
+class Motion(Part):
+    """The part that moves the robot: wheels, or legs.
+
+    Attributes:
+        on_the_plan: The robot's distance to the walls is measured in the planar tunnel after the motion; otherwise
+            `Moved.clearance` says it.
+    """
+
+    on_the_plan: ClassVar[bool] = True
+
+    def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Any:
+        """Draw what a motion needs beside `normals` and `uniforms`, for a whole batch at once."""
+        del key, batch, params
+        return ()
+
+    @abc.abstractmethod
+    def obey(self, action: Float[Array, n_action], state: State, params: EnvParams) -> Float[Array, 2]:
+        """Return the command that the robot obeys: the action within its limits, a NaN read as 0."""
+
+    def height(self, state: State, params: EnvParams) -> Array:
+        """Return the height of the trunk of a robot on legs, tunnel frame, m; 0 on wheels."""
+        del params
+        return jnp.zeros_like(state.station)
+
+    @abc.abstractmethod
+    def move(self, state: State, drive: Drive, noise: Any, tunnel: Tunnel, params: EnvParams) -> Moved:
+        """Move the robot for one control period.
+
+        Args:
+            state: State before.
+            drive: The clipped command as the other parts have changed it.
+            noise: Numbers from `draw_step`.
+            tunnel: Tunnel that the robot is in.
+            params: The task.
+        """

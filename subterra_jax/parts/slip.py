@@ -1,0 +1,108 @@
+"""Slip between the command and the true motion."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from subterra_jax import constants
+from subterra_jax.parts.part import Batch, Drive, Noise, Part, Step
+from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
+from subterra_jax.state import EnvParams, State
+
+
+@struct.dataclass
+class SlipParams:
+    """Sizes of the slip. Without slip, the sum of the commands is a perfect odometer.
+
+    Attributes:
+        gain_sigma: Standard deviation over episodes of the relative error of the speed, 1.
+        yaw_sigma: Standard deviation over episodes of the error of the yaw rate, rad/s.
+        wander: Relative error of the speed that changes along the way, 1.
+    """
+
+    gain_sigma: float = constants.SLIP_GAIN_SIGMA
+    yaw_sigma: float = constants.SLIP_YAW_SIGMA
+    wander: WanderParams = struct.field(default_factory=lambda: WanderParams(sigma=constants.SLIP_WANDER_SIGMA))
+
+
+@struct.dataclass
+class SlipState:
+    """The slip of one episode.
+
+    Attributes:
+        gain: Relative error of the speed, 1.
+        yaw: Error of the yaw rate, rad/s.
+        wander: Relative error of the speed at present, on top of `gain`, 1.
+    """
+
+    gain: Float[Array, ""]
+    yaw: Float[Array, ""]
+    wander: Float[Array, ""]
+
+
+def start_slip(noise: Float[Array, "3"], params: SlipParams) -> SlipState:
+    """Draw the slip of an episode; `noise` is standard normal."""
+    return SlipState(
+        gain=params.gain_sigma * noise[0],
+        yaw=params.yaw_sigma * noise[1],
+        wander=start_wander(noise[2], params.wander),
+    )
+
+
+def true_motion(command: Float[Array, "2"], state: SlipState) -> Float[Array, "2"]:
+    """Return the true speed (m/s), not below 0, and yaw rate (rad/s); a standing robot does not turn."""
+    speed = command[0] * jnp.maximum(1.0 + state.gain + state.wander, 0.0)
+    moves = (command[0] != 0.0) | (command[1] != 0.0)
+    return jnp.stack([speed, command[1] + jnp.where(moves, state.yaw, 0.0)])
+
+
+def advance_slip(
+    state: SlipState, travelled: Float[Array, ""], noise: Float[Array, "1"], params: SlipParams
+) -> SlipState:
+    """Return the slip after a distance (m); `noise` is standard normal."""
+    return dataclasses.replace(state, wander=advance_wander(state.wander, travelled, noise[0], params.wander))
+
+
+@dataclasses.dataclass(frozen=True)
+class Slip(Part):
+    """A robot that does not do exactly what it is commanded."""
+
+    name: ClassVar[str] = "slip"
+    streams: ClassVar[tuple[int, ...]] = (3,)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `slip`."""
+        return {"slip": SlipParams()}
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Float[Array, "*batch 3"]:
+        """Draw standard normal numbers."""
+        del params
+        return jax.random.normal(key, (*batch, 3))
+
+    def normals(self, params: EnvParams) -> int:
+        """One, for the wandering error."""
+        del params
+        return 1
+
+    def begin(self, draw: Float[Array, "3"], state: State, params: EnvParams) -> SlipState:
+        """Draw the slip of an episode."""
+        del state
+        return start_slip(draw, params.slip)
+
+    def drive(self, own: SlipState, drive: Drive, state: State, params: EnvParams) -> Drive:
+        """Let wheels and robot slip alike."""
+        del state, params
+        wheels = true_motion(drive.wheels, own)
+        return Drive(wheels, wheels)
+
+    def advance(self, own: SlipState, step: Step, noise: Noise, params: EnvParams) -> SlipState:
+        """Let the wandering error go on."""
+        return advance_slip(own, step.moved, noise.normal, params.slip)
+
+    def privileged(self, own: SlipState) -> dict[str, Array]:
+        """Return the slip of the speed (1) and of the yaw rate (rad/s)."""
+        return {"slip": own.gain + own.wander, "yaw_slip": own.yaw}
