@@ -319,14 +319,14 @@ class TunnelEnv:
 
     def fields(self, params: EnvParams) -> dict[str, slice]:
         """Return the place of each named entry in an observation."""
-        sizes = {name: np.size(low) for name, (low, _) in self._space(params).items()}
+        sizes = {name: jnp.size(low) for name, (low, _) in self._space(params).items()}
         ends = np.cumsum(list(sizes.values())).tolist()
         return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
 
     def observation_space(self, params: EnvParams) -> Box:
         """Return the bounds of an observation."""
         bounds = self._space(params).values()
-        low, high = (np.concatenate([np.ravel(bound[side]) for bound in bounds]) for side in (0, 1))
+        low, high = (np.concatenate([np.ravel(np.asarray(bound[side])) for bound in bounds]) for side in (0, 1))
         return Box(low.astype(np.float32), high.astype(np.float32))
 
     def action_space(self, params: EnvParams) -> Box:

@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import jax
+from flax.core import FrozenDict
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.tunnel import Tunnel
@@ -18,7 +20,7 @@ from subterra_jax.tunnel import Tunnel
 class _Named:
     """Fields, and named parts in the field `parts` that are read like fields."""
 
-    parts: dict[str, Any]
+    parts: Mapping[str, Any]
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "parts":
@@ -42,7 +44,7 @@ class _Named:
         fields = {name: value for name, value in updates.items() if name in own}
         parts = {name: value for name, value in updates.items() if name not in own}
         if parts:
-            fields["parts"] = {**fields.get("parts", self.parts), **parts}
+            fields["parts"] = type(self.parts)({**fields.get("parts", self.parts), **parts})
         return dataclasses.replace(self, **fields)  # type: ignore[type-var]
 
 
@@ -55,13 +57,13 @@ class EnvParams(_Named):
         tunnel: Tunnel, or a stack of tunnels of which each episode draws one.
         horizon: Steps after which an episode is truncated.
         parts: Params of the robot, of each part and of the rule, by name: `vehicle`, `lidar`, `odometry`, `start`,
-            `reward` and what the task adds.
+            `reward` and what the task adds. Frozen, so that a tree of axes can be hashed, as a static argument must.
         errand: What an agent is asked to do: `cover`, `stop`, `return` or `report`. Static.
     """
 
     tunnel: Tunnel
     horizon: Any
-    parts: dict[str, Any]
+    parts: FrozenDict[str, Any]
     errand: str = "cover"
 
 

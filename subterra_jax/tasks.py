@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.core import FrozenDict
 
 from subterra_jax import constants as c
 from subterra_jax.b2 import MISSIONS, WALK
@@ -29,6 +30,7 @@ from subterra_jax.tunnel.sources import Source, resolve
 
 PLAIN: tuple[Part, ...] = (Odometer(), PlanarLidar())
 SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())
+OPTIONAL: tuple[Part, ...] = (Slip(), Obstacles(), Faults())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +152,8 @@ def make(
         estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
             estimation track. It does not move the robot; `info` tells its error.
         parts: Further parts, as sensors of one's own; their entries stand at the end of the observation.
-        **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`.
+        **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
+            `obstacles` and `faults` bring their part to a task that lacks it.
 
     Returns:
         The static environment (a `TunnelEnv`), and params whose every leaf is an array (`EnvParams`).
@@ -171,7 +174,9 @@ def make(
     if id not in TASKS:
         raise ValueError(no_task(id, (*TASKS, WALK, *MISSIONS)))
     task = TASKS[id]
-    env = TunnelEnv(id=id, rule=task.rule, parts=(*task.parts, *parts), estimates=estimates)
+    named = {part.name for part in (*task.parts, *parts)}
+    brought = (part for part in OPTIONAL if part.name in overrides and part.name not in named)
+    env = TunnelEnv(id=id, rule=task.rule, parts=(*task.parts, *brought, *parts), estimates=estimates)
     horizon = overrides.pop("horizon", task.horizon)
     entries = collect_entries(env, {**task.params, **overrides})
     _check_robot(entries)
@@ -197,7 +202,7 @@ def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, A
     for source in sources:
         entries |= source.defaults()
     if unknown := set(overrides) - set(entries):
-        raise ValueError(f"{env.id} has no {sorted(unknown)}; there are {sorted([*entries, 'horizon'])}")
+        raise ValueError(f"no field {sorted(unknown)} in {env.id}; there are {sorted([*entries, 'horizon'])}")
     for name, value in overrides.items():
         wanted = type(entries[name])
         if dataclasses.is_dataclass(entries[name]) and not isinstance(value, wanted):
@@ -207,7 +212,7 @@ def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, A
 
 def make_params(env: TunnelEnv, tunnel: Any, horizon: Any, entries: Mapping[str, Any]) -> EnvParams:
     """Make params whose every leaf is a 32-bit array; a weakly typed one would compile each function a second time."""
-    params = EnvParams(tunnel=tunnel, horizon=horizon, parts=dict(entries), errand=env.rule.errand)
+    params = EnvParams(tunnel=tunnel, horizon=horizon, parts=FrozenDict(entries), errand=env.rule.errand)
     return jax.tree.map(_as_array, params, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
 
 

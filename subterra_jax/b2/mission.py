@@ -17,7 +17,7 @@ from subterra_jax.b2.sight import scan as trunk_scan
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.parts import Drive, Moved, Noise, Odometer, PlanarLidar, Sight, Step, Unicycle
 from subterra_jax.parts.odometer import OdometryState
-from subterra_jax.parts.part import Batch
+from subterra_jax.parts.part import Batch, Keys
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel, foot
@@ -78,7 +78,7 @@ class Legs(Unicycle):
         """Return `vehicle`, the limits of a command; `walk`, the robot; and `policy`, its gait (None: the trot)."""
         return {**super().defaults(), "walk": None, "policy": None}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> WalkResetNoise:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> WalkResetNoise:
         """Draw how the robot is built, and its first readings."""
         del params
         return draws.draw_reset(key, batch)

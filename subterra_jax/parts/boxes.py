@@ -6,11 +6,11 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 from subterra_jax import constants
 from subterra_jax.parts.hashing import uniform
-from subterra_jax.parts.part import Batch, Part, Sight
+from subterra_jax.parts.part import Batch, Keys, Part, Sight
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel, at_station
 
@@ -162,7 +162,7 @@ class Obstacles(Part):
         """Return `obstacles`."""
         return {"obstacles": ObstacleParams()}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
         """Draw random bits, the first of two words: the second is that of the faults."""
         del params
         return jax.random.bits(key, (*batch, 2))

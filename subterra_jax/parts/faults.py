@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from subterra_jax import constants
 from subterra_jax.parts.hashing import uniform
 from subterra_jax.parts.odometer import OdometryState
-from subterra_jax.parts.part import Batch, Drive, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Sight, Step
 from subterra_jax.state import EnvParams, State
 
 N_SEVERITIES = 5
@@ -186,7 +186,7 @@ class Faults(Part):
         """Return `faults`."""
         return {"faults": FaultParams()}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> tuple[Array, Array]:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, Array]:
         """Draw random bits `(*batch, 2)`, of which the second word counts, and a uniform number `(*batch,)`."""
         del params
         return jax.random.bits(key[0], (*batch, 2)), jax.random.uniform(key[1], batch)

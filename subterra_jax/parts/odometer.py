@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from subterra_jax import constants
-from subterra_jax.parts.part import Batch, Bounds, Noise, Part, Sight, Step
+from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, Sight, Step
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
 from subterra_jax.state import EnvParams, State
@@ -131,7 +131,7 @@ class Odometer(Part):
         """Return `odometry`."""
         return {"odometry": OdometryParams()}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Float[Array, "*batch n"]:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch n"]:
         """Draw standard normal numbers."""
         return jax.random.normal(key, (*batch, params.odometry.n_reset_noise))
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 Bounds = tuple[Any, Any]  # lowest and highest values: two numbers, or two arrays of the entry's shape
 Batch = tuple[int, ...]
+Keys = Any  # one key, or `(k,)` keys for k random streams
 
 
 @struct.dataclass
@@ -157,7 +158,7 @@ class Part(abc.ABC):
         """Entries of `EnvParams` that the part reads, by name, with their default values."""
         return {}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Any:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Any:
         """Draw what an episode needs, for a whole batch at once.
 
         Args:
@@ -230,7 +231,7 @@ class Part(abc.ABC):
         return {}
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Return lowest and highest values of each entry of `observe`, in the same order."""
+        """Return lowest and highest values of each entry of `observe`, in the same order; numbers may be traced."""
         del params
         return {}
 

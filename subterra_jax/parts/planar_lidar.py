@@ -41,8 +41,8 @@ class PlanarLidar(Part):
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Return bounds from 0 to the largest range."""
-        n_beams, range_max = params.lidar.n_beams, np.max(np.asarray(params.lidar.range_max))
-        return {"ranges": (np.zeros(n_beams), np.full(n_beams, range_max))}
+        n_beams, range_max = params.lidar.n_beams, jnp.max(jnp.asarray(params.lidar.range_max))
+        return {"ranges": (np.zeros(n_beams), jnp.full(n_beams, range_max))}
 
     def skips_unwanted(self, params: EnvParams) -> bool:
         """Tell whether the fused kernels cast the beams."""

@@ -6,10 +6,10 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from subterra_jax import constants
-from subterra_jax.parts.part import Batch, Drive, Noise, Part, Step
+from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Step
 from subterra_jax.parts.wander import WanderParams, advance_wander, start_wander
 from subterra_jax.state import EnvParams, State
 
@@ -78,7 +78,7 @@ class Slip(Part):
         """Return `slip`."""
         return {"slip": SlipParams()}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Float[Array, "*batch 3"]:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 3"]:
         """Draw standard normal numbers."""
         del params
         return jax.random.normal(key, (*batch, 3))

@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from subterra_jax import constants
-from subterra_jax.parts.part import Batch, Bounds, Step
+from subterra_jax.parts.part import Batch, Bounds, Keys, Step
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
@@ -98,7 +98,7 @@ class Rule(abc.ABC):
         """Entries of `EnvParams` that the rule reads, by name, with their default values; `start` at least."""
         return {"start": StartParams()}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> Any:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Any:
         """Draw what a start needs, for a whole batch at once; by default two numbers in [-1, 1] for `spread`."""
         del params
         return jax.random.uniform(key, (*batch, 2), minval=-1.0)

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants
-from subterra_jax.parts.part import Batch, Bounds, Step
+from subterra_jax.parts.part import Batch, Bounds, Keys, Step
 from subterra_jax.rules.rule import Rule, Start, Terms, Verdict, jerk, spread
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
@@ -92,7 +92,7 @@ class StopAt(Rule):
         """Return `start`, `goal` and `reward`."""
         return {**super().defaults(), "goal": GoalParams(), "reward": GoalRewardParams()}
 
-    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> tuple[Array, Array, Array]:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, Array, Array]:
         """Draw numbers for `spread`, three in [0, 1) for goal, place and direction, and a normal one for the start."""
         return (
             super().draw_reset(key[0], batch, params),

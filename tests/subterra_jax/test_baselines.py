@@ -96,7 +96,7 @@ def test_it_turns_by_half_a_turn_once_the_flag_is_up_and_never_stands_for_it(par
         flag = 1.0 if step >= 5 else 0.0
         wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
         obs = observation(heading=jnp.float32(wrapped), flag=jnp.float32(flag), goal=jnp.float32(9.0))
-        now, raised, _ = mission.watch(now, obs)
+        now, raised, _ = mission.watch(now, obs, params.replace(errand="return"))
         assert bool(raised) == (step == 5)
         if mission.turning(now):
             speed, rate = np.asarray(mission.turn_command(now, params))

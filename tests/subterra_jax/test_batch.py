@@ -115,10 +115,9 @@ def test_within_an_episode_the_bias_does_not_change():
 def test_params_may_differ_from_environment_to_environment():
     shared, params = batch_of()
     axes = jax.tree.map(lambda _: None, params)
-    axes = dataclasses.replace(axes, horizon=0, vehicle=dataclasses.replace(axes.vehicle, speed_max=0))
+    axes = axes.replace(horizon=0, vehicle=dataclasses.replace(axes.vehicle, speed_max=0))
     speeds = jnp.linspace(0.5, 2.0, 8)
-    mixed = dataclasses.replace(
-        params,
+    mixed = params.replace(
         horizon=jnp.arange(1, 9, dtype=jnp.int32),
         vehicle=dataclasses.replace(params.vehicle, speed_max=speeds),
     )

@@ -153,8 +153,8 @@ def test_params_may_be_batched(leaf):
     values = jnp.stack([getattr(owner, name), 2 * getattr(owner, name)])
 
     def put(tree, value):
-        inner = dataclasses.replace(getattr(tree, part) if part else tree, **{name: value})
-        return dataclasses.replace(tree, **{part: inner}) if part else inner
+        inner = (getattr(tree, part) if part else tree).replace(**{name: value})
+        return tree.replace(**{part: inner}) if part else inner
 
     @jax.jit
     def two_steps(params):

@@ -40,12 +40,12 @@ def test_a_list_that_was_altered_is_refused(monkeypatch):
 
 
 def test_episodes_are_spread_evenly_over_severities_and_tunnels():
-    _, params = st.make("Subterra/FaultedShort-v0")
-    episodes = listed_episodes("Subterra/FaultedShort-v0", params)
+    env, params = st.make("Subterra/FaultedShort-v0")
+    episodes = listed_episodes(env, params)
     assert np.bincount(episodes.severity).tolist() == [100] * 5
     assert np.bincount(episodes.group).tolist() == [50] * 10
     two = dataclasses.replace(params, tunnel=st.stack([params.tunnel] * 2))
-    episodes = listed_episodes("Subterra/FaultedShort-v0", two)
+    episodes = listed_episodes(env, two)
     assert (
         np.unique(np.stack([episodes.severity, episodes.tunnel]), axis=1, return_counts=True)[1].tolist() == [50] * 10
     )
@@ -53,9 +53,9 @@ def test_episodes_are_spread_evenly_over_severities_and_tunnels():
 
 @pytest.mark.parametrize("n", [0, 501])
 def test_a_number_of_episodes_that_the_list_has_not_is_refused(n):
-    _, params = st.make("Subterra/StopAtShort-v0")
+    env, params = st.make("Subterra/StopAtShort-v0")
     with pytest.raises(EvaluationError, match=f"episodes must be 1 to 500, got {n}"):
-        listed_episodes("Subterra/StopAtShort-v0", params, n)
+        listed_episodes(env, params, n)
 
 
 @struct.dataclass
@@ -204,8 +204,7 @@ def test_records_survive_json_and_nothing_measured_is_no_number():
 def test_the_bounds_are_those_of_a_closed_form_where_there_is_one():
     _, params = st.make("Subterra/StopAtShort-v0")
     still = dataclasses.replace(params.slip.wander, sigma=0.0)
-    steady = dataclasses.replace(
-        params,
+    steady = params.replace(
         slip=dataclasses.replace(params.slip, wander=still),
         odometry=dataclasses.replace(params.odometry, wander=still, distance_sigma=1e-6),
         goal=dataclasses.replace(params.goal, low=40.0, high=40.0),

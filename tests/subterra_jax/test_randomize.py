@@ -67,11 +67,11 @@ def test_a_randomised_batch_sees_and_moves_as_each_of_its_environments_should(ma
     ("ranges", "message"),
     [
         ({"lidar.sigma": (0.0, 1.0)}, r"no 'lidar.sigma'.*lidar has range_max, range_sigma"),
-        ({"radar.sigma": (0.0, 1.0)}, r"no 'radar.sigma'.*the params has tunnel, vehicle"),
+        ({"radar.sigma": (0.0, 1.0)}, r"no 'radar.sigma'.*the params has tunnel, horizon, vehicle"),
         ({"lidar": (0.0, 1.0)}, "'lidar' is no number"),
         ({"lidar.n_beams": (8, 16)}, r"'lidar.n_beams' cannot.*static"),
         ({"tunnel.length": (100.0, 200.0)}, r"'tunnel.length' cannot.*stack several"),
-        ({"slip.scale": (0.0, 1.0)}, r"no 'slip.scale'.*this task has no slip"),
+        ({"slip.scale": (0.0, 1.0)}, r"no 'slip.scale'.*the params has tunnel, horizon"),
         ({"lidar.range_sigma": (0.2, 0.1)}, r"'lidar.range_sigma' must be finite and not empty, got 0.2 to 0.1"),
         ({"lidar.range_sigma": (0.0, np.nan)}, "must be finite"),
         ({"lidar.range_sigma": LogUniform(0.0, 0.1)}, "must be above 0"),

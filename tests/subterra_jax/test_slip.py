@@ -36,7 +36,7 @@ def test_the_size_of_the_steps_does_not_matter_to_a_wandering_error():
 
 
 def test_slip_acts_on_the_motion_with_the_stated_spread():
-    noise = jax.random.normal(jax.random.key(1), (N, slip.N_RESET_NOISE))
+    noise = jax.random.normal(jax.random.key(1), (N, 3))
     states = jax.vmap(slip.start_slip, (0, None))(noise, slip.SlipParams())
     motion = np.asarray(jax.vmap(slip.true_motion, (None, 0))(jnp.array([2.0, 0.1]), states), np.float64)
     expected = 2.0 * np.hypot(0.02, 0.02)

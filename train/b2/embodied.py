@@ -7,7 +7,7 @@ from typing import Any
 import subterra_jax as st
 from subterra_jax.b2 import missions, trial
 from subterra_jax.b2.surrogate import stand_in
-from subterra_jax.parts.slip import Slip, SlipParams
+from subterra_jax.parts.slip import SlipParams
 from subterra_jax.tunnel.sources import load_tunnel
 from train import cli, policies
 from train.agents import agent_of
@@ -39,7 +39,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
     if planar.params.tunnel.count > 1:
         raise ConfigError(f"tunnel = {tunnel} is more than one; the B2 walks one")
     fields: dict[str, Any] = {"vehicle": missions.VEHICLE, "start": missions.START, "slip": _SLIP}
-    env, params = st.make(task, tunnel, planar.facts["lining"], parts=(Slip(),), **fields)
+    env, params = st.make(task, tunnel, planar.facts["lining"], **fields)
     if legs.robots:
         _mission(planar, tunnel, legs)
     return World(task, stand_in(env), params, {**planar.facts, "embodiment": B2})
