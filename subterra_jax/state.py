@@ -44,7 +44,8 @@ class _Named:
         fields = {name: value for name, value in updates.items() if name in own}
         parts = {name: value for name, value in updates.items() if name not in own}
         if parts:
-            fields["parts"] = type(self.parts)({**fields.get("parts", self.parts), **parts})
+            kind: Any = type(self.parts)
+            fields["parts"] = kind({**fields.get("parts", self.parts), **parts})
         return dataclasses.replace(self, **fields)  # type: ignore[type-var]
 
 
