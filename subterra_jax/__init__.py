@@ -11,12 +11,12 @@ from subterra_jax.host.errors import SubterraError, TunnelError
 from subterra_jax.host.versions import VERSION
 
 if TYPE_CHECKING:
-    from subterra_jax import batch, procedural, tunnel
+    from subterra_jax import batch, parts, procedural, rules, tunnel
     from subterra_jax.batch import AutoReset, rollout
-    from subterra_jax.env import TunnelEnv
+    from subterra_jax.env import Env, TunnelEnv
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
-    from subterra_jax.tasks import TASKS, make
+    from subterra_jax.tasks import TASKS, constants_digest, make, register
     from subterra_jax.tunnel import Tunnel
     from subterra_jax.tunnel.plan import TunnelPlan
     from subterra_jax.tunnel.sources import load_tunnel
@@ -27,6 +27,7 @@ __version__ = VERSION
 __all__ = [
     "TASKS",
     "AutoReset",
+    "Env",
     "EnvParams",
     "LogUniform",
     "State",
@@ -36,11 +37,15 @@ __all__ = [
     "TunnelError",
     "TunnelPlan",
     "batch",
+    "constants_digest",
     "load_tunnel",
     "make",
+    "parts",
     "procedural",
     "randomize",
+    "register",
     "rollout",
+    "rules",
     "stack",
     "tunnel",
 ]
@@ -49,6 +54,9 @@ __all__ = [
 _HOMES = {
     "TASKS": "tasks",
     "AutoReset": "batch",
+    "Env": "env",
+    "constants_digest": "tasks",
+    "register": "tasks",
     "EnvParams": "state",
     "LogUniform": "randomization",
     "State": "state",
@@ -61,7 +69,7 @@ _HOMES = {
     "rollout": "batch",
     "stack": "tunnel.tunnel",
 }
-_MODULES = ("batch", "procedural", "tunnel")
+_MODULES = ("batch", "parts", "procedural", "rules", "tunnel")
 
 
 def __getattr__(name: str) -> Any:
@@ -81,6 +89,6 @@ def __dir__() -> list[str]:
 
 
 if importlib.util.find_spec("gymnasium") is not None:
-    from subterra_jax.adapters import register
+    from subterra_jax.adapters import register_tasks
 
-    register()
+    register_tasks()

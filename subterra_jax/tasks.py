@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import importlib.util
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,8 +16,11 @@ import numpy as np
 from flax.core import FrozenDict
 
 from subterra_jax import constants as c
+from subterra_jax.adapters import register_tasks
 from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.env import TunnelEnv
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.loading import load_module
 from subterra_jax.host.versions import no_task
 from subterra_jax.parts import Faults, Obstacles, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
@@ -31,6 +35,10 @@ from subterra_jax.tunnel.sources import Source, resolve
 PLAIN: tuple[Part, ...] = (Odometer(), PlanarLidar())
 SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())
 OPTIONAL: tuple[Part, ...] = (Slip(), Obstacles(), Faults())
+
+
+class TaskError(SubterraError, ValueError):
+    """There is no such task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,11 +132,30 @@ def register(
     if rule.errand not in ERRANDS:
         raise ValueError(f"{id}: errand must be one of {', '.join(ERRANDS)}, {type(rule).__name__} has {rule.errand!r}")
     TASKS[id] = Task(rule, horizon, piece, tuple(parts), dict(params or {}))
-    try:
-        from subterra_jax.adapters import registration
-    except ImportError:  # Gymnasium is not installed
-        return
-    registration.register()
+    if importlib.util.find_spec("gymnasium") is not None:
+        register_tasks((id,))
+
+
+def find(id: str, short: bool = False) -> str:
+    """Return the id of a task; `MODULE:ID` and `FILE.py:ID` first run a user's module, which registers the task.
+
+    Args:
+        id: The id.
+        short: Take `StopAt` for `Subterra/StopAt-v0`, as command lines do.
+
+    Raises:
+        TaskError: There is no such task.
+        UserCodeError: The module cannot be run.
+    """
+    source, _, name = id.rpartition(":")
+    if source:
+        load_module(source)
+    known = (*TASKS, WALK, *MISSIONS)
+    if short and name not in known and f"Subterra/{name}-v0" in known:
+        return f"Subterra/{name}-v0"
+    if name not in known:
+        raise TaskError(no_task(name, known))
+    return name
 
 
 def make(
@@ -142,8 +169,9 @@ def make(
     """Make an environment and its params.
 
     Args:
-        id: A key of `TASKS`; or `Subterra/B2Walk-v0` or `Subterra/B2Traverse-v0`, for
-            which `subterra_jax.b2.tasks.make` and `subterra_jax.b2.missions.make` say what else there is.
+        id: A key of `TASKS`; `MODULE:ID` or `FILE.py:ID` for a task of one's own; or `Subterra/B2Walk-v0` or
+            `Subterra/B2Traverse-v0`, for which `subterra_jax.b2.tasks.make` and `subterra_jax.b2.missions.make` say
+            what else there is.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
             another lining. None is the packaged tunnel.
@@ -163,6 +191,7 @@ def make(
             honour.
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
+    id = find(id)
     if id == WALK:
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
@@ -171,8 +200,6 @@ def make(
         from subterra_jax.b2 import missions
 
         return missions.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
-    if id not in TASKS:
-        raise ValueError(no_task(id, (*TASKS, WALK, *MISSIONS)))
     task = TASKS[id]
     named = {part.name for part in (*task.parts, *parts)}
     brought = (part for part in OPTIONAL if part.name in overrides and part.name not in named)

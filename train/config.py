@@ -4,8 +4,7 @@ import dataclasses
 import math
 from typing import ClassVar
 
-import subterra_jax as st
-from subterra_jax.host.versions import no_task
+from subterra_jax.tasks import TaskError, find
 from train.checks import at_least, not_negative, positive, share
 from train.errors import ConfigError
 
@@ -141,8 +140,10 @@ def make_config(task: str, preset: str = "cpu") -> PPOConfig:
         ConfigError: There is no preset of that name, or none for that task.
     """
     known_preset(preset)
-    if task not in st.TASKS:
-        raise ConfigError(no_task(task, st.TASKS))
+    try:
+        task = find(task)
+    except TaskError as error:
+        raise ConfigError(str(error)) from error
     different = _TASKS[task][preset] if task in _TASKS else _OTHERS[preset]
     return dataclasses.replace(_PRESETS[preset], **different)  # type: ignore[arg-type]
 

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import subterra_jax as st
-from subterra_jax.host.versions import VERSION, no_task
+from subterra_jax.host.versions import VERSION
 from subterra_jax.procedural import expand
+from subterra_jax.tasks import TaskError, find
 from subterra_jax.tunnel.sources import tunnel_digest
 from train.belief.network import BeliefLayout, BeliefNetworks
 from train.errors import CheckpointError, ConfigError
@@ -42,10 +43,19 @@ class World:
     facts: dict[str, Any]
 
 
-def known_task(task: str) -> None:
-    """Raises `ConfigError` where there is no such task."""
+def known_task(task: str) -> str:
+    """Return the id of a task; `FILE.py:ID` first runs a user's file.
+
+    Raises:
+        ConfigError: There is no such task, or this command does not learn it.
+    """
+    try:
+        task = find(task)
+    except TaskError as error:
+        raise ConfigError(str(error)) from error
     if task not in st.TASKS:
-        raise ConfigError(no_task(task, st.TASKS))
+        raise ConfigError(f"{task} is not learnt by this command; there are {', '.join(st.TASKS)}")
+    return task
 
 
 def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) -> World:
@@ -57,7 +67,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) 
         ConfigError: There is no such task, or the tunnel has no room for it.
         TunnelError: The tunnel file is missing or wrong, or has no such lining.
     """
-    known_task(task)
+    task = known_task(task)
     names = [tunnel] if tunnel is None else expand(str(tunnel))
     plans = [st.load_tunnel(name) for name in names]
     lining = lining or plans[0].default_lining

@@ -3,6 +3,8 @@
 Each file needs its own library, and none is imported before its first use.
 """
 
+from collections.abc import Sequence
+
 from subterra_jax.b2 import MISSIONS, WALK
 
 # The keys of `subterra_jax.tasks.TASKS`, which loads jax; importing the package registers them and must not.
@@ -31,11 +33,11 @@ _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
 _ON_LEGS = dict.fromkeys(MISSIONS, "subterra_jax.b2.gym:B2Env") | {WALK: "subterra_jax.b2.gym:B2WalkEnv"}
 
 
-def register() -> None:
-    """Make every task known to Gymnasium under its id; doing so again changes nothing."""
+def register_tasks(tasks: Sequence[str] = PLANAR_TASKS) -> None:
+    """Make planar tasks, and those on legs, known to Gymnasium under their ids; doing so again changes nothing."""
     from gymnasium.envs import registration  # optional
 
-    for task in PLANAR_TASKS:
+    for task in tasks:
         if task not in registration.registry:
             registration.register(id=task, entry_point=_SINGLE, vector_entry_point=_VECTOR, kwargs={"task": task})
     for task, entry in _ON_LEGS.items():

@@ -15,32 +15,6 @@ from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import make
 
 
-class BoxSpace:
-    """A box with Gymnax's methods, which may be jitted.
-
-    Args:
-        box: The bounds.
-    """
-
-    def __init__(self, box: Box):
-        self.low, self.high = jnp.asarray(box.low), jnp.asarray(box.high)
-        self.shape, self.dtype = box.shape, jnp.float32
-
-    def sample(self, key: PRNGKeyArray) -> Float[Array, "n"]:
-        """Draw uniformly; standard normal without bounds, exponential beyond a single bound."""
-        has_low, has_high = jnp.isfinite(self.low), jnp.isfinite(self.high)
-        low, high = jnp.where(has_low, self.low, 0.0), jnp.where(has_high, self.high, 0.0)
-        keys = jax.random.split(key, 3)
-        inside = low + jax.random.uniform(keys[0], self.shape) * (high - low)
-        tail, bell = jax.random.exponential(keys[1], self.shape), jax.random.normal(keys[2], self.shape)
-        open_ended = jnp.where(has_low, low + tail, jnp.where(has_high, high - tail, bell))
-        return jnp.where(has_low & has_high, inside, open_ended)
-
-    def contains(self, x: Float[Array, "n"]) -> Bool[Array, ""]:
-        """Return whether every number lies within its bounds; False for a NaN."""
-        return jnp.all((x >= self.low) & (x <= self.high))
-
-
 class SubterraGymnax:
     """One environment with Gymnax's methods; hashable, so that Gymnax's wrappers may jit over it.
 
@@ -68,13 +42,13 @@ class SubterraGymnax:
         """Numbers in one action."""
         return self.env.action_size
 
-    def action_space(self, params: EnvParams | None = None) -> BoxSpace:
+    def action_space(self, params: EnvParams | None = None) -> Box:
         """Bounds of an action."""
-        return BoxSpace(self.env.action_space(self._or_default(params)))
+        return self.env.action_space(self._or_default(params))
 
-    def observation_space(self, params: EnvParams | None = None) -> BoxSpace:
+    def observation_space(self, params: EnvParams | None = None) -> Box:
         """Bounds of an observation."""
-        return BoxSpace(self.env.observation_space(self._or_default(params)))
+        return self.env.observation_space(self._or_default(params))
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: PRNGKeyArray, params: EnvParams | None = None) -> tuple[Float[Array, "n_obs"], State]:

@@ -37,6 +37,20 @@ def load_file(path: Path) -> ModuleType:
     return module
 
 
+def load_module(source: str) -> ModuleType:
+    """Runs a user's module: a `.py` file, or the name of a module that Python can import.
+
+    Raises:
+        UserCodeError: The module cannot be loaded.
+    """
+    if source.endswith(".py"):
+        return load_file(Path(source))
+    try:
+        return importlib.import_module(source)
+    except (ImportError, ValueError) as error:
+        raise UserCodeError(f"{source}: {error}") from error
+
+
 def load_object(name: str) -> Any:
     """Loads `module:NAME` or `FILE.py:NAME`, as a class or a function.
 
@@ -44,13 +58,7 @@ def load_object(name: str) -> Any:
         UserCodeError: The module cannot be imported, or has no such name.
     """
     place, _, attribute = name.rpartition(":")
-    if place.endswith(".py"):
-        module = load_file(Path(place))
-    else:
-        try:
-            module = importlib.import_module(place)
-        except (ImportError, ValueError) as error:
-            raise UserCodeError(f"{name}: {error}") from error
+    module = load_module(place)
     try:
         return getattr(module, attribute)
     except AttributeError as error:

@@ -7,11 +7,10 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.env import TunnelEnv
 from subterra_jax.evaluation import listed_episodes
-from subterra_jax.host.versions import no_task
 from subterra_jax.policies import check_fits, load, told
 from subterra_jax.recorder.config import Recording, RecordingError
 from subterra_jax.state import EnvParams
-from subterra_jax.tasks import TASKS
+from subterra_jax.tasks import TASKS, find
 from subterra_jax.tunnel.plan import TunnelPlan
 
 
@@ -37,9 +36,9 @@ def open_world(config: Recording) -> World:
         RecordingError: There is no such task, the tunnel is too short for it, or the cloud would not show all of it.
         TunnelError: The tunnel is missing or wrong.
     """
-    name = config.task if config.task in TASKS else f"Subterra/{config.task}-v0"
+    name = find(config.task, short=True)
     if name not in TASKS:
-        raise RecordingError(no_task(config.task, TASKS))
+        raise RecordingError(f"{name} cannot be recorded: the recorder drives robots on wheels")
     plan = st.load_tunnel(config.tunnel if config.scene is None else config.scene / "tunnel.npz")
     try:
         env, params = st.make(name, plan, config.lining)

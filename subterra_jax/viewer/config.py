@@ -4,11 +4,9 @@ import socket
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from subterra_jax.b2 import MISSIONS
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
-from subterra_jax.host.versions import no_task
-from subterra_jax.tasks import TASKS
+from subterra_jax.tasks import find
 
 
 class ViewerError(SubterraError):
@@ -69,10 +67,7 @@ def check_config(config: ViewerConfig) -> ViewerConfig:
         raise ViewerError(f"seed must be 0 to {2**31 - 1}, got {config.seed}")
     if not 0 <= config.port < 2**16:
         raise ViewerError(f"port must be 0 to {2**16 - 1}, got {config.port}")
-    task = config.task if config.task in (*TASKS, *MISSIONS) else f"Subterra/{config.task}-v0"
-    if task not in (*TASKS, *MISSIONS):
-        raise ViewerError(no_task(config.task, (*TASKS, *MISSIONS)))
-    return replace(config, task=task)
+    return replace(config, task=find(config.task, short=True))
 
 
 def free_port(host: str, port: int) -> int:

@@ -22,7 +22,10 @@ from subterra_jax.viewer.geometry import Centreline, lining_shape, planar_shapes
 from subterra_jax.viewer.recording import EpisodeFileError, Recording, load
 from subterra_jax.viewer.scene import SceneView
 
-TASKS = (*tasks.TASKS, *MISSIONS)  # tasks that the viewer shows
+
+def task_names() -> tuple[str, ...]:
+    """Return the ids of the tasks that the viewer shows, those of the user's own included."""
+    return (*tasks.TASKS, *MISSIONS)
 
 
 def register_agents(files: tuple[Path, ...]) -> tuple[str, ...]:

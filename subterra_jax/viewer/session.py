@@ -16,7 +16,7 @@ from subterra_jax.host.errors import SubterraError
 from subterra_jax.viewer import browsers, recording
 from subterra_jax.viewer.config import ViewerConfig, ViewerError, check_config, free_port
 from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment
-from subterra_jax.viewer.library import TASKS, Library, TunnelView, drive_episode
+from subterra_jax.viewer.library import Library, TunnelView, drive_episode, task_names
 from subterra_jax.viewer.panel import NO_RECORDING, Choice, Panel, set_value, status_text
 from subterra_jax.viewer.player import Player, Worker
 from subterra_jax.viewer.recording import Recording
@@ -163,7 +163,7 @@ class Session:
     def __init__(self, server: viser.ViserServer, config: ViewerConfig, library: Library):
         self._server, self._library = server, library
         first = Choice(next(iter(library.tunnels)), config.lining, config.task, config.agent, config.seed)
-        self.panel = Panel(server, first, tuple(library.tunnels), TASKS, library.agents, library.recordings())
+        self.panel = Panel(server, first, tuple(library.tunnels), task_names(), library.agents, library.recordings())
         self.view = EpisodeView(server, self.panel, library, self.report_error)
         self.worker = Worker(self.report_error)
         self._picture_lock = threading.Lock()
