@@ -80,7 +80,7 @@ def test_the_last_period_before_the_goal_just_reaches_it(params):
     start, speed = mission.start_mission(obs), []
     for station in (30.0, 39.9, 40.5):
         estimate = Station(jnp.float32(station), jnp.zeros(()), jnp.ones(()))
-        speed.append(float(mission.wanted_speed(start, estimate, obs, params)))
+        speed.append(float(mission.wanted_speed(start, estimate, obs, params.replace(errand="stop"))))
     np.testing.assert_allclose(speed, [2.0, 1.0, 0.0], atol=1e-4)
     there = mission.arrived(start, jnp.float32(1.0), jnp.float32(1.0), params)
     assert there.stopped

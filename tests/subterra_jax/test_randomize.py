@@ -67,7 +67,7 @@ def test_a_randomised_batch_sees_and_moves_as_each_of_its_environments_should(ma
     ("ranges", "message"),
     [
         ({"lidar.sigma": (0.0, 1.0)}, r"no 'lidar.sigma'.*lidar has range_max, range_sigma"),
-        ({"radar.sigma": (0.0, 1.0)}, r"no 'radar.sigma'.*the params has tunnel, horizon, vehicle"),
+        ({"radar.sigma": (0.0, 1.0)}, r"no 'radar.sigma'.*the params has tunnel, horizon"),
         ({"lidar": (0.0, 1.0)}, "'lidar' is no number"),
         ({"lidar.n_beams": (8, 16)}, r"'lidar.n_beams' cannot.*static"),
         ({"tunnel.length": (100.0, 200.0)}, r"'tunnel.length' cannot.*stack several"),

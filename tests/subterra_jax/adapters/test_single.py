@@ -14,7 +14,7 @@ from gymnasium import error, spaces
 from gymnasium.utils.env_checker import check_env
 
 import subterra_jax as st
-from subterra_jax.adapters import register
+from subterra_jax.adapters import register_tasks
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.streams import start_streams, take_key
 
@@ -64,7 +64,7 @@ def test_gymnasium_finds_a_task_by_module_and_id_alone_and_nothing_heavy_comes_w
 
 def test_registering_again_changes_nothing():
     before = dict(gymnasium.registry)
-    register()
+    register_tasks()
     assert gymnasium.registry == before
     assert set(st.TASKS) <= set(gymnasium.registry)
 
