@@ -18,9 +18,8 @@ from benchmarks.results import write_file
 from scene.reading.scans import parse_pointcloud2
 from subterra_jax.evaluation.episodes import N_LISTED
 from subterra_jax.host.versions import no_task
-from subterra_jax.recorder import Recording, record
-from subterra_jax.recorder.config import checked
-from subterra_jax.recorder.world import open_world
+from subterra_jax.recorder import RecorderConfig, record
+from subterra_jax.recorder.config import check_config, open_world
 from subterra_jax.tasks import TASKS
 
 SCHEMA = "subterra.recording-set/1"
@@ -62,7 +61,7 @@ class SetConfig:
     secret: int | None = None
 
 
-def plan_set(config: SetConfig) -> list[tuple[str, Recording]]:
+def plan_set(config: SetConfig) -> list[tuple[str, RecorderConfig]]:
     """Returns the recordings of a set with their names, as `StopAt-pockets-000`.
 
     Raises:
@@ -86,9 +85,9 @@ def plan_set(config: SetConfig) -> list[tuple[str, Recording]]:
     return plan
 
 
-def _recording(config: SetConfig, name: str, task: str, lining: str, episode: int) -> Recording:
+def _recording(config: SetConfig, name: str, task: str, lining: str, episode: int) -> RecorderConfig:
     with_cloud = config.scene is not None and not task.startswith(_WITHOUT_CLOUD)
-    one = Recording(
+    one = RecorderConfig(
         out=config.out / RECORDINGS / name, truth=config.out / TRUTH / name, task=task, lining=lining,
         agent=_SEEKER if task.startswith("Relocalise") else _DRIVER, tunnel=config.tunnel, scene=config.scene,
         cloud=config.cloud if with_cloud else "none", columns=config.columns, beams=config.beams, imu=True,
@@ -127,11 +126,11 @@ def make_set(config: SetConfig) -> Iterator[tuple[str, bool]]:
     (config.out / INDEX).write_text(json.dumps(content, indent=1, default=str) + "\n")
 
 
-def _check(plan: list[tuple[str, Recording]]) -> None:
+def _check(plan: list[tuple[str, RecorderConfig]]) -> None:
     """Checks numbers, folders, and each task with each lining before anything is written."""
     for _, one in plan:
         if not one.recording_folder.is_dir():
-            checked(one)
+            check_config(one)
     for one in {(one.task, one.lining): one for _, one in plan}.values():
         open_world(one)
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from subterra_jax.adapters.streams import take_key
+from subterra_jax.adapters.packing import take_key
 from subterra_jax.host.errors import MissingLibraryError
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make

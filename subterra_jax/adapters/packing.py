@@ -1,22 +1,29 @@
-"""Any pytree of 32-bit numbers as one array of words: passing many small arrays would cost more than a step itself."""
+"""Observations, states and reports between JAX and Gymnasium: spaces, streams of keys, and packed words.
+
+Passing many small arrays between host and device would cost more than a step itself, so a pytree travels as one array.
+"""
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, UInt32
+from gymnasium import spaces
+from jaxtyping import Array, PRNGKeyArray, UInt32
+
+from subterra_jax.env import TunnelEnv
+from subterra_jax.state import EnvParams
 
 
 def pack(tree: Any) -> UInt32[Array, "n_words"]:
-    """The leaves of a pytree one after another, their bits unchanged, a bool as 0 or 1."""
+    """Join the leaves of a pytree into one array of words, their bits unchanged, a bool as 0 or 1."""
     return jnp.concatenate([_words(jnp.asarray(leaf)).reshape(-1) for leaf in jax.tree.leaves(tree)])
 
 
 def unpacker(example: Any) -> Callable[[Any], Any]:
-    """The inverse of `pack`.
+    """Return the inverse of `pack`.
 
     Args:
         example: A pytree of arrays, or of shapes and dtypes, like those that were packed.
@@ -29,7 +36,7 @@ def unpacker(example: Any) -> Callable[[Any], Any]:
         TypeError: A leaf is neither bool nor 32 bits wide.
     """
     leaves, structure = jax.tree.flatten(example)
-    kinds = [_checked(np.dtype(leaf.dtype)) for leaf in leaves]
+    kinds = [_check_kind(np.dtype(leaf.dtype)) for leaf in leaves]
     shapes = [tuple(leaf.shape) for leaf in leaves]
     ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
 
@@ -47,7 +54,7 @@ def unpacker(example: Any) -> Callable[[Any], Any]:
 
 
 def _words(leaf: Array) -> Array:
-    _checked(leaf.dtype)
+    _check_kind(leaf.dtype)
     return leaf.astype(jnp.uint32) if leaf.dtype == jnp.bool_ else jax.lax.bitcast_convert_type(leaf, jnp.uint32)
 
 
@@ -57,7 +64,135 @@ def _values(words: Any, kind: np.dtype) -> Any:
     return words.view(kind) if isinstance(words, np.ndarray) else jax.lax.bitcast_convert_type(words, kind)
 
 
-def _checked(kind: np.dtype) -> np.dtype:
+def _check_kind(kind: np.dtype) -> np.dtype:
     if kind != np.bool_ and kind.itemsize != 4:
         raise TypeError(f"only bools and 32-bit numbers can be packed, got {kind}")
     return kind
+
+
+_WORD = 0xFFFFFFFF
+
+
+def start_streams(seeds: Sequence[int | None], fallback: np.random.Generator) -> UInt32[np.ndarray, "n 2"]:
+    """Begin streams at seeds.
+
+    A stream is the two words of a Threefry key. Each reset and each step takes one key and leaves the next, so that an
+    environment does the same alone and among others.
+
+    Args:
+        seeds: Seed of each stream, from 0 to 2⁶⁴ - 1; `None` draws one from `fallback`.
+        fallback: Source of the seeds that are `None`.
+
+    Raises:
+        ValueError: A seed is out of range.
+    """
+    chosen = [int(fallback.integers(2**63)) if seed is None else int(seed) for seed in seeds]
+    for seed in chosen:
+        if not 0 <= seed < 2**64:
+            raise ValueError(f"a seed must be from 0 to 2**64 - 1, got {seed}")
+    return np.array([[seed >> 32, seed & _WORD] for seed in chosen], np.uint32).reshape(-1, 2)
+
+
+def take_key(stream: UInt32[Array, "2"]) -> tuple[PRNGKeyArray, UInt32[Array, "2"]]:
+    """Return the next key of a stream, and the stream after it."""
+    now, rest = jax.random.split(jax.random.wrap_key_data(stream, impl="threefry2x32"))
+    return now, jax.random.key_data(rest)
+
+
+class Report(NamedTuple):
+    """Result of one step, or of a batch of steps.
+
+    Attributes:
+        obs: Observation, `(..., n_obs)`.
+        reward: Reward, `(...)`.
+        terminated: Whether the episode ended before the horizon, `(...)`.
+        truncated: Whether it ended at the horizon, `(...)`.
+        info: The environment's own `info`.
+    """
+
+    obs: Any
+    reward: Any
+    terminated: Any
+    truncated: Any
+    info: dict[str, Any]
+
+
+def step_and_pack(env: TunnelEnv, key: Any, state: Any, action: Any, params: EnvParams) -> tuple[jax.Array, Any]:
+    """Step an environment; return the report as words, and the state."""
+    obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+    return pack(Report(obs, reward, terminated, truncated, info)), state
+
+
+def report_shapes(env: TunnelEnv, params: EnvParams) -> tuple[Any, Report]:
+    """Return shapes and dtypes of a state and of a report, without computing either."""
+    key = jax.random.key(0)
+    _, state = jax.eval_shape(env.reset, key, params)
+    action = jax.ShapeDtypeStruct((env.action_size,), np.float32)
+    obs, _, reward, terminated, truncated, info = jax.eval_shape(env.step, key, state, action, params)
+    return state, Report(obs, reward, terminated, truncated, info)
+
+
+def python_reader(example: Report) -> Callable[[np.ndarray], Report]:
+    """Return a reader of one step's words as Python's own floats, ints and bools; quicker than `unpacker`.
+
+    Args:
+        example: Shapes and dtypes of the report. Its leaves lie in the words as `pack` puts them: the observation, the
+            reward, the flags, and info in the order of its names.
+    """
+    n_obs = example.obs.shape[0]
+    entries, at = [], 3
+    for name in sorted(example.info):
+        leaf = example.info[name]
+        entries.append((name, leaf.dtype.kind, slice(at, at + leaf.size) if leaf.ndim else at, leaf.shape))
+        at += leaf.size
+    scalars = [(name, kind, at) for name, kind, at, shape in entries if not shape]
+    arrays = [(name, kind, at, shape) for name, kind, at, shape in entries if shape]
+
+    def read(words: np.ndarray) -> Report:
+        rest = words[n_obs:]
+        real, whole = rest.view(np.float32).tolist(), rest.view(np.int32).tolist()
+        info: dict[str, Any] = {
+            name: real[at] if kind == "f" else bool(whole[at]) if kind == "b" else whole[at]
+            for name, kind, at in scalars
+        }
+        for name, kind, at, shape in arrays:
+            info[name] = (rest[at] != 0 if kind == "b" else rest[at].view(f"{kind}4")).reshape(shape)
+        return Report(words[:n_obs].view(np.float32), real[0], bool(whole[1]), bool(whole[2]), info)
+
+    return read
+
+
+PAPER_FIELDS = ("ranges", "odometry")  # of the paper's task, whose observation is a plain vector
+Observation = np.ndarray | dict[str, np.ndarray]
+
+
+def action_space(env: TunnelEnv, params: EnvParams) -> spaces.Box:
+    """Return the bounds of an action."""
+    box = env.action_space(params)
+    return spaces.Box(box.low, box.high, dtype=np.float32)
+
+
+def named_fields(env: TunnelEnv, params: EnvParams, flat: bool) -> dict[str, slice] | None:
+    """Return the parts of an observation by name; `None` for a plain vector.
+
+    Args:
+        env: The environment.
+        params: Its params.
+        flat: Return a plain vector for every task; a task with `PAPER_FIELDS` alone does so anyway.
+    """
+    fields = env.fields(params)
+    return None if flat or tuple(fields) == PAPER_FIELDS else fields
+
+
+def observation_space(env: TunnelEnv, params: EnvParams, fields: Mapping[str, slice] | None) -> spaces.Space[Any]:
+    """Return a `Box`, or a `Dict` with one `Box` for each named field."""
+    box = env.observation_space(params)
+    if fields is None:
+        return spaces.Box(box.low, box.high, dtype=np.float32)
+    # Gymnasium would sort the keys of a plain dict; this order is that of the vector.
+    return spaces.Dict([(name, spaces.Box(box.low[at], box.high[at], dtype=np.float32)) for name, at in fields.items()])
+
+
+def as_observation(vector: np.ndarray, fields: Mapping[str, slice] | None) -> Observation:
+    """Bring vectors `(..., n_obs)` into the form of the space; the parts of a dict are views."""
+    return vector if fields is None else {name: vector[..., at] for name, at in fields.items()}

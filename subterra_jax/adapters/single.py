@@ -13,10 +13,8 @@ import numpy as np
 from gymnasium import error
 from gymnasium.core import Env
 
-from subterra_jax.adapters import report, spaces
-from subterra_jax.adapters.packing import pack, unpacker
-from subterra_jax.adapters.spaces import Observation, as_observation
-from subterra_jax.adapters.streams import start_streams, take_key
+from subterra_jax.adapters import packing
+from subterra_jax.adapters.packing import Observation, as_observation, pack, start_streams, take_key, unpacker
 from subterra_jax.adapters.views import make_view
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
@@ -84,9 +82,9 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         self._view = make_view(view, scene)
         env, params = make(task, self._view.tunnel if tunnel is None else tunnel, lining, **overrides)
         self._env, self._params = env, params
-        self._fields = spaces.named_fields(env, params, flat)
-        self.observation_space = spaces.observation_space(env, params, self._fields)
-        self.action_space = spaces.action_space(env, params)
+        self._fields = packing.named_fields(env, params, flat)
+        self.observation_space = packing.observation_space(env, params, self._fields)
+        self.action_space = packing.action_space(env, params)
         self._stream: np.ndarray | None = None
         self._packed: Any = None
         self._compile()
@@ -94,10 +92,10 @@ class SubterraEnv(Env[Observation, np.ndarray]):
     def _compile(self) -> None:
         """Compile reset and step as functions of two flat arrays: the stream with the state, and the action."""
         env, params = self._env, self._params
-        state, example = report.shapes(env, params)
+        state, example = packing.report_shapes(env, params)
         stream = jax.ShapeDtypeStruct((2,), np.uint32)
         packed = jax.eval_shape(pack, (stream, state))
-        self._unpack, self._read = unpacker((stream, state)), report.python_reader(example)
+        self._unpack, self._read = unpacker((stream, state)), packing.python_reader(example)
         unpack = self._unpack
 
         def reset(stream: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -108,7 +106,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         def step(packed: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
             stream, state = unpack(packed)
             key, stream = take_key(stream)
-            words, state = report.step_and_pack(env, key, state, action, params)
+            words, state = packing.step_and_pack(env, key, state, action, params)
             return pack((stream, state)), words
 
         self._reset = compile_as_one_kernel(reset, stream)

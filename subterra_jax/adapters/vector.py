@@ -17,11 +17,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax.adapters import report, spaces
-from subterra_jax.adapters.packing import unpacker
-from subterra_jax.adapters.report import Report
-from subterra_jax.adapters.spaces import Observation, as_observation
-from subterra_jax.adapters.streams import start_streams, take_key
+from subterra_jax.adapters import packing
+from subterra_jax.adapters.packing import Observation, Report, as_observation, start_streams, take_key, unpacker
 from subterra_jax.adapters.views import make_view
 from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams
@@ -57,7 +54,7 @@ class Batch:
         if n_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {n_envs}")
         self.env, self.params, self.n_envs, self.mode = env, params, n_envs, mode
-        self._state, self._report = report.shapes(env, params)
+        self._state, self._report = packing.report_shapes(env, params)
         self._read = unpacker(self._report)
         self.rows: Rows | None = None
 
@@ -137,8 +134,8 @@ def _reset(env: TunnelEnv, mask: Bool[Array, "n"], stream: Array, others: Rows, 
 @partial(jax.jit, static_argnums=0)
 def _step(env: TunnelEnv, before: Rows, action: Float[Array, "n n_action"], params: EnvParams) -> tuple[Rows, Array]:
     key, stream = jax.vmap(take_key)(before.stream)
-    words, state = jax.vmap(partial(report.step_and_pack, env), (0, 0, 0, None))(key, before.state, action, params)
-    return Rows(stream, state, unpacker(report.shapes(env, params)[1])(words).obs), words
+    words, state = jax.vmap(partial(packing.step_and_pack, env), (0, 0, 0, None))(key, before.state, action, params)
+    return Rows(stream, state, unpacker(packing.report_shapes(env, params)[1])(words).obs), words
 
 
 def mask_info(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
@@ -222,9 +219,9 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self._view = make_view(view, scene)
         env, params = make(task, self._view.tunnel if tunnel is None else tunnel, lining, **overrides)
         self.batch = Batch(env, params, num_envs, self.autoreset_mode)
-        self.fields = spaces.named_fields(env, params, flat)
-        self.single_observation_space = spaces.observation_space(env, params, self.fields)
-        self.single_action_space = spaces.action_space(env, params)
+        self.fields = packing.named_fields(env, params, flat)
+        self.single_observation_space = packing.observation_space(env, params, self.fields)
+        self.single_action_space = packing.action_space(env, params)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._pending = np.zeros(num_envs, np.bool_)

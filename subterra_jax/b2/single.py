@@ -13,8 +13,8 @@ from gymnasium.core import Env
 if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it once, when it is imported
 
-from subterra_jax.adapters import spaces
-from subterra_jax.adapters.streams import start_streams, take_key
+from subterra_jax.adapters import packing
+from subterra_jax.adapters.packing import start_streams, take_key
 from subterra_jax.b2.params import Surroundings, WalkParams, WalkState
 from subterra_jax.b2.view import Camera
 from subterra_jax.b2.walk import WalkEnv
@@ -48,8 +48,8 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
 
     def _ready(self) -> None:
         """Spaces and compiled functions, once `env`, `params` and `walk` are there."""
-        self.observation_space = spaces.observation_space(self.env, self.params, None)
-        self.action_space = spaces.action_space(self.env, self.params)
+        self.observation_space = packing.observation_space(self.env, self.params, None)
+        self.action_space = packing.action_space(self.env, self.params)
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
         self._around = jax.jit(self.walk.surroundings)
 

@@ -7,7 +7,7 @@ import sys
 
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.errors import MissingLibraryError
-from subterra_jax.recorder import Recording, record
+from subterra_jax.recorder import RecorderConfig, record
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -19,7 +19,9 @@ def main(arguments: list[str] | None = None) -> int:
         except ImportError as error:
             raise MissingLibraryError("subterra_jax.recorder", "tyro") from error
         config = parse(
-            lambda words: tyro.cli(Recording, args=words, prog="python -m subterra_jax.recorder", description=__doc__),
+            lambda words: tyro.cli(
+                RecorderConfig, args=words, prog="python -m subterra_jax.recorder", description=__doc__
+            ),
             arguments,
         )
         trace = record(config)

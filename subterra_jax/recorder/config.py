@@ -1,4 +1,4 @@
-"""What to record, and whether it can be had."""
+"""Settings of a recording, their checks, and the task, tunnel and agent that they name."""
 
 import dataclasses
 import functools
@@ -9,28 +9,37 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
+import subterra_jax as st
+from subterra_jax.baselines.agent import Agent
+from subterra_jax.baselines.registry import make_agent
+from subterra_jax.env import TunnelEnv
+from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
 from subterra_jax.lidar3d import beams
+from subterra_jax.policies import check_fits, load, told
+from subterra_jax.state import EnvParams
+from subterra_jax.tasks import TASKS, find
+from subterra_jax.tunnel.plan import TunnelPlan
 
 CloudName = Literal["none", "vlp16", "os1"]
 _BEAMS: dict[str, tuple[Callable[[int], np.ndarray], int]] = {"vlp16": (beams.vlp16, 16), "os1": (beams.os1, 64)}
 
 
-class RecordingError(SubterraError):
-    """A recording that cannot be made as it was asked for."""
+class RecorderError(SubterraError):
+    """A recording cannot be made with its settings."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Recording:
-    """One episode to record.
+class RecorderConfig:
+    """Settings of one episode to record.
 
     Attributes:
         out: Folder to make; `recording/` and `truth/` go into it.
         task: Task id, as `Subterra/StopAt-v0` or `StopAt`.
-        agent: Who drives, by its name on the leaderboard.
-        policy: A policy drives instead: a `.safetensors` file or the name of a released one.
-        seed: Of everything random in the episode.
+        agent: Name of the driver, as on the leaderboard.
+        policy: Policy that drives instead: a `.safetensors` file or the name of a released one.
+        seed: Seed of everything random in the episode.
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
         tunnel: Tunnel file or name; the packaged tunnel if left out.
         lining: Variant of the walls; `pockets` if left out.
@@ -63,12 +72,12 @@ class Recording:
 
     @property
     def recording_folder(self) -> Path:
-        """Where the sensors' part goes."""
+        """Folder of the sensors' part."""
         return self.out / "recording"
 
     @property
     def truth_folder(self) -> Path:
-        """Where the truth goes."""
+        """Folder of the truth."""
         return self.truth or self.out / "truth"
 
     @functools.cached_property
@@ -83,11 +92,11 @@ class Recording:
         return _BEAMS[self.cloud][1]
 
 
-def checked(config: Recording) -> Recording:
-    """The config itself, once its numbers are known to make sense and its folders to be free.
+def check_config(config: RecorderConfig) -> RecorderConfig:
+    """Check the numbers and folders of a config; return it unchanged.
 
     Raises:
-        RecordingError: They are not; says which and why.
+        RecorderError: A number is out of range, two settings exclude each other, or a folder exists already.
         OutputError: A folder cannot be written.
     """
     least = {"columns": 8, "every": 1, "beams": 0, "seed": 0}
@@ -97,17 +106,81 @@ def checked(config: Recording) -> Recording:
         least["episode"] = 0
     for name, value in least.items():
         if getattr(config, name) < value:
-            raise RecordingError(f"{name} must be at least {value}, got {getattr(config, name)}")
+            raise RecorderError(f"{name} must be at least {value}, got {getattr(config, name)}")
     if config.seed >= 2**32:
-        raise RecordingError(f"seed must be below 2**32, got {config.seed}")
+        raise RecorderError(f"seed must be below 2**32, got {config.seed}")
     if config.cloud not in ("none", *_BEAMS):
-        raise RecordingError(f"no LiDAR {config.cloud!r}; there are {', '.join(_BEAMS)}")
+        raise RecorderError(f"no LiDAR {config.cloud!r}; there are {', '.join(_BEAMS)}")
     if config.cloud != "none" and config.scene is None:
-        raise RecordingError(f"cloud {config.cloud!r} needs a scene folder (`python -m scene.build` makes one)")
+        raise RecorderError(f"cloud {config.cloud!r} needs a scene folder (`python -m scene.build` makes one)")
     if config.scene is not None and config.tunnel is not None:
-        raise RecordingError("either scene or tunnel, not both: a scene brings its own tunnel")
+        raise RecorderError("either scene or tunnel, not both: a scene brings its own tunnel")
     for folder in (config.recording_folder, config.truth_folder):
         if folder.exists():
-            raise RecordingError(f"{folder}: exists already; recordings are not overwritten")
+            raise RecorderError(f"{folder}: exists already; recordings are not overwritten")
         require_folder(folder)
     return config
+
+
+@dataclasses.dataclass(frozen=True)
+class World:
+    """A task in a tunnel.
+
+    Attributes:
+        env: The environment.
+        params: The task.
+        plan: Piece of tunnel of the task.
+    """
+
+    env: TunnelEnv
+    params: EnvParams
+    plan: TunnelPlan
+
+
+def open_world(config: RecorderConfig) -> World:
+    """Make the task and read the tunnel of a recording.
+
+    Raises:
+        RecorderError: The task does not exist, the tunnel is too short for it, or the cloud would miss part of it.
+        TunnelError: The tunnel is missing or wrong.
+    """
+    name = find(config.task, short=True)
+    if name not in TASKS:
+        raise RecorderError(f"{name} cannot be recorded: the recorder drives robots on wheels")
+    plan = st.load_tunnel(config.tunnel if config.scene is None else config.scene / "tunnel.npz")
+    try:
+        env, params = st.make(name, plan, config.lining)
+    except ValueError as error:
+        raise RecorderError(str(error)) from error
+    unseen = [part for part in ("obstacles", "faults") if part in params.parts]
+    if unseen and config.cloud != "none":
+        raise RecorderError(f"the {config.cloud} sees none of the {unseen[0]} of {name}: leave out the cloud")
+    piece = TASKS[name].piece
+    if piece is not None:
+        plan = plan.slice(piece[0], min(piece[1], plan.length - piece[0]))
+    return World(env, params, plan)
+
+
+def open_agent(config: RecorderConfig, world: World) -> Agent:
+    """Make the agent of a recording.
+
+    Raises:
+        SubterraError: The agent or policy does not exist, or the policy does not fit the task.
+    """
+    if config.policy is None:
+        return make_agent(config.agent, world.params)
+    policy = load(config.policy)[0]
+    check_fits(policy, dataclasses.replace(world.env, estimates=True), world.params, config.policy)
+    return told(policy, world.params)
+
+
+def draw_episode(config: RecorderConfig, world: World) -> tuple[int, int | None]:
+    """Return seed and severity of the episode; without a severity the seed draws it.
+
+    Raises:
+        EvaluationError: The list does not have the episode.
+    """
+    if config.episode is None:
+        return config.seed, None
+    listed = listed_episodes(world.env, world.params, config.episode + 1)
+    return int(listed.seed[-1]), int(listed.severity[-1])

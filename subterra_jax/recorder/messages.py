@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.host.errors import MissingLibraryError
-from subterra_jax.recorder.poses import Poses
+from subterra_jax.recorder.trace import Poses
 
 _ONCE = "/tf_static"
 EPOCH = 1_700_000_000  # s since 1970, stamp of the start of every episode
@@ -160,7 +160,7 @@ def write_bag(folder: Path, messages: Iterable[Message]) -> dict[str, dict[str, 
         for message in messages:
             kind = message.content.__msgtype__
             if message.topic not in connections:
-                quality = _latched() if message.topic == _ONCE else []
+                quality = _latched_quality() if message.topic == _ONCE else []
                 connections[message.topic] = writer.add_connection(
                     message.topic, kind, typestore=types, offered_qos_profiles=quality
                 )
@@ -171,7 +171,7 @@ def write_bag(folder: Path, messages: Iterable[Message]) -> dict[str, dict[str, 
     return dict(sorted(topics.items()))
 
 
-def _latched() -> list[Any]:
+def _latched_quality() -> list[Any]:
     """Return the quality of service of a message sent once: late subscribers still receive it."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 

@@ -1,91 +1,253 @@
-"""One episode to two folders: what the sensors recorded, and the truth."""
+"""Record one episode into two folders: the robot's own sensors, and the truth."""
 
+import hashlib
+import heapq
+import json
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
+from subterra_jax.evaluation.episodes import SHA256
 from subterra_jax.lidar3d import Relief
-from subterra_jax.recorder import facts, messages, sensing, streams
-from subterra_jax.recorder.config import Recording, RecordingError, checked
-from subterra_jax.recorder.drive import Trace, drive
+from subterra_jax.recorder import messages
+from subterra_jax.recorder.config import (
+    RecorderConfig,
+    RecorderError,
+    World,
+    check_config,
+    draw_episode,
+    open_agent,
+    open_world,
+)
 from subterra_jax.recorder.messages import Message, write_bag
-from subterra_jax.recorder.poses import Poses, axis_rows, measure_imu, reckoned_poses, true_poses, tum_rows
-from subterra_jax.recorder.world import World, draw, open_agent, open_world
+from subterra_jax.recorder.trace import (
+    CLOUD_RANGE,
+    CLOUD_SIGMA,
+    IMU_RATE,
+    Inertial,
+    Poses,
+    Trace,
+    axis_rows,
+    clouds,
+    dense_scans,
+    drive,
+    measure_imu,
+    reckoned_poses,
+    true_poses,
+    tum_rows,
+)
+
+_IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def _merge(streams: list[Iterator[Message]]) -> Iterator[Message]:
+    """Merge streams in order of time; at equal times in the order of the list."""
+    return heapq.merge(*streams, key=lambda message: message.time)
+
+
+def _mounts(height: float, frames: tuple[str, ...]) -> Iterator[Message]:
+    """Yield the transforms of the sensors, sent once."""
+    lift = np.array([0.0, 0.0, height])
+    parts = [messages.transform(0.0, "base_link", frame, lift, _IDENTITY) for frame in frames]
+    yield Message(0.0, "/tf_static", messages.transforms(parts))
+
+
+def _scans(topic: str, trace: Trace, ranges: Float[np.ndarray, "rows n"], range_max: float) -> Iterator[Message]:
+    """Yield the scans of a planar LiDAR."""
+    for time, row in zip(trace.time, ranges, strict=True):
+        yield Message(time, topic, messages.laser_scan(time, "laser", row, range_max, trace.period))
+
+
+def _commands(trace: Trace) -> Iterator[Message]:
+    """Yield the commands, each at the start of the period in which it is obeyed."""
+    for time, (speed, yaw_rate) in zip(trace.time[:-1], trace.command, strict=True):
+        yield Message(time, "/cmd_vel", messages.command(time, float(speed), float(yaw_rate)))
+
+
+def _odometry(topic: str, poses: Poses, frame: str) -> Iterator[Message]:
+    """Yield the poses of `base_link` in a frame as odometry."""
+    for k, time in enumerate(poses.time):
+        yield Message(time, topic, messages.odometry(poses, k, frame))
+
+
+def _frames(poses: Poses, parent: str) -> Iterator[Message]:
+    """Yield the poses of `base_link` in a frame as transforms."""
+    quaternion = poses.rotation.as_quat(canonical=True)
+    for k, time in enumerate(poses.time):
+        part = messages.transform(time, parent, "base_link", poses.position[k], quaternion[k])
+        yield Message(time, "/tf", messages.transforms([part]))
+
+
+def _imu(samples: Inertial) -> Iterator[Message]:
+    """Yield the samples of an IMU."""
+    for time, gyro, accel in zip(samples.time, samples.gyro, samples.accel, strict=True):
+        yield Message(time, "/imu", messages.imu(time, gyro, accel))
+
+
+def _clouds(
+    relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], config: RecorderConfig, seed: int
+) -> Iterator[Message]:
+    """Yield the sweeps of a LiDAR in three dimensions, in its own frame."""
+    some = slice(None, None, config.every)
+    taken = Poses(poses.time[some], poses.position[some], poses.rotation[some])
+    beams = config.directions
+    ring = np.arange(len(beams)) % config.n_rings
+    for time, ranges in zip(taken.time, clouds(relief, taken, station[some], beams, seed), strict=True):
+        hit = np.isfinite(ranges)
+        yield Message(time, "/points", messages.point_cloud(time, beams[hit] * ranges[hit, None], ring[hit]))
+
+
+_RECORDING_SCHEMA, _TRUTH_SCHEMA = "subterra.recording/1", "subterra.recording-truth/1"
+_LIBRARIES = ("subterra-jax", "jax", "numpy", "rosbags")
+
+
+def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts that do not give the truth away: neither seed nor outcome."""
+    env, params, plan = world.env, world.params, world.plan
+    parts = {name: where for name, where in env.fields(params).items() if name not in ("ranges", "odometry")}
+    first = {name: float(trace.observation[0, where][0]) for name, where in parts.items() if name != "flag"}
+    sensors: dict[str, Any] = {"lidar_height": plan.lidar_height, "scan_beams": params.lidar.n_beams}
+    if config.beams:
+        sensors["scan_dense_beams"] = config.beams
+    if config.cloud != "none":
+        sensors |= {"cloud": config.cloud, "columns": config.columns, "every": config.every}
+        sensors |= {"cloud_range": CLOUD_RANGE, "cloud_sigma": CLOUD_SIGMA}
+    if config.imu:
+        sensors["imu_rate"] = IMU_RATE
+    return {
+        "schema": _RECORDING_SCHEMA,
+        "task": env.id,
+        "tunnel": plan.name,
+        "provenance": plan.provenance,
+        "lining": config.lining or plan.default_lining,
+        "agent": config.policy or config.agent,
+        "observed": first,
+        "steps": len(trace.command),
+        "period": trace.period,
+        "epoch": messages.EPOCH,
+        "frames": {"odom": "base_link at the start", "sensors": "turned like base_link, lidar_height above it"},
+        "sensors": sensors,
+        "topics": topics,
+        "versions": {name: version(name) for name in _LIBRARIES},
+    }
+
+
+def _outcome(trace: Trace, seed: int, severity: int | None) -> dict[str, Any]:
+    """Return seed, severity and result of the episode."""
+    state = trace.state
+    moved = np.hypot(*np.diff(np.asarray(state.position, np.float64), axis=0).T)
+    return {
+        "seed": seed,
+        "severity": severity,
+        "success": trace.success,
+        "contact": trace.contact,
+        "travelled": float(moved.sum()),
+        "station_first": float(state.station[0]),
+        "station_last": float(state.station[-1]),
+    }
+
+
+def _truth_facts(
+    config: RecorderConfig, recording: Path, outcome: dict[str, Any], topics: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the facts of the truth, with the digest of its recording."""
+    bag = recording / f"{recording.name}.mcap"
+    return {
+        "schema": _TRUTH_SCHEMA,
+        "episode": config.episode,
+        "list_sha256": None if config.episode is None else SHA256,
+        **outcome,
+        "recording_sha256": hashlib.sha256(bag.read_bytes()).hexdigest(),
+        "topics": topics,
+        "files": {
+            "lidar.tum": "poses of the LiDARs in the tunnel frame",
+            "base_link.tum": "poses of base_link in the tunnel frame",
+            "axis.csv": "centre of the track: station, x, y, z, m",
+        },
+    }
+
+
+def _write_facts(folder: Path, content: dict[str, Any]) -> None:
+    """Write the facts of a folder to a JSON file of the same name."""
+    (folder / f"{folder.name}.json").write_text(json.dumps(content, indent=1, default=str) + "\n")
+
 
 _POSE_FORMAT = "%.9f"
 
 
-def record(config: Recording) -> Trace:
-    """Drive an episode and write it down; the same config gives the same bytes.
+def record(config: RecorderConfig) -> Trace:
+    """Drive an episode and record it; the same config gives the same bytes.
 
     Args:
-        config: What to record and where to.
+        config: Settings of the recording.
 
     Returns:
         The episode.
 
     Raises:
-        RecordingError: It cannot be had, or the folders exist or cannot be written.
+        RecorderError: The settings are wrong, or a folder exists or cannot be written.
         SubterraError: Tunnel, scene, agent or policy are missing or wrong.
     """
-    config = checked(config)
+    config = check_config(config)
     messages.store()
     world = open_world(config)
     agent = open_agent(config, world)
     relief = None if config.cloud == "none" else Relief.from_scene(config.scene or "", config.lining or "pockets")
-    seed, severity = draw(config, world)
+    seed, severity = draw_episode(config, world)
     trace = drive(world.env, world.params, agent, seed, severity, config.steps)
     with ExitStack() as stack:
-        recording, truth = (stack.enter_context(_new(f)) for f in (config.recording_folder, config.truth_folder))
+        recording, truth = (stack.enter_context(_new_folder(f)) for f in (config.recording_folder, config.truth_folder))
         _write_recording(recording, config, trace, world, relief, seed)
-        _write_truth(truth, recording, config, trace, world, facts.outcome(trace, seed, severity))
+        _write_truth(truth, recording, config, trace, world, _outcome(trace, seed, severity))
     return trace
 
 
 def _write_recording(
-    folder: Path, config: Recording, trace: Trace, world: World, relief: Relief | None, seed: int
+    folder: Path, config: RecorderConfig, trace: Trace, world: World, relief: Relief | None, seed: int
 ) -> None:
-    """All that the robot itself knows."""
+    """Write the messages and facts that the robot itself knows."""
     parts, range_max = world.env.fields(world.params), float(world.params.lidar.range_max)
     height = world.plan.lidar_height
     reckoned = reckoned_poses(trace, trace.observation[:, parts["odometry"]])
-    sensor = true_poses(trace, world.plan).lifted(height)
-    wanted = {"laser": True, "lidar": relief is not None, "imu": config.imu}
-    found = [
-        streams.mounts(height, tuple(frame for frame, there in wanted.items() if there)),
-        streams.frames(reckoned, "odom"),
-        streams.odometry("/odom", reckoned, "odom"),
-        streams.commands(trace),
-        streams.scans("/scan", trace, trace.observation[:, parts["ranges"]], range_max),
+    sensor = true_poses(trace, world.plan).lift(height)
+    mounted = {"laser": True, "lidar": relief is not None, "imu": config.imu}
+    streams = [
+        _mounts(height, tuple(frame for frame, there in mounted.items() if there)),
+        _frames(reckoned, "odom"),
+        _odometry("/odom", reckoned, "odom"),
+        _commands(trace),
+        _scans("/scan", trace, trace.observation[:, parts["ranges"]], range_max),
     ]
     if config.beams:
-        dense = sensing.dense_scans(trace, world.env, world.params, config.beams, seed)
-        found.append(streams.scans("/scan_dense", trace, dense, range_max))
+        dense = dense_scans(trace, world.env, world.params, config.beams, seed)
+        streams.append(_scans("/scan_dense", trace, dense, range_max))
     if config.imu:
-        found.append(streams.inertial(measure_imu(sensor, seed)))
+        streams.append(_imu(measure_imu(sensor, seed)))
     if relief is not None:
-        found.append(streams.points(relief, sensor, np.asarray(trace.state.station), config, seed))
-    topics = write_bag(folder, streams.merged(found))
-    _save_tum(folder / "odometry.tum", reckoned.lifted(height))
-    facts.write(folder, facts.recording(config, trace, world, topics))
+        streams.append(_clouds(relief, sensor, np.asarray(trace.state.station), config, seed))
+    topics = write_bag(folder, _merge(streams))
+    _save_tum(folder / "odometry.tum", reckoned.lift(height))
+    _write_facts(folder, _recording_facts(config, trace, world, topics))
 
 
 def _write_truth(
-    folder: Path, recording: Path, config: Recording, trace: Trace, world: World, outcome: dict[str, Any]
+    folder: Path, recording: Path, config: RecorderConfig, trace: Trace, world: World, outcome: dict[str, Any]
 ) -> None:
-    """All that the robot does not know."""
+    """Write the messages and facts that the robot does not know."""
     body = true_poses(trace, world.plan)
-    found: list[Iterator[Message]] = [streams.frames(body, "map"), streams.odometry("/truth/odometry", body, "map")]
-    topics = write_bag(folder, streams.merged(found))
-    _save_tum(folder / "lidar.tum", body.lifted(world.plan.lidar_height))
+    streams: list[Iterator[Message]] = [_frames(body, "map"), _odometry("/truth/odometry", body, "map")]
+    topics = write_bag(folder, _merge(streams))
+    _save_tum(folder / "lidar.tum", body.lift(world.plan.lidar_height))
     _save_tum(folder / "base_link.tum", body)
     header = "station,x,y,z"
     np.savetxt(folder / "axis.csv", axis_rows(world.plan), fmt="%.6f", delimiter=",", header=header, comments="")
-    facts.write(folder, facts.truth(config, recording, outcome, topics))
+    _write_facts(folder, _truth_facts(config, recording, outcome, topics))
 
 
 def _save_tum(path: Path, poses: Poses) -> None:
@@ -93,8 +255,8 @@ def _save_tum(path: Path, poses: Poses) -> None:
 
 
 @contextmanager
-def _new(folder: Path) -> Iterator[Path]:
-    """A folder that appears under its name once all is in it, and not at all where something fails."""
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder that takes its name once complete; nothing is left after a failure."""
     partial = folder.with_name(f".{folder.name}.partial") / folder.name
     try:
         shutil.rmtree(partial.parent, ignore_errors=True)
@@ -102,6 +264,6 @@ def _new(folder: Path) -> Iterator[Path]:
         yield partial
         partial.rename(folder)
     except OSError as error:
-        raise RecordingError(f"{folder}: cannot be written ({error.strerror})") from error
+        raise RecorderError(f"{folder}: cannot be written ({error.strerror})") from error
     finally:
         shutil.rmtree(partial.parent, ignore_errors=True)

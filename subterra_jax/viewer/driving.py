@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.particle.cloud import Cloud
@@ -16,8 +16,41 @@ from subterra_jax.env import TunnelEnv
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.parts.boxes import PITCH
 from subterra_jax.state import EnvParams, State
-from subterra_jax.viewer.gait import Gait
-from subterra_jax.viewer.recording import Recording
+from subterra_jax.viewer.recording import N_POSE, Recording
+
+
+class Gait:
+    """Collects the poses of a walking robot as MuJoCo moves it; none for a wheeled one.
+
+    Args:
+        env: The environment; legs must be simulated by MuJoCo itself.
+
+    Attributes:
+        walks: Whether the robot has legs.
+    """
+
+    def __init__(self, env: TunnelEnv):
+        walk: Any = getattr(env.motion, "walk", None)
+        self.walks = walk is not None
+        self._poses: list[np.ndarray] = []
+        if walk is not None:
+            walk.physics.bench.watch = lambda data: self._poses.append(data.qpos[3:19].astype(np.float32))
+
+    def standing(self) -> Float[np.ndarray, "m 16"]:
+        """Return the poses before the first step."""
+        if not self.walks:
+            return np.zeros((0, N_POSE), np.float32)
+        from subterra_jax.b2.kinematics import standing_pose
+        from subterra_jax.b2.mission import PERIODS
+
+        pose = np.concatenate([[1.0, 0.0, 0.0, 0.0], np.asarray(standing_pose()[0], np.float64)])
+        return np.tile(pose.astype(np.float32), (PERIODS, 1))
+
+    def take(self, n_rows: int) -> Float[np.ndarray, "n_rows m 16"]:
+        """Return the poses since the last call, in `n_rows` rows."""
+        poses, self._poses = self._poses, []
+        return np.array(poses, np.float32).reshape(n_rows, -1, N_POSE) if poses else np.zeros((n_rows, 0, N_POSE), "f4")
+
 
 _CHUNK, _FEW = 100, 5  # steps between two pieces: of a robot on wheels, of one on legs
 _PARTICLES = 96  # particles that are kept: enough to show the shape of a cloud
@@ -49,11 +82,11 @@ def drive(env: TunnelEnv, params: EnvParams, agent: Agent, seed: int, names: dic
     step = 0
     for _, kept in driver.drive(params, agent, now, chunk):
         rows = jax.device_get(kept)
-        rows["pose"] = gait.taken(chunk)
+        rows["pose"] = gait.take(chunk)
         n = min(int(np.argmax(rows["over"])) + 1 if rows["over"].any() else chunk, int(params.horizon) - step)
         success, contact = (float(rows[name][n - 1]) for name in ("success", "contact"))
         series = {name: values[:n] for name, values in rows.items() if name not in ("over", "success", "contact")}
-        recording = recording.extended(series, success, contact)
+        recording = recording.extend(series, success, contact)
         yield recording
         step += chunk
 
@@ -75,7 +108,7 @@ class _Rows:
     def row(
         self, state: State, obs: Array, action: Array, memory: Any, reward: Array, coverage: Array, params: EnvParams
     ) -> dict[str, Array]:
-        """One row of every series."""
+        """Return one row of every series."""
         fields, station = self.env.fields(params), action[2]
         sigma = jnp.where(jnp.isnan(station), jnp.nan, jnp.exp(jnp.clip(action[3], -5.0, 5.0)))
         return {
@@ -95,7 +128,7 @@ class _Rows:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _first_row(driver: Driver, params: EnvParams, now: Episode) -> dict[str, Array]:
-    """The row of the start."""
+    """Return the row of the start."""
     rows, state = _Rows(driver.env), now.state
     nothing = jnp.array([0.0, 0.0, jnp.nan, jnp.nan, 0.0])
     obs = driver.env.observe(state, now.noise, params)
@@ -103,7 +136,7 @@ def _first_row(driver: Driver, params: EnvParams, now: Episode) -> dict[str, Arr
 
 
 def _particles(memory: Any) -> Array:
-    """Particles in an agent's memory, every so many; none of an agent without."""
+    """Return about `_PARTICLES` of the particles in an agent's memory; none for an agent without."""
     clouds = [leaf for leaf in jax.tree.leaves(memory, is_leaf=_is_cloud) if _is_cloud(leaf)]
     if not clouds:
         return jnp.zeros((0, 3))
@@ -120,7 +153,7 @@ def _is_cloud(leaf: Any) -> bool:
 def _start_recording(
     env: TunnelEnv, params: EnvParams, now: Episode, seed: int, names: dict[str, str], first: dict[str, np.ndarray]
 ) -> Recording:
-    """A recording of the start alone."""
+    """Return a recording of the start alone."""
     series: dict[str, Any] = {name: np.asarray(value)[None] for name, value in first.items()}
     named: dict[str, Any] = dict(names)
     fields = env.fields(params)
@@ -143,7 +176,7 @@ def _start_recording(
 
 
 def _boxes(env: TunnelEnv, state: State, params: EnvParams) -> np.ndarray:
-    """All obstacles of an episode, `(n, 6)`: middle, unit vector along the first side, half sides, m."""
+    """Return all obstacles of an episode, `(n, 6)`: middle, unit vector along the first side, half sides, m."""
     stations = jnp.arange(0.0, float(params.tunnel.length) + PITCH, PITCH)
     rows = [np.zeros((0, 6), np.float32)]
     for boxes in jax.device_get(jax.vmap(lambda s: env.boxes(state.replace(station=s), params))(stations)):

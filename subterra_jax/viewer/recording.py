@@ -117,7 +117,7 @@ class Recording:
         plain = ("".join(c if c.isalnum() or c in "-." else "-" for c in part) for part in parts)
         return "_".join(plain) + ".npz"
 
-    def extended(self, rows: dict[str, Any], success: float, contact: float) -> "Recording":
+    def extend(self, rows: dict[str, Any], success: float, contact: float) -> "Recording":
         """Return the episode with further rows of every series."""
         series: dict[str, Any] = {name: np.concatenate([getattr(self, name), values]) for name, values in rows.items()}
         return dataclasses.replace(self, success=success, contact=contact, **series)

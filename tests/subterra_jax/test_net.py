@@ -15,7 +15,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes, evaluate
-from subterra_jax.recorder import Recording, record
+from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.tunnel import at_station
 from subterra_jax.viewer import library
 from tests.subterra_jax import tunnels
@@ -659,7 +659,7 @@ def test_the_evaluation_gives_an_agent_what_it_declares_and_no_more(name):
 
 @pytest.mark.parametrize("name", ["nothing", "truth"])
 def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path):
-    trace = record(Recording(out=tmp_path / "one", task="TraverseShort", agent=probe(name), steps=3))
+    trace = record(RecorderConfig(out=tmp_path / "one", task="TraverseShort", agent=probe(name), steps=3))
     np.testing.assert_allclose(trace.command[:, 0], PROBES[name][1], rtol=1e-4)
 
 

@@ -15,8 +15,8 @@ from gymnasium.utils.env_checker import check_env
 
 import subterra_jax as st
 from subterra_jax.adapters import register_tasks
+from subterra_jax.adapters.packing import start_streams, take_key
 from subterra_jax.adapters.single import SubterraEnv
-from subterra_jax.adapters.streams import start_streams, take_key
 
 TASK, FURTHER = "Subterra/TraverseShort-v0", "Subterra/RelocaliseShort-v0"
 # Actions are m/s and rad/s, and a dead-reckoned distance has no bounds; the checkers would like it otherwise.

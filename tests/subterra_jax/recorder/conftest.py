@@ -4,15 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from subterra_jax.recorder import Recording, record
+from subterra_jax.recorder import RecorderConfig, record
 
 BEAMS = 48
 
 
 @pytest.fixture(scope="session")
-def config(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def config(tmp_path_factory: pytest.TempPathFactory) -> RecorderConfig:
     out: Path = tmp_path_factory.mktemp("episode") / "one"
-    return Recording(out=out, task="StopAtShort", agent="dead-reckoning", episode=1, imu=True, beams=BEAMS)
+    return RecorderConfig(out=out, task="StopAtShort", agent="dead-reckoning", episode=1, imu=True, beams=BEAMS)
 
 
 @pytest.fixture(scope="session")

@@ -13,9 +13,17 @@ import subterra_jax as st
 from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.lidar3d.surface import Axis, Triangles
-from subterra_jax.recorder.drive import Trace
-from subterra_jax.recorder.poses import GRAVITY, Poses, measure_imu, reckoned_poses, true_poses
-from subterra_jax.recorder.sensing import CLOUD_SIGMA, clouds, dense_scans
+from subterra_jax.recorder.trace import (
+    CLOUD_SIGMA,
+    GRAVITY,
+    Poses,
+    Trace,
+    clouds,
+    dense_scans,
+    measure_imu,
+    reckoned_poses,
+    true_poses,
+)
 from subterra_jax.state import State
 from tests.subterra_jax import surfaces
 from tests.subterra_jax.recorder.conftest import BEAMS
