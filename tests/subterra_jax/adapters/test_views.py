@@ -51,7 +51,7 @@ def test_a_box_and_a_goal_are_drawn_where_they_are():
     boxes = Boxes(centre=np.array([[3.0, 4.0]]), axis=np.array([[0.0, 1.0]]), half=np.array([[1.0, 0.5]]))
     goal = np.array([[-5.0, -2.0], [-5.0, 2.0]])
     picture = drawing.top_down(
-        np.zeros((0, 2)), np.zeros(2), 0.0, 0.4, np.zeros(4), view=24.0, size=240, goal=goal, boxes=boxes
+        np.zeros((0, 2)), np.zeros(2), 0.0, 0.4, np.zeros(4), view=24.0, size=240, goal=goal, boxes=[boxes]
     )
     rows, columns = np.nonzero((picture == drawing.BOX).all(axis=2))
     x, y = (columns + 0.5 - 120) / 10, (120 - rows - 0.5) / 10

@@ -37,7 +37,7 @@ def messages(config, trace):
 def test_the_episode_is_the_one_that_the_leaderboard_scores(config, trace):
     env, params = st.make(TASK)
     agent = make_agent(config.agent, params)
-    record = evaluate(env, params, agent, listed_episodes(TASK, params, 2)).where(np.array([False, True]))
+    record = evaluate(env, params, agent, listed_episodes(env, params, 2)).where(np.array([False, True]))
     truth = json.loads((config.truth_folder / "truth.json").read_text())
     assert truth["seed"] == record.seed[0]
     assert len(trace.command) * trace.period == pytest.approx(record.time[0])

@@ -70,12 +70,12 @@ def test_an_odometer_without_errors_reckons_the_true_path():
 
 
 def test_without_noise_a_dense_scan_of_as_many_beams_is_the_tasks_own(trace):
-    _, params = st.make("Subterra/StopAtShort-v0", lidar=LidarParams(range_sigma=0.0))
+    env, params = st.make("Subterra/StopAtShort-v0", lidar=LidarParams(range_sigma=0.0))
     some = dataclasses.replace(trace, state=jax.tree.map(lambda leaf: leaf[:20], trace.state))
     some = dataclasses.replace(some, observation=trace.observation[:20])
-    exact = dense_scans(some, params, 16, seed=1)
+    exact = dense_scans(some, env, params, 16, seed=1)
     assert np.std((trace.observation[:20, :16] - exact)[exact < 29.0]) == pytest.approx(0.05, rel=0.2)
-    every_third = dense_scans(some, params, BEAMS, seed=1)[:, :: BEAMS // 16]
+    every_third = dense_scans(some, env, params, BEAMS, seed=1)[:, :: BEAMS // 16]
     np.testing.assert_allclose(every_third, exact, atol=2e-4)
 
 
