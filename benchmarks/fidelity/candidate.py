@@ -16,15 +16,15 @@ from benchmarks.fidelity.files import FidelityError, file_hash
 
 @dataclass(frozen=True)
 class Track:
-    """The track as the compiled scene holds it, tunnel frame.
+    """Track of the compiled scene, tunnel frame.
 
     Attributes:
         sleeper: Middle of the top of each sleeper, in the order of the file, m, `(s, 3)`.
-        sleeper_mesh: All sleepers.
-        rail: By side (`left`, `right`), the rail head's inner face at its top, along the rail, m, `(k, 3)`.
-        rail_mesh: All rails.
-        fastening_mesh: Pads, clips and shoulders.
-        gauge: Of the track's configuration, m; `None` without a track.
+        sleeper_mesh: Mesh of all sleepers.
+        rail: Inner face of the rail head at its top, along the rail, by side (`left`, `right`), m, `(k, 3)`.
+        rail_mesh: Mesh of all rails.
+        fastening_mesh: Mesh of pads, clips and shoulders.
+        gauge: Gauge of the track's configuration, m; `None` without a track.
     """
 
     sleeper: Float[np.ndarray, "s 3"]
@@ -36,7 +36,7 @@ class Track:
 
 
 def track_of(model: mujoco.MjModel, manifest: dict[str, Any]) -> Track:
-    """The track from the compiled scene: its geoms by name."""
+    """Return the track of the compiled scene, from its geoms by name."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     parts: dict[str, list[trimesh.Trimesh]] = {"sleeper": [], "rail": [], "fastening": []}
@@ -70,7 +70,7 @@ def track_of(model: mujoco.MjModel, manifest: dict[str, Any]) -> Track:
 
 
 def nails_of(model: mujoco.MjModel) -> trimesh.Trimesh:
-    """All nails of the compiled scene: its geoms by name."""
+    """Return all nails of the compiled scene, from its geoms by name."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     named = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith("nails_")]
@@ -78,7 +78,7 @@ def nails_of(model: mujoco.MjModel) -> trimesh.Trimesh:
 
 
 def bed_of(model: mujoco.MjModel) -> trimesh.Trimesh:
-    """The bed of the compiled scene where it is seen: a slab above the invert of a round bore, else nothing."""
+    """Return the visible bed of the compiled scene: a slab above the invert of a round bore, else nothing."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     seen = [g for g in range(model.ngeom) if model.geom(g).name.startswith("bed_") and model.geom_group[g] == 0]
@@ -86,7 +86,7 @@ def bed_of(model: mujoco.MjModel) -> trimesh.Trimesh:
 
 
 def concatenate_meshes(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Several meshes as one; none gives an empty one."""
+    """Joins several meshes; without any, return an empty one."""
     if not meshes:
         return trimesh.Trimesh()
     before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
@@ -125,7 +125,7 @@ MANIFEST_SCHEMA = "subterra.manifest/1"
 
 @dataclass(frozen=True)
 class Bore:
-    """The arrays of `bore.npz` that the suite reads; docs/formats.md says what each is."""
+    """Arrays of `bore.npz` that the suite reads; docs/formats.md explains each."""
 
     station: Float[np.ndarray, " n"]
     position: Float[np.ndarray, "n 3"]
@@ -142,16 +142,16 @@ class Bore:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A reconstruction to be judged.
+    """Reconstruction to be judged.
 
     Attributes:
-        name: For people.
-        folder: The scene folder; what SCN and PAR read.
+        name: Name for people.
+        folder: Scene folder, which SCN and PAR read.
         lining: Open bore with its pockets, tunnel frame, m.
         solid: Watertight air volume.
         bore: Centreline and sections.
         track: Sleepers and rails.
-        manifest: Of the scene.
+        manifest: Manifest of the scene.
         scene: The MJCF file, by default the folder's own.
         tunnel: The planar tunnel of the environment, by default the folder's own.
         extra: Further visible surfaces (debris, pillars): empty in what the builder made.
@@ -174,12 +174,12 @@ class Candidate:
 
     @property
     def origin(self) -> Float[np.ndarray, "3"]:
-        """Of the tunnel frame in the input's frame, m."""
+        """Origin of the tunnel frame in the input's frame, m."""
         return np.asarray(self.manifest["frame"]["origin"], float)
 
     @property
     def length(self) -> float:
-        """Of the centreline, m."""
+        """Length of the centreline, m."""
         return float(self.bore.station[-1])
 
 
@@ -209,7 +209,7 @@ def load_candidate(folder: Path) -> Candidate:
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a scene folder whose files are those that it names.
+    """Reads the manifest of a scene folder and checks the files that it names.
 
     Raises:
         FidelityError: It cannot be read or has another schema; a file is missing or has changed since the build.

@@ -9,11 +9,11 @@ from subterra_jax.host.errors import SubterraError
 
 
 class FidelityError(SubterraError):
-    """A user's mistake; its text is one sentence that names the file and the cause."""
+    """User's mistake; its text is one sentence that names the file and the cause."""
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file, or of the names and hashes of a folder's files: what the builder records of its inputs."""
+    """Return the SHA-256 of a file, or of a folder's names and hashes, as the builder records its inputs."""
     return str(input_record([path])[0]["sha256"])
 
 
@@ -34,12 +34,12 @@ def write_text(path: Path, text: str) -> Path:
 
 
 def write_json(path: Path, content: Any, digits: int = 9) -> Path:
-    """Sorted keys, no NaN, floats rounded to some digits (17 keep all): the same result gives the same bytes."""
+    """Writes sorted keys and rounded floats (17 digits keep all): the same result gives the same bytes."""
     return write_text(path, json.dumps(round_floats(content, digits), indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
 def read_json(path: Path, schema: str) -> dict[str, Any]:
-    """A file written by `write_json`.
+    """Reads a file written by `write_json`.
 
     Raises:
         FidelityError: Missing, broken, or of another schema.
@@ -54,7 +54,7 @@ def read_json(path: Path, schema: str) -> dict[str, Any]:
 
 
 def round_floats(content: Any, digits: int = 9) -> Any:
-    """Floats to some significant digits, numpy numbers to Python's, anything not finite to `None`."""
+    """Rounds floats to significant digits, turns numpy numbers into Python's, and NaN and infinity into `None`."""
     if isinstance(content, dict):
         return {str(key): round_floats(value, digits) for key, value in content.items()}
     if isinstance(content, list | tuple):

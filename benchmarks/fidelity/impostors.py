@@ -17,11 +17,11 @@ NULL_STEP = 0.5  # m between rings
 
 
 def null_tube(candidate: Candidate, sleepers: bool = True) -> Candidate:
-    """A candidate with the axis of the given one and its median section everywhere.
+    """Return a candidate with the axis of the given one and its median section everywhere.
 
     Args:
-        candidate: Whose axis, median radius and track are taken.
-        sleepers: Whether it keeps the track.
+        candidate: Candidate with the axis, median radius and track to use.
+        sleepers: Keep the track.
     """
     bore = candidate.bore
     count = max(round(candidate.length / NULL_STEP), 2) + 1
@@ -55,7 +55,7 @@ def sweep_section(
     radius: Float[np.ndarray, " m"],
     angle: Float[np.ndarray, " m"],
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
-    """Lining (seen from inside) and solid (normals outward) of one polygon swept along frames."""
+    """Return lining (seen from inside) and solid (normals outward) of one polygon swept along frames."""
     around = radius[:, None] * np.cos(angle)[:, None], radius[:, None] * np.sin(angle)[:, None]
     vertices = position[:, None] + around[0][None] * left[:, None] + around[1][None] * up[:, None]
     rings, corners = vertices.shape[:2]
@@ -80,7 +80,7 @@ def sweep_section(
 
 
 def no_track() -> Track:
-    """No sleeper, no rail."""
+    """Return a track without sleepers and rails."""
     none = {"left": np.zeros((0, 3)), "right": np.zeros((0, 3))}
     return Track(np.zeros((0, 3)), trimesh.Trimesh(), none, trimesh.Trimesh(), trimesh.Trimesh(), None)
 
@@ -102,11 +102,11 @@ _POCKET = np.dtype(
 
 
 def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
-    """The true surface in the place of a reconstruction; its compiled scene stays the base's.
+    """Return the true surface as a candidate; its compiled scene stays the base's.
 
     Args:
-        truth: Of the simulated survey.
-        base: Whose scene folder and names are kept.
+        truth: Truth of the simulated survey.
+        base: Candidate whose scene folder and names are kept.
     """
     wall = true_faces(truth, WALL_PARTS)
     wall.merge_vertices(digits_vertex=6)
@@ -117,13 +117,13 @@ def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
 
 
 def true_faces(truth: Truth, names: tuple[str, ...]) -> trimesh.Trimesh:
-    """The faces of some parts of the true surface."""
+    """Return the faces of some parts of the true surface."""
     wanted = [truth.parts.index(name) for name in names if name in truth.parts]
     return without_faces(truth.surface, ~np.isin(truth.part, wanted))
 
 
 def cap_rims(lining: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The open surface, wound alike everywhere, with each rim closed by a fan that is wound as it is."""
+    """Closes each rim of an open surface with a fan that is wound like the surface."""
     _, first, count = np.unique(lining.edges_sorted, axis=0, return_index=True, return_counts=True)
     rim = lining.edges[first[count == 1]]
     loops = trimesh.graph.connected_components(rim, min_len=3)

@@ -43,9 +43,9 @@ class Inputs:
         trajectory: Poses of its LiDAR in the frame of the scene's input, TUM.
         truth: Folder of a simulated survey, for its truth.json and truth.ply.
         fit_recording: The recording that the builder read, for the gap between fit and hold.
-        fit_trajectory: Its poses; those of `--trajectory` where not given.
-        hold: How much of a recording is scored.
-        seed: Of sampling, noise and bootstrap.
+        fit_trajectory: Poses of that recording; those of `--trajectory` where not given.
+        hold: Part of a recording to score.
+        seed: Seed of sampling, noise and bootstrap.
         strict: Count metrics without a reference as 0.
         metrics: Python file with metrics of your own, see docs/guide/extend.md.
         out: Folder for all results.
@@ -65,7 +65,7 @@ class Inputs:
 
 
 def complete_inputs(inputs: Inputs) -> Inputs:
-    """The inputs as given, checked, or those of the packaged tunnel.
+    """Checks the inputs; without a scene, return those of the packaged tunnel.
 
     Raises:
         SubterraError: A path does not exist.
@@ -88,7 +88,7 @@ def complete_inputs(inputs: Inputs) -> Inputs:
 
 
 def read_case(inputs: Inputs) -> Case:
-    """The case of completed inputs.
+    """Reads the case of completed inputs.
 
     Raises:
         FidelityError: A file is not what it should be.
@@ -113,7 +113,7 @@ def read_case(inputs: Inputs) -> Case:
 
 
 def with_sigma(config: HoldConfig, recording: Path) -> HoldConfig:
-    """The data sheet's noise of the sensor that a recording's name tells, unless another was given."""
+    """Return the data sheet's noise of the sensor that a recording's name tells, unless another was given."""
     if config.sigma != HoldConfig().sigma:
         return config
     known = [sigma for name, sigma in SIGMA.items() if name in recording.name.lower()]
@@ -121,7 +121,7 @@ def with_sigma(config: HoldConfig, recording: Path) -> HoldConfig:
 
 
 def packaged_inputs(inputs: Inputs) -> Inputs:
-    """The packaged tunnel's scene and survey, made by the users' own commands where missing or not matching."""
+    """Return scene and survey of the packaged tunnel, made by the users' own commands where missing or changed."""
     survey, scene = Path("build/survey-351"), Path("build") / PACKAGED
     fitted, held = survey / "survey.bag", survey / f"survey_{HELD_OUT}.bag"
     if not fitted.exists() or not held.exists():
@@ -137,7 +137,7 @@ def packaged_inputs(inputs: Inputs) -> Inputs:
 
 
 def is_built_from(scene: Path, recording: Path) -> bool:
-    """Whether a scene folder is there and its manifest has the recording's hash."""
+    """Return True where a scene folder exists and its manifest has the recording's hash."""
     if not (scene / "manifest.json").exists():
         return False
     inputs = json.loads((scene / "manifest.json").read_text()).get("inputs", [])
@@ -145,7 +145,7 @@ def is_built_from(scene: Path, recording: Path) -> bool:
 
 
 def foreign_scene(case: Case, folder: Path) -> Path:
-    """A scene of another tunnel of the same class and length, made where it is missing, for N33."""
+    """Return a scene of another tunnel of the same class and length for N33, made where it is missing."""
     scene = folder / FOREIGN
     if not (scene / "manifest.json").exists():
         survey = folder / "foreign-survey"
@@ -174,13 +174,13 @@ SPLIT_SCHEMA = "subterra.split/1"
 
 @dataclass(frozen=True)
 class SplitConfig:
-    """The rule.
+    """Rule of the cut.
 
     Attributes:
         block: Length of a block, s.
         guard: Left out around every border between parts, s.
-        shares: Of fit, val and hold.
-        seed: Of the order of the blocks.
+        shares: Shares of fit, val and hold.
+        seed: Seed of the order of the blocks.
     """
 
     block: float = 2.0
@@ -190,7 +190,7 @@ class SplitConfig:
 
 
 def deal_blocks(duration: float, config: SplitConfig) -> Int[np.ndarray, " b"]:
-    """The part of each block of a recording of some seconds.
+    """Return the part of each block of a recording of some seconds.
 
     Blocks are dealt in hands of five, each of which holds the parts in their shares, so that every part sees the whole
     tunnel; the order within a hand is drawn.
@@ -201,7 +201,7 @@ def deal_blocks(duration: float, config: SplitConfig) -> Int[np.ndarray, " b"]:
 
 
 def part_at(time: float, dealt: Int[np.ndarray, " b"], config: SplitConfig) -> int:
-    """0 fit, 1 val, 2 hold for a time since the start of the recording, s; -1 within the guard of a border."""
+    """Return 0 fit, 1 val or 2 hold for a time since the start, s; -1 within the guard of a border."""
     block = int(time // config.block)
     into = time - block * config.block
     if block and into < 0.5 * config.guard and dealt[block - 1] != dealt[block]:
@@ -274,7 +274,7 @@ def _make_writer(path: Path) -> Any:
 
 
 def _add_channel(writer: Any, connection: Any) -> Any:
-    """The recording's channel anew, with its own message definition."""
+    """Adds the recording's channel with its own message definition."""
     name, kind, definition = connection.topic, connection.msgtype, connection.msgdef.data
     if isinstance(writer, Writer1):
         return writer.add_connection(name, kind, msgdef=definition, md5sum=connection.digest)

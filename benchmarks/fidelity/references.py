@@ -21,7 +21,7 @@ _FEWEST_RETURNS = 8  # returns of a ring or column that tell its direction
 
 
 def is_organised(recording: Recording) -> bool:
-    """Whether the recording holds sweeps as rings by columns, with a time for beams without return (Ouster).
+    """Return True where the recording holds sweeps as rings by columns, with times for lost beams (Ouster).
 
     A Livox message keeps a place for them too, but nothing in it tells where they looked.
     """
@@ -33,7 +33,7 @@ def is_organised(recording: Recording) -> bool:
 
 
 def organised_scans(recording: Recording) -> Iterator[Scan]:
-    """Sweeps in which a beam without return is a point `SILENT` metres away in the direction that it looked.
+    """Yields sweeps in which a beam without return is a point `SILENT_RANGE` metres away in its direction.
 
     Raises:
         ValueError: A message is no organised sweep.
@@ -51,7 +51,7 @@ def organised_scans(recording: Recording) -> Iterator[Scan]:
 def beam_directions(
     points: Float[np.ndarray, "rings columns 3"], back: Bool[np.ndarray, "rings columns"]
 ) -> tuple[Float[np.ndarray, "rings columns 3"], Bool[np.ndarray, "rings columns"]]:
-    """Where each beam of a sweep looked, and whether that is known, from the returns of its ring.
+    """Return the direction of each beam of a sweep, and where it is known, from the returns of its ring.
 
     A ring is a cone about the sensor's axis of rotation; its azimuth is that of the column plus a constant. Both
     constants are medians over the ring's own returns, so nothing of the maker's calibration is needed.
@@ -118,17 +118,17 @@ class Hold:
     """Beams of a recording that the builder never opened, tunnel frame.
 
     Attributes:
-        time: Of each beam, s, `(n,)`.
+        time: Time of each beam, s, `(n,)`.
         scan: Number of its scan, `(n,)`; beams are in the order of scans.
-        origin: Where the sensor was, m, `(n, 3)`.
+        origin: Position of the sensor, m, `(n, 3)`.
         direction: Unit vectors, `(n, 3)`.
-        range: To the return, m; `inf` where none came back, `(n,)`.
-        sensor: What recorded it.
+        range: Distance to the return, m; `inf` where none came back, `(n,)`.
+        sensor: Name of the sensor.
         sigma: Standard deviation of its range noise by the sensor's data sheet, m.
-        range_max: Its reach, m.
+        range_max: Reach of the sensor, m.
         hash: SHA-256 of the recording.
-        knows_missing: Whether beams without a return are among the beams.
-        cache: Computed once from this reference alone.
+        knows_missing: True where beams without a return are among the beams.
+        cache: Results computed from this reference alone.
     """
 
     time: Float[np.ndarray, " n"]
@@ -145,19 +145,19 @@ class Hold:
 
     @property
     def returned(self) -> Bool[np.ndarray, " n"]:
-        """Whether each beam came back."""
+        """True for beams that came back, `(n,)`."""
         return np.isfinite(self.range)
 
     @property
     def points(self) -> Float[np.ndarray, "k 3"]:
-        """The returns, m."""
+        """Points of the returns, m, `(k, 3)`."""
         kept = self.returned
         return self.origin[kept] + self.range[kept, None] * self.direction[kept]
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The exact truth of a simulated survey, tunnel frame.
+    """Exact truth of a simulated survey, tunnel frame.
 
     Attributes:
         station: m, `(n,)`.
@@ -166,11 +166,11 @@ class Truth:
         width: Largest inner width, m, `(n,)`.
         height: Floor to crown, m, `(n,)`.
         surface: The true surface: lining with pockets, floor, sleepers, rails, fastenings.
-        part: Which of `parts` each face of `surface` belongs to, `(f,)`.
-        parts: Names.
+        part: Index into `parts` of each face of `surface`, `(f,)`.
+        parts: Names of the parts.
         furniture: `rings`, `pockets`, `nails`, `sleepers`, `rails` of `truth.json`, in the survey frame.
-        origin: Subtracted from the survey frame, m, `(3,)`.
-        cache: Computed once from this reference alone.
+        origin: Point subtracted from the survey frame, m, `(3,)`.
+        cache: Results computed from this reference alone.
     """
 
     station: Float[np.ndarray, " n"]
@@ -188,7 +188,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class HoldConfig:
-    """How much of a held-out recording is scored.
+    """Part of a held-out recording to score.
 
     Attributes:
         scan_spacing: Distance that the sensor moves between two scans kept, m.
@@ -209,8 +209,8 @@ def load_hold(recording: Path, trajectory: Path, origin: Float[np.ndarray, "3"],
     Args:
         recording: Any recording that `scene` reads.
         trajectory: Poses of its LiDAR in the frame of the scene's input, TUM.
-        origin: Of the tunnel frame in that frame, m.
-        config: How much of it is kept.
+        origin: Origin of the tunnel frame in that frame, m.
+        config: Part of the recording to keep.
 
     Raises:
         FidelityError: Nothing of it has a pose.

@@ -18,7 +18,7 @@ _LEFT_DEPTH = 5e-4  # m that a removed pocket keeps, so that its sides do not va
 
 
 def remove_sleepers(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
-    """Sleepers missing with what fastens rails to them."""
+    """Removes a share of the sleepers with their fastenings."""
     track, line = candidate.track, axis_of(candidate)
     count = len(track.sleeper)
     gone = rng.permutation(count)[: round(share * count)]
@@ -35,7 +35,7 @@ def remove_sleepers(candidate: Candidate, share: float, rng: np.random.Generator
 
 
 def respace_sleepers(candidate: Candidate, spacing: float) -> Candidate:
-    """Sleepers at another spacing from the first one on; those beyond the end are gone."""
+    """Moves sleepers to another spacing from the first one on; those beyond the end are removed."""
     track, line = candidate.track, axis_of(candidate)
     old = line.local(track.sleeper)[:, 0]
     factor = spacing / float(np.median(np.diff(old)))
@@ -60,7 +60,7 @@ def respace_sleepers(candidate: Candidate, spacing: float) -> Candidate:
 
 
 def change_gauge(candidate: Candidate, gauge: float) -> Candidate:
-    """Rails and fastenings moved apart or together, half on each side, m."""
+    """Moves rails and fastenings apart or together, half on each side, to a gauge in m."""
     track, line = candidate.track, axis_of(candidate)
     middle = np.mean([line.local(points)[:, 1].mean() for points in track.rail.values() if len(points)])
     aside = 0.5 * (gauge - (track.gauge or gauge))
@@ -77,7 +77,7 @@ def change_gauge(candidate: Candidate, gauge: float) -> Candidate:
 
 
 def scale_pockets(candidate: Candidate, factor: float, share: float, rng: np.random.Generator) -> Candidate:
-    """Depth of a share of the pockets times a factor; 0 closes them, and the nails in them are gone."""
+    """Multiplies the depth of a share of the pockets; 0 closes them and removes the nails in them."""
     bore = candidate.bore
     if not len(bore.pocket):
         return candidate
@@ -109,7 +109,7 @@ def scale_pockets(candidate: Candidate, factor: float, share: float, rng: np.ran
 
 
 def shift_pattern(candidate: Candidate, shift: float) -> Candidate:
-    """Pockets and joints along the tunnel by some metres; mouths and track stay."""
+    """Shifts pockets and joints along the tunnel by some metres; mouths and track stay."""
     bore, line = candidate.bore, axis_of(candidate)
 
     def target(station: np.ndarray) -> np.ndarray:
@@ -131,7 +131,7 @@ def shift_pattern(candidate: Candidate, shift: float) -> Candidate:
 
 
 def ring_pitch(candidate: Candidate) -> float:
-    """Median distance of the ring joints, m; 1.5 where none is known."""
+    """Return the median distance of the ring joints, m; 1.5 where none is known."""
     joints = candidate.bore.ring_station
     return float(np.median(np.diff(joints))) if len(joints) > 2 else 1.5
 
@@ -163,7 +163,7 @@ def _in_pockets(pocket: np.ndarray, station: np.ndarray, angle: np.ndarray, radi
 
 
 def _outside_pockets(pocket: np.ndarray, line: Curve) -> Callable[[np.ndarray], np.ndarray]:
-    """Whether bodies lie farther from every pocket than a nail reaches."""
+    """Return a test whether bodies lie farther from every pocket than a nail reaches."""
 
     def away(middles: np.ndarray) -> np.ndarray:
         local = line.local(middles)
@@ -189,7 +189,7 @@ _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel
 def place_box(
     candidate: Candidate, station: float, left: float, up: float, size: tuple[float, float, float]
 ) -> trimesh.Trimesh:
-    """A box in the frame of the axis, m."""
+    """Return a box in the frame of the axis, m."""
     position, tangent, side, top = axis_of(candidate).frames(np.array([station]))
     placement = np.eye(4)
     placement[:3, :3] = np.column_stack([tangent[0], side[0], top[0]])
@@ -198,7 +198,7 @@ def place_box(
 
 
 def add_bodies(candidate: Candidate, parts: list[trimesh.Trimesh]) -> Candidate:
-    """The candidate with closed bodies standing in it; the air volume loses what they take."""
+    """Puts closed bodies into the bore; the air volume loses theirs."""
     solid = candidate.solid.copy()
     solid.merge_vertices(digits_vertex=6)
     taken = trimesh.boolean.difference([solid, *parts], engine="manifold", check_volume=False)
@@ -207,7 +207,7 @@ def add_bodies(candidate: Candidate, parts: list[trimesh.Trimesh]) -> Candidate:
 
 
 def block_bore(candidate: Candidate, whole: bool) -> Candidate:
-    """A box of 1 m on the track in mid-tunnel, or a wall across the whole section."""
+    """Puts a box of 1 m on the track in mid-tunnel, or a wall across the whole section."""
     bore, station = candidate.bore, 0.5 * candidate.length
     width, height = float(bore.width.max()), float(bore.height.max())
     if whole:
@@ -219,7 +219,7 @@ def block_bore(candidate: Candidate, whole: bool) -> Candidate:
 
 
 def add_debris(candidate: Candidate, count: int, rng: np.random.Generator) -> Candidate:
-    """Pieces of debris that float in the bore."""
+    """Puts pieces of debris that float into the bore."""
     station = rng.uniform(1.0, candidate.length - 1.0, count)
     local = np.column_stack([station, rng.uniform(-1.5, 1.5, count), rng.uniform(-1.0, 1.5, count)])
     parts = []
@@ -231,7 +231,7 @@ def add_debris(candidate: Candidate, count: int, rng: np.random.Generator) -> Ca
 
 
 def add_pillars(candidate: Candidate, spacing: float) -> Candidate:
-    """Pillars beside the track, floor to crown, as landmarks that are not there."""
+    """Puts pillars beside the track, floor to crown, as landmarks that are not there."""
     bore = candidate.bore
     stations = np.arange(0.5 * min(spacing, candidate.length), candidate.length - 1.0, spacing)
     aside, height = 0.36 * float(np.median(bore.width)), float(np.median(bore.height))
@@ -240,7 +240,7 @@ def add_pillars(candidate: Candidate, spacing: float) -> Candidate:
 
 
 def close_mouth(candidate: Candidate) -> Candidate:
-    """An end wall where the tunnel goes on."""
+    """Puts an end wall where the tunnel goes on."""
     lining = candidate.lining.copy()
     lining.merge_vertices(digits_vertex=6)
     edges, count = np.unique(lining.edges_sorted, axis=0, return_counts=True)

@@ -65,12 +65,12 @@ OUT_OF_SCENE = "all but SCN PAR"
 
 @dataclass(frozen=True)
 class Setting:
-    """What a control may use beside the case.
+    """Means of a control beside the case.
 
     Attributes:
-        rng: Its own random numbers; the same for all doses.
+        rng: Random numbers of the control; the same for all doses.
         scratch: A folder to write a changed scene into.
-        foreign: Makes another tunnel of the same class; only N33 asks for it.
+        foreign: Function that loads another tunnel of the same class; only N33 calls it.
     """
 
     rng: np.random.Generator
@@ -80,17 +80,17 @@ class Setting:
 
 @dataclass(frozen=True)
 class Control:
-    """A row of the table.
+    """Row of the table of controls.
 
     Attributes:
         id: N01 to N36.
-        corruption: In words.
-        doses: In growing severity.
-        bold: The doses that must FAIL.
+        corruption: Corruption in words.
+        doses: Doses in growing severity.
+        bold: Doses that must FAIL.
         falls: Points that a category must lose at least at the bold dose.
         quiet: Categories that may move by at most 2 points.
-        evaluated: Categories computed; the others are taken over from the base, since nothing they read has changed.
-        reason: Why a row differs from the specification's, empty where it does not.
+        evaluated: Categories to compute; the others keep the base's values, since nothing they read has changed.
+        reason: Reason for a difference from the specification; empty where there is none.
     """
 
     id: str
@@ -108,7 +108,7 @@ Spoil = Callable[[Case, float, Setting], Case]
 
 @cache
 def load_controls() -> dict[str, Control]:
-    """The controls by id, in order."""
+    """Return the controls by id, in order."""
     with TABLE.open(newline="") as file:
         rows = list(csv.DictReader(file))
     return {
@@ -122,7 +122,7 @@ def load_controls() -> dict[str, Control]:
 
 
 def spoil_case(case: Case, control: str, dose: float, setting: Setting) -> Case:
-    """The case with one control at one dose.
+    """Return the case with one control at one dose.
 
     Raises:
         KeyError: No such control.
@@ -212,11 +212,11 @@ THINNED_LIMIT = 2.0
 
 @dataclass(frozen=True)
 class Invariance:
-    """A control that must be quiet.
+    """Control that must be quiet.
 
     Attributes:
-        change: Of the case.
-        text: In words.
+        change: Change of the case.
+        text: Change in words.
         category_limit: Points that a category may move.
         exempt: Categories that may move.
     """
@@ -236,7 +236,7 @@ def _on_meshes(change: Callable[[trimesh.Trimesh], trimesh.Trimesh]) -> Callable
 
 
 def permute(candidate: Candidate, rng: np.random.Generator) -> Candidate:
-    """Vertices and faces in another order."""
+    """Puts vertices and faces into another order."""
 
     def mixed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         order = rng.permutation(len(mesh.vertices))
@@ -247,13 +247,13 @@ def permute(candidate: Candidate, rng: np.random.Generator) -> Candidate:
 
 
 def subdivide(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Every face in four by the middles of its edges."""
+    """Cuts every face in four at the middles of its edges."""
     vertices, faces = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
 def move_together(case: Case, rng: np.random.Generator) -> Case:
-    """Reconstruction and references turned and shifted alike."""
+    """Turns and shifts reconstruction and references alike."""
     turn = Rotation.from_euler("z", YAW).as_matrix()
     candidate = case.candidate
 
@@ -280,7 +280,7 @@ def move_together(case: Case, rng: np.random.Generator) -> Case:
 
 
 def reverse_axis(case: Case, rng: np.random.Generator) -> Case:
-    """Chainage from the other end, of the reconstruction alone."""
+    """Counts stations of the reconstruction from the other end."""
     bore, track = case.candidate.bore, case.candidate.track
     angle = np.pi - bore.angle
     angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
@@ -301,7 +301,7 @@ def reverse_axis(case: Case, rng: np.random.Generator) -> Case:
 
 
 def exchange_formats(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Written as OBJ and as binary STL, and read again."""
+    """Writes a mesh as OBJ and as binary STL and reads it again."""
     for kind in ("obj", "stl"):
         data = mesh.export(file_type=kind)
         assert isinstance(data, str | bytes)
@@ -312,18 +312,18 @@ def exchange_formats(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def shuffle_beams(hold: Hold, rng: np.random.Generator) -> Hold:
-    """Beams of each scan in another order; scans stay in theirs."""
+    """Puts the beams of each scan into another order; scans stay in theirs."""
     order = np.lexsort((rng.random(len(hold.scan)), hold.scan))
     return take_beams(hold, order)
 
 
 def thin_beams(hold: Hold, rng: np.random.Generator) -> Hold:
-    """Every second beam."""
+    """Keeps every second beam."""
     return take_beams(hold, np.flatnonzero(rng.random(len(hold.scan)) < 0.5))
 
 
 def take_beams(hold: Hold, rows: np.ndarray) -> Hold:
-    """Some beams of a recording."""
+    """Return some beams of a recording."""
     names = ("time", "scan", "origin", "direction", "range")
     return replace(hold, **{name: getattr(hold, name)[rows] for name in names}, cache={})
 

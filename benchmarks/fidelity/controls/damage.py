@@ -25,17 +25,17 @@ _SLIVER = 1e-4
 
 
 def change_both(candidate: Candidate, change) -> Candidate:
-    """Lining and solid changed alike."""
+    """Changes lining and solid alike."""
     return replace(candidate, lining=change(candidate.lining), solid=change(candidate.solid))
 
 
 def drop_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
-    """Random faces missing."""
+    """Removes random faces."""
     return change_both(candidate, lambda mesh: without_faces(mesh, rng.random(len(mesh.faces)) < share))
 
 
 def cut_hole(candidate: Candidate, area: float, rng: np.random.Generator) -> Candidate:
-    """One round hole in a wall, m²."""
+    """Cuts one round hole into a wall, m²."""
     bore = candidate.bore
     row = int(rng.integers(len(bore.station) // 4, 3 * len(bore.station) // 4))
     column = int(np.argmin(np.abs(bore.angle - 0.3)))
@@ -52,7 +52,7 @@ def cut_hole(candidate: Candidate, area: float, rng: np.random.Generator) -> Can
 
 
 def flip_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
-    """Faces wound the wrong way; a share of 1 flips all."""
+    """Winds faces the wrong way; a share of 1 flips all."""
 
     def wrong(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         turned = rng.random(len(mesh.faces)) < share
@@ -62,7 +62,7 @@ def flip_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> 
 
 
 def double_faces(candidate: Candidate, share: float, rng: np.random.Generator) -> Candidate:
-    """Faces there twice, and as many slivers along edges."""
+    """Repeats faces, and adds as many slivers along edges."""
 
     def worse(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         pick = rng.permutation(len(mesh.faces))[: max(int(share * len(mesh.faces)), 1)]
@@ -78,7 +78,7 @@ def double_faces(candidate: Candidate, share: float, rng: np.random.Generator) -
 
 
 def add_fins(candidate: Candidate, count: int, rng: np.random.Generator) -> Candidate:
-    """Fins on edges of the wall, so that three faces share an edge; each pierces the wall behind it."""
+    """Adds fins on edges of the wall, so that three faces share an edge; each pierces the wall behind it."""
 
     def fin(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         pick = rng.permutation(len(mesh.faces))[:count]
@@ -96,7 +96,7 @@ def add_fins(candidate: Candidate, count: int, rng: np.random.Generator) -> Cand
 
 
 def add_vertex_noise(candidate: Candidate, sigma: float, rng: np.random.Generator) -> Candidate:
-    """Every vertex displaced at random, m; twins in lining and solid alike."""
+    """Displaces every vertex at random, m; twins in lining and solid alike."""
     solid = trimesh.Trimesh(candidate.solid.vertices, candidate.solid.faces, process=False)
     offset = rng.normal(0.0, sigma, solid.vertices.shape)
     distance, twin = cKDTree(candidate.solid.vertices).query(candidate.lining.vertices)
@@ -107,7 +107,7 @@ def add_vertex_noise(candidate: Candidate, sigma: float, rng: np.random.Generato
 
 
 def coarsen(candidate: Candidate, share: float) -> Candidate:
-    """Smoothed (Laplace, the more the larger the share) and then left with fewer faces."""
+    """Smooths (Laplace, the more the larger the share) and then reduces the number of faces."""
 
     def smooth(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         origin = mesh.vertices.mean(axis=0)
@@ -128,7 +128,7 @@ PANELS = ("wall_", "bed_")
 
 
 def copy_scene(candidate: Candidate, scratch: Path, changed: Callable[[Path], bool] = lambda file: False) -> Candidate:
-    """The candidate with its folder linked file by file into a scratch folder, less what is to be written anew."""
+    """Links a candidate's folder file by file into a scratch folder, less the files that are written anew."""
     folder = scratch / "scene"
     for file in sorted(path for path in candidate.folder.rglob("*") if path.is_file()):
         if file.name not in ("scene.xml", "cloud.ply") and not changed(file):
@@ -142,7 +142,7 @@ def copy_scene(candidate: Candidate, scratch: Path, changed: Callable[[Path], bo
 
 
 def edit_scene(candidate: Candidate, change: Callable[[mujoco.MjSpec], None]) -> Candidate:
-    """The scene of a copied candidate with its model changed."""
+    """Changes the model of a copied candidate's scene."""
     spec = mujoco.MjSpec.from_file(str(candidate.scene))
     change(spec)
     spec.compile()
@@ -151,7 +151,7 @@ def edit_scene(candidate: Candidate, change: Callable[[mujoco.MjSpec], None]) ->
 
 
 def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate:
-    """Everything that does not move larger about the middle of the axis, and the planar tunnel with it."""
+    """Scales everything that does not move about the middle of the axis, and the planar tunnel with it."""
     middle = candidate.bore.position.mean(axis=0)
     made = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
 
@@ -181,7 +181,7 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
 
 
 def drop_scene_faces(candidate: Candidate, share: float, rng: np.random.Generator, scratch: Path) -> Candidate:
-    """Random faces of the drawn lining missing in the compiled scene."""
+    """Removes random faces of the drawn lining in the compiled scene."""
     made = copy_scene(candidate, scratch, lambda file: file.name.startswith("lining_"))
     for file in sorted((candidate.folder / "meshes").glob("lining_*.obj")):
         mesh = trimesh.load_mesh(file, process=False)
@@ -190,7 +190,7 @@ def drop_scene_faces(candidate: Candidate, share: float, rng: np.random.Generato
 
 
 def collide_whole_mesh(candidate: Candidate, scratch: Path) -> Candidate:
-    """The bore as collidable meshes instead of panels: MuJoCo takes the convex hull of each."""
+    """Makes the bore collide as meshes instead of panels: MuJoCo takes the convex hull of each."""
     made = copy_scene(candidate, scratch)
     candidate.lining.export(made.folder / "meshes" / "whole_bore.obj")
 
@@ -213,7 +213,7 @@ def collide_whole_mesh(candidate: Candidate, scratch: Path) -> Candidate:
 
 
 def move_panels(candidate: Candidate, distance: float, scratch: Path) -> Candidate:
-    """Collision panels of the walls farther out than the wall, m."""
+    """Moves the collision panels of the walls outwards, m."""
     made = copy_scene(candidate, scratch)
     axis = candidate.bore.position
 
@@ -231,7 +231,7 @@ def move_panels(candidate: Candidate, distance: float, scratch: Path) -> Candida
 
 
 def widen_plan(candidate: Candidate, wider: float, scratch: Path) -> Candidate:
-    """The environment's planar tunnel made from another geometry than the mesh: walls apart by some metres more."""
+    """Moves the walls of the environment's planar tunnel apart, so that it is not the mesh's, m."""
     made = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
     with np.load(candidate.tunnel) as data:
         arrays = {name: data[name] for name in data.files}
@@ -247,14 +247,14 @@ def widen_plan(candidate: Candidate, wider: float, scratch: Path) -> Candidate:
 
 
 def turn_beams(case: Case, angle: float) -> Case:
-    """Beams of the held-out recording turned about each sensor's own vertical and side axis, rad."""
+    """Turns the held-out beams about each sensor's own vertical and side axis, rad."""
     hold = _require_hold(case)
     turn = Rotation.from_euler("zy", [angle, angle]).as_matrix()
     return replace(case, hold=replace(hold, direction=hold.direction @ turn.T, cache={}), cache={})
 
 
 def permute_poses(case: Case, rng: np.random.Generator) -> Case:
-    """Every scan at the place of another."""
+    """Puts every scan at the place of another."""
     hold = _require_hold(case)
     scans, first, index = np.unique(hold.scan, return_index=True, return_inverse=True)
     place = hold.origin[first][rng.permutation(len(scans))]
@@ -264,7 +264,7 @@ def permute_poses(case: Case, rng: np.random.Generator) -> Case:
 
 
 def judge_foreign(case: Case, other: Candidate) -> Case:
-    """Another tunnel judged by this one's references, brought to begin at its mouth in its direction."""
+    """Judges another tunnel by this one's references, moved to its mouth and direction."""
     here, there = case.candidate.bore, other.bore
     turn = _yaw_matrix(there.tangent[0]) @ _yaw_matrix(here.tangent[0]).T
     shift = there.position[0] - turn @ here.position[0]
@@ -272,7 +272,7 @@ def judge_foreign(case: Case, other: Candidate) -> Case:
 
 
 def forge_recording(case: Case, sigma: float, rng: np.random.Generator) -> Case:
-    """The recording replaced by beams cast in the candidate itself, with range noise or without."""
+    """Replaces the recording by beams cast in the candidate itself, with range noise or without."""
     hold = _require_hold(case)
     reach, _ = Caster(visible_mesh(case.candidate)).first(hold.origin, hold.direction)
     reach = reach + rng.normal(0.0, 1.0, len(reach)) * sigma
@@ -283,7 +283,7 @@ def forge_recording(case: Case, sigma: float, rng: np.random.Generator) -> Case:
 
 
 def leak_hold(case: Case) -> Case:
-    """A builder that had the held-out recording: the manifest's inputs hold its hash, and the fit is the hold."""
+    """Gives the builder the held-out recording: the manifest's inputs hold its hash, and the fit is the hold."""
     hold = _require_hold(case)
     manifest = dict(case.candidate.manifest)
     manifest["inputs"] = [*manifest.get("inputs", []), {"file": "hold", "sha256": hold.hash}]

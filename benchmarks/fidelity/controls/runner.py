@@ -44,18 +44,18 @@ class Job:
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Name for files."""
         return f"{self.control}-{self.dose:g}"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a control did.
+    """Result of a control.
 
     Attributes:
-        job: Which.
-        values: All 199.
-        leaks: What the leak detector said.
+        job: Control and dose.
+        values: Values of all 199 metrics.
+        leaks: Findings of the leak detector.
     """
 
     job: Job
@@ -64,7 +64,7 @@ class Outcome:
 
 
 def read_outcome(folder: Path | None, job: Job, key: str) -> Outcome | None:
-    """What an earlier run of the same base left for a job; `None` where nothing did."""
+    """Return the kept outcome of a job for the same base; `None` where there is none."""
     path = None if folder is None else folder / f"{job.name}.json"
     if path is None or not path.exists():
         return None
@@ -86,12 +86,12 @@ Evaluate = Callable[..., dict[str, Value]]
 
 @dataclass(frozen=True)
 class Bench:
-    """What every control starts from.
+    """Start of every control: the base case, its values and where results are kept.
 
     Attributes:
         case: The base case.
-        base: Its values.
-        folder: Where finished controls are kept; `None` keeps nothing.
+        base: Values of the base case.
+        folder: Folder for finished controls; `None` keeps nothing.
         foreign: Scene folder of another tunnel, for N33.
         compute: `evaluate`, or a part of it in tests.
     """
@@ -103,7 +103,7 @@ class Bench:
     compute: Evaluate = evaluate
 
     def key(self, job: Job) -> str:
-        """Of base and code, for N33 of the foreign scene too: a kept result of others is not taken up."""
+        """Return the SHA-256 of base, code and, for N33, the foreign scene: a kept result of others is not read."""
         other = "" if self.foreign is None or job.control != "N33" else candidate_hash(_foreign_candidate(self))
         return sha256(f"{self._own} {other}".encode()).hexdigest()
 
@@ -112,13 +112,13 @@ class Bench:
         return f"{case_hash(self.case)} {controls_hash()}"
 
     def kept(self) -> list[Outcome]:
-        """What earlier runs left of this base, in the order of `jobs`."""
+        """Return the kept outcomes of this base, in the order of `list_jobs`."""
         found = (read_outcome(self.folder, job, self.key(job)) for job in list_jobs(foreign=self.foreign is not None))
         return [outcome for outcome in found if outcome is not None]
 
 
 def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
-    """Every control at every dose, then the invariances; N33 only where a foreign tunnel is at hand."""
+    """Return every control at every dose, then the invariances; N33 only where a foreign tunnel is at hand."""
     wanted = [
         Job(control.id, dose)
         for control in load_controls().values()
@@ -129,7 +129,7 @@ def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
 
 
 def is_bold(job: Job) -> bool:
-    """Whether this dose must be noticed; invariances always count."""
+    """Return True for a dose that must be noticed; invariances always count."""
     return job.control in INVARIANCES or job.dose in load_controls()[job.control].bold
 
 
@@ -155,7 +155,7 @@ def run_jobs(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcom
 
 
 def run_control(bench: Bench, job: Job) -> Outcome:
-    """One control at one dose."""
+    """Computes one control at one dose."""
     rng = np.random.default_rng(np.random.SeedSequence(bench.case.seed, spawn_key=tuple(job.control.encode())))
     fresh = replace(bench.case, cache={})
     with tempfile.TemporaryDirectory() as scratch:
@@ -171,7 +171,7 @@ def run_control(bench: Bench, job: Job) -> Outcome:
 
 
 def without_figures(reasons: list[str]) -> set[str]:
-    """Reasons without their figures, so that two candidates' can be compared."""
+    """Return reasons without their figures, so that those of two candidates can be compared."""
     return {re.sub(r"(?<![\w.])-?\d[\d.e-]*(?!\w)", "#", reason) for reason in reasons}
 
 
@@ -219,7 +219,7 @@ KINDS = ("N20", "N26", "N32", "N34", "N35")  # their doses are kinds, not amount
 
 
 def judge_outcomes(outcomes: list[Outcome], base: Base) -> list[dict[str, Any]]:
-    """One row a control and dose, for `controls.csv` and the heat map.
+    """Return a row per control and dose, for `controls.csv` and the heat map.
 
     A control is *detected* where its bold doses fail for a reason that the reconstruction has not, and every category
     named for it falls by its points.
@@ -277,7 +277,7 @@ def _fall(before: float | None, after: float | None) -> float | None:
 
 
 def _spearman(same: list[dict[str, Any]], control: Control | None, base: Base) -> float | None:
-    """Rank correlation of dose and mean score of the named categories, the reconstruction itself being dose 0."""
+    """Return the rank correlation of dose and mean score of the named categories; the reconstruction is dose 0."""
     if control is None or len(same) < 2 or control.id in KINDS or not control.falls:
         return None
     order = sorted(same, key=lambda row: control.doses.index(row["dose"]))
@@ -287,5 +287,5 @@ def _spearman(same: list[dict[str, Any]], control: Control | None, base: Base) -
 
 
 def is_ranked(job: Job) -> bool:
-    """Whether a control's outcome has a place in the order: invariances change nothing, and cheats no geometry."""
+    """Return True where an outcome has a place in the order: invariances change nothing, cheats no geometry."""
     return job.control not in INVARIANCES and bool(load_controls()[job.control].falls)

@@ -21,12 +21,12 @@ _ARM = 1.0  # m from the axis at which a section's stretch is measured
 
 
 def axis_of(candidate: Candidate) -> Curve:
-    """The candidate's centreline."""
+    """Return the candidate's centreline."""
     return Curve(candidate.bore.station, candidate.bore.position)
 
 
 def warp(candidate: Candidate, move: PointMap) -> Candidate:
-    """The candidate with every point moved; stations become arc length of the moved axis."""
+    """Moves every point of a candidate; stations become arc length of the moved axis."""
     return replace(
         candidate,
         lining=warp_mesh(candidate.lining, move),
@@ -40,14 +40,14 @@ def warp(candidate: Candidate, move: PointMap) -> Candidate:
 
 
 def warp_mesh(mesh: trimesh.Trimesh, move: PointMap) -> trimesh.Trimesh:
-    """The mesh with its vertices moved."""
+    """Moves the vertices of a mesh."""
     if not len(mesh.faces):
         return mesh
     return trimesh.Trimesh(move(np.asarray(mesh.vertices, float)), mesh.faces, process=False)
 
 
 def warp_track(track: Track, move: PointMap) -> Track:
-    """The track with every point moved; its gauge becomes the distance of the moved rails."""
+    """Moves every point of the track; its gauge becomes the distance of the moved rails."""
     rail = {side: move(points) if len(points) else points for side, points in track.rail.items()}
     return replace(
         track,
@@ -60,7 +60,7 @@ def warp_track(track: Track, move: PointMap) -> Track:
 
 
 def warp_bore(bore: Bore, move: PointMap) -> Bore:
-    """Axis and frames moved; width, height and radii grow as the map stretches a section at its axis."""
+    """Moves axis and frames; width, height and radii grow as the map stretches a section at its axis."""
     position = move(bore.position)
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
     tangent = _unit(np.gradient(position, station, axis=0))
@@ -83,19 +83,19 @@ def warp_bore(bore: Bore, move: PointMap) -> Bore:
 
 
 def move_references(case: Case, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Case:
-    """The case with held-out recording, fit and truth turned about the origin and shifted."""
+    """Turns held-out recording, fit and truth about the origin and shifts them."""
     hold, fit = (None if h is None else move_hold(h, turn, shift) for h in (case.hold, case.fit))
     truth = None if case.truth is None else move_truth(case.truth, turn, shift)
     return replace(case, hold=hold, fit=fit, truth=truth, cache={})
 
 
 def move_hold(hold: Hold, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Hold:
-    """A recording turned about the origin and shifted, with nothing computed of it yet."""
+    """Turns a recording about the origin and shifts it; kept results are dropped."""
     return replace(hold, origin=hold.origin @ turn.T + shift, direction=hold.direction @ turn.T, cache={})
 
 
 def move_truth(truth: Truth, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Truth:
-    """A truth turned about the origin of the tunnel frame and shifted, with nothing computed of it yet."""
+    """Turns a truth about the origin of the tunnel frame and shifts it; kept results are dropped."""
     surface = warp_mesh(truth.surface, lambda points: points @ turn.T + shift)
     return replace(
         truth, position=truth.position @ turn.T + shift, tangent=truth.tangent @ turn.T, surface=surface,
@@ -104,7 +104,7 @@ def move_truth(truth: Truth, turn: Float[np.ndarray, "3 3"], shift: Float[np.nda
 
 
 def bend_recording(hold: Hold, move: PointMap) -> Hold:
-    """A recording whose sensor positions and returns are moved, and the beams with them."""
+    """Moves sensor positions and returns of a recording, and the beams with them."""
     origin, end = (
         move(hold.origin),
         move(hold.origin + np.where(hold.returned, hold.range, 1.0)[:, None] * hold.direction),
@@ -116,7 +116,7 @@ def bend_recording(hold: Hold, move: PointMap) -> Hold:
 
 
 def _turn_positions(value: Any, origin: np.ndarray, turn: np.ndarray, shift: np.ndarray, key: str = "") -> Any:
-    """Positions of truth.json (survey frame) turned with the rest."""
+    """Turns the positions of truth.json (survey frame) with the rest."""
     if isinstance(value, dict):
         return {name: _turn_positions(inner, origin, turn, shift, name) for name, inner in value.items()}
     if key in ("position", "left", "right"):
@@ -142,7 +142,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:
-    """Number of the body of each vertex, and the middle of each body, m."""
+    """Return the number of the body of each vertex, and the middle of each body, m."""
     count = len(mesh.vertices)
     if not count:
         return np.zeros(0, int), np.zeros((0, 3))
@@ -157,7 +157,7 @@ def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.
 def keep_bodies(
     mesh: trimesh.Trimesh, keep: Callable[[Float[np.ndarray, "b 3"]], Bool[np.ndarray, " b"]]
 ) -> trimesh.Trimesh:
-    """The bodies whose middle is to be kept."""
+    """Keeps the bodies whose middle passes a test."""
     if not len(mesh.faces):
         return mesh
     label, middle = find_bodies(mesh)
@@ -167,7 +167,7 @@ def keep_bodies(
 def move_bodies(
     mesh: trimesh.Trimesh, shift: Callable[[Float[np.ndarray, "b 3"]], Float[np.ndarray, "b 3"]]
 ) -> trimesh.Trimesh:
-    """Each body moved by what is asked for its middle."""
+    """Moves each body by the shift of its middle."""
     if not len(mesh.faces):
         return mesh
     label, middle = find_bodies(mesh)
@@ -175,7 +175,7 @@ def move_bodies(
 
 
 def without_faces(mesh: trimesh.Trimesh, gone: Bool[np.ndarray, " f"]) -> trimesh.Trimesh:
-    """The mesh less some faces; vertices that no face uses go too."""
+    """Removes some faces, and the vertices that no face uses then."""
     left = trimesh.Trimesh(mesh.vertices, mesh.faces[~gone], process=False)
     left.remove_unreferenced_vertices()
     return left
@@ -186,24 +186,24 @@ _WAVE = 100.0  # m
 
 
 def local_map(candidate: Candidate, change: PointMap) -> PointMap:
-    """A map of (station, left, up) about the candidate's axis as a map of points."""
+    """Return a map of points from a map of (station, left, up) about the candidate's axis."""
     line = axis_of(candidate)
     return lambda points: line.point(change(line.local(points)))
 
 
 def scale_all(candidate: Candidate, factor: float) -> Candidate:
-    """Everything larger about the middle of the axis."""
+    """Scales everything about the middle of the axis."""
     middle = candidate.bore.position.mean(axis=0)
     return warp(candidate, lambda points: middle + factor * (points - middle))
 
 
 def scale_section(candidate: Candidate, wide: float, high: float) -> Candidate:
-    """Every section wider and higher about its axis."""
+    """Scales width and height of every section about its axis."""
     return warp(candidate, local_map(candidate, lambda local: local * [1.0, wide, high]))
 
 
 def stretch_axis(case: Case, factor: float) -> Case:
-    """Reconstruction and recording longer together, as a drifting odometry makes them; control stays."""
+    """Lengthens reconstruction and recording together, as a drifting odometry does; control stays."""
     candidate = case.candidate
     line, middle = axis_of(candidate), candidate.bore.position.mean(axis=0)
     longer = Curve(line.station * factor, middle + factor * (line.position - middle))
@@ -217,26 +217,26 @@ def stretch_axis(case: Case, factor: float) -> Case:
 
 
 def turn_yaw(candidate: Candidate, angle: float) -> Candidate:
-    """Turned about the vertical through the middle of the axis, rad."""
+    """Turns everything about the vertical through the middle of the axis, rad."""
     middle = candidate.bore.position.mean(axis=0)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
     return warp(candidate, lambda points: middle + (points - middle) @ turn.T)
 
 
 def roll_sections(candidate: Candidate, angle: float) -> Candidate:
-    """Every section turned about its axis, rad."""
+    """Turns every section about its axis, rad."""
     c, s = np.cos(angle), np.sin(angle)
     turn = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     return warp(candidate, local_map(candidate, lambda local: local @ turn.T))
 
 
 def shift_left(candidate: Candidate, left: float) -> Candidate:
-    """Everything to the left, m."""
+    """Shifts everything to the left, m."""
     return warp(candidate, local_map(candidate, lambda local: local + np.array([0.0, left, 0.0])))
 
 
 def raise_floor(candidate: Candidate, rise: float) -> Candidate:
-    """Floor and track higher; the walls above 1.3 m stay, m."""
+    """Raises floor and track; the walls above 1.3 m stay, m."""
     bottom = -0.5 * float(np.median(candidate.bore.height))
 
     def change(local: np.ndarray) -> np.ndarray:
@@ -251,7 +251,7 @@ def raise_floor(candidate: Candidate, rise: float) -> Candidate:
 
 
 def shorten(candidate: Candidate, share: float) -> Candidate:
-    """The last part cut off."""
+    """Cuts off the last part."""
     bore = candidate.bore
     end = candidate.length * (1.0 - share)
     line = axis_of(candidate)
@@ -276,7 +276,7 @@ def shorten(candidate: Candidate, share: float) -> Candidate:
 
 
 def straighten(candidate: Candidate, share: float) -> Candidate:
-    """The axis taken towards a straight line of the same length and mean direction; 1 leaves no curvature."""
+    """Moves the axis towards a straight line of the same length and mean direction; 1 leaves no curvature."""
     line = axis_of(candidate)
     chord = line.position[-1] - line.position[0]
     chord /= np.linalg.norm(chord)
@@ -287,7 +287,7 @@ def straighten(candidate: Candidate, share: float) -> Candidate:
 
 
 def add_wave(candidate: Candidate, amplitude: float) -> Candidate:
-    """A sideways wave of 100 m length, amplitude in m."""
+    """Adds a sideways wave of 100 m length, amplitude in m."""
 
     def change(local: np.ndarray) -> np.ndarray:
         aside = amplitude * np.sin(2.0 * np.pi * local[:, 0] / _WAVE)

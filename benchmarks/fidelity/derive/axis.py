@@ -38,20 +38,20 @@ _KNOWN_SHARE = 0.6  # share of the sectors that makes a slice count
 
 
 def reference_curve(case: Case) -> Curve:
-    """The generator's axis where there is a truth, otherwise the held-out recording's."""
+    """Return the generator's axis where there is a truth, otherwise the held-out recording's."""
     return truth_curve(case) if case.truth is not None else hold_curve(case)
 
 
 @per_hold
 def hold_points(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Returns of the held-out recording, at most about 400,000, m."""
+    """Return the points of the held-out recording, at most about 400,000, m."""
     points = returns(case).points  # in an order that does not hang on the file's
     return points[:: max(1, -(-len(points) // _MOST_POINTS))]
 
 
 @per_hold
 def seed_path(case: Case) -> Curve:
-    """Where the sensor went, each place once."""
+    """Return the path of the sensor, each place once."""
     assert case.hold is not None
     first = np.unique(case.hold.scan, return_index=True)[1]
     kept: list[np.ndarray] = []
@@ -69,7 +69,7 @@ def seed_path(case: Case) -> Curve:
 
 @per_hold
 def hold_curve(case: Case) -> Curve:
-    """Middle of width and height, re-estimated from the held-out recording by medians of polar radii.
+    """Estimates the axis of the held-out recording: the middle of width and height, by medians of polar radii.
 
     Method: 0.5 m slices across the sensor's path, median radius of each 5 degree sector, their middle by mirrored
     sectors, repeated about the new axis; a track is cut away from the floor once the floor is known. No code of the
@@ -94,26 +94,26 @@ def hold_curve(case: Case) -> Curve:
 
 @per_hold
 def hold_local(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Those returns as station, left and up about the recording's own axis, m."""
+    """Return `hold_points` as station, left and up about the recording's own axis, m."""
     return hold_curve(case).local(hold_points(case))
 
 
 @kept_until("LIN")
 @per_case
 def lining_caster(case: Case) -> Caster:
-    """Rays in the lining alone."""
+    """Return the caster of rays into the lining alone."""
     return Caster(case.candidate.lining)
 
 
 @per_case
 def lining_mouths(case: Case) -> tuple[float, float]:
-    """Where the lining begins and ends along the reference axis, m: median over 16 sectors of its first and last."""
+    """Return the first and last station of the lining along the reference axis, m; medians over 16 sectors."""
     local = reference_curve(case).local(np.asarray(case.candidate.lining.vertices))
     return surface_extent(local)
 
 
 def surface_extent(local: Float[np.ndarray, "k 3"]) -> tuple[float, float]:
-    """First and last station of a surface, m, each the median over 16 sectors."""
+    """Return the first and last station of a surface, m, each the median over 16 sectors."""
     sector = np.minimum(((np.arctan2(local[:, 2], local[:, 1]) + np.pi) / (np.pi / 8)).astype(int), 15)
     low, high = np.full(16, np.inf), np.full(16, -np.inf)
     np.minimum.at(low, sector, local[:, 0])
@@ -124,7 +124,7 @@ def surface_extent(local: Float[np.ndarray, "k 3"]) -> tuple[float, float]:
 
 @per_case
 def lining_curve(case: Case) -> Curve:
-    """The axis of the lining itself: middle of width and height of its sections, mouth to mouth.
+    """Estimates the axis of the lining itself: the middle of width and height of its sections, mouth to mouth.
 
     The declared centreline only says from where the sections are looked at.
     """
@@ -140,7 +140,7 @@ def lining_curve(case: Case) -> Curve:
 
 
 def curve_through(position: Float[np.ndarray, "n 3"]) -> Curve:
-    """A curve through points, its stations their chords' sum from 0."""
+    """Return the curve through points; stations are sums of chords from 0."""
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
     return Curve(np.concatenate([[0.0], np.cumsum(steps)]), position)
 
@@ -155,7 +155,7 @@ class AxisPair:
     """Two axes at the same reference stations.
 
     Attributes:
-        station: On the reference axis, every metre, `(n,)`.
+        station: Stations on the reference axis, every metre, `(n,)`.
         left, up: Offset of the lining's axis, m, `(n,)`.
         judged: Points of the lining's axis, m, `(n, 3)`.
         reference: Points of the reference axis, m, `(n, 3)`.
@@ -170,7 +170,7 @@ class AxisPair:
 
 @per_case
 def axis_pair(case: Case) -> AxisPair:
-    """The two axes where both are there.
+    """Return lining axis and reference axis where both exist.
 
     Raises:
         ValueError: They share less than 5 m.
@@ -190,20 +190,20 @@ def axis_pair(case: Case) -> AxisPair:
 
 
 def chord_heading(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " m"]:
-    """Of the chords over 2 m, rad."""
+    """Return the heading of the chords over 2 m, rad."""
     chord = points[2:] - points[:-2]
     return np.arctan2(chord[:, 1], chord[:, 0])
 
 
 def plan_curvature(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Of the plan, by a local parabola over 10 m, 1/m."""
+    """Return the curvature of the plan by a local parabola over 10 m, 1/m."""
     first, second = (_derivative(points[:, :2], order) for order in (1, 2))
     across = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
     return across / np.linalg.norm(first, axis=1) ** 3
 
 
 def longitudinal_slope(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Longitudinal slope by a local parabola over 10 m."""
+    """Return the longitudinal slope by a local parabola over 10 m, 1."""
     first = _derivative(points, 1)
     return first[:, 2] / np.linalg.norm(first[:, :2], axis=1)
 
@@ -214,14 +214,14 @@ def _derivative(values: np.ndarray, order: int) -> np.ndarray:
 
 
 def drift_slope(judged: Float[np.ndarray, " k"], true: Float[np.ndarray, " t"]) -> float:
-    """Robust slope of the axial residual of a sequence of features, m/m.
+    """Estimates the slope of the axial residual of a sequence of features, m/m.
 
     Features are matched in order: each to the true one nearest to where the drift so far puts it, so that a drift of
     more than half a spacing is followed, and a constant offset does not count.
 
     Args:
-        judged: Their stations on the reference axis as reconstructed.
-        true: The same of the truth.
+        judged: Stations of the reconstructed features on the reference axis, m.
+        true: Stations of the true features, m.
     """
     reach = 0.5 * float(np.median(np.diff(true)))
     drift, residual = 0.0, np.full(len(judged), np.nan)
@@ -238,7 +238,7 @@ def drift_slope(judged: Float[np.ndarray, " k"], true: Float[np.ndarray, " t"]) 
 
 @per_case
 def registration(case: Case) -> Float[np.ndarray, "4 4"]:
-    """Best rigid motion of the visible surface onto the held-out cloud, about the middle of the cloud."""
+    """Estimates the rigid motion of the visible surface onto the held-out cloud, about the middle of the cloud."""
     target = hold_points(case)
     centre = np.round(target.mean(axis=0))
     source, _ = sample_surface(visible_surface(case), 2 * _ICP_SPACING)
@@ -252,5 +252,5 @@ def registration(case: Case) -> Float[np.ndarray, "4 4"]:
 
 
 def rotation_angle(motion: Float[np.ndarray, "4 4"]) -> float:
-    """Angle of a rigid motion, degrees."""
+    """Return the angle of a rigid motion, degrees."""
     return float(np.rad2deg(Rotation.from_matrix(motion[:3, :3]).magnitude()))

@@ -18,7 +18,7 @@ _SWAY_WINDOW = 11  # nodes over which the sway of the carrier is smoothed away
 
 @per_hold
 def sensor_path(case: Case) -> Curve:
-    """Smoothed sensor positions of the held-out recording, straight on beyond both ends.
+    """Return the smoothed sensor positions of the held-out recording, straight on beyond both ends.
 
     The positions are strung by nearness, not by time: a way back adds nothing, and poses in a wrong order leave the
     path where it is.
@@ -44,7 +44,7 @@ def sensor_path(case: Case) -> Curve:
 
 
 def _string_nodes(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Positions in order from the end that is nearer to the first of them: always on to the nearest one left."""
+    """Orders positions from the end nearer to the first of them, always on to the nearest one left."""
     far = nodes[np.argmax(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1))]
     other = nodes[np.argmax(np.linalg.norm(nodes - far, axis=1))]
     here = min((far, other), key=lambda end: float(np.linalg.norm(end - nodes[0])))
@@ -57,7 +57,7 @@ def _string_nodes(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def mouths_on_path(case: Case) -> tuple[float, float]:
-    """Stations of the candidate's two ends on the sensor's path, m, the smaller one first."""
+    """Return the stations of the candidate's two ends on the sensor's path, m, the smaller one first."""
     ends = sensor_path(case).local(case.candidate.bore.position[[0, -1]])[:, 0]
     return float(ends.min()), float(ends.max())
 
@@ -71,10 +71,10 @@ class Returns:
 
     Attributes:
         scan: Number of the scan, `(n,)`.
-        origin: m, `(n, 3)`.
+        origin: Position of the sensor, m, `(n, 3)`.
         direction: Unit vectors, `(n, 3)`.
-        range: m, `(n,)`.
-        points: m, `(n, 3)`.
+        range: Measured range, m, `(n,)`.
+        points: Points of the returns, m, `(n, 3)`.
         local: Station, left and up of the points along `sensor_path`, m, `(n, 3)`.
         heading: `direction` in the path's frame at the points, `(n, 3)`.
     """
@@ -90,12 +90,12 @@ class Returns:
 
 @dataclass(frozen=True)
 class CastBeams:
-    """`Returns` cast in the candidate.
+    """The beams of `Returns`, cast in the candidate.
 
     Attributes:
-        range: m; `inf` where the beam leaves the candidate, `(n,)`.
-        face: Of `surface`; -1 where nothing is hit, `(n,)`.
-        cosine: Of the angle between beam and face normal, 0 to 1, 0 where nothing is hit, `(n,)`.
+        range: Range in the candidate, m; `inf` where the beam leaves it, `(n,)`.
+        face: Face of `visible_surface`; -1 where nothing is hit, `(n,)`.
+        cosine: Cosine between beam and face normal, 0 to 1, 0 where nothing is hit, `(n,)`.
         difference: Range in the candidate less range measured, m, `(n,)`.
     """
 
@@ -106,13 +106,13 @@ class CastBeams:
 
     @property
     def hit(self) -> Bool[np.ndarray, " n"]:
-        """Whether the beam meets the candidate."""
+        """True where the beam meets the candidate, `(n,)`."""
         return self.face >= 0
 
 
 @per_hold
 def returns(case: Case) -> Returns:
-    """The held-out returns, sorted so that the order in the file does not matter."""
+    """Return the held-out returns, sorted so that the order in the file does not matter."""
     hold = case.hold
     assert hold is not None
     order = np.lexsort((hold.direction[:, 2], hold.time))
@@ -128,7 +128,7 @@ def returns(case: Case) -> Returns:
 @kept_until("LIN")
 @per_case
 def cast_beams(case: Case) -> CastBeams:
-    """Every held-out return's beam, cast in everything visible of the candidate."""
+    """Casts every held-out beam with a return in everything visible of the candidate."""
     real, rays = returns(case), surface_caster(case)
     reach, face = rays.first(real.origin, real.direction)
     cosine = np.zeros(len(face))
@@ -140,13 +140,13 @@ def cast_beams(case: Case) -> CastBeams:
 
 
 def points_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Points on the held-out beams at other ranges, m; not a number where the range is not finite."""
+    """Return the points on the held-out beams at other ranges, m; NaN where the range is not finite."""
     real = returns(case)
     return real.origin + np.where(np.isfinite(reach), reach, np.nan)[:, None] * real.direction
 
 
 def local_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """The same in station, left and up along the sensor's path."""
+    """Return these points in station, left and up along the sensor's path, m."""
     real = returns(case)
     shift = np.where(np.isfinite(reach), reach, np.nan) - real.range
     local = real.local + shift[:, None] * real.heading
@@ -162,10 +162,10 @@ def _noise_draws(case: Case) -> dict[str, Float[np.ndarray, " n"]]:
 
 
 def noisy_ranges(case: Case, draw: str) -> Float[np.ndarray, " n"]:
-    """Ranges that the sensor would have measured in the candidate, m; `inf` where a beam leaves it.
+    """Return the ranges that the sensor would have measured in the candidate, m; `inf` where a beam leaves it.
 
     Args:
-        case: With a held-out recording, whose data sheet gives the noise.
+        case: Case with a held-out recording, whose data sheet gives the noise.
         draw: Name of the draw; the same name gives the same noise.
     """
     assert case.hold is not None
@@ -177,7 +177,7 @@ def noisy_ranges(case: Case, draw: str) -> Float[np.ndarray, " n"]:
 
 @per_case
 def synthetic_points(case: Case) -> Float[np.ndarray, "n 3"]:
-    """Noisy points of the paired beams, m, `(n, 3)`; not a number where a beam leaves the candidate."""
+    """Return the noisy points of the cast beams, m, `(n, 3)`; NaN where a beam leaves the candidate."""
     return points_at(case, noisy_ranges(case, "first"))
 
 
@@ -186,13 +186,13 @@ BIN = 10.0  # m
 
 @per_hold
 def observed_extent(case: Case) -> tuple[float, float]:
-    """Stations between which the held-out returns lie, but for one in a thousand at either end, m."""
+    """Return the stations between which the held-out returns lie, but for one in a thousand at either end, m."""
     low, high = np.percentile(returns(case).local[:, 0], [0.1, 99.9])
     return float(low), float(high)
 
 
 def station_bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Equal bins of about `BIN` over `extent`; what lies beyond belongs to the first and the last."""
+    """Return equal bins of about `BIN` over `observed_extent`; first and last hold the stations beyond."""
     low, high = observed_extent(case)
     count = max(round((high - low) / BIN), 1)
     return np.clip(((station - low) / (high - low) * count).astype(int), 0, count - 1)
@@ -200,11 +200,11 @@ def station_bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray
 
 @dataclass(frozen=True)
 class Silence:
-    """Of every beam, returned or not.
+    """Beams without a return, measured and expected.
 
     Attributes:
-        silent: Nothing came back, `(n,)`.
-        expected_silent: Cast in the candidate it meets nothing within reach, `(n,)`.
+        silent: True where nothing came back, `(n,)`.
+        expected_silent: True where the candidate gives no return within reach, `(n,)`.
     """
 
     silent: Bool[np.ndarray, " n"]
@@ -213,7 +213,7 @@ class Silence:
 
 @per_case
 def silence(case: Case) -> Silence:
-    """Real and expected beams without a return.
+    """Return the beams without a return, measured and expected in the candidate.
 
     A beam is expected back if it meets the candidate within the sensor's reach and its echo, cos(incidence) over the
     squared distance, is not too weak. No data sheet says how weak: the cut is the one number that the recording sets,
@@ -240,11 +240,11 @@ _QUANTILES = (5, 25, 50, 75, 95)
 
 @dataclass(frozen=True)
 class BeamDirections:
-    """Of every returned beam, relative to the tunnel at the sensor.
+    """Direction of every returned beam, relative to the tunnel at the sensor.
 
     Attributes:
-        azimuth: From the tunnel's axis ahead, to the left, rad, `(n,)`.
-        elevation: rad, `(n,)`.
+        azimuth: Angle from the tunnel's axis ahead, to the left, rad, `(n,)`.
+        elevation: Angle above the tunnel's axis, rad, `(n,)`.
     """
 
     azimuth: Float[np.ndarray, " n"]
@@ -253,7 +253,7 @@ class BeamDirections:
 
 @per_hold
 def beam_directions(case: Case) -> BeamDirections:
-    """Azimuth and elevation of the held-out returns' beams."""
+    """Return azimuth and elevation of the held-out beams with a return."""
     real, path = returns(case), sensor_path(case)
     _, starts = np.unique(real.scan, return_index=True)
     tangent, left, up = path.frames(path.local(real.origin[starts])[:, 0])[1:]
@@ -264,7 +264,7 @@ def beam_directions(case: Case) -> BeamDirections:
 
 @per_case
 def scan_descriptors(case: Case) -> tuple[Float[np.ndarray, "s d"], Float[np.ndarray, "s d"], Int[np.ndarray, " s"]]:
-    """Descriptors of the scans, real and synthetic, and the number of each scan.
+    """Return the descriptors of the scans, real and synthetic, and the number of each scan.
 
     A descriptor holds quantiles of the ranges and their median in sectors of azimuth and elevation, in log metres; a
     sector without beams in either holds the scan's median.
@@ -303,5 +303,5 @@ def _describe_scan(reach: Float[np.ndarray, " n"], sector: Int[np.ndarray, " n"]
 @kept_until("DIS")
 @per_hold
 def cloud_tree(case: Case) -> cKDTree:
-    """Of all held-out returns."""
+    """Return the tree of all held-out returns."""
     return cKDTree(returns(case).points, balanced_tree=False)

@@ -20,11 +20,11 @@ _ENTROPY_POINTS = 4000
 
 @dataclass(frozen=True)
 class Planes:
-    """A plane through the neighbours of each chosen point.
+    """Planes through the neighbours of chosen points.
 
     Attributes:
-        point: m, `(n, 3)`.
-        normal: Unit vectors, `(n, 3)`.
+        point: Chosen points, m, `(n, 3)`.
+        normal: Normals, unit vectors, `(n, 3)`.
         residual: Distance of the point from its plane, freed of the plane's three parameters, m, `(n,)`.
         sigma: Standard deviation of the neighbours about it, m, `(n,)`.
         planarity: (middle - smallest) / largest spread: near 0 for a line or a ball, `(n,)`.
@@ -38,7 +38,7 @@ class Planes:
 
 
 def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> Planes:
-    """Principal axes of the `NEIGHBOURS` nearest points of a cloud."""
+    """Fits a plane through the `NEIGHBOURS` nearest points of a cloud, by principal axes."""
     count = min(NEIGHBOURS, len(cloud))
     around = cloud[tree.query(query, count)[1]]
     middle = around.mean(axis=1)
@@ -53,7 +53,7 @@ def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.n
 
 @per_hold
 def plane_rows(case: Case) -> Int[np.ndarray, " k"]:
-    """Numbers of the returns at which planes are fitted: the same count of each scan, evenly in time."""
+    """Return the numbers of the returns with a plane: the same count of each scan, evenly in time."""
     scan = returns(case).scan
     starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
     ends = np.append(starts[1:], len(scan))
@@ -65,7 +65,7 @@ def plane_rows(case: Case) -> Int[np.ndarray, " k"]:
 
 @per_hold
 def real_planes(case: Case) -> Planes:
-    """Of the held-out cloud at `chosen`."""
+    """Return the planes of the held-out cloud at `plane_rows`."""
     points = returns(case).points
     return fit_planes(points, cloud_tree(case), points[plane_rows(case)])
 
@@ -73,7 +73,7 @@ def real_planes(case: Case) -> Planes:
 @kept_until("DIS")
 @per_case
 def synthetic_tree(case: Case) -> tuple[Float[np.ndarray, "m 3"], cKDTree]:
-    """The synthetic points that there are, and their tree."""
+    """Return the finite synthetic points and their tree."""
     points = synthetic_points(case)
     points = points[np.isfinite(points[:, 0])]
     if len(points) < NEIGHBOURS:
@@ -83,7 +83,7 @@ def synthetic_tree(case: Case) -> tuple[Float[np.ndarray, "m 3"], cKDTree]:
 
 @per_case
 def synthetic_planes(case: Case) -> Planes:
-    """Of the synthetic cloud at `chosen`; rows of a beam that leaves the candidate are not a number."""
+    """Return the planes of the synthetic cloud at `plane_rows`; NaN rows where a beam leaves the candidate."""
     cloud, tree = synthetic_tree(case)
     query = synthetic_points(case)[plane_rows(case)]
     there = np.isfinite(query[:, 0])
@@ -95,7 +95,7 @@ def synthetic_planes(case: Case) -> Planes:
 
 
 def mean_entropy(tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> float:
-    """Mean map entropy: the mean of ½ ln det(2πe Σ) of the points within 0.3 m, nat.
+    """Return the mean map entropy: the mean of ½ ln det(2πe Σ) of the points within 0.3 m, nat.
 
     Source: Razlaw et al. 2015, Evaluation of registration methods for sparse 3D laser scans; MapEval uses it too.
     """
@@ -117,9 +117,9 @@ class VoxelMap:
     """Normal distributions of a cloud in voxels.
 
     Attributes:
-        key: Voxel, `(v, 3)`, sorted.
-        mean: m, `(v, 3)`.
-        covariance: m², `(v, 3, 3)`.
+        key: Indices of the voxels, sorted, `(v, 3)`.
+        mean: Mean of the points, m, `(v, 3)`.
+        covariance: Covariance of the points, m², `(v, 3, 3)`.
     """
 
     key: Int[np.ndarray, "v 3"]
@@ -128,7 +128,7 @@ class VoxelMap:
 
 
 def voxel_map(local: Float[np.ndarray, "n 3"], edge: float) -> VoxelMap:
-    """Means and covariances of the voxels that hold at least `FEWEST` points."""
+    """Return means and covariances of the voxels that hold at least `FEWEST_IN_VOXEL` points."""
     _, first, voxel, count = np.unique(
         cell_numbers(local, edge), return_index=True, return_inverse=True, return_counts=True
     )
@@ -144,7 +144,7 @@ def voxel_map(local: Float[np.ndarray, "n 3"], edge: float) -> VoxelMap:
 
 
 def voxel_wasserstein(a: VoxelMap, b: VoxelMap) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
-    """Voxels that both clouds have, and the 2-Wasserstein distance of their normal distributions, m.
+    """Return the voxels of both clouds and the 2-Wasserstein distance of their normal distributions, m.
 
     Source: MapEval, arXiv 2411.17928: W² = |μ₁ - μ₂|² + tr(Σ₁ + Σ₂ - 2 (Σ₂^½ Σ₁ Σ₂^½)^½).
     """
@@ -160,7 +160,7 @@ def voxel_wasserstein(a: VoxelMap, b: VoxelMap) -> tuple[Int[np.ndarray, "v 3"],
 
 
 def spatial_consistency(key: Int[np.ndarray, "v 3"], distance: Float[np.ndarray, " v"]) -> float:
-    """Spatial consistency score: mean over the voxels of deviation over mean of the distances of their neighbours."""
+    """Return the spatial consistency score: mean over voxels of deviation over mean of their neighbours' distances."""
     ratios = []
     for near in cKDTree(key.astype(float)).query_ball_point(key.astype(float), 1.8):  # 26 neighbours
         if len(near) >= 3 and (mean := distance[near].mean()) > 0:
@@ -170,13 +170,13 @@ def spatial_consistency(key: Int[np.ndarray, "v 3"], distance: Float[np.ndarray,
 
 @per_hold
 def real_map(case: Case) -> VoxelMap:
-    """Of the held-out points."""
+    """Return the voxel map of the held-out points."""
     return voxel_map(returns(case).local, MAP_VOXEL * case.tolerance)
 
 
 @per_case
 def map_distances(case: Case) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
-    """Voxels and Wasserstein distances between held-out and synthetic map.
+    """Return voxels and Wasserstein distances between held-out and synthetic map.
 
     Raises:
         ValueError: They share no voxel.
@@ -191,7 +191,7 @@ def map_distances(case: Case) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray,
 
 @per_hold
 def own_consistency(case: Case) -> float:
-    """Spatial consistency score of the odd held-out points against the even ones."""
+    """Return the spatial consistency score of the odd held-out points against the even ones."""
     local = returns(case).local
     halves = [voxel_map(local[k::2], MAP_VOXEL * case.tolerance) for k in (0, 1)]
     return spatial_consistency(*voxel_wasserstein(*halves))
@@ -222,7 +222,7 @@ class Patches:
         beam: Numbers of the beams on each plane, `(planes, at most _MOST)`, -1 as padding.
         roughness: Variance about the planes, noise taken off, m²; may come out below 0 where there is hardly any.
         noise: Variance of the returns along the normals, m².
-        resolved: Whether the roughness stands out of its own standard error.
+        resolved: True where the roughness stands out of its own standard error.
     """
 
     beam: Int[np.ndarray, "p k"]
@@ -232,13 +232,13 @@ class Patches:
 
     @property
     def planes(self) -> int:
-        """How many."""
+        """Number of planes."""
         return len(self.beam)
 
 
 @per_hold
 def hold_patches(case: Case) -> Patches | None:
-    """The held-out wall; `None` where its points lie too far apart."""
+    """Return the patches of the held-out wall; `None` where its points lie too far apart."""
     assert case.hold is not None
     hold = case.hold
     index = np.flatnonzero(hold.returned)
@@ -272,7 +272,7 @@ def hold_patches(case: Case) -> Patches | None:
 
 
 def lining_roughness(case: Case) -> float:
-    """Variance of the lining about the same planes, sampled by the same beams, m²; `nan` without planes."""
+    """Return the variance of the lining about the same planes, sampled by the same beams, m²; NaN without planes."""
     patches = hold_patches(case)
     if patches is None:
         return float("nan")
@@ -292,7 +292,7 @@ def lining_roughness(case: Case) -> float:
 
 
 def _patch_planes(points: Float[np.ndarray, "p k 3"], inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normal of the plane through each set of points, and their signed distances from it."""
+    """Return the normal of the plane through each set of points, and their signed distances from it."""
     weight = inside[..., None] / inside.sum(axis=1)[:, None, None]
     centred = np.where(inside[..., None], points - (weight * points).sum(axis=1, keepdims=True), 0.0)
     normal = np.linalg.eigh(np.einsum("pki,pkj->pij", centred, centred))[1][..., 0]
@@ -300,14 +300,14 @@ def _patch_planes(points: Float[np.ndarray, "p k 3"], inside: np.ndarray) -> tup
 
 
 def _patch_variance(away: Float[np.ndarray, "p k"], inside: np.ndarray) -> Float[np.ndarray, " p"]:
-    """Variance about each plane, three degrees of freedom taken off, m²."""
+    """Return the variance about each plane, three degrees of freedom taken off, m²."""
     return (np.where(inside, away, 0.0) ** 2).sum(axis=1) / (inside.sum(axis=1) - 3)
 
 
 def _return_noise(
     points: Float[np.ndarray, "p k 3"], inside: np.ndarray, normal: Float[np.ndarray, "p 3"], away: np.ndarray
 ) -> Float[np.ndarray, " p"]:
-    """Variance of one return along the normal, from pairs close to each other in the plane, m²; `nan` without."""
+    """Estimates the variance of one return along the normal, from close pairs in the plane, m²; NaN without."""
     points = np.where(inside[..., None], points - points[:, :1], 1e3 * (1.0 + np.arange(points.shape[1]))[:, None])
     parts = [slice(start, start + _PATCHES_AT_ONCE) for start in range(0, len(points), _PATCHES_AT_ONCE)]
     return np.concatenate([_pair_noise(points[part], normal[part]) for part in parts])

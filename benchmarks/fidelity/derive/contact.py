@@ -29,11 +29,11 @@ _EVERYTHING = 2**31 - 1  # touches whatever collides with anything
 
 
 class Probe:
-    """The scene with a free sphere in it.
+    """The compiled scene with a free sphere in it.
 
     Args:
-        case: Whose scene.
-        bits: What the sphere collides with, as MuJoCo's `contype` and `conaffinity` name it.
+        case: Case with the scene.
+        bits: Collision bits of the sphere, MuJoCo's `contype` and `conaffinity`.
     """
 
     def __init__(self, case: Case, bits: int = _EVERYTHING) -> None:
@@ -51,7 +51,7 @@ class Probe:
         self._adr = int(self._model.jnt_qposadr[self._model.body("fidelity_probe").jntadr[0]])
 
     def depth(self, position: Float[np.ndarray, "3"]) -> float:
-        """Distance of the nearest contact with something that does not move, m; `inf` where there is none."""
+        """Return the distance of the nearest contact with a fixed body, m; `inf` where there is none."""
         self._data.qpos[self._adr : self._adr + 3] = position
         mujoco.mj_fwdPosition(self._model, self._data)
         nearest = np.inf
@@ -66,7 +66,7 @@ class Probe:
 
 @per_release("scene", "mesh")
 def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
-    """Whether the probe touches nothing, at each station of the centreline."""
+    """Return True where the probe touches nothing, at each station of the centreline."""
     bore, probe = case.candidate.bore, Probe(case)
     station = np.arange(
         bore.station[0] + _PROBE_SPACING, bore.station[-1] - _PROBE_SPACING, _PROBE_SPACING * case.tolerance
@@ -77,7 +77,7 @@ def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
 
 @per_release("scene", "mesh", "tunnel")
 def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.ndarray, " k"]]:
-    """How far the probe goes from the middle to each wall at LiDAR height before it touches.
+    """Moves the probe from the middle to each wall at LiDAR height until it touches.
 
     A scene may hold walls in several sets, each for bodies that collide with one bit: true ones, and coarse ones that
     are fast.
@@ -104,7 +104,7 @@ def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.
 
 
 def _wall_bits(case: Case) -> list[int]:
-    """The bits that geoms of the scene collide by, that of the most geoms first."""
+    """Return the bits that geoms of the scene collide by, that of the most geoms first."""
     model = scene_model(case)
     fixed = model.geom_bodyid == 0
     used = (model.geom_contype | model.geom_conaffinity)[fixed]
@@ -113,7 +113,7 @@ def _wall_bits(case: Case) -> list[int]:
 
 
 def _first_touch(probe: Probe, start: np.ndarray, way: np.ndarray, reach: float) -> float:
-    """First offset with contact, m; half a metre behind the wall where there is none."""
+    """Return the first offset with contact, m; half a metre behind the wall where there is none."""
     last = 0.0
     for offset in np.arange(0.0, reach + 0.5, _COARSE_STEP):
         if probe.depth(start + offset * way) < 0.0:
@@ -131,7 +131,7 @@ def _first_touch(probe: Probe, start: np.ndarray, way: np.ndarray, reach: float)
 
 
 def _mesh_touch(case: Case, start: np.ndarray, way: np.ndarray, reach: np.ndarray) -> np.ndarray:
-    """Offset at which the nearest surface is one radius away, by bisection between the middle and the wall, m."""
+    """Return the offset at which the nearest surface is one radius away, by bisection, m."""
     low, high = np.zeros(len(reach)), reach.copy()
     for _ in range(13):
         middle = (low + high) / 2
@@ -151,11 +151,11 @@ _LIFT = (-0.01, 0.02)  # m about where the robot stands at first
 
 @dataclass(frozen=True)
 class Stepper:
-    """One compiled step.
+    """One compiled step of the scene.
 
     Attributes:
-        step: From MJX data to MJX data.
-        model: For MuJoCo.
+        step: Function from MJX data to MJX data.
+        model: Model of MuJoCo.
         data: MJX data of the model's first pose.
     """
 
@@ -164,7 +164,7 @@ class Stepper:
     data: mjx.Data
 
     def at(self, qpos: np.ndarray, qvel: np.ndarray) -> mjx.Data:
-        """MJX data of a state."""
+        """Return the MJX data of a state."""
         return self.data.replace(qpos=jax.numpy.asarray(qpos), qvel=jax.numpy.asarray(qvel))
 
 
@@ -181,7 +181,7 @@ def stepper(case: Case) -> Stepper:
 
 @per_release("scene")
 def step_is_finite(case: Case) -> bool:
-    """Whether one step from the first pose gives finite numbers."""
+    """Return True where one step from the first pose gives finite numbers."""
     made = stepper(case)
     after = made.step(made.data)
     return bool(np.isfinite(np.asarray(after.qpos)).all() and np.isfinite(np.asarray(after.qvel)).all())
@@ -189,7 +189,7 @@ def step_is_finite(case: Case) -> bool:
 
 @per_release("scene", "tunnel", "mesh")
 def contact_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Deepest contact of the robot at random places, by MuJoCo and by MJX, m; 0 where it touches nothing."""
+    """Return the deepest contact of the robot at random places, by MuJoCo and by MJX, m; 0 without contact."""
     made = stepper(case)
     cpu = mujoco.MjData(made.model)
     ours, theirs = np.zeros(_PLACEMENTS), np.zeros(_PLACEMENTS)
@@ -204,7 +204,7 @@ def contact_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarra
 
 
 def _poses_by_wall(case: Case, model: mujoco.MjModel) -> Float[np.ndarray, "k q"]:
-    """Poses of the robot by either wall, from clear of it to a little inside, at random headings."""
+    """Return poses of the robot by either wall, from clear of it to a little inside, at random headings."""
     rng = case.rng("mjx_contact_parity")
     station, middle, left = random_stations(case, "mjx_contact_parity", _PLACEMENTS)
     adr = int(model.jnt_qposadr[model.body_jntadr[robot_body(model)]])
@@ -225,7 +225,7 @@ def _poses_by_wall(case: Case, model: mujoco.MjModel) -> Float[np.ndarray, "k q"
 
 
 def _robot_radius(model: mujoco.MjModel) -> float:
-    """Largest horizontal reach of the robot's geoms from its origin, m."""
+    """Return the largest horizontal reach of the robot's geoms from its origin, m."""
     body = robot_body(model)
     own = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
     return float(max(np.hypot(*model.geom_pos[k, :2]) + model.geom_size[k, 0] for k in own))
@@ -233,7 +233,7 @@ def _robot_radius(model: mujoco.MjModel) -> float:
 
 @per_release("scene")
 def path_divergence(case: Case) -> Float[np.ndarray, " k"]:
-    """Distance between the robot's positions by MuJoCo and by MJX after each of 100 steps from one state, m."""
+    """Return the distance between the robot's positions by MuJoCo and by MJX after each of 100 steps, m."""
     made = stepper(case)
     body = robot_body(made.model)
     joint = made.model.body_jntadr[body]

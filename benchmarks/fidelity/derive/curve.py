@@ -16,11 +16,11 @@ _FINE = 0.1  # m
 
 @dataclass(frozen=True)
 class Curve:
-    """A centreline with upright frames: `left` is horizontal, `up` completes it.
+    """Centreline with upright frames: `left` is horizontal, `up` completes it.
 
     Attributes:
         station: Arc length, growing, m, `(n,)`.
-        position: m, `(n, 3)`.
+        position: Points of the curve, m, `(n, 3)`.
     """
 
     station: Float[np.ndarray, " n"]
@@ -29,11 +29,11 @@ class Curve:
 
     @property
     def length(self) -> float:
-        """Of the curve, m."""
+        """Length of the curve, m."""
         return float(self.station[-1] - self.station[0])
 
     def frames(self, station: Float[np.ndarray, " k"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Position, tangent, left and up at stations, `(k, 3)` each; straight on beyond the ends."""
+        """Return position, tangent, left and up at stations, `(k, 3)` each; straight on beyond the ends."""
         spline = CubicSpline(self.station, self.position)
         inside = np.clip(station, self.station[0], self.station[-1])
         tangent = spline(inside, 1)
@@ -44,7 +44,7 @@ class Curve:
         return position, tangent, left, np.cross(tangent, left)
 
     def local(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-        """Station, left and up of points, m; beyond the ends the curve goes straight on."""
+        """Return station, left and up of points, m; beyond the ends the curve goes straight on."""
         if not self._fine:
             count = max(int(self.length / _FINE), 2) + 1
             station = np.linspace(self.station[0], self.station[-1], count)
@@ -69,20 +69,20 @@ class Curve:
         return (1.0 - share) * self._fine[name][here] + share * self._fine[name][there]
 
     def point(self, local: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-        """Points at station, left and up."""
+        """Return the points at station, left and up, m."""
         position, _, left, up = self.frames(local[:, 0])
         return position + local[:, 1:2] * left + local[:, 2:3] * up
 
 
 @per_case
 def candidate_curve(case: Case) -> Curve:
-    """The candidate's centreline."""
+    """Return the candidate's centreline."""
     return Curve(case.candidate.bore.station, case.candidate.bore.position)
 
 
 @per_truth
 def truth_curve(case: Case) -> Curve:
-    """The true centreline."""
+    """Return the true centreline."""
     assert case.truth is not None
     return Curve(case.truth.station, case.truth.position)
 
@@ -99,14 +99,14 @@ _FLOOR_ANGLE = np.deg2rad(36.0)
 
 
 def section_angles(count: int) -> Float[np.ndarray, " m"]:
-    """Angles from left towards up, rad; none of them exactly horizontal or vertical."""
+    """Return angles from left towards up, rad; none of them is exactly horizontal or vertical."""
     return (np.arange(count) + 0.5) * 2 * np.pi / count - np.pi
 
 
 def cast_profile(
     caster: Caster, curve: Curve, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " m"]
 ) -> Float[np.ndarray, "n m"]:
-    """Distance from the curve to the first surface in its normal plane, m; NaN where there is none."""
+    """Return the distance from the curve to the first surface in its normal plane, m; NaN where there is none."""
     position, _, left, up = curve.frames(station)
     direction = np.cos(angle)[:, None] * left[:, None] + np.sin(angle)[:, None] * up[:, None]
     origin = np.repeat(position, len(angle), axis=0)
@@ -117,7 +117,7 @@ def cast_profile(
 def running_median(
     profile: Float[np.ndarray, "n m"], step: float, window: float = MEDIAN_WINDOW
 ) -> Float[np.ndarray, "n m"]:
-    """Running median along the tunnel, by direction; what is unknown does not count."""
+    """Return the running median along the tunnel, by direction; unknown values do not count."""
     half = max(round(window / step / 2), 1)
     padded = np.pad(profile, ((half, half), (0, 0)), constant_values=np.nan)
     stacked = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
@@ -125,7 +125,7 @@ def running_median(
 
 
 def nanmedian(values: Float[np.ndarray, "*shape k"]) -> Float[np.ndarray, "*shape"]:
-    """Median over the last axis; NaN, without a warning, where nothing is known."""
+    """Return the median over the last axis; NaN, without a warning, where nothing is known."""
     ordered = np.sort(values, axis=-1)  # NaN last
     known = np.isfinite(values).sum(axis=-1)
     low = np.maximum((known - 1) // 2, 0)[..., None]
@@ -137,7 +137,7 @@ def nanmedian(values: Float[np.ndarray, "*shape k"]) -> Float[np.ndarray, "*shap
 def point_profile(
     local: Float[np.ndarray, "k 3"], station: Float[np.ndarray, " n"], floor: float | None
 ) -> Float[np.ndarray, "n m"]:
-    """Median polar radius of real points by 5 degree sector and 0.5 m slice, m.
+    """Return the median polar radius of points by 5 degree sector and 0.5 m slice, m.
 
     Args:
         local: Station, left, up.
@@ -156,7 +156,7 @@ def point_profile(
 
 
 def faces_track(angle: Float[np.ndarray, " m"], floor: float) -> Bool[np.ndarray, " m"]:
-    """Which sectors look, with any part of theirs, where sleepers and rails may stand on the floor."""
+    """Return True for sectors that look, with any part, where sleepers and rails may stand on the floor."""
     off_nadir = np.abs(_wrap(angle + np.pi / 2))
     return off_nadir - SECTOR / 2 < np.arctan2(TRACK_HALF, abs(floor))
 
@@ -164,7 +164,7 @@ def faces_track(angle: Float[np.ndarray, " m"], floor: float) -> Bool[np.ndarray
 def grouped_median(
     group: np.ndarray, values: Float[np.ndarray, " k"], count: int, least: int = 1, share: float = 0.5
 ) -> Float[np.ndarray, " count"]:
-    """Median of each group, or what another `share` lies below; NaN for one with fewer than `least` members."""
+    """Return the median of each group, or another quantile; NaN for a group of fewer than `least` members."""
     order = np.lexsort((values, group))
     size = np.bincount(group, minlength=count)
     start = np.cumsum(size) - size
@@ -178,7 +178,7 @@ def grouped_median(
 
 
 def section_middle(profile: Float[np.ndarray, "n m"], angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, "n 2"]:
-    """Middle of width and height about the curve, left and up, m.
+    """Return the middle of width and height about the curve, left and up, m.
 
     The left offset is the median over mirrored directions of half the difference of the distances to the two walls,
     the height's middle that of the crown above the axis and of the flat middle of the floor.
@@ -194,14 +194,14 @@ def section_middle(profile: Float[np.ndarray, "n m"], angle: Float[np.ndarray, "
 def crown_and_floor(
     profile: Float[np.ndarray, "n m"], angle: Float[np.ndarray, " m"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Heights of crown and floor above the curve, m."""
+    """Return the heights of crown and floor above the curve, m."""
     height = profile * np.sin(angle)
     crown = nanmedian(height[:, np.abs(_wrap(angle - np.pi / 2)) < _CROWN_ANGLE])
     return crown, nanmedian(height[:, np.abs(_wrap(angle + np.pi / 2)) < _FLOOR_ANGLE])
 
 
 def smooth_along(values: Float[np.ndarray, "n k"], step: float, window: float) -> Float[np.ndarray, "n k"]:
-    """Local straight-line fit in a Gaussian window along the first axis; gaps are bridged, ends are not bent."""
+    """Fits straight lines in a Gaussian window along the first axis; gaps are bridged, ends are not bent."""
     n = len(values)
     place = np.arange(n) * step
     weight = np.exp(-0.5 * ((place[:, None] - place) / (window / 2)) ** 2)

@@ -18,11 +18,11 @@ _EIGEN_FLOOR = 1e-6  # of an eigenvalue; less than the noise of any normal
 
 @dataclass(frozen=True)
 class ScanInformation:
-    """Information of the scans, a point's share of it each.
+    """Information of the scans, per point.
 
     Attributes:
-        station: Of the sensor, m, `(s,)`.
-        axial: Of a shift along the tunnel: mean of (normal · axis)², `(s,)`.
+        station: Station of the sensor, m, `(s,)`.
+        axial: Information about a shift along the tunnel: mean of (normal · axis)², `(s,)`.
         translation: Eigenvalues of the translation block, growing, `(s, 3)`.
         weakest: Direction of the smallest of them, `(s, 3)`.
         rotation: Smallest eigenvalue of the rotation block, arms in units of the scan's mean range, `(s,)`.
@@ -39,18 +39,18 @@ class ScanInformation:
 
 @per_hold
 def real_information(case: Case) -> ScanInformation:
-    """Of the held-out scans."""
+    """Return the information of the held-out scans."""
     return _information(case, real_planes(case))
 
 
 @per_case
 def synthetic_information(case: Case) -> ScanInformation:
-    """Of the same scans taken in the candidate."""
+    """Return the information of the same scans taken in the candidate."""
     return _information(case, synthetic_planes(case))
 
 
 def _information(case: Case, planes: Planes) -> ScanInformation:
-    """Hessians of point-to-plane registration about the sensor, from normals by local planes on either side."""
+    """Return Hessians of point-to-plane registration about the sensor, from normals by local planes."""
     real, pick = returns(case), plane_rows(case)
     scan = real.scan[pick]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
@@ -91,18 +91,18 @@ _ICP_PAIRS = 16
 
 @per_hold
 def real_alias(case: Case) -> Float[np.ndarray, " s"]:
-    """Alias ratios of the held-out scans."""
+    """Return the alias ratios of the held-out scans."""
     return _alias_ratios(case, real_planes(case))
 
 
 @per_case
 def synthetic_alias(case: Case) -> Float[np.ndarray, " s"]:
-    """Alias ratios of the same scans taken in the candidate."""
+    """Return the alias ratios of the same scans taken in the candidate."""
     return _alias_ratios(case, synthetic_planes(case))
 
 
 def _alias_ratios(case: Case, planes: Planes) -> Float[np.ndarray, " s"]:
-    """Cost at the best shift of 0.2 to 3 m over the cost at none, of some scans against the map; 1 is a perfect alias.
+    """Return the cost at the best shift of 0.2 to 3 m over the cost without shift, per scan; 1 is a perfect alias.
 
     The cost is the mean distance from the planes of the nearest map points, cut off at 0.3 m. Scans without a
     minimum of the cost among the shifts count with the smallest cost there.
@@ -136,18 +136,18 @@ def _alias_ratios(case: Case, planes: Planes) -> Float[np.ndarray, " s"]:
 
 @per_hold
 def real_icp(case: Case) -> Float[np.ndarray, " p"]:
-    """Axial errors of scan-to-scan registration of held-out scans, m."""
+    """Return the axial errors of scan-to-scan registration of held-out scans, m."""
     return _icp_errors(case, returns(case).points)
 
 
 @per_case
 def synthetic_icp(case: Case) -> Float[np.ndarray, " p"]:
-    """The same of scans taken in the candidate."""
+    """Return the axial errors of the same scans taken in the candidate, m."""
     return _icp_errors(case, synthetic_points(case))
 
 
 def _icp_errors(case: Case, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " p"]:
-    """How far along the axis generalised ICP moves each of some scans that lie on their predecessors already, m."""
+    """Return the axial shift by generalised ICP of scans that lie on their predecessors already, m."""
     import small_gicp
 
     scan = returns(case).scan
@@ -175,7 +175,7 @@ _STATION_SPACING = 1.0  # m
 
 @per_case
 def localised_stations(case: Case) -> Bool[np.ndarray, " s"]:
-    """For each metre of `tunnel.npz` whether 16 beams on its axis fix the place along it.
+    """Return True for each metre of `tunnel.npz` where 16 beams on its axis fix the station.
 
     Shifted along the axis t, a range changes by (n·t)/(n·d) and its distance from the wall by n·t; the standard
     deviation of the shift is σ over the root of the sum of (n·t)² over the beams that return.
@@ -199,7 +199,7 @@ def _axial_information(
     start: Float[np.ndarray, "w 2"],
     end: Float[np.ndarray, "w 2"],
 ) -> float:
-    """Sum of (n·t)² over the beams from a place."""
+    """Return the sum of (n·t)² over the beams from a place."""
     near = np.minimum(np.linalg.norm(start - place, axis=1), np.linalg.norm(end - place, axis=1)) < PLANAR_REACH
     wall, offset = (end - start)[near], start[near] - place
     length = np.linalg.norm(wall, axis=1)

@@ -38,13 +38,13 @@ _AXIS_SECTORS = 8
 
 @dataclass(frozen=True)
 class MeshDistances:
-    """Held-out points against the candidate.
+    """Distances of held-out points to the candidate.
 
     Attributes:
-        distance: To the nearest point of the candidate, m, `(n,)`.
-        signed: The same, positive where the point is on the sensor's side of it, m, `(n,)`.
-        station: Along the sensor's path, m, `(n,)`.
-        sector: Of eight about the candidate's axis, 0 to its left, 2 its crown, 6 its floor, `(n,)`.
+        distance: Distance to the nearest point of the candidate, m, `(n,)`.
+        signed: Distance, positive where the point is on the sensor's side of the surface, m, `(n,)`.
+        station: Station along the sensor's path, m, `(n,)`.
+        sector: One of eight about the candidate's axis: 0 to its left, 2 its crown, 6 its floor, `(n,)`.
     """
 
     distance: Float[np.ndarray, " n"]
@@ -55,11 +55,11 @@ class MeshDistances:
 
 @dataclass(frozen=True)
 class CloudDistances:
-    """Samples of the candidate that held-out beams observed, against the held-out points.
+    """Distances of observed samples of the candidate to the held-out points.
 
     Attributes:
-        distance: To the nearest held-out point, m, `(n,)`.
-        station: Along the sensor's path, m, `(n,)`.
+        distance: Distance to the nearest held-out point, m, `(n,)`.
+        station: Station along the sensor's path, m, `(n,)`.
     """
 
     distance: Float[np.ndarray, " n"]
@@ -68,7 +68,7 @@ class CloudDistances:
 
 @per_hold
 def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
-    """Numbers of at most `MOST` of the returns, evenly spaced in time."""
+    """Return the numbers of at most `MOST_POINTS` returns, evenly spaced in time."""
     count = len(returns(case).range)
     return np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
 
@@ -76,7 +76,7 @@ def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
 @kept_until("CMP")
 @per_case
 def mesh_distances(case: Case) -> MeshDistances:
-    """Distances of held-out points to everything visible of the candidate; nothing is registered first."""
+    """Return the distances of held-out points to everything visible of the candidate, without registration."""
     pick, real = thinned_rows(case), returns(case)
     points = real.points[pick]
     distance, closest, face = surface_nearest(case).query(points)
@@ -89,7 +89,7 @@ def mesh_distances(case: Case) -> MeshDistances:
 
 
 def mean_distance(case: Case, other: Hold) -> float:
-    """Mean distance of another recording's points to the candidate, m."""
+    """Return the mean distance of another recording's points to the candidate, m."""
     points = other.points
     return float(
         surface_nearest(case)
@@ -100,7 +100,7 @@ def mean_distance(case: Case, other: Hold) -> float:
 
 @per_case
 def cloud_distances(case: Case) -> CloudDistances:
-    """One sample in 10 cm of the candidate, of those that a held-out beam cast in it would have hit.
+    """Return the distances of samples, one in 10 cm, that a held-out beam cast in the candidate would have hit.
 
     A sample counts as observed if a beam hits the candidate within 5 cm of it at less than 80° of incidence; half the
     smallest tolerance, so that a return that is there is within reach of it.
@@ -129,7 +129,7 @@ _EARLY = 0.15  # m
 
 @per_case
 def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
-    """For each cell of observable candidate surface, whether most beams that hit it came back from behind it.
+    """Return True for each cell of observable surface if most beams that hit it came back from behind it.
 
     Cells of 10 cm stand for equal areas; beams at more than 80° of incidence do not count, for there a millimetre off
     the surface is centimetres along the beam. A beam passes through if its return lies over 15 cm behind the surface.
@@ -146,7 +146,7 @@ _THIN = 0.1  # m
 
 
 def density_aware_chamfer(case: Case) -> float:
-    """Between held-out points and the candidate's points on the same beams, each thinned to one in 10 cm; 0 to 1.
+    """Return the density-aware Chamfer distance of held-out and synthetic points, one in 10 cm each; 0 to 1.
 
     Source: Wu et al. 2021, arXiv 2111.12702, eq. 6: ½ Σ over both of the mean of 1 - exp(-α d) / n, with n the
     number of points that share the nearest neighbour.
@@ -173,12 +173,12 @@ M3C2_REGISTRATION = 0.01  # m: what poses that are given to a centimetre leave b
 
 @dataclass(frozen=True)
 class M3C2Distances:
-    """At each core point that has both clouds in its cylinder.
+    """M3C2 at each core point that has both clouds in its cylinder.
 
     Attributes:
         significant: 1 where |distance| exceeds the level of detection, else 0, `(n,)`.
-        distance: Signed, m, `(n,)`.
-        station: Along the sensor's path, m, `(n,)`.
+        distance: Signed distance, m, `(n,)`.
+        station: Station along the sensor's path, m, `(n,)`.
     """
 
     significant: Float[np.ndarray, " n"]
@@ -188,7 +188,7 @@ class M3C2Distances:
 
 @per_case
 def m3c2_distances(case: Case) -> M3C2Distances:
-    """M3C2 of held-out points against the candidate's points on the same beams.
+    """Computes M3C2 of held-out points against the candidate's points on the same beams.
 
     The candidate's points carry no noise; the level of detection is 1.96·√(s₁²/n₁ + s₂²/n₂) + registration, in which
     the registration error is the given poses' (`REGISTRATION`).
@@ -227,7 +227,7 @@ class SelfCast:
     """Distances of a noisy cloud to the mesh that it was cast in.
 
     Attributes:
-        distance: m, `(n,)`.
+        distance: Distance to the mesh, m, `(n,)`.
         noise_alone: σ·√(2/π)·mean|cos incidence|, m: the mean distance that noise gives on planes.
     """
 
@@ -237,7 +237,7 @@ class SelfCast:
 
 @per_case
 def self_cast(case: Case) -> SelfCast:
-    """At the held-out beams; logged only, since any mesh passes."""
+    """Casts a noisy cloud at the held-out beams and measures it against the same mesh; any mesh passes."""
     real, cast = returns(case), cast_beams(case)
     pick = thinned_rows(case)
     pick = pick[cast.hit[pick]]
@@ -257,14 +257,14 @@ _FREE_RAYS = 150_000
 
 @dataclass(frozen=True)
 class Occupied:
-    """Voxels on one grid, axes station, left, up, `(i, j, k)` each.
+    """Occupied voxels on one grid, axes station, left, up, `(i, j, k)` each.
 
     Attributes:
-        real: Holds a held-out point.
-        first: Holds a point of the first noisy draw in the candidate.
-        second: Of the second draw; differs from the first in noise alone.
-        known: The held-out beams tell what is there, or one of the surfaces is.
-        station: Of the middle of each slice, m, `(i,)`.
+        real: Voxels with a held-out point.
+        first: Voxels with a point of the first noisy draw in the candidate.
+        second: Voxels of the second draw, which differs from the first in noise alone.
+        known: Voxels that held-out beams show, or that hold one of the surfaces.
+        station: Station of the middle of each slice, m, `(i,)`.
     """
 
     real: Bool[np.ndarray, "i j k"]
@@ -277,7 +277,7 @@ class Occupied:
 @kept_until("OCC")
 @per_case
 def occupied_voxels(case: Case) -> Occupied:
-    """Held-out and synthetic points, and what is known about the voxels near them."""
+    """Return the voxels of held-out and synthetic points, and the known voxels near them."""
     edge = VOXEL_EDGE * case.tolerance
     real = returns(case)
     clouds = [_voxel_indices(real.local, edge)]
@@ -292,7 +292,7 @@ def occupied_voxels(case: Case) -> Occupied:
 
 @per_hold
 def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
-    """Indices of voxels through which held-out beams passed in the last metres before their returns."""
+    """Return the indices of voxels that held-out beams passed in the last metres before their returns."""
     real = returns(case)
     pick = np.linspace(0, len(real.range) - 1, min(len(real.range), _FREE_RAYS)).astype(int)
     edge = VOXEL_EDGE * case.tolerance
@@ -302,22 +302,22 @@ def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
 
 
 def dilate(grid: Bool[np.ndarray, "i j k"], by: int = 1) -> Bool[np.ndarray, "i j k"]:
-    """A grid grown by whole voxels in every direction."""
+    """Grows a grid by whole voxels in every direction."""
     return ndimage.maximum_filter(grid.astype(np.uint8), 2 * by + 1, mode="constant").astype(bool)
 
 
 def shell_voxels(grids: Occupied) -> Bool[np.ndarray, "i j k"]:
-    """Known voxels within `SHELL` of either surface."""
+    """Return the known voxels within `SHELL_VOXELS` of either surface."""
     return grids.known & dilate(grids.real | grids.first, SHELL_VOXELS)
 
 
 def iou(a: Bool[np.ndarray, "..."], b: Bool[np.ndarray, "..."]) -> float:
-    """Intersection over union."""
+    """Return the intersection over union."""
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 
 def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarray, " g"]:
-    """F1 with a tolerance of one voxel for each group of slices; 0 where one of the surfaces is not there.
+    """Return F1 with a tolerance of one voxel for each group of slices; 0 where one of the surfaces is absent.
 
     Args:
         grids: Both surfaces.

@@ -24,11 +24,11 @@ CARVE_MARGIN = 0.20  # m before the return where a beam's air ends
 
 @dataclass(frozen=True)
 class Carved:
-    """Samples along beams.
+    """Samples along held-out beams.
 
     Attributes:
         passed: Points that beams went through, tunnel frame, m, `(k, 3)`.
-        beam: Which beam passed each, `(k,)`.
+        beam: Number of the beam of each point, `(k,)`.
         ended: Returns of the same beams, m, `(b, 3)`.
     """
 
@@ -39,7 +39,7 @@ class Carved:
 
 @per_hold
 def carve_beams(case: Case) -> Carved:
-    """Every 15 cm of about 300 beams a metre, from the sensor to 20 cm before the return or 25 m."""
+    """Samples about 300 beams a metre every 15 cm, from the sensor to 20 cm before the return or 25 m."""
     real = returns(case)
     length = np.linalg.norm(np.ptp(real.origin, axis=0)) + 10.0
     back = np.arange(0, len(real.range), max(1, int(len(real.range) / (_BEAMS_PER_METRE * length))))
@@ -54,7 +54,7 @@ def carve_beams(case: Case) -> Carved:
 
 
 def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
-    """Passed and ended points as station, left and up about a curve; remembered."""
+    """Return passed and ended points as station, left and up about a curve, m; kept with the recording."""
     assert case.hold is not None
     key = ("carving.about", id(curve))
     if key not in case.hold.cache:
@@ -75,10 +75,10 @@ class Lattice:
     """Cells about a curve.
 
     Attributes:
-        curve: Axis.
+        curve: Axis of the lattice.
         low: Corner of the first cell: station, left, up, m.
-        shape: Cells.
-        edge: Of a cell, m.
+        shape: Number of cells each way.
+        edge: Edge of a cell, m.
     """
 
     curve: Curve
@@ -87,25 +87,25 @@ class Lattice:
     edge: float
 
     def local(self) -> Float[np.ndarray, "k 3"]:
-        """Middles of all cells: station, left, up, m."""
+        """Return the middles of all cells: station, left, up, m."""
         axes = [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def points(self) -> Float[np.ndarray, "k 3"]:
-        """Middles of all cells in the tunnel frame, m."""
+        """Return the middles of all cells in the tunnel frame, m."""
         axes = [low + self.edge * (np.arange(n) + 0.5) for low, n in zip(self.low, self.shape, strict=True)]
         position, _, left, up = (a[:, None, None] for a in self.curve.frames(axes[0]))
         placed = position + axes[1][None, :, None, None] * left + axes[2][None, None, :, None] * up
         return placed.reshape(-1, 3)
 
     def cell(self, local: Float[np.ndarray, "k 3"]) -> tuple[Int[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
-        """Flat index of the cell of each point, and whether it lies in the lattice at all."""
+        """Return the flat index of the cell of each point, and True where it lies in the lattice."""
         place = np.floor((local - self.low) / self.edge).astype(int)
         inside = ((place >= 0) & (place < self.shape)).all(axis=1)
         return np.ravel_multi_index(tuple(np.where(inside[:, None], place, 0).T), self.shape), inside
 
     def marked(self, local: Float[np.ndarray, "k 3"], least: int = 1) -> Bool[np.ndarray, "n m k"]:
-        """Cells with at least so many of the points."""
+        """Return True for cells with at least so many of the points."""
         cell, inside = self.cell(local)
         return (np.bincount(cell[inside], minlength=int(np.prod(self.shape))) >= least).reshape(self.shape)
 
@@ -115,11 +115,11 @@ class Air:
     """Air of candidate and reference in the same voxels.
 
     Attributes:
-        lattice: The voxels.
-        judged, reference: Whether each is air that can be reached from a mouth, `(n, m, k)`.
-        known: Whether the reference says anything of it, `(n, m, k)`.
+        lattice: Lattice of the voxels.
+        judged, reference: Voxels of air that can be reached from a mouth, `(n, m, k)`.
+        known: Voxels that the reference knows, `(n, m, k)`.
         blocked: Voxels inside the candidate's lining that are not its air, `(n, m, k)`.
-        filled: Those of them that its extra surfaces take or close off, not its track, `(n, m, k)`.
+        filled: Blocked voxels that its extra surfaces take or close off, not its track, `(n, m, k)`.
     """
 
     lattice: Lattice
@@ -132,12 +132,12 @@ class Air:
 
 @per_case
 def air_lattice(case: Case) -> Lattice:
-    """20 cm voxels around the reference's sections."""
+    """Return voxels of 20 cm around the reference's sections."""
     return make_lattice(case, AIR_VOXEL * case.tolerance)
 
 
 def make_lattice(case: Case, edge: float) -> Lattice:
-    """Cells from mouth to mouth of the reference, with 0.8 m to spare around its largest section."""
+    """Return cells from mouth to mouth of the reference, with 0.8 m to spare around its largest section."""
     curve, cut = reference_curve(case), sections(case)
     x, z = cut.reference * np.cos(cut.angle), cut.reference * np.sin(cut.angle)
     low = np.floor((np.array([np.nanmin(x), np.nanmin(z)]) - 0.8) / edge)
@@ -150,7 +150,7 @@ def make_lattice(case: Case, edge: float) -> Lattice:
 @kept_until("F3D")
 @per_case
 def air_voxels(case: Case) -> Air:
-    """Both, in voxels."""
+    """Return the air of candidate and reference in voxels."""
     cells = air_lattice(case)
     inside = (lining_radii(case).depth(cells.points()) > 0).reshape(cells.shape)
     track = cells.marked(cells.curve.local(track_points(case, cells.edge)))
@@ -161,24 +161,24 @@ def air_voxels(case: Case) -> Air:
 
 
 def object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
-    """Samples of what stands in the candidate's bore: track and extra surfaces."""
+    """Return samples of the objects in the candidate's bore: track and extra surfaces, m."""
     return np.concatenate([track_points(case, edge), sample_surface(case.candidate.extra, edge / 2)[0]])
 
 
 def track_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
-    """Samples of the candidate's track."""
+    """Return samples of the candidate's track, m."""
     track = case.candidate.track
     parts = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
     return sample_surface(concatenate_meshes([part for part in parts if len(part.faces)]), edge / 2)[0]
 
 
 def true_object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
-    """The same of the truth."""
+    """Return samples of the objects in the true bore, m."""
     return sample_surface(true_part(case, _OBJECTS), edge / 2)[0]
 
 
 def reference_air(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
-    """Air of the reference and where it is known.
+    """Return the air of the reference and where it is known.
 
     The truth is known to 0.6 m behind its surface. Held-out beams know the cells that they pass; a cell in which at
     least two of them end is air where its middle lies nearer to the axis than their ends do.
@@ -199,7 +199,7 @@ def reference_air(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m k"]
 
 
 def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
-    """What of the air is connected with the first or last metre of the lattice that has any."""
+    """Return the air that is connected with the first or last metre of the lattice that has any."""
     part, count = label(free)
     if not count:
         return free
@@ -212,15 +212,8 @@ def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
     return np.isin(part, np.flatnonzero(found > 0.1 * found.max()))
 
 
-@per_case
-def clearance(case: Case) -> tuple[Float[np.ndarray, "n m k"], Float[np.ndarray, "n m k"]]:
-    """Distance to the edge of the air in every voxel, of candidate and reference, m; negative outside the air."""
-    both = air_voxels(case)
-    return signed_distance(both.judged, both.lattice.edge), signed_distance(both.reference, both.lattice.edge)
-
-
 def signed_distance(free: Bool[np.ndarray, "n m k"], edge: float) -> Float[np.ndarray, "n m k"]:
-    """Signed Euclidean distance to the edge of free cells, m."""
+    """Return the signed Euclidean distance to the edge of free cells, m."""
     if free.all() or not free.any():
         return np.full(free.shape, np.inf if free.all() else -np.inf)
     return distance_transform_edt(free, edge) - distance_transform_edt(~free, edge)
@@ -238,11 +231,11 @@ _TIGHTER = (0.0, 0.05, 0.10)  # m that the reference's own median outline is dra
 
 @dataclass(frozen=True)
 class Clearances:
-    """Distance to the nearest surface around the axis.
+    """Distances to the nearest surface around the axis.
 
     Attributes:
-        station: Of the sections, m, `(n,)`.
-        judged, reference: By section and place in it, m, `(n, k)`.
+        station: Stations of the sections, m, `(n,)`.
+        judged, reference: Distances by section and place in it, m, `(n, k)`.
     """
 
     station: Float[np.ndarray, " n"]
@@ -266,7 +259,7 @@ def _truth_nearest(case: Case) -> Nearest:
 
 @per_case
 def axis_clearances(case: Case) -> Clearances:
-    """Of candidate and reference; a held-out recording's is the distance to its nearest return."""
+    """Return the clearances of candidate and reference; a recording's is the distance to its nearest return."""
     station, points = _places_near_axis(case)
     judged = surface_nearest(case).query(points)[0]
     if case.truth is not None:
@@ -279,7 +272,7 @@ def axis_clearances(case: Case) -> Clearances:
 
 @per_case
 def headrooms(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Stations, and floor to crown in three lanes of candidate and reference, m; NaN where not known.
+    """Return stations, and floor to crown in three lanes of candidate and reference, m; NaN where not known.
 
     Medians over 0.5 m of chainage, so that a sleeper a centimetre off counts by its centimetre.
     """
@@ -321,7 +314,7 @@ def _seen_headroom(case: Case):
 
 @per_case
 def infringements(case: Case) -> tuple[Bool[np.ndarray, "n e"], Bool[np.ndarray, "n e"]]:
-    """Whether lining and reference cut into each of four envelopes in every section.
+    """Return True where lining and reference cut into each of four envelopes, by section.
 
     A metro car's envelope, and the median outline of the reference drawn in by 0, 5 and 10 cm: a car alone is clear of
     any bore that it is driven through and would tell nothing apart.

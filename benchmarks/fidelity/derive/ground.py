@@ -27,13 +27,13 @@ _LEVELS = (0.3, 0.7)  # m above the ground at which the robot would run into som
 
 @dataclass(frozen=True)
 class Ground:
-    """What lies under and over the robot.
+    """Ground under the robot and headroom over it.
 
     Attributes:
-        station: Of the rows, m, `(n,)`.
-        left: Of the columns, m, `(m,)`.
-        height: Of the ground above the axis, m; NaN where none is seen, `(n, m)`.
-        headroom: Above it, m, `(n, m)`.
+        station: Stations of the rows, m, `(n,)`.
+        left: Offsets of the columns, m, `(m,)`.
+        height: Height of the ground above the axis, m; NaN where none is seen, `(n, m)`.
+        headroom: Headroom above the ground, m, `(n, m)`.
         step: Largest difference of height to the four neighbours, m; NaN beside what is not seen, `(n, m)`.
     """
 
@@ -45,29 +45,29 @@ class Ground:
 
     @property
     def cell(self) -> float:
-        """Edge, m."""
+        """Edge of a cell, m."""
         return float(self.left[1] - self.left[0])
 
     @property
     def traversable(self) -> Bool[np.ndarray, "n m"]:
-        """Where neither a step nor the roof stops the robot."""
+        """True where neither a step nor the roof stops the robot, `(n, m)`."""
         with np.errstate(invalid="ignore"):
             return (self.step < STEP_MOST) & (self.headroom > HEADROOM_LEAST)
 
     @property
     def clearance(self) -> Float[np.ndarray, "n m"]:
-        """Distance to what is not traversable, m; the mouths are open."""
+        """Distance to the nearest cell that is not traversable, m; the mouths are open."""
         free = self.traversable
         return distance_transform_edt(free, self.cell) if not free.all() else np.full(free.shape, GROUND_HALF)
 
 
 def ground_curve(case: Case) -> Curve:
-    """The reference axis, or the lining's own where there is no reference."""
+    """Return the reference axis, or the lining's own where there is no reference."""
     return lining_curve(case) if case.truth is None and case.hold is None else reference_curve(case)
 
 
 def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
-    """Stations of the rows and offsets to the left of the columns, m."""
+    """Return stations of the rows and offsets to the left of the columns, m."""
     station = curve.station[0] + MOUTH_MARGIN + cell * (np.arange(int((curve.length - 2 * MOUTH_MARGIN) / cell)) + 0.5)
     columns = int(GROUND_HALF / cell)
     return station, cell * np.arange(-columns, columns + 1)
@@ -75,13 +75,13 @@ def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Flo
 
 @per_case
 def judged_ground(case: Case) -> Ground:
-    """The candidate's, by rays."""
+    """Return the candidate's ground, by rays."""
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
 
 
 @per_truth
 def true_ground(case: Case) -> Ground:
-    """The truth's, by rays."""
+    """Return the true ground, by rays."""
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, truth_caster(case), truth_radii(case))
 
 
@@ -113,7 +113,7 @@ def _barred_cells(
     left: Float[np.ndarray, " m"],
     height: Float[np.ndarray, "n m"],
 ) -> Bool[np.ndarray, "n m"]:
-    """Cells from which something stands in the way to the next, along or across: a wall that rays down do not meet."""
+    """Return True for cells with an obstacle towards the next cell along or across: a wall that rays down miss."""
     position, tangent, across, up = curve.frames(station)
     cell, known = left[1] - left[0], np.isfinite(height)
     barred = np.zeros(height.shape, bool)
@@ -133,14 +133,14 @@ def _ray_heights(
     among: Bool[np.ndarray, " k"],
     sign: int,
 ) -> Float[np.ndarray, " k"]:
-    """Height above the axis at which rays up or down end, m; NaN where they do not."""
+    """Return the height above the axis at which rays up or down end, m; NaN where they do not."""
     reach = np.full(len(eye), np.nan)
     reach[among] = caster.first(eye[among], direction[among])[0]
     return np.where(np.isfinite(reach), _EYE_HEIGHT + sign * reach, np.nan)
 
 
 def cell_steps(height: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-    """Largest difference to the four neighbours, m; beyond the mouths the ground goes on."""
+    """Return the largest difference to the four neighbours, m; beyond the mouths the ground goes on."""
     padded = np.pad(height, ((1, 1), (0, 0)), mode="edge")
     padded = np.pad(padded, ((0, 0), (1, 1)), constant_values=np.nan)
     inner = padded[1:-1, 1:-1]
@@ -159,7 +159,7 @@ _FLOOR_BELOW = -1.0  # m above the axis; returns below it are of the ground
 
 @per_case
 def both_grounds(case: Case) -> tuple[Ground, Ground]:
-    """Candidate and truth, by rays; without a truth candidate and recording by the same held-out beams.
+    """Return the grounds to compare: by rays against the truth, else both by the same held-out beams.
 
     Beams that graze the ground leave gaps and blur steps; with the same beams and noise they do so on both sides.
     The last 25 cm before the reference's wall are left out: the robot's middle cannot get there.
@@ -215,12 +215,12 @@ _EIGHT = np.ones((3, 3), int)
 
 @dataclass(frozen=True)
 class Route:
-    """A way.
+    """Route of the robot over the ground.
 
     Attributes:
         cells: Row and column of each cell, `(k, 2)`.
-        place: Station and left of each, m, `(k, 2)`.
-        clearance: To what stops the robot, m, `(k,)`.
+        place: Station and left of each cell, m, `(k, 2)`.
+        clearance: Distance to the nearest obstacle, m, `(k,)`.
     """
 
     cells: Int[np.ndarray, "k 2"]
@@ -229,12 +229,12 @@ class Route:
 
     @property
     def length(self) -> float:
-        """Along the way, m."""
+        """Length along the route, m."""
         return float(np.linalg.norm(np.diff(self.place, axis=0), axis=1).sum())
 
 
 def find_route(ground: Ground) -> Route | None:
-    """The way of most clearance from mouth to mouth, begun and ended next to the axis; `None` where there is none.
+    """Return the route of most clearance from mouth to mouth, starting next to the axis; `None` where none exists.
 
     A cell costs the inverse square of its clearance, and what the robot does not fit on is barred.
     """
@@ -264,19 +264,19 @@ def _nearest_to_axis(ground: Ground, fits: Bool[np.ndarray, "n m"], end: int) ->
 
 @per_case
 def judged_route(case: Case) -> Route | None:
-    """On the candidate's own ground."""
+    """Return the route on the candidate's own ground."""
     return find_route(judged_ground(case))
 
 
 @per_case
 def both_routes(case: Case) -> tuple[Route | None, Route | None]:
-    """On the two grounds that are compared."""
+    """Return the routes on the two grounds that are compared."""
     judged, reference = both_grounds(case)
     return find_route(judged), find_route(reference)
 
 
 def blocked_metres(ground: Ground) -> int:
-    """Stretches of 1 m between the rails that the robot does not get through."""
+    """Count the stretches of 1 m between the rails that the robot cannot pass."""
     between = np.abs(ground.left) < GAUGE_HALF
     passable = (ground.clearance[:, between] >= ROBOT_RADIUS).any(axis=1)
     metre = ((ground.station - ground.station[0]) / 1.0).astype(int)
@@ -284,14 +284,14 @@ def blocked_metres(ground: Ground) -> int:
 
 
 def feasible_trips(ground: Ground, triples: Int[np.ndarray, "t 3"]) -> Bool[np.ndarray, " t"]:
-    """Whether a robot of each inflation gets from start to goal; cells are flat indices."""
+    """Return True where a robot of each inflation gets from start to goal; cells are flat indices."""
     clearance = ground.clearance
     parts = [label(clearance >= inflation, _EIGHT)[0].ravel() for inflation in INFLATIONS]
     return np.array([parts[k][a] == parts[k][b] > 0 for a, b, k in triples])
 
 
 def draw_trips(ground: Ground, rng: np.random.Generator) -> Int[np.ndarray, "t 3"]:
-    """Random start, goal and inflation on traversable ground.
+    """Draws random start, goal and inflation on traversable ground.
 
     Raises:
         ValueError: There is none.

@@ -30,12 +30,12 @@ _BLUR = np.ones((3, 3))
 
 @dataclass(frozen=True)
 class Unrolled:
-    """A map of depths.
+    """Map of depths of the unrolled lining.
 
     Attributes:
-        station: Of the rows, m, `(n,)`.
-        angle: Of the columns, from left towards up, rad, `(m,)`.
-        depth: Behind the smooth section along the ray from the axis, m; NaN where not known, `(n, m)`.
+        station: Stations of the rows, m, `(n,)`.
+        angle: Angles of the columns, from left towards up, rad, `(m,)`.
+        depth: Depth behind the smooth section along the ray from the axis, m; NaN where not known, `(n, m)`.
         smooth: Radius of the typical smooth section, m, `(m,)`.
         wall: Columns that are wall or roof, not floor, `(m,)`.
     """
@@ -74,7 +74,7 @@ def _make_map(station: np.ndarray, radius: np.ndarray, smooth: np.ndarray) -> Un
 
 
 def map_of_radii(radii: Radii) -> Unrolled:
-    """A map from a table of radii; its smooth section is the running median over 1.5 m."""
+    """Return a map from a table of radii; its smooth section is the running median over 1.5 m."""
     coarse = running_median(radii.radius[::_COARSE_ROWS], _COARSE_ROWS * ROW)
     return _make_map(radii.station, radii.radius, _stretch(coarse, len(radii.station), _COARSE_ROWS))
 
@@ -88,19 +88,19 @@ def _stretch(coarse: Float[np.ndarray, "c m"], rows: int, step: int, first: floa
 
 @per_case
 def lining_map(case: Case) -> Unrolled:
-    """The candidate's lining, from the reference axis."""
+    """Return the map of the candidate's lining, from the reference axis."""
     return map_of_radii(cast_radii(reference_curve(case), lining_caster(case)))
 
 
 @per_truth
 def truth_map(case: Case) -> Unrolled:
-    """The true lining, from the same axis."""
+    """Return the map of the true lining, from the same axis."""
     return map_of_radii(truth_radii(case))
 
 
 @per_case
 def hold_map(case: Case) -> Unrolled:
-    """The held-out recording's, from the same axis, each return put into its cell; the mean of each."""
+    """Return the map of the held-out recording, from the same axis; the mean of the returns in each cell."""
     assert case.hold is not None
     curve = reference_curve(case)
     key = ("unrolled.hold_map", case.truth is None)
@@ -111,7 +111,7 @@ def hold_map(case: Case) -> Unrolled:
 
 
 def map_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
-    """A map from points given as station, left and up."""
+    """Return a map from points given as station, left and up."""
     rows = max(int(curve.length / ROW), 2)
     step = curve.length / rows
     row = (local[:, 0] - curve.station[0]) / step
@@ -138,18 +138,18 @@ def map_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
 
 @per_case
 def observed_map(case: Case) -> Unrolled:
-    """The candidate's as the held-out beams would have shown it: the same beams, so the same gaps and shadows."""
+    """Return the candidate's map as the held-out beams would show it: the same gaps and shadows."""
     points = points_at(case, cast_beams(case).range)
     return map_of_points(reference_curve(case), reference_curve(case).local(points[np.isfinite(points).all(axis=1)]))
 
 
 def both_maps(case: Case) -> tuple[Unrolled, Unrolled]:
-    """Candidate and truth, each whole; without a truth candidate and recording by the same held-out beams."""
+    """Return the maps to compare: candidate and truth, else candidate and recording by the same beams."""
     return (lining_map(case), truth_map(case)) if case.truth is not None else (observed_map(case), hold_map(case))
 
 
 def blur(depth: Float[np.ndarray, "n m"], known: Bool[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-    """Mean over the known cells among nine, m; NaN where there is none."""
+    """Return the mean over the known cells among nine, m; NaN where there is none."""
     usable = known & np.isfinite(depth)
     weight = convolve(usable.astype(float), _BLUR, mode="constant")
     total = convolve(np.where(usable, depth, 0.0), _BLUR, mode="constant")
@@ -157,13 +157,13 @@ def blur(depth: Float[np.ndarray, "n m"], known: Bool[np.ndarray, "n m"]) -> Flo
 
 
 def common_rows(first: Unrolled, second: Unrolled) -> int:
-    """Rows of two maps of one axis that are compared."""
+    """Return the number of rows that two maps of one axis share."""
     return min(len(first.station), len(second.station))
 
 
 @per_case
 def paired_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Stations, and depths of candidate and held-out recording in the cells that beams show of both, m.
+    """Return stations, and depths of candidate and recording in the cells that beams show of both, m.
 
     Both are averaged over the same cells of three by three, so that range noise of single returns does not decide.
     """
@@ -186,25 +186,25 @@ _ROW_HEIGHT = 0.25  # of the highest row
 
 
 def relief(unrolled: Unrolled) -> Float[np.ndarray, "n m"]:
-    """Depth of recesses, m; 0 on plain wall, on the floor and where nothing is known."""
+    """Return the depth of recesses, m; 0 on plain wall, on the floor and where nothing is known."""
     depth = np.nan_to_num(unrolled.depth)
     return np.where((depth > _RELIEF) & unrolled.wall, depth, 0.0)
 
 
 def relief_along(unrolled: Unrolled) -> Float[np.ndarray, " n"]:
-    """Mean relief by chainage, where the wall is known, m."""
+    """Return the mean relief by station, where the wall is known, m."""
     known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=1)
     return relief(unrolled).sum(axis=1) / np.maximum(known, 1)
 
 
 def relief_around(unrolled: Unrolled) -> Float[np.ndarray, " m"]:
-    """Mean relief by direction, m."""
+    """Return the mean relief by direction, m."""
     known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=0)
     return relief(unrolled).sum(axis=0) / np.maximum(known, 1)
 
 
 def coarse_pitch(signal: Float[np.ndarray, " n"]) -> float | None:
-    """Lag of the first high peak of the autocorrelation, m; `None` without relief. Multiples of a pitch are as high."""
+    """Return the lag of the first high peak of the autocorrelation, m; `None` without relief."""
     if signal.mean() < _FAINT:
         return None
     centred = signal - signal.mean()
@@ -219,7 +219,7 @@ def coarse_pitch(signal: Float[np.ndarray, " n"]) -> float | None:
 
 
 def ring_pitch(unrolled: Unrolled, near: float, band: float) -> float | None:
-    """Pitch near another whose comb of four harmonics is strongest, m; `None` without relief."""
+    """Return the pitch near another whose comb of four harmonics is strongest, m; `None` without relief."""
     signal = relief_along(unrolled)
     if signal.mean() < _FAINT:
         return None
@@ -232,7 +232,7 @@ def ring_pitch(unrolled: Unrolled, near: float, band: float) -> float | None:
 
 
 def ring_phases(unrolled: Unrolled, length: float) -> Float[np.ndarray, " w"]:
-    """Phase of a pitch in overlapping windows, rad; NaN in a window without relief."""
+    """Return the phase of a pitch in overlapping windows, rad; NaN in a window without relief."""
     signal = relief_along(unrolled)
     size = int(PHASE_PITCHES * length / ROW)
     result = []
@@ -244,7 +244,7 @@ def ring_phases(unrolled: Unrolled, length: float) -> Float[np.ndarray, " w"]:
 
 
 def pocket_rows(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Float[np.ndarray, " r"]:
-    """Where along the section rows of recesses lie, m."""
+    """Return the positions along the section of rows of recesses, m."""
     signal = relief_around(unrolled)
     smooth = np.convolve(np.concatenate([signal[-2:], signal, signal[:2]]), np.ones(5) / 5, mode="valid")
     if smooth.max() < _FAINT:
@@ -254,7 +254,7 @@ def pocket_rows(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Float[np.nd
 
 
 def _fourier(signal: np.ndarray, station: np.ndarray, frequency: np.ndarray) -> np.ndarray:
-    """Fourier integral of a signal at frequencies, 1/m."""
+    """Return the Fourier integral of a signal at frequencies in 1/m."""
     parts = np.array_split(frequency, max(len(frequency) // 100, 1))
     return np.concatenate([np.exp(-2j * np.pi * part[:, None] * station) @ signal for part in parts])
 
@@ -271,10 +271,10 @@ class Pockets:
     """Recesses of the lining.
 
     Attributes:
-        station: m, `(p,)`.
-        arc: Along the section, m, `(p,)`.
-        depth: Normal to the wall, m, `(p,)`.
-        area: Of the opening, m², `(p,)`.
+        station: Station, m, `(p,)`.
+        arc: Position along the section, m, `(p,)`.
+        depth: Depth normal to the wall, m, `(p,)`.
+        area: Area of the opening, m², `(p,)`.
     """
 
     station: Float[np.ndarray, " p"]
@@ -287,20 +287,20 @@ class Pockets:
 
     @property
     def place(self) -> Float[np.ndarray, "p 2"]:
-        """On the unrolled wall, m."""
+        """Position on the unrolled wall, m, `(p, 2)`."""
         return np.column_stack([self.station, self.arc])
 
 
 def detect_pockets(
     unrolled: Unrolled, depth: Float[np.ndarray, "n m"], arc: Float[np.ndarray, " m"], least: tuple[float, float]
 ) -> Pockets:
-    """Connected cells that are deep enough and together have the area of a pocket.
+    """Finds connected cells that are deep enough and together have the area of a pocket.
 
     Args:
-        unrolled: Where the cells are.
-        depth: Of the cells, m.
-        arc: Along the section at each column, m: that of the reference, so that both sides are measured alike.
-        least: Depth, m, and area, m².
+        unrolled: Map of the cells.
+        depth: Depth of the cells, m.
+        arc: Position along the section at each column, m; that of the reference, so that both sides are measured alike.
+        least: Least depth, m, and area, m².
     """
     deep = (np.nan_to_num(depth) * unrolled.slant > least[0]) & unrolled.wall
     size = np.where(unrolled.wall, unrolled.pitch, 0.0) * ROW
@@ -316,20 +316,20 @@ def detect_pockets(
 
 
 def shown_pockets(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Pockets:
-    """Those that beams show."""
+    """Return the pockets that beams show."""
     return detect_pockets(unrolled, blur(unrolled.depth, np.isfinite(unrolled.depth)), arc, GRAZED_POCKET)
 
 
 @per_case
 def judged_pockets(case: Case) -> Pockets:
-    """Those of the candidate's lining; against a held-out recording those that its beams would have shown."""
+    """Return the pockets of the candidate's lining; against a recording those that its beams would have shown."""
     judged, arc = both_maps(case)[0], reference_arc(case)
     return shown_pockets(judged, arc) if case.truth is None else detect_pockets(judged, judged.depth, arc, DEEP_POCKET)
 
 
 @per_case
 def reference_pockets(case: Case) -> Pockets:
-    """The open pockets of the truth; otherwise those that the held-out recording shows."""
+    """Return the open pockets of the truth; otherwise those that the held-out recording shows."""
     if case.truth is None:
         return shown_pockets(hold_map(case), reference_arc(case))
     rows = [pocket for pocket in case.truth.furniture.get("pockets", ()) if pocket["open"]]
@@ -343,13 +343,13 @@ def reference_pockets(case: Case) -> Pockets:
 
 
 def reference_arc(case: Case) -> Float[np.ndarray, " m"]:
-    """Length along the reference's section at each column, m: both sides are measured by it."""
+    """Return the length along the reference's section at each column, m: both sides are measured by it."""
     return both_maps(case)[1].arc
 
 
 @per_case
 def matched_pockets(case: Case) -> Int[np.ndarray, "k 2"]:
-    """Pairs (judged, reference) that are each other's nearest and at most 15 cm apart on the unrolled wall."""
+    """Return pairs (judged, reference) of mutual nearest pockets at most 15 cm apart on the unrolled wall."""
     judged, reference = judged_pockets(case), reference_pockets(case)
     if not len(judged) or not len(reference):
         return np.zeros((0, 2), int)

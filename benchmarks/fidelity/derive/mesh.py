@@ -26,7 +26,7 @@ class Edges:
 
     Attributes:
         ends: Vertex numbers, `(e, 2)`.
-        faces: How many faces meet there, `(e,)`.
+        faces: Number of faces at the edge, `(e,)`.
         length: m, `(e,)`.
     """
 
@@ -36,7 +36,7 @@ class Edges:
 
 
 def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """A copy in which corners at one place are one vertex, about a whole-metre origin.
+    """Return a copy in which corners at one place are one vertex, about a whole-metre origin.
 
     Raises:
         ValueError: Vertices that are not finite, or faces that name none.
@@ -50,14 +50,14 @@ def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def is_sound(mesh: trimesh.Trimesh) -> bool:
-    """Whether all vertices are finite and all faces name vertices that there are."""
+    """Return True where all vertices are finite and all faces name existing vertices."""
     faces = np.asarray(mesh.faces)
     in_range = not len(faces) or (faces.min() >= 0 and faces.max() < len(mesh.vertices))
     return bool(np.isfinite(np.asarray(mesh.vertices)).all() and in_range)
 
 
 def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
-    """Of a welded mesh."""
+    """Return the edges of a welded mesh."""
     ends, count = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
     return Edges(ends, count, np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1))
 
@@ -65,38 +65,38 @@ def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
 @kept_until("TOP")
 @per_case
 def welded_lining(case: Case) -> trimesh.Trimesh:
-    """The lining, welded."""
+    """Return the welded lining."""
     return weld(case.candidate.lining)
 
 
 @kept_until("TOP")
 @per_case
 def welded_solid(case: Case) -> trimesh.Trimesh:
-    """The solid, welded."""
+    """Return the welded solid."""
     return weld(case.candidate.solid)
 
 
 @kept_until("TOP")
 @per_case
 def lining_edges(case: Case) -> Edges:
-    """Edges of the welded lining."""
+    """Return the edges of the welded lining."""
     return mesh_edges(welded_lining(case))
 
 
 @kept_until("MSH")
 @per_case
 def solid_edges(case: Case) -> Edges:
-    """Edges of the welded solid."""
+    """Return the edges of the welded solid."""
     return mesh_edges(welded_solid(case))
 
 
 def weld_offset(case: Case) -> Float[np.ndarray, "3"]:
-    """What `welded` subtracted from the lining."""
+    """Return the origin that `weld` subtracts from the lining, m."""
     return np.floor(case.candidate.lining.vertices.mean(axis=0))
 
 
 def mouth_vertices(case: Case) -> Bool[np.ndarray, " v"]:
-    """Whether each vertex of the welded lining lies in the plane of a declared mouth."""
+    """Return True for vertices of the welded lining in the plane of a declared mouth."""
     bore, vertices = case.candidate.bore, welded_lining(case).vertices + weld_offset(case)
     flush = np.zeros(len(vertices), bool)
     for end in (0, -1):
@@ -107,7 +107,7 @@ def mouth_vertices(case: Case) -> Bool[np.ndarray, " v"]:
 
 
 def face_parts(mesh: trimesh.Trimesh) -> Int[np.ndarray, " f"]:
-    """Number of the component of each face; faces that share an edge belong together."""
+    """Return the number of the component of each face; faces that share an edge belong together."""
     ends, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
     count = len(mesh.faces)
     face = mesh.edges_face
@@ -124,7 +124,7 @@ class AxisHits:
         origin: m, less `offset`, `(k, 3)`.
         direction: Unit vectors, `(k, 3)`.
         distance: m; `inf` where nothing was hit, `(k,)`.
-        cosine: Between the ray and the face's normal; negative where the face looks at the eye, `(k,)`.
+        cosine: Cosine between ray and normal of the face; negative where the face looks at the eye, `(k,)`.
     """
 
     origin: Float[np.ndarray, "k 3"]
@@ -136,7 +136,7 @@ class AxisHits:
 @kept_until("TOP")
 @per_case
 def axis_hits(case: Case) -> AxisHits:
-    """Rays in random directions from random places of the axis, into the lining alone."""
+    """Casts rays in random directions from random places of the axis, into the lining alone."""
     bore, rng = case.candidate.bore, case.rng("axis_hits")
     station = rng.uniform(bore.station[0] + 0.2, bore.station[-1] - 0.2, _AXIS_RAYS)
     middle = np.stack([np.interp(station, bore.station, axis) for axis in bore.position.T], axis=1)
@@ -151,7 +151,7 @@ def axis_hits(case: Case) -> AxisHits:
 def first_hits(
     mesh: trimesh.Trimesh, origin: Float[np.ndarray, "k 3"], direction: Float[np.ndarray, "k 3"]
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Face that each ray meets first (-1 for none) and how far away, m; exact in the plane that embree finds."""
+    """Return the face that each ray meets first (-1 for none) and its distance, m, exact in the plane of the face."""
     caster = RayMeshIntersector(mesh, scale_to_box=False)
     face = np.asarray(caster.intersects_first(origin, direction), np.int64)
     normal = mesh.face_normals[face]
@@ -172,10 +172,10 @@ Diagrams = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Grid:
-    """A box along a curve.
+    """Box along a curve.
 
     Attributes:
-        curve: Along which it lies.
+        curve: Curve of the box.
         cell: Sizes along, left and up, m.
         low: Station, left and up of its first corner, m.
         shape: Cells each way.
@@ -187,7 +187,7 @@ class Grid:
     shape: tuple[int, int, int]
 
     def occupied(self, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "a b c"]:
-        """Cells with a point in them; points outside the box are left out."""
+        """Return True for cells with a point in them; points outside the box are left out."""
         cells = np.zeros(self.shape, bool)
         for start in range(0, len(points), _POINTS_AT_ONCE):
             local = self.curve.local(points[start : start + _POINTS_AT_ONCE])
@@ -197,13 +197,13 @@ class Grid:
         return cells
 
     def on_curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The cells along the curve itself."""
+        """Return the cells along the curve itself."""
         middle = np.floor((0.0 - self.low[1:]) / self.cell[1:]).astype(int)
         along = np.arange(self.shape[0])
         return along, np.full_like(along, middle[0]), np.full_like(along, middle[1])
 
     def clearance(self, occupied: Bool[np.ndarray, "a b c"]) -> Float[np.ndarray, "a b c"]:
-        """Distance to what bounds the space about the curve, m; 0 outside it. The mouths bound nothing."""
+        """Return the distance to the bounds of the space about the curve, m; 0 outside it. The mouths are open."""
         number, _ = label(~occupied)
         _, left, up = self.on_curve()
         reach = np.ceil(_FLOOD_HALF / self.cell[1:]).astype(int)
@@ -213,7 +213,7 @@ class Grid:
 
 
 def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Grid:
-    """A grid that holds the points between the ends of a curve."""
+    """Return a grid that holds the points between the ends of a curve."""
     cell = np.asarray(_GRID_CELL) * case.tolerance
     across = np.abs(curve.local(points[::10])[:, 1:])
     half = np.percentile(across, 99.9, axis=0) + _GRID_PAD
@@ -225,7 +225,7 @@ def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Gr
 @kept_until("TOP")
 @per_case
 def surface_samples(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Points all over the candidate's visible surface."""
+    """Return points all over the candidate's visible surface, m."""
     return sample_surface(visible_surface(case), _SAMPLE_SPACING)[0]
 
 
@@ -238,7 +238,7 @@ def _truth_samples(case: Case) -> Float[np.ndarray, "k 3"]:
 
 @per_case
 def free_components(case: Case) -> tuple[int, int]:
-    """Components of the candidate's free space that its centreline runs through, and cells of the centreline free."""
+    """Count the components of free space along the candidate's centreline, and its free cells."""
     import cc3d
 
     curve = candidate_curve(case)
@@ -251,27 +251,27 @@ def free_components(case: Case) -> tuple[int, int]:
 
 @per_truth
 def truth_grid(case: Case) -> Grid:
-    """The grid of the comparison with the truth."""
+    """Return the grid of the comparison with the truth."""
     return _make_grid(case, truth_curve(case), _truth_samples(case))
 
 
 @per_hold
 def hold_grid(case: Case) -> Grid:
-    """The grid of the comparison with the held-out recording."""
+    """Return the grid of the comparison with the held-out recording."""
     assert case.hold is not None
     return _make_grid(case, hold_curve(case), case.hold.points)
 
 
 @per_truth
 def truth_diagrams(case: Case) -> Diagrams:
-    """Persistence of the true clearance."""
+    """Return the persistence of the true clearance."""
     grid = truth_grid(case)
     return persistence_diagrams(grid.clearance(grid.occupied(_truth_samples(case))))
 
 
 @per_hold
 def hold_diagrams(case: Case) -> Diagrams:
-    """Persistence of the clearance that the held-out returns leave."""
+    """Return the persistence of the clearance that the held-out returns leave."""
     assert case.hold is not None
     grid = hold_grid(case)
     return persistence_diagrams(grid.clearance(_close_gaps(grid.occupied(case.hold.points))))
@@ -279,7 +279,7 @@ def hold_diagrams(case: Case) -> Diagrams:
 
 @per_case
 def candidate_diagrams(case: Case) -> Diagrams:
-    """Persistence of the candidate's clearance, sampled as the reference is."""
+    """Return the persistence of the candidate's clearance, sampled as the reference is."""
     if case.truth is not None:
         grid = truth_grid(case)
         return persistence_diagrams(grid.clearance(grid.occupied(surface_samples(case))))
@@ -293,17 +293,17 @@ def candidate_diagrams(case: Case) -> Diagrams:
 
 
 def _close_gaps(occupied: Bool[np.ndarray, "a b c"]) -> Bool[np.ndarray, "a b c"]:
-    """Occupied cells with the gaps of one cell shut that lie between the beams of a recording."""
+    """Closes gaps of one cell, which lie between the beams of a recording."""
     return binary_closing(np.pad(occupied, 1, mode="edge"), np.ones((3, 3, 3)))[1:-1, 1:-1, 1:-1]
 
 
 def reference_diagrams(case: Case) -> Diagrams:
-    """Of the truth where there is one, else of the held-out recording."""
+    """Return the diagrams of the truth where there is one, else of the held-out recording."""
     return truth_diagrams(case) if case.truth is not None else hold_diagrams(case)
 
 
 def persistence_diagrams(clearance: Float[np.ndarray, "a b c"]) -> Diagrams:
-    """Birth and death of components, loops and voids of the space wider than a falling clearance, m, `(k, 2)` each.
+    """Return birth and death of components, loops and voids as the clearance falls, m, `(k, 2)` each.
 
     Nothing lies below 0, so that a slit between two beams, however deep the wall behind it, lasts no longer than it is
     wide. Signs are turned, so that births come before deaths: the space at level t is where minus the clearance is

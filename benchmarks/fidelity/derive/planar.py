@@ -26,13 +26,13 @@ _NOISE_DRAWS = 100_000
 
 @dataclass(frozen=True)
 class LidarPoses:
-    """Places of the environment's LiDAR.
+    """Poses of the environment's LiDAR.
 
     Attributes:
-        station: m, `(k,)`.
-        position: Tunnel frame, m, `(k, 3)`.
-        heading: rad, `(k,)`.
-        way: Unit vectors of the beams in space, in the plane that follows the grade, `(k, b, 3)`.
+        station: Station, m, `(k,)`.
+        position: Position in the tunnel frame, m, `(k, 3)`.
+        heading: Heading, rad, `(k,)`.
+        way: Directions of the beams in the plane that follows the grade, unit vectors, `(k, b, 3)`.
     """
 
     station: Float[np.ndarray, " k"]
@@ -41,19 +41,19 @@ class LidarPoses:
     way: Float[np.ndarray, "k b 3"]
 
     def ranges_in_plan(self, reach: Float[np.ndarray, " n"], most: float) -> Float[np.ndarray, "k b"]:
-        """Ranges along the beams as the plan sees them, at most `most`, m."""
+        """Return the ranges along the beams in plan, at most `most`, m."""
         flat = np.linalg.norm(self.way[..., :2], axis=2)
         return np.minimum(reach.reshape(flat.shape) * flat, most)
 
 
 def make_environment(case: Case) -> tuple[st.TunnelEnv, EnvParams]:
-    """The task on the candidate's own tunnel, read afresh."""
+    """Makes the task on the candidate's own tunnel, read afresh."""
     return st.make(TASK, tunnel=case.candidate.tunnel, lining=PLAN_LINING)
 
 
 @per_release("tunnel", "mesh")
 def lidar_poses(case: Case) -> LidarPoses:
-    """Random poses on both sides of the centreline, between ring stations, at random headings."""
+    """Return random poses on both sides of the centreline, between ring stations, at random headings."""
     rng, params = case.rng("env_lidar_vs_mesh"), lidar.LidarParams()
     station, place, left = random_stations(case, "env_lidar_vs_mesh", _POSE_COUNT)
     lateral = rng.uniform(-_LATERAL, _LATERAL, _POSE_COUNT)
@@ -70,7 +70,7 @@ def lidar_poses(case: Case) -> LidarPoses:
 
 @per_release("tunnel", "mesh")
 def lidar_ranges(case: Case) -> Float[np.ndarray, "k b"]:
-    """Noise-free beams of `subterra_jax.lidar` at the poses, m."""
+    """Return the noise-free beams of `subterra_jax.lidar` at the poses, m."""
     at, params = lidar_poses(case), lidar.LidarParams()
     tunnel = st.Tunnel.from_plan(st.load_tunnel(case.candidate.tunnel), PLAN_LINING, reach=params.range_max)
     scan = jax.jit(jax.vmap(lambda xy, heading, station: lidar.scan(tunnel, xy, heading, station, params)))
@@ -79,7 +79,7 @@ def lidar_ranges(case: Case) -> Float[np.ndarray, "k b"]:
 
 @per_release("tunnel")
 def compile_observer(case: Case) -> Callable[[LidarPoses, jax.Array], np.ndarray]:
-    """The ranges in the environment's observations at poses, given standard normal numbers for their noise, m."""
+    """Return the function from poses and standard normal numbers to the ranges in the observations, m."""
     env, params = make_environment(case)
 
     def look(xy: jax.Array, heading: jax.Array, station: jax.Array, normal: jax.Array) -> jax.Array:
@@ -93,7 +93,7 @@ def compile_observer(case: Case) -> Callable[[LidarPoses, jax.Array], np.ndarray
 
 @per_release("tunnel", "mesh")
 def observed_ranges(case: Case) -> Float[np.ndarray, "k b"]:
-    """The ranges in the environment's observations at the poses, noise set to 0, m."""
+    """Return the ranges in the environment's observations at the poses, noise set to 0, m."""
     at = lidar_poses(case)
     return compile_observer(case)(at, jnp.zeros(at.way.shape[:2]))
 
@@ -104,7 +104,7 @@ def _plan_arrays(at: LidarPoses) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 @per_release("tunnel", "mesh")
 def mesh_ranges(case: Case) -> Float[np.ndarray, "k b"]:
-    """Rays in the meshes at the poses, m."""
+    """Return the ranges of rays in the meshes at the poses, m."""
     at = lidar_poses(case)
     flat = at.way.reshape(-1, 3)
     reach = surface_caster(case).first(np.repeat(at.position, at.way.shape[1], axis=0), flat)[0]
@@ -113,7 +113,7 @@ def mesh_ranges(case: Case) -> Float[np.ndarray, "k b"]:
 
 @per_release("scene", "tunnel", "mesh")
 def mujoco_ranges(case: Case) -> Float[np.ndarray, "k b"]:
-    """Rays by `mj_multiRay` in the compiled scene at the poses, m."""
+    """Return the ranges by `mj_multiRay` in the compiled scene at the poses, m."""
     at = lidar_poses(case)
     reach = scene_ranges(scene_model(case), at.position, at.way)[0]
     return at.ranges_in_plan(reach, float(lidar.LidarParams().range_max))
@@ -121,7 +121,7 @@ def mujoco_ranges(case: Case) -> Float[np.ndarray, "k b"]:
 
 @per_release("tunnel", "mesh")
 def range_noise(case: Case) -> Float[np.ndarray, " n"]:
-    """Differences between noisy and noise-free ranges of the environment, beams with a hit well within reach, m."""
+    """Return noisy less noise-free ranges of the environment, of beams with a hit well within reach, m."""
     env, params = make_environment(case)
     at, clean = lidar_poses(case), observed_ranges(case)
     inside = (clean > 1.0) & (clean < float(params.lidar.range_max) - 1.0)
@@ -141,7 +141,7 @@ _EPISODES = 256
 
 @per_release("tunnel")
 def repeated_observations(case: Case) -> Bool[np.ndarray, " k"]:
-    """Whether each observation of an episode comes out the same in an environment made a second time."""
+    """Return True for each observation that comes out the same in an environment made a second time."""
     actions = case.rng("env_determinism").uniform(-1.0, 2.0, (_EPISODE_STEPS, 2)).astype(np.float32)
     one, other = (_observe_episode(case, actions) for _ in range(2))
     return np.array([np.array_equal(a, b) for a, b in zip(one, other, strict=True)])
@@ -154,7 +154,7 @@ def _observe_episode(case: Case, actions: np.ndarray) -> np.ndarray:
 
 @partial(jax.jit, static_argnums=0)
 def _roll_out(env: st.TunnelEnv, params: EnvParams, key: jax.Array, actions: jax.Array) -> jax.Array:
-    """Observations of an episode, the first one included."""
+    """Return the observations of an episode, the first one included."""
     begin, go = jax.random.split(key)
     first, state = env.reset(begin, params)
 
@@ -168,7 +168,7 @@ def _roll_out(env: st.TunnelEnv, params: EnvParams, key: jax.Array, actions: jax
 
 @per_release("tunnel")
 def odometry_drift(case: Case) -> float:
-    """Root mean square error of the environment's odometer after 100 m at its top speed, m."""
+    """Return the root mean square error of the odometer after 100 m at top speed, m."""
     env, params = make_environment(case)
     speed, period = float(params.vehicle.speed_max), float(params.vehicle.period)
     interval = jnp.asarray(params.vehicle.period)

@@ -35,10 +35,10 @@ class Plane:
     """Free cells of candidate and reference at the height of the sensor.
 
     Attributes:
-        lattice: Cells, one layer.
-        judged, reference: Whether each is free, `(n, m)`.
-        known: Whether the reference says anything of it, `(n, m)`.
-        height: Of the plane above the reference axis, m.
+        lattice: Lattice of one layer.
+        judged, reference: Free cells, `(n, m)`.
+        known: Cells that the reference knows, `(n, m)`.
+        height: Height of the plane above the reference axis, m.
     """
 
     lattice: Lattice
@@ -49,12 +49,12 @@ class Plane:
 
     @property
     def station(self) -> Float[np.ndarray, " n"]:
-        """Of the rows, m."""
+        """Stations of the rows, m."""
         return self.lattice.low[0] + self.lattice.edge * (np.arange(self.lattice.shape[0]) + 0.5)
 
 
 def sensor_height(case: Case) -> float:
-    """Of the held-out sensor above the reference axis, m; 1.2 m above the floor where nothing was held out."""
+    """Return the height of the held-out sensor above the reference axis, m; without one 1.2 m above the floor."""
     if case.hold is not None:
         return float(np.median(reference_curve(case).local(case.hold.origin[::100])[:, 2]))
     return float(np.median(shapely.bounds(sections(case).reference_outline)[:, 1])) + WIDTH_HEIGHT
@@ -62,7 +62,7 @@ def sensor_height(case: Case) -> float:
 
 @per_case
 def free_plane(case: Case) -> Plane:
-    """Both, in cells."""
+    """Return the free cells of candidate and reference."""
     around, height = make_lattice(case, PLANE_CELL * case.tolerance), sensor_height(case)
     low = np.array([around.low[0], around.low[1], height - around.edge / 2])
     cells = Lattice(around.curve, low, (around.shape[0], around.shape[1], 1), around.edge)
@@ -78,7 +78,7 @@ def free_plane(case: Case) -> Plane:
 
 
 def carved_cells(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
-    """Free and known cells by the held-out beams that run or end within 15 cm of the plane.
+    """Return free and known cells by the held-out beams that run or end within 15 cm of the plane.
 
     A cell in which at least two beams end is free where its middle lies nearer to the axis than their ends do.
     """
@@ -95,14 +95,14 @@ def carved_cells(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m"], B
 
 
 def unknown_share(case: Case) -> float:
-    """Share of the candidate's free cells of which held-out beams say nothing."""
+    """Return the share of the candidate's free cells that no held-out beam shows."""
     _, known = carved_cells(case, free_plane(case).lattice)
     return float(1.0 - known[free_plane(case).judged].mean())
 
 
 @per_case
 def gapless_maps(case: Case) -> tuple[Bool[np.ndarray, "r m"], Bool[np.ndarray, "r m"], Float[np.ndarray, " r"]]:
-    """Both maps without gaps, and the stations of their rows.
+    """Return both maps without gaps, and the stations of their rows.
 
     The truth has none. A held-out recording's map lies between its two walls, each the median of the returns near the
     plane in a row and its neighbours; rows in which it does not show both are left out.
@@ -118,7 +118,7 @@ def gapless_maps(case: Case) -> tuple[Bool[np.ndarray, "r m"], Bool[np.ndarray, 
 
 
 def _wall_distances(local: Float[np.ndarray, "k 3"], both: Plane) -> Float[np.ndarray, "2 n"]:
-    """Distance from the axis to the left and right wall in every row, m; NaN where fewer than 5 returns tell."""
+    """Return the distance from the axis to the left and right wall by row, m; NaN with fewer than 5 returns."""
     near = local[np.abs(local[:, 2] - both.height) < _SLAB]
     rows = len(both.station)
     row = ((near[:, 0] - both.lattice.low[0]) / both.lattice.edge).astype(int)
@@ -133,12 +133,12 @@ def _wall_distances(local: Float[np.ndarray, "k 3"], both: Plane) -> Float[np.nd
 
 
 def edge_cells(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
-    """Free cells beside cells that are not; the mouths are open."""
+    """Return the free cells beside cells that are not free; the mouths are open."""
     return free & ~binary_erosion(np.pad(free, ((1, 1), (0, 0)), mode="edge"))[1:-1]
 
 
 def cell_distances(from_cells: Bool[np.ndarray, "n m"], to: Bool[np.ndarray, "n m"], edge: float) -> np.ndarray:
-    """Distance from each of some cells to the nearest of others, m.
+    """Return the distance from each of some cells to the nearest of others, m.
 
     Raises:
         ValueError: There are none to go to.
@@ -149,7 +149,7 @@ def cell_distances(from_cells: Bool[np.ndarray, "n m"], to: Bool[np.ndarray, "n 
 
 
 def medial_axis(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
-    """Skeleton of the free space without its pockets."""
+    """Return the skeleton of the free space without its pockets."""
     padded = np.pad(free, ((20, 20), (1, 1)), mode="edge")  # a skeleton shrinks from the mouths
     padded[:, [0, -1]] = False
     return skeletonize(binary_opening(padded, np.ones((2 * _SPUR + 1,) * 2)))[20:-20, 1:-1]
@@ -157,7 +157,7 @@ def medial_axis(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
 
 @per_case
 def free_widths(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Stations, and free widths of candidate and reference in the plane, m; `inf` where a side is open.
+    """Return stations, and free widths of candidate and reference in the plane, m; `inf` where a side is open.
 
     Against the truth they are measured every 10 cm by rays, pockets with them; against a held-out recording every
     metre in the smooth sections.

@@ -26,10 +26,10 @@ Result = TypeVar("Result")
 
 
 def per_release(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[Case], Result]]:
-    """Computes a function of released files once in this process for as long as what it reads stays the same.
+    """Keeps the result of a function of released files in this process for as long as the files stay the same.
 
     Args:
-        *reads: Of `scene` (the MJCF with its meshes), `tunnel` (the planar tunnel), `mesh` (visible surface and
+        *reads: Files read: `scene` (MJCF with its meshes), `tunnel` (planar tunnel), `mesh` (visible surface and
             centreline).
     """
 
@@ -49,7 +49,7 @@ def per_release(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[C
 
 @per_case
 def scene_hash(case: Case) -> str:
-    """SHA-256 of the MJCF and of every file that it names."""
+    """Return the SHA-256 of the MJCF and of every file that it names."""
     scene = case.candidate.scene
     digest = sha256(scene.read_bytes())
     for path in asset_files(scene):
@@ -59,13 +59,13 @@ def scene_hash(case: Case) -> str:
 
 @per_case
 def tunnel_hash(case: Case) -> str:
-    """SHA-256 of the planar tunnel."""
+    """Return the SHA-256 of the planar tunnel."""
     return sha256(case.candidate.tunnel.read_bytes()).hexdigest()
 
 
 @per_case
 def mesh_hash(case: Case) -> str:
-    """SHA-256 of the visible surface and the centreline in memory."""
+    """Return the SHA-256 of the visible surface and the centreline in memory."""
     digest, judged = sha256(case.candidate.bore.position.tobytes()), case.candidate
     track = judged.track
     laid = (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh)
@@ -78,7 +78,7 @@ _HASHES = {"scene": scene_hash, "tunnel": tunnel_hash, "mesh": mesh_hash}
 
 
 def asset_files(scene: Path) -> list[Path]:
-    """Files that an MJCF names, where they lie."""
+    """Return the paths of the files that an MJCF names."""
     root = ElementTree.parse(scene).getroot()
     compiler = root.find("compiler")
     where = compiler.attrib if compiler is not None else {}
@@ -89,7 +89,7 @@ def asset_files(scene: Path) -> list[Path]:
 
 @per_release("scene")
 def scene_model(case: Case) -> mujoco.MjModel:
-    """The compiled scene.
+    """Return the compiled scene.
 
     Raises:
         ValueError: MuJoCo refuses it.
@@ -99,19 +99,19 @@ def scene_model(case: Case) -> mujoco.MjModel:
 
 @per_release("scene")
 def scene_track(case: Case) -> Track:
-    """The track that the compiled scene holds, whatever the candidate has in memory."""
+    """Return the track of the compiled scene, whatever the candidate has in memory."""
     return track_of(scene_model(case), case.candidate.manifest)
 
 
 def placed_data(model: mujoco.MjModel) -> mujoco.MjData:
-    """Data with every geom where the model's first pose puts it."""
+    """Return data with every geom at the model's first pose."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     return data
 
 
 def robot_body(model: mujoco.MjModel) -> int:
-    """Number of the first body that moves freely.
+    """Return the number of the first body that moves freely.
 
     Raises:
         ValueError: None does.
@@ -123,13 +123,13 @@ def robot_body(model: mujoco.MjModel) -> int:
 
 
 def lidar_elevation(case: Case, station: np.ndarray) -> np.ndarray:
-    """Height of the environment's LiDAR plane at stations, tunnel frame, m."""
+    """Return the height of the environment's LiDAR plane at stations, tunnel frame, m."""
     with np.load(case.candidate.tunnel) as tunnel:
         return np.interp(station, tunnel["station"], tunnel["elevation"]) + float(tunnel["lidar_height"])
 
 
 def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Random stations of the centreline, so that none lies in a ring of vertices.
+    """Draws random stations of the centreline, so that none lies in a ring of vertices.
 
     Returns:
         Stations (m, `(count,)`), positions on the centreline and unit vectors to the left, `(count, 3)`.
@@ -159,12 +159,12 @@ _RAYS_PER_EYE = 1000
 
 @dataclass(frozen=True)
 class RayPairs:
-    """Ranges of the same rays.
+    """Ranges of the same rays in scene and mesh.
 
     Attributes:
-        scene: By MuJoCo, m; `inf` for none, `(k,)`.
-        mesh: By embree in lining and track, m; `inf` for none, `(k,)`.
-        comparable: Whether what MuJoCo hit is among those meshes, `(k,)`.
+        scene: Ranges by MuJoCo, m; `inf` for none, `(k,)`.
+        mesh: Ranges by embree in lining and track, m; `inf` for none, `(k,)`.
+        comparable: True where MuJoCo hit a part of those meshes, `(k,)`.
     """
 
     scene: Float[np.ndarray, " k"]
@@ -174,7 +174,7 @@ class RayPairs:
 
 @per_release("scene", "mesh")
 def rays_from_axis(case: Case) -> RayPairs:
-    """Rays all around from random places of the centreline."""
+    """Casts rays all around from random places of the centreline."""
     _, eye, _ = random_stations(case, "mj_ray_vs_mesh_mae", _EYES)
     way = case.rng("mj_ray_leak_rate").normal(size=(_EYES, _RAYS_PER_EYE, 3))
     way /= np.linalg.norm(way, axis=2, keepdims=True)
@@ -182,7 +182,7 @@ def rays_from_axis(case: Case) -> RayPairs:
 
 
 def ray_pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r 3"]) -> RayPairs:
-    """Casts rays from eyes in both."""
+    """Casts rays from eyes in scene and mesh."""
     model = scene_model(case)
     reach, geom = scene_ranges(model, eye, way)
     flat = way.reshape(-1, 3)
@@ -195,7 +195,7 @@ def ray_pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, 
 def scene_ranges(
     model: mujoco.MjModel, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, "e r 3"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ranges by `mj_multiRay` in what is drawn, robot left out, m, `inf` for none, and the geoms hit, `(e·r,)` each."""
+    """Return ranges by `mj_multiRay` in drawn geoms without the robot, m, `inf` for none, and the geoms hit."""
     data = placed_data(model)
     try:
         robot = robot_body(model)
@@ -217,7 +217,7 @@ _SEAT_REACH = 0.20  # m between parts of the fastening of one seat
 
 
 def count_assets(case: Case) -> dict[str, int]:
-    """Assets by the names of the manifest; a fastener is a clip with its shoulder, two to a seat."""
+    """Counts assets by the names of the manifest; a fastener is a clip with its shoulder, two to a seat."""
     model = scene_model(case)
     names = [model.geom(k).name for k in range(model.ngeom)]
     pieces = fastening_pieces(scene_track(case).fastening_mesh)
@@ -237,7 +237,7 @@ class Pieces:
     """Connected pieces of a mesh.
 
     Attributes:
-        middle: m, `(k, 3)`.
+        middle: Middle of each piece, m, `(k, 3)`.
         height: Vertical extent, m, `(k,)`.
     """
 
@@ -246,7 +246,7 @@ class Pieces:
 
 
 def fastening_pieces(mesh: trimesh.Trimesh) -> Pieces:
-    """Pads and clips one by one."""
+    """Return pads and clips one by one."""
     if not len(mesh.faces):
         return Pieces(np.zeros((0, 3)), np.zeros(0))
     part = face_parts(mesh)
@@ -259,12 +259,12 @@ def fastening_pieces(mesh: trimesh.Trimesh) -> Pieces:
 
 @per_case
 def fastening_sets(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Middle of each fastening, that is, of the pieces that lie together, m."""
+    """Return the middle of each fastening, that is, of the pieces that lie together, m."""
     return cluster_points(fastening_pieces(case.candidate.track.fastening_mesh).middle, _SEAT_REACH)
 
 
 def cluster_points(middle: Float[np.ndarray, "p 3"], reach: float) -> Float[np.ndarray, "k 3"]:
-    """Mean of each group of points that hang together by steps of at most `reach`, m."""
+    """Return the mean of each group of points that hang together by steps of at most `reach`, m."""
     if not len(middle):
         return middle
     pair = cKDTree(middle).query_pairs(reach, output_type="ndarray")
@@ -281,7 +281,7 @@ _BED_ASIDE = 0.3  # m from the track's middle, where the bed is looked for
 
 @per_case
 def seat_mismatches(case: Case) -> Float[np.ndarray, " k"]:
-    """Overlaps (below 0) and gaps (above) of pad on sleeper, rail on pad, and of sleepers that hang over the bed, m.
+    """Return overlaps (below 0) and gaps of pad on sleeper, rail on pad, and sleepers over the bed, m.
 
     Raises:
         ValueError: There is no track.
@@ -309,14 +309,14 @@ def seat_mismatches(case: Case) -> Float[np.ndarray, " k"]:
 
 
 def _surface_level(caster: Caster, at: np.ndarray, up: np.ndarray, above: bool) -> Float[np.ndarray, " k"]:
-    """Height about `at` of the first surface met from far above or from far below, m; `nan` for none."""
+    """Return the height about `at` of the first surface met from far above or below, m; NaN for none."""
     sign = 1.0 if above else -1.0
     reach = caster.first(at + sign * _RAY_START * up, -sign * up)[0]
     return np.where(np.isfinite(reach), sign * (_RAY_START - reach), np.nan)
 
 
 def _hanging_gaps(case: Case, sleepers: Caster, at: np.ndarray, left: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """How far the bottom of each sleeper is above the bed, or its top below it, m."""
+    """Return the height of each sleeper's bottom above the bed, or of the bed above its top, m."""
     place = at + _BED_ASIDE * left
     bed = Caster(concatenate_meshes([case.candidate.lining, *_bed_slabs(case)]))
     # From just above the sleeper: the lining overhead is out of the way.
@@ -326,7 +326,7 @@ def _hanging_gaps(case: Case, sleepers: Caster, at: np.ndarray, left: np.ndarray
 
 
 def _bed_slabs(case: Case) -> list[trimesh.Trimesh]:
-    """Slabs of the released scene on which sleepers lie; none where there is no scene."""
+    """Return the slabs of the released scene on which sleepers lie; none where there is no scene."""
     return _scene_slabs(case) if case.candidate.scene.exists() else []
 
 

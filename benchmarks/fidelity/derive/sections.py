@@ -37,10 +37,10 @@ class Sections:
     """Sections every metre of the reference axis.
 
     Attributes:
-        station: m, `(n,)`.
-        angle: From left towards up, rad, `(m,)`.
+        station: Stations, m, `(n,)`.
+        angle: Angles from left towards up, rad, `(m,)`.
         judged: Polar radius of the lining, m; 0 in a section that is not closed, `(n, m)`.
-        reference: The same of the reference; NaN where it is not known, `(n, m)`.
+        reference: Polar radius of the reference, m; NaN where it is not known, `(n, m)`.
         judged_outline, reference_outline: Polygons in (left, up), `(n,)`.
     """
 
@@ -53,12 +53,12 @@ class Sections:
 
     @property
     def common(self) -> np.ndarray:
-        """What both outlines hold, `(n,)` polygons."""
+        """Intersection of both outlines, `(n,)` polygons."""
         return shapely.intersection(self.judged_outline, self.reference_outline)
 
 
 def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
-    """Those parts of the true surface."""
+    """Return some parts of the true surface."""
     truth = case.truth
     assert truth is not None
     kept = np.isin(truth.part, [truth.parts.index(name) for name in names if name in truth.parts])
@@ -68,18 +68,18 @@ def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
 @kept_until("F2D")
 @per_truth
 def truth_bore_caster(case: Case) -> Caster:
-    """Rays in the true bore: lining with its joints and pockets, floor; no track."""
+    """Return the caster of rays into the true bore: lining with joints and pockets, floor; no track."""
     return Caster(true_part(case, SHELL_PARTS))
 
 
 def row_stations(curve: Curve) -> Float[np.ndarray, " n"]:
-    """Stations of the rows that medians are taken over."""
+    """Return the stations of the rows that medians are taken over, m."""
     return np.arange(curve.station[0] + 0.5 * ROW_STEP, curve.station[-1], ROW_STEP)
 
 
 @per_truth
 def truth_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
-    """Smooth polar radii of the truth in 360 directions, m."""
+    """Return smooth polar radii of the truth in 360 directions, m."""
     curve = truth_curve(case)
     cast = cast_profile(truth_bore_caster(case), curve, row_stations(curve), section_angles(360))
     return running_median(cast, ROW_STEP)
@@ -87,7 +87,7 @@ def truth_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
 
 @per_hold
 def hold_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
-    """Smooth polar radii of the held-out recording by 5 degree sector, m; NaN where too few points lie."""
+    """Return smooth polar radii of the recording by 5 degree sector, m; NaN where too few points lie."""
     curve = hold_curve(case)
     local = hold_local(case)
     low = (np.abs(local[:, 1]) > TRACK_HALF) & (local[:, 2] < -1.0) & (np.abs(local[:, 1]) < 2.0)
@@ -98,7 +98,7 @@ def hold_radius_rows(case: Case) -> Float[np.ndarray, "n m"]:
 
 @per_case
 def sections(case: Case) -> Sections:
-    """Sections of both, the reference being the truth where there is one.
+    """Return the sections of lining and reference; the truth is the reference where there is one.
 
     Pockets and joints fall to the median over 1.5 m. Against a held-out recording the lining is measured in the same
     5 degree sectors as the points, and only sectors that they show count.
@@ -135,7 +135,7 @@ def sections(case: Case) -> Sections:
 def outlines(
     radius: Float[np.ndarray, "n m"], angle: Float[np.ndarray, " m"], known: Bool[np.ndarray, "n m"]
 ) -> np.ndarray:
-    """Polygons through the known radii, straight across what is not known; empty where nothing is, `(n,)`."""
+    """Return polygons through the known radii, straight across gaps; empty where nothing is known, `(n,)`."""
     points = radius[..., None] * np.column_stack([np.cos(angle), np.sin(angle)])
     kept = known & np.isfinite(radius) & (radius > 0)
     rings = [
@@ -146,19 +146,19 @@ def outlines(
 
 
 def widths(outline: np.ndarray, above: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Width of each outline at heights above the axis, m; 0 of one that is empty."""
+    """Return the width of each outline at heights above the axis, m; 0 of one that is empty."""
     lines = shapely.linestrings([[(-50.0, z), (50.0, z)] for z in above])
     return shapely.length(shapely.intersection(outline, lines))
 
 
 def heights(outline: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Height of each outline on the axis, m."""
+    """Return the height of each outline on the axis, m."""
     return shapely.length(shapely.intersection(outline, shapely.LineString([(0.0, -50.0), (0.0, 50.0)])))
 
 
 @per_case
 def dimensions(case: Case) -> dict[str, Float[np.ndarray, "2 n"]]:
-    """`width` at 1.2 m above the reference's floor, `height` and `area` of lining and reference."""
+    """Return `width` at 1.2 m above the reference's floor, `height` and `area` of lining and reference."""
     cut = sections(case)
     down = shapely.bounds(cut.reference_outline)[:, 1]
     both = (cut.judged_outline, cut.reference_outline)
@@ -171,7 +171,7 @@ def dimensions(case: Case) -> dict[str, Float[np.ndarray, "2 n"]]:
 
 @per_case
 def variation(case: Case) -> Float[np.ndarray, "2 n 2"]:
-    """Width and height of lining and reference less their straight trends along the tunnel, m."""
+    """Return width and height of lining and reference less their straight trends along the tunnel, m."""
     size = dimensions(case)
     stacked = np.stack([size["width"], size["height"]], axis=-1)
     return detrend(stacked, axis=1)
@@ -183,13 +183,13 @@ COLUMNS = 360
 
 @dataclass(frozen=True)
 class Radii:
-    """A bore seen from its axis.
+    """Bore seen from its axis.
 
     Attributes:
-        curve: The axis.
-        station: Of the rows, m, `(n,)`.
-        radius: To the first surface, m; NaN where there is none, `(n, 360)`.
-        filled: The same with holes closed by their nearest neighbour, `(n, 360)`.
+        curve: Axis of the bore.
+        station: Stations of the rows, m, `(n,)`.
+        radius: Distance to the first surface, m; NaN where there is none, `(n, 360)`.
+        filled: Radius with holes closed by their nearest neighbour, m, `(n, 360)`.
     """
 
     curve: Curve
@@ -198,11 +198,11 @@ class Radii:
     filled: Float[np.ndarray, "n m"]
 
     def depth(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-        """How far inside the bore points lie, along the ray from the axis, m; negative outside or past its mouths."""
+        """Return the depth of points inside the bore, along the ray from the axis, m; negative outside."""
         return self.depth_local(self.curve.local(points))
 
     def depth_local(self, local: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
-        """The same of points given as station, left and up about `curve`."""
+        """Return that depth of points given as station, left and up about `curve`, m."""
         row = np.clip(np.round((local[:, 0] - self.station[0]) / ROW).astype(int), 0, len(self.station) - 1)
         angle = (np.arctan2(local[:, 2], local[:, 1]) + np.pi) / (2 * np.pi) * COLUMNS
         column = np.minimum(angle.astype(int), COLUMNS - 1)
@@ -213,7 +213,7 @@ class Radii:
 
 
 def cast_radii(curve: Curve, caster: Caster) -> Radii:
-    """Rays from a curve.
+    """Casts rays from a curve.
 
     Raises:
         ValueError: Less than half of them meet anything.
@@ -238,19 +238,19 @@ def _close_holes(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
 
 @per_case
 def lining_radii(case: Case) -> Radii:
-    """The candidate's lining from its own axis."""
+    """Return the radii of the candidate's lining from its own axis."""
     return cast_radii(lining_curve(case), lining_caster(case))
 
 
 @per_truth
 def truth_radii(case: Case) -> Radii:
-    """The true bore, pockets with it and track without, from the true axis."""
+    """Return the radii of the true bore from the true axis, with pockets and without track."""
     return cast_radii(truth_curve(case), truth_bore_caster(case))
 
 
 @kept_until("NAV")
 @per_truth
 def truth_caster(case: Case) -> Caster:
-    """Rays in all of the true surface."""
+    """Return the caster of rays into all of the true surface."""
     assert case.truth is not None
     return Caster(case.truth.surface)

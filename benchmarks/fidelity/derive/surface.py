@@ -16,10 +16,10 @@ _PARALLEL = 1e-12
 
 
 class Caster:
-    """First hits of rays in a mesh: embree says which triangle, float64 says where.
+    """First hits of rays in a mesh: embree finds the triangle, float64 the place.
 
     Attributes:
-        mesh: What is hit, from both sides.
+        mesh: Mesh that rays hit, from both sides.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -31,7 +31,7 @@ class Caster:
     def first(
         self, origin: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-        """Distance to the first hit, m, and the face hit; `inf` and -1 where a ray meets nothing.
+        """Return the distance to the first hit, m, and the face hit; `inf` and -1 where a ray meets nothing.
 
         Args:
             origin: m, `(n, 3)`.
@@ -60,7 +60,7 @@ class Nearest:
     many small triangles crowd around a large one the distance may come out up to `CELL` too long, nowhere too short.
 
     Attributes:
-        mesh: What distances are measured to.
+        mesh: Mesh to measure distances to.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -71,7 +71,7 @@ class Nearest:
     def query(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-        """Distance, m, closest point, and its face.
+        """Return distance, m, closest point, and its face.
 
         Raises:
             ValueError: The mesh has no triangle.
@@ -95,17 +95,17 @@ class Nearest:
 
 
 def face_corners(mesh: trimesh.Trimesh, face: Int[np.ndarray, " k"] | slice) -> Float[np.ndarray, "k 3 3"]:
-    """Corners of some faces, m; unlike `mesh.triangles` they stay with nobody: 72 bytes a face are most of a mesh."""
+    """Return the corners of some faces, m, without the cache of `mesh.triangles`, which is most of a mesh."""
     return np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]]
 
 
 def face_normals(mesh: trimesh.Trimesh, face: Int[np.ndarray, " k"]) -> Float[np.ndarray, "k 3"]:
-    """Normals of some faces, as long as twice their areas, m²."""
+    """Return the normals of some faces, as long as twice their areas, m²."""
     return trimesh.triangles.cross(face_corners(mesh, face))
 
 
 def sample_surface(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, " k"]]:
-    """Points on every triangle, at most about `cell` apart, and the face of each; at least one a triangle."""
+    """Return points on every triangle, at most about `cell` apart and at least one each, and their faces."""
     if not len(mesh.faces):
         return np.zeros((0, 3)), np.zeros(0, np.int64)
     triangles = face_corners(mesh, slice(None))
@@ -125,7 +125,7 @@ def sample_surface(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray
 
 
 def visible_mesh(candidate: Candidate) -> trimesh.Trimesh:
-    """Everything that a sensor can see of a candidate: lining, nails, track, its bed, what else is there."""
+    """Return everything that a sensor can see of a candidate: lining, nails, track, bed, extra surfaces."""
     track = candidate.track
     laid = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
     parts = [candidate.lining, *laid, candidate.extra, candidate.nails, candidate.bed]
@@ -135,25 +135,25 @@ def visible_mesh(candidate: Candidate) -> trimesh.Trimesh:
 @kept_until("NAV")
 @per_case
 def visible_surface(case: Case) -> trimesh.Trimesh:
-    """Everything visible of the candidate, tunnel frame."""
+    """Return everything visible of the candidate, tunnel frame."""
     return visible_mesh(case.candidate)
 
 
 @kept_until("NAV")
 @per_case
 def surface_caster(case: Case) -> Caster:
-    """Rays in `surface`."""
+    """Return the caster of rays into `visible_surface`."""
     return Caster(visible_surface(case))
 
 
 @kept_until("F3D")
 @per_case
 def surface_nearest(case: Case) -> Nearest:
-    """Distances to `surface`."""
+    """Return the distances to `visible_surface`."""
     return Nearest(visible_surface(case))
 
 
 def cell_numbers(points: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, " n"]:
-    """A whole number for the cube that each point lies in."""
+    """Return a whole number for the cube that each point lies in."""
     index = np.floor(points / edge).astype(np.int64) + (1 << 20)
     return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]

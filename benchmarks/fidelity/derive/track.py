@@ -22,13 +22,13 @@ _GAUGE_STEP = 0.5  # m
 def measure_gauge(
     curve: Curve, mesh: trimesh.Trimesh, left: Float[np.ndarray, "k 3"], right: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Distance between the inner faces, every half metre, m.
+    """Measures the distance between the inner faces of the rails, every half metre, m.
 
     Args:
-        curve: Along which the rails lie.
-        mesh: Of the rails.
+        curve: Curve along which the rails lie.
+        mesh: Mesh of the rails.
         left: Points of the left rail at the height of its top, in any order.
-        right: Of the right one.
+        right: Points of the right rail.
 
     Raises:
         ValueError: There are no two rails.
@@ -55,7 +55,7 @@ def measure_gauge(
 
 
 def _sort_along(curve: Curve, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
-    """Station, left and up of points, in order of station."""
+    """Return station, left and up of points, in order of station."""
     local = curve.local(points)
     return local[np.argsort(local[:, 0], kind="stable")]
 
@@ -75,13 +75,13 @@ _RAIL_STEP = 1.0  # m between places of the rails
 
 @dataclass(frozen=True)
 class Railway:
-    """A track to be matched.
+    """Track to be matched.
 
     Attributes:
-        curve: In whose coordinates offsets are taken.
+        curve: Curve in whose coordinates offsets are taken.
         sleeper: Middle of the top of each sleeper, m, `(s, 3)`; empty where none is known.
         rail: Top of both rails, left before right, at the same stations, m, `(2, k, 3)`; `k` is 0 where none is known.
-        gauge: m; `None` where it is not measured.
+        gauge: Gauge, m; `None` where it is not measured.
         start: First station of which something is known, m.
         end: Last one, m.
     """
@@ -95,13 +95,13 @@ class Railway:
 
 
 def reference_railway(case: Case) -> Railway:
-    """The true track where there is a truth, else the one that the held-out recording shows."""
+    """Return the true track where there is a truth, else the one that the held-out recording shows."""
     return truth_railway(case) if case.truth is not None else hold_railway(case)
 
 
 @per_truth
 def truth_railway(case: Case) -> Railway:
-    """Of the generator; its gauge is measured on its surface."""
+    """Return the generator's track; its gauge is measured on its surface."""
     truth = case.truth
     assert truth is not None
     curve = truth_curve(case)
@@ -118,7 +118,7 @@ def truth_railway(case: Case) -> Railway:
 
 @per_hold
 def hold_railway(case: Case) -> Railway:
-    """From held-out returns near the floor: sleepers by their periodic height profile, rails by their heads."""
+    """Finds sleepers by their periodic height profile and rails by their heads, in held-out returns near the floor."""
     assert case.hold is not None
     curve = hold_curve(case)
     local = curve.local(case.hold.points)
@@ -139,7 +139,7 @@ def hold_railway(case: Case) -> Railway:
 
 
 def _bed_heights(local: Float[np.ndarray, "k 3"], curve: Curve) -> tuple[np.ndarray, np.ndarray]:
-    """Stations, and the height of the bed there by the low points of each window, m."""
+    """Return stations, and the height of the bed there by the low points of each window, m."""
     station = np.arange(curve.station[0], curve.station[-1], _BED_WINDOW / 2)
     local = local[np.argsort(local[:, 0])]
     edges = np.searchsorted(local[:, 0], [station - _BED_WINDOW / 2, station + _BED_WINDOW / 2])
@@ -151,7 +151,7 @@ def _bed_heights(local: Float[np.ndarray, "k 3"], curve: Curve) -> tuple[np.ndar
 
 
 def _find_heads(left: Float[np.ndarray, " k"]) -> tuple[float, float]:
-    """Offset of the track and half the distance of its rails: the pair of places where most high points lie, m."""
+    """Return the offset of the track and half the distance of its rails, m: most high points lie there."""
     count, edges = np.histogram(left, np.arange(-2.0, 2.001, 0.01))
     near = np.convolve(count, np.ones(7), mode="same")  # a head is 7 cm wide
     place = (edges[:-1] + edges[1:]) / 2
@@ -162,7 +162,7 @@ def _find_heads(left: Float[np.ndarray, " k"]) -> tuple[float, float]:
 
 
 def _find_sleepers(station: np.ndarray, height: np.ndarray) -> tuple[Float[np.ndarray, " s"], float]:
-    """Stations of the sleepers, and how far they stand out of the bed, m."""
+    """Return the stations of the sleepers, and their height over the bed, m."""
     first = station.min()
     index = ((station - first) / _PROFILE_BIN).astype(int)
     order = np.lexsort((height, index))
@@ -190,7 +190,7 @@ def _find_sleepers(station: np.ndarray, height: np.ndarray) -> tuple[Float[np.nd
 def _find_rails(
     local: np.ndarray, height: np.ndarray, offset: float, half: float, curve: Curve
 ) -> Float[np.ndarray, "2 k 3"]:
-    """Middle of the top of both heads, every metre in which both are seen, m."""
+    """Return the middle of the top of both heads, every metre in which both are seen, m."""
     station = np.arange(curve.station[0] + _RAIL_STEP / 2, curve.station[-1], _RAIL_STEP)
     found = np.full((2, len(station), 2), np.nan)
     for side, sign in enumerate((1.0, -1.0)):
@@ -209,7 +209,7 @@ def _find_rails(
 
 
 def _head_top(points: Float[np.ndarray, "k 2"]) -> tuple[float, float]:
-    """Middle and height of the upper face of a head."""
+    """Return middle and height of the upper face of a head, m."""
     upper = points[points[:, 1] > np.percentile(points[:, 1], 90) - 0.03]
     low, high = np.percentile(upper[:, 0], [5, 95])
     core = upper[np.abs(upper[:, 0] - (low + high) / 2) < 0.028]
@@ -222,33 +222,33 @@ _HALF_SPACING = 0.3  # m; half a spacing
 
 @per_case
 def candidate_sleepers(case: Case) -> Float[np.ndarray, "s 3"]:
-    """The candidate's sleepers in the stretch of which the reference knows, in its coordinates, by station, m."""
+    """Return the candidate's sleepers in the known stretch of the reference, in its coordinates, by station, m."""
     reference = reference_railway(case)
     local = _sort_along(reference.curve, case.candidate.track.sleeper)
     return local[(local[:, 0] > reference.start - _HALF_SPACING) & (local[:, 0] < reference.end + _HALF_SPACING)]
 
 
 def reference_sleepers(reference: Railway) -> Float[np.ndarray, "s 3"]:
-    """The reference's sleepers in its coordinates, by station, m."""
+    """Return the reference's sleepers in its coordinates, by station, m."""
     return _sort_along(reference.curve, reference.sleeper)
 
 
 def sleeper_spacings(sleeper: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, " d"]:
-    """Distances between neighbours, m; a step over a missing sleeper is none."""
+    """Return the distances between neighbours, m; a step over a missing sleeper is left out."""
     step = np.linalg.norm(np.diff(sleeper, axis=0), axis=1)
     return step[step < _MISSING_STEP * np.median(step)] if len(step) else step
 
 
 @per_case
 def candidate_gauge(case: Case) -> Float[np.ndarray, " k"]:
-    """Gauge along the candidate's exported rails, m."""
+    """Return the gauge along the candidate's exported rails, m."""
     track = case.candidate.track
     return measure_gauge(candidate_curve(case), track.rail_mesh, track.rail["left"], track.rail["right"])
 
 
 @per_case
 def rail_offsets(case: Case) -> Float[np.ndarray, "k 3"]:
-    """At each place of the reference's rails: its station, and how far the candidate's track lies left and above, m.
+    """Return stations of the reference's rails, and the candidate track's offset left and above, m.
 
     Raises:
         ValueError: The candidate has no two rails.
@@ -268,7 +268,7 @@ def rail_offsets(case: Case) -> Float[np.ndarray, "k 3"]:
 
 
 def sleepers_fit(case: Case, margin: float) -> Bool[np.ndarray, " s"]:
-    """Whether the top of each sleeper keeps `margin` (m) from the wall of the local section."""
+    """Return True where the top of each sleeper keeps `margin` (m) from the wall of the local section."""
     bore, track, curve = case.candidate.bore, case.candidate.track, candidate_curve(case)
     corner, at = curve.local(np.asarray(track.sleeper_mesh.vertices)), curve.local(track.sleeper)
     owner = _nearest_row(at[:, 0], corner[:, 0])
@@ -284,7 +284,7 @@ def _nearest_row(grid: Float[np.ndarray, " n"], values: Float[np.ndarray, " k"])
 
 
 def rail_gaps(case: Case) -> tuple[float, float]:
-    """Longest stretch between the first and the last sleeper that the left and the right rail leave out, m."""
+    """Return the longest gap of the left and the right rail between the first and the last sleeper, m."""
     track, curve = case.candidate.track, candidate_curve(case)
     sleeper, mesh = curve.local(track.sleeper), track.rail_mesh
     start, end = float(sleeper[:, 0].min()), float(sleeper[:, 0].max())
@@ -301,14 +301,14 @@ def rail_gaps(case: Case) -> tuple[float, float]:
 
 
 def _longest_gap(low: np.ndarray, high: np.ndarray, start: float, end: float) -> float:
-    """Longest part of start to end that no interval covers."""
+    """Return the longest part of start to end that no interval covers."""
     order = np.argsort(low)
     covered = np.maximum.accumulate(np.concatenate([[start], high[order]]))
     return float(max(np.max(np.minimum(np.append(low[order], end), end) - covered), 0.0))
 
 
 def rail_twist(case: Case, base: float) -> Float[np.ndarray, " k"]:
-    """Change of the left rail's height above the right one over `base`, every half metre, 1; empty without rails."""
+    """Return the change of the left rail's height above the right one over `base`, every half metre, 1."""
     curve, rail = candidate_curve(case), case.candidate.track.rail
     if min(len(top) for top in rail.values()) < 2:
         return np.empty(0)

@@ -50,8 +50,8 @@ def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
     """Writes each figure as PNG and SVG.
 
     Args:
-        folder: To write to.
-        sheet: What to draw from.
+        folder: Folder to write to.
+        sheet: Material of the figures.
 
     Returns:
         PNG file and caption by name, in order.

@@ -30,7 +30,7 @@ _LIMIT = 5.0  # cm
 
 
 def draw_signed_errors(sheet: Sheet) -> Drawn | None:
-    """F3: signed distance over chainage and angle."""
+    """Draws F3: signed distance over station and angle."""
     if sheet.case.hold is None:
         return None
     found, local = mesh_distances(sheet.case), returns(sheet.case).local[thinned_rows(sheet.case)]
@@ -51,7 +51,7 @@ def draw_signed_errors(sheet: Sheet) -> Drawn | None:
 
 
 def draw_errors_along(sheet: Sheet) -> Drawn | None:
-    """F4: mean and 95th percentile of the distance along the tunnel, with the null tube."""
+    """Draws F4: mean and 95th percentile of the distance along the tunnel, with the null tube."""
     if sheet.case.hold is None:
         return None
     figure, axes = plt.subplots(figsize=(12, 3.2), layout="constrained")
@@ -80,7 +80,7 @@ def draw_errors_along(sheet: Sheet) -> Drawn | None:
 
 
 def draw_error_distribution(sheet: Sheet) -> Drawn | None:
-    """F7: histogram and distribution of the distance, with the recording's own noise and the self-cast curve."""
+    """Draws F7: histogram and distribution of the distance, with the recording's own noise and the self-cast curve."""
     if sheet.case.hold is None:
         return None
     own = synthetic_points(sheet.case)[thinned_rows(sheet.case)]
@@ -114,7 +114,7 @@ _MAP_CELL = (0.10, 2.0)  # m, deg
 
 
 def draw_sections(sheet: Sheet) -> Drawn | None:
-    """F5: reconstruction, reference and held-out points at eight stations."""
+    """Draws F5: reconstruction, reference and held-out points at eight stations."""
     if sheet.case.hold is None and sheet.case.truth is None:
         return None
     found = sections(sheet.case)
@@ -152,7 +152,7 @@ def draw_sections(sheet: Sheet) -> Drawn | None:
 
 
 def draw_depth_maps(sheet: Sheet) -> Drawn | None:
-    """F6: radii along held-out beams unrolled: candidate, recording, difference; the smooth part removed."""
+    """Draws F6: radii along held-out beams unrolled: candidate, recording, difference; the smooth part removed."""
     if sheet.case.hold is None:
         return None
     real, cast = returns(sheet.case), cast_beams(sheet.case)
@@ -213,7 +213,7 @@ _PLANES = (("station, m", "left, m", 2), ("station, m", "up, m", 1), ("left, m",
 
 
 def draw_projections(sheet: Sheet) -> Drawn | None:
-    """F1: occupied voxels of the mesh as held-out beams see it, summed along each axis."""
+    """Draws F1: occupied voxels of the mesh as held-out beams see it, summed along each axis."""
     if sheet.case.hold is None:
         return None
     grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance
@@ -247,7 +247,7 @@ def draw_projections(sheet: Sheet) -> Drawn | None:
 
 
 def draw_mismatch(sheet: Sheet) -> Drawn | None:
-    """F2: agreement by voxel from the side, and unrolled."""
+    """Draws F2: agreement by voxel from the side, and unrolled."""
     if sheet.case.hold is None:
         return None
     grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance

@@ -16,12 +16,12 @@ from benchmarks.fidelity.case import Case
 
 @dataclass(frozen=True)
 class Sheet:
-    """What figures draw from.
+    """Material of all figures.
 
     Attributes:
-        case: What was judged.
-        null: The same with the null tube in its place.
-        report: See `report.content`.
+        case: Case of the reconstruction.
+        null: Case of the null tube on the same references.
+        report: Content of the report.
         controls: Rows of controls; may be empty.
         sweep: Rows of the sweep; may be empty.
     """
@@ -33,7 +33,7 @@ class Sheet:
     sweep: list[dict[str, Any]]
 
     def note(self, n: int | None = None) -> str:
-        """What every caption ends with: samples, seed, split."""
+        """Return the end of every caption: samples, seed, split."""
         hold = self.report["split"]["hold"]
         split = (
             f"held out: {hold['file']}" if hold and hold["file"] else "held-out beams" if hold else "nothing held out"
@@ -53,7 +53,7 @@ DIVERGING = LinearSegmentedColormap.from_list("error", ["#0072b2", "#f7f7f7", "#
 def bin_along(
     station: Float[np.ndarray, " n"], values: Float[np.ndarray, " n"], width: float, statistic
 ) -> tuple[Float[np.ndarray, " b"], Float[np.ndarray, " b"]]:
-    """Middle of each bin along the tunnel and a statistic of the values in it; bins of fewer than 5 are left out."""
+    """Return the middle of each bin along the tunnel and a statistic of its values; bins below 5 are left out."""
     number = np.floor(station / width).astype(int)
     order = np.argsort(number, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
@@ -66,7 +66,7 @@ _KINDS = ("common", "category", "independent", "tolerance", "seed")
 
 
 def draw_categories(sheet: Sheet) -> Drawn:
-    """F13: bars of the categories, sorted, with the null tube and the truth as candidate."""
+    """Draws F13: bars of the categories, sorted, with the null tube and the truth as candidate."""
     entries = sheet.report["categories"]
     order = sorted(entries, key=lambda c: -1.0 if entries[c]["score"] is None else entries[c]["score"])
     failed = {m["category"] for m in sheet.report["metrics"] if m["status"] == "gate failed"}
@@ -104,7 +104,7 @@ def draw_categories(sheet: Sheet) -> Drawn:
 
 
 def draw_controls(sheet: Sheet) -> Drawn | None:
-    """F14: points lost by each category under each control at its bold dose."""
+    """Draws F14: points lost by each category under each control at its bold dose."""
     rows = [row for row in sheet.controls if row["bold"]]
     if not rows:
         return None
@@ -138,7 +138,7 @@ def draw_controls(sheet: Sheet) -> Drawn | None:
 
 
 def draw_sweep(sheet: Sheet) -> Drawn | None:
-    """F15: moves of the global score under thresholds, tolerances and seeds."""
+    """Draws F15: moves of the global score under thresholds, tolerances and seeds."""
     if not sheet.sweep:
         return None
     figure, axes = plt.subplots(figsize=(8, 3.2), layout="constrained")

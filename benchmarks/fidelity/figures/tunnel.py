@@ -28,7 +28,7 @@ from benchmarks.fidelity.figures.sheet import (
 
 
 def draw_axis(sheet: Sheet) -> Drawn | None:
-    """F16: reconstruction and reference in plan and profile, and the offset along the tunnel."""
+    """Draws F16: reconstruction and reference in plan and profile, and the offset along the tunnel."""
     if sheet.case.hold is None and sheet.case.truth is None:
         return None
     ours, reference = candidate_curve(sheet.case), reference_curve(sheet.case)
@@ -58,7 +58,7 @@ def draw_axis(sheet: Sheet) -> Drawn | None:
 
 
 def draw_range_image(sheet: Sheet) -> Drawn | None:
-    """F8: ranges of one held-out scan, the same beams in the candidate, and the difference."""
+    """Draws F8: ranges of one held-out scan, the same beams in the candidate, and the difference."""
     if sheet.case.hold is None:
         return None
     real, cast = returns(sheet.case), cast_beams(sheet.case)
@@ -84,7 +84,7 @@ def draw_range_image(sheet: Sheet) -> Drawn | None:
 
 
 def draw_sensor_distributions(sheet: Sheet) -> Drawn | None:
-    """F9: ranges, incidences and ranges by elevation, real and synthetic."""
+    """Draws F9: ranges, incidences and ranges by elevation, real and synthetic."""
     if sheet.case.hold is None:
         return None
     real, synthetic = returns(sheet.case), noisy_ranges(sheet.case, "first")
@@ -131,7 +131,7 @@ def _statistics_title(first: str, a: float | None, second: str, b: float | None,
 
 
 def draw_degeneracy(sheet: Sheet) -> Drawn | None:
-    """F12: axial information along the tunnel."""
+    """Draws F12: axial information along the tunnel."""
     if sheet.case.hold is None:
         return None
     frames = (
@@ -153,7 +153,7 @@ def draw_degeneracy(sheet: Sheet) -> Drawn | None:
 
 
 def draw_free_space(sheet: Sheet) -> Drawn | None:
-    """F11: free cells of both, the way of most clearance, clearance along it."""
+    """Draws F11: free cells of both, the route of most clearance, clearance along it."""
     if sheet.case.hold is None and sheet.case.truth is None:
         return None
     found = free_plane(sheet.case)
@@ -211,7 +211,7 @@ _NAMES = ("components", "loops", "voids")
 
 
 def draw_persistence(sheet: Sheet) -> Drawn | None:
-    """F10: birth and death of components, loops and voids, reconstruction and reference."""
+    """Draws F10: birth and death of components, loops and voids, reconstruction and reference."""
     if sheet.case.hold is None and sheet.case.truth is None:
         return None
     ours, reference = candidate_diagrams(sheet.case), reference_diagrams(sheet.case)

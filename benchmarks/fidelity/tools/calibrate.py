@@ -22,12 +22,12 @@ class Survey:
     """Values of one simulated survey.
 
     Attributes:
-        name: Of its folder.
-        base: Of the reconstruction.
-        ceiling: Of the truth as candidate.
-        null: Of the null tube.
-        spoilt: By control and bold dose.
-        same: By invariance control.
+        name: Name of its folder.
+        base: Values of the reconstruction.
+        ceiling: Values of the truth as candidate.
+        null: Values of the null tube.
+        spoilt: Values by control and bold dose.
+        same: Values by invariance control.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Survey:
 
 
 def load_survey(folder: Path) -> Survey:
-    """What `controls` left in a folder.
+    """Reads the results of `controls` in a folder.
 
     Raises:
         FidelityError: Nothing, or without a truth.
@@ -61,7 +61,7 @@ def load_survey(folder: Path) -> Survey:
 
 
 def draft_table() -> dict[str, Metric]:
-    """The table without any calibration."""
+    """Return the table without any calibration."""
     with table.METRICS.open(newline="") as file:
         rows = {row["id"]: row for row in csv.DictReader(file)}
     return {
@@ -71,7 +71,7 @@ def draft_table() -> dict[str, Metric]:
 
 
 def decided_rows(rows: dict[str, Metric]) -> dict[str, tuple[Metric, str]]:
-    """Rows that `decisions.csv` changes by hand, with its reasons."""
+    """Return the rows that `decisions.csv` changes by hand, with its reasons."""
     with DECISIONS.open(newline="") as file:
         return {
             row["id"]: (replace(rows[row["id"]], role=row["role"], map=table.parse_map(row["map"])), row["reason"])
@@ -80,14 +80,14 @@ def decided_rows(rows: dict[str, Metric]) -> dict[str, tuple[Metric, str]]:
 
 
 def ideal_distance(map: Map, value: float) -> float:
-    """How far from the ideal: from 0 for D, from 1 (or the good end, if that is more) for U, from the target for B."""
+    """Return the distance from the ideal: 0 for D, 1 (or a larger good end) for U, the target for B."""
     if map.kind == "U":
         return max(max(1.0, map.good) - value, 0.0)
     return abs(value - map.target) if map.kind == "B" else abs(value)
 
 
 def map_ends(map: Map) -> tuple[float, float]:
-    """Good and bad end as distances from the ideal."""
+    """Return good and bad end as distances from the ideal."""
     if map.kind == "U":
         top = max(1.0, map.good)
         return top - map.good, top - map.bad
@@ -95,7 +95,7 @@ def map_ends(map: Map) -> tuple[float, float]:
 
 
 def move_ends(map: Map, good: float, bad: float) -> Map:
-    """The map with ends at distances from the ideal."""
+    """Return the map with ends at distances from the ideal."""
     if map.kind == "U":
         top = max(1.0, map.good)
         return replace(map, good=round(top - good, 6), bad=round(top - bad, 6))
@@ -103,12 +103,12 @@ def move_ends(map: Map, good: float, bad: float) -> Map:
 
 
 def two_digits(value: float) -> float:
-    """Two significant digits."""
+    """Rounds to two significant digits."""
     return float(f"{value:.2g}")
 
 
 def ideal_distances(row: Metric, found: list[Values]) -> list[float]:
-    """How far some candidates lie from the ideal, of those that have the metric."""
+    """Return the distances of some candidates from the ideal, of those that have the metric."""
     known = [values[row.id].value for values in found]
     return [ideal_distance(row.map, value) for value in known if value is not None] if row.map.kind in "DUB" else []
 
@@ -126,7 +126,7 @@ RESOLVED = {
 
 
 def null_rule(row: Metric, surveys: list[Survey]) -> tuple[float, float, str] | None:
-    """Good and bad end where the null tube would get half marks or more, and why; else `None`."""
+    """Return good and bad end where the null tube would get half marks or more, and the reason; else `None`."""
     sides = [ideal_distances(row, [getattr(s, name) for s in surveys]) for name in ("ceiling", "null", "base")]
     if not _is_measured(row) or not all(sides):
         return None
@@ -141,7 +141,7 @@ def null_rule(row: Metric, surveys: list[Survey]) -> tuple[float, float, str] | 
 
 
 def good_end_rule(row: Metric, surveys: list[Survey]) -> tuple[float, str] | None:
-    """Where the good end belongs and why; `None` where the truth reaches it."""
+    """Return the good end that the truth needs and the reason; `None` where the truth reaches it."""
     if not _is_measured(row):
         return None
     worst = max(ideal_distances(row, [survey.ceiling for survey in surveys]), default=0.0)
@@ -151,7 +151,7 @@ def good_end_rule(row: Metric, surveys: list[Survey]) -> tuple[float, str] | Non
 
 
 def bad_end_rule(rows: dict[str, Metric], surveys: list[Survey]) -> dict[str, tuple[float, str]]:
-    """Where bad ends belong and why, by metric, for every control that lowers a category too little."""
+    """Return bad ends and reasons, by metric, for every control that lowers a category too little."""
     found: dict[str, tuple[float, str]] = {}
     for survey in surveys:
         before = scoring.score_all(survey.base, rows=rows).categories
@@ -173,7 +173,7 @@ def _is_measured(row: Metric) -> bool:
 
 
 def _restlessness(row: Metric, surveys: list[Survey]) -> float:
-    """How far a change that changes nothing moves a metric at most."""
+    """Return the largest move of a metric under a change that changes nothing."""
     moves = [
         abs(changed - base)
         for survey in surveys
@@ -184,7 +184,7 @@ def _restlessness(row: Metric, surveys: list[Survey]) -> float:
 
 
 def _reached_distance(row: Metric, survey: Survey, spoilt: Values) -> float | None:
-    """The distance that a control reaches on a metric that plainly sees it and does not yet score 0 for it."""
+    """Return the distance that a control reaches on a metric that sees it and does not yet score 0 for it."""
     if not row.scored or len(near := ideal_distances(row, [survey.base, survey.ceiling, spoilt])) < 3:
         return None
     base, ceiling, reached = near
@@ -200,12 +200,12 @@ FEWEST_SURVEYS = 3
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """Where the evidence lies.
+    """Place of the evidence.
 
     Attributes:
         runs: Output folders of `controls` on simulated surveys with `--truth`.
         out: File to write; the table takes its thresholds from there.
-        fewest: Surveys that are enough.
+        fewest: Smallest number of surveys.
     """
 
     runs: tuple[Path, ...]
@@ -241,12 +241,12 @@ def run(config: CalibrateConfig) -> None:
 def calibrate(
     rows: dict[str, Metric], decided: dict[str, tuple[Metric, str]], surveys: list[Survey]
 ) -> dict[str, tuple[Metric, str]]:
-    """Rows with moved maps or roles and the reasons, by metric; what evidence says nothing against is not among them.
+    """Return rows with moved maps or roles and the reasons, by metric; unchanged rows are left out.
 
     Args:
-        rows: The draft.
+        rows: Rows of the draft.
         decided: Rows changed by hand; rules do not touch them again.
-        surveys: The evidence.
+        surveys: Surveys to learn from.
     """
     moved = {id: row for id, (row, _) in decided.items()}
     reasons = {id: [reason] for id, (_, reason) in decided.items()}

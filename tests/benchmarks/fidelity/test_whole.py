@@ -4,12 +4,16 @@ import csv
 import json
 import shutil
 import sys
+from contextlib import redirect_stdout
 from hashlib import sha256
+from io import StringIO
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from benchmarks.fidelity import scoring
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.files import file_hash
 from tests.benchmarks.fidelity import tubescene
@@ -58,13 +62,22 @@ def recording(scene) -> tuple[Path, Path]:
     return write_bag(folder / "held_out.bag", scans), write_tum(folder / "held_out.tum", np.array(poses))
 
 
-@pytest.mark.timeout(900)  # a minute of one core, on a machine that may be busy
-def test_a_run_scores_all_18_categories_of_a_right_tube(scene, recording, tmp_path, monkeypatch, capsys) -> None:
+@pytest.fixture(scope="module")
+def scored(scene, recording, tmp_path_factory) -> tuple[Path, tuple[object, ...], str]:
+    """Folder of a whole run, its words, and what it printed."""
+    out = tmp_path_factory.mktemp("scored")
     words = ("run", "--scene", scene, "--recording", recording[0], "--trajectory", recording[1],
-             "--beams-per-scan", 9000, "--out", tmp_path)  # fmt: skip
-    fidelity(monkeypatch, *words)
-    assert "warp" not in "".join(capsys.readouterr())
-    report = json.loads((tmp_path / "report.json").read_text())
+             "--beams-per-scan", 9000)  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        fidelity(patch, *words, "--out", out)
+    return out, words, said.getvalue()
+
+
+@pytest.mark.timeout(900)  # a minute of one core, on a machine that may be busy
+def test_a_run_scores_all_18_categories_of_a_right_tube(scored, recording) -> None:
+    folder, _, said = scored
+    assert "warp" not in said
+    report = json.loads((folder / "report.json").read_text())
     assert report["title"] == "Fidelity"
     assert len(report["metrics"]) == 199
     assert [m["id"] for m in report["metrics"] if m["status"] == "failed"] == []
@@ -73,10 +86,63 @@ def test_a_run_scores_all_18_categories_of_a_right_tube(scene, recording, tmp_pa
     assert report["global"] > 90.0, scores
     assert report["global"] > report["global_null"]
     assert report["split"]["hold"]["sha256"] == sha256(recording[0].read_bytes()).hexdigest()
-    with (tmp_path / "metrics.csv").open(newline="") as file:
-        assert sum(1 for _ in csv.DictReader(file)) == 199
+    assert report["outside"] is None
+    assert report["constants"] == scoring.constants_digest()
+    assert report["constants"] in (folder / "report.html").read_text()
+    assert report["constants"] in (folder / "report.md").read_text()
+    with (folder / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 199
+    assert "source" not in rows[0]
     for name in ("report.html", "report.md", "categories.csv", "junit.xml", "figures/F01-voxels.png"):
-        assert (tmp_path / name).stat().st_size > 0
+        assert (folder / name).stat().st_size > 0
+
+
+@pytest.mark.timeout(900)
+def test_a_metric_from_a_file_is_listed_apart_and_the_verdict_stays_the_suite_s(
+    scored, tmp_path, monkeypatch, capsys
+) -> None:
+    before, words, _ = scored
+    out = Path(shutil.copytree(before, tmp_path / "out"))  # its values are read again, not computed
+    file = tmp_path / "my_metrics.py"
+    file.write_text(_code_of_the_guide())
+    fidelity(monkeypatch, *words, "--metrics", file, "--out", out)
+    said = capsys.readouterr().out
+    assert "1 of 200 metrics from outside (my_metrics.py): global with them" in said
+    assert "the verdict is that of the suite alone" in said
+    suite, report = (json.loads((folder / "report.json").read_text()) for folder in (before, out))
+    added = report.pop("outside")
+    assert suite.pop("outside") is None
+    assert report == suite  # nothing of the suite's own report moves
+    (entry,) = added["metrics"]
+    assert (entry["id"], entry["category"], entry["source"]) == ("lin_deep_pocket_ratio", "LIN", "my_metrics.py")
+    assert entry["status"] == "scored"
+    assert entry["value"] is not None
+    assert entry["null_value"] == 0.0  # the null tube has no pockets
+    assert (added["count"], added["count_with_suite"]) == (1, 200)
+    assert added["files"] == {"my_metrics.py": sha256(file.read_bytes()).hexdigest()}
+    own = [m["score"] for m in report["metrics"] if m["category"] == "LIN" and m["score"] is not None]
+    assert added["categories"]["LIN"]["score"] == pytest.approx(np.mean([*own, entry["score"]]), abs=1e-6)
+    shift = (added["categories"]["LIN"]["score"] - report["categories"]["LIN"]["score"]) / 18
+    assert added["global"] - report["global"] == pytest.approx(shift, abs=1e-6)
+    with (out / "metrics.csv").open(newline="") as opened:
+        rows = list(csv.DictReader(opened))
+    assert [row["source"] for row in rows] == ["suite"] * 199 + ["my_metrics.py"]
+    html, markdown = ((out / name).read_text() for name in ("report.html", "report.md"))
+    assert "This verdict is the suite's own." in html
+    assert "1 from outside (200 metrics in all)" in html
+    assert "This verdict is the suite's own." in markdown
+    assert "| LIN lin_deep_pocket_ratio |" in markdown
+    cases = {(c.get("classname"), c.get("name")) for c in ElementTree.parse(out / "junit.xml").iter("testcase")}
+    assert ("fidelity.outside", "metric.lin_deep_pocket_ratio") in cases
+    assert ("fidelity", "verdict") in cases
+
+
+def _code_of_the_guide() -> str:
+    """The example of the guide, as its reader would copy it."""
+    pages = (Path(__file__).parents[3] / "docs" / "guide").glob("extend*.md")
+    blocks = [block.split("```")[0] for page in pages for block in page.read_text().split("```python\n")[1:]]
+    return next(block for block in blocks if "lin_deep_pocket_ratio" in block)
 
 
 def _mesh_gone(folder: Path) -> str:
