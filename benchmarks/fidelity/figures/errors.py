@@ -6,9 +6,9 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.patches import Patch
 
 from benchmarks.fidelity.derive.axis import reference_curve
-from benchmarks.fidelity.derive.beams import cast_beams, returns, synthetic_points
+from benchmarks.fidelity.derive.beams import Returns, cast_beams, returns, synthetic_points
 from benchmarks.fidelity.derive.clouds import real_planes
-from benchmarks.fidelity.derive.distances import VOXEL_EDGE, mesh_distances, occupied_voxels, thinned_rows
+from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, mesh_distances, occupied_voxels, thinned_rows
 from benchmarks.fidelity.derive.sections import sections
 from benchmarks.fidelity.derive.surface import surface_nearest
 from benchmarks.fidelity.figures.sheet import (
@@ -24,9 +24,16 @@ from benchmarks.fidelity.figures.sheet import (
     Drawn,
     Sheet,
     bin_along,
-)
+)  # fmt: skip  # isort: skip
 
 _LIMIT = 5.0  # cm
+_SLICE = 0.15  # m
+_MAP_CELL = (0.10, 2.0)  # m, deg
+_PLANES = (("station, m", "left, m", 2), ("station, m", "up, m", 1), ("left, m", "up, m", 0))
+_TURN = (-180, -90, 0, 90, 180)  # deg
+
+
+# Distances of held-out points to the mesh.
 
 
 def draw_signed_errors(sheet: Sheet) -> Drawn | None:
@@ -35,19 +42,15 @@ def draw_signed_errors(sheet: Sheet) -> Drawn | None:
         return None
     found, local = mesh_distances(sheet.case), returns(sheet.case).local[thinned_rows(sheet.case)]
     figure, axes = plt.subplots(figsize=(12, 3.6), layout="constrained")
-    middle = np.median(local[:, 2])
-    angle = np.degrees(np.arctan2(local[:, 2] - middle, local[:, 1]))
+    angle = np.degrees(np.arctan2(local[:, 2] - np.median(local[:, 2]), local[:, 1]))
     order = np.argsort(np.abs(found.signed))
     picture = axes.scatter(found.station[order], angle[order], c=100 * found.signed[order], s=1.5, lw=0, cmap=DIVERGING,
                            vmin=-_LIMIT, vmax=_LIMIT, rasterized=True)  # fmt: skip
     axes.set_facecolor("0.8")  # points near the mesh are nearly white
-    axes.set(xlabel="station, m", ylabel="angle from left\ntowards up, deg", yticks=(-180, -90, 0, 90, 180))
+    axes.set(xlabel="station, m", ylabel="angle from left\ntowards up, deg", yticks=_TURN)
     figure.colorbar(picture, label="signed distance, cm", extend="both")
-    return (
-        figure,
-        "Held-out points by signed distance to the mesh; positive: the point lies on the sensor's side of it."
-        + sheet.note(len(angle)),
-    )
+    caption = "Held-out points by signed distance to the mesh; positive: the point lies on the sensor's side of it."
+    return figure, caption + sheet.note(len(angle))
 
 
 def draw_errors_along(sheet: Sheet) -> Drawn | None:
@@ -55,28 +58,22 @@ def draw_errors_along(sheet: Sheet) -> Drawn | None:
     if sheet.case.hold is None:
         return None
     figure, axes = plt.subplots(figsize=(12, 3.2), layout="constrained")
-    found, null = mesh_distances(sheet.case), mesh_distances(sheet.null)
-    width = max(1.0, float(np.ptp(found.station)) / 120)
-    x, mean = bin_along(found.station, 100 * found.distance, width, np.mean)
-    _, low = bin_along(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 25))
-    _, high = bin_along(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 75))
-    _, p95 = bin_along(found.station, 100 * found.distance, width, lambda v: np.percentile(v, 95))
-    axes.fill_between(x, low, high, color=BLUE, alpha=0.2, label="middle half")
-    axes.plot(x, mean, color=BLUE, label="mean")
-    axes.plot(x, p95, color=BLUE, ls="--", lw=1, label="95th percentile")
-    axes.plot(*bin_along(null.station, 100 * null.distance, width, np.mean), color=GREY, label="null tube, mean")
-    axes.plot(
-        *bin_along(null.station, 100 * null.distance, width, lambda v: np.percentile(v, 95)),
-        color=GREY,
-        ls="--",
-        lw=1,
-        label="null tube, 95th percentile",
-    )
+    width = max(1.0, float(np.ptp(mesh_distances(sheet.case).station)) / 120)
+    for case, colour, name in ((sheet.case, BLUE, ""), (sheet.null, GREY, "null tube, ")):
+        found = mesh_distances(case)
+        station, distance = found.station, 100 * found.distance
+        middle, mean = bin_along(station, distance, width, np.mean)
+        low, high, p95 = (
+            bin_along(station, distance, width, lambda v, q=q: np.percentile(v, q))[1] for q in (25, 75, 95)
+        )
+        if not name:
+            axes.fill_between(middle, low, high, color=colour, alpha=0.2, label="middle half")
+        axes.plot(middle, mean, color=colour, label=f"{name}mean")
+        axes.plot(middle, p95, color=colour, ls="--", lw=1, label=f"{name}95th percentile")
     axes.set(xlabel="station, m", ylabel="distance to the mesh, cm", ylim=(0, None))
     axes.legend(ncol=5, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.16))
-    return figure, f"Distance of held-out points to the mesh in bins of {width:.1f} m." + sheet.note(
-        len(found.distance)
-    )
+    caption = f"Distance of held-out points to the mesh in bins of {width:.1f} m."
+    return figure, caption + sheet.note(len(mesh_distances(sheet.case).distance))
 
 
 def draw_error_distribution(sheet: Sheet) -> Drawn | None:
@@ -102,15 +99,11 @@ def draw_error_distribution(sheet: Sheet) -> Drawn | None:
     left.set(ylabel="density, 1/cm")
     right.set(ylabel="share of points", ylim=(0, 1.01))
     right.legend(frameon=False, loc="lower right")
-    return (
-        figure,
-        "Distances to the mesh. The self-cast curve is the range noise alone and says nothing of the tunnel."
-        + sheet.note(len(curves[0][1])),
-    )
+    caption = "Distances to the mesh. The self-cast curve is the range noise alone and says nothing of the tunnel."
+    return figure, caption + sheet.note(len(curves[0][1]))
 
 
-_SLICE = 0.15  # m
-_MAP_CELL = (0.10, 2.0)  # m, deg
+# Cross-sections, and the lining unrolled.
 
 
 def draw_sections(sheet: Sheet) -> Drawn | None:
@@ -127,28 +120,22 @@ def draw_sections(sheet: Sheet) -> Drawn | None:
             near = local[np.abs(local[:, 0] - found.station[row]) < _SLICE]
             count += len(near)
             axis.plot(near[:, 1], near[:, 2], ".", color=ORANGE, ms=1.2, rasterized=True)
-        wall, real = found.judged[row], found.reference[row]
-        c, s = np.cos(found.angle), np.sin(found.angle)
-        axis.fill(
-            np.append(wall * c, (real * c)[::-1]), np.append(wall * s, (real * s)[::-1]), color=RED, alpha=0.25, lw=0
-        )
-        axis.plot(real * c, real * s, color=INK, lw=0.9)
-        axis.plot(wall * c, wall * s, color=BLUE, lw=0.9)
+        across, above = np.cos(found.angle), np.sin(found.angle)
+        wall, real = ((radius * across, radius * above) for radius in (found.judged[row], found.reference[row]))
+        between = (np.append(ours, theirs[::-1]) for ours, theirs in zip(wall, real, strict=True))
+        axis.fill(*between, color=RED, alpha=0.25, lw=0)
+        axis.plot(*real, color=INK, lw=0.9)
+        axis.plot(*wall, color=BLUE, lw=0.9)
         axis.set(title=f"{found.station[row]:.1f} m", aspect="equal")
     names = (("reconstruction", BLUE), ("reference", INK), ("held-out points", ORANGE), ("between the two", RED))
-    figure.legend(
-        handles=[plt.Line2D([], [], color=c, label=n) for n, c in names],
-        loc="outside lower center",
-        ncol=4,
-        frameon=False,
-    )
+    lines = [plt.Line2D([], [], color=colour, label=name) for name, colour in names]
+    figure.legend(handles=lines, loc="outside lower center", ncol=4, frameon=False)
     for axis in axes[1]:
         axis.set(xlabel="left, m")
     for axis in axes[:, 0]:
         axis.set(ylabel="up, m")
-    return figure, "Cross-sections; shaded: over- and under-break between reconstruction and reference." + sheet.note(
-        count
-    )
+    caption = "Cross-sections; shaded: over- and under-break between reconstruction and reference."
+    return figure, caption + sheet.note(count)
 
 
 def draw_depth_maps(sheet: Sheet) -> Drawn | None:
@@ -156,37 +143,28 @@ def draw_depth_maps(sheet: Sheet) -> Drawn | None:
     if sheet.case.hold is None:
         return None
     real, cast = returns(sheet.case), cast_beams(sheet.case)
-    reach = np.where(cast.hit, cast.range, np.nan)[:, None]
-    path_scale = (reach[:, 0] - real.range)[:, None]
-    figure, axes = plt.subplots(3, 1, figsize=(12, 7), layout="constrained", sharex=True)
-    radius = np.hypot(real.local[:, 1], real.local[:, 2] - np.median(real.local[:, 2]))
-    outward = radius + path_scale[:, 0] * np.clip(_outward_share(real), 0, 1)
-    angle = np.degrees(np.arctan2(real.local[:, 2] - np.median(real.local[:, 2]), real.local[:, 1]))
+    longer = np.where(cast.hit, cast.range, np.nan) - real.range
+    height = real.local[:, 2] - np.median(real.local[:, 2])
+    radius, angle = np.hypot(real.local[:, 1], height), np.degrees(np.arctan2(height, real.local[:, 1]))
+    outward = radius + longer * np.clip(_outward_share(real), 0, 1)
     maps = [_cell_means(real.local[:, 0], angle, values) for values in (outward, radius)]
     smooth = [m - _running_median(m) for m in maps]
+    figure, axes = plt.subplots(3, 1, figsize=(12, 7), layout="constrained", sharex=True)
     pictures = (("reconstruction", smooth[0]), ("recording", smooth[1]), ("difference", maps[0] - maps[1]))
-    extent = [real.local[:, 0].min(), real.local[:, 0].max(), -180, 180]
+    extent = (real.local[:, 0].min(), real.local[:, 0].max(), -180, 180)
     for axis, (name, picture) in zip(axes, pictures, strict=True):
-        shown = axis.imshow(
-            100 * picture.T,
-            origin="lower",
-            extent=extent,
-            aspect="auto",
-            cmap=DIVERGING,
-            vmin=-12,
-            vmax=12,
-            interpolation="nearest",
-        )
+        shown = axis.imshow(100 * picture.T, origin="lower", extent=extent, aspect="auto", cmap=DIVERGING,
+                            vmin=-12, vmax=12, interpolation="nearest")  # fmt: skip
         axis.set_facecolor(GREY)
-        axis.set(ylabel=f"{name}\nangle, deg", yticks=(-180, -90, 0, 90, 180))
+        axis.set(ylabel=f"{name}\nangle, deg", yticks=_TURN)
     axes[-1].set(xlabel="station, m")
     figure.colorbar(shown, ax=axes, label="cm outward", shrink=0.5)
-    return figure, "Lining unrolled in cells of 10 cm by 2 degrees, smooth part removed; grey: not seen." + sheet.note(
-        len(radius)
-    )
+    caption = "Lining unrolled in cells of 10 cm by 2 degrees, smooth part removed; grey: not seen."
+    return figure, caption + sheet.note(len(radius))
 
 
-def _outward_share(real) -> np.ndarray:
+def _outward_share(real: Returns) -> np.ndarray:
+    """Return the part of each beam's direction that points away from the sensor's path, 1."""
     away = real.local[:, 1:] - np.array([0.0, np.median(real.local[:, 2])])
     away = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     return np.einsum("ij,ij->i", real.heading[:, 1:], away)
@@ -209,7 +187,7 @@ def _running_median(values: np.ndarray, half: int = 12) -> np.ndarray:
     return np.where(known, np.nanmedian(np.where(known[..., None], windows, 0.0), axis=-1), np.nan)
 
 
-_PLANES = (("station, m", "left, m", 2), ("station, m", "up, m", 1), ("left, m", "up, m", 0))
+# Voxels of the bore's shell, and the voxels in which cloud and mesh disagree (the paper's Fig. 3).
 
 
 def draw_projections(sheet: Sheet) -> Drawn | None:
@@ -222,28 +200,13 @@ def draw_projections(sheet: Sheet) -> Drawn | None:
     for axis, (x, y, along) in zip(axes, _PLANES, strict=True):
         total = grids.first.sum(axis=along).astype(float)
         rest = [k for k in range(3) if k != along]
-        extent = [
-            low[rest[0]],
-            low[rest[0]] + edge * total.shape[0],
-            low[rest[1]],
-            low[rest[1]] + edge * total.shape[1],
-        ]
-        aspect = "equal" if along == 0 else "auto"
-        picture = axis.imshow(
-            np.where(total > 0, total, np.nan).T,
-            origin="lower",
-            extent=extent,
-            aspect=aspect,
-            cmap="viridis",
-            norm=LogNorm(1),
-        )
+        picture = axis.imshow(np.where(total > 0, total, np.nan).T, origin="lower",
+                              extent=_extent(low[rest], edge, total.shape), cmap="viridis", norm=LogNorm(1),
+                              aspect="equal" if along == 0 else "auto")  # fmt: skip
         axis.set(xlabel=x, ylabel=y)
         figure.colorbar(picture, ax=axis, shrink=0.8, label="voxels" if along == 0 else None)
-    return (
-        figure,
-        f"Occupied voxels of {edge * 100:.0f} cm of the bore's shell, summed along the third axis."
-        + sheet.note(int(grids.first.sum())),
-    )
+    caption = f"Occupied voxels of {edge * 100:.0f} cm of the bore's shell, summed along the third axis."
+    return figure, caption + sheet.note(int(grids.first.sum()))
 
 
 def draw_mismatch(sheet: Sheet) -> Drawn | None:
@@ -253,36 +216,31 @@ def draw_mismatch(sheet: Sheet) -> Drawn | None:
     grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance
     low = _low_corner(sheet, grids)
     figure, (side, unrolled) = plt.subplots(2, 1, figsize=(12, 5.4), layout="constrained", sharex=True)
-    colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
-    picture = _agreement_classes(np.asarray(grids.real.any(axis=1)), np.asarray(grids.first.any(axis=1)))
-    extent = [low[0], low[0] + edge * picture.shape[0], low[2], low[2] + edge * picture.shape[1]]
-    side.imshow(
-        picture.T, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=0, vmax=2, interpolation="nearest"
-    )
-    side.set(ylabel="up, m")
+    flat = _agreement_classes(np.asarray(grids.real.any(axis=1)), np.asarray(grids.first.any(axis=1)))
     rolled = _unroll_classes(grids, low, edge)
-    extent = [low[0], low[0] + edge * rolled.shape[0], -180, 180]
-    unrolled.imshow(
-        rolled.T, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=0, vmax=2, interpolation="nearest"
-    )
-    unrolled.set(ylabel="angle from left\ntowards up, deg", xlabel="station, m", yticks=(-180, -90, 0, 90, 180))
+    colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
+    end = low[0] + edge * rolled.shape[0]
+    for axis, picture, extent in (
+        (side, flat, _extent(low[[0, 2]], edge, flat.shape)), (unrolled, rolled, (low[0], end, -180, 180)),
+    ):  # fmt: skip
+        axis.imshow(picture.T, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=0, vmax=2,
+                    interpolation="nearest")  # fmt: skip
+    side.set(ylabel="up, m")
+    unrolled.set(ylabel="angle from left\ntowards up, deg", xlabel="station, m", yticks=_TURN)
     names = (("both", AGREE), ("mesh only", ONLY_MESH), ("held-out cloud only", ONLY_CLOUD))
-    side.legend(
-        handles=[Patch(color=c, label=n) for n, c in names],
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1.22),
-        ncol=3,
-        frameon=False,
-    )
+    patches = [Patch(color=colour, label=name) for name, colour in names]
+    side.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncol=3, frameon=False)
     both, either = int((grids.real & grids.first).sum()), int((grids.real | grids.first).sum())
-    return (
-        figure,
-        f"Voxels of {edge * 100:.0f} cm: from the side and unrolled. {both / max(either, 1):.1%} agree."
-        + sheet.note(either),
-    )
+    caption = f"Voxels of {edge * 100:.0f} cm: from the side and unrolled. {both / max(either, 1):.1%} agree."
+    return figure, caption + sheet.note(either)
 
 
-def _low_corner(sheet: Sheet, grids) -> np.ndarray:
+def _extent(low: np.ndarray, edge: float, shape: tuple[int, ...]) -> tuple[float, float, float, float]:
+    return low[0], low[0] + edge * shape[0], low[1], low[1] + edge * shape[1]
+
+
+def _low_corner(sheet: Sheet, grids: Occupied) -> np.ndarray:
+    """Return the low corner of the grid: station, left, up, m."""
     real, edge = returns(sheet.case), VOXEL_EDGE * sheet.case.tolerance
     low = [grids.station[0] - 0.5 * edge]
     first = np.argwhere(grids.real).min(axis=0)
@@ -290,15 +248,16 @@ def _low_corner(sheet: Sheet, grids) -> np.ndarray:
 
 
 def _agreement_classes(real: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Return 0 for both, 1 for the mesh alone, 2 for the cloud alone, NaN for neither."""
     return np.where(real & mesh, 0.0, np.where(mesh, 1.0, np.where(real, 2.0, np.nan)))
 
 
-def _unroll_classes(grids, low: np.ndarray, edge: float, sectors: int = 90) -> np.ndarray:
+def _unroll_classes(grids: Occupied, low: np.ndarray, edge: float, sectors: int = 90) -> np.ndarray:
     real, mesh = (np.zeros((grids.real.shape[0], sectors), bool) for _ in range(2))
+    middle = np.median(low[1:] + edge * (np.argwhere(grids.real)[:, 1:] + 0.5), axis=0)
     for target, grid in ((real, grids.real), (mesh, grids.first)):
         index = np.argwhere(grid)
         place = low[1:] + edge * (index[:, 1:] + 0.5)
-        middle = np.median(low[1:] + edge * (np.argwhere(grids.real)[:, 1:] + 0.5), axis=0)
         angle = np.arctan2(place[:, 1] - middle[1], place[:, 0] - middle[0])
         target[index[:, 0], np.floor((angle + np.pi) / (2 * np.pi) * sectors).astype(int) % sectors] = True
     return _agreement_classes(real, mesh)

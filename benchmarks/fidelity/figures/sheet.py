@@ -130,11 +130,8 @@ def draw_controls(sheet: Sheet) -> Drawn | None:
     axes.set_yticklabels([f"{row['id']} {row['corruption'][:44]} · {row['dose']:g}" for row in rows], fontsize=7)
     axes.xaxis.tick_top()
     figure.colorbar(picture, label="points lost", shrink=0.5)
-    return (
-        figure,
-        "Points that each category loses under each control; x marks a fall that is short of what is asked."
-        + sheet.note(len(rows)),
-    )
+    caption = "Points that each category loses under each control; x marks a fall that is short of what is asked."
+    return figure, caption + sheet.note(len(rows))
 
 
 def draw_sweep(sheet: Sheet) -> Drawn | None:
@@ -148,8 +145,7 @@ def draw_sweep(sheet: Sheet) -> Drawn | None:
         axes.plot(delta, row + rng.uniform(-0.22, 0.22, len(delta)), "o", color=BLUE, ms=4, alpha=0.6)
     axes.axvline(0, color=INK, lw=0.8)
     axes.set(yticks=range(len(_KINDS)), yticklabels=_KINDS, xlabel="move of the global score, points")
-    return (
-        figure,
+    caption = (
         "Global score under thresholds ±10 % (common, by category, independent), tolerances ±10 % and other seeds."
-        + sheet.note(len(sheet.sweep)),
     )
+    return figure, caption + sheet.note(len(sheet.sweep))

@@ -50,11 +50,8 @@ def draw_axis(sheet: Sheet) -> Drawn | None:
     offset.set(xlabel="station, m", ylabel="offset from the\nreference, cm")
     plan.legend(frameon=False, ncol=3)
     offset.legend(frameon=False, ncol=2)
-    return (
-        figure,
-        "Centrelines in plan and profile, and the reconstruction's offset from the reference; no alignment."
-        + sheet.note(len(ours.station)),
-    )
+    caption = "Centrelines in plan and profile, and the reconstruction's offset from the reference; no alignment."
+    return figure, caption + sheet.note(len(ours.station))
 
 
 def draw_range_image(sheet: Sheet) -> Drawn | None:
@@ -76,11 +73,8 @@ def draw_range_image(sheet: Sheet) -> Drawn | None:
         axis.set(title=name, xlabel="azimuth from the axis, deg")
         figure.colorbar(shown, ax=axis, label="cm" if name == "difference" else "m")
     axes[0].set(ylabel="elevation, deg")
-    return (
-        figure,
-        f"Scan {int(scans[len(scans) // 2])} of the held-out recording and the same beams cast."
-        + sheet.note(int(rows.sum())),
-    )
+    caption = f"Scan {int(scans[len(scans) // 2])} of the held-out recording and the same beams cast."
+    return figure, caption + sheet.note(int(rows.sum()))
 
 
 def draw_sensor_distributions(sheet: Sheet) -> Drawn | None:
@@ -158,56 +152,28 @@ def draw_free_space(sheet: Sheet) -> Drawn | None:
         return None
     found = free_plane(sheet.case)
     lattice, edge = found.lattice, found.lattice.edge
-    classes = np.where(
-        found.judged & found.reference, 0.0, np.where(found.judged, 1.0, np.where(found.reference, 2.0, np.nan))
-    )
-    classes = np.where(found.known, classes, np.nan)
+    only = np.where(found.judged, 1.0, np.where(found.reference, 2.0, np.nan))
+    classes = np.where(found.known, np.where(found.judged & found.reference, 0.0, only), np.nan)
     left = lattice.low[1] + edge * (np.arange(lattice.shape[1]) + 0.5)
+    ends = [low + edge * n for low, shape in zip(lattice.low[:2], lattice.shape, strict=False) for n in (0, shape)]
     figure, (map_axis, room) = plt.subplots(2, 1, figsize=(12, 5), layout="constrained", sharex=True)
-    extent = [
-        lattice.low[0],
-        lattice.low[0] + edge * lattice.shape[0],
-        lattice.low[1],
-        lattice.low[1] + edge * lattice.shape[1],
-    ]
-    map_axis.imshow(
-        classes.T,
-        origin="lower",
-        extent=extent,
-        aspect="auto",
-        cmap=ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD]),
-        vmin=0,
-        vmax=2,
-        alpha=0.55,
-        interpolation="nearest",
-    )
+    colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
+    map_axis.imshow(classes.T, origin="lower", extent=ends, aspect="auto", cmap=colours, vmin=0, vmax=2, alpha=0.55,
+                    interpolation="nearest")  # fmt: skip
     for free, colour, label in ((found.reference, INK, "reference"), (found.judged, BLUE, "reconstruction")):
         clearance = distance_transform_edt(np.pad(free, ((0, 0), (1, 1))))[:, 1:-1] * edge
         map_axis.plot(found.station, left[np.argmax(clearance, axis=1)], color=colour, lw=1)
         room.plot(found.station, clearance.max(axis=1), color=colour, lw=1.2, label=label)
-    names = (
-        ("free in both", AGREE),
-        ("free in the reconstruction only", ONLY_MESH),
-        ("free in the reference only", ONLY_CLOUD),
-    )
-    map_axis.legend(
-        handles=[Patch(color=c, alpha=0.55, label=n) for n, c in names],
-        loc="upper center",
-        bbox_to_anchor=(0.5, 1.2),
-        ncol=3,
-        frameon=False,
-    )
+    names = ("free in both", "free in the reconstruction only", "free in the reference only")
+    patches = [Patch(color=colours(k), alpha=0.55, label=name) for k, name in enumerate(names)]
+    map_axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.2), ncol=3, frameon=False)
     map_axis.set(ylabel="left, m")
     room.set(xlabel="station, m", ylabel="largest clearance, m", ylim=(0, 1.1 * room.dataLim.y1))
     room.legend(frameon=False, loc="lower right")
-    return (
-        figure,
+    caption = (
         f"Free cells of {edge * 100:.0f} cm at sensor height, places of most clearance (lines), and that clearance."
-        + sheet.note(int(found.known.sum())),
     )
-
-
-_NAMES = ("components", "loops", "voids")
+    return figure, caption + sheet.note(int(found.known.sum()))
 
 
 def draw_persistence(sheet: Sheet) -> Drawn | None:
@@ -230,8 +196,5 @@ def draw_persistence(sheet: Sheet) -> Drawn | None:
         axis.set(title=name, xlabel="clearance at birth, m", aspect="equal")
     axes[0].set(ylabel="clearance at death, m")
     axes[0].legend(frameon=False)
-    return (
-        figure,
-        "Persistence of free space as the clearance asked falls; far from the diagonal is what lasts."
-        + sheet.note(count),
-    )
+    caption = "Persistence of free space as the clearance asked falls; far from the diagonal is what lasts."
+    return figure, caption + sheet.note(count)
