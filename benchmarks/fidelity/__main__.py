@@ -127,8 +127,8 @@ def run_controls(config: ControlsConfig) -> None:
     if foreign is None and (not config.only or "N33" in config.only):
         foreign = foreign_scene(opened.case, config.out)
     bench = Bench(opened.case, opened.values["base"], config.out / "controls", foreign)
-    wanted = [job for job in list_jobs(config.only, foreign is not None) if not config.bold_only or is_bold(job)]
-    outcomes = run_jobs(bench, wanted, config.processes)
+    jobs = [job for job in list_jobs(config.only, foreign is not None) if not config.bold_only or is_bold(job)]
+    outcomes = run_jobs(bench, jobs, config.processes)
     rows = judge_outcomes(outcomes, opened.judgement.base)
     content = {"schema": CONTROLS_SCHEMA, "key": case_hash(opened.case), "rows": rows}
     write_json(config.out / "controls.json", content)

@@ -81,8 +81,8 @@ def bed_of(model: mujoco.MjModel) -> trimesh.Trimesh:
     """Return the visible bed of the compiled scene: a slab above the invert of a round bore, else nothing."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    seen = [g for g in range(model.ngeom) if model.geom(g).name.startswith("bed_") and model.geom_group[g] == 0]
-    return concatenate_meshes([geom_mesh(model, data, geom) for geom in seen])
+    visible = [g for g in range(model.ngeom) if model.geom(g).name.startswith("bed_") and model.geom_group[g] == 0]
+    return concatenate_meshes([geom_mesh(model, data, geom) for geom in visible])
 
 
 def concatenate_meshes(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
@@ -222,9 +222,9 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
         raise FidelityError(f"{path}: is no manifest ({error})") from error
     if schema != MANIFEST_SCHEMA:
         raise FidelityError(f"{path}: schema is {schema}, not {MANIFEST_SCHEMA}; build the scene anew")
-    for name, wanted in manifest.get("files", {}).items():
+    for name, expected in manifest.get("files", {}).items():
         if not (folder / name).is_file():
             raise FidelityError(f"{folder / name}: is missing, though {path.name} names it")
-        if file_hash(folder / name) != wanted:
+        if file_hash(folder / name) != expected:
             raise FidelityError(f"{folder / name}: its SHA-256 is not that of {path.name}; it changed after the build")
     return manifest

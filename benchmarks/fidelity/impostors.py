@@ -118,8 +118,8 @@ def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
 
 def true_faces(truth: Truth, names: tuple[str, ...]) -> trimesh.Trimesh:
     """Return the faces of some parts of the true surface."""
-    wanted = [truth.parts.index(name) for name in names if name in truth.parts]
-    return without_faces(truth.surface, ~np.isin(truth.part, wanted))
+    numbers = [truth.parts.index(name) for name in names if name in truth.parts]
+    return without_faces(truth.surface, ~np.isin(truth.part, numbers))
 
 
 def cap_rims(lining: trimesh.Trimesh) -> trimesh.Trimesh:

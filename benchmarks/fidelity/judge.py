@@ -108,14 +108,14 @@ def compute_values(case: Case, folder: Path) -> dict[str, Values]:
 
 def make_candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
     """Return the makers of the candidates to score by name, the reconstruction first."""
-    made: dict[str, Callable[[], Candidate]] = {
+    makers: dict[str, Callable[[], Candidate]] = {
         "base": lambda: case.candidate,
         "null": lambda: null_tube(case.candidate),
         "null_bare": lambda: null_tube(case.candidate, False),
     }
     if (truth := case.truth) is not None:
-        made["ceiling"] = lambda: truth_candidate(truth, case.candidate)
-    return made
+        makers["ceiling"] = lambda: truth_candidate(truth, case.candidate)
+    return makers
 
 
 def _kept_values(path: Path, key: str) -> dict[str, Values]:

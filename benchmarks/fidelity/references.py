@@ -68,10 +68,10 @@ def beam_directions(
     )
     look, known = np.zeros_like(points, dtype=float), np.zeros(back.shape, bool)
     for ring in np.flatnonzero(back.sum(axis=1) >= _FEWEST_RETURNS):
-        seen = back[ring]
-        middle = np.angle(np.exp(1j * residual[ring, seen]).sum())
-        offset = middle + np.median(_wrap(residual[ring, seen] - middle))
-        level = np.median(elevation[ring, seen])
+        returned = back[ring]
+        middle = np.angle(np.exp(1j * residual[ring, returned]).sum())
+        offset = middle + np.median(_wrap(residual[ring, returned] - middle))
+        level = np.median(elevation[ring, returned])
         heading = sense * turn + offset
         look[ring] = np.stack(
             [np.cos(level) * np.cos(heading), np.cos(level) * np.sin(heading), np.full(columns, np.sin(level))], axis=1
@@ -95,9 +95,9 @@ def _read_fields(message: Any) -> tuple[Float[np.ndarray, "rings columns 3"], In
         f.name: (order + _FIELD_TYPES[f.datatype], f.offset) for f in message.fields if f.datatype in _FIELD_TYPES
     }
     name = next(time for time in TIME_FIELDS if time in fields)
-    wanted = ["x", "y", "z", name]
+    names = ["x", "y", "z", name]
     layout = np.dtype({
-        "names": wanted, "formats": [fields[n][0] for n in wanted], "offsets": [fields[n][1] for n in wanted],
+        "names": names, "formats": [fields[n][0] for n in names], "offsets": [fields[n][1] for n in names],
         "itemsize": message.point_step,
     })  # fmt: skip
     if message.height * message.width * message.point_step != len(message.data):

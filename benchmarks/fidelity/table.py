@@ -103,16 +103,16 @@ def parse_map(text: str) -> Map:
     Raises:
         ValueError: Any other text.
     """
-    found = _MAP.match(text.strip())
-    if found is None:
+    match = _MAP.match(text.strip())
+    if match is None:
         raise ValueError(f"{text!r} is no score map")
-    if found["kind"] == "D":
-        return Map("D", float(found["a"]), float(found["b"]))
-    if found["kind"] == "U":
-        return Map("U", float(found["b"]), float(found["a"]))
-    if found["t"]:
-        return Map("B", float(found["ba"]), float(found["bb"]), float(found["t"]))
-    return Map("P" if found["p"] else "-")
+    if match["kind"] == "D":
+        return Map("D", float(match["a"]), float(match["b"]))
+    if match["kind"] == "U":
+        return Map("U", float(match["b"]), float(match["a"]))
+    if match["t"]:
+        return Map("B", float(match["ba"]), float(match["bb"]), float(match["t"]))
+    return Map("P" if match["p"] else "-")
 
 
 def map_text(map: Map) -> str:

@@ -226,8 +226,8 @@ def lin_depth_map_ncc(case: Case) -> Value:
         return number(0.0, len(judged), "the lining is smooth")
 
     def correlation(index: np.ndarray) -> float:
-        chosen = index.astype(int)
-        return float(np.corrcoef(judged[chosen], hold[chosen])[0, 1])
+        rows = index.astype(int)
+        return float(np.corrcoef(judged[rows], hold[rows])[0, 1])
 
     return estimate(correlation, np.arange(len(judged), dtype=float), station, case.rng("lin_depth_map_ncc"))
 

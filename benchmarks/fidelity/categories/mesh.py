@@ -258,14 +258,14 @@ def tri_roughness_ratio(case: Case) -> Value:
 
     Where the wall is so smooth that its roughness drowns in the noise, the noise stays in both.
     """
-    real, made = hold_patches(case), lining_roughness(case)
+    real, roughness = hold_patches(case), lining_roughness(case)
     if real is None:
         return missing("too few held-out points on smooth wall for planes of 0.5 m")
     if real.resolved:
-        return number(np.sqrt(made / real.roughness), real.planes)
+        return number(np.sqrt(roughness / real.roughness), real.planes)
     reason = f"the wall's own roughness drowns in {1e3 * np.sqrt(real.noise):.0f} mm of noise, which stays in both"
     whole = max(real.roughness + real.noise, 1e-12)
-    return number(np.sqrt((made + real.noise) / whole), real.planes, reason)
+    return number(np.sqrt((roughness + real.noise) / whole), real.planes, reason)
 
 
 @metric("tri_face_count")
@@ -353,8 +353,8 @@ def _through_mouth(case: Case, origin: np.ndarray, direction: np.ndarray, end: i
 def lasting_difference(case: Case, id: str, dimension: int) -> Value:
     """Difference in the number of lasting loops (1) or of bodies that float in the free space (2)."""
     diagrams = candidate_diagrams(case)[dimension], reference_diagrams(case)[dimension]
-    made, real = (int(np.sum(d[:, 1] - d[:, 0] > _LASTING_PERSISTENCE * case.tolerance)) for d in diagrams)
-    return number(abs(made - real), made + real)
+    judged, real = (int(np.sum(d[:, 1] - d[:, 0] > _LASTING_PERSISTENCE * case.tolerance)) for d in diagrams)
+    return number(abs(judged - real), judged + real)
 
 
 @family("reference", {"topo_bottleneck_h0": 0, "topo_bottleneck_h1": 1})
@@ -362,8 +362,8 @@ def bottleneck_distance(case: Case, id: str, dimension: int) -> Value:
     """Bottleneck distance of the clearance diagrams of components (0) or loops (1), m."""
     import gudhi
 
-    made, real = candidate_diagrams(case)[dimension], reference_diagrams(case)[dimension]
-    return number(gudhi.bottleneck_distance(made, real), len(made) + len(real))
+    judged, real = candidate_diagrams(case)[dimension], reference_diagrams(case)[dimension]
+    return number(gudhi.bottleneck_distance(judged, real), len(judged) + len(real))
 
 
 @metric("topo_floater_area")

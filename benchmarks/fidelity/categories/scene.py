@@ -76,36 +76,36 @@ _SIGMA = 0.05  # m; the range noise that the paper gives its environment
 @metric("trk_sleeper_f1", needs="reference")
 def trk_sleeper_f1(case: Case) -> Value:
     """F1 of sleepers that are each other's nearest within 0.15 m; 0 where the truth has none but the candidate."""
-    real, made = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
-    if not len(real) and (case.truth is None or not len(made)):
+    real, judged = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
+    if not len(real) and (case.truth is None or not len(judged)):
         return missing(_NO_SLEEPERS)
-    if not len(real) or not len(made):
-        return number(0.0, len(real) + len(made))
-    gap, nearest = cKDTree(real).query(made)
-    back: Int[np.ndarray, " r"] = cKDTree(made).query(real)[1]
-    matched = (back[nearest] == np.arange(len(made))) & (gap <= _SLEEPER_MATCH * case.tolerance)
-    return number(2.0 * matched.sum() / (len(real) + len(made)), len(real) + len(made))
+    if not len(real) or not len(judged):
+        return number(0.0, len(real) + len(judged))
+    gap, nearest = cKDTree(real).query(judged)
+    back: Int[np.ndarray, " r"] = cKDTree(judged).query(real)[1]
+    matched = (back[nearest] == np.arange(len(judged))) & (gap <= _SLEEPER_MATCH * case.tolerance)
+    return number(2.0 * matched.sum() / (len(real) + len(judged)), len(real) + len(judged))
 
 
 @metric("trk_sleeper_count_rel_err", needs="reference")
 def trk_sleeper_count_rel_err(case: Case) -> Value:
     """Relative difference of counts, %."""
-    real, made = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
+    real, judged = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
     if not len(real):
         return missing(_NO_SLEEPERS)
-    return number(100.0 * abs(len(made) - len(real)) / len(real), len(real))
+    return number(100.0 * abs(len(judged) - len(real)) / len(real), len(real))
 
 
 @family("reference", {"trk_sleeper_spacing_err": np.mean, "trk_sleeper_spacing_std_err": np.std})
 def spacing_error(case: Case, id: str, statistic: Statistic) -> Value:
     """Difference of mean or standard deviation of the spacings, missing sleepers left out, m."""
     real = sleeper_spacings(reference_sleepers(reference_railway(case)))
-    made = sleeper_spacings(candidate_sleepers(case))
+    judged = sleeper_spacings(candidate_sleepers(case))
     if not len(real):
         return missing(_NO_SLEEPERS)
-    if not len(made):
+    if not len(judged):
         return number(float("nan"), 0, "the candidate has no two sleepers side by side")
-    return number(abs(float(statistic(made)) - float(statistic(real))), len(made))
+    return number(abs(float(statistic(judged)) - float(statistic(real))), len(judged))
 
 
 @metric("trk_sleeper_in_bore")
@@ -186,8 +186,8 @@ def trk_asset_penetration_max(case: Case) -> Value:
     """Largest overlap or gap of rail, pad, sleeper and bed, m."""
     if not len(case.candidate.track.sleeper):
         return missing(_NO_TRACK)
-    found = seat_mismatches(case)
-    return number(np.abs(found).max(), len(found))
+    mismatches = seat_mismatches(case)
+    return number(np.abs(mismatches).max(), len(mismatches))
 
 
 # SCN: the released scene is in MuJoCo what the meshes say.
@@ -206,8 +206,8 @@ def mj_compiles(case: Case) -> Value:
 @metric("mj_version_match")
 def mj_version_match(case: Case) -> Value:
     """The MuJoCo in use is one that this project asks for."""
-    wanted = [Requirement(text) for text in requires("subterra-jax") or ()]
-    pin = next(one for one in wanted if one.name == "mujoco" and one.marker is None)
+    requirements = [Requirement(text) for text in requires("subterra-jax") or ()]
+    pin = next(one for one in requirements if one.name == "mujoco" and one.marker is None)
     reason = (
         f"{mujoco.__version__}, asked for {pin.specifier} by the project's own metadata; "
         "not the paper's 3.8.1, because mujoco and mujoco-mjx must be of one release and MJX is tested at this one"
@@ -250,10 +250,10 @@ def mj_wall_contact_err(case: Case) -> Value:
 
     Of several sets of walls, for bodies that collide with different bits, the finest one counts.
     """
-    sets, meant = first_contacts(case)
-    errors = [float(np.median(np.abs(made - meant))) for made in sets]
+    sets, expected = first_contacts(case)
+    errors = [float(np.median(np.abs(made - expected))) for made in sets]
     reason = "by set of walls: " + ", ".join(f"{1e3 * error:.1f} mm" for error in errors)
-    return number(errors[0], len(meant), reason)
+    return number(errors[0], len(expected), reason)
 
 
 @metric("mj_ray_vs_mesh_mae")
@@ -275,10 +275,10 @@ def mj_ray_leak_rate(case: Case) -> Value:
 @metric("mj_manifest_match")
 def mj_manifest_match(case: Case) -> Value:
     """The scene holds the numbers of assets that the manifest states."""
-    found, stated = count_assets(case), case.candidate.manifest.get("count", {})
-    shared = sorted(set(found) & set(stated))
-    wrong = [f"{name}: {found[name]} of {stated[name]}" for name in shared if found[name] != stated[name]]
-    reason = "; ".join(wrong) or ", ".join(f"{found[n]} {n}" for n in shared)
+    counted, stated = count_assets(case), case.candidate.manifest.get("count", {})
+    shared = sorted(set(counted) & set(stated))
+    wrong = [f"{name}: {counted[name]} of {stated[name]}" for name in shared if counted[name] != stated[name]]
+    reason = "; ".join(wrong) or ", ".join(f"{counted[n]} {n}" for n in shared)
     return pass_or_fail(bool(shared) and not wrong, reason)
 
 
@@ -295,8 +295,11 @@ def _frame_error(case: Case) -> float:
     lining = [k for k in range(model.ngeom) if model.geom(k).name.split("_")[0] in LINING_NAMES]
     if not lining:
         raise ValueError("no geom of the scene is called lining")
-    made, meant = np.concatenate([geom_mesh(model, data, k).vertices for k in lining]), case.candidate.lining.vertices
-    return float(max(cKDTree(meant).query(made)[0].max(), cKDTree(made).query(meant)[0].max()))
+    compiled, expected = (
+        np.concatenate([geom_mesh(model, data, k).vertices for k in lining]),
+        case.candidate.lining.vertices,
+    )
+    return float(max(cKDTree(expected).query(compiled)[0].max(), cKDTree(compiled).query(expected)[0].max()))
 
 
 @metric("mj_inertia_valid")
@@ -407,8 +410,8 @@ def env_odom_drift_ratio(case: Case) -> Value:
     when = np.array([odometry.covers(t, t) for t in hold.time[first]])
     if when.sum() < 2:
         return missing("the odometry and the held-out recording have no time in common")
-    chosen = first[when]
-    way = odometry.at(hold.time[chosen])[0]
-    arcs = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (way, hold.origin[chosen])]
+    beams = first[when]
+    way = odometry.at(hold.time[beams])[0]
+    arcs = [np.linalg.norm(np.diff(path, axis=0), axis=1).sum() for path in (way, hold.origin[beams])]
     real = abs(arcs[0] - arcs[1]) * 100.0 / max(arcs[1], 1e-9)
-    return number(np.log10(planar.odometry_drift(case) / max(real, 1e-6)), len(chosen))
+    return number(np.log10(planar.odometry_drift(case) / max(real, 1e-6)), len(beams))

@@ -118,11 +118,11 @@ def beam_return_bacc(case: Case) -> Value:
     assert case.hold is not None
     if not case.hold.knows_missing:
         return missing(_NO_SILENCE)
-    found = silence(case)
-    if not found.silent.any() or found.silent.all():
+    beams = silence(case)
+    if not beams.silent.any() or beams.silent.all():
         return missing("all beams of the recording came back, or none")
-    right = [np.mean(found.expected_silent[found.silent]), np.mean(~found.expected_silent[~found.silent])]
-    return number(float(np.mean(right)), len(found.silent))
+    right = [np.mean(beams.expected_silent[beams.silent]), np.mean(~beams.expected_silent[~beams.silent])]
+    return number(float(np.mean(right)), len(beams.silent))
 
 
 @metric("selfcast_p2s_mean", needs="hold")
@@ -141,8 +141,8 @@ def selfcast_within_10cm(case: Case) -> Value:
 @metric("selfcast_noise_ratio", needs="hold")
 def selfcast_noise_ratio(case: Case) -> Value:
     """That mean over the mean that noise alone gives on a plane; 1: only noise was measured."""
-    found = self_cast(case)
-    return number(float(np.mean(found.distance) / found.noise_alone), len(found.distance), _CIRCULAR)
+    cloud = self_cast(case)
+    return number(float(np.mean(cloud.distance) / cloud.noise_alone), len(cloud.distance), _CIRCULAR)
 
 
 # DIS: the distributions that a sensor measures in the candidate against those of the recording.
@@ -217,8 +217,8 @@ def dropout_diff(case: Case) -> Value:
     assert case.hold is not None
     if not case.hold.knows_missing:
         return missing(_NO_SILENCE)
-    found = silence(case)
-    return number(abs(float(np.mean(found.silent)) - float(np.mean(found.expected_silent))), len(found.silent))
+    beams = silence(case)
+    return number(abs(float(np.mean(beams.silent)) - float(np.mean(beams.expected_silent))), len(beams.silent))
 
 
 @metric("noise_sigma_diff", needs="hold")

@@ -37,23 +37,23 @@ _MOUTH_LENGTH = 2.0  # m
 })  # fmt: skip
 def mesh_distance(case: Case, id: str, statistic: Statistic) -> Value:
     """Statistic of the distance from held-out points to the surface, m."""
-    found = mesh_distances(case)
-    return estimate(statistic, found.distance, found.station, case.rng(id), BOOTSTRAP_SAMPLES)
+    distances = mesh_distances(case)
+    return estimate(statistic, distances.distance, distances.station, case.rng(id), BOOTSTRAP_SAMPLES)
 
 
 @family("hold", {"c2m_within_5cm": 0.05, "c2m_within_10cm": 0.10})
 def mesh_precision(case: Case, id: str, within: float) -> Value:
     """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
-    found = mesh_distances(case)
-    near = (found.distance <= within * case.tolerance).astype(float)
-    return estimate(np.mean, near, found.station, case.rng(id), BOOTSTRAP_SAMPLES)
+    distances = mesh_distances(case)
+    near = (distances.distance <= within * case.tolerance).astype(float)
+    return estimate(np.mean, near, distances.station, case.rng(id), BOOTSTRAP_SAMPLES)
 
 
 @metric("c2m_signed_bias", needs="hold")
 def c2m_signed_bias(case: Case) -> Value:
     """Magnitude of the mean distance, signed by the side of the sensor, m."""
-    found, rng = mesh_distances(case), case.rng("c2m_signed_bias")
-    return estimate(lambda d: float(abs(np.mean(d))), found.signed, found.station, rng, BOOTSTRAP_SAMPLES)
+    distances, rng = mesh_distances(case), case.rng("c2m_signed_bias")
+    return estimate(lambda d: float(abs(np.mean(d))), distances.signed, distances.station, rng, BOOTSTRAP_SAMPLES)
 
 
 @metric("c2m_chainage_worst", needs="hold")
@@ -93,8 +93,8 @@ def c2m_fit_hold_gap(case: Case) -> Value:
 @metric("m3c2_signif_frac", needs="hold")
 def m3c2_signif_frac(case: Case) -> Value:
     """Share of core points whose M3C2 distance exceeds its level of detection."""
-    found = m3c2_distances(case)
-    return estimate(np.mean, found.significant, found.station, case.rng("m3c2_signif_frac"), BOOTSTRAP_SAMPLES)
+    distances = m3c2_distances(case)
+    return estimate(np.mean, distances.significant, distances.station, case.rng("m3c2_signif_frac"), BOOTSTRAP_SAMPLES)
 
 
 # CMP: completeness both ways, of the surface that held-out beams observed.
@@ -159,9 +159,9 @@ def extra_surface_frac(case: Case) -> Value:
 @metric("missing_surface_frac", needs="hold")
 def missing_surface_frac(case: Case) -> Value:
     """Share of held-out points with no surface within 20 cm."""
-    found = mesh_distances(case)
-    far = (found.distance > _FAR * case.tolerance).astype(float)
-    return estimate(np.mean, far, found.station, case.rng("missing_surface_frac"), BOOTSTRAP_SAMPLES)
+    distances = mesh_distances(case)
+    far = (distances.distance > _FAR * case.tolerance).astype(float)
+    return estimate(np.mean, far, distances.station, case.rng("missing_surface_frac"), BOOTSTRAP_SAMPLES)
 
 
 # OCC: voxels of held-out points against the candidate seen by the same beams (the paper's Fig. 3).

@@ -82,7 +82,7 @@ def scale_pockets(candidate: Candidate, factor: float, share: float, rng: np.ran
     if not len(bore.pocket):
         return candidate
     pick = rng.permutation(len(bore.pocket))[: round(share * len(bore.pocket))]
-    chosen = bore.pocket[pick]
+    pockets = bore.pocket[pick]
     line = axis_of(candidate)
 
     def deeper(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -90,9 +90,9 @@ def scale_pockets(candidate: Candidate, factor: float, share: float, rng: np.ran
         radius, angle = np.hypot(local[:, 1], local[:, 2]), np.arctan2(local[:, 2], local[:, 1])
         smooth = _smooth_radius(candidate, local[:, 0], angle)
         excess = radius - smooth
-        inside = (excess > 0.02) & _in_pockets(chosen, local[:, 0], angle, smooth)
-        wanted = smooth + np.maximum(factor * excess, _LEFT_DEPTH)
-        grown = np.where(inside, wanted / np.maximum(radius, 1e-9), 1.0)
+        inside = (excess > 0.02) & _in_pockets(pockets, local[:, 0], angle, smooth)
+        deeper_radius = smooth + np.maximum(factor * excess, _LEFT_DEPTH)
+        grown = np.where(inside, deeper_radius / np.maximum(radius, 1e-9), 1.0)
         vertices = mesh.vertices.copy()
         vertices[inside] = line.point(local * np.column_stack([np.ones(len(local)), grown, grown]))[inside]
         return trimesh.Trimesh(vertices, mesh.faces, process=False)
@@ -101,7 +101,7 @@ def scale_pockets(candidate: Candidate, factor: float, share: float, rng: np.ran
     pocket["depth"][pick] *= factor
     if not factor:
         pocket = np.delete(pocket, pick)
-    nails = candidate.nails if factor else keep_bodies(candidate.nails, _outside_pockets(chosen, line))
+    nails = candidate.nails if factor else keep_bodies(candidate.nails, _outside_pockets(pockets, line))
     return replace(
         candidate, lining=deeper(candidate.lining), solid=deeper(candidate.solid),
         bore=replace(bore, pocket=pocket), nails=nails,

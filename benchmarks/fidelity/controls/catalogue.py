@@ -140,14 +140,14 @@ def _change_candidate(change: Callable[[Candidate, float, Setting], Candidate]) 
 
 def _scale_all(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
     factor = 1.0 + dose / 100.0
-    made = scale_scene(candidate, factor, setting.scratch)
+    scene = scale_scene(candidate, factor, setting.scratch)
     moved = scale_all(candidate, factor)
-    return replace(moved, folder=made.folder, scene=made.scene, tunnel=made.tunnel)
+    return replace(moved, folder=scene.folder, scene=scene.scene, tunnel=scene.tunnel)
 
 
 def _drop_faces(candidate: Candidate, dose: float, setting: Setting) -> Candidate:
-    made = drop_scene_faces(candidate, dose / 100.0, setting.rng, setting.scratch)
-    return drop_faces(made, dose / 100.0, setting.rng)
+    holed = drop_scene_faces(candidate, dose / 100.0, setting.rng, setting.scratch)
+    return drop_faces(holed, dose / 100.0, setting.rng)
 
 
 def _spoil_poses(case: Case, dose: float, setting: Setting) -> Case:
@@ -265,7 +265,7 @@ def move_together(case: Case, rng: np.random.Generator) -> Case:
 
     bore, track = candidate.bore, candidate.track
     turned = {name: getattr(bore, name) @ turn.T for name in ("tangent", "lateral", "up")}
-    made = replace(
+    moved = replace(
         candidate, lining=mesh(candidate.lining), solid=mesh(candidate.solid), extra=mesh(candidate.extra),
         nails=mesh(candidate.nails), bed=mesh(candidate.bed),
         bore=replace(bore, position=move(bore.position), **turned),
@@ -276,7 +276,7 @@ def move_together(case: Case, rng: np.random.Generator) -> Case:
             rail={side: move(points) if len(points) else points for side, points in track.rail.items()},
         ),
     )  # fmt: skip
-    return replace(move_references(case, turn, SHIFT), candidate=made)
+    return replace(move_references(case, turn, SHIFT), candidate=moved)
 
 
 def reverse_axis(case: Case, rng: np.random.Generator) -> Case:

@@ -118,8 +118,8 @@ def coarsen(candidate: Candidate, share: float) -> Candidate:
         work.meshing_decimation_quadric_edge_collapse(
             targetfacenum=int((1.0 - share) * len(mesh.faces)), preserveboundary=True, preservenormal=True
         )
-        made = work.current_mesh()
-        return trimesh.Trimesh(made.vertex_matrix() + origin, made.face_matrix(), process=False)
+        mesh_made = work.current_mesh()
+        return trimesh.Trimesh(mesh_made.vertex_matrix() + origin, mesh_made.face_matrix(), process=False)
 
     return change_both(candidate, smooth)
 
@@ -153,7 +153,7 @@ def edit_scene(candidate: Candidate, change: Callable[[mujoco.MjSpec], None]) ->
 def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate:
     """Scales everything that does not move about the middle of the axis, and the planar tunnel with it."""
     middle = candidate.bore.position.mean(axis=0)
-    made = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
+    copy = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
 
     def change(spec: mujoco.MjSpec) -> None:
         for mesh in spec.meshes:
@@ -164,7 +164,7 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
         for body in spec.worldbody.bodies:
             body.pos = middle + factor * (np.asarray(body.pos) - middle)
 
-    edit_scene(made, change)
+    edit_scene(copy, change)
     with np.load(candidate.tunnel) as data:
         arrays = {name: data[name] for name in data.files}
     for name, value in arrays.items():
@@ -176,23 +176,23 @@ def scale_scene(candidate: Candidate, factor: float, scratch: Path) -> Candidate
             arrays[name] = middle[2] + factor * (value - middle[2])
         elif name == "lidar_height":
             arrays[name] = np.asarray(value * factor)
-    np.savez(made.tunnel, **arrays)
-    return made
+    np.savez(copy.tunnel, **arrays)
+    return copy
 
 
 def drop_scene_faces(candidate: Candidate, share: float, rng: np.random.Generator, scratch: Path) -> Candidate:
     """Removes random faces of the drawn lining in the compiled scene."""
-    made = copy_scene(candidate, scratch, lambda file: file.name.startswith("lining_"))
+    copy = copy_scene(candidate, scratch, lambda file: file.name.startswith("lining_"))
     for file in sorted((candidate.folder / "meshes").glob("lining_*.obj")):
         mesh = trimesh.load_mesh(file, process=False)
-        without_faces(mesh, rng.random(len(mesh.faces)) < share).export(made.folder / "meshes" / file.name)
-    return made
+        without_faces(mesh, rng.random(len(mesh.faces)) < share).export(copy.folder / "meshes" / file.name)
+    return copy
 
 
 def collide_whole_mesh(candidate: Candidate, scratch: Path) -> Candidate:
     """Makes the bore collide as meshes instead of panels: MuJoCo takes the convex hull of each."""
-    made = copy_scene(candidate, scratch)
-    candidate.lining.export(made.folder / "meshes" / "whole_bore.obj")
+    copy = copy_scene(candidate, scratch)
+    candidate.lining.export(copy.folder / "meshes" / "whole_bore.obj")
 
     def change(spec: mujoco.MjSpec) -> None:
         for geom in list(spec.worldbody.geoms):
@@ -209,12 +209,12 @@ def collide_whole_mesh(candidate: Candidate, scratch: Path) -> Candidate:
             group=3,
         )
 
-    return edit_scene(made, change)
+    return edit_scene(copy, change)
 
 
 def move_panels(candidate: Candidate, distance: float, scratch: Path) -> Candidate:
     """Moves the collision panels of the walls outwards, m."""
-    made = copy_scene(candidate, scratch)
+    copy = copy_scene(candidate, scratch)
     axis = candidate.bore.position
 
     def change(spec: mujoco.MjSpec) -> None:
@@ -227,12 +227,12 @@ def move_panels(candidate: Candidate, distance: float, scratch: Path) -> Candida
                 normal = sides[np.argmax(np.abs(sides @ away))]
                 geom.pos = np.asarray(geom.pos) + distance * np.sign(normal @ away) * normal
 
-    return edit_scene(made, change)
+    return edit_scene(copy, change)
 
 
 def widen_plan(candidate: Candidate, wider: float, scratch: Path) -> Candidate:
     """Moves the walls of the environment's planar tunnel apart, so that it is not the mesh's, m."""
-    made = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
+    copy = copy_scene(candidate, scratch, lambda file: file.name == "tunnel.npz")
     with np.load(candidate.tunnel) as data:
         arrays = {name: data[name] for name in data.files}
     normal = np.column_stack([-arrays["tangent"][:, 1], arrays["tangent"][:, 0]])
@@ -242,8 +242,8 @@ def widen_plan(candidate: Candidate, wider: float, scratch: Path) -> Candidate:
             away = np.stack([np.interp(at, arrays["station"], column) for column in normal.T], axis=1)
             arrays[f"{side}_{lining}"] = arrays[f"{side}_{lining}"] + sign * wider * away
     arrays["half_width"] = arrays["half_width"] + 0.5 * wider
-    np.savez(made.tunnel, **arrays)
-    return made
+    np.savez(copy.tunnel, **arrays)
+    return copy
 
 
 def turn_beams(case: Case, angle: float) -> Case:

@@ -113,19 +113,21 @@ class Bench:
 
     def kept(self) -> list[Outcome]:
         """Return the kept outcomes of this base, in the order of `list_jobs`."""
-        found = (read_outcome(self.folder, job, self.key(job)) for job in list_jobs(foreign=self.foreign is not None))
-        return [outcome for outcome in found if outcome is not None]
+        outcomes = (
+            read_outcome(self.folder, job, self.key(job)) for job in list_jobs(foreign=self.foreign is not None)
+        )
+        return [outcome for outcome in outcomes if outcome is not None]
 
 
 def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
     """Return every control at every dose, then the invariances; N33 only where a foreign tunnel is at hand."""
-    wanted = [
+    jobs = [
         Job(control.id, dose)
         for control in load_controls().values()
         for dose in control.doses
         if foreign or control.id != "N33"
     ] + [Job(id, 0.0) for id in INVARIANCES]
-    return [job for job in wanted if not only or job.control in only]
+    return [job for job in jobs if not only or job.control in only]
 
 
 def is_bold(job: Job) -> bool:
@@ -133,25 +135,25 @@ def is_bold(job: Job) -> bool:
     return job.control in INVARIANCES or job.dose in load_controls()[job.control].bold
 
 
-def run_jobs(bench: Bench, wanted: list[Job], processes: int = 2) -> list[Outcome]:
+def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]:
     """Does the jobs, in their order; those kept from an earlier run of the same base are read."""
     done: dict[Job, Outcome] = {}
     todo = []
-    for job in wanted:
+    for job in jobs:
         known = read_outcome(bench.folder, job, bench.key(job))
         if known is None:
             todo.append(job)
         else:
             done[job] = known
     with progress_bar() as progress:
-        stage = progress.start("controls", len(wanted))
+        stage = progress.start("controls", len(jobs))
         if done:
             stage.resume(len(done))
         for outcome in _compute_outcomes(bench, todo, processes):
             done[outcome.job] = outcome
             write_outcome(bench.folder, outcome, bench.key(outcome.job))
             stage.advance()
-    return [done[job] for job in wanted]
+    return [done[job] for job in jobs]
 
 
 def run_control(bench: Bench, job: Job) -> Outcome:

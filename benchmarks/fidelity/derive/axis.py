@@ -82,10 +82,10 @@ def hold_curve(case: Case) -> Curve:
         low, high = np.percentile(local[:, 0], [0.5, 99.5])
         station = np.arange(low, high, SLICE)
         profile = running_median(point_profile(local, station, floor), SLICE)
-        seen = np.isfinite(profile).mean(axis=1) > _KNOWN_SHARE
-        if seen.sum() < 4:
+        complete = np.isfinite(profile).mean(axis=1) > _KNOWN_SHARE
+        if complete.sum() < 4:
             raise ValueError("the held-out recording shows too little of the section")
-        keep = slice(np.flatnonzero(seen)[0], np.flatnonzero(seen)[-1] + 1)
+        keep = slice(np.flatnonzero(complete)[0], np.flatnonzero(complete)[-1] + 1)
         offset = smooth_along(section_middle(profile[keep], angle), SLICE, _AXIS_SMOOTH)
         floor = float(np.nanmedian(crown_and_floor(profile[keep], angle)[1])) - float(np.median(offset[:, 1]))
         curve = curve_through(curve.point(np.column_stack([station[keep], offset])))

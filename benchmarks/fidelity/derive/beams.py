@@ -269,11 +269,11 @@ def scan_descriptors(case: Case) -> tuple[Float[np.ndarray, "s d"], Float[np.nda
     A descriptor holds quantiles of the ranges and their median in sectors of azimuth and elevation, in log metres; a
     sector without beams in either holds the scan's median.
     """
-    real, seen = returns(case), beam_directions(case)
+    real, angles = returns(case), beam_directions(case)
     reach = noisy_ranges(case, "first")
     both = np.isfinite(reach)
     sector = np.zeros(len(reach), int)
-    for angle, count in zip((seen.azimuth, seen.elevation), _DIRECTION_SECTORS, strict=True):
+    for angle, count in zip((angles.azimuth, angles.elevation), _DIRECTION_SECTORS, strict=True):
         edges = np.quantile(angle, np.linspace(0.0, 1.0, count + 1)[1:-1])
         sector = sector * count + np.searchsorted(edges, angle)
     rows: list[tuple[np.ndarray, np.ndarray]] = []

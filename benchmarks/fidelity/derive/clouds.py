@@ -87,9 +87,9 @@ def synthetic_planes(case: Case) -> Planes:
     cloud, tree = synthetic_tree(case)
     query = synthetic_points(case)[plane_rows(case)]
     there = np.isfinite(query[:, 0])
-    found = fit_planes(cloud, tree, query[there])
-    full = [np.full((len(query), *column.shape[1:]), np.nan) for column in vars(found).values()]
-    for column, values in zip(full, vars(found).values(), strict=True):
+    planes = fit_planes(cloud, tree, query[there])
+    full = [np.full((len(query), *column.shape[1:]), np.nan) for column in vars(planes).values()]
+    for column, values in zip(full, vars(planes).values(), strict=True):
         column[there] = values
     return Planes(*full)
 

@@ -182,23 +182,23 @@ def stepper(case: Case) -> Stepper:
 @per_release("scene")
 def step_is_finite(case: Case) -> bool:
     """Return True where one step from the first pose gives finite numbers."""
-    made = stepper(case)
-    after = made.step(made.data)
+    compiled = stepper(case)
+    after = compiled.step(compiled.data)
     return bool(np.isfinite(np.asarray(after.qpos)).all() and np.isfinite(np.asarray(after.qvel)).all())
 
 
 @per_release("scene", "tunnel", "mesh")
 def contact_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return the deepest contact of the robot at random places, by MuJoCo and by MJX, m; 0 without contact."""
-    made = stepper(case)
-    cpu = mujoco.MjData(made.model)
+    compiled = stepper(case)
+    cpu = mujoco.MjData(compiled.model)
     ours, theirs = np.zeros(_PLACEMENTS), np.zeros(_PLACEMENTS)
-    still = np.zeros(made.model.nv)
-    for k, qpos in enumerate(_poses_by_wall(case, made.model)):
+    still = np.zeros(compiled.model.nv)
+    for k, qpos in enumerate(_poses_by_wall(case, compiled.model)):
         cpu.qpos[:], cpu.qvel[:] = qpos, 0.0
-        mujoco.mj_forward(made.model, cpu)
+        mujoco.mj_forward(compiled.model, cpu)
         # A step reports the contacts of the pose that it starts from.
-        device = mjx.get_data(made.model, made.step(made.at(qpos, still)))
+        device = mjx.get_data(compiled.model, compiled.step(compiled.at(qpos, still)))
         ours[k], theirs[k] = (min(float(np.min(data.contact.dist, initial=0.0)), 0.0) for data in (cpu, device))
     return ours, theirs
 
@@ -234,17 +234,17 @@ def _robot_radius(model: mujoco.MjModel) -> float:
 @per_release("scene")
 def path_divergence(case: Case) -> Float[np.ndarray, " k"]:
     """Return the distance between the robot's positions by MuJoCo and by MJX after each of 100 steps, m."""
-    made = stepper(case)
-    body = robot_body(made.model)
-    joint = made.model.body_jntadr[body]
-    place, speed = int(made.model.jnt_qposadr[joint]), int(made.model.jnt_dofadr[joint])
-    cpu = placed_data(made.model)
+    compiled = stepper(case)
+    body = robot_body(compiled.model)
+    joint = compiled.model.body_jntadr[body]
+    place, speed = int(compiled.model.jnt_qposadr[joint]), int(compiled.model.jnt_dofadr[joint])
+    cpu = placed_data(compiled.model)
     cpu.qvel[speed : speed + 3] = _PUSH_SPEEDS[0] * cpu.xmat[body].reshape(3, 3)[:, 0]
     cpu.qvel[speed + 5] = _PUSH_SPEEDS[1]
-    device = made.at(cpu.qpos.copy(), cpu.qvel.copy())
+    device = compiled.at(cpu.qpos.copy(), cpu.qvel.copy())
     gap = np.zeros(_DIVERGENCE_STEPS)
     for k in range(_DIVERGENCE_STEPS):
-        mujoco.mj_step(made.model, cpu)
-        device = made.step(device)
+        mujoco.mj_step(compiled.model, cpu)
+        device = compiled.step(device)
         gap[k] = np.linalg.norm(cpu.qpos[place : place + 3] - np.asarray(device.qpos)[place : place + 3])
     return gap

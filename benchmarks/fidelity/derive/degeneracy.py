@@ -160,9 +160,9 @@ def _icp_errors(case: Case, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
         if min(len(before), len(here)) < 200:
             continue
         middle = np.round(here.mean(axis=0))
-        found = small_gicp.align(before - middle, here - middle, downsampling_resolution=0.25, num_threads=1)
+        motion = small_gicp.align(before - middle, here - middle, downsampling_resolution=0.25, num_threads=1)
         axis = sensor_path(case).frames(sensor_path(case).local(here.mean(axis=0)[None])[:, 0])[1][0]
-        errors.append(abs(float(found.T_target_source[:3, 3] @ axis)))
+        errors.append(abs(float(motion.T_target_source[:3, 3] @ axis)))
     return np.asarray(errors)
 
 

@@ -106,8 +106,8 @@ def cloud_distances(case: Case) -> CloudDistances:
     smallest tolerance, so that a return that is there is within reach of it.
     """
     cast = cast_beams(case)
-    seen = cast.cosine > STEEPEST
-    hits = points_at(case, cast.range)[seen]
+    observed = cast.cosine > STEEPEST
+    hits = points_at(case, cast.range)[observed]
     samples, _ = sample_surface(visible_surface(case), _MESH_CELL)
     samples = samples[:: max(len(samples) // (4 * MOST_POINTS), 1)]
     if not len(hits) or not len(samples):
@@ -135,9 +135,9 @@ def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
     the surface is centimetres along the beam. A beam passes through if its return lies over 15 cm behind the surface.
     """
     cast = cast_beams(case)
-    seen = cast.cosine > STEEPEST
-    _, cell = np.unique(cell_numbers(local_at(case, cast.range)[seen], _OBSERVED_CELL), return_inverse=True)
-    crossed = np.bincount(cell, cast.difference[seen] < -_EARLY * case.tolerance)
+    observed = cast.cosine > STEEPEST
+    _, cell = np.unique(cell_numbers(local_at(case, cast.range)[observed], _OBSERVED_CELL), return_inverse=True)
+    crossed = np.bincount(cell, cast.difference[observed] < -_EARLY * case.tolerance)
     return crossed > 0.5 * np.bincount(cell)
 
 

@@ -58,8 +58,8 @@ def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Fl
     assert case.hold is not None
     key = ("carving.about", id(curve))
     if key not in case.hold.cache:
-        found = carve_beams(case)
-        case.hold.cache[key] = (curve, curve.local(found.passed), curve.local(found.ended))
+        samples = carve_beams(case)
+        case.hold.cache[key] = (curve, curve.local(samples.passed), curve.local(samples.ended))
     return case.hold.cache[key][1:]
 
 
@@ -207,9 +207,16 @@ def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
     ends = np.concatenate(
         [part[rows[0] : rows[0] + _MOUTH_VOXELS].ravel(), part[rows[-1] - _MOUTH_VOXELS + 1 : rows[-1] + 1].ravel()]
     )
-    found = np.bincount(ends, minlength=count + 1)
-    found[0] = 0
-    return np.isin(part, np.flatnonzero(found > 0.1 * found.max()))
+    cells = np.bincount(ends, minlength=count + 1)
+    cells[0] = 0
+    return np.isin(part, np.flatnonzero(cells > 0.1 * cells.max()))
+
+
+@per_case
+def clearance(case: Case) -> tuple[Float[np.ndarray, "n m k"], Float[np.ndarray, "n m k"]]:
+    """Return the distance to the edge of the air of candidate and reference, m; negative outside the air."""
+    both = air_voxels(case)
+    return signed_distance(both.judged, both.lattice.edge), signed_distance(both.reference, both.lattice.edge)
 
 
 def signed_distance(free: Bool[np.ndarray, "n m k"], edge: float) -> Float[np.ndarray, "n m k"]:

@@ -304,15 +304,15 @@ def detect_pockets(
     """
     deep = (np.nan_to_num(depth) * unrolled.slant > least[0]) & unrolled.wall
     size = np.where(unrolled.wall, unrolled.pitch, 0.0) * ROW
-    found = []
+    pockets = []
     for region in regionprops(label(deep, _EIGHT)[0]):
         rows, columns = region.coords.T
         area = float(size[columns].sum())
         if least[1] < area < _LARGEST_POCKET:
             values = depth[rows, columns] * unrolled.slant[columns]
             bottom = float(np.median(values[values >= np.median(values)]))
-            found.append((unrolled.station[rows].mean(), arc[columns].mean(), bottom, area))
-    return Pockets(*np.array(found, float).reshape(-1, 4).T)
+            pockets.append((unrolled.station[rows].mean(), arc[columns].mean(), bottom, area))
+    return Pockets(*np.array(pockets, float).reshape(-1, 4).T)
 
 
 def shown_pockets(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Pockets:

@@ -245,8 +245,8 @@ def free_components(case: Case) -> tuple[int, int]:
     grid = _make_grid(case, curve, surface_samples(case))
     number = cc3d.connected_components(~grid.occupied(surface_samples(case)), connectivity=6)
     ends = 1  # a mouth's own cell is cut by its rim
-    found = number[grid.on_curve()][ends:-ends]
-    return len(np.setdiff1d(np.unique(found), [0])), int((found > 0).sum())
+    numbers = number[grid.on_curve()][ends:-ends]
+    return len(np.setdiff1d(np.unique(numbers), [0])), int((numbers > 0).sum())
 
 
 @per_truth

@@ -127,11 +127,11 @@ def range_noise(case: Case) -> Float[np.ndarray, " n"]:
     inside = (clean > 1.0) & (clean < float(params.lidar.range_max) - 1.0)
     if not inside.any():
         raise ValueError("no beam of the environment has a hit well within reach")
-    found: list[np.ndarray] = []
+    differences: list[np.ndarray] = []
     for key in jax.random.split(jax.random.key(case.seed), -(-_NOISE_DRAWS // int(inside.sum()))):
         drawn = env.draw_step(key, (len(at.station),), params)["lidar"].normal
-        found.append((compile_observer(case)(at, drawn) - clean)[inside])
-    return np.concatenate(found)[:_NOISE_DRAWS]
+        differences.append((compile_observer(case)(at, drawn) - clean)[inside])
+    return np.concatenate(differences)[:_NOISE_DRAWS]
 
 
 _EPISODE_STEPS = 64

@@ -292,7 +292,7 @@ def seat_mismatches(case: Case) -> Float[np.ndarray, " k"]:
     sleepers, rails, pads = (Caster(m) for m in (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh))
     at = curve.local(track.sleeper)
     _, _, left, up = curve.frames(at[:, 0])
-    found = []
+    gaps = []
     for rail in track.rail.values():
         face = curve.local(rail)
         face = face[np.argsort(face[:, 0])]
@@ -302,9 +302,9 @@ def seat_mismatches(case: Case) -> Float[np.ndarray, " k"]:
         top = _surface_level(sleepers, seat, up, above=True)
         pad = _surface_level(pads, seat, up, above=False), _surface_level(pads, seat, up, above=True)
         foot = _surface_level(rails, seat, up, above=False)
-        found += [pad[0] - top, foot - np.where(np.isfinite(pad[1]), pad[1], top)]
-    found.append(np.maximum(_hanging_gaps(case, sleepers, track.sleeper, left, up), 0.0))
-    every = np.concatenate(found)
+        gaps += [pad[0] - top, foot - np.where(np.isfinite(pad[1]), pad[1], top)]
+    gaps.append(np.maximum(_hanging_gaps(case, sleepers, track.sleeper, left, up), 0.0))
+    every = np.concatenate(gaps)
     return every[np.isfinite(every)]
 
 

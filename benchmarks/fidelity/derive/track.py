@@ -192,7 +192,7 @@ def _find_rails(
 ) -> Float[np.ndarray, "2 k 3"]:
     """Return the middle of the top of both heads, every metre in which both are seen, m."""
     station = np.arange(curve.station[0] + _RAIL_STEP / 2, curve.station[-1], _RAIL_STEP)
-    found = np.full((2, len(station), 2), np.nan)
+    tops = np.full((2, len(station), 2), np.nan)
     for side, sign in enumerate((1.0, -1.0)):
         head = (
             (np.abs(local[:, 1] - offset - sign * half) < 0.08)
@@ -203,9 +203,9 @@ def _find_rails(
         edges = np.searchsorted(points[:, 0], [station - _RAIL_STEP, station + _RAIL_STEP])
         for k, (a, b) in enumerate(edges.T):
             if b - a >= 20:
-                found[side, k] = _head_top(points[a:b, 1:])
-    seen = np.isfinite(found).all(axis=(0, 2))
-    return np.array([curve.point(np.column_stack([station[seen], one[seen]])) for one in found])
+                tops[side, k] = _head_top(points[a:b, 1:])
+    known = np.isfinite(tops).all(axis=(0, 2))
+    return np.array([curve.point(np.column_stack([station[known], one[known]])) for one in tops])
 
 
 def _head_top(points: Float[np.ndarray, "k 2"]) -> tuple[float, float]:
@@ -258,12 +258,12 @@ def rail_offsets(case: Case) -> Float[np.ndarray, "k 3"]:
         raise ValueError("the candidate has no two rails")
     real = [reference.curve.local(top) for top in reference.rail]
     station = (real[0][:, 0] + real[1][:, 0]) / 2
-    made = []
+    judged = []
     for side in ("left", "right"):
         local = _sort_along(reference.curve, rail[side])
         known = (station >= local[0, 0]) & (station <= local[-1, 0])
-        made.append([np.where(known, np.interp(station, local[:, 0], local[:, k]), np.nan) for k in (1, 2)])
-    gap = np.mean(made, axis=0).T - (real[0] + real[1])[:, 1:] / 2
+        judged.append([np.where(known, np.interp(station, local[:, 0], local[:, k]), np.nan) for k in (1, 2)])
+    gap = np.mean(judged, axis=0).T - (real[0] + real[1])[:, 1:] / 2
     return np.column_stack([station, gap])[np.isfinite(gap).all(axis=1)]
 
 

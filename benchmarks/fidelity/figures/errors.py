@@ -40,12 +40,13 @@ def draw_signed_errors(sheet: Sheet) -> Drawn | None:
     """Draws F3: signed distance over station and angle."""
     if sheet.case.hold is None:
         return None
-    found, local = mesh_distances(sheet.case), returns(sheet.case).local[thinned_rows(sheet.case)]
+    distances, local = mesh_distances(sheet.case), returns(sheet.case).local[thinned_rows(sheet.case)]
     figure, axes = plt.subplots(figsize=(12, 3.6), layout="constrained")
     angle = np.degrees(np.arctan2(local[:, 2] - np.median(local[:, 2]), local[:, 1]))
-    order = np.argsort(np.abs(found.signed))
-    picture = axes.scatter(found.station[order], angle[order], c=100 * found.signed[order], s=1.5, lw=0, cmap=DIVERGING,
-                           vmin=-_LIMIT, vmax=_LIMIT, rasterized=True)  # fmt: skip
+    order = np.argsort(np.abs(distances.signed))
+    station, signed = distances.station[order], 100 * distances.signed[order]
+    picture = axes.scatter(station, angle[order], c=signed, s=1.5, lw=0, cmap=DIVERGING, vmin=-_LIMIT, vmax=_LIMIT,
+                           rasterized=True)  # fmt: skip
     axes.set_facecolor("0.8")  # points near the mesh are nearly white
     axes.set(xlabel="station, m", ylabel="angle from left\ntowards up, deg", yticks=_TURN)
     figure.colorbar(picture, label="signed distance, cm", extend="both")
@@ -60,8 +61,8 @@ def draw_errors_along(sheet: Sheet) -> Drawn | None:
     figure, axes = plt.subplots(figsize=(12, 3.2), layout="constrained")
     width = max(1.0, float(np.ptp(mesh_distances(sheet.case).station)) / 120)
     for case, colour, name in ((sheet.case, BLUE, ""), (sheet.null, GREY, "null tube, ")):
-        found = mesh_distances(case)
-        station, distance = found.station, 100 * found.distance
+        distances = mesh_distances(case)
+        station, distance = distances.station, 100 * distances.distance
         middle, mean = bin_along(station, distance, width, np.mean)
         low, high, p95 = (
             bin_along(station, distance, width, lambda v, q=q: np.percentile(v, q))[1] for q in (25, 75, 95)
@@ -110,23 +111,23 @@ def draw_sections(sheet: Sheet) -> Drawn | None:
     """Draws F5: reconstruction, reference and held-out points at eight stations."""
     if sheet.case.hold is None and sheet.case.truth is None:
         return None
-    found = sections(sheet.case)
-    rows = np.linspace(0, len(found.station) - 1, 10).astype(int)[1:-1]
+    cut = sections(sheet.case)
+    rows = np.linspace(0, len(cut.station) - 1, 10).astype(int)[1:-1]
     local = None if sheet.case.hold is None else reference_curve(sheet.case).local(returns(sheet.case).points)
     figure, axes = plt.subplots(2, 4, figsize=(12, 6.6), layout="constrained", sharex=True, sharey=True)
     count = 0
     for axis, row in zip(axes.flat, rows, strict=True):
         if local is not None:
-            near = local[np.abs(local[:, 0] - found.station[row]) < _SLICE]
+            near = local[np.abs(local[:, 0] - cut.station[row]) < _SLICE]
             count += len(near)
             axis.plot(near[:, 1], near[:, 2], ".", color=ORANGE, ms=1.2, rasterized=True)
-        across, above = np.cos(found.angle), np.sin(found.angle)
-        wall, real = ((radius * across, radius * above) for radius in (found.judged[row], found.reference[row]))
+        across, above = np.cos(cut.angle), np.sin(cut.angle)
+        wall, real = ((radius * across, radius * above) for radius in (cut.judged[row], cut.reference[row]))
         between = (np.append(ours, theirs[::-1]) for ours, theirs in zip(wall, real, strict=True))
         axis.fill(*between, color=RED, alpha=0.25, lw=0)
         axis.plot(*real, color=INK, lw=0.9)
         axis.plot(*wall, color=BLUE, lw=0.9)
-        axis.set(title=f"{found.station[row]:.1f} m", aspect="equal")
+        axis.set(title=f"{cut.station[row]:.1f} m", aspect="equal")
     names = (("reconstruction", BLUE), ("reference", INK), ("held-out points", ORANGE), ("between the two", RED))
     lines = [plt.Line2D([], [], color=colour, label=name) for name, colour in names]
     figure.legend(handles=lines, loc="outside lower center", ncol=4, frameon=False)

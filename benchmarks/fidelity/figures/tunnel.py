@@ -65,8 +65,8 @@ def draw_range_image(sheet: Sheet) -> Drawn | None:
     rise = np.degrees(np.arcsin(np.clip(real.heading[rows, 2], -1, 1)))
     figure, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained", sharey=True)
     span = dict(vmin=0, vmax=float(np.percentile(real.range[rows], 98)), cmap="viridis")
-    seen = np.where(cast.hit, cast.range, np.nan)
-    pictures = (("recorded", real.range[rows], span), ("in the reconstruction", seen[rows], span),
+    in_candidate = np.where(cast.hit, cast.range, np.nan)
+    pictures = (("recorded", real.range[rows], span), ("in the reconstruction", in_candidate[rows], span),
                 ("difference", 100 * cast.difference[rows], dict(vmin=-20, vmax=20, cmap=DIVERGING)))  # fmt: skip
     for axis, (name, values, style) in zip(axes, pictures, strict=True):
         shown = axis.scatter(turn, rise, c=values, s=2.5, lw=0, rasterized=True, **style)
@@ -134,10 +134,10 @@ def draw_degeneracy(sheet: Sheet) -> Drawn | None:
         (synthetic_information(sheet.null), GREY, "in the null tube"),
     )
     figure, (axial, strong) = plt.subplots(2, 1, figsize=(12, 4.6), layout="constrained", sharex=True)
-    for found, colour, label in frames:
-        order = np.argsort(found.station)
-        axial.plot(found.station[order], found.axial[order], color=colour, lw=1.2, label=label)
-        strong.plot(found.station[order], 100 * found.strong[order], color=colour, lw=1.2)
+    for scans, colour, label in frames:
+        order = np.argsort(scans.station)
+        axial.plot(scans.station[order], scans.axial[order], color=colour, lw=1.2, label=label)
+        strong.plot(scans.station[order], 100 * scans.strong[order], color=colour, lw=1.2)
     axial.set(ylabel="axial information a point", yscale="log")
     axial.legend(frameon=False, ncol=3, loc="upper center", bbox_to_anchor=(0.5, 1.22))
     strong.set(xlabel="station, m", ylabel="points whose normal lies\nwithin 60° of the axis, %", ylim=(0, None))
@@ -150,20 +150,20 @@ def draw_free_space(sheet: Sheet) -> Drawn | None:
     """Draws F11: free cells of both, the route of most clearance, clearance along it."""
     if sheet.case.hold is None and sheet.case.truth is None:
         return None
-    found = free_plane(sheet.case)
-    lattice, edge = found.lattice, found.lattice.edge
-    only = np.where(found.judged, 1.0, np.where(found.reference, 2.0, np.nan))
-    classes = np.where(found.known, np.where(found.judged & found.reference, 0.0, only), np.nan)
+    plane = free_plane(sheet.case)
+    lattice, edge = plane.lattice, plane.lattice.edge
+    only = np.where(plane.judged, 1.0, np.where(plane.reference, 2.0, np.nan))
+    classes = np.where(plane.known, np.where(plane.judged & plane.reference, 0.0, only), np.nan)
     left = lattice.low[1] + edge * (np.arange(lattice.shape[1]) + 0.5)
     ends = [low + edge * n for low, shape in zip(lattice.low[:2], lattice.shape, strict=False) for n in (0, shape)]
     figure, (map_axis, room) = plt.subplots(2, 1, figsize=(12, 5), layout="constrained", sharex=True)
     colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
     map_axis.imshow(classes.T, origin="lower", extent=ends, aspect="auto", cmap=colours, vmin=0, vmax=2, alpha=0.55,
                     interpolation="nearest")  # fmt: skip
-    for free, colour, label in ((found.reference, INK, "reference"), (found.judged, BLUE, "reconstruction")):
+    for free, colour, label in ((plane.reference, INK, "reference"), (plane.judged, BLUE, "reconstruction")):
         clearance = distance_transform_edt(np.pad(free, ((0, 0), (1, 1))))[:, 1:-1] * edge
-        map_axis.plot(found.station, left[np.argmax(clearance, axis=1)], color=colour, lw=1)
-        room.plot(found.station, clearance.max(axis=1), color=colour, lw=1.2, label=label)
+        map_axis.plot(plane.station, left[np.argmax(clearance, axis=1)], color=colour, lw=1)
+        room.plot(plane.station, clearance.max(axis=1), color=colour, lw=1.2, label=label)
     names = ("free in both", "free in the reconstruction only", "free in the reference only")
     patches = [Patch(color=colours(k), alpha=0.55, label=name) for k, name in enumerate(names)]
     map_axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.2), ncol=3, frameon=False)
@@ -173,7 +173,7 @@ def draw_free_space(sheet: Sheet) -> Drawn | None:
     caption = (
         f"Free cells of {edge * 100:.0f} cm at sensor height, places of most clearance (lines), and that clearance."
     )
-    return figure, caption + sheet.note(int(found.known.sum()))
+    return figure, caption + sheet.note(int(plane.known.sum()))
 
 
 def draw_persistence(sheet: Sheet) -> Drawn | None:

@@ -211,13 +211,13 @@ def _split_entry(case: Case, inputs: Inputs) -> dict[str, Any]:
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    versions = {"python": platform.python_version()}
     for name in VERSIONS:
         try:
-            found[name] = metadata.version(name)
+            versions[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            versions[name] = "not installed"
+    return versions
 
 
 def _commit() -> str | None:
@@ -244,16 +244,16 @@ def write_report(
         controls: Rows of controls where they were run.
         swept: Content of `sweep.json` where the sweep was run.
     """
-    made = report_content(case, inputs, judgement, controls, swept["summary"] if swept else None)
+    content = report_content(case, inputs, judgement, controls, swept["summary"] if swept else None)
     rows = controls or []
-    write_json(folder / "report.json", made)
-    forms.write_metrics(folder, made)
-    forms.write_categories(folder, made)
+    write_json(folder / "report.json", content)
+    forms.write_metrics(folder, content)
+    forms.write_categories(folder, content)
     forms.write_controls(folder, rows)
     forms.write_sweep(folder, swept["rows"] if swept else [])
-    forms.write_junit(folder, made)
+    forms.write_junit(folder, content)
     null = replace(case, candidate=null_tube(case.candidate), cache={})
-    figures = draw_all(folder / "figures", Sheet(case, null, made, rows, swept["rows"] if swept else []))
-    forms.write_markdown(folder, made)
-    forms.write_html(folder, made, figures, rows)
-    return made
+    figures = draw_all(folder / "figures", Sheet(case, null, content, rows, swept["rows"] if swept else []))
+    forms.write_markdown(folder, content)
+    forms.write_html(folder, content, figures, rows)
+    return content

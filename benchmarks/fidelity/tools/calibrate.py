@@ -48,16 +48,16 @@ def load_survey(folder: Path) -> Survey:
     if "ceiling" not in values:
         raise FidelityError(f"{folder}: was judged without --truth, so it has no ceiling to calibrate by")
     base, ceiling, null = (load_values(values[name]) for name in ("base", "ceiling", "null"))
-    found = Survey(folder.name, base, ceiling, null)
+    survey = Survey(folder.name, base, ceiling, null)
     for job in list_jobs():
         path = folder / "controls" / f"{job.name}.json"
         if path.exists() and is_bold(job):
             values = load_values(read_json(path, OUTCOME_SCHEMA)["values"])
             if job.control in INVARIANCES:
-                found.same[job.control] = values
+                survey.same[job.control] = values
             else:
-                found.spoilt[job.control, job.dose] = values
-    return found
+                survey.spoilt[job.control, job.dose] = values
+    return survey
 
 
 def draft_table() -> dict[str, Metric]:
@@ -152,7 +152,7 @@ def good_end_rule(row: Metric, surveys: list[Survey]) -> tuple[float, str] | Non
 
 def bad_end_rule(rows: dict[str, Metric], surveys: list[Survey]) -> dict[str, tuple[float, str]]:
     """Return bad ends and reasons, by metric, for every control that lowers a category too little."""
-    found: dict[str, tuple[float, str]] = {}
+    ends: dict[str, tuple[float, str]] = {}
     for survey in surveys:
         before = scoring.score_all(survey.base, rows=rows).categories
         for (control, dose), values in survey.spoilt.items():
@@ -163,9 +163,9 @@ def bad_end_rule(rows: dict[str, Metric], surveys: list[Survey]) -> dict[str, tu
                 reason = f"{control} at {dose:g} must lower {category} by {asked:g}"
                 for row in rows.values():
                     if row.category == category and (end := _reached_distance(row, survey, values)) is not None:
-                        least = min(end, found.get(row.id, (end, ""))[0])
-                        found[row.id] = (least, f"{reason}; this is what it reaches on {survey.name}")
-    return found
+                        least = min(end, ends.get(row.id, (end, ""))[0])
+                        ends[row.id] = (least, f"{reason}; this is what it reaches on {survey.name}")
+    return ends
 
 
 def _is_measured(row: Metric) -> bool:
