@@ -17,6 +17,7 @@ from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.files import FidelityError, write_json
 from benchmarks.fidelity.registry import Entry, Need, Value, compute_metric, dump_values, load_values, number
 from benchmarks.fidelity.table import Metric, parse_map
+from subterra_jax.host.loading import file_digest
 
 SCHEMA = "subterra.fidelity-outside/1"
 Compute = Callable[[Case], Value | float]
@@ -106,11 +107,12 @@ def load_metrics(path: Path) -> None:
     """Runs a file that registers metrics; metrics of files loaded before are dropped.
 
     Raises:
+        UserCodeError: The file cannot be read.
         FidelityError: The file cannot be run, or registers nothing.
     """
     clear()
+    _FILES[path.name] = file_digest(path)
     try:
-        _FILES[path.name] = sha256(path.read_bytes()).hexdigest()
         runpy.run_path(str(path))
     except FidelityError as error:
         raise FidelityError(f"{path}: {error}") from error

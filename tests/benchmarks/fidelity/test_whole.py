@@ -23,10 +23,10 @@ from tests.scene.bags import write_bag, write_tum
 SHORT = Tube(length=12.0)
 
 
-def fidelity(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
-    """`python -m benchmarks.fidelity`, in this process."""
+def fidelity(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
+    """`python -m benchmarks.fidelity`, in this process; its exit status."""
     monkeypatch.setattr(sys, "argv", ["fidelity", *map(str, words)])
-    main()
+    return main()
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def scored(scene, recording, tmp_path_factory) -> tuple[Path, tuple[object, ...]
     words = ("run", "--scene", scene, "--recording", recording[0], "--trajectory", recording[1],
              "--beams-per-scan", 9000)  # fmt: skip
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
-        fidelity(patch, *words, "--out", out)
+        assert fidelity(patch, *words, "--out", out) == 0
     return out, words, said.getvalue()
 
 
@@ -106,7 +106,7 @@ def test_a_metric_from_a_file_is_listed_apart_and_the_verdict_stays_the_suite_s(
     out = Path(shutil.copytree(before, tmp_path / "out"))  # its values are read again, not computed
     file = tmp_path / "my_metrics.py"
     file.write_text(_code_of_the_guide())
-    fidelity(monkeypatch, *words, "--metrics", file, "--out", out)
+    assert fidelity(monkeypatch, *words, "--metrics", file, "--out", out) == 0
     said = capsys.readouterr().out
     assert "1 of 200 metrics from outside (my_metrics.py): global with them" in said
     assert "the verdict is that of the suite alone" in said
@@ -180,9 +180,7 @@ def _mesh_gone_from_an_older_scene(folder: Path) -> str:
 )
 def test_what_is_wrong_with_a_scene_is_said_in_one_sentence(own_scene, tmp_path, monkeypatch, capsys, spoil) -> None:
     expected = spoil(own_scene)
-    with pytest.raises(SystemExit) as ended:
-        fidelity(monkeypatch, "run", "--scene", own_scene, "--out", tmp_path / "out")
-    assert ended.value.code == 2
+    assert fidelity(monkeypatch, "run", "--scene", own_scene, "--out", tmp_path / "out") == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith(f"error: {expected}")
     assert "\n" not in said
@@ -192,10 +190,8 @@ def test_what_is_wrong_with_a_scene_is_said_in_one_sentence(own_scene, tmp_path,
 def test_a_fit_recording_that_the_builder_did_not_read_is_refused(
     scene, recording, tmp_path, monkeypatch, capsys
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        fidelity(monkeypatch, "run", "--scene", scene, "--fit-recording", recording[0],
-                 "--fit-trajectory", recording[1], "--out", tmp_path / "out")  # fmt: skip
-    assert ended.value.code == 2
+    words = ("--fit-recording", recording[0], "--fit-trajectory", recording[1])
+    assert fidelity(monkeypatch, "run", "--scene", scene, *words, "--out", tmp_path / "out") == 2
     assert "held_out.bag: is not what" in capsys.readouterr().err
 
 
