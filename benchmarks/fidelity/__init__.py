@@ -1,4 +1,4 @@
-"""How true a reconstruction is: 18 categories, 199 metrics, a verdict that can fail.
+"""Scores a reconstruction: 18 categories, 199 metrics, a verdict that can fail.
 
 scene folder ─► candidate ┐
 held-out recording ┐      ├─► case ─► categories/ ─► values ─► scoring ─► report/

@@ -120,6 +120,8 @@ def geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> trimesh.
     return mesh
 
 
+# The candidate: the files of one scene folder.
+
 MANIFEST_SCHEMA = "subterra.manifest/1"
 
 

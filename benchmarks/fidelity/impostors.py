@@ -94,6 +94,8 @@ def _interpolate(at: np.ndarray, station: np.ndarray, values: np.ndarray) -> np.
     return np.stack([np.interp(at, station, column) for column in values.T], axis=1)
 
 
+# The truth as a candidate: the score of a perfect reconstruction, and so where thresholds can be met.
+
 WALL_PARTS = ("lining", "joint", "floor", "pocket")
 BORE_ANGLES = 360
 _POCKET = np.dtype(

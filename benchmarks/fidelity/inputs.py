@@ -167,6 +167,8 @@ def run_module(*words: object) -> None:
         raise SubterraError(f"python -m {' '.join(command)} failed")
 
 
+# The cut of a recording into fit, val and hold, by blocks of time.
+
 SPLIT_PARTS = ("fit", "val", "hold")
 GUARD = -1
 SPLIT_SCHEMA = "subterra.split/1"

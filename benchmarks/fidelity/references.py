@@ -110,6 +110,8 @@ def _wrap(angle: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
+# Held-out recording and truth.
+
 TRUTH_SCHEMA = "subterra.truth/1"
 
 

@@ -181,6 +181,8 @@ def _nearest_gap(station: np.ndarray, away: np.ndarray) -> np.ndarray:
     return np.min(np.abs(station[:, None] - away[None]), axis=1)
 
 
+# Bodies that stand in the bore or close it.
+
 _WALL_THICKNESS = 0.3  # m thick
 _DEBRIS_RADIUS = 0.3  # m, radius of a piece of debris
 _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel

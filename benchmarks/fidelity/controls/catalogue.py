@@ -203,6 +203,8 @@ SPOIL: dict[str, Spoil] = {
     "N35": _forge_recording,
     "N36": lambda case, d, s: leak_hold(case),
 }
+# Invariances: changes that must not move the scores.
+
 SHIFT = np.array([1000.0, -640.0, 35.0])  # m
 YAW = np.radians(30.0)
 GLOBAL_LIMIT = 0.3

@@ -124,6 +124,8 @@ def coarsen(candidate: Candidate, share: float) -> Candidate:
     return change_both(candidate, smooth)
 
 
+# Controls of the compiled scene: a changed copy of the scene folder, with links to all that is unchanged.
+
 PANELS = ("wall_", "bed_")
 
 
@@ -244,6 +246,9 @@ def widen_plan(candidate: Candidate, wider: float, scratch: Path) -> Candidate:
     arrays["half_width"] = arrays["half_width"] + 0.5 * wider
     np.savez(copy.tunnel, **arrays)
     return copy
+
+
+# Controls of the references, and cheats.
 
 
 def turn_beams(case: Case, angle: float) -> Case:

@@ -81,6 +81,8 @@ def write_outcome(folder: Path | None, outcome: Outcome, key: str) -> None:
         write_json(folder / f"{outcome.job.name}.json", content, digits=17)
 
 
+# The runner.
+
 Evaluate = Callable[..., dict[str, Value]]
 
 
@@ -214,6 +216,8 @@ def _compute_outcomes(bench: Bench, todo: list[Job], processes: int) -> Iterator
     finally:
         pool.shutdown(cancel_futures=True)  # an interrupt waits for what is under way, not for all that was asked
 
+
+# The judgement: whether each control was noticed, and whether the rest stayed quiet.
 
 QUIET = 2.0
 MONOTONE = -0.9

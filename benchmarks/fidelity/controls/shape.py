@@ -141,6 +141,9 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+# Meshes of many bodies: which there are, some removed, each moved by itself.
+
+
 def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:
     """Return the number of the body of each vertex, and the middle of each body, m."""
     count = len(mesh.vertices)
@@ -180,6 +183,8 @@ def without_faces(mesh: trimesh.Trimesh, gone: Bool[np.ndarray, " f"]) -> trimes
     left.remove_unreferenced_vertices()
     return left
 
+
+# Controls of size and shape: scale, width, length, place, roll, curvature.
 
 _FLOOR_RISE = (0.5, 1.3)  # m above the floor between which a raised floor fades into the wall
 _WAVE = 100.0  # m

@@ -145,6 +145,8 @@ def curve_through(position: Float[np.ndarray, "n 3"]) -> Curve:
     return Curve(np.concatenate([[0.0], np.cumsum(steps)]), position)
 
 
+# Offset and registration between the two axes, and drift of features along them.
+
 PAIR_STEP = 1.0  # m
 _ICP_SPACING = 0.15  # m between the points that are registered
 _ICP_REACH = 0.5  # m; correspondences farther apart are none

@@ -62,6 +62,8 @@ def mouths_on_path(case: Case) -> tuple[float, float]:
     return float(ends.min()), float(ends.max())
 
 
+# Held-out beams, and the same beams cast in the candidate.
+
 _NEAR = 1.0  # m over which the path's frame is taken as straight: less than a millimetre at a radius of 500 m
 
 
@@ -181,6 +183,8 @@ def synthetic_points(case: Case) -> Float[np.ndarray, "n 3"]:
     return points_at(case, noisy_ranges(case, "first"))
 
 
+# Bins along the observed stretch of the path.
+
 BIN = 10.0  # m
 
 
@@ -196,6 +200,9 @@ def station_bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray
     low, high = observed_extent(case)
     count = max(round((high - low) / BIN), 1)
     return np.clip(((station - low) / (high - low) * count).astype(int), 0, count - 1)
+
+
+# Beams without a return.
 
 
 @dataclass(frozen=True)
@@ -233,6 +240,8 @@ def silence(case: Case) -> Silence:
     expected_silent[met[order[int(np.argmax(balance)) :]]] = False
     return Silence(~hold.returned, expected_silent)
 
+
+# Directions of the beams, and descriptors of whole scans.
 
 _DIRECTION_SECTORS = (12, 4)  # of azimuth and elevation
 _QUANTILES = (5, 25, 50, 75, 95)

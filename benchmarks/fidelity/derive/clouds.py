@@ -108,6 +108,8 @@ def mean_entropy(tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> float:
     return float(np.nanmean(values))
 
 
+# Map statistics after MapEval: voxelised Wasserstein distance and its spatial consistency.
+
 MAP_VOXEL = 0.5  # m
 FEWEST_IN_VOXEL = 10  # points of either cloud in a voxel that is compared
 
@@ -201,6 +203,8 @@ def _matrix_root(matrix: Float[np.ndarray, "v 3 3"]) -> Float[np.ndarray, "v 3 3
     values, axes = np.linalg.eigh(matrix)
     return (axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ axes.transpose(0, 2, 1)
 
+
+# Roughness of the wall over half a metre. Medians over patches: a mean depends on the few with an edge.
 
 _PATCH_RADIUS = 0.25  # m; planes of 0.5 m
 _PATCH_LEAST = 20  # points on a plane

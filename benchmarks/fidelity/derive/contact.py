@@ -142,6 +142,8 @@ def _mesh_touch(case: Case, start: np.ndarray, way: np.ndarray, reach: np.ndarra
 
 with redirect_stdout(io.StringIO()):  # it prints that warp, which nothing here needs, is not installed
     from mujoco import mjx
+# The robot in MJX beside MuJoCo; the step is compiled once for each content of the scene.
+
 _PLACEMENTS = 200
 _DIVERGENCE_STEPS = 100
 _PUSH_SPEEDS = (0.5, 0.3)  # m/s forwards, rad/s

@@ -87,6 +87,8 @@ def truth_curve(case: Case) -> Curve:
     return Curve(case.truth.station, case.truth.position)
 
 
+# Polar profiles about a curve: rays into a mesh, medians of points, the middle of a section.
+
 ROW_STEP = 0.25  # m between the rows that medians are taken over
 MEDIAN_WINDOW = 1.5  # m of chainage: pockets take less than half of it along any one direction
 SECTOR = np.deg2rad(5.0)

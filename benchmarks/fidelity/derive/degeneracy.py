@@ -82,6 +82,8 @@ def _scan_information(
     )  # fmt: skip
 
 
+# Aliases: scans shifted along the tunnel, and scan-to-scan registration.
+
 SHIFT_STEP, SHIFT_MOST = 0.05, 3.0  # m
 SHIFT_LEAST = 0.2  # m; a smaller shift is the same place
 _ALIAS_SCANS, _ALIAS_POINTS = 24, 250
@@ -165,6 +167,8 @@ def _icp_errors(case: Case, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
         errors.append(abs(float(motion.T_target_source[:3, 3] @ axis)))
     return np.asarray(errors)
 
+
+# The planar scan of the environment.
 
 PLANAR_BEAMS = 16
 PLANAR_SIGMA = 0.05  # m, of a range; the environment's default

@@ -123,6 +123,8 @@ def cloud_distances(case: Case) -> CloudDistances:
     return CloudDistances(distance, local[even, 0])
 
 
+# Cells of the surface that held-out beams pass through.
+
 _OBSERVED_CELL = 0.1  # m
 _EARLY = 0.15  # m
 
@@ -140,6 +142,8 @@ def phantom_cells(case: Case) -> Bool[np.ndarray, " c"]:
     crossed = np.bincount(cell, cast.difference[observed] < -_EARLY * case.tolerance)
     return crossed > 0.5 * np.bincount(cell)
 
+
+# The density-aware Chamfer distance.
 
 ALPHA = 40.0  # 1/m
 _THIN = 0.1  # m
@@ -164,6 +168,8 @@ def _one_way(points: Float[np.ndarray, "n 3"], others: Float[np.ndarray, "m 3"])
     shared = np.bincount(index, minlength=len(others))[index]
     return float(np.mean(1.0 - np.exp(-ALPHA * distance) / shared))
 
+
+# M3C2: distances along the normal between held-out and synthetic cloud, and their significance.
 
 M3C2_CORES = 5000
 M3C2_RADIUS = 0.15  # m, of the cylinder
@@ -218,6 +224,8 @@ def m3c2_distances(case: Case) -> M3C2Distances:
     return M3C2Distances(beyond.astype(float), distance[known], real.local[plane_rows(case)][pick][known, 0])
 
 
+# The comparison that cannot fail: a cloud cast in the candidate with noise, against the same candidate.
+
 PAPER_SIGMA = 0.05  # m: the range noise that the paper states for its LiDAR
 _MOST_SELF_CAST = 30_000
 
@@ -246,6 +254,8 @@ def self_cast(case: Case) -> SelfCast:
     distance, _, _ = surface_nearest(case).query(real.origin[pick] + reach[:, None] * real.direction[pick])
     return SelfCast(distance, float(PAPER_SIGMA * np.sqrt(2.0 / np.pi) * np.mean(cast.cosine[pick])))
 
+
+# Occupied voxels in station, left and up along the sensor's path.
 
 VOXEL_EDGE = 0.20  # m
 SHELL_VOXELS = 3  # voxels about either surface that count for kappa: 0.6 m

@@ -63,6 +63,8 @@ def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Fl
     return case.hold.cache[key][1:]
 
 
+# Air in voxels of (station, left, up), 20 cm, so that nothing is aligned with the world.
+
 AIR_VOXEL = 0.20  # m
 KNOWN_AROUND = 0.6  # m around the reference's air that is known, too
 _OBJECTS = ("sleeper", "rail", "fastening")
@@ -225,6 +227,8 @@ def signed_distance(free: Bool[np.ndarray, "n m k"], edge: float) -> Float[np.nd
         return np.full(free.shape, np.inf if free.all() else -np.inf)
     return distance_transform_edt(free, edge) - distance_transform_edt(~free, edge)
 
+
+# Distances in the air: around the axis, up and down in lanes, and in vehicle envelopes.
 
 LANES = (-1.0, 0.0, 1.0)  # m to the left of the axis
 _AROUND_AXIS = 1.0  # m to either side of the axis, and up and down

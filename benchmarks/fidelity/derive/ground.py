@@ -1,4 +1,8 @@
-"""The ground that a small robot drives on, of candidate and reference, and routes over it."""
+"""The ground that a small robot drives on, of candidate and reference, and routes over it.
+
+A step of 10 cm stops the robot. Sleepers (6 cm above the ballast) do not, rails (18 cm above the sleepers) do: it
+drives between the rails, and may drive beside them, but cannot change over.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -148,6 +152,8 @@ def cell_steps(height: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
     return np.max([np.abs(inner - other) for other in shifted], axis=0)
 
 
+# The two grounds to compare: by rays against the truth, by the same beams against a recording.
+
 _ROW_SPREAD = (-2, -1, 0, 1, 2)  # rows whose returns a cell shares: one row has too few, and rails run along
 _GROUND_SHARE = 0.8  # of the returns in a cell lie lower than its ground: a rail fills only a part of it
 _GAP_CELLS = 3  # cells without a return that are taken from their neighbours
@@ -203,6 +209,8 @@ def _ground_of_points(curve: Curve, cell: float, local: Float[np.ndarray, "k 3"]
     height = np.where(away <= _GAP_CELLS, height[tuple(nearest)], np.nan)
     return Ground(station, left, height, np.where(np.isfinite(height), np.inf, np.nan), cell_steps(height))
 
+
+# Routes of the robot: from mouth to mouth between the rails, and between any two places.
 
 ROBOT_RADIUS = 0.40  # m of the robot
 GAUGE_HALF = 0.70  # m; between the rails

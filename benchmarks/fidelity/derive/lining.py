@@ -174,6 +174,8 @@ def paired_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray
     return np.repeat(hold.station[:rows], known.sum(axis=1)), both[0], both[1]
 
 
+# The grid of the rings: axial pitch, phase along the tunnel, rows around the section.
+
 RING_LAGS = (0.5, 4.0)  # m; pitch of rings
 RING_BAND = 0.30  # of the pitch to either side in which the candidate's is looked for
 PITCH_HARMONICS = 4
@@ -258,6 +260,8 @@ def _fourier(signal: np.ndarray, station: np.ndarray, frequency: np.ndarray) -> 
     parts = np.array_split(frequency, max(len(frequency) // 100, 1))
     return np.concatenate([np.exp(-2j * np.pi * part[:, None] * station) @ signal for part in parts])
 
+
+# Pockets: those that a map shows, those of the truth, and the pairs of both.
 
 POCKET_MATCH = 0.15  # m
 DEEP_POCKET = (0.06, 0.008)  # m behind the smooth section, about half a pocket, and m² of it

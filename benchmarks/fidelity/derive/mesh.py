@@ -161,6 +161,8 @@ def first_hits(
     return face, np.where(face >= 0, distance, np.inf)
 
 
+# Free space on a grid along a curve, and the persistence of its clearance.
+
 _GRID_CELL = (0.5, 0.25, 0.25)  # m along, left, up
 _SAMPLE_SPACING = 0.10  # m between samples of a surface
 _POINTS_AT_ONCE = 300_000  # points, whose coordinates take 100 MB on their way

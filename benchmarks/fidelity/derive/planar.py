@@ -134,6 +134,8 @@ def range_noise(case: Case) -> Float[np.ndarray, " n"]:
     return np.concatenate(differences)[:_NOISE_DRAWS]
 
 
+# Episodes: their repetition, and the drift of the odometer.
+
 _EPISODE_STEPS = 64
 _ODOMETRY_LENGTH = 100.0  # m
 _EPISODES = 256

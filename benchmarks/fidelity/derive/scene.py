@@ -1,4 +1,8 @@
-"""The released scene: files and hashes, rays, inventory, rail seats."""
+"""The released scene: files and hashes, rays, inventory, rail seats.
+
+Results from released files are kept while the files are the same: controls that change neither scene nor planar tunnel
+then cost SCN and PAR nothing.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -143,6 +147,8 @@ def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tupl
     return station, position, left / np.linalg.norm(left, axis=1, keepdims=True)
 
 
+# Rays in the compiled scene and in the meshes that it was made from.
+
 LINING_NAMES = ("lining", "recess", "floor")  # what pieces of the lining are called
 VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups that a camera draws
 _MESH_NAMES = {
@@ -211,6 +217,8 @@ def scene_ranges(
     return np.where(reach < 0.0, np.inf, reach).ravel(), geom.ravel()
 
 
+# Inventory: assets counted from geoms, fastenings by rail seat.
+
 _PAD_HEIGHT = 0.03  # m; what is lower is a pad, what is higher a clip
 _FASTENER_REACH = 0.10  # m between clip and shoulder
 _SEAT_REACH = 0.20  # m between parts of the fastening of one seat
@@ -273,6 +281,8 @@ def cluster_points(middle: Float[np.ndarray, "p 3"], reach: float) -> Float[np.n
     weight = np.bincount(label)[:, None]
     return np.stack([np.bincount(label, column) for column in middle.T], axis=1) / weight
 
+
+# Rail seats: overlaps and gaps, measured by vertical rays.
 
 _HEAD_HALF = 0.0365  # m from a head's inner face to its middle
 _RAY_START = 1.0  # m

@@ -177,6 +177,8 @@ def variation(case: Case) -> Float[np.ndarray, "2 n 2"]:
     return detrend(stacked, axis=1)
 
 
+# Polar radii with pockets: every 5 cm along the axis, every degree around it.
+
 ROW = 0.05  # m
 COLUMNS = 360
 

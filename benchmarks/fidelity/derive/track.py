@@ -60,6 +60,8 @@ def _sort_along(curve: Curve, points: Float[np.ndarray, "k 3"]) -> Float[np.ndar
     return local[np.argsort(local[:, 0], kind="stable")]
 
 
+# Sleepers and rails of the reference: the generator's, or those that the held-out recording shows.
+
 STANDARD_GAUGE = 1.435  # m
 _PROFILE_BIN = 0.025  # m of the height profile between the rails
 _BETWEEN = 0.55  # m to either side of the track's middle
@@ -215,6 +217,8 @@ def _head_top(points: Float[np.ndarray, "k 2"]) -> tuple[float, float]:
     core = upper[np.abs(upper[:, 0] - (low + high) / 2) < 0.028]
     return float((low + high) / 2), float(np.median(core[:, 1] if len(core) else upper[:, 1]))
 
+
+# The candidate's track in the coordinates of the reference, and within its own bore.
 
 _MISSING_STEP = 1.5  # spacings; a longer step is a missing sleeper, not a spacing
 _HALF_SPACING = 0.3  # m; half a spacing

@@ -54,6 +54,9 @@ def draw_axis(sheet: Sheet) -> Drawn | None:
     return figure, caption + sheet.note(len(ours.station))
 
 
+# Beams: recorded, and cast in the candidate.
+
+
 def draw_range_image(sheet: Sheet) -> Drawn | None:
     """Draws F8: ranges of one held-out scan, the same beams in the candidate, and the difference."""
     if sheet.case.hold is None:

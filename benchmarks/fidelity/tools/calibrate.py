@@ -1,4 +1,15 @@
-"""Sets thresholds from simulated surveys with known truth, before any real recording is scored."""
+"""Sets thresholds from simulated surveys with known truth, before any real recording is scored.
+
+Three rules may move a threshold:
+
+- *Null rule*: the null tube gets half marks or more though it is plainly worse than the truth. The good end moves to
+  half of the null tube's error, not below 1.5 times the truth's own, nor below what the references resolve, nor below
+  five times the move under an invariance; the bad end to three times the good one, so that a tenth more or less of
+  either never decides.
+- *Good end*: the truth itself, scored as a candidate, does not reach 100; it moves to 1.5 times what the truth reaches.
+- *Bad end*: a control's bold dose lowers a category by less than it must; it moves, in the metrics of that category
+  that plainly see the control, to what the control reaches.
+"""
 
 import csv
 from dataclasses import dataclass, field, replace
@@ -113,6 +124,8 @@ def ideal_distances(row: Metric, found: list[Values]) -> list[float]:
     return [ideal_distance(row.map, value) for value in known if value is not None] if row.map.kind in "DUB" else []
 
 
+# The rules by which surveys may move a threshold.
+
 WIDEN = 1.5
 PLAIN = 2.0  # times the distance of the truth (or reconstruction) at which a null tube or control is plainly seen
 APART = 1.2  # times the reconstruction from which a null tube has its axis: what both share is no fault of a tube
@@ -193,6 +206,8 @@ def _reached_distance(row: Metric, survey: Survey, spoilt: Values) -> float | No
         return None
     return two_digits(reached)
 
+
+# The command.
 
 THRESHOLDS_SCHEMA = "subterra.fidelity-thresholds/1"
 FEWEST_SURVEYS = 3
