@@ -113,7 +113,7 @@ def read_case(inputs: Inputs) -> Case:
 
 
 def with_sigma(config: HoldConfig, recording: Path) -> HoldConfig:
-    """Return the data sheet's noise of the sensor that a recording's name tells, unless another was given."""
+    """Return the data sheet's noise of the sensor in a recording's name, unless another was given."""
     if config.sigma != HoldConfig().sigma:
         return config
     known = [sigma for name, sigma in SIGMA.items() if name in recording.name.lower()]

@@ -23,7 +23,7 @@ _FEWEST_RETURNS = 8  # returns of a ring or column that tell its direction
 def is_organised(recording: Recording) -> bool:
     """Return True where the recording holds sweeps as rings by columns, with times for lost beams (Ouster).
 
-    A Livox message keeps a place for them too, but nothing in it tells where they looked.
+    A Livox message keeps a place for them too, but nothing in it gives their direction.
     """
     for message in _messages(recording):
         names = {field.name for field in message.fields}

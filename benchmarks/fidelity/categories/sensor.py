@@ -251,7 +251,7 @@ def mme_diff(case: Case) -> Value:
 
 @metric("c2st_auc", needs="hold")
 def c2st_auc(case: Case) -> Value:
-    """Area under the curve of a forest that tells real from synthetic scans; 0.5: it cannot.
+    """Area under the curve of a forest that separates real from synthetic scans; 0.5: it cannot.
 
     A scan and its twin are never on both sides of a fold. Blocks of neighbouring scans make the folds, since
     neighbouring scans are nearly the same scan.
@@ -271,7 +271,7 @@ def c2st_auc(case: Case) -> Value:
     return number(float(roc_auc_score(label, guess)), len(label))
 
 
-# DEG: whether a scan in the candidate tells its own pose as well, and as badly, as the recorded one.
+# DEG: whether a scan in the candidate fixes its own pose as well, and as badly, as the recorded one.
 
 
 def _both_information(case: Case) -> tuple[ScanInformation, ScanInformation]:
@@ -379,5 +379,5 @@ def deg_icp_axial_logratio(case: Case) -> Value:
 
 @metric("deg_planar_axial_info")
 def deg_planar_axial_info(case: Case) -> Value:
-    """Share of stations at which the environment's planar scan alone tells the station."""
+    """Share of stations at which the environment's planar scan alone fixes the station."""
     return number(float(np.mean(localised_stations(case))), len(localised_stations(case)))

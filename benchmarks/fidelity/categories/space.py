@@ -191,7 +191,7 @@ def free3d_false_occupied(case: Case) -> Value:
     if len(case.candidate.extra.faces):
         cell, kept = both.lattice.cell(local)
         outside |= kept & both.filled.ravel()[cell]
-    # Beyond the ends of the reference a beam still runs in air that nobody reconstructed.
+    # Beyond the ends of the reference a beam still runs in air without a reconstruction.
     among = (local[:, 0] > both.lattice.low[0]) & (local[:, 0] < reference_curve(case).station[-1])
     return estimate(mean, outside[among].astype(float), local[among, 0], case.rng("free3d_false_occupied"))
 

@@ -24,7 +24,7 @@ def sensor_path(case: Case) -> Curve:
     path where it is.
 
     Raises:
-        ValueError: The sensor passed fewer than four positions `STEP` apart.
+        ValueError: The sensor passed fewer than four positions `NODE_STEP` apart.
     """
     hold = case.hold
     assert hold is not None

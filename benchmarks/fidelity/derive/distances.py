@@ -197,7 +197,7 @@ def m3c2_distances(case: Case) -> M3C2Distances:
     """Computes M3C2 of held-out points against the candidate's points on the same beams.
 
     The candidate's points carry no noise; the level of detection is 1.96·√(s₁²/n₁ + s₂²/n₂) + registration, in which
-    the registration error is the given poses' (`REGISTRATION`).
+    the registration error is the given poses' (`M3C2_REGISTRATION`).
 
     Source: Lague, Brodu, Leroux 2013, ISPRS J. Photogramm. 82; computed by py4dgeo.
     """

@@ -121,7 +121,7 @@ class AxisHits:
     """First hits of rays from the axis.
 
     Attributes:
-        origin: m, less `offset`, `(k, 3)`.
+        origin: m, less `weld_offset`, `(k, 3)`.
         direction: Unit vectors, `(k, 3)`.
         distance: m; `inf` where nothing was hit, `(k,)`.
         cosine: Cosine between ray and normal of the face; negative where the face looks at the eye, `(k,)`.

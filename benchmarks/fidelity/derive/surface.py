@@ -57,7 +57,8 @@ class Nearest:
     """Closest points of a mesh.
 
     A k-d tree over samples of every triangle proposes triangles, `trimesh` gives the exact closest point of each. Where
-    many small triangles crowd around a large one the distance may come out up to `CELL` too long, nowhere too short.
+    many small triangles crowd around a large one the distance may come out up to `SAMPLE_CELL` too long, but nowhere
+    too short.
 
     Attributes:
         mesh: Mesh to measure distances to.

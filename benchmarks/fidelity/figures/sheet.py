@@ -46,7 +46,7 @@ class Sheet:
 Drawn = tuple[Figure, str]
 Draw = Callable[[Sheet], Drawn | None]
 INK, BLUE, ORANGE, GREEN, RED, GREY = "#1b1b1b", "#0072b2", "#e69f00", "#009e73", "#d55e00", "#999999"
-AGREE, ONLY_MESH, ONLY_CLOUD = "#009e73", "#d55e00", "#0072b2"  # the paper's green, red and blue, told apart by anybody
+AGREE, ONLY_MESH, ONLY_CLOUD = "#009e73", "#d55e00", "#0072b2"  # the paper's green, red and blue, for all eyes
 DIVERGING = LinearSegmentedColormap.from_list("error", ["#0072b2", "#f7f7f7", "#d55e00"])
 
 
