@@ -36,7 +36,7 @@ class LeaderboardConfig:
     """Settings of a leaderboard.
 
     Attributes:
-        tasks: Task ids, as `Subterra/StopAt-v0` or `StopAt`; all tasks if not given.
+        tasks: Task ids, as `Subterra/StopAt-v0`, `StopAt` or `FILE.py:ID`; all tasks if not given.
         agents: Agents: a baseline; `policy:NAME` or `policy:FILE`; `released-policy`, the one released for the task;
             `module:Class` or `FILE.py:Class`. All baselines and `released-policy` if not given.
         load: Python files to run first; they register tasks or agents of your own.
@@ -109,9 +109,11 @@ def load_files(paths: tuple[Path, ...]) -> None:
         UserCodeError: A file is missing, or raises an error.
     """
     for path in paths:
-        known = {*st.TASKS, *registry.names()}
+        tasks, agents = dict(st.TASKS), registry.names()
         load_file(path)
-        _digests.update({name: file_digest(path) for name in (*st.TASKS, *registry.names()) if name not in known})
+        added = [name for name, task in st.TASKS.items() if tasks.get(name) is not task]
+        added += [name for name in registry.names() if name not in agents]
+        _digests.update(dict.fromkeys(added, file_digest(path)))
 
 
 def code_digests(task: str, agent: str) -> dict[str, str]:
@@ -186,6 +188,10 @@ def _is_object(agent: str) -> bool:
 
 
 def _full_task(name: str) -> str:
+    """Returns the id of a task; one given as `FILE.py:ID` is loaded first."""
+    source, _, name = name.rpartition(":")
+    if source:
+        load_files((Path(source),))
     full = name if name in st.TASKS else f"Subterra/{name}-v0"
     if full not in st.TASKS:
         raise BenchmarkError(no_task(name, st.TASKS))

@@ -238,7 +238,7 @@ def draw(rows: list[dict[str, Any]], facts: dict[str, Any]) -> Figure:
             axes.barh(place, success, height, color=colours(i), alpha=0.75, label=world)
             axes.errorbar(success, place, xerr=spread, fmt="none", ecolor="0.2", elinewidth=1.0, capsize=2.0)
         axes.set_title(task.removeprefix("Subterra/"), fontsize=9)
-        axes.set_yticks(range(len(agents)), agents, fontsize=8)
+        axes.set_yticks(range(len(agents)), [re.sub(r"[^:]*/", "", name) for name in agents], fontsize=8)
         axes.set_xlim(0.0, 103.0)
         axes.tick_params(labelbottom=True, labelsize=8)
         axes.grid(axis="x", alpha=0.3)

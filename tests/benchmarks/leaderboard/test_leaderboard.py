@@ -9,10 +9,12 @@ import sys
 from importlib import resources
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 from PIL import Image
 
+import subterra_jax as st
 from benchmarks.leaderboard import __main__ as command
 from benchmarks.leaderboard import entries as entry_module
 from benchmarks.leaderboard import report
@@ -42,7 +44,7 @@ def run(monkeypatch, *arguments: str) -> int:
         (("--tasks", "Relocalise", "--agents", "policy:StopAt-v0"), "error: policy:StopAt-v0: a policy that drives to"),
         (("--agents", "policy:mine.safetensors"), "error: mine.safetensors: no such policy"),
         (("--agents", "no.py:Mine"), "error: no.py: cannot be read (No such file or directory)"),
-        (("--agents", "nowhere:Mine"), "error: nowhere:Mine: No module named 'nowhere'"),
+        (("--agents", "nowhere:Mine"), "error: nowhere: No module named 'nowhere'"),
         (("--agents", "json:Mine"), "error: json:Mine: json has no 'Mine'"),
         (("--agents", "pathlib:Path", "--tasks", "TraverseShort"), "error: agent 'pathlib:Path' has no uses_lidar"),
         (("--load", "no.py"), "error: no.py: cannot be read (No such file or directory)"),
@@ -234,3 +236,25 @@ def test_a_users_own_classes_files_and_policies_drive(monkeypatch, tmp_path):
     changed = [path.name for path, time in before.items() if path.stat().st_mtime_ns != time]
     assert len(changed) == 2
     assert all("mine_py" in name for name in changed)
+
+
+TASK = """
+from subterra_jax import tasks
+from subterra_jax.rules import Traverse
+
+tasks.register("Mine/Cover-v0", Traverse(), horizon=HORIZON, piece=(0.0, 60.0))
+"""
+
+
+def test_a_task_of_a_users_own_file_is_driven_and_driven_again_once_the_file_changes(monkeypatch, tmp_path):
+    for known in (st.TASKS, gymnasium.registry):  # puts them back at the end
+        monkeypatch.setitem(known, "Mine/Cover-v0", None)
+        monkeypatch.delitem(known, "Mine/Cover-v0")
+    mine, out = tmp_path / "cover.py", tmp_path / "out"
+    words = ("--agents", "dead-reckoning", "--episodes", "2", "--out", str(out))
+    for horizon, success in ((450, 1.0), (450, 1.0), (20, 0.0)):
+        mine.write_text(TASK.replace("HORIZON", str(horizon)))
+        assert run(monkeypatch, *words, "--tasks", f"{mine}:Mine/Cover-v0") == 0
+        (row,) = json.loads((out / "leaderboard.json").read_text())["scores"]
+        assert (row["task"], row["success"]) == ("Mine/Cover-v0", success)
+    assert run(monkeypatch, *words, "--tasks", "Mine/Cover-v0", "--load", str(mine)) == 0
