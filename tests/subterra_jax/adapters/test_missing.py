@@ -6,6 +6,7 @@ import sys
 import pytest
 
 import subterra_jax as st
+from subterra_jax.adapters.views import make_view
 
 
 @pytest.mark.parametrize(
@@ -13,7 +14,6 @@ import subterra_jax as st
     [
         ("sb3", "stable_baselines3.common.vec_env.base_vec_env", "stable-baselines3"),
         ("brax", "brax.envs.base", "brax"),
-        ("camera", "mujoco", "mujoco"),
     ],
 )
 def test_a_missing_library_is_named_with_the_command_that_installs_it(adapter, library, package, monkeypatch):
@@ -21,4 +21,11 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(adapter, l
     monkeypatch.delitem(sys.modules, f"subterra_jax.adapters.{adapter}", raising=False)
     with pytest.raises(st.SubterraError, match=f"pip install {package}$") as caught:
         importlib.import_module(f"subterra_jax.adapters.{adapter}")
+    assert isinstance(caught.value, ImportError)
+
+
+def test_a_view_without_mujoco_names_the_command_that_installs_it(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(st.SubterraError, match=r"pip install mujoco$") as caught:
+        make_view("mujoco", tmp_path)
     assert isinstance(caught.value, ImportError)

@@ -62,7 +62,7 @@ def test_a_box_and_a_goal_are_drawn_where_they_are():
 
 
 def test_a_scene_that_is_not_there_is_named(tmp_path):
-    from subterra_jax.adapters.camera import SceneError
+    from subterra_jax.adapters.views import SceneError
 
     with pytest.raises(SceneError, match=r"scene\.xml is missing"):
         make_view("mujoco", tmp_path)
@@ -78,7 +78,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from subterra_jax.adapters.camera import MujocoView, Path, SceneError
+from subterra_jax.adapters.views import MujocoView, Path, SceneError
 
 folder, position, heading = Path(sys.argv[1]), np.array([float(v) for v in sys.argv[2:4]]), float(sys.argv[4])
 view = MujocoView(folder)
