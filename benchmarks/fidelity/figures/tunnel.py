@@ -179,6 +179,9 @@ def draw_free_space(sheet: Sheet) -> Drawn | None:
     return figure, caption + sheet.note(int(plane.known.sum()))
 
 
+_DIAGRAMS = ("components", "loops", "voids")
+
+
 def draw_persistence(sheet: Sheet) -> Drawn | None:
     """Draws F10: birth and death of components, loops and voids, reconstruction and reference."""
     if sheet.case.hold is None and sheet.case.truth is None:
@@ -186,7 +189,7 @@ def draw_persistence(sheet: Sheet) -> Drawn | None:
     ours, reference = candidate_diagrams(sheet.case), reference_diagrams(sheet.case)
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
     count = 0
-    for axis, name, mine, theirs in zip(axes, _NAMES, ours, reference, strict=True):
+    for axis, name, mine, theirs in zip(axes, _DIAGRAMS, ours, reference, strict=True):
         for pairs, colour, mark, label in ((theirs, ORANGE, "o", "reference"), (mine, BLUE, "x", "reconstruction")):
             pairs = np.nan_to_num(np.asarray(pairs, float).reshape(-1, 2), posinf=0.0, neginf=0.0)
             count += len(pairs)
