@@ -51,20 +51,10 @@ def register_recording(
     progress: Stages,
     partial: Partial,
 ) -> Registered:
-    """Finds the poses where they are not given, and places every return.
+    """Finds the poses where they are not known, and places every return in a cloud thinned to `voxel`, m.
 
-    Args:
-        path: The recording.
-        known: Poses or control positions, where given.
-        calibration: Mounts of prism and IMU against the LiDAR.
-        voxel: Thinning of the cloud, m.
-        reading: What the user says instead of having it detected.
-        progress: Shows the stages.
-        partial: Partial results of an earlier build, and place for those of this one.
-
-    Raises:
-        RecordingError: Damaged, or the poses belong to another recording.
-        FitError: The poses cannot be found, or nothing is left.
+    `calibration` holds the mounts of prism and IMU against the LiDAR. Raises `RecordingError` for a damaged recording,
+    or poses of another one, and `FitError` where the poses cannot be found, or no return is left.
     """
     with Recording(path, reading.topic, reading.format) as recording:
         print(f"detected: {describe(recording.peek())}", flush=True)

@@ -27,23 +27,13 @@ def require_one_bore(
     voxel: float,
     origin: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, " k"]:
-    """Refuses a surface that leaves its axis by far, with the girth of a tunnel.
+    """Refuses a surface that leaves its axis by far, with the girth of a tunnel; raises `FitError`.
 
     All of a branch is as far from both ends as its junction, but for a constant: it falls into the slices of the
-    junction, and reaches far out of them.
+    junction, and reaches far out of them. `along` is half the difference of each node's distances from both ends, from
+    0, m; slices have a `length`, m. `origin` is that of the nodes' frame in the input's, m.
 
-    Args:
-        nodes: Middles of the surface's voxels, m.
-        along: Half the difference of each node's distances from both ends, from 0, m.
-        length: Length of a slice, m.
-        voxel: Edge of a voxel, m.
-        origin: Origin of the nodes' frame in the input's, m.
-
-    Returns:
-        Nodes of the bore itself: not of a niche or a passage.
-
-    Raises:
-        FitError: There is a branch or a room.
+    Returns the nodes of the bore itself, without those of a niche or a passage.
     """
     index = np.floor(along / length).astype(np.intp)
     count = np.bincount(index)

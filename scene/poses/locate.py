@@ -83,9 +83,8 @@ def locate_by_control(
 ) -> Located:
     """Locates the LiDAR in the control's frame from control, odometry and IMU.
 
-    Raises:
-        RecordingError: The control does not overlap the recording.
-        FitError: Too few scans, or what was measured does not determine the trajectory.
+    Raises `RecordingError` where the control does not overlap the recording, and `FitError` for too few scans, or where
+    the measurements do not determine the trajectory.
     """
     times = [scan.stamp for scan in recording.scans()]
     if len(times) < 2:

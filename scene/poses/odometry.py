@@ -238,11 +238,7 @@ class Odometry:
 def estimate_odometry(recording: Recording, guide: Guide | None, stage: Stage, log: OdometryLog) -> Odometry:
     """Estimates one pose for each sweep of at least 100 returns; raises `FitError` for fewer than two.
 
-    Args:
-        recording: The recording; each scan is read once.
-        guide: Known motion; without it, each sweep is expected to go on as the last did.
-        stage: Counts the scans.
-        log: Sweeps that an earlier build tracked, and place for those of this one.
+    Without a guide, each sweep is expected to go on as the last did.
     """
     tracked = log.read()
     tracker = Tracker()

@@ -42,19 +42,10 @@ def register_scans(
     most_uncovered: float = 0.05,
     partial: Partial | None = None,
 ) -> tuple[Cloud, int]:
-    """Return the registered cloud, and the number of scans that the trajectory did not cover.
+    """Places every return; returns the cloud, thinned to `voxel`, m, and the number of scans without a pose.
 
-    Args:
-        recording: The scans.
-        trajectory: Poses of the sensor.
-        voxel: Thinning, m.
-        stage: Counts the scans.
-        most_uncovered: Share of the scans that may lack a pose; those are left out.
-        partial: Partial results of an earlier build, and place for those of this one.
-
-    Raises:
-        RecordingError: The trajectory misses a larger share of the scans.
-        FitError: No point is left.
+    Scans that the trajectory does not cover are left out. Raises `RecordingError` where they are more than
+    `most_uncovered`, a share, and `FitError` where no point is left.
     """
     partial = partial or Partial(None)
     state = _Registration(VoxelMean(voxel))

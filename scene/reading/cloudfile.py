@@ -23,20 +23,10 @@ def read_cloud(
     stage: Stage | None = None,
     partial: Partial | None = None,
 ) -> tuple[Cloud, dict[str, Any]]:
-    """Reads and thins a registered cloud.
+    """Reads a registered cloud, thinned to `voxel`, m; returns it and what was detected.
 
-    Args:
-        path: A file of any format of kind `cloud`.
-        voxel: Thinning, m.
-        config: What the user says instead of having it detected.
-        stage: Counts the points.
-        partial: Partial results of an earlier build, and place for those of this one.
-
-    Returns:
-        The cloud, and what was detected.
-
-    Raises:
-        RecordingError: Unreadable, truncated, without coordinates, empty, or with no finite point.
+    Raises `RecordingError` for a file that is unreadable, truncated, without coordinates, empty, or without a finite
+    point.
     """
     config = config or ReadingConfig()
     detected = detect(path, config.format)

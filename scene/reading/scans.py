@@ -67,12 +67,7 @@ class ScanSource:
     ) -> None:
         """Describes the recording.
 
-        Args:
-            path: See the attributes, as for `scan_count` and `facts`.
-            scan_count: Number of scans.
-            facts: Detected facts.
-            read: Reads the scan of a number from 0, as `make_scan` returns it; may raise anything on damage.
-            close: Closes the file.
+        `read` reads the scan of a number from 0, as `make_scan` returns it. It may raise anything on damage.
         """
         self.path, self.topic, self.scan_count, self.facts = path, path.name, scan_count, facts
         self._read, self._close = read, close
@@ -112,16 +107,14 @@ def make_scan(
 ) -> tuple[Scan, str]:
     """Return a sweep with its returns in the order of time, and the convention of its point times.
 
-    Returns at the origin (nothing came back) and those that are not finite, in place or time, are dropped.
+    Returns at the origin (nothing came back) and those that are not finite, in place or time, are dropped. Raises
+    `ValueError` where the point times span more than a sweep can last.
 
     Args:
         stamp: Stamp of the message, s.
         points: Points in the sensor frame, m.
         values: Point times as stored; `None` where there are none.
         name: Name of their field.
-
-    Raises:
-        ValueError: The point times span more than a sweep can last.
     """
     good = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
     if values is None:

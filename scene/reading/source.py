@@ -171,16 +171,10 @@ class Frame:
 
 
 def choose_frame(sample: np.ndarray, declared: str | None, unit: str | None, axes: str | None) -> Frame:
-    """Return the frame of a cloud; flags come before declarations, declarations before detection.
+    """Return the frame of a cloud; flags (`unit`, `axes`) come before declarations, declarations before detection.
 
-    Args:
-        sample: Points from all over the cloud, as stored; few or none where the unit is declared, `(k, 3)`.
-        declared: Unit the file itself gives; words other than a key of `UNITS` are refused.
-        unit: Unit by flag.
-        axes: Axes by flag.
-
-    Raises:
-        ValueError: A flag is no unit, or no order of axes; the file declares another unit.
+    `sample` holds points from all over the cloud, as stored; few or none where the file declares the unit. Raises
+    `ValueError` for a flag that is no unit or no order of axes, and where the file declares another unit.
     """
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r} is none of {UNIT_NAMES}")

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from scene.bore import Bore
-from scene.writing.markup import DECK, LOW_WALL, add_element, format_numbers, format_quaternion
+from scene.writing.markup import DECK, LOW_WALL, SceneParts, add_element, format_numbers, format_quaternion
 from scene.writing.track import Track
 
 _SEGMENTS = 6  # of a ring
@@ -107,24 +107,24 @@ def make_root(name: str) -> ET.Element:
     return root
 
 
-def add_materials(asset: ET.Element, meshes: Path, rings: bool, reuse: bool) -> None:
+def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
     """Adds pictures and materials; joints of segments are drawn only on a lining that has rings."""
     for name, picture in (("concrete", lambda: concrete_picture(rings)), ("ballast", ballast_picture)):
-        if not (reuse and (meshes / f"{name}.png").exists()):
-            write_png(meshes / f"{name}.png", picture())
+        if not (reuse and (parts.meshes / f"{name}.png").exists()):
+            write_png(parts.meshes / f"{name}.png", picture())
     sky = {"builtin": "gradient", "rgb1": "0.55 0.70 0.88", "rgb2": "0.90 0.93 0.96", "width": "64", "height": "384"}
-    add_element(asset, "texture", type="skybox", **sky)
+    add_element(parts.asset, "texture", type="skybox", **sky)
     for name in ("concrete", "ballast"):
-        add_element(asset, "texture", name=name, type="2d", file=f"{name}.png")
-    add_element(asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
-    add_element(asset, "material", name="floor", texture="ballast", specular="0")
+        add_element(parts.asset, "texture", name=name, type="2d", file=f"{name}.png")
+    add_element(parts.asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
+    add_element(parts.asset, "material", name="floor", texture="ballast", specular="0")
     add_element(
-        asset, "material", name="ballast", texture="ballast", texuniform="true", texrepeat="0.7 0.7", specular="0"
+        parts.asset, "material", name="ballast", texture="ballast", texuniform="true", texrepeat="0.7 0.7", specular="0"
     )
     for name, colour in _COLOURS.items():
         gloss = ("0.7", "0.6") if name in _SHINY else ("0.1", "0.1")
-        add_element(asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])
-    add_element(asset, "material", name="lamp", rgba="1 0.97 0.88 1", emission="1")
+        add_element(parts.asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])
+    add_element(parts.asset, "material", name="lamp", rgba="1 0.97 0.88 1", emission="1")
 
 
 def add_lights(world: ET.Element, bore: Bore, track: Track, spacing: float) -> int:

@@ -1,5 +1,6 @@
 """MJCF elements: numbers, boxes and meshes as attributes."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -62,10 +63,17 @@ def add_box(
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class SceneParts:
+    """A scene that is being written."""
+
+    asset: ET.Element  # Element that declares meshes and materials
+    world: ET.Element  # Element that places geoms
+    meshes: Path  # Folder of meshes and pictures
+
+
 def add_mesh(
-    asset: ET.Element,
-    world: ET.Element,
-    folder: Path,
+    parts: SceneParts,
     name: str,
     mesh: trimesh.Trimesh,
     material: str,
@@ -79,13 +87,13 @@ def add_mesh(
     which of them each corner of each face has, `(f, 3)`. With `reuse`, a file that is there already is taken.
     """
     origin = np.floor(mesh.vertices.mean(axis=0))
-    path = folder / f"{name}.obj"
+    path = parts.meshes / f"{name}.obj"
     if not (reuse and path.exists()):
         path.write_text(_obj_text(mesh.vertices - origin, mesh.faces, coordinates))
-    add_element(asset, "mesh", name=name, file=path.name, inertia="shell")
+    add_element(parts.asset, "mesh", name=name, file=path.name, inertia="shell")
     add_element(
-        world, "geom", name=name, type="mesh", mesh=name, pos=format_numbers(origin), material=material, group=group,
-        contype="0", conaffinity="0",
+        parts.world, "geom", name=name, type="mesh", mesh=name, pos=format_numbers(origin), material=material,
+        group=group, contype="0", conaffinity="0",
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from scene.bore import Bore
 from scene.writing.dressing import add_cameras, add_lights, add_materials, add_scout, make_root
 from scene.writing.furnished import Furnished
 from scene.writing.furniture import FurnitureConfig
-from scene.writing.markup import LOW_WALL, SOLID, add_box, add_element, add_mesh
+from scene.writing.markup import LOW_WALL, SOLID, SceneParts, add_box, add_element, add_mesh
 from scene.writing.mesh import has_rings, split_lining, split_skin
 from scene.writing.planar import Walls
 from scene.writing.track import Track
@@ -50,21 +50,21 @@ def write_scene(
     With furniture the file is `scene_furnished.xml`. It shares the meshes that a call without furniture has written
     into the same folder. `walls` are those at the LiDAR's height.
     """
-    meshes = folder / "meshes"
-    meshes.mkdir(exist_ok=True)
     root = make_root(name)
-    asset, world = add_element(root, "asset"), add_element(root, "worldbody")
-    add_materials(asset, meshes, rings=has_rings(bore), reuse=furnished is not None)
+    parts = SceneParts(add_element(root, "asset"), add_element(root, "worldbody"), folder / "meshes")
+    parts.meshes.mkdir(exist_ok=True)
+    world = parts.world
+    add_materials(parts, rings=has_rings(bore), reuse=furnished is not None)
     count = {"sleepers": len(track.sleeper_station), "rails": 0, "pads": 0, "fasteners": 0}
-    count["lining_chunks"] = _add_lining(asset, world, meshes, bore, lining, track, config, furnished)
+    count["lining_chunks"] = _add_lining(parts, bore, lining, track, config.chunk_length, furnished)
     openings = furnished.openings if furnished else []
     count["wall_panels"] = add_patches(world, bore, track, openings)
     count["low_wall_panels"] = add_low_panels(world, walls, bore, track, furnished.niches if furnished else [])
     add_slabs(world, bore, track)
     if len(track.sleeper_station):
-        add_track(asset, world, meshes, bore.axis, track)
+        add_track(parts, bore.axis, track)
         count |= {"rails": 2, "pads": 2 * len(track.sleeper_station), "fasteners": 4 * len(track.sleeper_station)}
-    count["nails"] = add_nails(asset, world, meshes, bore, config.chunk_length)
+    count["nails"] = add_nails(parts, bore, config.chunk_length)
     if furnished:
         _add_furniture(world, furnished)
     count["lights"] = add_lights(world, bore, track, config.furniture.lamp_spacing)
@@ -77,35 +77,20 @@ def write_scene(
 
 
 def _add_lining(
-    asset: ET.Element,
-    world: ET.Element,
-    meshes: Path,
-    bore: Bore,
-    lining: trimesh.Trimesh,
-    track: Track,
-    config: SceneConfig,
-    furnished: Furnished | None,
+    parts: SceneParts, bore: Bore, lining: trimesh.Trimesh, track: Track, length: float, furnished: Furnished | None
 ) -> int:
-    parts = split_lining(lining, bore, config.chunk_length)
-    for k, chunk in enumerate(parts):
-        first, last = k * config.chunk_length, (k + 1) * config.chunk_length
+    """Adds the lining in chunks of a length, m, with the meshes of `scene.xml` where no niche is near."""
+    chunks = split_lining(lining, bore, length)
+    for k, chunk in enumerate(chunks):
+        first, last = k * length, (k + 1) * length
         own = furnished is not None and any(
             a - _NEAR_NICHE < last and first < b + _NEAR_NICHE for a, b in furnished.niches
         )
         for part, (mesh, coordinates) in split_skin(chunk, bore, track.bed).items():
             name = f"{part}_{k:03d}{'_niche' if own else ''}"
-            add_mesh(
-                asset,
-                world,
-                meshes,
-                name,
-                mesh,
-                _MATERIAL[part],
-                "0",
-                coordinates,
-                reuse=not own and furnished is not None,
-            )
-    return len(parts)
+            reuse = not own and furnished is not None
+            add_mesh(parts, name, mesh, _MATERIAL[part], "0", coordinates, reuse)
+    return len(chunks)
 
 
 def _add_furniture(world: ET.Element, furnished: Furnished) -> None:

@@ -1,6 +1,5 @@
 """The track as meshes and geoms: bed, deck, sleepers, rails, fastenings, nails."""
 
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -10,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scene.bore import Axis, Bore
 from scene.writing import markup
-from scene.writing.markup import DECK, GROUND, SOLID, add_box, add_element
+from scene.writing.markup import DECK, GROUND, SOLID, SceneParts, add_box, add_element
 from scene.writing.track import RailProfile, Track, TrackConfig
 from scene.writing.unrolled import wall_points
 
@@ -128,12 +127,14 @@ def add_slabs(world: ET.Element, bore: Bore, track: Track) -> None:
             add_box(world, f"{name}_{k:03d}", half_size, middle, rotation, bits, **seen)
 
 
-def add_track(asset: ET.Element, world: ET.Element, meshes: Path, axis: Axis, track: Track) -> None:
+def add_track(parts: SceneParts, axis: Axis, track: Track) -> None:
     """Adds sleepers, their fastenings, and rails."""
     for name, mesh in (("sleeper", sleeper_mesh(track.config)), ("fastening", fastening_mesh(track.config))):
         text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=5, header=None)
-        (meshes / f"{name}.obj").write_text(text)
-        add_element(asset, "mesh", name=name, file=f"{name}.obj", **({} if name == "sleeper" else {"inertia": "shell"}))
+        (parts.meshes / f"{name}.obj").write_text(text)
+        add_element(
+            parts.asset, "mesh", name=name, file=f"{name}.obj", **({} if name == "sleeper" else {"inertia": "shell"})
+        )
     at = axis.at(track.sleeper_station)
     for k, z in enumerate(np.interp(track.sleeper_station, axis.station, track.elevation)):
         frame = Rotation.from_matrix(
@@ -146,23 +147,23 @@ def add_track(asset: ET.Element, world: ET.Element, meshes: Path, axis: Axis, tr
             "group": "1",
         }
         add_element(
-            world, "geom", name=f"sleeper_{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
+            parts.world, "geom", name=f"sleeper_{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
             contype=str(SOLID | GROUND), **place,
         )  # fmt: skip
         add_element(
-            world, "geom", name=f"fastening_{k:04d}", type="mesh", mesh="fastening", material="bolt", contype="0",
+            parts.world, "geom", name=f"fastening_{k:04d}", type="mesh", mesh="fastening", material="bolt", contype="0",
             **place,
         )  # fmt: skip
-    _add_rails(world, axis, track)
+    _add_rails(parts.world, axis, track)
 
 
-def add_nails(asset: ET.Element, world: ET.Element, meshes: Path, bore: Bore, chunk: float) -> int:
+def add_nails(parts: SceneParts, bore: Bore, chunk: float) -> int:
     """Adds the bolts that bridge pockets, for looks; returns how many there are."""
     edges = np.append(np.arange(0.0, bore.length - 1e-6, chunk), bore.length + 1e-6)
     for k in range(len(edges) - 1):
         merged = nail_mesh(bore, edges[k], edges[k + 1])
         if merged is not None:
-            markup.add_mesh(asset, world, meshes, f"nails_{k:03d}", merged, "bolt", group="1")
+            markup.add_mesh(parts, f"nails_{k:03d}", merged, "bolt", group="1")
     return len(bore.nail)
 
 

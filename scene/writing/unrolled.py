@@ -137,14 +137,10 @@ def section_corners(bore: Bore) -> Float[np.ndarray, " c"]:
 def triangulate(
     plane: Unrolled, length: float, fold: Float[np.ndarray, " c"], boxes: Float[np.ndarray, "r 4"]
 ) -> Sheet:
-    """Triangulates one turn over the whole length, m.
+    """Triangulates one turn over the whole length, m, with edges along the axis at the arc lengths `fold`, m.
 
-    Args:
-        plane: Arc length of the section.
-        length: Length of the axis, m.
-        fold: Arc lengths at which edges must run along the axis, m.
-        boxes: Recesses as least and greatest arc length, least and greatest station, m; 0.6 grid steps clear of one
-            another, of the seam and of the mouths.
+    Boxes are recesses as least and greatest arc length, least and greatest station, m. They are 0.6 grid steps clear of
+    one another, of the seam and of the mouths.
     """
     u, s = _grid(plane.girth, length, fold)
     recess, clear = np.full(len(u), -1), np.ones(len(u), bool)
