@@ -16,7 +16,7 @@ import tyro
 from scene.errors import FitError, RecordingError
 from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
-from scene.progress import progress_bar
+from scene.progress import Stages
 from scene.reading.formats import load_readers
 from scene.reconstruct import Reconstruction, reconstruct
 from scene.resume import Partial, partial_folder
@@ -93,7 +93,7 @@ def build(
     started = time.monotonic()
     partial = partial or Partial(partial_folder(out))
     try:
-        with progress_bar() as progress:
+        with Stages() as progress:
             result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, partial)
         _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
         with replace_folder(out) as folder:

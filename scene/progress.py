@@ -11,10 +11,10 @@ _LINE_EVERY, _LINE_SHARE = 10.0, 0.1  # s, and share of a stage, between two lin
 
 
 class _Rate(ProgressColumn):
-    """Steps a second."""
+    """Column with the steps per second."""
 
     def render(self, task: Task) -> Text:
-        """Empty until there is a speed."""
+        """Return the rate; empty until there is one."""
         return Text("" if not task.speed else f"{task.speed:.3g}/s")
 
 
@@ -22,25 +22,21 @@ class Stage:
     """One stage of long work, whose steps are counted.
 
     Attributes:
-        name: What is done.
-        done: Steps so far.
+        name: Name of the stage.
+        total: Number of steps in all; `None` where nobody knows.
+        done: Number of steps so far.
     """
 
     def __init__(self, bars: Progress, console: Console, name: str, total: int | None) -> None:
-        self.name, self._total, self.done = name, total, 0
+        self.name, self.total, self.done = name, total, 0
         self._bars, self._console = bars, console
         self._task = bars.add_task(name, total=total)
         self._started = self._line_at = time.monotonic()
         self._first = self._line_done = 0
 
-    @property
-    def total(self) -> int | None:
-        """Steps in all; `None` where nobody knows."""
-        return self._total
-
-    @total.setter
-    def total(self, total: int | None) -> None:
-        self._total = total
+    def expect(self, total: int | None) -> None:
+        """Sets the number of steps in all, once it is known."""
+        self.total = total
         self._bars.update(self._task, total=total)
 
     def advance(self, steps: int = 1) -> None:
@@ -58,7 +54,7 @@ class Stage:
         print(f"Resumed {share} of {self.name}", flush=True)
 
     def _line(self) -> None:
-        """One line for each tenth of a stage that lasts."""
+        """Prints one line for each tenth of a stage that lasts."""
         now = time.monotonic()
         steps = self.done - self._line_done
         if now - self._line_at < _LINE_EVERY or steps < _LINE_SHARE * (self.total or 0) or self.done == self.total:
@@ -66,11 +62,8 @@ class Stage:
         self._line_at, self._line_done = now, self.done
         rate = (self.done - self._first) / (now - self._started)
         left = max((self.total or 0) - self.done, 0) / rate
-        print(
-            f"{self.name}: {self.done / (self.total or 1):.0%}, {rate:.3g}/s, {left:.0f} s left",
-            file=self._console.file,
-            flush=True,
-        )
+        text = f"{self.name}: {self.done / (self.total or 1):.0%}, {rate:.3g}/s, {left:.0f} s left"
+        print(text, file=self._console.file, flush=True)
 
 
 class Stages:
@@ -91,15 +84,5 @@ class Stages:
         self._bars.stop()
 
     def start(self, name: str, total: int | None) -> Stage:
-        """A new stage below the others.
-
-        Args:
-            name: What is done.
-            total: Steps in all; `None` where nobody knows.
-        """
+        """Starts a stage below the others, of `total` steps; `None` where nobody knows."""
         return Stage(self._bars, self._console, name, total)
-
-
-def progress_bar() -> Stages:
-    """Stages on stderr."""
-    return Stages()

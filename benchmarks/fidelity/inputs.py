@@ -21,7 +21,7 @@ from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.files import FidelityError, file_hash, write_json
 from benchmarks.fidelity.references import HoldConfig, load_hold, load_truth
 from scene.errors import require_input
-from scene.progress import progress_bar
+from scene.progress import Stages
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_folder
 
@@ -254,7 +254,7 @@ def _copy_messages(reader: Any, folder: Path, config: SplitConfig, recording: Pa
     if duration < 5 * config.block:
         raise FidelityError(f"{recording}: is shorter than five blocks of {config.block:g} s")
     dealt, counts = deal_blocks(duration, config), dict.fromkeys((*SPLIT_PARTS, "guard"), 0)
-    with ExitStack() as stack, progress_bar() as progress:
+    with ExitStack() as stack, Stages() as progress:
         writers = [stack.enter_context(_make_writer(folder / _part_name(name, recording))) for name in SPLIT_PARTS]
         channels = [{c.id: _add_channel(writer, c) for c in reader.connections} for writer in writers]
         stage = progress.start("split", reader.message_count)

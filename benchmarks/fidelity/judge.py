@@ -18,7 +18,7 @@ from benchmarks.fidelity.references import Hold
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
-from scene.progress import progress_bar
+from scene.progress import Stages
 
 VALUES_SCHEMA = "subterra.fidelity-values/1"
 NOISE_BAND = (0.5, 3.0)  # times the sensor's stated sigma
@@ -93,7 +93,7 @@ def compute_values(case: Case, folder: Path) -> dict[str, Values]:
     path, key = folder / "values.json", case_hash(case)
     values = _kept_values(path, key)
     candidates = make_candidates(case)
-    with progress_bar() as progress:
+    with Stages() as progress:
         for name in [name for name in candidates if name not in values]:
             stage = progress.start(f"metrics of {name}", table.COUNT)
             one = replace(case, candidate=candidates[name](), cache={})

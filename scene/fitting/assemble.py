@@ -60,19 +60,15 @@ def find_stretches(bore: Bore, flat_floor: bool, sigma: float) -> Shaped[np.ndar
         kind = max(sorted(set(best[first:last])), key=best[first:last].count)
         fits = [next((fit for fit in fits if fit.type == kind), fits[-1]) for fits in windows[first:last]]
         inside = (rows >= first) & (rows < last)
+        curvature = float(np.mean([1 / fit.wall_radius for fit in fits]))  # a mean that counts straight walls
+        wall_radius = 1 / curvature if curvature else np.inf
         result.append((
             bore.length * first / count, bore.length * last / count, kind, bore.width[inside].mean(),
             bore.height[inside].mean(), np.mean([fit.crown_radius for fit in fits]),
-            _mean_radius([fit.wall_radius for fit in fits]), np.sqrt(np.mean([fit.rms**2 for fit in fits])),
+            wall_radius, np.sqrt(np.mean([fit.rms**2 for fit in fits])),
             np.sqrt(np.mean(bore.residual_rms[inside] ** 2)), best[first:last].count(kind) / (last - first),
         ))  # fmt: skip
     return np.array(result, STRETCH)
-
-
-def _mean_radius(radius: list[float]) -> float:
-    """Mean by curvature, so that straight walls count."""
-    curvature = float(np.mean(1 / np.asarray(radius)))
-    return 1 / curvature if curvature else np.inf
 
 
 def _runs(best: list[str], shortest: int) -> list[tuple[int, int]]:
@@ -163,18 +159,14 @@ def bore_from_sections(axis: Axis, sections: Sections) -> Bore:
     require_no_room(station, width)
     seen = sections.weight > 0
     coverage = np.array([seen[max(row - 2, 0) : row + 3].any(axis=0).mean() for row in low])
+    padded = np.pad(sections.spread, 2, mode="edge")
+    spread = np.mean([padded[low + k] for k in range(5)], axis=0)  # over five rows, one station step
     bore = Bore(
         station, at.position, at.tangent, at.lateral, at.up, width, height, grid.angle, radius,
-        _window_mean(sections.spread, low), coverage, coverage < _MIN_COVERAGE,
+        spread, coverage, coverage < _MIN_COVERAGE,
         np.empty(0), np.empty(0, POCKET), probability_known(sections.sigma).mean(axis=1)[low],
     )  # fmt: skip
     return replace(bore, stretch=find_stretches(bore, sections.flat_floor, float(np.quantile(sections.sigma, _SURE))))
-
-
-def _window_mean(rows: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Mean over the five rows, one station step, around each place."""
-    padded = np.pad(rows, 2, mode="edge")
-    return np.mean([padded[at + k] for k in range(5)], axis=0)
 
 
 _STRAIGHT = 1e-5  # 1/m

@@ -177,7 +177,10 @@ class OdometryLog:
     def read(self) -> TrackedSweeps:
         """Reads all whole pieces from the first on."""
         tracked = TrackedSweeps()
-        while not tracked.done and (piece := self._piece(len(tracked.times))) is not None:
+        while not tracked.done:
+            piece = self._partial.load(f"{self._name}-{self._pieces:04d}")
+            if piece is None or int(piece["start"]) != len(tracked.times):
+                break  # the next piece must go on where the last one ended
             tracked.times.extend(float(time) for time in piece["times"])
             tracked.poses.extend(piece["poses"])
             tracked.weakest.extend(piece["weakest"])
@@ -220,11 +223,6 @@ class OdometryLog:
             done=np.array(done),
         )
         self._pieces, self._written, self._fresh = self._pieces + 1, len(tracked.times), []
-
-    def _piece(self, start: int) -> dict[str, np.ndarray] | None:
-        """Return the next piece, if it goes on where the last one ended."""
-        piece = self._partial.load(f"{self._name}-{self._pieces:04d}")
-        return piece if piece is not None and int(piece["start"]) == start else None
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ def read_cloud(
         except ValueError as error:
             raise RecordingError(f"{path}: {error}") from error
         if stage is not None:
-            stage.total = source.count
+            stage.expect(source.count)
             if skip:
                 stage.resume(read)
         # Chunks that an earlier build had thinned are decoded again, which most formats cannot do without.

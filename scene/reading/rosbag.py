@@ -31,19 +31,6 @@ _ROS2_PROFILE = b"\x04\0\0\0ros2"
 _KNOWN_SCHEMAS = ("ros2msg", "ros2idl", "omgidl", "")
 
 
-def open_mcap(path: Path) -> Any:
-    """Opens a file with the library's reader; types are named as ROS2 names them."""
-    reader: Any = Reader2.STORAGE_PLUGINS[".mcap"](_AnyProfile(path))  # type: ignore[arg-type]
-    reader.schemas = _Schemas()
-    reader.open()
-    return reader
-
-
-def is_ros1(connection: Any) -> bool:
-    """Return whether the messages of a connection are serialised as ROS1 does."""
-    return getattr(connection.ext, "serialization_format", "") == "ros1"
-
-
 class _AnyProfile:
     """A path whose file says that its profile is ROS2."""
 
@@ -111,7 +98,9 @@ class RosBag(ScanSource):
         except RecordingError:
             self.close()
             raise
-        self._ros1 = self._ros1 or is_ros1(self._connections[0])
+        self._ros1 = (
+            self._ros1 or getattr(self._connections[0].ext, "serialization_format", "") == "ros1"
+        )  # a MCAP file
         self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
         self.topic, self._type = self._connections[0].topic, self._connections[0].msgtype
         self.scan_count = sum(connection.msgcount for connection in self._connections)
@@ -193,11 +182,11 @@ def _likelihood(connection: Any) -> tuple[bool, bool, bool, int]:
 
 
 def _open_reader(path: Path, format: str) -> Any:
-    """Return the library's reader of a folder, or of one storage file whatever its name ends in."""
+    """Opens a folder, or one storage file whatever its name ends in, with the library's reader."""
     if format == "mcap":
-        return open_mcap(path)
-    reader: Any
-    if format == "bag":
+        reader: Any = Reader2.STORAGE_PLUGINS[".mcap"](_AnyProfile(path))  # type: ignore[arg-type]
+        reader.schemas = _Schemas()
+    elif format == "bag":
         reader = Reader1(path)
     else:
         reader = Reader2(path) if path.is_dir() else Reader2.STORAGE_PLUGINS[f".{format}"](path)

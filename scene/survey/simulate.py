@@ -19,7 +19,8 @@ from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
 from scene.survey.rack import IMUS, LIDARS, calibration
 from scene.survey.sweeps import n_sweeps, sweeps, write_profiles
-from scene.survey.write import CloudWriter, describe_truth, replace_file, write_json, write_mesh, write_tum, write_yaml
+from scene.survey.write import CloudWriter, describe_truth, write_json, write_mesh, write_tum, write_yaml
+from subterra_jax.host.files import replace_file
 
 Message = tuple[int, str, bytes]  # time in ns since the start of the survey, topic, bytes
 

@@ -9,7 +9,8 @@ from scene.survey.carrier import CARRY_HEIGHT, Carried, rotate
 from scene.survey.cast import Caster, Hits, draw_reflectivity, draw_returns, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
-from scene.survey.write import CloudWriter, replace_file
+from scene.survey.write import CloudWriter
+from subterra_jax.host.files import replace_file
 
 _RAYS_AT_ONCE = 240_000  # large enough for numpy, small enough for the memory
 _SECOND_RETURN = 0.02  # share of returns marked as second ones

@@ -1,8 +1,6 @@
 """Files of a survey, each written under a temporary name and renamed, and its truth for the measuring of builders."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -17,20 +15,9 @@ from scene.survey.bore import Bore
 from scene.survey.config import SurveyConfig
 from scene.survey.mesh import Mesh
 from scene.survey.messages import EPOCH
+from subterra_jax.host.files import replace_file
 
 CLOUD_POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", "<f4")])
-
-
-@contextmanager
-def replace_file(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside `path`, and rename to `path` if all went well; otherwise leave nothing behind."""
-    part = path.with_name(f".{path.name}.part")
-    part.unlink(missing_ok=True)
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

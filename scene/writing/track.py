@@ -89,7 +89,10 @@ def lay_track(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None)
     else:
         station, measured, config = seen.station, seen.measured, replace(config, protrusion=seen.protrusion)
     elevation = smooth + config.protrusion
-    clearance = _clearance(bore, elevation, station) - config.sleeper_length / 2
+    level = elevation - bore.position[:, 2]
+    nearer = np.minimum(wall_offset(bore, level, 1), wall_offset(bore, level, -1))
+    row = np.clip(np.rint(station / bore.station[1]).astype(int), 0, len(bore.station) - 1)
+    clearance = nearer[row] - config.sleeper_length / 2
     if (clearance < config.margin).any():
         worst = int(np.argmin(clearance))
         raise FitError(
@@ -134,10 +137,3 @@ def wall_offset(bore: Bore, level: Float[np.ndarray, " n"], side: int) -> Float[
     crosses = (upward < level) != (next_upward < level)
     share = np.where(crosses, (level - upward) / np.where(crosses, next_upward - upward, 1.0), 0.0)
     return np.where(crosses, across + share * (next_across - across), 0.0).max(axis=1)
-
-
-def _clearance(bore: Bore, elevation: np.ndarray, station: np.ndarray) -> np.ndarray:
-    """Distance from the axis to the nearer wall at the height of the track, at each station, m."""
-    level = elevation - bore.position[:, 2]
-    nearer = np.minimum(wall_offset(bore, level, 1), wall_offset(bore, level, -1))
-    return nearer[np.clip(np.rint(station / bore.station[1]).astype(int), 0, len(bore.station) - 1)]

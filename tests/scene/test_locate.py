@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scene.errors import RecordingError
-from scene.progress import progress_bar
+from scene.progress import Stages
 from scene.reconstruct import ReconstructConfig, reconstruct
 from tests.scene.bags import write_bag, write_tum
 
@@ -36,14 +36,14 @@ def test_control_of_another_day_is_refused_before_any_odometry(bag, tmp_path):
 
     control = write_tum(tmp_path / "prism.tum", control_rows(0.0))
     with pytest.raises(RecordingError, match=r"prism\.tum: control runs from 0\.00 to 11\.70 s, but .*a\.bag from 100"):
-        reconstruct(bag, None, ReconstructConfig(), progress_bar(), control)
+        reconstruct(bag, None, ReconstructConfig(), Stages(), control)
 
 
 def test_control_and_a_trajectory_together_are_refused(bag, tmp_path):
 
     control = write_tum(tmp_path / "prism.tum", control_rows(100.0))
     with pytest.raises(RecordingError, match=r"prism\.tum: control is for a recording without a trajectory"):
-        reconstruct(bag, control, ReconstructConfig(), progress_bar(), control)
+        reconstruct(bag, control, ReconstructConfig(), Stages(), control)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 
 from scene.errors import FitError, RecordingError
 from scene.poses.imu import read_inertial
-from scene.progress import progress_bar
+from scene.progress import Stages
 from scene.reading.recording import Recording
 from scene.reconstruct import ReconstructConfig, reconstruct
 from tests.scene.bags import custom_msg, write_bag, write_imu_bag, write_tum
@@ -27,7 +27,7 @@ def nothing(count: int = 0) -> np.ndarray:
 
 def outcome(path, *arguments) -> str:
     with pytest.raises((RecordingError, FitError)) as caught:
-        reconstruct(path, None, ReconstructConfig(), progress_bar(), *arguments)
+        reconstruct(path, None, ReconstructConfig(), Stages(), *arguments)
     assert str(path.name) in str(caught.value) or arguments
     assert "\n" not in str(caught.value)
     return str(caught.value)

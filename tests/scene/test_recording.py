@@ -4,7 +4,7 @@ import pytest
 from scene.errors import RecordingError
 from scene.poses.registration import register_scans
 from scene.poses.trajectory import load_tum
-from scene.progress import progress_bar
+from scene.progress import Stages
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag, write_bag_without_lidar, write_tum
 
@@ -65,7 +65,7 @@ def test_a_trajectory_that_misses_the_recording_is_refused_with_both_spans(tmp_p
         Recording(write_bag(tmp_path / "a.bag", SCANS)) as recording,
         pytest.raises(RecordingError, match=r"t\.tum: covers 0\.00 to 49\.95 s, but .*a\.bag runs from 100\.00"),
     ):
-        register_scans(recording, trajectory, 0.05, progress_bar().start("", 5))
+        register_scans(recording, trajectory, 0.05, Stages().start("", 5))
 
 
 def test_returns_move_with_the_sensor_during_a_sweep(tmp_path):
@@ -76,6 +76,6 @@ def test_returns_move_with_the_sensor_during_a_sweep(tmp_path):
     rows[:, 1] = 10.0 * (rows[:, 0] - 100.0)
     trajectory = load_tum(write_tum(tmp_path / "t.tum", rows))
     with Recording(write_bag(tmp_path / "a.bag", [(100.0, points)])) as recording:
-        cloud, uncovered = register_scans(recording, trajectory, 0.01, progress_bar().start("", 1))
+        cloud, uncovered = register_scans(recording, trajectory, 0.01, Stages().start("", 1))
     assert uncovered == 0
     np.testing.assert_allclose(cloud.points[:, 0] + cloud.origin[0], 10.0, atol=1e-4)

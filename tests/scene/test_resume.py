@@ -17,7 +17,7 @@ from scene.cloud import VoxelMean
 from scene.poses.odometry import OdometryLog, estimate_odometry
 from scene.poses.registration import register_scans
 from scene.poses.trajectory import Trajectory
-from scene.progress import progress_bar
+from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
@@ -42,7 +42,7 @@ def partial(folder: Path, key: str = "a", fresh: bool = False) -> Partial:
 
 
 def stage(dies_after: int | None = None):
-    counter = progress_bar().start("scans", 60)
+    counter = Stages().start("scans", 60)
     advance = counter.advance
 
     def counted(steps: int = 1) -> None:

@@ -30,7 +30,7 @@ from benchmarks.fidelity.controls.catalogue import (
 from benchmarks.fidelity.files import read_json, write_json
 from benchmarks.fidelity.judge import Base
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
-from scene.progress import progress_bar
+from scene.progress import Stages
 
 OUTCOME_SCHEMA = "subterra.fidelity-control/1"
 
@@ -147,7 +147,7 @@ def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]
             todo.append(job)
         else:
             done[job] = known
-    with progress_bar() as progress:
+    with Stages() as progress:
         stage = progress.start("controls", len(jobs))
         if done:
             stage.resume(len(done))
