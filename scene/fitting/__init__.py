@@ -1,1 +1,1 @@
-"""Cloud or rings in, bore out: axis, sections, lining, and what of a track is seen."""
+"""From a cloud or rings to the bore: axis, sections, lining, and the track that the cloud shows."""

@@ -117,9 +117,9 @@ def _mask_unseen(shape: np.ndarray, seen: Bool[np.ndarray, "m n"], nugget: float
 def leave_one_out(
     model: Correlation, station: Float[np.ndarray, "n m"], value: Float[np.ndarray, "n m"]
 ) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"]]:
-    """Predicts each value from the others.
+    """Return each value's distance from what the others predict of it, and that prediction's standard deviation, m.
 
-    NaN where nothing was seen.
+    Both are NaN where nothing was seen.
     """
     at, y = station.T, value.T
     seen = np.isfinite(y)

@@ -48,11 +48,11 @@ def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
 
 
 def add_pattern(faint: Holes, clear: Holes, grid: Grid, reach: float) -> Holes:
-    """Adds the faint holes that stand where the pattern of those clear and in rows, `clear`, has a pocket.
+    """Adds the faint holes that stand where the pattern of the clear holes has a pocket.
 
     Holes faint in themselves, as pockets are that the scanner looks at head on, make a row where most of its places
-    either side of the joints hold one; chance would fill about a quarter of them. `reach` is half a row's width,
-    columns.
+    either side of the joints hold one; chance would fill about a quarter of them. `clear` are the clear holes in rows,
+    and `reach` is half the width of a row, in columns.
     """
     station = (clear.row + 0.5) * grid.step
     joints = find_ring_joints(station, grid.rows * grid.step)
@@ -129,10 +129,10 @@ _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
-    """Return the pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints that they straddle, m.
+    """Finds the pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints between them, m.
 
-    Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and
-    at a pitch of rings are none: both are empty then.
+    Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and at a
+    pitch of rings are no pockets: both results are empty then.
     """
     grid = sections.grid
     nothing = np.empty(0, POCKET), np.empty(0)

@@ -127,6 +127,11 @@ class _Points:
     radius: np.ndarray
     weight: np.ndarray
 
+    def outward_of(self, wall: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+        """Return the cell of each point, -1 outside the grid, and its distance outward of the wall, m."""
+        cell = grid.cell(self.station, self.angle)
+        return cell, self.radius - wall.ravel()[np.maximum(cell, 0)]
+
 
 def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     """Fits the sections from one end of the seen bore to the other; stations are those of `axis`.
@@ -170,8 +175,7 @@ def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None
 
 
 def _require_open_middle(points: _Points, fine: Grid, wall: np.ndarray) -> None:
-    cell = fine.cell(points.station, points.angle)
-    outward = points.radius - wall.ravel()[np.maximum(cell, 0)]
+    cell, outward = points.outward_of(wall, fine)
     hollow = np.mean(np.abs(outward[cell >= 0]) < _HOLLOW)
     if hollow < _MIN_HOLLOW:
         raise FitError(f"no tunnel in the cloud: only {hollow:.0%} of its points lie on a wall around an open middle")
@@ -181,8 +185,7 @@ def _follow_wall(
     points: _Points, first: np.ndarray, fine: Grid, floors: Floors | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the wall at the half-metre scale, and the cells that it was fitted to."""
-    cell = fine.cell(points.station, points.angle)
-    outward = points.radius - first.ravel()[np.maximum(cell, 0)]
+    cell, outward = points.outward_of(first, fine)
     residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     weight = np.where(inlier, np.minimum(weight, 50.0), 0.0)
@@ -197,8 +200,7 @@ def _measure_wall(
     points: _Points, wall: np.ndarray, sigma: np.ndarray, fine: Grid, flat_floor: bool, voxel: float, spacing: float
 ) -> Sections:
     """Measures what the points show of the wall that was fitted to them."""
-    cell = fine.cell(points.station, points.angle)
-    outward = points.radius - wall.ravel()[np.maximum(cell, 0)]
+    cell, outward = points.outward_of(wall, fine)
     residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
     on_wall = (np.abs(outward) < _ON_WALL) & (cell >= 0)
     behind = (outward > _ON_WALL) & (outward < _DEEPEST) & (cell >= 0)

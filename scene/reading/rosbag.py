@@ -98,9 +98,7 @@ class RosBag(ScanSource):
         except RecordingError:
             self.close()
             raise
-        self._ros1 = (
-            self._ros1 or getattr(self._connections[0].ext, "serialization_format", "") == "ros1"
-        )  # a MCAP file
+        self._ros1 = self._ros1 or getattr(self._connections[0].ext, "serialization_format", "") == "ros1"
         self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
         self.topic, self._type = self._connections[0].topic, self._connections[0].msgtype
         self.scan_count = sum(connection.msgcount for connection in self._connections)

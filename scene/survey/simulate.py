@@ -101,7 +101,7 @@ _BEHIND = {"avia": 20.0}  # m of bore that a LiDAR sees behind itself, where it 
 
 
 def simulate(config: SurveyConfig, console: Console) -> str:
-    """Write the survey of `config`; return a line that says what was written."""
+    """Writes the survey of `config`; returns a line that says what was written."""
     of_bore, of_walk, of_prism, of_profiles, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
     bore = draw_bore(of_bore, config.length, config.truth, config.correlation)
     mesh = bore.mesh()

@@ -1,1 +1,1 @@
-"""Bore in, files out: meshes, planar tunnel, track, MJCF and manifest."""
+"""From the bore to files: meshes, planar tunnel, track and MJCF."""
