@@ -238,12 +238,12 @@ class Sightings:
 class Steps:
     """Relative poses between knots, from LiDAR odometry."""
 
-    first: Int[np.ndarray, " m"]  # Knots joined
-    second: Int[np.ndarray, " m"]
+    first: Int[np.ndarray, " m"]  # Earlier knot of each
+    second: Int[np.ndarray, " m"]  # Later knot of each
     turn: Float[np.ndarray, "m 3 3"]  # Attitude of the second in the first
     shift: Float[np.ndarray, "m 3"]  # Position of the second in the first, m
-    turn_root: Float[np.ndarray, "m 3 3"]  # Square roots of the information matrices, `(m, 3, 3)`, 1/rad and 1/m
-    shift_root: Float[np.ndarray, "m 3 3"]
+    turn_root: Float[np.ndarray, "m 3 3"]  # Square root of the information matrix of the turn, 1/rad
+    shift_root: Float[np.ndarray, "m 3 3"]  # Square root of the information matrix of the shift, 1/m
 
     def add_to(self, equations: NormalEquations, chain: Chain, robust: float) -> None:
         """Adds these terms; beyond `robust` standard deviations (Cauchy) a step counts ever less."""

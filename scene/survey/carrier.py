@@ -55,12 +55,12 @@ class Walk:
     bore: Bore  # The bore walked through
     speed: float  # Mean speed, m/s
     duration: float  # Length of the survey, s
-    ahead: Sway  # Sway of the position, m
-    across: Sway
-    above: Sway
+    ahead: Sway  # Sway of the position along the centreline, m
+    across: Sway  # Sway of the position to the left, m
+    above: Sway  # Sway of the position upwards, m
     yaw: Sway  # Sway of the attitude against the centreline's frame, rad
-    pitch: Sway
-    roll: Sway
+    pitch: Sway  # rad
+    roll: Sway  # rad
 
     def station(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the station of the carrier, m."""
@@ -106,7 +106,7 @@ class Carried:
 
 
 def draw_walk(rng: np.random.Generator, bore: Bore, speed: float, period: float) -> Walk:
-    """Draw a walk through `bore`, a whole number of scans of `period` s long."""
+    """Draws a walk through `bore`, a whole number of scans of `period` s long."""
     duration = period * np.ceil((bore.alignment.length + STOP - START) / speed / period)
     degree = np.pi / 180.0
     return Walk(

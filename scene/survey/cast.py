@@ -39,7 +39,7 @@ class Caster:
         self._window: int | None = None
 
     def load(self, station: float, near: Float[np.ndarray, "3"]) -> None:
-        """Load what can be seen by a carrier at `station`, m, about `near`, m, if it is not yet."""
+        """Loads what can be seen by a carrier at `station`, m, about `near`, m, if it is not yet."""
         window = int(np.floor(station / _WINDOW))
         if window == self._window:
             return

@@ -35,7 +35,7 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class SurveyConfig:
-    """Simulate the survey of one bore and write it with its truth.
+    """Simulates the survey of one bore and writes it with its truth.
 
     Example: python -m scene.survey --truth metro --length 60 --out build/survey
     """

@@ -55,7 +55,7 @@ class Furniture:
 
 
 def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True) -> Furniture:
-    """Draw the furniture of a bore of `length` m, without rings, pockets and nails if not `rings`.
+    """Draws the furniture of a bore of `length` m, without rings, pockets and nails if not `rings`.
 
     The first joint and the first sleeper stand at drawn stations: whoever assumes that they start at a mouth is wrong.
     """

@@ -26,7 +26,7 @@ SCAN_PERIOD = 0.1  # s, one message of every LiDAR here
 class Lidar:
     """One model of LiDAR. Its frame: x forward, y left, z up."""
 
-    name: str  # As the user calls it
+    name: str  # Name that the user gives
     # Times of the beams of one sweep in the order of firing, ns after its first; not decreasing
     offset: Int[np.ndarray, "n"]
     stamp: int  # Time of the header's stamp, ns after the first beam
@@ -34,7 +34,7 @@ class Lidar:
     # Time of each beam of whole sweeps, s, and a drawn phase `(2,)`, rad, to unit vectors
     directions: Callable[[Float[np.ndarray, "n"], Float[np.ndarray, "2"]], Float[np.ndarray, "n 3"]]
     range_min: float  # Least range reported, m
-    range_max: float
+    range_max: float  # Largest range reported, m
     weakest_echo: float  # Weakest echo that it detects: albedo · cos(incidence) / distance², 1/m²
     divergence: float  # Half the opening angle of a beam, rad
 

@@ -64,8 +64,8 @@ def refine_breaks(breaks: Float[np.ndarray, "b"], cell: float) -> Float[np.ndarr
 class Shape:
     """One outline at its nominal size; other sizes stretch it across and upright."""
 
-    width: float  # Nominal largest width, and height from floor to crown, m
-    height: float
+    width: float  # Nominal largest width, m
+    height: float  # Nominal height from floor to crown, m
     nodes: Float[np.ndarray, "m 2"]  # Along `lateral`, and above the floor, m
     # Outward normals; horizontal at the feet, so that roughness does not lift them off the floor
     normal: Float[np.ndarray, "m 2"]
@@ -198,8 +198,8 @@ class Section:
     """Section by station, on the nodes of a shape."""
 
     shape: Shape  # The outline
-    width_field: Field  # Slow deviations from its width and height, m
-    height_field: Field
+    width_field: Field  # Slow deviation from its width, m
+    height_field: Field  # Slow deviation from its height, m
     roughness: Field  # Deviation along the outward normal by station and girth, m
     widening: Trend = field(default_factory=Trend)  # Further width by station, m
     # Rise of the floor towards the left, m/m; on the axis it lies half the height below the centreline

@@ -35,49 +35,30 @@ def sweeps(
     at_once = max(1, _RAYS_AT_ONCE // len(offset)) if every == 1 else 1
     for first in range(0, len(numbers), at_once):
         batch = numbers[first : first + at_once]
-        yield from _cast_sweeps(rng, lidar, carried, caster, errors, phase, offset, batch)
+        n, begin = len(offset), SCAN_PERIOD * batch
+        ray = lidar.directions((begin[:, None] + 1e-9 * lidar.offset).ravel(), phase)
+        poses = carried.poses_between(begin[0], (begin[:, None] + 1e-9 * offset).ravel())
+        heading = rotate(poses.quaternion, ray)
+        caster.load(float(carried.walk.station(begin[:1])[0]), poses.position[0])
+        hits = caster.cast_loaded(poses.position, heading)
 
-
-def _cast_sweeps(
-    rng: np.random.Generator,
-    lidar: Lidar,
-    carried: Carried,
-    caster: Caster,
-    errors: SensorErrors,
-    phase: np.ndarray,
-    offset: np.ndarray,
-    numbers: np.ndarray,
-) -> Iterator[Sweep]:
-    n, begin = len(offset), SCAN_PERIOD * numbers
-    ray = lidar.directions((begin[:, None] + 1e-9 * lidar.offset).ravel(), phase)
-    poses = carried.poses_between(begin[0], (begin[:, None] + 1e-9 * offset).ravel())
-    heading = rotate(poses.quaternion, ray)
-    caster.load(float(carried.walk.station(begin[:1])[0]), poses.position[0])
-    hits = caster.cast_loaded(poses.position, heading)
-
-    valid = draw_returns(rng, lidar, errors, hits)
-    distance = hits.distance
-    if errors.mixed_pixels > 0.0:
-        distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
-    sigma = noise_sigma(errors, distance, hits.cosine)
-    # Rounded once, here: the cloud and the bag then hold the same point.
-    seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)
-    points = (seen[:, None] * ray).astype(np.float32)
-    reflectivity = np.where(valid, draw_reflectivity(rng, hits.cosine, hits.part), 0).astype(np.uint8)
-    second = valid & (rng.random(len(ray), np.float32) < _SECOND_RETURN)
-    placed = poses.position + seen[:, None] * heading
-    for k, number in enumerate(numbers):
-        of = slice(k * n, (k + 1) * n)
-        yield Sweep(
-            int(number),
-            round(SCAN_PERIOD * 1e9) * int(number),
-            offset,
-            valid[of],
-            points[of],
-            reflectivity[of],
-            second[of],
-            placed[of],
-        )
+        valid = draw_returns(rng, lidar, errors, hits)
+        distance = hits.distance
+        if errors.mixed_pixels > 0.0:
+            distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
+        sigma = noise_sigma(errors, distance, hits.cosine)
+        # Rounded once, here: the cloud and the bag then hold the same point.
+        seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)
+        points = (seen[:, None] * ray).astype(np.float32)
+        reflectivity = np.where(valid, draw_reflectivity(rng, hits.cosine, hits.part), 0).astype(np.uint8)
+        second = valid & (rng.random(len(ray), np.float32) < _SECOND_RETURN)
+        placed = poses.position + seen[:, None] * heading
+        for k, number in enumerate(batch):
+            of = slice(k * n, (k + 1) * n)
+            yield Sweep(
+                int(number), round(SCAN_PERIOD * 1e9) * int(number), offset, valid[of], points[of], reflectivity[of],
+                second[of], placed[of],
+            )  # fmt: skip
 
 
 _POINTS = 3600  # in one turn
@@ -97,7 +78,7 @@ def profile_stations(length: float, spacing: float) -> tuple[np.ndarray, np.ndar
 
 
 def write_profiles(config: SurveyConfig, bore: Bore, caster: Caster, seed: np.random.SeedSequence) -> int:
-    """Write `cloud.ply` and `held_out.ply`; return the number of points of the first."""
+    """Writes `cloud.ply` and `held_out.ply`; returns the number of points of the first."""
     counts = []
     stations = profile_stations(config.length, config.profiles)
     for name, at, one in zip(("cloud.ply", "held_out.ply"), stations, seed.spawn(2), strict=True):

@@ -21,13 +21,13 @@ CLOUD_POINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("intensity", 
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Write JSON on one line."""
+    """Writes JSON on one line."""
     with replace_file(path) as part:
         part.write_text(json.dumps(content, allow_nan=False) + "\n")
 
 
 def write_yaml(path: Path, content: dict[str, Any]) -> None:
-    """Write YAML, lists of numbers on one line."""
+    """Writes YAML, lists of numbers on one line."""
     with replace_file(path) as part:
         part.write_text(yaml.safe_dump(content, default_flow_style=None, sort_keys=False, width=120))
 
@@ -49,7 +49,7 @@ def write_tum(
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY in float64, with the `part` of each triangle."""
+    """Writes a binary PLY in float64, with the `part` of each triangle."""
     faces = np.empty(len(mesh.faces), [("n", "u1"), ("v", "<i4", 3), ("part", "u1")])
     faces["n"], faces["v"], faces["part"] = 3, mesh.faces, mesh.part
     header = (
@@ -79,7 +79,7 @@ class CloudWriter:
             file.write(header(self._count))
 
     def add(self, placed: Float[np.ndarray, "n 3"], intensity: Shaped[np.ndarray, "n"]) -> None:
-        """Append points, m, in the survey frame."""
+        """Appends points, m, in the survey frame."""
         points = np.empty(len(placed), CLOUD_POINT)
         points["x"], points["y"], points["z"] = placed.T
         points["intensity"] = intensity
@@ -94,7 +94,7 @@ class CloudWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Put the final counts into the headers and close."""
+        """Puts the final counts into the headers and closes."""
         self._write_headers()
         for file, _ in self._files:
             file.close()
