@@ -163,9 +163,8 @@ def _find_sleepers(station: np.ndarray, lateral: np.ndarray, height: np.ndarray,
     owner = _nearest_sleeper(centre, station[near])
     on_top = (np.abs(station[near] - centre[owner]) < 0.06) & (height[near] > _STEP)
     protrusion = float(np.median(height[near][on_top]))
-    place, measured = _complete_sleepers(
-        _sleeper_middles(centre, station[near], height[near], protrusion), spacing, length
-    )
+    middles = _sleeper_middles(centre, station[near], height[near], protrusion)
+    place, measured = _complete_sleepers(middles, spacing, length)
     return SeenSleepers(place, measured, protrusion)
 
 

@@ -29,7 +29,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Where prism and IMU are, seen from the LiDAR."""
+    """The places of prism and IMU, seen from the LiDAR."""
 
     name: str  # Preset, file or lever arm, for the manifest
     prism: Float[np.ndarray, "3"]  # Position of the prism in LiDAR coordinates, m

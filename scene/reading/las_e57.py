@@ -39,7 +39,8 @@ def declared_unit(records: Iterable[Any]) -> str | None:
 
 
 def _unit_of_wkt(text: str) -> str | None:
-    flat, _, height = _split_height(text)
+    vertical = re.search(r"VERT(?:_CS|CRS|ICALCRS)", text)
+    flat, height = (text[: vertical.start()], text[vertical.start() :]) if vertical else (text, "")
     if not re.search(r"PROJ(?:CS|CRS|ECTEDCRS)|LOCAL_CS|ENG(?:CRS|INEERINGCRS)|GEOCCS|GEODCRS", flat):
         return DEGREES if re.search(r"GEOG(?:CS|CRS|RAPHICCRS)", text) else None
     for inner in ("GEOGCS", "BASEGEOGCRS", "BASEGEODCRS", "PARAMETER", "ELLIPSOID"):
@@ -68,12 +69,6 @@ def _unit_name(name: str, factor: float) -> str:
     return next(
         (unit for unit, metres in UNITS.items() if abs(factor / metres - 1) < _SAME_FACTOR), f"{name} ({factor:g} m)"
     )
-
-
-def _split_height(text: str) -> tuple[str, str, str]:
-    """Plan and height of a compound system."""
-    at = re.search(r"VERT(?:_CS|CRS|ICALCRS)", text)
-    return (text[: at.start()], at.group(), text[at.start() :]) if at else (text, "", "")
 
 
 def _remove_parts(text: str, name: str) -> str:

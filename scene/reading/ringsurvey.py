@@ -91,7 +91,7 @@ class RingSurvey:
 
 @dataclass(frozen=True)
 class _RingColumns:
-    """Where a ring table keeps what."""
+    """The columns of a ring table."""
 
     xyz: list[int]
     unit: str | None

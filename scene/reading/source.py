@@ -80,7 +80,7 @@ _TEXT_BLOCK = 1 << 22  # bytes
 
 @dataclass(frozen=True)
 class Lines:
-    """Where numbers stand in a text file."""
+    """The lines of a text file that hold numbers."""
 
     path: Path  # The file
     columns: tuple[int, ...]  # Columns to read, in this order

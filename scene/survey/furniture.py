@@ -44,7 +44,7 @@ N_ROWS = 8  # longitudinal rows of pockets: four on the left side from the floor
 
 @dataclass(frozen=True)
 class Furniture:
-    """Where the furniture of one bore stands."""
+    """The furniture of one bore."""
 
     joints: np.ndarray  # Stations of the ring joints, m `(r,)`; empty where the bore has no rings
     pocketed: np.ndarray  # Joints with pockets: those far enough from the mouths

@@ -118,9 +118,8 @@ def add_materials(parts: SceneParts, rings: bool, reuse: bool) -> None:
         add_element(parts.asset, "texture", name=name, type="2d", file=f"{name}.png")
     add_element(parts.asset, "material", name="concrete", texture="concrete", specular="0.15", shininess="0.2")
     add_element(parts.asset, "material", name="floor", texture="ballast", specular="0")
-    add_element(
-        parts.asset, "material", name="ballast", texture="ballast", texuniform="true", texrepeat="0.7 0.7", specular="0"
-    )
+    repeat = {"texuniform": "true", "texrepeat": "0.7 0.7"}
+    add_element(parts.asset, "material", name="ballast", texture="ballast", **repeat, specular="0")
     for name, colour in _COLOURS.items():
         gloss = ("0.7", "0.6") if name in _SHINY else ("0.1", "0.1")
         add_element(parts.asset, "material", name=name, rgba=colour, specular=gloss[0], shininess=gloss[1])
@@ -157,14 +156,8 @@ def add_cameras(world: ET.Element, bore: Bore, track: Track) -> None:
         right /= np.linalg.norm(right)
         position = at.position[0] + across * at.lateral[0]
         position[2] = np.interp(station, bore.station, track.elevation) + height
-        add_element(
-            world,
-            "camera",
-            name=name,
-            pos=format_numbers(position),
-            xyaxes=format_numbers([*right, *np.cross(right, look)]),
-            fovy="65",
-        )
+        axes = format_numbers([*right, *np.cross(right, look)])
+        add_element(world, "camera", name=name, pos=format_numbers(position), xyaxes=axes, fovy="65")
 
 
 def add_scout(world: ET.Element, bore: Bore, track: Track, radius: float, lidar_height: float) -> None:
@@ -172,13 +165,8 @@ def add_scout(world: ET.Element, bore: Bore, track: Track, radius: float, lidar_
     at = bore.axis.at(np.array([min(2.0, bore.length / 2)]))
     elevation = float(np.interp(at.station[0], bore.station, track.elevation))
     yaw = Rotation.from_euler("z", np.arctan2(at.tangent[0, 1], at.tangent[0, 0]))
-    body = add_element(
-        world,
-        "body",
-        name="scout",
-        pos=format_numbers([*at.position[0, :2], elevation + 0.01]),
-        quat=format_quaternion(yaw),
-    )
+    start = format_numbers([*at.position[0, :2], elevation + 0.01])
+    body = add_element(world, "body", name="scout", pos=start, quat=format_quaternion(yaw))
     add_element(body, "freejoint", name="scout")
     touch = {"contype": "0", "conaffinity": str(LOW_WALL | DECK), "group": "2", "material": "scout"}
     hull = {"type": "capsule", "size": format_numbers([radius, 0.08]), "pos": "0 0 0.52", "mass": "40"}

@@ -70,7 +70,7 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class TunnelSpace:
-    """Where furniture may stand."""
+    """The room in the tunnel for furniture."""
 
     bore: Bore  # The bore
     track: Track  # Its track
@@ -189,15 +189,10 @@ def _third_rail(space: TunnelSpace) -> list[Piece]:
     for start, end in _stretches(space, 3.0):
         if space.wall(start, end, top, -1)[0] < -middle + 0.15 or -middle - 0.1 < config.gauge:
             continue
-        station = start + 0.5
-        pot = (middle - 0.05, middle + 0.05)
-        pieces.append(
-            space.box("third_rail", "galvanised", (start, end + 0.02), (middle - 0.04, middle + 0.04), (top - 0.1, top))
-        )
-        pieces.append(
-            space.box("insulator", "insulator", (station - 0.05, station + 0.05), pot, (-track.protrusion, top - 0.1))
-        )
-        cover = (middle - 0.08, middle + 0.08)
+        rail, pot, cover = ((middle - half, middle + half) for half in (0.04, 0.05, 0.08))
+        span = (start + 0.5 - 0.05, start + 0.5 + 0.05)
+        pieces.append(space.box("third_rail", "galvanised", (start, end + 0.02), rail, (top - 0.1, top)))
+        pieces.append(space.box("insulator", "insulator", span, pot, (-track.protrusion, top - 0.1)))
         pieces.append(space.box("third_rail_cover", "cover", (start, end), cover, (top + 0.05, top + 0.07)))
     return pieces
 

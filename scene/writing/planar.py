@@ -1,4 +1,4 @@
-"""Bore to the planar tunnel: its walls cut at LiDAR height above the track, as polylines."""
+"""From the bore to the planar tunnel: its walls cut at LiDAR height above the track, as polylines."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -49,7 +49,7 @@ class TrackConfig:
 
     @property
     def rail_offset(self) -> float:
-        """From the axis to the middle of a rail's head: half the gauge is face to face, not centre to centre."""
+        """Distance from the axis to the middle of a rail's head; the gauge itself is face to face."""
         return (self.gauge + self.rail.head_width) / 2
 
 
