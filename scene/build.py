@@ -17,12 +17,12 @@ from scene.errors import FitError, RecordingError
 from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
 from scene.progress import Stages
-from scene.reading.formats import load_readers
 from scene.reconstruct import Reconstruction, reconstruct
 from scene.resume import Partial, partial_folder
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_folder, require_folder
+from subterra_jax.host.loading import load_module
 
 _POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
 
@@ -89,7 +89,7 @@ def build(
     check_number("keep-every", 0.0 if partial is None else partial.every)
     mounts = find_calibration(calibration)
     if reader is not None:
-        load_readers(reader)
+        load_module(reader)
     started = time.monotonic()
     partial = partial or Partial(partial_folder(out))
     try:

@@ -1,10 +1,5 @@
 """The table of input formats: its rows, rows of a user's own, and the search for the format of an input."""
 
-import hashlib
-import importlib
-import importlib.util
-import inspect
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,8 +14,8 @@ from scene.reading.ply_pcd import open_pcd, open_ply
 from scene.reading.ringsurvey import is_ring_survey, read_ring_survey
 from scene.reading.rosbag import RosBag
 from scene.reading.scanfolder import open_folder, scan_files
-from scene.reading.source import cause
 from scene.reading.tables import open_parquet, open_table
+from subterra_jax.host.loading import source_digest
 
 Kind = Literal["recording", "cloud", "rings"]
 _SHOWN_FACTS = ("format", "topic", "message_type", "times", "point_times", "unit", "axes")
@@ -112,36 +107,9 @@ def register_reader(
     _own[name] = Format(name, label or name, kind, open, suffixes, magic)
 
 
-def load_readers(source: str) -> None:
-    """Runs a user's module, which calls `register_reader`.
-
-    `source` is the path of a `.py` file or the name of an importable module. Raises `RecordingError` where it fails.
-    """
-    path = Path(source)
-    try:
-        if path.suffix != ".py":
-            importlib.import_module(source)
-            return
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[path.stem] = module  # dataclasses and tracebacks of the module look it up
-        spec.loader.exec_module(module)
-    except Exception as error:  # a user's code raises anything
-        raise RecordingError(f"{source}: cannot be loaded as a reader ({cause(error)})") from error
-
-
 def own_readers() -> list[str]:
     """Return names and source hashes of the rows that users added; partial results depend on them."""
-    result = []
-    for name, row in sorted(_own.items()):
-        try:
-            source = inspect.getsource(inspect.getmodule(row.open) or row.open)
-        except (OSError, TypeError):  # typed into a session: there is no file
-            source = repr(row.open)
-        result.append(f"{name} {hashlib.sha256(source.encode()).hexdigest()}")
-    return result
+    return [f"{name} {source_digest(row.open) or row.open!r}" for name, row in sorted(_own.items())]
 
 
 def detect(path: Path, name: str | None = None) -> Detected:

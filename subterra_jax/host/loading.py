@@ -47,7 +47,7 @@ def load_module(source: str) -> ModuleType:
         return load_file(Path(source))
     try:
         return importlib.import_module(source)
-    except (ImportError, ValueError) as error:
+    except Exception as error:  # a user's code raises anything
         raise UserCodeError(f"{source}: {error}") from error
 
 

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from scene.build import build
 from scene.errors import RecordingError
 from scene.reading import Scan, ScanSource, formats, make_scan, register_reader
-from scene.reading.formats import detect, load_readers, own_readers
+from scene.reading.formats import detect, own_readers
 from scene.reading.recording import Recording
+from subterra_jax.host.loading import UserCodeError, load_module
 from tests.scene.bags import write_tum
 from tests.scene.clouds import curved_d_bore
 
@@ -27,7 +29,8 @@ START = 1317376510.25
 def table(monkeypatch: pytest.MonkeyPatch) -> None:
     """The table of formats as it was, whatever a test adds."""
     monkeypatch.setattr(formats, "_own", {})
-    monkeypatch.delitem(sys.modules, READER.stem, raising=False)
+    for name in [name for name in sys.modules if name.startswith(f"{READER.stem}_")]:
+        monkeypatch.delitem(sys.modules, name)
 
 
 def write_zip(path: Path, scans: list[np.ndarray]) -> Path:
@@ -44,7 +47,7 @@ def scans_of(count: int) -> list[np.ndarray]:
 
 def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(tmp_path):
     points = scans_of(3)
-    load_readers(str(shutil.copy(READER, tmp_path)))
+    load_module(str(shutil.copy(READER, tmp_path)))
     with Recording(write_zip(tmp_path / "walk.zip", points)) as recording:
         scans = list(recording.scans())
         facts = recording.peek()
@@ -71,7 +74,7 @@ def test_a_scene_is_built_from_it_by_one_option(tmp_path):
 
 
 def test_a_damaged_scan_is_named(tmp_path):
-    load_readers(str(READER))
+    load_module(str(READER))
     path = tmp_path / "walk.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("1.0.ply", "ply\nnonsense\n")
@@ -103,8 +106,8 @@ def test_a_reader_that_cannot_be_loaded_is_one_sentence(tmp_path, text, cause):
     path = tmp_path / "broken.py"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(RecordingError, match=rf"broken\.py: cannot be loaded as a reader \(.*{cause}"):
-        load_readers(str(path))
+    with pytest.raises(UserCodeError, match=rf"broken\.py: .*{cause}"):
+        build(tmp_path / "walk.zip", tmp_path / "out", reader=str(path))
 
 
 def test_partial_results_depend_on_the_readers_own_code(tmp_path):
@@ -112,7 +115,7 @@ def test_partial_results_depend_on_the_readers_own_code(tmp_path):
     second.write_text(second.read_text() + "# changed\n")
     keys = []
     for path in (first, second):
-        load_readers(str(path))
+        load_module(str(path))
         keys.append(own_readers())
     assert keys[0] != keys[1]
 
