@@ -10,24 +10,17 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import draws, gait, kinematics, observation, track
 from subterra_jax.b2.observation import gravity_direction, locate, true_velocity
-from subterra_jax.b2.params import (
-    Body,
-    Build,
-    Surroundings,
-    WalkParams,
-    WalkResetNoise,
-    WalkState,
-    WalkStepNoise,
-)
+from subterra_jax.b2.params import Body, Build, Surroundings, WalkParams, WalkResetNoise, WalkState, WalkStepNoise
 from subterra_jax.b2.physics import BUMPER_RADIUS, BUMPERS, Physics
 from subterra_jax.env import Box, Info
 from subterra_jax.parts.unicycle import clearance
 from subterra_jax.tunnel import at_station
 
 N_ACTION = 12
-_STIFFNESS = np.tile(np.array([b2.JOINT[part].stiffness for part in b2.PARTS], np.float32), 4)
-_DAMPING = np.tile(np.array([b2.JOINT[part].damping for part in b2.PARTS], np.float32), 4)
-_TORQUE = np.tile(np.array([b2.JOINT[part].torque for part in b2.PARTS], np.float32), 4)
+_STIFFNESS, _DAMPING, _TORQUE = (
+    np.tile(np.array([getattr(b2.JOINT[part], name) for part in b2.PARTS], np.float32), 4)
+    for name in ("stiffness", "damping", "torque")
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,10 +7,10 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.particle.agent import ParticleAgent
-from subterra_jax.baselines.rings.count import RingCount
-from subterra_jax.baselines.rings.filter import ring_filter
-from subterra_jax.baselines.scanmatch.odometry import scan_matching
+from subterra_jax.baselines.particle import particle_agent
+from subterra_jax.baselines.rings.grid import ring_filter
+from subterra_jax.baselines.rings.loop import RingCount
+from subterra_jax.baselines.scanmatch import scan_matching
 from subterra_jax.baselines.simple import Random
 from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine, HeadingHold, Pursuit
@@ -73,4 +73,4 @@ _navigator("ring-count", RingCount(), CentreLine())
 register("ring-filter", ring_filter)
 _navigator(CEILING, Truth(), CentreLine())
 register("scan-matching", scan_matching)
-register("particle-filter", ParticleAgent.of)
+register("particle-filter", particle_agent)

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from subterra_jax.baselines.reckoning import StepDistances
 from subterra_jax.baselines.rings import grid as ringgrid
 from subterra_jax.baselines.rings import loop as rings
 
@@ -28,11 +29,11 @@ class Tracker:
 
 TRACKERS = {
     # The first released policies have this one.
-    "loop": Tracker(rings.start, rings.moved, rings.advance, rings.anew),
+    "loop": Tracker(rings.start, rings.fuse_distances, rings.advance, rings.restart),
     # It sees past what stands in the tunnel.
-    "careful": Tracker(rings.start, rings.moved, partial(rings.advance, careful=True), rings.anew),
+    "careful": Tracker(rings.start, rings.fuse_distances, partial(rings.advance, careful=True), rings.restart),
     # On wet rail too.
-    "grid": Tracker(ringgrid.start, ringgrid.moved, ringgrid.advance, ringgrid.anew),
+    "grid": Tracker(ringgrid.start, StepDistances, ringgrid.advance, ringgrid.restart),
 }
 
 

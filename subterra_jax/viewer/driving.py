@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Agent
-from subterra_jax.baselines.particle.cloud import Cloud
+from subterra_jax.baselines.cloud import Cloud
 from subterra_jax.env import TunnelEnv
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.parts.boxes import PITCH
@@ -143,7 +143,7 @@ def _particles(memory: Any) -> Array:
     cloud: Cloud = clouds[0]
     stride = max(1, cloud.log_weight.shape[0] // _PARTICLES)
     weight = jnp.exp(cloud.log_weight) * cloud.log_weight.shape[0]
-    return jnp.stack([cloud.place.station, cloud.place.lateral, weight], axis=-1)[::stride][:_PARTICLES]
+    return jnp.stack([cloud.pose.station, cloud.pose.lateral, weight], axis=-1)[::stride][:_PARTICLES]
 
 
 def _is_cloud(leaf: Any) -> bool:

@@ -7,16 +7,15 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar
-from subterra_jax.baselines.particle import likelihood
-from subterra_jax.baselines.particle import scan as particle_scan
-from subterra_jax.baselines.particle.scan import Place, ScanModel
-from subterra_jax.baselines.particle.wallmap import wall_map
+from subterra_jax.baselines import scanmodel
+from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose
+from subterra_jax.baselines.wallmap import wall_map
 from subterra_jax.tunnel import at_station
 from tests.subterra_jax import tunnels
 
 BEAMS = lidar.LidarParams()
 FAR = jnp.float32(30.0)
-fit, first_look, endpoints = jax.jit(likelihood.fit), jax.jit(likelihood.first_look), jax.jit(particle_scan.endpoints)
+fit, fit_roughly, endpoints = (jax.jit(getattr(scanmodel, name)) for name in ("fit", "fit_roughly", "endpoints"))
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +28,8 @@ def tunnel(plan):
     return st.Tunnel.from_plan(plan, "pockets")
 
 
-def place_of(station, lateral, heading) -> Place:
-    return Place(*(jnp.atleast_1d(jnp.asarray(value, jnp.float32)) for value in (station, lateral, heading)))
+def pose_of(station, lateral, heading) -> TunnelPose:
+    return TunnelPose(*(jnp.atleast_1d(jnp.asarray(value, jnp.float32)) for value in (station, lateral, heading)))
 
 
 @jax.jit
@@ -103,7 +102,7 @@ def test_endpoints_agree_with_the_exact_geometry_of_the_centreline(plan, tunnel)
     for _ in range(6):
         station, lateral, heading = rng.uniform(10.0, 80.0), rng.uniform(-0.8, 0.8), rng.uniform(-0.3, 0.3)
         ranges = np.asarray(true_scan(tunnel, station, lateral, heading), float)
-        ends = endpoints(walls, place_of(station, lateral, heading), jnp.asarray(ranges, jnp.float32), FAR, ScanModel())
+        ends = endpoints(walls, pose_of(station, lateral, heading), jnp.asarray(ranges, jnp.float32), FAR, ScanModel())
         expected = exact_endpoints(plan, station, lateral, heading, ranges)
         useful = np.asarray(ends.useful)[:, 0]
         assert useful.sum() >= 10
@@ -132,14 +131,14 @@ def exact_endpoints(plan, station: float, lateral: float, heading: float, ranges
 def test_the_likelihood_equals_a_float64_reference(tunnel):
     walls, model = wall_map(tunnel).pick(tunnel), ScanModel()
     ranges = true_scan(tunnel, 40.0, 0.2, 0.05)
-    place = place_of([40.0, 40.2, 40.6, 45.0], [0.2, 0.21, 0.2, 0.18], [0.05, 0.05, 0.045, 0.05])
-    got, adjusted = fit(walls, place, ranges, FAR, model)
-    ends = endpoints(walls, place, ranges, FAR, model)
+    pose = pose_of([40.0, 40.2, 40.6, 45.0], [0.2, 0.21, 0.2, 0.18], [0.05, 0.05, 0.045, 0.05])
+    got, adjusted = fit(walls, pose, ranges, FAR, model)
+    ends = endpoints(walls, pose, ranges, FAR, model)
     for i in range(4):
         score, shift, turn = reference_fit(walls, ends, i, model)
         assert float(got[i]) == pytest.approx(score, abs=2e-2)
-        assert float(adjusted.lateral[i] - place.lateral[i]) == pytest.approx(shift, abs=1e-5)
-        assert float(adjusted.heading[i] - place.heading[i]) == pytest.approx(turn, abs=1e-5)
+        assert float(adjusted.lateral[i] - pose.lateral[i]) == pytest.approx(shift, abs=1e-5)
+        assert float(adjusted.heading[i] - pose.heading[i]) == pytest.approx(turn, abs=1e-5)
 
 
 def reference_fit(walls, ends, i: int, model: ScanModel) -> tuple[float, float, float]:
@@ -174,7 +173,7 @@ def test_the_true_station_fits_best_among_its_neighbours_in_most_scans(tunnel):
         ranges = lidar.add_noise(true_scan(tunnel, station, 0.1, 0.02), noise, BEAMS)
         n = jnp.ones(len(offsets))
         return fit(
-            walls, Place(station + jnp.asarray(offsets, jnp.float32), 0.1 * n, 0.02 * n), ranges, FAR, ScanModel()
+            walls, TunnelPose(station + jnp.asarray(offsets, jnp.float32), 0.1 * n, 0.02 * n), ranges, FAR, ScanModel()
         )[0]
 
     rng = np.random.default_rng(2)
@@ -190,7 +189,7 @@ def test_a_first_look_finds_offset_and_heading(tunnel):
     walls = wall_map(tunnel).pick(tunnel)
     for lateral, heading in ((0.5, 0.1), (-0.5, 0.1), (0.45, -0.1), (-0.3, -0.05)):
         ranges = true_scan(tunnel, 30.0, lateral, heading)
-        found = first_look(walls, place_of(30.0, 0.0, 0.0), ranges, FAR, ScanModel())
+        found = fit_roughly(walls, pose_of(30.0, 0.0, 0.0), ranges, FAR, ScanModel())
         assert float(found.lateral[0]) == pytest.approx(lateral, abs=0.03)
         assert float(found.heading[0]) == pytest.approx(heading, abs=0.01)
 
@@ -198,14 +197,14 @@ def test_a_first_look_finds_offset_and_heading(tunnel):
 def test_an_echo_from_beyond_a_mouth_speaks_against_a_place(tunnel):
     walls = wall_map(tunnel).pick(tunnel)
     ranges = true_scan(tunnel, 12.0, 0.0, 0.0)
-    place = place_of([12.0, 2.0], [0.0, 0.0], [0.0, 0.0])
-    inside, outside = fit(walls, place, ranges, FAR, ScanModel())[0]
+    pose = pose_of([12.0, 2.0], [0.0, 0.0], [0.0, 0.0])
+    inside, outside = fit(walls, pose, ranges, FAR, ScanModel())[0]
     assert float(inside - outside) > 5.0
 
 
 def test_no_echo_from_a_wall_speaks_against_a_place(tunnel):
     walls = wall_map(tunnel).pick(tunnel)
     ranges = true_scan(tunnel, 1.0, 0.0, 0.0)  # the beams behind leave through the mouth
-    place = place_of([1.0, 30.0], [0.0, 0.0], [0.0, 0.0])
-    at_mouth, within = fit(walls, place, ranges, FAR, ScanModel())[0]
+    pose = pose_of([1.0, 30.0], [0.0, 0.0], [0.0, 0.0])
+    at_mouth, within = fit(walls, pose, ranges, FAR, ScanModel())[0]
     assert float(at_mouth - within) > 5.0

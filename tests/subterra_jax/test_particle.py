@@ -8,29 +8,30 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax.baselines import cloud as particle_cloud
+from subterra_jax.baselines import reckoning
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.particle import belief as particle_belief
-from subterra_jax.baselines.particle import cloud as particle_cloud
-from subterra_jax.baselines.particle import motion as particle_motion
-from subterra_jax.baselines.particle.cloud import Cloud, CloudParams, new_cloud
-from subterra_jax.baselines.particle.localiser import particle_filter
-from subterra_jax.baselines.particle.scan import Place
-from subterra_jax.baselines.particle.wallmap import wall_map
+from subterra_jax.baselines.cloud import Cloud, CloudParams, new_cloud
+from subterra_jax.baselines.particle import particle_filter
 from subterra_jax.baselines.registry import make_agent
+from subterra_jax.baselines.scanmodel import TunnelPose
+from subterra_jax.baselines.wallmap import wall_map
 from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.parts.wander import WanderParams
 from tests.subterra_jax import tunnels
 
-moved, resampled = jax.jit(particle_cloud.moved), jax.jit(particle_cloud.resampled)
-believed = jax.jit(particle_belief.believed)
+move, resample = jax.jit(particle_cloud.move), jax.jit(particle_cloud.resample)
+summarise = jax.jit(particle_cloud.summarise)
 EXACT = CloudParams(scale_sigma=0.0, wander=WanderParams(0.0), step_sigma=0.0)
 PERIOD = jnp.float32(0.1)
 
 
 def cloud_at(stations, weights=None, heading=0.0) -> Cloud:
     station = jnp.asarray(stations, jnp.float32)
-    place = Place(station, jnp.zeros_like(station), jnp.broadcast_to(jnp.asarray(heading, jnp.float32), station.shape))
-    cloud = new_cloud(jax.random.key(0), place, EXACT)
+    pose = TunnelPose(
+        station, jnp.zeros_like(station), jnp.broadcast_to(jnp.asarray(heading, jnp.float32), station.shape)
+    )
+    cloud = new_cloud(jax.random.key(0), pose, EXACT)
     if weights is None:
         return cloud
     weight = jnp.asarray(weights, jnp.float32)
@@ -43,9 +44,9 @@ def seen(distance: float, heading: float = 0.0) -> Observed:
 
 def reckon(readings: list[float], speeds: list[float]):
     """Distances reckoned from what the odometer reads, and what is remembered at the end."""
-    memory, distances = particle_motion.first_reckoning(seen(0.0)), []
+    memory, distances = reckoning.begin_reckoning(seen(0.0)), []
     for reading, speed in zip(readings, speeds, strict=True):
-        step, _, memory = particle_motion.reckoned(memory, seen(reading), jnp.float32(speed), 0.5, PERIOD)
+        step, _, memory = reckoning.reckon(memory, seen(reading), jnp.float32(speed), 0.5, PERIOD)
         distances.append(float(step))
     return distances, memory
 
@@ -65,13 +66,13 @@ def test_the_age_of_what_is_observed_shows_when_the_robot_sets_off():
     distances, memory = reckon([0.0, 0.0, 0.0, 0.2, 0.4], [0.0, 2.0, 2.0, 2.0, 2.0])
     assert int(memory.delay) == 2
     np.testing.assert_allclose(distances, [0.0, 0.0, 0.0, 0.2, 0.2], atol=1e-6)
-    assert float(particle_motion.unseen(memory, PERIOD)) == pytest.approx(0.4)
+    assert float(reckoning.unobserved_distance(memory, PERIOD)) == pytest.approx(0.4)
 
 
 def test_the_odometer_weighs_as_much_as_its_nominal_errors_allow():
     _, params = st.make("Subterra/StopAtShort-v0")
     # Variances: odometer 0.02² + 0.01², plant 0.02² + 0.02².
-    assert particle_motion.odometer_share(params) == pytest.approx(8.0 / 13.0, rel=1e-5)
+    assert reckoning.odometer_share(params) == pytest.approx(8.0 / 13.0, rel=1e-5)
 
 
 def test_without_errors_a_cloud_follows_the_bend(plan_of):
@@ -79,9 +80,9 @@ def test_without_errors_a_cloud_follows_the_bend(plan_of):
     walls, cloud = wall_map(bend).pick(bend), cloud_at([20.0, 25.0])
 
     def drive(cloud, _):
-        return moved(jax.random.key(1), cloud, walls, jnp.float32(0.2), jnp.float32(0.002), EXACT), None
+        return move(jax.random.key(1), cloud, walls, jnp.float32(0.2), jnp.float32(0.002), EXACT), None
 
-    after = jax.lax.scan(drive, cloud, None, length=100)[0].place
+    after = jax.lax.scan(drive, cloud, None, length=100)[0].pose
     np.testing.assert_allclose(after.station, [40.0, 45.0], atol=0.01)
     np.testing.assert_allclose(after.lateral, 0.0, atol=0.02)
     np.testing.assert_allclose(after.heading, 0.0, atol=0.005)
@@ -90,18 +91,16 @@ def test_without_errors_a_cloud_follows_the_bend(plan_of):
 def test_a_cloud_that_faces_back_drives_to_smaller_stations(plan_of):
     straight = st.Tunnel.from_plan(plan_of(tunnels.tunnel_arrays(tunnels.straight(80.0))), "smooth")
     cloud = cloud_at([40.0], heading=np.pi)
-    after = moved(
-        jax.random.key(1), cloud, wall_map(straight).pick(straight), jnp.float32(2.0), jnp.float32(0.0), EXACT
-    )
-    assert float(after.place.station[0]) == pytest.approx(38.0, abs=1e-3)
-    assert float(jnp.cos(believed(after, EXACT).heading)) == pytest.approx(-1.0, abs=1e-3)
+    after = move(jax.random.key(1), cloud, wall_map(straight).pick(straight), jnp.float32(2.0), jnp.float32(0.0), EXACT)
+    assert float(after.pose.station[0]) == pytest.approx(38.0, abs=1e-3)
+    assert float(jnp.cos(summarise(after, EXACT).heading)) == pytest.approx(-1.0, abs=1e-3)
 
 
 def test_resampling_draws_each_particle_as_often_as_its_weight_says():
     weights = np.full(200, 1e-6)
     weights[[10, 50, 120]] = [0.5, 0.3, 0.2]
-    drawn = resampled(jax.random.key(3), cloud_at(np.arange(200.0), weights), dataclasses.replace(EXACT, jitter=0.0))
-    found = np.bincount(np.asarray(drawn.place.station).astype(int), minlength=200)
+    drawn = resample(jax.random.key(3), cloud_at(np.arange(200.0), weights), dataclasses.replace(EXACT, jitter=0.0))
+    found = np.bincount(np.asarray(drawn.pose.station).astype(int), minlength=200)
     assert found[10] == pytest.approx(100, abs=1)
     assert found[50] == pytest.approx(60, abs=1)
     assert found[120] == pytest.approx(40, abs=1)
@@ -110,14 +109,14 @@ def test_resampling_draws_each_particle_as_often_as_its_weight_says():
 
 def test_a_cloud_with_enough_particles_is_not_resampled():
     before = cloud_at(np.arange(100.0), np.linspace(1.0, 2.0, 100))
-    after = resampled(jax.random.key(3), before, EXACT)
-    np.testing.assert_array_equal(before.place.station, after.place.station)
+    after = resample(jax.random.key(3), before, EXACT)
+    np.testing.assert_array_equal(before.pose.station, after.pose.station)
     np.testing.assert_array_equal(before.log_weight, after.log_weight)
 
 
 def test_a_cloud_speaks_for_its_heaviest_cluster_and_admits_the_other():
     stations = np.concatenate([np.full(60, 10.0), np.full(40, 13.0)])
-    said = believed(cloud_at(stations), EXACT)
+    said = summarise(cloud_at(stations), EXACT)
     assert float(said.station) == pytest.approx(10.0)
     assert float(said.share) == pytest.approx(0.6, abs=1e-3)
     assert float(said.sigma) == pytest.approx(np.sqrt(0.4) * 3.0, rel=1e-3)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax.baselines.reckoning import StepDistances
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.rings import grid as ringgrid
 from subterra_jax.baselines.rings import loop as rings
-from subterra_jax.baselines.rings.filter import Driving, Unhurried
+from subterra_jax.baselines.rings.grid import PacedSteering, PaceMemory
 from subterra_jax.baselines.steering import HeadingHold
 from subterra_jax.evaluation import evaluate, listed_episodes
 
@@ -71,8 +72,8 @@ def tracked():
 
     def step(now, seen):
         ranges, command, read, direction, pitch = seen
-        grid = ringgrid.advance(now[0], ranges, ringgrid.moved(command, read), direction, pitch)
-        loop = rings.advance(now[1], ranges, rings.moved(command, read), direction, pitch)
+        grid = ringgrid.advance(now[0], ranges, StepDistances(command, read), direction, pitch)
+        loop = rings.advance(now[1], ranges, rings.fuse_distances(command, read), direction, pitch)
         kept = {name: getattr(grid, name) for name in ("station", "reckoned", "rate", "strength", "spread", "wet")}
         return (grid, loop), (kept, loop.station)
 
@@ -131,7 +132,7 @@ def test_a_member_of_a_batch_is_tracked_whatever_its_neighbours_are(tracked):
 
 def test_who_begins_anew_is_as_at_the_start_and_who_does_not_is_as_before(tracked):
     after = tracked[1]
-    cleared = jax.jit(ringgrid.anew)(after, jnp.ones(len(CASES)).at[1].set(0.0))
+    cleared = jax.jit(ringgrid.restart)(after, jnp.ones(len(CASES)).at[1].set(0.0))
     begun = jax.jit(lambda: ringgrid.start((), N_BEAMS))()
     jax.tree.map(lambda part, fresh: np.testing.assert_array_equal(part[1], fresh), cleared, begun)
     jax.tree.map(lambda part, kept: np.testing.assert_array_equal(part[2], kept[2]), cleared, after)
@@ -140,12 +141,12 @@ def test_who_begins_anew_is_as_at_the_start_and_who_does_not_is_as_before(tracke
 def test_the_agent_drives_slowly_where_it_learns_and_faster_where_it_counts():
     params = st.make("Subterra/FaultedShort-v0")[1]
     steering = make_agent("ring-filter", params).steering
-    assert isinstance(steering, Unhurried)
-    blind = Unhurried(HeadingHold())
+    assert isinstance(steering, PacedSteering)
+    blind = PacedSteering(HeadingHold())
 
     @jax.jit
     def speed(driven, wanted):
-        return blind.steer(Driving(jnp.zeros(2), driven), wanted, params)[0]
+        return blind.steer(PaceMemory(jnp.zeros(2), driven), wanted, params)[0]
 
     found = [float(speed(driven, wanted)) for driven, wanted in ((1.0, 2.0), (20.0, 2.0), (20.0, 0.1))]
     assert found == pytest.approx([steering.slow, steering.cruise, 0.1])

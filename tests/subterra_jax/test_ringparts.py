@@ -5,10 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.baselines.rings import bank as ringbank
-from subterra_jax.baselines.rings import belief as ringbelief
-from subterra_jax.baselines.rings import lag as ringlag
-from subterra_jax.baselines.rings import pattern as ringpattern
+from subterra_jax.baselines import reckoning
+from subterra_jax.baselines.rings import bank
 from subterra_jax.baselines.rings import walls as wallfit
 from subterra_jax.baselines.rings.walls import Bumps
 
@@ -23,8 +21,8 @@ def room(slope=SLOPE):
     return np.minimum(np.where(left > 0.0, left, 99.0), np.where(right > 0.0, right, 99.0)).clip(0.0, 30.0)
 
 
-look = jax.jit(wallfit.look)
-begun = jax.tree.map(jnp.asarray, wallfit.start((), 16))
+look = jax.jit(wallfit.track_walls)
+begun = jax.tree.map(jnp.asarray, wallfit.begin_walls((), 16))
 
 
 def fitted(ranges, scans=20):
@@ -68,18 +66,18 @@ def test_the_age_of_observations_shows_when_the_robot_sets_off():
     read = jnp.full(12, 0.11).at[jnp.array([0, 1, 2, 3, 9])].set(0.0)
 
     def step(lag, both):
-        driven, unseen, lag = ringlag.advance(lag, ringlag.Moved(*both))
+        driven, unseen, lag = reckoning.advance_delay(lag, reckoning.StepDistances(*both))
         return lag, (driven, unseen)
 
-    lag, (driven, unseen) = jax.jit(lambda: jax.lax.scan(step, ringlag.start(()), (commanded, read)))()
+    lag, (driven, unseen) = jax.jit(lambda: jax.lax.scan(step, reckoning.begin_delay(()), (commanded, read)))()
     assert float(lag.delay) == 3.0
     np.testing.assert_allclose(driven, [0.0] * 4 + [0.106] * 5 + [0.1] + [0.106] * 2, rtol=1e-5)
     assert float(unseen[-1]) == pytest.approx(0.3)
     assert float(driven.sum() + unseen[-1]) == pytest.approx(0.1 * 11 + 0.006 * 7, rel=1e-4)
 
 
-predicted = jax.jit(ringbelief.predicted)
-ON = {wet: np.asarray(jax.jit(ringbelief.start, static_argnums=(0, 1))((), wet)) for wet in (False, True)}
+predicted = jax.jit(bank.predict)
+ON = {wet: np.asarray(jax.jit(bank.begin_belief, static_argnums=(0, 1))((), wet)) for wet in (False, True)}
 
 
 def test_wet_rail_moves_its_half_of_the_belief_and_no_probability_is_lost():
@@ -87,24 +85,24 @@ def test_wet_rail_moves_its_half_of_the_belief_and_no_probability_is_lost():
     for _ in range(4):
         belief = predicted(belief, np.float32(2.5), zero, zero, zero)
     belief = np.asarray(belief)
-    mean = np.sum(belief * ringbelief.CELL, axis=-1) / np.sum(belief, axis=-1)
+    mean = np.sum(belief * bank.CELL, axis=-1) / np.sum(belief, axis=-1)
     np.testing.assert_allclose(mean, [0.0, -10.0], atol=1e-4)
     assert belief.sum() == pytest.approx(1.0, abs=1e-5)
     mixed = np.asarray(predicted(ON[False], zero, np.float32(0.25), zero, np.float32(0.4)))
     np.testing.assert_allclose(mixed.sum(axis=-1), [0.75, 0.25], atol=1e-6)
-    assert np.sum(mixed * np.square(ringbelief.CELL)) == pytest.approx(0.4, abs=1e-5)
+    assert np.sum(mixed * np.square(bank.CELL)) == pytest.approx(0.4, abs=1e-5)
 
 
 def test_a_scan_tells_the_phase_and_leaves_the_ring_open():
-    flat = np.full((2, ringbelief.CELLS), 0.5 / ringbelief.CELLS, np.float32)
-    heard = np.where(np.arange(ringbelief.PHASES) == 7, 0.0, -50.0).astype(np.float32)
-    belief, evidence = jax.jit(ringbelief.updated)(flat, heard)
+    flat = np.full((2, bank.CELLS), 0.5 / bank.CELLS, np.float32)
+    heard = np.where(np.arange(bank.PHASES) == 7, 0.0, -50.0).astype(np.float32)
+    belief, evidence = jax.jit(bank.correct)(flat, heard)
     either = np.asarray(belief).sum(axis=0)
-    assert np.flatnonzero(either > 0.1).tolist() == [7 + 48 * k for k in range(ringbelief.RINGS)]
-    assert float(evidence) == pytest.approx(-np.log(ringbelief.PHASES), abs=1e-4)
-    moved, by = jax.jit(ringbelief.recentred)(ON[False], np.float32(3.2))
+    assert np.flatnonzero(either > 0.1).tolist() == [7 + 48 * k for k in range(bank.RINGS)]
+    assert float(evidence) == pytest.approx(-np.log(bank.PHASES), abs=1e-4)
+    moved, by = jax.jit(bank.recentre)(ON[False], np.float32(3.2))
     assert float(by) == 3.0
-    assert float(moved[0, ringbelief.CELLS // 2 - 3]) == 1.0
+    assert float(moved[0, bank.CELLS // 2 - 3]) == 1.0
 
 
 def test_a_pattern_is_learnt_and_the_likeliest_phase_is_where_it_was_heard():
@@ -116,22 +114,22 @@ def test_a_pattern_is_learnt_and_the_likeliest_phase_is_where_it_was_heard():
 
     def step(memory, seen):
         bumps = Bumps(seen[1], jnp.asarray(along, jnp.float32), jnp.ones((2, 5), bool))
-        at = ringbank.phases(seen[0], bumps, one, pitch)
+        at = bank.ring_phases(seen[0], bumps, one, pitch)
         # What a robot says that believes to be 0.3 m short of where it is.
-        behind = ringbank.phases(seen[0] - 0.3, bumps, one, pitch)
-        likely = ringbank.log_likelihood(memory, memory.pattern, bumps, behind, 16)
-        memory, pattern = ringbank.learnt(memory, memory.pattern, bumps, at, one)
+        behind = bank.ring_phases(seen[0] - 0.3, bumps, one, pitch)
+        likely = bank.log_likelihood(memory, memory.pattern, bumps, behind, 16)
+        memory, pattern = bank.learn(memory, memory.pattern, bumps, at, one)
         return memory.replace(pattern=pattern), likely
 
     @jax.jit
     def learnt():
         seen = jnp.asarray(station, jnp.float32), jnp.asarray(height, jnp.float32)
-        memory, likely = jax.lax.scan(step, ringbank.start(()), seen)
-        shape = ringpattern.heights(memory.pattern, ringpattern.turns(jnp.zeros((2, 1))), ringbelief.PHASE)
-        return ringbank.strength(memory, 5), shape[0, 0], likely
+        memory, likely = jax.lax.scan(step, bank.empty_memory(()), seen)
+        shape = bank.pattern_heights(memory.pattern, bank.multiples(jnp.zeros((2, 1))), bank.PHASE)
+        return bank.pattern_strength(memory, 5), shape[0, 0], likely
 
     strength, shape, likely = (np.asarray(part) for part in learnt())
     assert strength > 0.9
-    assert np.corrcoef(shape, relief(ringbelief.PHASE / (2.0 * np.pi) * 1.35))[0, 1] > 0.9
-    best = ringbelief.PHASE[np.argmax(likely[-3:].sum(axis=0))] / (2.0 * np.pi) * 1.35
+    assert np.corrcoef(shape, relief(bank.PHASE / (2.0 * np.pi) * 1.35))[0, 1] > 0.9
+    best = bank.PHASE[np.argmax(likely[-3:].sum(axis=0))] / (2.0 * np.pi) * 1.35
     assert np.mod(best - 0.3 + 0.675, 1.35) - 0.675 == pytest.approx(0.0, abs=0.06)

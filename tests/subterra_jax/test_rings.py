@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from subterra_jax.baselines.rings import loop as rings
-from subterra_jax.baselines.rings import scan as ringscan
+from subterra_jax.baselines.rings.walls import fit_careful, fit_plain, side_beams
 
 HALF_WIDTH, DEPTH, PITCH, N_BEAMS = 2.8, 0.13, 1.35, 16
 ANGLE = 2.0 * np.pi * np.arange(N_BEAMS) / N_BEAMS
@@ -83,7 +83,7 @@ def test_a_batch_is_tracked_as_its_members_are():
     for i in range(3):
         one = advance(rings.start((), N_BEAMS), ranges[i], moved[i], direction[i], pitch[i])
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, atol=1e-6), both, one)
-    cleared = rings.anew(both, jnp.array([1.0, 0.0, 1.0]))
+    cleared = rings.restart(both, jnp.array([1.0, 0.0, 1.0]))
     assert float(cleared.seen[1]) == 0.0
     assert float(cleared.seen[0]) == pytest.approx(float(both.seen[0]))
 
@@ -99,12 +99,12 @@ def walls_seen(offset: float, angle: float) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_careful_look_at_smooth_walls_sees_no_bump_and_places_along_the_axis_not_the_robot():
     ranges, ahead = walls_seen(offset=1.6, angle=0.2)
-    found = jax.jit(ringscan.careful)(jnp.asarray(ranges))
+    found = jax.jit(fit_careful)(jnp.asarray(ranges))
     assert found.valid.all()
-    np.testing.assert_allclose(found.bump, 0.0, atol=2e-3)
-    np.testing.assert_allclose(found.along, ahead[ringscan.side_beams(N_BEAMS)[0]], atol=2e-2)
+    np.testing.assert_allclose(found.height, 0.0, atol=2e-3)
+    np.testing.assert_allclose(found.along, ahead[side_beams(N_BEAMS, N_BEAMS)[0]], atol=2e-2)
     # 1.2 m from the left wall and 4.4 m from the right one: along the robot the places are up to 0.9 m off.
-    assert np.abs(ringscan.plain(jnp.asarray(ranges)).along - ahead[ringscan.side_beams(N_BEAMS)[0]]).max() > 0.5
+    assert np.abs(fit_plain(jnp.asarray(ranges)).along - ahead[side_beams(N_BEAMS, N_BEAMS)[0]]).max() > 0.5
 
 
 def test_beams_that_end_on_a_box_do_not_move_the_track():

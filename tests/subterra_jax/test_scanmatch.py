@@ -8,9 +8,17 @@ import pytest
 import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.baselines.registry import make_agent
-from subterra_jax.baselines.scanmatch.localiser import N_SHIFTS, best, mismatch
-from subterra_jax.baselines.scanmatch.odometry import scan_matching
-from subterra_jax.baselines.scanmatch.profile import MatchParams, Pose, centred, empty_profile, remembered
+from subterra_jax.baselines.scanmatch import (
+    N_SHIFTS,
+    AxisPose,
+    MatchParams,
+    add_scan,
+    best_match,
+    centre,
+    empty_profile,
+    mismatch,
+    scan_matching,
+)
 from subterra_jax.evaluation import evaluate, listed_episodes
 from tests.subterra_jax import tunnels
 
@@ -18,9 +26,9 @@ BEAMS, PARAMS = lidar.LidarParams(), MatchParams()
 N_SEEN, N_MATCHED = 100, 25
 
 
-def pose_at(station, half_width=2.825) -> Pose:
+def pose_at(station, half_width=2.825) -> AxisPose:
     zero = jnp.zeros(())
-    return Pose(jnp.asarray(station, jnp.float32), zero, zero, zero, jnp.float32(half_width))
+    return AxisPose(jnp.asarray(station, jnp.float32), zero, zero, zero, jnp.float32(half_width))
 
 
 @jax.jit
@@ -35,15 +43,15 @@ def matched(tunnel, wrong, key):
         return lidar.add_noise(lidar.scan(tunnel, position, jnp.zeros(()), station, BEAMS), noise, BEAMS)
 
     scans = jax.vmap(look)(station, noise)
-    add = lambda profile, one: (remembered(profile, pose_at(one[0]), one[1], PARAMS), None)  # noqa: E731
+    add = lambda profile, one: (add_scan(profile, pose_at(one[0]), one[1], PARAMS), None)  # noqa: E731
     profile, _ = jax.lax.scan(add, empty_profile(), (station[:N_SEEN], scans[:N_SEEN]))
 
     def one(profile, now):
-        pose = centred(pose_at(now[0] - wrong), now[1], PARAMS)
+        pose = centre(pose_at(now[0] - wrong), now[1], PARAMS)
         cost = mismatch(profile, pose, now[1], PARAMS)
-        return remembered(profile, pose_at(now[0]), now[1], PARAMS), cost
+        return add_scan(profile, pose_at(now[0]), now[1], PARAMS), cost
 
-    return best(jnp.sum(jax.lax.scan(one, profile, (station[N_SEEN:], scans[N_SEEN:]))[1], axis=0), PARAMS)
+    return best_match(jnp.sum(jax.lax.scan(one, profile, (station[N_SEEN:], scans[N_SEEN:]))[1], axis=0), PARAMS)
 
 
 @pytest.fixture(scope="module")
@@ -75,20 +83,20 @@ def test_between_smooth_walls_there_is_less_information_than_between_pockets(fou
 
 
 def test_a_flat_cost_says_nothing():
-    assert not bool(best(jnp.zeros(N_SHIFTS), PARAMS).informative)
+    assert not bool(best_match(jnp.zeros(N_SHIFTS), PARAMS).informative)
 
 
 def test_a_parabola_gives_its_vertex_and_its_curvature():
     shift = np.round(np.arange(-0.4, 0.401, 0.02), 2)
-    found = best(jnp.asarray(2000.0 * (shift - 0.053) ** 2, jnp.float32), PARAMS)
+    found = best_match(jnp.asarray(2000.0 * (shift - 0.053) ** 2, jnp.float32), PARAMS)
     assert float(found.shift) == pytest.approx(0.053, abs=1e-3)
     assert float(found.information) == pytest.approx(4000.0, rel=1e-3)
 
 
 def test_a_bin_that_stands_for_another_place_begins_anew(straight):
     scan = lidar.scan(straight["smooth"], jnp.array([20.0, 0.0]), jnp.zeros(()), jnp.float32(20.0), BEAMS)
-    once = remembered(empty_profile(), pose_at(20.0), scan, PARAMS)
-    turned = remembered(once, pose_at(20.0 + 256 * 0.08), scan, PARAMS)
+    once = add_scan(empty_profile(), pose_at(20.0), scan, PARAMS)
+    turned = add_scan(once, pose_at(20.0 + 256 * 0.08), scan, PARAMS)
     np.testing.assert_allclose(turned.count.sum(), once.count.sum())
     assert int(jnp.max(turned.stamp)) > int(jnp.max(once.stamp))
 

@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
-from subterra_jax.baselines.particle.wallmap import WallMap, wall_map
+from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.policies.belief import scan as belief_scan
 from subterra_jax.rules import Relocalise
 from train.belief import lessons

@@ -1,97 +1,168 @@
-"""Counting rings through faults, without a map: a Bayes filter of place and grip, and a pattern learnt on the way.
+"""Counting rings through faults, without a map: a bank of Bayes filters of error and grip, with learnt patterns.
 
-`rings` follows dead reckoning that is out by some percent. On wet rail 30 % of the speed is lost while wheels and
-odometer turn as before, beams drop out or end in dust, and what one observes is old. Here the error of dead reckoning
-is a belief on a grid (`ringbelief`), dry and wet rail are two modes of it, the walls are fitted past beams that do not
-count (`wallfit`), and the age of observations shows when the robot sets off (`ringlag`).
+The loop of `loop` follows dead reckoning that is wrong by some percent. On wet rail 30 % of the speed is lost while
+wheels and odometer turn as before, beams drop out or end in dust, and observations are late. Here the error of dead
+reckoning is a belief on a grid with two modes, dry and wet rail (`bank`). The walls are tracked past unusable beams
+(`walls`). The delay shows when the robot sets off (`reckoning`).
 
-Before a pattern is known nothing tells wet rail from dry, and what is learnt then stays wrong: therefore there are two
-such filters, one that begins on dry rail and one that begins on wet rail, and the one counts to whose pattern the scans
-keep better. Nothing is told of an episode: neither its severity nor where rail is wet.
+Before a pattern is known, wet rail cannot be distinguished from dry, and a pattern learnt then stays wrong. Therefore
+there are two filters, one that begins on dry rail and one that begins on wet rail. The one whose pattern fits the scans
+better is used. Neither the severity of an episode nor the position of wet rail is known to them.
 
 Measured: `docs/measurements.md`.
 """
 
 import dataclasses
+import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.baselines.rings import bank as ringbank
-from subterra_jax.baselines.rings import belief as ringbelief
-from subterra_jax.baselines.rings import lag as ringlag
-from subterra_jax.baselines.rings import pattern as ringpattern
-from subterra_jax.baselines.rings import walls as wallfit
-from subterra_jax.baselines.rings.lag import Moved
-from subterra_jax.baselines.rings.track import GridTrack, anew, start
+from subterra_jax.baselines.agent import Known, Observed
+from subterra_jax.baselines.avoidance import steering_of
+from subterra_jax.baselines.drift import fault_sizes
+from subterra_jax.baselines.fused import FusedCount
+from subterra_jax.baselines.navigator import Navigator
+from subterra_jax.baselines.reckoning import Delay, StepDistances, advance_delay, begin_delay, delayed_distance
+from subterra_jax.baselines.rings import bank
+from subterra_jax.baselines.rings.loop import RingMemory, begin_memory
+from subterra_jax.baselines.rings.walls import Bumps, Walls, begin_walls, track_walls
+from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.steering import CentreLine, Steering
 from subterra_jax.parts.faults import FaultParams
+from subterra_jax.state import EnvParams
 
-__all__ = ["WET_LOSS", "GridTrack", "advance", "anew", "moved", "start"]
-
-WET_LOSS = FaultParams().wet_loss  # of the speed, on wet rail; nominal, as the sizes of slip and odometer errors are
+WET_LOSS = FaultParams().wet_loss  # nominal share of the speed lost on wet rail
 _WETTING, _DRYING = 0.02, 0.08  # 1/m; patches are 10 m long
-_HOLD = 8.0  # m after the start in which the grip does not change: the pattern is learnt
-_BLUR = 0.01  # m, of dead reckoning in a step of the usual length
-_LEAST_MOVE = 0.05  # m; of a scan after less only a share is believed: its errors are those of the scan before
+_HOLD = 8.0  # m after the start, in which the pattern is learnt and the grip does not change
+_BLUR = 0.01  # standard deviation of dead reckoning in a step of the usual length, m
+_LEAST_MOVE = 0.05  # m; a scan after less counts in part: it shares the errors of the scan before
 _RATE_GAIN, _RATE_MOST = 0.1, 0.08
-_RATE_NEWS = 0.1  # m, of one scan
+_RATE_NEWS = 0.1  # largest news of one scan, m
+_BEGINS_WET = 0.15  # probability that the start is wet
+_LEARNING, _SLOW = 15.0, 0.5  # distance in which rings are learnt, m, and the speed there, m/s: four scans for one
+_CRUISE = 1.2  # m/s: a patch of wet rail takes less from a step than a scan can measure
+_LOCKED = 0.1  # error of the pattern itself, m: it was learnt while the start was left behind
 
 
-def moved(commanded: Float[Array, "*env"], read: Float[Array, "*env"]) -> Moved:
-    """Distance since the last scan by the command and by the odometer, m: as `rings.moved`, but kept apart."""
-    return Moved(commanded, read)
+@struct.dataclass
+class GridTrack:
+    """Rings, station and grip of a batch of robots. A bank is one filter: the first began on dry rail, the second wet.
+
+    Attributes:
+        station: Estimated station less that of the start, m: the present one, past the delay of observations.
+        reckoned: Station less that of the start by dead reckoning alone, m.
+        rate: Estimated relative error of the dead reckoning.
+        innovation: Excess of the station by the last scan, m.
+        strength: Clarity of the pattern, from 0, no pattern, to 1.
+        spread: Standard deviation of the station by the belief, m.
+        wet: Probability of wet rail.
+        driven: Distance driven, m.
+        walls: The tracked walls.
+        lag: Delay of the observations.
+        base: Station at the middle of each bank's grid, m.
+        belief: Belief about the true station beyond it, dry and wet.
+        rates: Estimated relative error of dead reckoning of each bank.
+        evidence: Log evidence of each bank, less that of the best.
+        memory: The pattern of each bank.
+    """
+
+    station: Float[Array, "*env"]
+    reckoned: Float[Array, "*env"]
+    rate: Float[Array, "*env"]
+    innovation: Float[Array, "*env"]
+    strength: Float[Array, "*env"]
+    spread: Float[Array, "*env"]
+    wet: Float[Array, "*env"]
+    driven: Float[Array, "*env"]
+    walls: Walls
+    lag: Delay
+    base: Float[Array, "*env bank"]
+    belief: Float[Array, "*env bank 2 cells"]
+    rates: Float[Array, "*env bank"]
+    evidence: Float[Array, "*env bank"]
+    memory: bank.PatternMemory
+
+
+def start(batch: tuple[int, ...], n_beams: int, wet: bool = True) -> GridTrack:
+    """Return the track at the start, without a pattern; `wet` where the rail may be wet there, at twice the cost."""
+    zero, banks = jnp.zeros(batch), (False, True) if wet else (False,)
+    each = jnp.zeros((*batch, len(banks)))
+    odds = (0.0, math.log(_BEGINS_WET / (1.0 - _BEGINS_WET)))[: len(banks)]
+    return GridTrack(
+        **dict.fromkeys(("station", "reckoned", "rate", "innovation", "strength", "spread", "wet", "driven"), zero),
+        walls=begin_walls(batch, n_beams),
+        lag=begin_delay(batch),
+        base=each,
+        belief=jnp.stack([bank.begin_belief(batch, is_wet) for is_wet in banks], axis=-3),
+        rates=each,
+        evidence=each + jnp.asarray(odds),
+        memory=bank.empty_memory(each.shape),
+    )
+
+
+def restart(track: GridTrack, keep: Float[Array, "*env"]) -> GridTrack:
+    """Return the track where `keep` is 1, and one at the start where it is 0."""
+    fresh = start((), 1, wet=track.base.shape[-1] > 1)
+    fresh = dataclasses.replace(fresh, walls=jax.tree.map(lambda part: jnp.zeros(()), track.walls))
+
+    def choose(now: Array, begun: Array) -> Array:
+        return jnp.where(keep.reshape(keep.shape + (1,) * (now.ndim - keep.ndim)) > 0.0, now, begun)
+
+    return jax.tree.map(choose, track, fresh)
 
 
 def advance(
     track: GridTrack,
     ranges: Float[Array, "*env n_beams"],
-    moved: Moved,
+    moved: StepDistances,
     direction: Float[Array, "*env"],
     pitch: Float[Array, "*env"],
     loss: float | Float[Array, ""] = WET_LOSS,
 ) -> GridTrack:
-    """After a scan.
+    """Advances by a scan.
 
     Args:
-        track: Before.
+        track: Track before.
         ranges: The scan, m, the first beam straight ahead, the others counter-clockwise.
         moved: Distance since the last scan along the axis, by command and odometer.
         direction: 1 where the robot faces growing stations, else −1.
-        pitch: Distance between rings, m. Where it is 0 there are none, and this is dead reckoning.
-        loss: Share of the speed that is lost on wet rail; 0 where there is none.
+        pitch: Distance between rings, m; 0 where there are none, which leaves dead reckoning.
+        loss: Share of the speed lost on wet rail; 0 where there is none.
     """
-    step, unseen, lag = ringlag.advance(track.lag, moved)
-    share = jnp.minimum(jnp.abs(step) / ringbank.STEP, 2.0)
-    walls, bumps = wallfit.look(track.walls, ranges, share)
-    seen = dataclasses.replace(track, walls=walls, lag=lag, driven=track.driven + jnp.abs(step))
+    step, unobserved, lag = advance_delay(track.lag, moved)
+    share = jnp.minimum(jnp.abs(step) / bank.STEP, 2.0)
+    walls, bumps = track_walls(track.walls, ranges, share)
+    scanned = dataclasses.replace(track, walls=walls, lag=lag, driven=track.driven + jnp.abs(step))
     # From here on everything has an axis of banks.
-    heard = jax.tree.map(lambda part: part[..., None, :, :], bumps)
+    relief = jax.tree.map(lambda part: part[..., None, :, :], bumps)
     drive = _Drive.of(step, share, direction, pitch, loss)
-    after, says = _advanced(seen, heard, drive, ranges.shape[-1])
-    pending = drive.direction * unseen[..., None] * (1.0 + after.rates)
-    station = says.station + pending * (1.0 - drive.loss * says.wet)
+    after, estimates = _advance_banks(scanned, relief, drive, ranges.shape[-1])
+    pending = drive.direction * unobserved[..., None] * (1.0 + after.rates)
+    station = estimates.station + pending * (1.0 - drive.loss * estimates.wet)
     best = jnp.argmax(after.evidence, axis=-1)[..., None]
-    chosen = lambda each: jnp.take_along_axis(each, best, axis=-1)[..., 0]  # noqa: E731
+    of_best = lambda each: jnp.take_along_axis(each, best, axis=-1)[..., 0]  # noqa: E731
     weight = jax.nn.softmax(after.evidence, axis=-1)
-    variance = jnp.square(says.spread) + jnp.square(station - chosen(station)[..., None])
-    reckoned = track.reckoned + direction * (step + unseen - ringlag.unseen(track.lag))
+    variance = jnp.square(estimates.spread) + jnp.square(station - of_best(station)[..., None])
+    reckoned = track.reckoned + direction * (step + unobserved - delayed_distance(track.lag))
     return dataclasses.replace(
         after,
-        station=chosen(station),
+        station=of_best(station),
         reckoned=reckoned,
-        rate=chosen(after.rates),
-        innovation=chosen(says.innovation),
-        strength=chosen(says.strength),
+        rate=of_best(after.rates),
+        innovation=of_best(estimates.innovation),
+        strength=of_best(estimates.strength),
         spread=jnp.sqrt(jnp.sum(weight * variance, axis=-1)),
-        wet=chosen(says.wet),
+        wet=of_best(estimates.wet),
     )
 
 
 @struct.dataclass
 class _Drive:
-    """One step of all banks: distance (m), the same in usual steps, direction, pitch, whether there are rings, loss."""
+    """One step of all banks: distance (m, and in usual steps), direction, pitch (m), presence of rings, loss."""
 
     step: Array
     share: Array
@@ -108,8 +179,8 @@ class _Drive:
 
 
 @struct.dataclass
-class _Says:
-    """What each bank says: station as observed (m), innovation (m), strength, spread (m), probability of wet rail."""
+class _Estimates:
+    """Estimates of each bank: observed station (m), innovation (m), strength, spread (m), probability of wet rail."""
 
     station: Array
     innovation: Array
@@ -118,30 +189,30 @@ class _Says:
     wet: Array
 
 
-def _advanced(track: GridTrack, heard: wallfit.Bumps, drive: _Drive, n_beams: int) -> tuple[GridTrack, _Says]:
-    """Each bank after a step and a scan."""
-    cell = drive.pitch / ringbelief.PHASES
+def _advance_banks(track: GridTrack, relief: Bumps, drive: _Drive, n_beams: int) -> tuple[GridTrack, _Estimates]:
+    """Each bank after a step and a scan, and its estimates."""
+    cell = drive.pitch / bank.PHASES
     driven = drive.direction * drive.step * (1.0 + track.rates)
     base = track.base + driven
-    # Where nothing can be lost, wet rail is dry.
+    # Where wet rail loses nothing it is treated as dry.
     changes = jnp.where((track.driven[..., None] > _HOLD) & (drive.loss > 0.0), jnp.abs(drive.step), 0.0)
     lost, blur = drive.loss * driven / cell, jnp.square(_BLUR / cell) * drive.share * drive.rings
-    prior = ringbelief.predicted(track.belief, lost, _WETTING * changes, _DRYING * changes, blur)
-    pattern = ringpattern.sides(track.memory.pattern, drive.direction)
-    strong = ringbank.strength(track.memory, heard.height.shape[-1]) * drive.rings
-    at = ringbank.phases(base, heard, drive.direction, drive.pitch)
-    told = jnp.clip(jnp.abs(drive.step) / _LEAST_MOVE, 0.0, 1.0) * drive.rings
-    likely = told[..., None] * ringbank.log_likelihood(track.memory, pattern, heard, at, n_beams)
-    belief, evidence = ringbelief.updated(prior, likely)
-    before, after = ringbelief.summary(prior), ringbelief.summary(belief)
+    prior = bank.predict(track.belief, lost, _WETTING * changes, _DRYING * changes, blur)
+    pattern = bank.orient(track.memory.pattern, drive.direction)
+    strong = bank.pattern_strength(track.memory, relief.height.shape[-1]) * drive.rings
+    at = bank.ring_phases(base, relief, drive.direction, drive.pitch)
+    trust = jnp.clip(jnp.abs(drive.step) / _LEAST_MOVE, 0.0, 1.0) * drive.rings
+    likely = trust[..., None] * bank.log_likelihood(track.memory, pattern, relief, at, n_beams)
+    belief, evidence = bank.correct(prior, likely)
+    before, after = bank.summarise(prior), bank.summarise(belief)
     news = cell * (after.dry_error - before.dry_error)
     rate = _rate(track.rates, drive, jnp.square(1.0 - after.wet) * news)
     station = base + cell * after.error
-    at = ringbank.phases(station, heard, drive.direction, drive.pitch)
+    at = bank.ring_phases(station, relief, drive.direction, drive.pitch)
     weight = drive.share * jnp.square(after.sharpness) * drive.rings
-    memory, pattern = ringbank.learnt(track.memory, pattern, heard, at, weight)
-    memory = dataclasses.replace(memory, pattern=ringpattern.sides(pattern, drive.direction))
-    belief, moved_by = ringbelief.recentred(belief, after.error)
+    memory, pattern = bank.learn(track.memory, pattern, relief, at, weight)
+    memory = dataclasses.replace(memory, pattern=bank.orient(pattern, drive.direction))
+    belief, moved_by = bank.recentre(belief, after.error)
     evidence = track.evidence + evidence
     banks = dataclasses.replace(
         track,
@@ -151,10 +222,103 @@ def _advanced(track: GridTrack, heard: wallfit.Bumps, drive: _Drive, n_beams: in
         evidence=evidence - jnp.max(evidence, axis=-1, keepdims=True),
         memory=memory,
     )
-    return banks, _Says(station, -news, strong, cell * after.spread, after.wet)
+    return banks, _Estimates(station, -news, strong, cell * after.spread, after.wet)
 
 
 def _rate(rate: Array, drive: _Drive, news: Array) -> Array:
-    """The rate after a scan that moved the station by so much on dry rail."""
+    """Rates after a scan that moved the station on dry rail by `news`, m."""
     news = jnp.clip(news, -_RATE_NEWS, _RATE_NEWS)
     return jnp.clip(rate + _RATE_GAIN * drive.share * drive.direction * news, -_RATE_MOST, _RATE_MOST)
+
+
+@struct.dataclass
+class RingFilter:
+    """Counts rings where the walls have any, on wet rail too, and falls back on commands and odometry elsewhere.
+
+    Attributes:
+        wet: Whether the task may have wet rail, as its params say.
+        privileged: False: it receives no truth.
+    """
+
+    wet: bool = struct.field(pytree_node=False, default=True)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def begin(self, obs: Observed, params: EnvParams) -> RingMemory:
+        """Begins at the believed start."""
+        return begin_memory(start((), obs.ranges.shape[-1], self.wet), obs, params)
+
+    def update(
+        self, memory: RingMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
+    ) -> tuple[Station, RingMemory]:
+        """Advances by dead reckoning and a scan."""
+        fused, reckoning = FusedCount().update(memory.reckoning, obs, driven, params, known)
+        commanded = driven.speed * params.vehicle.period
+        moved = StepDistances(commanded, obs.distance - memory.reckoning.reading) * driven.cosine
+        pitch = jnp.asarray(obs.ring_pitch)
+        loss = fault_sizes(params).wet_loss if self.wet else 0.0
+        track = advance(memory.track, obs.ranges, moved, driven.direction, pitch, loss)
+        locked, lost = jnp.hypot(track.spread, _LOCKED), jnp.exp(fused.log_sigma)
+        sigma = jnp.hypot(track.strength * locked + (1.0 - track.strength) * lost, memory.start[1])
+        estimate = Station(memory.start[0] + track.station, jnp.log(sigma), driven.direction)
+        return estimate, dataclasses.replace(memory, track=track, reckoning=reckoning)
+
+
+@struct.dataclass
+class PaceMemory:
+    """Memory of `PacedSteering`.
+
+    Attributes:
+        steering: Memory of the steering.
+        driven: Distance commanded, m.
+    """
+
+    steering: Any
+    driven: Float[Array, ""]
+
+
+@struct.dataclass
+class PacedSteering:
+    """A steering that drives slowly past the first rings, and no faster than they can be counted, towards a goal.
+
+    Attributes:
+        steering: The steering itself.
+        cruise: Largest speed, m/s.
+        slow: Largest speed over the first distance, m/s.
+        learning: That first distance, m.
+        uses_lidar: Whether the steering uses the LiDAR.
+    """
+
+    steering: Steering
+    cruise: float = _CRUISE
+    slow: float = _SLOW
+    learning: float = _LEARNING
+    uses_lidar: bool = struct.field(pytree_node=False, default=True)
+
+    def begin(self, obs: Observed, params: EnvParams) -> PaceMemory:
+        """Return the memory at the start."""
+        return PaceMemory(self.steering.begin(obs, params), jnp.zeros(()))
+
+    def look(self, memory: PaceMemory, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> PaceMemory:
+        """Updates the memory of the steering by an observation."""
+        steering = self.steering.look(memory.steering, obs, command, params)
+        return PaceMemory(steering, memory.driven + command[0] * params.vehicle.period)
+
+    def cosine(self, memory: PaceMemory) -> Float[Array, ""]:
+        """Return the cosine of the angle to the axis."""
+        return self.steering.cosine(memory.steering)
+
+    def steer(self, memory: PaceMemory, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
+        """Return the command of the steering at the limited speed."""
+        if params.errand != "cover":
+            speed = jnp.minimum(speed, jnp.where(memory.driven < self.learning, self.slow, self.cruise))
+        return self.steering.steer(memory.steering, speed, params)
+
+    def turned(self, memory: PaceMemory) -> PaceMemory:
+        """Return the memory after a turn by half a circle."""
+        return dataclasses.replace(memory, steering=self.steering.turned(memory.steering))
+
+
+def ring_filter(params: EnvParams) -> Navigator:
+    """Makes the agent of a task."""
+    steering = PacedSteering(steering_of(params, CentreLine()))
+    return Navigator(RingFilter(wet="faults" in params.parts), steering, name="ring-filter")

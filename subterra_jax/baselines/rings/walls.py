@@ -1,8 +1,10 @@
-"""Two walls fitted to the side beams of one scan after the other, so that what stands out of them can be heard.
+"""Walls and their relief from the side beams of a scan: ring counters compare it with the pattern of the rings.
 
-The walls are tracked: distance of each, slope of both against the heading, and their bend. Where another pair of walls
-has more beams on it than the tracked one, as at the start, after a turn or after a dropout, it is taken over. Beams
-that fall short (dust, boxes) or see nothing do not count.
+Ring joints and pockets stand out of two smooth walls. There are two ways to measure them. `fit_plain` and
+`fit_careful` fit two straight lines to one scan; the careful fit leaves out beams that end short of both walls, on
+something that stands in the tunnel. `track_walls` follows distance, slope and bend of the walls from scan to scan.
+Where another pair of walls has more beams on it than the tracked one, as at the start, after a turn or after a
+dropout, it takes over. Beams that fall short (dust, boxes) or get no echo are not used.
 """
 
 import dataclasses
@@ -14,32 +16,39 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 _NEAREST, _FARTHEST = 1.0, 4.5  # m to a wall; nearer is an obstacle, farther an opening or a mouth
+_STEEPEST = math.sqrt(0.5)  # sine of the angle to the axis: flatter beams meet a wall where bends blur the position
+_CLIP = (-0.2, 0.3)  # m, largest relief of one beam
+
+# The fit of one scan.
+_TOUCH, _ACROSS = 0.3, 6.0  # m to a wall for the careful fit, which may run along either wall
+_SHORT_OF_ALL = 0.15  # m; a beam so far before the fitted walls has not met them: three of its standard deviations
+_SHORT_MOST = 6  # beams that may be left out, of ten
+
+# The tracked walls.
 _SHORT, _LONG = -0.15, 0.35  # m against the fitted wall, within which a beam has met it or a pocket in it
-_STEEPEST = math.sqrt(0.5)  # sine of the angle to the axis: flatter beams meet a wall where bends blur the place
 _MOST_BEAMS = 9  # a side; of more, some are left out
 _RANGE_SIGMA, _FIT_SIGMA = 0.05, 0.02  # m, of a range and of the fit
 _SLOPES = np.linspace(-0.15, 0.15, 11).astype(np.float32)  # against the tracked one: a step turns by at most 0.15 rad
 _STEEP = 0.3  # slope beyond which the walls are not tracked: the robot is turning round
-_ON_WALL, _TRACKED = 0.09, 0.1  # m, how near a beam or the tracked wall has to be to count for a candidate
+_ON_WALL, _TRACKED = 0.09, 0.1  # m, distance at which a beam or the tracked wall supports a candidate
 _MORE = 0.7  # beams by which another pair of walls must be better
 _REDESCEND = 0.12  # m, beyond which a residual loses its weight
-_KEEP, _KEEP_SLOPE, _KEEP_BEND = 4.0, 4.0, 600.0  # how much the tracked values weigh, beams, m² and m⁴
-_SHARPEST = 0.03  # 1/m
+_KEEP, _KEEP_SLOPE, _KEEP_BEND = 4.0, 4.0, 600.0  # weights of the tracked values: beams, m² and m⁴
+_SHARPEST = 0.03  # largest bend, 1/m
 _SETTLED = 3.0  # scans
-_USUAL = 0.01  # of what a beam sees all the time, per 0.15 m
-_CLIP = (-0.2, 0.3)  # m, of what one beam may say
+_USUAL = 0.01  # gain of the usual distance beyond the walls, per usual step of 0.2 m
 
 
 @struct.dataclass
 class Walls:
-    """The walls as tracked.
+    """The tracked walls.
 
     Attributes:
         distance: Distance of each wall, m; left first.
-        slope: Slope of both against the heading, 1.
-        bend: Their curvature, 1/m.
-        scans: How many scans they were seen in.
-        usual: What each side beam sees on average beyond them, m.
+        slope: Slope of both walls against the heading, 1.
+        bend: Curvature of both walls, 1/m.
+        scans: Number of scans in which they were seen.
+        usual: Average distance of each side beam's end beyond the walls, m.
     """
 
     distance: Float[Array, "*env 2"]
@@ -51,12 +60,13 @@ class Walls:
 
 @struct.dataclass
 class Bumps:
-    """What a scan shows of the walls' relief.
+    """Relief of the walls in one scan: side beams, left and then right, from the front to the back.
 
     Attributes:
-        height: How far each side beam goes beyond the wall and the usual, m; 0 where it does not count.
-        along: How far ahead it ends, m.
-        valid: Whether it counts.
+        height: Distance of each beam's end beyond the wall, m; 0 where the beam is not used. In a tracked scan, also
+            less the usual.
+        along: Distance of its end ahead of the robot, m.
+        valid: Whether the beam is used.
     """
 
     height: Float[Array, "*env 2 side"]
@@ -64,42 +74,87 @@ class Bumps:
     valid: Bool[Array, "*env 2 side"]
 
 
-def start(batch: tuple[int, ...], n_beams: int) -> Walls:
-    """No wall seen yet."""
+def begin_walls(batch: tuple[int, ...], n_beams: int) -> Walls:
+    """Return the walls before any scan."""
     zero, side = jnp.zeros(batch), side_beams(n_beams)[0].shape[1]
     return Walls(jnp.zeros((*batch, 2)), zero, zero, zero, jnp.zeros((*batch, 2, side)))
 
 
-def side_beams(n_beams: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Side beams `(2, m)`, left and then right, from the front to the back; their sine and cosine."""
+def side_beams(n_beams: int, most: int = _MOST_BEAMS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return at most `most` beams a side, `(2, m)`: left and right, front to back; with their sines and cosines."""
     angle = np.arange(n_beams) * (2.0 * np.pi / n_beams)
     left = np.flatnonzero(np.sin(angle) > _STEEPEST - 1e-6)
-    left = left[:: max(1, math.ceil(len(left) / _MOST_BEAMS))]
+    left = left[:: max(1, math.ceil(len(left) / most))]
     index = np.stack([left, (n_beams - left) % n_beams])
     return index, np.abs(np.sin(angle[index])).astype(np.float32), np.cos(angle[index]).astype(np.float32)
 
 
 def height_variance(n_beams: int, model_sigma: float) -> Float[np.ndarray, "2 side"]:
-    """Variance of a height, m²: the noise of the range across the wall, and what a model of the relief leaves out."""
+    """Return the variance of a height, m²: noise of the range across the wall, and error of the relief model."""
     return np.square(_RANGE_SIGMA * side_beams(n_beams)[1]) + np.float32(model_sigma**2)
 
 
-def look(walls: Walls, ranges: Float[Array, "*env n_beams"], share: Float[Array, "*env"]) -> tuple[Walls, Bumps]:
-    """The walls after a scan, and what stands out of them.
+def fit_plain(ranges: Float[Array, "*env n"]) -> Bumps:
+    """Measures relief by a fit to all beams, for a robot near the middle that faces along a free tunnel."""
+    across, along = _beam_ends(ranges)
+    valid = (across > _NEAREST) & (across < _FARTHEST)
+    off, _ = _fit_lines(across, along, valid)
+    return Bumps(jnp.where(valid, jnp.clip(off, *_CLIP), 0.0), along, valid)
+
+
+def fit_careful(ranges: Float[Array, "*env n"]) -> Bumps:
+    """Measures relief by a fit without short beams, for a robot that swerves round obstacles.
+
+    Short beams are removed one at a time, the shortest first: it distorts the fit most, so that others look short
+    until it is gone. The slope of the fit is the robot's angle to the axis; relief is measured along and across the
+    axis.
+    """
+    across, along = _beam_ends(ranges)
+    valid = (across > _TOUCH) & (across < _ACROSS)
+    for _ in range(_SHORT_MOST):
+        off, _ = _fit_lines(across, along, valid)
+        least = jnp.min(jnp.where(valid, off, 0.0), axis=(-2, -1), keepdims=True)
+        valid = valid & ((off > least) | (least > -_SHORT_OF_ALL))
+    off, slope = _fit_lines(across, along, valid)
+    shrink = 1.0 / jnp.sqrt(1.0 + slope * slope)
+    ahead = (along + slope * across) * shrink
+    return Bumps(jnp.where(valid, jnp.clip(off * shrink, *_CLIP), 0.0), ahead, valid)
+
+
+def _beam_ends(ranges: Float[Array, "*env n"]) -> tuple[Array, Array]:
+    """Ends of the side beams: to the side and ahead of the robot, m."""
+    index, sine, cosine = side_beams(ranges.shape[-1], ranges.shape[-1])
+    distance = ranges[..., index]
+    return distance * sine, distance * cosine
+
+
+def _fit_lines(across: Array, along: Array, valid: Array) -> tuple[Array, Array]:
+    """Distance of ends behind two parallel lines fitted to valid ends, m; slope of each wall away from the robot."""
+    number = jnp.maximum(jnp.sum(valid, axis=-1, keepdims=True), 1)
+    off = jnp.where(valid, across - jnp.sum(across * valid, axis=-1, keepdims=True) / number, 0.0)
+    ahead = jnp.where(valid, along - jnp.sum(along * valid, axis=-1, keepdims=True) / number, 0.0)
+    # Turned by a small angle, the left wall comes nearer ahead and the right one recedes.
+    signed = jnp.asarray([[1.0], [-1.0]])
+    slope = jnp.sum(signed * off * ahead, axis=(-2, -1)) / (jnp.sum(ahead * ahead, axis=(-2, -1)) + 1e-3)
+    return off - slope[..., None, None] * signed * ahead, slope[..., None, None] * signed
+
+
+def track_walls(walls: Walls, ranges: Float[Array, "*env n_beams"], share: Float[Array, "*env"]) -> tuple[Walls, Bumps]:
+    """Tracks the walls through a scan, and measures their relief.
 
     Args:
-        walls: Before.
+        walls: Walls before the scan.
         ranges: The scan, m, the first beam straight ahead, the others counter-clockwise.
-        share: Distance driven since the last scan, in units of 0.15 m, at most 2.
+        share: Distance driven since the last scan, in usual steps of 0.2 m, at most 2.
     """
     index, sine, cosine = side_beams(ranges.shape[-1])
     across, along = ranges[..., index] * sine, ranges[..., index] * cosine
     precision = 1.0 / height_variance(ranges.shape[-1], _FIT_SIGMA)
     usable = (across > _NEAREST) & (across < _FARTHEST)
     weight = jnp.where(usable, precision * (precision.size / max(float(np.sum(precision)), 1.0)), 0.0)
-    chosen, loose = _chosen(walls, across, along, weight)
-    fitted = _fitted(chosen, loose, across, along, weight)
-    height = across - _wall(fitted, along)
+    pair, loose = _choose_pair(walls, across, along, weight)
+    fitted = _fit_pair(pair, loose, across, along, weight)
+    height = across - _wall_distance(fitted, along)
     seen = (weight > 0.0) & (jnp.abs(fitted.slope) < _STEEP)[..., None, None]
     valid = seen & (height > _SHORT) & (height < _LONG)
     usual = walls.usual + _USUAL * share[..., None, None] * jnp.where(valid, height - walls.usual, 0.0)
@@ -108,23 +163,23 @@ def look(walls: Walls, ranges: Float[Array, "*env n_beams"], share: Float[Array,
     return Walls(fitted.distance, fitted.slope, fitted.bend, scans, usual), Bumps(height, along, valid)
 
 
-def _wall(walls: Walls, along: Float[Array, "*env 2 side"]) -> Float[Array, "*env 2 side"]:
-    """Where the walls are beside the robot, m to the side."""
+def _wall_distance(walls: Walls, along: Float[Array, "*env 2 side"]) -> Float[Array, "*env 2 side"]:
+    """Distance of each wall to the side at the end of each beam, m."""
     slope, bend = walls.slope[..., None, None], walls.bend[..., None, None]
     return walls.distance[..., None] + _signed(slope + 0.5 * bend * along, along)
 
 
 def _signed(factor: Array, along: Float[Array, "*env 2 side"]) -> Float[Array, "*env 2 side"]:
-    """Turned to the left the left wall comes nearer ahead, and the right one goes away."""
+    """Product with its sign for each wall: turned left, the left wall comes nearer ahead and the right one recedes."""
     return jnp.asarray([[1.0], [-1.0]]) * factor * along
 
 
-def _chosen(
+def _choose_pair(
     walls: Walls, across: Float[Array, "*env 2 side"], along: Float[Array, "*env 2 side"], weight: Array
 ) -> tuple[Walls, Bool[Array, "*env"]]:
-    """The pair of walls that most beams lie on, and whether it is another than the tracked one.
+    """The pair of walls with most beams on it, and whether it differs from the tracked one.
 
-    Candidates have one of several slopes and go through one of the beams, or are as far away as the tracked wall.
+    Candidates have one of several slopes, and pass through the end of a beam or at the distance of the tracked wall.
     """
     settled = jnp.minimum(walls.scans / _SETTLED, 1.0)
     slope = walls.slope[..., None] + _SLOPES
@@ -143,42 +198,43 @@ def _chosen(
     at = jnp.argmax(pair, axis=-1, keepdims=True)
     kept = jnp.sum(score[..., len(_SLOPES) // 2, :, -1], axis=-1)
     other = (jnp.max(pair, axis=-1) - kept > _MORE) | (walls.scans < 1.0)
-    found = jnp.take_along_axis(distance, at[..., None], axis=-2)[..., 0, :]
-    turned = jnp.clip(jnp.take_along_axis(slope, at, axis=-1)[..., 0], -2.0 * _STEEP, 2.0 * _STEEP)
-    distance = jnp.where(other[..., None], found, walls.distance)
-    return walls.replace(distance=distance, slope=jnp.where(other, turned, walls.slope)), other  # type: ignore[attr-defined]
+    best_distance = jnp.take_along_axis(distance, at[..., None], axis=-2)[..., 0, :]
+    best_slope = jnp.clip(jnp.take_along_axis(slope, at, axis=-1)[..., 0], -2.0 * _STEEP, 2.0 * _STEEP)
+    distance = jnp.where(other[..., None], best_distance, walls.distance)
+    return walls.replace(distance=distance, slope=jnp.where(other, best_slope, walls.slope)), other  # type: ignore[attr-defined]
 
 
 def _bell(value: Array) -> Array:
+    """Unscaled normal density."""
     return jnp.exp(-0.5 * value * value)
 
 
-def _fitted(walls: Walls, loose: Bool[Array, "*env"], across: Array, along: Array, weight: Array) -> Walls:
-    """The walls by least squares whose weights redescend, drawn to where they were; one unknown after the other."""
+def _fit_pair(walls: Walls, loose: Bool[Array, "*env"], across: Array, along: Array, weight: Array) -> Walls:
+    """Fits the walls by least squares, weights redescending, with the last walls as prior; one unknown at a time."""
     loose = loose | (walls.scans < _SETTLED)
     keep, keep_slope = jnp.where(loose, 0.3, _KEEP), jnp.where(loose, 0.5, _KEEP_SLOPE)
     row = _signed(jnp.ones_like(along), along)
     now = walls
     for _ in range(3):
-        rest, trust = _rest(now, across, along, weight)
+        rest, trust = _residuals(now, across, along, weight)
         pull = keep[..., None] * (walls.distance - now.distance)
         moved = (jnp.sum(trust * rest, axis=-1) + pull) / (jnp.sum(trust, axis=-1) + keep[..., None])
         now = dataclasses.replace(now, distance=now.distance + moved)
-        rest, trust = _rest(now, across, along, weight)
-        now = dataclasses.replace(now, slope=_drawn(walls.slope, now.slope, row, rest, trust, keep_slope))
-        rest = across - _wall(now, along)
-        bend = _drawn(walls.bend, now.bend, 0.5 * row * along, rest, trust, jnp.asarray(_KEEP_BEND))
+        rest, trust = _residuals(now, across, along, weight)
+        now = dataclasses.replace(now, slope=_solve_shared(walls.slope, now.slope, row, rest, trust, keep_slope))
+        rest = across - _wall_distance(now, along)
+        bend = _solve_shared(walls.bend, now.bend, 0.5 * row * along, rest, trust, jnp.asarray(_KEEP_BEND))
         now = dataclasses.replace(now, bend=jnp.clip(bend, -_SHARPEST, _SHARPEST))
     return now
 
 
-def _rest(walls: Walls, across: Array, along: Array, weight: Array) -> tuple[Array, Array]:
-    """Residuals, m, and the weights that they leave."""
-    rest = across - _wall(walls, along)
+def _residuals(walls: Walls, across: Array, along: Array, weight: Array) -> tuple[Array, Array]:
+    """Residuals, m, and the redescending weights."""
+    rest = across - _wall_distance(walls, along)
     return rest, weight / jnp.square(1.0 + jnp.square(rest / _REDESCEND))
 
 
-def _drawn(before: Array, now: Array, row: Array, rest: Array, trust: Array, keep: Array) -> Array:
-    """One unknown that both walls share, better by one step of least squares."""
+def _solve_shared(before: Array, now: Array, row: Array, rest: Array, trust: Array, keep: Array) -> Array:
+    """One unknown shared by both walls, after one step of least squares."""
     size = jnp.sum(trust * row * row, axis=(-2, -1)) + keep
     return now + (jnp.sum(trust * row * rest, axis=(-2, -1)) + keep * (before - now)) / size

@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
 from subterra_jax.baselines.corridor import Corridor
-from subterra_jax.baselines.particle.wallmap import WallMap, wall_map
 from subterra_jax.baselines.rings import loop as rings
 from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.policies.belief import grid
 from subterra_jax.policies.belief import scan as belief_scan
 from subterra_jax.policies.belief import turn as belief_turn
@@ -117,7 +117,7 @@ class Belief:
     def _believed(self, memory: Memory, obs: Observed, params: EnvParams, done: Bool[Array, ""]) -> Memory:
         """The memory after what was driven and seen; `done` where it has just turned round."""
         habits, length = self.habits, jnp.asarray(params.tunnel.length)
-        moved = rings.moved(memory.command[0] * params.vehicle.period, obs.distance - memory.reading)
+        moved = rings.fuse_distances(memory.command[0] * params.vehicle.period, obs.distance - memory.reading)
         busy = belief_turn.turning(memory.turn) | done
         track = rings.advance(memory.track, obs.ranges, moved, jnp.ones(()), jnp.asarray(obs.ring_pitch))
         # What is driven while it turns leads nowhere in particular: a belief that spreads by as much.
@@ -128,7 +128,7 @@ class Belief:
         turned = grid.turned_round(log_mass, track.station, length, habits.cell)
         log_mass = jnp.where(done, turned, log_mass)
         travelled = memory.travelled + jnp.where(done, track.station, 0.0) + jnp.where(busy, moved, 0.0)
-        track = rings.anew(track, 1.0 - done)
+        track = rings.restart(track, 1.0 - done)
         gain = jnp.where(busy, 0.0, self._gain(memory.walls, track.station, obs, params))
         return dataclasses.replace(
             memory, log_mass=grid.weighed(log_mass, gain), track=track, reading=obs.distance, travelled=travelled

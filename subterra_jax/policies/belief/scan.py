@@ -1,6 +1,6 @@
 """How well a scan fits a place, learnt: what each sideways beam found against what the map has there.
 
-Offset and angle of the robot are first adjusted to each place, as in `subterra_jax.baselines.particle.likelihood`; then
+Offset and angle of the robot are first adjusted to each place, as in `subterra_jax.baselines.scanmodel`; then
 a small network, the same for all beams and places, says what each beam is worth beside its nominal likelihood.
 """
 
@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.corridor import Corridor
-from subterra_jax.baselines.particle.likelihood import adjusted
-from subterra_jax.baselines.particle.scan import Endpoints, Place, ScanModel, endpoints
-from subterra_jax.baselines.particle.wallmap import WallMap
+from subterra_jax.baselines.scanmodel import Endpoints, ScanModel, TunnelPose, endpoints, least_squares_step
+from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.lidar import bearings
 from subterra_jax.policies.layers import Tensors, perceptron
 
@@ -24,7 +23,7 @@ _PRIOR = ScanModel(range_sigma=0.05, lateral_sigma=0.1, heading_sigma=0.03)  # o
 _STRAY = 0.05 * 0.1  # 1/m: share of beams that meet what no map has, times the density of where they end
 
 
-def place_of(corridor: Corridor, station: Float[Array, "*n"], forward: Float[Array, "*n"]) -> Place:
+def place_of(corridor: Corridor, station: Float[Array, "*n"], forward: Float[Array, "*n"]) -> TunnelPose:
     """Where a robot between two tracked walls would be at a station.
 
     Args:
@@ -33,11 +32,11 @@ def place_of(corridor: Corridor, station: Float[Array, "*n"], forward: Float[Arr
         forward: 1 where it faces growing stations, −1 where it faces falling ones.
     """
     offset, backward = jnp.broadcast_to(corridor.offset, station.shape), 0.5 * (1.0 - forward)
-    return Place(station, forward * offset, corridor.angle + jnp.pi * backward)
+    return TunnelPose(station, forward * offset, corridor.angle + jnp.pi * backward)
 
 
 def score(
-    tensors: Tensors, walls: WallMap, place: Place, ranges: Float[Array, "n_beams"], range_max: Float[Array, ""]
+    tensors: Tensors, walls: WallMap, place: TunnelPose, ranges: Float[Array, "n_beams"], range_max: Float[Array, ""]
 ) -> Float[Array, "*n"]:
     """Log likelihood of a scan at several places, up to a constant.
 
@@ -119,5 +118,5 @@ def _fitted(
         left_over = residual + shift + ends.along * turn
         # Cauchy's weight, as in the particle filter: a pocket that is not there pulls little.
         weight = jnp.where(useful, 1.0 / (variance * (1.0 + left_over * left_over / (6.0 * variance))), 0.0)
-        shift, turn = adjusted(residual, ends.along, weight, _PRIOR)
+        shift, turn = least_squares_step(residual, ends.along, weight, _PRIOR)
     return side * (residual + shift + ends.along * turn)

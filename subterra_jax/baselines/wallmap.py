@@ -1,6 +1,6 @@
-"""The map of a localiser: how far either wall stands from the centreline at each station, and how the centreline bends.
+"""The map of a localiser: distance of either wall from the centreline at each station, and the centreline's curvature.
 
-Made once on the host in float64 from the walls that the simulator itself holds; a pytree, so that it can be data.
+It is made once on the host, in float64, from the walls of the simulator. It is a pytree, so it can be data.
 """
 
 import dataclasses
@@ -22,13 +22,13 @@ class WallMap:
     """Walls and centreline of one tunnel, or of the tunnels of a stack one after another.
 
     Attributes:
-        wall: Distance of the left and of the right wall from the centreline in each cell of station, m, averaged over
-            the blur of a range; the first surface that one meets going outward.
+        wall: Distance of the left and of the right wall from the centreline in each cell of station, m: the first
+            surface going outward, averaged over the blur of a range.
         spread: Variance of that distance within the blur, m²: large where a pocket begins.
         bend: Curvature of the centreline ahead, behind and at each node, 1/m; positive to the left.
         half_width: Usual distance of a wall, m.
         cell: Length of a cell of station, m.
-        spacing: Length between nodes of the centreline, m; `(k,)` for a stack of k, as the next four.
+        spacing: Length between nodes of the centreline, m. It and the next four are `(k,)` for a stack of k.
         first_cell: First cell of each tunnel.
         n_cells: Cells of each tunnel.
         first_node: First node of each tunnel.
@@ -47,7 +47,7 @@ class WallMap:
     n_nodes: Int[Array, "k"]
 
     def pick(self, tunnel: Tunnel) -> "WallMap":
-        """The map of the one tunnel that an agent is in, found by its first node; scalars where there were `k`."""
+        """Picks the map of one tunnel, found by its first node; fields of `(k,)` become scalars."""
         index = jnp.argmax(self.first_node == tunnel.first_node)
         names = ("spacing", "first_cell", "n_cells", "first_node", "n_nodes")
         return dataclasses.replace(self, **{name: getattr(self, name)[index] for name in names})
@@ -55,31 +55,31 @@ class WallMap:
     def offset(
         self, station: Float[Array, "*n"], left: Bool[Array, "*n"]
     ) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Bool[Array, "*n"]]:
-        """Distance of a wall from the centreline (m), its variance (m²), and whether the station is inside.
+        """Return the distance of a wall from the centreline (m), its variance (m²), and whether the station is inside.
 
         A station beyond a mouth gives the last cell and False.
         """
-        place = jnp.floor(station / self.cell).astype(jnp.int32)
-        cell = self.first_cell + jnp.clip(place, 0, self.n_cells - 1)
-        where = cell + jnp.where(left, 0, self.wall.shape[1])
-        inside = (place >= 0) & (place < self.n_cells)
-        return self.wall.reshape(-1)[where], self.spread.reshape(-1)[where], inside
+        index = jnp.floor(station / self.cell).astype(jnp.int32)
+        cell = self.first_cell + jnp.clip(index, 0, self.n_cells - 1)
+        entry = cell + jnp.where(left, 0, self.wall.shape[1])
+        inside = (index >= 0) & (index < self.n_cells)
+        return self.wall.reshape(-1)[entry], self.spread.reshape(-1)[entry], inside
 
     def curvature(self, station: Float[Array, "*n"]) -> Float[Array, "3 *n"]:
-        """Curvature ahead of a station, behind it and at it, 1/m."""
+        """Return the curvature ahead of a station, behind it and at it, 1/m."""
         node = jnp.clip(jnp.round(station / self.spacing).astype(jnp.int32), 0, self.n_nodes - 1)
         return self.bend[:, self.first_node + node]
 
 
 def wall_map(tunnel: Tunnel, cell: float = 0.02, blur: float = 0.03) -> WallMap:
-    """Make the map.
+    """Makes the map of a tunnel.
 
     Args:
         tunnel: A tunnel or a stack.
         cell: Length of a cell, m.
-        blur: Standard deviation of where along the tunnel an echo lies, m: about that of a range.
+        blur: Standard deviation of an echo's position along the tunnel, m: about that of a range.
     """
-    parts = [_one(tunnel, index, cell, blur) for index in range(tunnel.count)]
+    parts = [_map_tunnel(tunnel, index, cell, blur) for index in range(tunnel.count)]
     wall, spread, bend = (np.concatenate([part[i] for part in parts], axis=1) for i in range(3))
     n_cells, n_nodes = (np.array([part[i].shape[1] for part in parts], np.int32) for i in (0, 2))
     return WallMap(
@@ -96,26 +96,26 @@ def wall_map(tunnel: Tunnel, cell: float = 0.02, blur: float = 0.03) -> WallMap:
     )
 
 
-def _one(tunnel: Tunnel, index: int, cell: float, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _map_tunnel(tunnel: Tunnel, index: int, cell: float, blur: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Wall `(2, n_cells)`, spread `(2, n_cells)` and bend `(3, n_nodes)` of one tunnel."""
     here = tunnel.pick(index)
     first, spacing = int(here.first_node), float(here.spacing)
     rows = slice(first, first + int(here.n_nodes))
     grid = np.asarray(tunnel.grid, np.float64)[rows]
     n_cells = max(1, int(np.ceil(spacing * (len(grid) - 1) / cell - 1e-6)))
-    station, lateral = _straightened(_segments(tunnel, rows), grid, spacing)
+    station, lateral = _tunnel_coordinates(_segments(tunnel, rows), grid, spacing)
     sides = (lateral.mean(axis=1) > 0.0, lateral.mean(axis=1) <= 0.0)
     profile = np.stack([_profile(station[side], np.abs(lateral[side]), n_cells, cell) for side in sides])
-    mean = np.stack([_blurred(row, blur / cell) for row in profile])
+    mean = np.stack([_blur(row, blur / cell) for row in profile])
     # About the mean first, or a variance of cm² would be lost in squares of m.
-    spread = np.stack([_blurred((row - row.mean()) ** 2, blur / cell) for row in profile])
+    spread = np.stack([_blur((row - row.mean()) ** 2, blur / cell) for row in profile])
     spread = np.maximum(spread - (mean - profile.mean(axis=1, keepdims=True)) ** 2, 0.0)
     return mean, spread, _bend(grid, spacing)
 
 
 def _segments(tunnel: Tunnel, rows: slice) -> np.ndarray:
-    """Wall segments that the windows of some nodes hold, tunnel frame, m, `(n, 2, 2)`."""
-    # In a stack each tunnel lies near its own origin: only the windows tell whose a block is.
+    """Wall segments in the windows of some nodes, tunnel frame, m, `(n, 2, 2)`."""
+    # In a stack each tunnel lies near its own origin: only the windows show to which tunnel a block belongs.
     first = np.asarray(tunnel.scan_first)[rows]
     blocks = slice(int(first.min()), int(first.max()) + tunnel.n_scan)
     box, wall = np.asarray(tunnel.box, np.float64)[:, blocks], np.asarray(tunnel.wall, np.float64)[blocks]
@@ -125,14 +125,14 @@ def _segments(tunnel: Tunnel, rows: slice) -> np.ndarray:
     return segment[np.any(segment[:, 0] != segment[:, 1], axis=1)]
 
 
-def _straightened(segment: np.ndarray, grid: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+def _tunnel_coordinates(segment: np.ndarray, grid: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Station and lateral offset (m) of both ends of segments, each `(n, 2)`."""
     points = segment.reshape(-1, 2)
     station = np.concatenate([_nearest(points[i : i + _ROWS], grid) for i in range(0, len(points), _ROWS)]) * spacing
     for _ in range(3):
-        place = station / spacing
-        index = np.clip(np.floor(place).astype(int), 0, len(grid) - 2)
-        row = grid[index] + (place - index)[:, None] * (grid[index + 1] - grid[index])
+        position = station / spacing
+        index = np.clip(np.floor(position).astype(int), 0, len(grid) - 2)
+        row = grid[index] + (position - index)[:, None] * (grid[index + 1] - grid[index])
         from_x, from_y = points[:, 0] - row[:, 0], points[:, 1] - row[:, 1]
         lateral = row[:, 2] * from_y - row[:, 3] * from_x
         station = station + row[:, 2] * from_x + row[:, 3] * from_y
@@ -140,6 +140,7 @@ def _straightened(segment: np.ndarray, grid: np.ndarray, spacing: float) -> tupl
 
 
 def _nearest(points: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Index of the node nearest to each point."""
     squared = (points[:, None, 0] - grid[None, :, 0]) ** 2 + (points[:, None, 1] - grid[None, :, 1]) ** 2
     return np.argmin(squared, axis=1)
 
@@ -160,7 +161,7 @@ def _profile(station: np.ndarray, offset: np.ndarray, n_cells: int, cell: float)
     return np.interp(np.arange(n_cells), known, profile[known])
 
 
-def _blurred(values: np.ndarray, sigma: float) -> np.ndarray:
+def _blur(values: np.ndarray, sigma: float) -> np.ndarray:
     """Values averaged with a normal weight of `sigma` cells."""
     reach = int(np.ceil(3.0 * sigma))
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-9)) ** 2)
@@ -177,5 +178,5 @@ def _bend(grid: np.ndarray, spacing: float) -> np.ndarray:
         from_x, from_y = grid[other, 0] - grid[:, 0], grid[other, 1] - grid[:, 1]
         lateral = grid[:, 2] * from_y - grid[:, 3] * from_x
         rows.append(2.0 * lateral / np.maximum(from_x**2 + from_y**2, spacing**2))
-    smooth = _blurred(np.gradient(angle, spacing), 1.0 / spacing)
+    smooth = _blur(np.gradient(angle, spacing), 1.0 / spacing)
     return np.stack([*rows, smooth])

@@ -1,0 +1,230 @@
+"""A cloud of particles along a tunnel: its motion, its weights, resampling, and its heaviest cluster."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from subterra_jax.baselines.drift import fault_sizes
+from subterra_jax.baselines.reckoning import command_errors, odometer_errors, odometer_share
+from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit
+from subterra_jax.baselines.wallmap import WallMap
+from subterra_jax.parts.wander import WanderParams, advance_wander
+from subterra_jax.state import EnvParams
+
+_POWERS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # exponents by which a likelihood may be flattened
+_CANDIDATES = 32  # particles tried as the middle of the heaviest cluster
+# As often as 10 m patches change, 1/m, in a cloud of which some particles must be right at once.
+_SLIP_RATE = 0.1
+
+
+@struct.dataclass
+class CloudParams:
+    """Motion and resampling of a cloud.
+
+    Attributes:
+        scale_sigma: Standard deviation of the relative error of dead reckoning that lasts an episode, 1.
+        wander: The relative error that changes along the way.
+        step_sigma: Standard deviation of the noise of one step of dead reckoning, m.
+        slip_rate: Rate at which a particle changes between dry and wet rail, 1/m; 0 is never.
+        slip_loss: Share of the speed lost on wet rail, 1.
+        ess_share: The cloud is resampled when its effective size falls below this share.
+        least_share: Share to which one scan may reduce the effective size. A likelihood that would reduce it further is
+            flattened, so that chance does not select a few particles of a sparse cloud.
+        roughening: Standard deviation of the noise on the lasting scale error of a resampled particle, 1.
+        jitter: Standard deviation of the noise on its station, in lengths of the cloud over its particles.
+        cluster: Half the length of one cluster, m: half the shortest distance at which a wall repeats.
+    """
+
+    scale_sigma: float | Float[Array, ""]
+    wander: WanderParams
+    step_sigma: float | Float[Array, ""] = 0.01
+    slip_rate: float | Float[Array, ""] = 0.0
+    slip_loss: float | Float[Array, ""] = 0.3
+    ess_share: float = 0.5
+    least_share: float = 0.5
+    roughening: float = 0.0005
+    jitter: float = 0.2
+    cluster: float = 0.6
+
+
+def cloud_params(params: EnvParams) -> CloudParams:
+    """Return the motion of a cloud for the nominal errors of a task; on the host."""
+    share = odometer_share(params)
+    (lasting, changing), (plant_lasting, plant_changing) = odometer_errors(params), command_errors(params)
+    fused = lambda a, b: float(np.hypot(share * a, (1.0 - share) * b))  # noqa: E731
+    wander = params.slip.wander if "slip" in params.parts else params.odometry.wander
+    return CloudParams(
+        scale_sigma=fused(lasting, plant_lasting),
+        wander=WanderParams(fused(changing, plant_changing), 30.0 if wander is None else float(wander.length)),
+        step_sigma=max(0.005, share * float(params.odometry.distance_sigma)),
+        slip_rate=_SLIP_RATE if "faults" in params.parts else 0.0,
+        slip_loss=float(fault_sizes(params).wet_loss),
+    )
+
+
+@struct.dataclass
+class Cloud:
+    """Particles.
+
+    Attributes:
+        pose: Pose of each particle.
+        scale: Lasting relative error of dead reckoning, 1.
+        wander: Changing relative error, 1.
+        wet: 1 where the particle assumes wet rail, else 0.
+        log_weight: Log of the weight; the weights sum to 1 after `weigh`.
+    """
+
+    pose: TunnelPose
+    scale: Float[Array, "n"]
+    wander: Float[Array, "n"]
+    wet: Float[Array, "n"]
+    log_weight: Float[Array, "n"]
+
+
+def new_cloud(key: PRNGKeyArray, pose: TunnelPose, params: CloudParams) -> Cloud:
+    """Makes particles at given poses, `(n,)`, with random scale errors and equal weights."""
+    n = pose.station.shape[0]
+    normal = jax.random.normal(key, (2, n))
+    return Cloud(
+        pose=pose,
+        scale=params.scale_sigma * normal[0],
+        wander=params.wander.sigma * normal[1],
+        wet=jnp.zeros(n),
+        log_weight=jnp.full(n, -jnp.log(float(n))),
+    )
+
+
+def move(
+    key: PRNGKeyArray,
+    cloud: Cloud,
+    walls: WallMap,
+    travelled: Float[Array, ""],
+    turned: Float[Array, ""],
+    params: CloudParams,
+) -> Cloud:
+    """Moves a cloud by one step.
+
+    Args:
+        key: Key of the noise.
+        cloud: The cloud before.
+        walls: The map, for the curvature.
+        travelled: Dead-reckoned distance, m.
+        turned: Dead-reckoned turn, rad; NaN is unknown, and replaced by that of the axis.
+        params: Motion of the cloud.
+    """
+    n = cloud.scale.shape[0]
+    normal = jax.random.normal(key, (2, n))
+    flips = jax.random.uniform(jax.random.fold_in(key, 1), (n,)) < params.slip_rate * jnp.abs(travelled)
+    wet = jnp.where(flips, 1.0 - cloud.wet, cloud.wet)
+    grip = 1.0 - params.slip_loss * wet
+    distance = travelled * (1.0 + cloud.scale + cloud.wander) * grip + params.step_sigma * normal[0]
+    pose = cloud.pose
+    curvature = walls.curvature(pose.station)[2]
+    turned = jnp.where(jnp.isnan(turned), curvature * distance, turned)
+    middle = pose.heading + 0.5 * turned
+    along = distance * jnp.cos(middle) / (1.0 - curvature * pose.lateral)
+    after = TunnelPose(
+        station=pose.station + along,
+        lateral=pose.lateral + distance * jnp.sin(middle),
+        heading=pose.heading + turned - curvature * along,
+    )
+    wander = jax.vmap(advance_wander, (0, None, 0, None))(cloud.wander, travelled, normal[1], params.wander)
+    return dataclasses.replace(cloud, pose=after, wander=wander, wet=wet)
+
+
+def weigh(
+    cloud: Cloud,
+    walls: WallMap,
+    ranges: Float[Array, "n_beams"],
+    range_max: Float[Array, ""],
+    model: ScanModel,
+    params: CloudParams,
+) -> Cloud:
+    """Multiplies the weights by the likelihood of a scan, and adjusts offsets and headings to it."""
+    gain, pose = fit(walls, cloud.pose, ranges, range_max, model)
+    options = _normalise(cloud.log_weight + jnp.asarray(_POWERS)[:, None] * gain)
+    enough = _effective_size(options) >= params.least_share * gain.shape[0]
+    # The largest power that leaves enough particles, or else the least.
+    chosen = jnp.where(jnp.any(enough), jnp.argmax(enough), len(_POWERS) - 1)
+    return dataclasses.replace(cloud, pose=pose, log_weight=options[chosen])
+
+
+def _normalise(log_weight: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    """Scales weights to a sum of 1."""
+    return log_weight - jax.scipy.special.logsumexp(log_weight, axis=-1, keepdims=True)
+
+
+def _effective_size(log_weight: Float[Array, "*m n"]) -> Float[Array, "*m"]:
+    """Effective number of particles."""
+    return 1.0 / jnp.sum(jnp.exp(2.0 * log_weight), axis=-1)
+
+
+def resample(key: PRNGKeyArray, cloud: Cloud, params: CloudParams) -> Cloud:
+    """Resamples a cloud by its weights where too few particles carry them; systematically, in order.
+
+    Source: Arulampalam et al. 2002, A tutorial on particle filters for online nonlinear/non-Gaussian Bayesian tracking;
+    for the jitter, Gordon et al. 1993, Novel approach to nonlinear/non-Gaussian Bayesian state estimation.
+    """
+    n = cloud.scale.shape[0]
+    weight = jnp.exp(cloud.log_weight)
+    due = _effective_size(cloud.log_weight) < params.ess_share * n
+    offset_key, rough_key = jax.random.split(key)
+    total = jnp.cumsum(weight)
+    point = (jnp.arange(n) + jax.random.uniform(offset_key)) / n * total[-1]
+    drawn = jnp.clip(jnp.searchsorted(total, point), 0, n - 1)
+    parent = jnp.where(due, drawn, jnp.arange(n))
+    heirs = jax.tree.map(lambda leaf: leaf[parent], cloud)
+    normal = jnp.where(due, jax.random.normal(rough_key, (2, n)), 0.0)
+    length = jnp.max(heirs.pose.station) - jnp.min(heirs.pose.station)
+    pose = dataclasses.replace(heirs.pose, station=heirs.pose.station + params.jitter * length / n * normal[0])
+    log_weight = jnp.where(due, -jnp.log(float(n)), cloud.log_weight)
+    return dataclasses.replace(
+        heirs, pose=pose, scale=heirs.scale + params.roughening * normal[1], log_weight=log_weight
+    )
+
+
+@struct.dataclass
+class CloudSummary:
+    """Estimate by the heaviest cluster of a cloud.
+
+    Attributes:
+        station: Mean station of the heaviest cluster, m.
+        sigma: Standard deviation of all particles about it, m.
+        share: Weight of that cluster.
+        lateral: Lateral offset of the cluster, m.
+        heading: The cluster's heading against the tangent of growing station, rad, in [-π, π].
+    """
+
+    station: Float[Array, ""]
+    sigma: Float[Array, ""]
+    share: Float[Array, ""]
+    lateral: Float[Array, ""]
+    heading: Float[Array, ""]
+
+
+def summarise(cloud: Cloud, params: CloudParams) -> CloudSummary:
+    """Finds the heaviest cluster of a cloud, and its means."""
+    weight, station = jnp.exp(cloud.log_weight), cloud.pose.station
+    # Clusters that face opposite ways lie apart, however near their stations are.
+    cos, sin = jnp.cos(cloud.pose.heading), jnp.sin(cloud.pose.heading)
+    stride = max(1, station.shape[0] // _CANDIDATES)
+    first = slice(stride // 2, None, stride)
+    near = jnp.abs(station - station[first, None]) < params.cluster
+    near &= cos * cos[first, None] > 0.0
+    mass = jnp.sum(jnp.where(near, weight, 0.0), axis=1)
+    best = jnp.argmax(mass)
+    inside = jnp.where(near[best], weight, 0.0)
+    share = jnp.maximum(mass[best], 1e-12)
+    mean = lambda value: jnp.sum(inside * value) / share  # noqa: E731
+    middle = mean(station)
+    return CloudSummary(
+        station=middle,
+        sigma=jnp.sqrt(jnp.sum(weight * (station - middle) ** 2)),
+        share=share,
+        lateral=mean(cloud.pose.lateral),
+        heading=jnp.arctan2(mean(sin), mean(cos)),
+    )

@@ -1,1 +1,0 @@
-"""Scan matching against the last few scans, without a map."""
