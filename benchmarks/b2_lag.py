@@ -1,4 +1,4 @@
-"""Identifies the lags of a B2 gait, the defaults of `subterra_jax.b2.surrogate`: `python -m benchmarks.b2_lag`.
+"""Identifies the lags of a B2 gait, the defaults of `subterra_jax.b2.transfer`: `python -m benchmarks.b2_lag`.
 
 Robots walk along the centreline in MuJoCo under commands with added noise; lags and gains are fitted to their motion.
 """
@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from benchmarks.command import BenchmarkError, require_least, run_main
 from subterra_jax.b2.film import Driver
+from subterra_jax.b2.gait import RELEASED
 from subterra_jax.b2.gym import B2Env
-from subterra_jax.b2.policy import RELEASED
-from subterra_jax.b2.surrogate import identify
+from subterra_jax.b2.transfer import identify
 from train import cli
 
 _SPEEDS = (0.0, 0.3, 0.5, 0.8)  # m/s; one is drawn every 2 s

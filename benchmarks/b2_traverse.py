@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks.command import require_least, run_main
 from subterra_jax import policies
-from subterra_jax.b2 import missions, trial
-from subterra_jax.b2.policy import RELEASED
+from subterra_jax.b2 import tasks, transfer
+from subterra_jax.b2.gait import RELEASED
 from subterra_jax.baselines import registry
 from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
@@ -57,7 +57,7 @@ class Command:
     length: float = 0.0
     coverage: float = 0.9
     odometer: Literal["legs", "drift"] = "legs"
-    speed: float = missions.VEHICLE.speed_max
+    speed: float = tasks.VEHICLE.speed_max
     out: Path | None = None
 
 
@@ -70,7 +70,7 @@ def load_driver(name: str, env: Any, params: Any) -> Any:
     return agent
 
 
-def show_progress(now: trial.Walk) -> None:
+def show_progress(now: transfer.Walk) -> None:
     """Prints station, falls and contacts of the robots on one line."""
     falls, contacts = int(np.sum(now.fall)), int(np.sum(now.contact))
     counts = f"{int(np.sum(now.over))} of {len(now.over)} over, {falls} falls, {contacts} contacts"
@@ -103,18 +103,18 @@ def command(arguments: Command) -> None:
     if arguments.length:
         plan = load_tunnel(arguments.tunnel)
         tunnel = plan.slice(0.0, min(arguments.length, plan.length))
-    env, params = missions.make(
+    env, params = tasks.make_mission(
         tunnel=tunnel,
         scene=arguments.scene,
         policy=arguments.policy,
         engine=arguments.engine,
         odometer=arguments.odometer,
         goal_coverage=arguments.coverage,
-        vehicle=missions.VEHICLE.replace(speed_max=arguments.speed),  # type: ignore[attr-defined]
+        vehicle=tasks.VEHICLE.replace(speed_max=arguments.speed),  # type: ignore[attr-defined]
     )
     agent, started = load_driver(arguments.agent, env, params), time.perf_counter()
-    walks = trial.drive(env, params, agent, arguments.robots, arguments.seed, show_progress)
-    figures = trial.figures(*walks, params)
+    walks = transfer.walk_robots(env, params, agent, arguments.robots, arguments.seed, show_progress)
+    figures = transfer.figures(*walks, params)
     print(file=sys.stderr)
     figures["wall_seconds"] = time.perf_counter() - started
     cli.table(f"{arguments.robots} B2s, {arguments.engine}, gait {arguments.policy}, {arguments.agent}", figures)

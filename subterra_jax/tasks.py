@@ -170,8 +170,8 @@ def make(
 
     Args:
         id: A key of `TASKS`; `MODULE:ID` or `FILE.py:ID` for a task of one's own; or `Subterra/B2Walk-v0` or
-            `Subterra/B2Traverse-v0`, for which `subterra_jax.b2.tasks.make` and `subterra_jax.b2.missions.make` say
-            what else there is.
+            `Subterra/B2Traverse-v0`, whose further arguments are those of `subterra_jax.b2.tasks.make` and
+            `subterra_jax.b2.tasks.make_mission`.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
             another lining. None is the packaged tunnel.
@@ -192,14 +192,11 @@ def make(
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
     id = find(id)
-    if id == WALK:
+    if id == WALK or id in MISSIONS:
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
-        return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
-    if id in MISSIONS:
-        from subterra_jax.b2 import missions
-
-        return missions.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
+        make_walking = walking.make if id == WALK else walking.make_mission
+        return make_walking(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
     task = TASKS[id]
     named = {part.name for part in (*task.parts, *parts)}
     brought = (part for part in OPTIONAL if part.name in overrides and part.name not in named)

@@ -1,8 +1,8 @@
 """The Unitree B2: its model, the track under its feet, a task in which it learns to walk, and missions on that gait.
 
-constants ─► model ──► physics (MJX) or engine (MuJoCo in C) ─► walk (50 Hz) ─► hierarchy (5 Hz)
-track ───────┘                                                   ▲ policy
-kinematics ─► gait ──────────────────────────────────────────────┘
+constants ─► model ─┐
+track ──────────────┴► physics (MJX) or engine (MuJoCo in C) ─► walk (50 Hz) ─► mission (5 Hz)
+kinematics ─► gait ───────────────────────────────────────────────┘
 """
 
 # Task ids. Importing them does not load MuJoCo.

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from subterra_jax.b2.gait import RELEASED
 from subterra_jax.b2.gym import B2Env  # first: it chooses how MuJoCo draws
-from subterra_jax.b2.policy import RELEASED
 from subterra_jax.b2.view import Moment, PictureError
 
 # isort: split

@@ -1,11 +1,15 @@
-"""A scripted trot: from a commanded velocity and a clock to the joint targets of the servos.
+"""The gait: a scripted trot, and the trained policy that corrects it.
 
-Diagonal legs step together. A foot on the ground moves back as fast as the trunk should move forward. A foot in the
-air swings forward on an arc. The learnt action is added to these targets, so the robot walks before any training.
+The trot leads from a commanded velocity and a clock to the joint targets of the servos. Diagonal legs step together.
+A foot on the ground moves back as fast as the trunk should move forward. A foot in the air swings forward on an arc.
+The learnt action is added to these targets, so the robot walks before any training.
 """
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -13,9 +17,13 @@ from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
+from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read
+from subterra_jax.policies.layers import Tensors, perceptron
 
 _OFFSET = np.array([0.0, 0.5, 0.5, 0.0], np.float32)  # of each leg's clock: diagonal legs together
 _WEIGHT = b2.TOTAL_MASS * b2.GRAVITY
+RELEASED = "B2Walk-v0"
+_CLIP = 10.0  # largest normalised observation, standard deviations
 
 
 @struct.dataclass
@@ -172,3 +180,63 @@ def _leg_phase(state: GaitState) -> Float[Array, "4"]:
 def _size(velocity: Float[Array, "3"]) -> Float[Array, ""]:
     """Size of a velocity, m/s; 1 rad/s of yaw rate counts as 0.5 m/s."""
     return jnp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1] + 0.25 * velocity[2] * velocity[2])
+
+
+@struct.dataclass
+class WalkPolicy:
+    """Twelve joint offsets for one observation of `WalkEnv`: the mean of the distribution that was trained.
+
+    Attributes:
+        tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `policy.hidden_<i>`.
+        name: Name shown to people.
+    """
+
+    tensors: Tensors
+    name: str = struct.field(pytree_node=False, default=RELEASED)
+
+    @property
+    def n_observation(self) -> int:
+        """Size of one observation."""
+        return self.tensors["statistics.mean"].shape[0]
+
+    def act(self, observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
+        """Return the action, in [-1, 1]."""
+        scaled = (observation - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
+        parameters = perceptron(self.tensors, "policy", jnp.clip(scaled, -_CLIP, _CLIP), jax.nn.swish)
+        return jnp.tanh(parameters[..., : parameters.shape[-1] // 2])
+
+
+def load_policy(source: str | Path = RELEASED) -> tuple[WalkPolicy, dict[str, Any]]:
+    """Loads a gait and its facts.
+
+    Args:
+        source: A `.safetensors` file with its `.json` beside it, or the name of a released policy.
+
+    Raises:
+        PolicyError: The file is missing or damaged, or holds no gait.
+    """
+    file = read(source)
+    return make_policy(file), file.facts
+
+
+def make_policy(file: PolicyFile) -> WalkPolicy:
+    """Makes a gait from its file; raises `PolicyError` for another kind of policy, or tensors that do not fit."""
+    if file.facts["kind"] != GAIT:
+        raise PolicyError(f"{file.path}: a policy of kind {file.facts['kind']!r}, which is no gait")
+    try:
+        policy = WalkPolicy({name: jnp.asarray(tensor) for name, tensor in file.tensors.items()}, file.facts["name"])
+        jax.eval_shape(policy.act, jax.ShapeDtypeStruct((policy.n_observation,), jnp.float32))
+    except (KeyError, TypeError, ValueError) as error:
+        raise PolicyError(f"{file.path}: tensors and layout do not belong together ({error})") from error
+    return policy
+
+
+def check_fits(policy: WalkPolicy, size: int, source: str | Path) -> None:
+    """Raises `PolicyError` where a gait was made for observations of another size than `size`."""
+    if policy.n_observation != size:
+        raise PolicyError(f"{source}: made for observations of {policy.n_observation} numbers, the B2 gives {size}")
+
+
+def zero_action(observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
+    """Return the action that leaves the trot unchanged."""
+    return jnp.zeros((*observation.shape[:-1], 12))

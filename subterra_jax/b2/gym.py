@@ -1,38 +1,149 @@
-"""Gymnasium, one B2 in MuJoCo's own engine: `gymnasium.make("Subterra/B2Traverse-v0")`, `"Subterra/B2Walk-v0"`."""
+"""Gymnasium: one B2 in MuJoCo's own engine, as `Subterra/B2Traverse-v0` and `Subterra/B2Walk-v0`."""
 
+import os
+import sys
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium import error
+from gymnasium.core import Env
 
-from subterra_jax.b2 import TRAVERSE, WALK
-from subterra_jax.b2.single import SingleB2  # first: it says how MuJoCo is to draw
+if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it once, when it is imported
 
-# isort: split
-from subterra_jax.b2 import missions, tasks
-from subterra_jax.b2 import policy as gaits
+from subterra_jax.adapters import packing
+from subterra_jax.adapters.packing import start_streams, take_key
+from subterra_jax.b2 import TRAVERSE, WALK, tasks
 from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
-from subterra_jax.b2.params import WalkParams, WalkState
-from subterra_jax.b2.policy import WalkPolicy
+from subterra_jax.b2.gait import RELEASED, WalkPolicy
+from subterra_jax.b2.params import Surroundings, WalkParams, WalkState
+from subterra_jax.b2.view import Camera
+from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.tunnel.plan import TunnelPlan
+
+
+class SingleB2(Env[np.ndarray, np.ndarray]):
+    """One B2: a pure environment with a state of its own, on the CPU.
+
+    `info` is that of the pure environment: Python floats and bools, and arrays. A subclass makes `env`, `params` and
+    `walk`, and gives the state and params of the walking robot.
+
+    Attributes:
+        env: The pure environment.
+        params: Its parameters.
+        walk: The walking robot in it.
+        state: Its state; `None` before the first reset.
+    """
+
+    env: Any
+    params: Any
+    walk: WalkEnv
+
+    def __init__(self, render_mode: str | None, width: int, height: int):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        self.render_mode, self._size = render_mode, (width, height)
+        self._cpu = jax.local_devices(backend="cpu")[0]
+        self._stream: np.ndarray | None = None
+        self._camera: Camera | None = None
+        self.state: Any = None
+
+    def _prepare(self) -> None:
+        """Makes spaces and compiled functions from `env`, `params` and `walk`."""
+        self.observation_space = packing.observation_space(self.env, self.params, None)
+        self.action_space = packing.action_space(self.env, self.params)
+        self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
+        self._around = jax.jit(self.walk.surroundings)
+
+    def walking(self) -> tuple[WalkState, WalkParams]:
+        """Return the state and the parameters of the walking robot."""
+        raise NotImplementedError
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begins an episode; the same seed begins the same sequence of episodes. There are no options."""
+        super().reset(seed=seed)
+        if seed is not None or self._stream is None:
+            self._stream = start_streams([seed], self.np_random)[0]
+        with jax.default_device(self._cpu):
+            obs, self.state = self._reset(self._key(), self.params)
+        return np.array(obs), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Takes one step; the action is clipped, a NaN read as 0."""
+        if self.state is None:
+            raise error.ResetNeeded("reset() must come before step()")
+        action = np.asarray(action, np.float32)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"an action must have shape {self.action_space.shape}, got {action.shape}")
+        with jax.default_device(self._cpu):
+            obs, self.state, *rest = self._step(self._key(), self.state, action, self.params)
+        obs, reward, terminated, truncated, info = jax.device_get((obs, *rest))
+        plain = {name: value if np.ndim(value) else value.item() for name, value in info.items()}
+        return np.array(obs), float(reward), bool(terminated), bool(truncated), plain
+
+    def render(self) -> np.ndarray | None:
+        """Draws the last step, `(height, width, 3)` uint8; `None` without `rgb_array`.
+
+        Raises:
+            PictureError: There is no OpenGL.
+        """
+        if self.render_mode is None:
+            return None
+        if self.state is None:
+            raise error.ResetNeeded("reset() must come before render()")
+        around = self.around()
+        return self.camera().picture(jax.device_get(self.walking()[0]), around)
+
+    def camera(self) -> Camera:
+        """Return the camera, made at the first call.
+
+        Raises:
+            PictureError: There is no OpenGL.
+        """
+        if self._camera is None:
+            self._camera = Camera(self.walk, self.walking()[1], *self._size)
+        return self._camera
+
+    def around(self) -> Surroundings:
+        """Return the ground and walls around the robot."""
+        with jax.default_device(self._cpu):
+            return jax.device_get(self._around(*self.walking()))
+
+    def close(self) -> None:
+        """Releases the renderer, if there is one."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+    def _key(self) -> jax.Array:
+        """The next key of this environment's stream."""
+        key, stream = take_key(jnp.asarray(self._stream))
+        self._stream = np.asarray(stream)
+        return key
 
 
 class B2Env(SingleB2):
     """One B2 that walks a tunnel on a frozen gait; action and observation are those of the planar task.
 
-    A step is 0.2 s: ten of the gait, fifty of physics. `info` tells `station`, `fall` and `contact` among others.
+    A step is 0.2 s: ten control periods of the gait, fifty steps of physics. `info` has `station`, `fall` and
+    `contact` among others.
 
     Args:
         task: Id of the task.
-        tunnel: As for `missions.make`.
-        lining: As for `missions.make`.
+        tunnel: As for `tasks.make_mission`.
+        lining: As for `tasks.make_mission`.
         scene: A built scene folder to walk in, instead of a tunnel.
         policy: The gait: its file or name, or `trot`.
         odometer: `legs`, the robot's own; or `drift`, the model of the planar tasks.
-        render_mode: None or `rgb_array`.
-        width: Of a picture, pixels.
-        height: Of a picture, pixels.
-        **overrides: As for `missions.make`.
+        render_mode: `None` or `rgb_array`.
+        width: Width of a picture, pixels.
+        height: Height of a picture, pixels.
+        **overrides: As for `tasks.make_mission`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012  as Gymnasium declares it
@@ -44,7 +155,7 @@ class B2Env(SingleB2):
         lining: str | None = None,
         *,
         scene: str | Path | None = None,
-        policy: WalkPolicy | str | Path = gaits.RELEASED,
+        policy: WalkPolicy | str | Path = RELEASED,
         odometer: Literal["legs", "drift"] = "legs",
         render_mode: str | None = None,
         width: int = 480,
@@ -53,28 +164,28 @@ class B2Env(SingleB2):
     ):
         super().__init__(render_mode, width, height)
         with jax.default_device(self._cpu):
-            self.env, self.params = missions.make(
+            self.env, self.params = tasks.make_mission(
                 task, tunnel, lining, scene=scene, policy=policy, odometer=odometer, engine="mujoco", **overrides
             )
         self.walk = self.env.motion.walk
-        self._ready()
+        self._prepare()
 
     def walking(self) -> tuple[WalkState, WalkParams]:
-        """State and parameters of the walking part."""
+        """Return the state and the parameters of the walking robot."""
         return self.state.legs.walk, self.params.walk
 
 
 class B2WalkEnv(SingleB2):
-    """One B2 that learns to walk: twelve joint offsets fifty times a second, as `subterra_jax.b2.walk.WalkEnv` has it.
+    """One B2 that learns to walk: twelve joint offsets fifty times a second, as in `subterra_jax.b2.walk.WalkEnv`.
 
     Args:
         task: Id of the task.
         tunnel: As for `tasks.make`.
         lining: As for `tasks.make`.
         scene: A built scene folder to walk in, instead of a tunnel.
-        render_mode: None or `rgb_array`.
-        width: Of a picture, pixels.
-        height: Of a picture, pixels.
+        render_mode: `None` or `rgb_array`.
+        width: Width of a picture, pixels.
+        height: Height of a picture, pixels.
         **overrides: As for `tasks.make`.
     """
 
@@ -98,8 +209,8 @@ class B2WalkEnv(SingleB2):
         if scene is not None:
             self.env = SceneWalk.of(self.env, Path(scene), lining)
         self.walk = self.env
-        self._ready()
+        self._prepare()
 
     def walking(self) -> tuple[WalkState, WalkParams]:
-        """State and parameters."""
+        """Return the state and the parameters of the walking robot."""
         return self.state, self.params

@@ -11,23 +11,27 @@ from flax import struct
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.b2 import draws, posing
-from subterra_jax.b2.params import WalkResetNoise, WalkState, WalkStepNoise
-from subterra_jax.b2.sight import scan as trunk_scan
+from subterra_jax.b2 import constants as b2
+from subterra_jax.b2 import draws, observation
+from subterra_jax.b2.kinematics import compose, rotate, standing_pose, yaw_quaternion
+from subterra_jax.b2.params import Body, WalkParams, WalkResetNoise, WalkState, WalkStepNoise
 from subterra_jax.b2.walk import WalkEnv
+from subterra_jax.lidar import LidarParams, cast
+from subterra_jax.lidar3d import beams, casting
+from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.parts import Drive, Moved, Noise, Odometer, PlanarLidar, Sight, Step, Unicycle
 from subterra_jax.parts.odometer import OdometryState
 from subterra_jax.parts.part import Batch, Keys
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
-from subterra_jax.tunnel import Tunnel, foot
+from subterra_jax.tunnel import Tunnel, foot, node_at
 
 PERIODS = 10  # control periods of the gait in one of the task
 _BEYOND = 0.5  # m outside a mouth at which the trunk's middle has left the tunnel
 
 
 @struct.dataclass
-class Tread:
+class StepSums:
     """Sums over the control periods of one step.
 
     Attributes:
@@ -51,11 +55,11 @@ class LegsState:
 
     Attributes:
         walk: State of the walking robot.
-        tread: Sums over the last step.
+        sums: Sums over the last step.
     """
 
     walk: WalkState
-    tread: Tread
+    sums: StepSums
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,22 +95,22 @@ class Legs(Unicycle):
     def begin(self, draw: WalkResetNoise, state: State, params: EnvParams) -> LegsState:
         """Stand where the task has its start."""
         zero = jnp.zeros(())
-        return LegsState(posing.stand(state, draw, params.walk), Tread(zero, zero, zero, zero, zero))
+        return LegsState(stand(state, draw, params.walk), StepSums(zero, zero, zero, zero, zero))
 
     def move(self, state: State, drive: Drive, noise: WalkStepNoise, tunnel: Tunnel, params: EnvParams) -> Moved:
         """Walk for one control period of the task; see `Motion.move`."""
-        walk, tread, height = self._walk(state.legs.walk, drive.wheels, noise, params)
-        position, heading = posing.seen_from_above(walk, params.walk)
+        walk, sums, height = self._walk(state.legs.walk, drive.wheels, noise, params)
+        position, heading = pose_on_plan(walk, params.walk)
         motion = _mean_motion(state, position, heading, params)
-        fall = tread.fall > 0.0
+        fall = sums.fall > 0.0
         outside = _outside(foot(tunnel, position, state.station).station, tunnel)
         return Moved(
             position=position,
             heading=heading,
             drive=Drive(motion, motion),
-            own=LegsState(walk, tread),
-            clearance=tread.clearance,
-            contact=(tread.contact > 0.0) | outside,
+            own=LegsState(walk, sums),
+            clearance=sums.clearance,
+            contact=(sums.contact > 0.0) | outside,
             fallen=fall,
             info={"height": height, "fall": fall},
         )
@@ -118,32 +122,32 @@ class Legs(Unicycle):
 
     def _walk(
         self, walk: WalkState, command: Float[Array, "2"], noise: WalkStepNoise, params: EnvParams
-    ) -> tuple[WalkState, Tread, Float[Array, ""]]:
+    ) -> tuple[WalkState, StepSums, Float[Array, ""]]:
         """The robot at the end of a step, the sums over it, and the height of its trunk, m."""
         walk = dataclasses.replace(walk, command=jnp.stack([command[0], jnp.zeros(()), command[1]]))
         period = self.walk.physics.period
 
-        def control(walk: WalkState, drawn: WalkStepNoise) -> tuple[WalkState, tuple[Tread, Array]]:
+        def control(walk: WalkState, drawn: WalkStepNoise) -> tuple[WalkState, tuple[StepSums, Array]]:
             action = jnp.zeros(12)
             if params.policy is not None:
                 action = params.policy.act(self.walk.observe(walk, drawn, params.walk))
             walk, _, fall, _, info = self.walk.advance(walk, action, drawn, params.walk)
-            felt = walk.proprioception
+            sensors = walk.proprioception
             # About the vertical, whichever way the trunk leans.
-            turning = -jnp.sum(felt.rates * felt.gravity)
+            turning = -jnp.sum(sensors.rates * sensors.gravity)
             contact, fell = (flag.astype(jnp.float32) for flag in (info["contact"], fall))
-            tread = Tread(felt.velocity[0] * period, turning * period, info["clearance"], contact, fell)
-            return walk, (tread, info["height"])
+            sums = StepSums(sensors.velocity[0] * period, turning * period, info["clearance"], contact, fell)
+            return walk, (sums, info["height"])
 
-        walk, (treads, height) = lax.scan(control, walk, noise)
-        tread = Tread(
-            distance=jnp.sum(treads.distance),
-            turn=jnp.sum(treads.turn),
-            clearance=jnp.min(treads.clearance),
-            contact=jnp.max(treads.contact),
-            fall=jnp.max(treads.fall),
+        walk, (periods, height) = lax.scan(control, walk, noise)
+        sums = StepSums(
+            distance=jnp.sum(periods.distance),
+            turn=jnp.sum(periods.turn),
+            clearance=jnp.min(periods.clearance),
+            contact=jnp.max(periods.contact),
+            fall=jnp.max(periods.fall),
         )
-        return walk, tread, height[-1]
+        return walk, sums, height[-1]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,9 +157,9 @@ class LegOdometer(Odometer):
     def advance(self, own: OdometryState, step: Step, noise: Noise, params: EnvParams) -> OdometryState:
         """Add what legs and gyroscope measured."""
         del noise
-        tread = step.after[Legs.name].tread
-        turned = tread.turn + own.heading_bias * jnp.asarray(params.vehicle.period)
-        return dataclasses.replace(own, distance=own.distance + tread.distance, heading=wrap(own.heading + turned))
+        sums = step.after[Legs.name].sums
+        turned = sums.turn + own.heading_bias * jnp.asarray(params.vehicle.period)
+        return dataclasses.replace(own, distance=own.distance + sums.distance, heading=wrap(own.heading + turned))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +174,7 @@ class TrunkLidar(PlanarLidar):
         """Cast the beams from the trunk, m."""
         del own
         walk = sight.parts[Legs.name].walk
-        return trunk_scan(walk, sight.station, params.walk, params.lidar, params.relief)
+        return scan(walk, sight.station, params.walk, params.lidar, params.relief)
 
     def skips_unwanted(self, params: EnvParams) -> bool:
         """Tell that every scan is cast."""
@@ -192,3 +196,95 @@ def _mean_motion(
 def _outside(station: Float[Array, ""], tunnel: Tunnel) -> Bool[Array, ""]:
     """Tell whether the trunk's middle has left the tunnel."""
     return (station < -_BEYOND) | (station > tunnel.length + _BEYOND)
+
+
+def stand(plane: State, noise: WalkResetNoise, walk: WalkParams) -> WalkState:
+    """Make a robot that stands where a planar state says, on the sleepers, with no command.
+
+    Args:
+        plane: Position, heading, station and lateral offset.
+        noise: Random numbers for its build, the clock of its gait and its first readings.
+        walk: The robot and its track.
+    """
+    track = walk.track
+    anchor = jnp.argmin(jnp.abs(track.station - plane.station)).astype(jnp.int32)
+    along_track = track.quaternion[anchor]
+    ahead = plane.station - track.station[anchor]
+    position = rotate(along_track, jnp.stack([ahead, plane.lateral, jnp.float32(b2.STAND_HEIGHT)]))
+    facing = compose(along_track, yaw_quaternion(wrap(plane.heading - yaw(along_track))))
+    pose, _ = standing_pose()
+    body = Body(jnp.concatenate([position, facing, pose]), jnp.zeros(18), jnp.zeros(18))
+    drawn = draws.begin(noise, walk)
+    return dataclasses.replace(
+        drawn,
+        body=body,
+        anchor=anchor,
+        command=jnp.zeros(3),
+        drawn_command=jnp.zeros(3),
+        facing=jnp.ones(()),
+        proprioception=observation.measure(body, noise.sensor, jnp.zeros(2), drawn.gait, walk.sensor, walk.gait),
+        furthest=plane.station,
+    )
+
+
+def pose_on_plan(walk: WalkState, params: WalkParams) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """Return the position of the trunk's middle (tunnel frame, m) and its heading (rad), seen from above."""
+    position = params.track.position[walk.anchor, :2] + walk.body.qpos[:2]
+    return position, yaw(walk.body.qpos[3:7])
+
+
+def yaw(quaternion: Float[Array, "4"]) -> Float[Array, ""]:
+    """Return the direction of the turned x axis, seen from above, rad."""
+    x, y, _ = rotate(quaternion, jnp.array([1.0, 0.0, 0.0]))
+    return jnp.arctan2(y, x)
+
+
+def scan(
+    walk: WalkState, station: Float[Array, ""], params: WalkParams, sensor: LidarParams, relief: Relief | None
+) -> Float[Array, "n_beams"]:
+    """Casts one planar scan from the trunk, tilted as the trunk is.
+
+    With a relief, all of its triangles are seen. Without one, the walls of the planar tunnel stand upright and the
+    ballast is a plane along the track, on which beams that point down end.
+
+    Args:
+        walk: The robot.
+        station: Its station, m.
+        params: The robot's track and tunnel.
+        sensor: The LiDAR.
+        relief: The bore's surface, if there is one.
+
+    Returns:
+        True ranges, m, in [0, range_max]; exactly `range_max` where a beam meets nothing within it.
+    """
+    quaternion = walk.body.qpos[3:7]
+    # From the anchor: in the tunnel frame float32 would round to a tenth of a millimetre a kilometre away.
+    mount = walk.body.qpos[:3] + rotate(quaternion, jnp.array(b2.LIDAR))
+    origin = params.track.position[walk.anchor] + mount
+    directions = jnp.asarray(beams.planar(sensor.n_beams), jnp.float32)
+    if relief is not None:
+        return casting.scan(relief, origin, quaternion, station, directions, sensor.range_max)
+    directions = casting.rotate(quaternion, directions)
+    up = rotate(params.track.quaternion[walk.anchor], jnp.array([0.0, 0.0, 1.0]))
+    height = jnp.sum(mount * up) + params.track.protrusion
+    nearest = jnp.minimum(_walls(origin, directions, station, params), _ground(height, up, directions))
+    return jnp.minimum(nearest, sensor.range_max)
+
+
+def _walls(
+    origin: Float[Array, "3"], directions: Float[Array, "n_beams 3"], station: Float[Array, ""], params: WalkParams
+) -> Float[Array, "n_beams"]:
+    """Distance to upright walls, m; `inf` where there are none within the tunnel's reach."""
+    level = jnp.sqrt(directions[:, 0] ** 2 + directions[:, 1] ** 2)
+    # A beam straight up meets no wall; the division must not make it NaN.
+    level = jnp.maximum(level, 1e-3)
+    first = params.tunnel.scan_first[node_at(params.tunnel, station)]
+    return cast.nearest(params.tunnel, first, origin[:2], directions[:, :2] / level[:, None]) / level
+
+
+def _ground(
+    height: Float[Array, ""], up: Float[Array, "3"], directions: Float[Array, "n_beams 3"]
+) -> Float[Array, "n_beams"]:
+    """Distance to the ballast, m; `inf` for beams that do not point down to it."""
+    sinking = -(directions[:, 0] * up[0] + directions[:, 1] * up[1] + directions[:, 2] * up[2])
+    return jnp.where(sinking > 1e-6, height / jnp.maximum(sinking, 1e-6), jnp.inf)

@@ -1,26 +1,46 @@
-"""The walking task by its id: an environment and its params."""
+"""The tasks of the B2 by id: the walking task and the missions on a learnt gait, each as environment and params."""
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.b2 import WALK
+from subterra_jax.b2 import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.gait import GaitParams
+from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
+from subterra_jax.b2.gait import RELEASED, GaitParams, WalkPolicy, check_fits, load_policy
+from subterra_jax.b2.mission import PERIODS, LegOdometer, Legs, TrunkLidar
 from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.params import CommandParams, RandomisationParams, SensorParams, WalkParams, WalkRewardParams
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
+from subterra_jax.constants import DISTANCE_BIAS_SIGMA
+from subterra_jax.env import TunnelEnv
+from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.parts import Odometer
+from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.unicycle import VehicleParams
+from subterra_jax.rules import StartParams, Traverse
+from subterra_jax.state import EnvParams
+from subterra_jax.tasks import collect_entries, make_params
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
 
 _MARGIN = 0.1  # to either side of the robot's envelope, m
+
+TROT = "trot"  # the scripted gait, without a trained policy
+ENGINES = ("mjx", "mujoco")
+
+# Five commands a second, within the velocities for which the gait was trained.
+VEHICLE = VehicleParams(speed_max=0.8, yaw_rate_max=0.8, radius=0.4, period=0.2)
+# All four feet on the track, between the rails, at no larger angle than the robot reaches by itself.
+START = StartParams(station=2.0, lateral=0.3, heading=0.1)
+HORIZON = 4000
 
 
 def make(
@@ -102,3 +122,86 @@ def _load_track(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None
         return plan, read_scene_track(Path(scene), plan)
     plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
     return plan, lay_standard_track(plan)
+
+
+def make_mission(
+    id: str = TRAVERSE,
+    tunnel: TunnelPlan | str | Path | None = None,
+    lining: str | None = None,
+    *,
+    scene: str | Path | None = None,
+    policy: WalkPolicy | str | Path = RELEASED,
+    engine: Literal["mjx", "mujoco"] = "mjx",
+    odometer: Literal["legs", "drift"] = "legs",
+    relief: Relief | None = None,
+    walk: dict[str, Any] | None = None,
+    **overrides: Any,
+) -> tuple[TunnelEnv, EnvParams]:
+    """Makes a planar task on the legs of the B2, and its params.
+
+    Args:
+        id: One of `MISSIONS`.
+        tunnel: As for `make`.
+        lining: As for `make`.
+        scene: A built scene folder, instead of `tunnel`. The robot walks on its sleepers where they lie, and with
+            `engine="mujoco"` in `scene.xml` itself; the LiDAR sees all of its triangles.
+        policy: The gait: a policy, its file or name, or `trot`.
+        engine: `mjx`, for thousands on a GPU; or `mujoco`, in C on the host, for a few.
+        odometer: `legs`, the robot's own; or `drift`, the model of the planar tasks applied to its true motion.
+        relief: Surface that the LiDAR sees; that of the scene, if any, if left out.
+        walk: Fields of `WalkParams` to replace.
+        **overrides: Fields of `EnvParams` to replace.
+
+    Raises:
+        ValueError: No such task, engine, odometer or field.
+        TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
+        TrackError: The scene has no track.
+        RobotError: The tunnel is narrower than the robot.
+        PolicyError: There is no such gait, or it does not fit the robot.
+    """
+    for name, value, known in (("task", id, MISSIONS), ("engine", engine, ENGINES)):
+        if value not in known:
+            raise ValueError(f"no {name} {value!r}; there are {', '.join(known)}")
+    if odometer not in ("legs", "drift"):
+        raise ValueError(f"odometer must be 'legs' or 'drift', got {odometer!r}")
+    # No pushes on the way.
+    parts = {"randomisation": RandomisationParams(push=0.0), "sensor": SensorParams(), **(walk or {})}
+    physics = MujocoPhysics() if engine == "mujoco" else Physics()
+    walker, walking = make(WALK, tunnel, lining, scene=scene, physics=physics, driven=True, **parts)
+    if scene is not None:
+        relief = relief or Relief.from_scene(scene, lining or "pockets")
+        if engine == "mujoco":
+            walker = SceneWalk.of(walker, Path(scene), lining)
+    trained = _gait(policy, walker.observation_size(walking))
+    own = {"walk": walking, "policy": trained, "relief": relief}
+    env = TunnelEnv(
+        id=id,
+        rule=Traverse(),
+        parts=(LegOdometer() if odometer == "legs" else Odometer(), TrunkLidar()),
+        motion=Legs(walker),
+    )
+    fields: dict[str, Any] = {
+        "vehicle": VEHICLE,
+        "odometry": OdometryParams(distance_bias_sigma=0.0 if odometer == "legs" else DISTANCE_BIAS_SIGMA),
+        "start": START,
+    }
+    if given := set(own) & set(overrides):
+        raise ValueError(f"{env.id} has no {sorted(given)} to replace; `walk=`, `policy=` and `relief=` make them")
+    horizon = overrides.pop("horizon", HORIZON)
+    params = make_params(env, walking.tunnel, horizon, collect_entries(env, {**fields, **own, **overrides}))
+    commanded, period = PERIODS * physics.period, float(jnp.asarray(params.vehicle.period))
+    if abs(period - commanded) > 1e-6:
+        raise ValueError(f"the B2 takes a command every {commanded:g} s, got period={period:g}")
+    return env, params
+
+
+def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:
+    """The gait, loaded and checked; `None` for the trot."""
+    if policy == TROT:
+        return None
+    if isinstance(policy, str | Path):
+        source, (policy, _) = policy, load_policy(policy)
+    else:
+        source = policy.name
+    check_fits(policy, size, source)
+    return policy

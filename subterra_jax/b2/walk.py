@@ -71,15 +71,7 @@ class WalkEnv:
         return Box(-np.ones(N_ACTION, np.float32), np.ones(N_ACTION, np.float32))
 
     def reset(self, key: PRNGKeyArray, params: WalkParams) -> tuple[Float[Array, "n_obs"], WalkState]:
-        """Begins an episode anywhere along the tunnel.
-
-        Args:
-            key: Key of all draws.
-            params: The task.
-
-        Returns:
-            First observation and state.
-        """
+        """Begins an episode anywhere along the tunnel; returns first observation and state."""
         start_key, sense_key = jax.random.split(key)
         state = self.begin(self.draw_reset(start_key, (), params), params)
         return self.observe(state, self.draw_step(sense_key, (), params), params), state
@@ -89,14 +81,8 @@ class WalkEnv:
     ) -> tuple[Float[Array, "n_obs"], WalkState, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
         """Advances by one control period of 20 ms. It does not reset: see `AutoReset`.
 
-        Args:
-            key: Key of all draws.
-            state: State before.
-            action: Joint offsets; clipped to [-1, 1], NaN read as 0.
-            params: The task.
-
-        Returns:
-            Observation, state, reward, terminated, truncated and info.
+        The action is clipped to [-1, 1], a NaN read as 0. Returns observation, state, reward, terminated, truncated
+        and info.
         """
         noise = self.draw_step(key, (), params)
         state, reward, terminated, truncated, info = self.advance(state, action, noise, params)
@@ -117,17 +103,7 @@ class WalkEnv:
     def advance(
         self, state: WalkState, action: Float[Array, "12"], noise: WalkStepNoise, params: WalkParams
     ) -> tuple[WalkState, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
-        """Computes all of a step except the observation.
-
-        Args:
-            state: State before.
-            action: As for `step`.
-            noise: Random numbers of the step.
-            params: The task.
-
-        Returns:
-            State, reward, terminated, truncated and info.
-        """
+        """Computes all of a step except the observation: state, reward, terminated, truncated and info."""
         period = self.physics.period
         action = jnp.clip(jnp.where(jnp.isnan(action), 0.0, action), -1.0, 1.0)
         gait_state, targets = command_joints(state, action, period, params)

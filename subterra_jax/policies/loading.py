@@ -26,7 +26,7 @@ PREFIX = "policy:"  # of the names of released policies among the agents
 
 
 def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
-    """A policy and its facts: an `Agent`, or of a gait the `WalkPolicy` of `subterra_jax.b2.policy`.
+    """A policy and its facts: an `Agent`, or of a gait the `WalkPolicy` of `subterra_jax.b2.gait`.
 
     Args:
         source: A `.safetensors` file, or the name of a released policy.
@@ -36,7 +36,7 @@ def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
     """
     file = read(source)
     if file.facts["kind"] == GAIT:
-        from subterra_jax.b2.policy import make_policy  # it moves legs and drives no task
+        from subterra_jax.b2.gait import make_policy  # it moves legs and drives no task
 
         return make_policy(file), file.facts
     return _checked(file), file.facts

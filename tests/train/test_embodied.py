@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from subterra_jax.b2 import missions
-from subterra_jax.b2.surrogate import Lag, LaggedWheels
+from subterra_jax.b2 import tasks
+from subterra_jax.b2.transfer import Lag, LaggedWheels
 from subterra_jax.policies import PolicyError
 from train import navigate
 from train.b2 import embodied
@@ -24,7 +24,7 @@ def world():
 
 
 def test_the_stand_in_is_told_what_the_legs_are_told_and_obeys_as_late(world):
-    mission, params = missions.make(policy="trot")
+    mission, params = tasks.make_mission(policy="trot")
     assert isinstance(world.env.motion, LaggedWheels)
     assert world.env.motion.lag == Lag()
     assert world.facts["embodiment"] == "b2"

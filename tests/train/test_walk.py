@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.b2 import policy as gaits
+from subterra_jax.b2 import gait as gaits
 from subterra_jax.host.errors import OutputError
 from subterra_jax.policies.files import PolicyError
 from train import release, walk
@@ -57,7 +57,7 @@ def test_the_policy_does_not_see_the_truth_and_the_critic_does(networks, policy)
 def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
     release.write(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
-    loaded, facts = gaits.load(out)
+    loaded, facts = gaits.load_policy(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
     np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), networks.act(policy, seen[:, None]), atol=1e-6)
     assert facts["kind"] == "walk"
@@ -69,7 +69,7 @@ def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_
 
 def test_a_missing_gait_is_refused_by_name(tmp_path):
     with pytest.raises(PolicyError, match="no such policy"):
-        gaits.load(tmp_path / "none.safetensors")
+        gaits.load_policy(tmp_path / "none.safetensors")
 
 
 def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
@@ -78,7 +78,7 @@ def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
     facts = out.with_suffix(".json")
     facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "mlp"}))
     with pytest.raises(PolicyError, match="kind 'mlp', which is no gait"):
-        gaits.load(out)
+        gaits.load_policy(out)
 
 
 def test_a_constant_lag_is_scored_as_what_it_is():

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import subterra_jax as st
-from subterra_jax.b2 import missions, trial
-from subterra_jax.b2.surrogate import stand_in
+from subterra_jax.b2 import tasks, transfer
 from subterra_jax.parts.slip import SlipParams
 from subterra_jax.tunnel.sources import load_tunnel
 from train import cli, policies
@@ -29,7 +28,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
 
     Raises:
         ConfigError: The B2 does not do this task, or the tunnel is more than one.
-        SubterraError: As `missions.make`.
+        SubterraError: As `tasks.make_mission`.
     """
     if task not in TASKS:
         raise ConfigError(f"the B2 does not do {task!r}; it does {', '.join(TASKS)}")
@@ -38,18 +37,18 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
     planar = policies.open_world(task, tunnel, lining)
     if planar.params.tunnel.count > 1:
         raise ConfigError(f"tunnel = {tunnel} is more than one; the B2 walks one")
-    fields: dict[str, Any] = {"vehicle": missions.VEHICLE, "start": missions.START, "slip": _SLIP}
+    fields: dict[str, Any] = {"vehicle": tasks.VEHICLE, "start": tasks.START, "slip": _SLIP}
     env, params = st.make(task, tunnel, planar.facts["lining"], **fields)
     if legs.robots:
         _mission(planar, tunnel, legs)
-    return World(task, stand_in(env), params, {**planar.facts, "embodiment": B2})
+    return World(task, transfer.stand_in(env), params, {**planar.facts, "embodiment": B2})
 
 
 def score(session: Session, snapshot: Snapshot, tunnel: Path | str | None, legs: Legs) -> dict[str, float]:
     """Has robots walk under the policy that was kept; writes `legs.json` and prints the figures."""
     env, params = _mission(session.world, tunnel, legs)
     agent = agent_of(session.learner.networks, snapshot.policy)
-    found = trial.figures(*trial.drive(env, params, agent, legs.robots), params)
+    found = transfer.figures(*transfer.walk_robots(env, params, agent, legs.robots), params)
     session.folder.write_json(ON_LEGS, {**dataclasses.asdict(legs), **session.world.facts, **found})
     cli.table(f"{session.world.task}: {legs.robots} B2s in {legs.engine}, gait {legs.gait}", found)
     return found
@@ -61,4 +60,4 @@ def _mission(world: World, tunnel: Path | str | None, legs: Legs) -> tuple[Any, 
     if (piece := st.TASKS[world.task].piece) is not None:
         start, length = piece
         plan = plan.slice(start, min(length, plan.length - start))
-    return missions.make(tunnel=plan, lining=world.facts["lining"], policy=legs.gait, engine=legs.engine)
+    return tasks.make_mission(tunnel=plan, lining=world.facts["lining"], policy=legs.gait, engine=legs.engine)

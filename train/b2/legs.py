@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from subterra_jax.b2.policy import RELEASED
+from subterra_jax.b2.gait import RELEASED
 
 
 @dataclasses.dataclass(frozen=True)

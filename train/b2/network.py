@@ -48,7 +48,7 @@ class WalkNetworks(Networks):
         return self._policy.apply(weights, seen.reshape(*stack.shape[:-2], -1)) + self._offset
 
     def tensors(self, policy: Policy) -> dict[str, Any]:
-        """What walking needs of a policy, as a tree whose names `subterra_jax.b2.policy` knows."""
+        """What walking needs of a policy, as a tree whose names `subterra_jax.b2.gait` knows."""
         seen = slice(0, self.layout.n_seen)
         statistics = {"mean": policy.statistics.mean[seen], "std": policy.statistics.std[seen]}
         return {"policy": policy.weights, "statistics": statistics}

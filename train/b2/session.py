@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 
-from subterra_jax.b2.policy import WalkPolicy
+from subterra_jax.b2.gait import WalkPolicy
 from train import cli, release
 from train.agents import tensors_of
 from train.b2.score import score, walker

@@ -1,4 +1,4 @@
-"""The B2 in Gymnasium and the hierarchy beneath: one compiled step for all of it."""
+"""The B2 in Gymnasium and the mission beneath: one compiled step for all of it."""
 
 import dataclasses
 import shutil
@@ -15,7 +15,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 import subterra_jax as st
-from subterra_jax.b2 import missions, posing
+from subterra_jax.b2 import mission, tasks
 from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.params import CommandParams
 from subterra_jax.b2.track import TrackError
@@ -33,7 +33,7 @@ def plan():
 @pytest.fixture(scope="module")
 def env(plan):
     """One environment, compiled with less zeal: half the time, the same numbers to rounding."""
-    made = gymnasium.make(ID, tunnel=plan, policy="trot", walk={"sensor": missions.SensorParams(**QUIET)})
+    made = gymnasium.make(ID, tunnel=plan, policy="trot", walk={"sensor": tasks.SensorParams(**QUIET)})
     inner: Any = made.unwrapped
     key, params, _action = jax.random.key(0), inner.params, jnp.zeros(2)
     options = {"xla_backend_optimization_level": 0}
@@ -115,7 +115,7 @@ def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
     normal = np.array([-plan.tangent[at, 1], plan.tangent[at, 0]])
     qpos = np.array(state.legs.walk.body.qpos)
     qpos[:2] += (lateral - float(state.lateral)) * normal
-    turn = float(posing.yaw(state.legs.walk.body.qpos[3:7])) + 1.2
+    turn = float(mission.yaw(state.legs.walk.body.qpos[3:7])) + 1.2
     qpos[3:7] = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
     changed(env, walk=with_body(state, qpos), lateral=jnp.float32(lateral))
     _, _, terminated, _, info = env.step(np.array([0.8, 0.0], np.float32))
@@ -172,7 +172,7 @@ def test_who_asks_for_what_is_not_there_is_told_in_a_sentence(plan, tmp_path):
     with pytest.raises(ValueError, match="no engine 'bullet'"):
         st.make(ID, plan, policy="trot", engine="bullet")
     with pytest.raises(ValueError, match=r"every 0\.2 s"):
-        st.make(ID, plan, policy="trot", vehicle=missions.VEHICLE.replace(period=0.1))
+        st.make(ID, plan, policy="trot", vehicle=tasks.VEHICLE.replace(period=0.1))
     with pytest.raises(ValueError, match="no field"):
         st.make(ID, plan, policy="trot", obstacles=None)
     narrow = dataclasses.replace(plan, half_width=np.full_like(plan.half_width, 0.3))

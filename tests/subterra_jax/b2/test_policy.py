@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.b2 import policy as gaits
+from subterra_jax.b2 import gait as gaits
 from subterra_jax.policies import load
 
 
 @pytest.fixture(scope="module")
 def gait():
-    return gaits.load()
+    return gaits.load_policy()
 
 
 def test_the_released_gait_is_what_the_package_loads_by_name(gait, walking):

@@ -9,7 +9,7 @@ import pytest
 
 from subterra_jax import lidar
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2 import sight
+from subterra_jax.b2 import mission
 from subterra_jax.b2.track import lay_standard_track
 from subterra_jax.lidar import LidarParams
 from subterra_jax.tunnel import Tunnel
@@ -33,7 +33,7 @@ def look(world):
     def ranges(quaternion, offset):
         body = SimpleNamespace(qpos=jnp.concatenate([offset, quaternion, jnp.zeros(12)]))
         walk = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR))
-        return sight.scan(walk, params.track.station[ANCHOR], params, SENSOR, None)
+        return mission.scan(walk, params.track.station[ANCHOR], params, SENSOR, None)
 
     return lambda quaternion, lateral=0.0: ranges(jnp.asarray(quaternion), jnp.array([0.0, lateral, HEIGHT]))
 

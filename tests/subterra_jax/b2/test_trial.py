@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.b2 import film, trial
+from subterra_jax.b2 import film, transfer
 from subterra_jax.b2.view import PictureError
 from subterra_jax.env import TunnelEnv
 from tests.subterra_jax import probes
@@ -25,7 +25,7 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
         furthest=np.array([90.0, 90.0, 30.0, 10.0]),
         odometry=SimpleNamespace(distance=np.array([84.0, 76.0, 20.0, 0.0])),
     )
-    walk = trial.Walk(
+    walk = transfer.Walk(
         state=state,
         over=np.ones(4, bool),
         success=np.array([True, True, False, False]),
@@ -33,7 +33,7 @@ def test_figures_of_four_robots_are_what_one_counts_by_hand():
         fall=np.array([False, False, True, False]),
         steps=np.array([500, 500, 250, 1]),
     )
-    told = trial.figures(walk, np.array([0.3, -0.4]), PARAMS)
+    told = transfer.figures(walk, np.array([0.3, -0.4]), PARAMS)
     assert told["robots"] == 4
     assert (told["success_percent"], told["fall_percent"], told["contact_percent"]) == (50.0, 25.0, 25.0)
     assert told["coverage_median_percent"] == pytest.approx(60.0)
@@ -70,5 +70,5 @@ class _Rolling(TunnelEnv):
 def test_a_robot_on_legs_is_driven_by_what_its_agent_declares_and_no_more(name):
     agent, speed = probes.PROBES[name]
     env, params = st.make("Subterra/TraverseShort-v0", horizon=3)
-    walk, _ = trial.drive(_Rolling(env.id, env.rule), params, agent, 2)
+    walk, _ = transfer.walk_robots(_Rolling(env.id, env.rule), params, agent, 2)
     np.testing.assert_allclose(walk.state.command[:, 0], speed, rtol=1e-4)

@@ -1,0 +1,242 @@
+"""Navigation from wheels to legs: a planar stand-in on which it is cheap to learn, and the trial on many B2s.
+
+The stand-in obeys late and nods, as the walking robot does. `identify` measures its lags from a run of that robot.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from subterra_jax.baselines.agent import Agent
+from subterra_jax.env import TunnelEnv
+from subterra_jax.episode import Driver, Episode, Taken
+from subterra_jax.lidar import bearings
+from subterra_jax.parts import Noise, PlanarLidar, Sight, Unicycle
+from subterra_jax.parts.unicycle import clip_action
+from subterra_jax.state import EnvParams, State
+
+_CHUNK = 25  # steps between two looks at whether any robot is still on its way
+
+
+@dataclasses.dataclass(frozen=True)
+class Lag:
+    """First-order lags of speed and yaw rate.
+
+    The defaults were identified from the released gait: 900 steps of six robots in MuJoCo, steered along the
+    centreline with noisy commands.
+
+    Attributes:
+        speed: Time constant of the forward speed, s.
+        yaw_rate: Time constant of the yaw rate, s.
+        speed_gain: Final speed over a lasting command, 1.
+        yaw_rate_gain: Final yaw rate over a lasting command, 1.
+    """
+
+    speed: float = 0.38
+    yaw_rate: float = 0.24
+    speed_gain: float = 1.01
+    yaw_rate_gain: float = 1.07
+
+
+@dataclasses.dataclass(frozen=True)
+class Nod:
+    """Random lean of the trunk in each step; beams that point down end on the ballast.
+
+    Attributes:
+        pitch: Mean pitch, nose down, rad.
+        pitch_sigma: Standard deviation of the pitch, rad.
+        roll_sigma: Standard deviation of the roll, rad.
+        height: Height of the LiDAR over the ballast, m.
+    """
+
+    pitch: float = 0.03
+    pitch_sigma: float = 0.04
+    roll_sigma: float = 0.03
+    height: float = 0.75
+
+
+@dataclasses.dataclass(frozen=True)
+class LaggedWheels(Unicycle):
+    """A robot that follows its commands through two first-order lags.
+
+    `State.command` is the motion of the robot, so that the reward's jerk is that of its motion.
+
+    Attributes:
+        lag: The lags.
+    """
+
+    lag: Lag = Lag()
+
+    def obey(self, action: Float[Array, "n_action"], state: State, params: EnvParams) -> Float[Array, "2"]:
+        """Follow the clipped command, late."""
+        lag, period = self.lag, jnp.asarray(params.vehicle.period)
+        target = clip_action(action[:2], params.vehicle) * jnp.array([lag.speed_gain, lag.yaw_rate_gain])
+        share = 1.0 - jnp.exp(-period / jnp.array([lag.speed, lag.yaw_rate]))
+        return clip_action(state.command + share * (target - state.command), params.vehicle)
+
+
+@dataclasses.dataclass(frozen=True)
+class NoddingLidar(PlanarLidar):
+    """A planar LiDAR that leans with the trunk: beams that point down end on the ballast.
+
+    Attributes:
+        nod: Lean of the trunk.
+    """
+
+    nod: Nod = Nod()
+
+    def normals(self, params: EnvParams) -> int:
+        """One for each beam, then pitch and roll."""
+        return super().normals(params) + 2
+
+    def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        """Return noisy `ranges`, m."""
+        n_beams, nod = params.lidar.n_beams, self.nod
+        seen = super().observe(own, sight, Noise(noise.normal[:n_beams]), params)["ranges"]
+        bearing = jnp.asarray(bearings(n_beams), jnp.float32)
+        pitch = nod.pitch + nod.pitch_sigma * noise.normal[n_beams]
+        roll = nod.roll_sigma * noise.normal[n_beams + 1]
+        sinking = jnp.sin(pitch) * jnp.cos(bearing) - jnp.sin(roll) * jnp.sin(bearing)
+        ground = jnp.where(sinking > 1e-3, nod.height / jnp.maximum(sinking, 1e-3), jnp.inf)
+        return {"ranges": jnp.minimum(seen, ground)}
+
+
+def stand_in(env: TunnelEnv, lag: Lag = Lag(), nod: Nod = Nod()) -> TunnelEnv:
+    """Make the planar stand-in of the walking robot: the same task on wheels that lag, with a LiDAR that nods.
+
+    Args:
+        env: A planar task.
+        lag: Lags of the robot.
+        nod: Lean of its trunk.
+    """
+    parts = tuple(NoddingLidar(nod) if part.name == PlanarLidar.name else part for part in env.parts)
+    return dataclasses.replace(env, motion=LaggedWheels(lag), parts=parts)
+
+
+def identify(commands: Float[np.ndarray, "n 2"], motions: Float[np.ndarray, "n 2"], period: float) -> Lag:
+    """Identifies the lags and gains of a run.
+
+    Args:
+        commands: Commanded speed (m/s) and yaw rate (rad/s) of each step.
+        motions: Speed and yaw rate of the robot in each step.
+        period: Length of a step, s.
+
+    Returns:
+        Least squares of `y[k] = a y[k-1] + b u[k]`: gain b / (1 - a), time constant -period / ln a.
+
+    Raises:
+        ValueError: A command was never varied, or the motion does not follow it.
+    """
+    fits = []
+    for name, u, y in zip(("speed", "yaw rate"), commands.T, motions.T, strict=True):
+        design = np.column_stack([y[:-1], u[1:]])
+        (a, b), _, rank, _ = np.linalg.lstsq(design, y[1:], rcond=None)
+        if rank < 2 or not 0.0 < a < 1.0 or b <= 0.0:
+            raise ValueError(f"the {name} does not follow its command: y[k] = {a:.3g} y[k-1] + {b:.3g} u[k]")
+        fits.append((-period / np.log(a), b / (1.0 - a)))
+    (speed, speed_gain), (yaw_rate, yaw_rate_gain) = fits
+    return Lag(float(speed), float(yaw_rate), float(speed_gain), float(yaw_rate_gain))
+
+
+@struct.dataclass
+class Walk:
+    """Robots on their way.
+
+    Attributes:
+        state: State of the environment.
+        over: The robot has arrived or failed.
+        success: The robot has arrived.
+        contact: The robot touched a wall.
+        fall: The robot fell.
+        steps: Steps taken.
+    """
+
+    state: State
+    over: Bool[Array, "*n"]
+    success: Bool[Array, "*n"]
+    contact: Bool[Array, "*n"]
+    fall: Bool[Array, "*n"]
+    steps: Int[Array, "*n"]
+
+
+def walk_robots(
+    env: TunnelEnv,
+    params: EnvParams,
+    agent: Agent,
+    n_robots: int,
+    seed: int = 0,
+    watch: Callable[[Walk], None] | None = None,
+) -> tuple[Walk, Float[np.ndarray, "n"]]:
+    """Let robots walk until all have arrived or failed.
+
+    Args:
+        env: The task.
+        params: Its params.
+        agent: The agent that steers.
+        n_robots: Number of robots.
+        seed: Seed of the first; the others have those after it.
+        watch: Called now and then with the robots as they are.
+
+    Returns:
+        The robots at their ends, and all lateral offsets on the way, m.
+    """
+    driver = Driver(env, start=_start, add=_add, keep=_keep)
+    now = driver.begin(params, agent, seed + np.arange(n_robots, dtype=np.uint32))
+    offsets = []
+    for last, kept in driver.drive(params, agent, now, _CHUNK):
+        now, lateral = last, np.asarray(kept).ravel()
+        offsets.append(lateral[~np.isnan(lateral)])
+        if watch is not None:
+            watch(_walk(now))
+    return _walk(now), np.concatenate(offsets)
+
+
+def _walk(now: Episode) -> Walk:
+    success, contact, fall = now.tally
+    return jax.device_get(Walk(now.state, now.over, success, contact, fall, now.state.steps))
+
+
+def _start(state: State, params: EnvParams) -> tuple[Array, Array, Array]:
+    del state, params
+    no = jnp.zeros((), bool)
+    return no, no, no
+
+
+def _add(now: Episode, taken: Taken, params: EnvParams) -> tuple[tuple[Array, Array, Array], Array]:
+    """Note how the robot fares."""
+    del now, params
+    flags = (taken.info["success"], taken.info["contact"], taken.info["fall"])
+    return flags, taken.terminated | taken.truncated
+
+
+def _keep(now: Episode, taken: Taken, params: EnvParams) -> Float[Array, ""]:
+    """Keep the lateral offset, m; NaN once the episode is over."""
+    del params
+    return jnp.where(now.over, jnp.nan, taken.after.lateral)
+
+
+def figures(now: Walk, lateral: Float[np.ndarray, "n"], params: EnvParams) -> dict[str, float]:
+    """Compute the figures of a trial: percentages of robots, tunnel and distance, speed (m/s) and offset (m)."""
+    begun, period, length = (float(np.asarray(x)) for x in (
+        params.start.station, params.vehicle.period, params.tunnel.length
+    ))  # fmt: skip
+    walked = np.asarray(now.state.station) - begun
+    error = (np.asarray(now.state.odometry.distance) - walked) / np.maximum(walked, 1.0)
+    share = 100.0 / len(now.over)
+    return {
+        "robots": float(len(now.over)),
+        "success_percent": share * float(np.sum(now.success)),
+        "fall_percent": share * float(np.sum(now.fall)),
+        "contact_percent": share * float(np.sum(now.contact)),
+        "coverage_median_percent": 100.0 * float(np.median(now.state.furthest)) / length,
+        "speed_mean": float(np.mean(walked / (np.asarray(now.steps) * period))),
+        "lateral_rms": float(np.sqrt(np.mean(np.square(lateral)))),
+        "odometer_error_percent": 100.0 * float(np.mean(error)),
+        "odometer_error_sigma_percent": 100.0 * float(np.std(error)),
+    }
