@@ -51,12 +51,12 @@ def drive(env, action, n_steps, seed=1):
 def changed(env, **fields):
     """Another state of the environment's robot."""
     inner = env.unwrapped
-    inner.state = dataclasses.replace(inner.state, **fields)
+    inner.state = inner.state.replace(**fields)
 
 
 def with_body(state, qpos):
     body = dataclasses.replace(state.legs.walk.body, qpos=jnp.asarray(qpos, jnp.float32))
-    return dataclasses.replace(state.legs.walk, body=body)
+    return dataclasses.replace(state.legs, walk=dataclasses.replace(state.legs.walk, body=body))
 
 
 def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env):
@@ -99,7 +99,7 @@ def test_a_fall_ends_the_episode_and_is_no_success(env):
     state = env.unwrapped.state
     qpos = np.array(state.legs.walk.body.qpos)
     qpos[3:7] = [np.cos(0.8), np.sin(0.8), 0.0, 0.0]
-    changed(env, walk=with_body(state, qpos))
+    changed(env, legs=with_body(state, qpos))
     _, _, terminated, truncated, info = env.step(np.zeros(2, np.float32))
     assert terminated
     assert not truncated
@@ -117,7 +117,7 @@ def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
     qpos[:2] += (lateral - float(state.lateral)) * normal
     turn = float(mission.yaw(state.legs.walk.body.qpos[3:7])) + 1.2
     qpos[3:7] = [np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2)]
-    changed(env, walk=with_body(state, qpos), lateral=jnp.float32(lateral))
+    changed(env, legs=with_body(state, qpos), lateral=jnp.float32(lateral))
     _, _, terminated, _, info = env.step(np.array([0.8, 0.0], np.float32))
     assert terminated
     assert info["contact"]
