@@ -11,7 +11,7 @@ from subterra_jax.host.errors import SubterraError, TunnelError
 from subterra_jax.host.versions import VERSION
 
 if TYPE_CHECKING:
-    from subterra_jax import batch, parts, procedural, rules, tunnel
+    from subterra_jax import batch, parts, procedural, rules, tasks, tunnel
     from subterra_jax.batch import AutoReset, rollout
     from subterra_jax.env import Env, TunnelEnv
     from subterra_jax.randomization import LogUniform, randomize
@@ -47,6 +47,7 @@ __all__ = [
     "rollout",
     "rules",
     "stack",
+    "tasks",
     "tunnel",
 ]
 
@@ -69,7 +70,7 @@ _HOMES = {
     "rollout": "batch",
     "stack": "tunnel.tunnel",
 }
-_MODULES = ("batch", "parts", "procedural", "rules", "tunnel")
+_MODULES = ("batch", "parts", "procedural", "rules", "tasks", "tunnel")
 
 
 def __getattr__(name: str) -> Any:

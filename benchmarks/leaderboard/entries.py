@@ -21,8 +21,8 @@ from subterra_jax.evaluation.bounds import stop_bounds
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
 from subterra_jax.host.files import require_folder
 from subterra_jax.host.loading import file_digest, load_file, load_object, source_digest
-from subterra_jax.host.versions import no_task
 from subterra_jax.policies.files import TENSORS
+from subterra_jax.tasks import find
 from subterra_jax.tunnel.plan import TunnelPlan
 
 SCHEMA = "subterra.leaderboard-entry/1"
@@ -189,12 +189,12 @@ def _is_object(agent: str) -> bool:
 
 def _full_task(name: str) -> str:
     """Returns the id of a task; one given as `FILE.py:ID` is loaded first."""
-    source, _, name = name.rpartition(":")
-    if source:
+    source, _, _ = name.rpartition(":")
+    if source.endswith(".py"):
         load_files((Path(source),))
-    full = name if name in st.TASKS else f"Subterra/{name}-v0"
+    full = find(name, short=True)
     if full not in st.TASKS:
-        raise BenchmarkError(no_task(name, st.TASKS))
+        raise BenchmarkError(f"{full} is scored by benchmarks.b2_traverse; the leaderboard has {', '.join(st.TASKS)}")
     return full
 
 

@@ -88,9 +88,9 @@ def test_a_sector_that_drops_out_is_as_wide_in_the_dense_scan():
     faults = dataclasses.replace(
         states.faults, severity=0.0 * four, dropout_left=four, dropout_first=four, dropout_count=four
     )
-    states = dataclasses.replace(states, faults=faults)
+    states = states.replace(faults=faults)
     trace = Trace(jax.device_get(states), np.zeros((2, 18)), np.zeros((1, 2)), 0.1, False, False)
-    found = dense_scans(trace, params, 64, seed=0)
+    found = dense_scans(trace, env, params, 64, seed=0)
     assert (found[:, 16:32] == 30.0).all()
     assert (found[:, [8, 12]] < 30.0).all()
 

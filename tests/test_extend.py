@@ -1,0 +1,219 @@
+"""The page about extensions: its files, from outside the package, work wherever a task or a sensor is taken."""
+
+import re
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import tasks
+from subterra_jax.baselines.registry import make_agent
+from subterra_jax.evaluation import evaluate, listed_episodes
+from subterra_jax.host.loading import load_file
+from subterra_jax.parts import Part
+from subterra_jax.rules import Rule, Start, StopAt, Traverse, Verdict
+from tests.train.conftest import SMALL, call
+
+PAGE = Path(__file__).parents[1] / "docs" / "guide" / "extend.md"
+FILES = dict(re.findall(r"`(\w+\.py)`:?\s*\n\s*```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
+TASK = "keep_left.py:Mine/KeepLeft-v0"
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    """A folder outside the package that holds the page's files."""
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(tasks, "TASKS", tasks.TASKS)
+    yield tmp_path
+    for name in FILES:
+        sys.modules.pop(Path(name).stem, None)
+
+
+def test_a_sensor_from_outside_is_observed_with_its_noise_and_its_bias(desk):
+    gyro = load_file(desk / "gyro.py")
+    env, params = st.make(
+        "Subterra/StopAt-v0", parts=[gyro.Gyro()], gyro=gyro.GyroParams(sigma=0.02, bias_sigma=0.05), tunnel="control"
+    )
+    where = env.fields(params)["yaw_rate"]
+    assert where.stop == env.observation_size(params)
+
+    @jax.jit
+    @jax.vmap
+    def two_steps(key):
+        keys = jax.random.split(key, 3)
+        _, state = env.reset(keys[0], params)
+        rates = []
+        for k in keys[1:]:
+            obs, state, *_ = env.step(k, state, jnp.array([0.0, 0.3]), params)
+            rates.append(obs[where][0])
+        return jnp.stack(rates)
+
+    rates = np.asarray(two_steps(jax.random.split(jax.random.key(0), 2000)), float)
+    assert rates.mean() == pytest.approx(0.3, abs=4 * 0.05 / np.sqrt(2000))
+    # A bias is shared by the steps of an episode, noise is not.
+    assert np.std(rates[:, 0] - rates[:, 1]) == pytest.approx(0.02 * np.sqrt(2), rel=0.1)
+    assert np.std(rates.mean(axis=1)) == pytest.approx(np.hypot(0.05, 0.02 / np.sqrt(2)), rel=0.1)
+
+
+def test_a_sensor_from_outside_leaves_the_other_entries_as_they_are(desk):
+    gyro = load_file(desk / "gyro.py")
+    plain, params = st.make("Subterra/ObstructedShort-v0")
+    richer, more = st.make("Subterra/ObstructedShort-v0", parts=[gyro.Gyro()])
+    _, one = plain.reset(jax.random.key(3), params)
+    _, other = richer.reset(jax.random.key(3), more)
+    np.testing.assert_array_equal(one.position, other.position)
+    np.testing.assert_array_equal(one.goal.station, other.goal.station)
+    assert list(richer.fields(more))[:-1] == list(plain.fields(params))
+
+
+def test_its_params_are_randomised_like_those_of_the_package(desk):
+    gyro = load_file(desk / "gyro.py")
+    env, params = st.make("Subterra/Traverse-v0", parts=[gyro.Gyro()])
+    mixed, axes = st.randomize(jax.random.key(0), params, {"gyro.sigma": (0.1, 0.2)}, 8)
+    obs, _ = st.AutoReset(env, params_axes=axes).reset(jax.random.key(1), mixed, 8)
+    assert obs.shape == (8, 19)
+    assert float(mixed.gyro.sigma.min()) >= 0.1
+
+
+def test_gymnasium_makes_tasks_with_a_sensor_from_outside(desk):
+    gymnasium = pytest.importorskip("gymnasium")
+    gyro = load_file(desk / "gyro.py")
+    env = gymnasium.make("subterra_jax:Subterra/TraverseShort-v0", parts=(gyro.Gyro(),))
+    assert set(env.observation_space.spaces) == {"ranges", "odometry", "yaw_rate"}
+    assert env.reset(seed=0)[0]["yaw_rate"].shape == (1,)
+
+
+def test_a_task_from_outside_is_evaluated_on_listed_episodes(desk):
+    env, params = st.make(TASK)
+    episodes = listed_episodes(env, params, 4)
+    np.testing.assert_array_equal(episodes.seed, listed_episodes(env, params, 500).seed[:4])
+    records = evaluate(env, params, make_agent("oracle", params), episodes)
+    # Its controller keeps to the middle, 2.8 m from the wall, and drives on to the far mouth.
+    assert not records.success.any()
+    np.testing.assert_allclose(records.progress, 1.0)
+    wide, params = st.make(TASK, lane=load_file(desk / "keep_left.py").LaneParams(gap=2.8))
+    assert evaluate(wide, params, make_agent("oracle", params), episodes).success.all()
+
+
+def test_a_task_from_outside_works_with_gymnasium_and_stable_baselines(desk):
+    gymnasium = pytest.importorskip("gymnasium")
+    env = gymnasium.make("keep_left:Mine/KeepLeft-v0")
+    assert env.reset(seed=0)[0]["gap"] == 2.0
+    several = gymnasium.make_vec("Mine/KeepLeft-v0", num_envs=3)
+    assert several.reset(seed=0)[0]["gap"].shape == (3, 1)
+    pytest.importorskip("stable_baselines3")
+    from subterra_jax.adapters.sb3 import SubterraVecEnv
+
+    vector = SubterraVecEnv(2, TASK)
+    vector.reset()
+    assert vector.step(np.zeros((2, 2), np.float32))[1].shape == (2,)
+
+
+def test_leaderboard_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
+    from benchmarks.leaderboard.__main__ import main as leaderboard
+    from subterra_jax.recorder.__main__ import main as recorder
+    from subterra_jax.viewer import library
+
+    words = ["--tasks", TASK, "--agents", "dead-reckoning", "--episodes", "2", "--batch", "2", "--out", "board"]
+    assert leaderboard(words) == 0
+    assert "KeepLeft" in (desk / "board" / "leaderboard.md").read_text()
+    assert recorder(["--task", TASK, "--agent", "dead-reckoning", "--steps", "20", "--out", "episode"]) == 0
+    plan = st.load_tunnel().slice(0.0, 60.0)
+    *_, episode = library.drive_episode(plan, "0", "t", "smooth", "Mine/KeepLeft-v0", "dead-reckoning", 0)
+    assert episode.coverage[-1] >= 0.9
+
+
+def test_a_policy_is_trained_on_a_task_from_outside(desk):
+    from train import navigate
+
+    status = call(navigate.main, "--task", TASK, *SMALL, "--out", "run")
+    assert status == 0
+    assert (desk / "run" / "evaluation.json").exists()
+
+
+class Twice(Part):
+    """Observes what the odometer observes."""
+
+    name = "twice"
+
+    def observe(self, own, sight, noise, params):
+        return {"odometry": jnp.zeros(2)}
+
+    def space(self, params):
+        return {"odometry": (np.zeros(2), np.ones(2))}
+
+
+class Needy(Traverse):
+    """Wants slip."""
+
+    needs = ("slip",)
+
+
+class Crooked(Traverse):
+    """Starts at two stations at once."""
+
+    def start(self, draw, tunnel, params):
+        return Start(jnp.zeros(2))
+
+
+class Formless(Traverse):
+    """Starts nowhere."""
+
+    def start(self, draw, tunnel, params):
+        return 0.0
+
+
+@pytest.mark.parametrize(
+    ("rule", "parts", "message"),
+    [
+        (Traverse(), (*tasks.PLAIN, Twice()), "the part 'odometry' and the part 'twice' observe 'odometry'"),
+        (Traverse(), (*tasks.PLAIN, *tasks.PLAIN), "two parts are called"),
+        (Needy(), tasks.PLAIN, "the rule Needy needs the part 'slip'; there are"),
+        (Crooked(), tasks.PLAIN, r"the rule Crooked.start must return one number as station, got .*\(2,\)"),
+        (Formless(), tasks.PLAIN, "the rule Formless.start must return a Start, got float"),
+    ],
+)
+def test_parts_that_do_not_go_together_are_refused_in_one_sentence(rule, parts, message, monkeypatch):
+    monkeypatch.setitem(tasks.TASKS, "Mine/Bad-v0", tasks.Task(rule, 10, (0.0, 60.0), parts))
+    with pytest.raises(ValueError, match=message) as refused:
+        st.make("Mine/Bad-v0")
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("id", "rule", "message"),
+    [
+        ("Subterra/Traverse-v0", StopAt(), "is a task of the benchmark"),
+        ("Traverse", StopAt(), "must read Namespace/Name-v0"),
+        ("Mine/Bad-v0", object(), "rule must be a subterra_jax.rules.Rule, got object"),
+    ],
+)
+def test_a_registration_that_cannot_be_is_refused(id, rule, message):
+    with pytest.raises(ValueError, match=message):
+        st.register(id, rule, horizon=10)
+
+
+def test_a_rule_without_a_verdict_cannot_be_made():
+    assert issubclass(Traverse, Rule)
+    assert Verdict(jnp.array(True), jnp.array(True), {}).own == ()
+    with pytest.raises(TypeError, match="judge"):
+        type("Half", (Rule,), {})()
+
+
+def test_spaces_have_samples_and_know_what_they_contain():
+    env, params = st.make("Subterra/StopAt-v0", estimates=True)
+    for space in (env.action_space(params), env.observation_space(params)):
+        draws = jax.vmap(space.sample)(jax.random.split(jax.random.key(0), 64))
+        assert draws.shape == (64, *space.shape)
+        assert jax.vmap(space.contains)(draws).all()
+    action = env.action_space(params)
+    assert not action.contains(jnp.full(4, jnp.nan))
+    assert not action.contains(jnp.zeros(3))
+    assert not action.contains(action.high + 1.0)
