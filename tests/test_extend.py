@@ -192,7 +192,6 @@ def test_parts_that_do_not_go_together_are_refused_in_one_sentence(rule, parts, 
     [
         ("Subterra/Traverse-v0", StopAt(), "is a task of the benchmark"),
         ("Traverse", StopAt(), "must read Namespace/Name-v0"),
-        ("Mine/Bad-v0", object(), "rule must be a subterra_jax.rules.Rule, got object"),
     ],
 )
 def test_a_registration_that_cannot_be_is_refused(id, rule, message):
