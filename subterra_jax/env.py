@@ -315,7 +315,7 @@ class TunnelEnv:
 
     def observation_size(self, params: EnvParams) -> int:
         """Count the numbers of one observation."""
-        return self.observation_space(params).shape[0]
+        return sum(jnp.size(low) for low, _ in self._space(params).values())
 
     def fields(self, params: EnvParams) -> dict[str, slice]:
         """Return the place of each named entry in an observation."""
