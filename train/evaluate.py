@@ -51,7 +51,7 @@ def evaluate(world: World, agent: Agent, n_episodes: int) -> dict[str, Any]:
     check_episodes(n_episodes)
     released.check_fits(agent, world.env, world.params, agent.name)
     episodes = listed_episodes(world.env, world.params, n_episodes)
-    agent = released.told(agent, world.params)
+    agent = released.with_map(agent, world.params)
     return scores(drive(world.env, world.params, agent, episodes, _BATCH))
 
 

@@ -137,7 +137,7 @@ def make_driver(name: str, params: st.EnvParams) -> Any:
     if name in registry.names():
         return registry.make_agent(name, params)
     if name.startswith(policies.PREFIX):
-        agent = policies.told(policies.load(name.removeprefix(policies.PREFIX))[0], params)
+        agent = policies.with_map(policies.load(name.removeprefix(policies.PREFIX))[0], params)
     else:
         factory = load_object(name)
         parameters = inspect.signature(factory).parameters.values()

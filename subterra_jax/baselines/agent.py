@@ -54,18 +54,18 @@ class Agent(Protocol):
 
     @property
     def uses_lidar(self) -> bool:
-        """Whether it reads the ranges."""
+        """True where it reads the ranges."""
 
     @property
     def uses_map(self) -> bool:
-        """Whether it reads the tunnel in `params`: the one it is in, where there are several."""
+        """True where it reads the tunnel in `params`: the one it is in, of a stack."""
 
     @property
     def privileged(self) -> bool:
-        """Whether it is told what `TunnelEnv.privileged` knows."""
+        """True where it gets the truth of `TunnelEnv.privileged`."""
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
-        """Memory at the start of an episode: any pytree of arrays.
+        """Returns the memory at the start of an episode: any pytree of arrays.
 
         Args:
             key: Source of the agent's own randomness.
@@ -76,18 +76,18 @@ class Agent(Protocol):
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Memory]:
-        """One control period.
+        """Returns the action of one control period, and the memory after it.
 
         Args:
             key: Source of the agent's own randomness.
-            memory: What it remembers. The first call gets the observation that `begin` got.
+            memory: Memory so far. The first call gets the observation that `begin` got.
             obs: The observation.
             params: As for `begin`.
-            known: The truth, or None.
+            known: The truth; None for an agent that is not `privileged`.
 
         Returns:
             Always five numbers: speed (m/s), yaw rate (rad/s), station estimated for the end of this control period,
-            which is when it is scored (m; NaN from one who has none), log of its standard deviation in m, and
+            which is when it is scored (m; NaN for none), log of its standard deviation in m, and
             direction faced (that of growing station: above 0); and the memory.
         """
 

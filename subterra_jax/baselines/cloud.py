@@ -8,9 +8,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.drift import fault_sizes
 from subterra_jax.baselines.reckoning import command_errors, odometer_errors, odometer_share
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit
+from subterra_jax.baselines.stations import fault_sizes
 from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.parts.wander import WanderParams, advance_wander
 from subterra_jax.state import EnvParams

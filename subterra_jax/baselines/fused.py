@@ -7,13 +7,12 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed
-from subterra_jax.baselines.drift import believed_start, slip_sizes
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven, Station, believed_start, slip_sizes
 from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
 
 _S, _GAIN, _SLIP, _BIAS, _SCALE = range(5)
-_LEAST_STEP = 1e-3  # m; a shorter step tells nothing about scales
+_LEAST_STEP = 1e-3  # m; a shorter step holds no information on scales
 _FLAG_SIGMA = 0.1  # m; the flag is noticed within one step of 0.2 m
 
 
@@ -43,7 +42,7 @@ class FusedCount:
     privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> Belief:
-        """The priors that the task states."""
+        """Begins with the nominal errors of the task."""
         start, start_sigma = believed_start(params)
         sigmas = jnp.zeros(5).at[_S].set(start_sigma)
         slip = slip_sizes(params)
@@ -57,20 +56,20 @@ class FusedCount:
     def update(
         self, memory: Belief, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Belief]:
-        """Predict by the command, correct by the odometer and the flag."""
+        """Predicts by the command, and corrects by the odometer and the flag."""
         del known
         step = driven.speed * params.vehicle.period
-        belief = _moved(memory, driven.direction * driven.cosine * step)
-        # Only the ratio of reading to command is news, and it must not move the mean of the station by itself.
+        belief = _predict(memory, driven.direction * driven.cosine * step)
+        # Only the ratio of reading to command is new, and it must not move the mean of the station by itself.
         read = obs.distance - memory.reading - step
         row = step * jnp.array([0.0, 1.0, 1.0, 1.0, 1.0])
         noise = params.odometry.distance_sigma**2
-        corrected = _corrected(belief, row, read, jnp.maximum(noise, 1e-10))
+        corrected = _correct(belief, row, read, jnp.maximum(noise, 1e-10))
         belief = _where(step > _LEAST_STEP, corrected, belief)
-        belief = _wandered(belief, step, params)
+        belief = _advance_errors(belief, step, params)
         if params.errand == "return":
             at = obs.goal - driven.direction * params.goal.flag_reach
-            fix = _corrected(belief, jnp.eye(5)[_S], at - belief.mean[_S], jnp.asarray(_FLAG_SIGMA**2))
+            fix = _correct(belief, jnp.eye(5)[_S], at - belief.mean[_S], jnp.asarray(_FLAG_SIGMA**2))
             belief = _where(driven.flagged, fix, belief)
         sigma = jnp.sqrt(jnp.maximum(belief.cov[_S, _S], 1e-4))
         estimate = Station(belief.mean[_S], jnp.log(sigma), driven.direction)
@@ -83,8 +82,8 @@ def _where(condition: Array, one: Belief, other: Belief) -> Belief:
     )
 
 
-def _moved(belief: Belief, step: Float[Array, ""]) -> Belief:
-    """After a commanded step along the axis, m."""
+def _predict(belief: Belief, step: Float[Array, ""]) -> Belief:
+    """Predicts the belief after a commanded step along the axis, m."""
     moved = jnp.zeros(5).at[_S].set(1.0)
     slips = belief.mean[_GAIN] + belief.mean[_SLIP]
     rows = belief.cov + moved[:, None] * step * (belief.cov[_GAIN] + belief.cov[_SLIP])[None]
@@ -92,20 +91,20 @@ def _moved(belief: Belief, step: Float[Array, ""]) -> Belief:
     return dataclasses.replace(belief, mean=belief.mean + moved * step * (1.0 + slips), cov=cov)
 
 
-def _corrected(belief: Belief, row: Float[Array, "5"], innovation: Float[Array, ""], noise: Float[Array, ""]) -> Belief:
-    """After one scalar measurement; `innovation` is the reading less what an error-free world would read."""
+def _correct(belief: Belief, row: Float[Array, "5"], innovation: Float[Array, ""], noise: Float[Array, ""]) -> Belief:
+    """Corrects by one scalar measurement; `innovation` is the reading less that of a world without errors."""
     spread = jnp.sum(belief.cov * row[None], axis=1)
     total = jnp.sum(row * spread) + noise
     gain = spread / total
-    # A row that holds the station gets its innovation complete; the errors' part is still to be taken off.
+    # The innovation of a row with the station is complete; the part of the errors is subtracted here.
     expected = jnp.sum(row.at[_S].set(0.0) * belief.mean)
     mean = belief.mean + gain * (innovation - expected)
     cov = belief.cov - gain[:, None] * spread[None]
     return dataclasses.replace(belief, mean=mean, cov=0.5 * (cov + cov.T))
 
 
-def _wandered(belief: Belief, step: Float[Array, ""], params: EnvParams) -> Belief:
-    """After the wandering errors have gone on over a distance, m."""
+def _advance_errors(belief: Belief, step: Float[Array, ""], params: EnvParams) -> Belief:
+    """Advances the wandering errors over a distance, m."""
     keep, added = jnp.ones(5), jnp.zeros(5)
     for index, wander in ((_SLIP, slip_sizes(params).wander), (_SCALE, params.odometry.wander)):
         if wander is not None:
@@ -116,6 +115,6 @@ def _wandered(belief: Belief, step: Float[Array, ""], params: EnvParams) -> Beli
 
 
 def _process(wander: WanderParams, step: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Factor and added variance of one step of a wandering error."""
+    """Returns factor and added variance of one step of a wandering error."""
     ratio = jnp.abs(step) / wander.length
     return jnp.exp(-ratio), -jnp.expm1(-2.0 * ratio) * wander.sigma**2

@@ -1,45 +1,143 @@
-"""An agent put together from a localiser, a steering and the mission; most baselines are one."""
+"""An agent made of a localiser, a steering and a mission, and what the mission asks: cover, stop, return, report."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.baselines import mission
 from subterra_jax.baselines.agent import Action, Known, Observed
-from subterra_jax.baselines.stations import Driven, Localiser
+from subterra_jax.baselines.stations import Driven, Localiser, Station
 from subterra_jax.baselines.steering import Steering
 from subterra_jax.state import EnvParams
+
+# A robot that stands for a second has stopped, which ends the episode: it creeps while it turns.
+TURN_SPEED = 0.1  # m/s
+_TURN_RATE = 1.5  # rad/s
+_TURNED = 0.1  # rad; the steering corrects what is left of a turn
+_FAR = 1e6  # m
+
+
+@struct.dataclass
+class Mission:
+    """Progress of an agent in its task.
+
+    Attributes:
+        direction: 1 on the way out, -1 on the way back.
+        flagged: True once the flag has been seen.
+        to_turn: Angle still to turn, rad; 0 while it drives.
+        heading: Last reading of the odometer's heading, rad.
+        stopped: True once it has arrived; it then stands.
+    """
+
+    direction: Float[Array, ""]
+    flagged: Bool[Array, ""]
+    to_turn: Float[Array, ""]
+    heading: Float[Array, ""]
+    stopped: Bool[Array, ""]
+
+
+def start_mission(obs: Observed) -> Mission:
+    """Returns the mission at the start: on the way out."""
+    no = jnp.zeros((), bool)
+    return Mission(jnp.ones(()), no, jnp.zeros(()), obs.heading, no)
+
+
+def is_turning(mission: Mission) -> Bool[Array, ""]:
+    """Tells whether the robot is turning round."""
+    return mission.to_turn > 0.0
+
+
+def target_speed(mission: Mission, estimate: Station, obs: Observed, params: EnvParams) -> Float[Array, ""]:
+    """Returns the speed to drive at, m/s: the largest, and in the last period what just reaches the target.
+
+    Args:
+        mission: Progress in the task.
+        estimate: Estimate of the station.
+        obs: The observation.
+        params: The task.
+    """
+    speed_max = jnp.asarray(params.vehicle.speed_max)
+    if params.errand == "cover":
+        return speed_max
+    if params.errand == "report":
+        return jnp.zeros(())  # stand and report
+    target = obs.goal
+    if params.errand == "return":
+        home = jnp.asarray(params.start.station, jnp.float32)
+        # Out until the flag is raised, wherever the goal is believed to be.
+        target = jnp.where(mission.direction > 0.0, _FAR, home)
+    to_go = mission.direction * (target - estimate.station)
+    return jnp.where(mission.stopped, 0.0, jnp.clip(to_go / params.vehicle.period, 0.0, speed_max))
+
+
+def check_arrival(mission: Mission, target: Float[Array, ""], driven: Float[Array, ""], params: EnvParams) -> Mission:
+    """Returns the mission after a command: the target speed of the last period, driven in full, is the arrival."""
+    if params.errand == "cover":
+        return mission
+    there = (target < params.vehicle.speed_max) & (driven >= target) & ~is_turning(mission)
+    return dataclasses.replace(mission, stopped=mission.stopped | there)
+
+
+def watch(mission: Mission, obs: Observed, params: EnvParams) -> tuple[Mission, Bool[Array, ""], Bool[Array, ""]]:
+    """Checks the flag and the turn.
+
+    Returns:
+        The mission, true where the flag has just been raised, and true where the turn has just ended.
+    """
+    if params.errand != "return":
+        no = jnp.zeros((), bool)
+        return mission, no, no
+    raised = (obs.flag > 0.5) & ~mission.flagged
+    was_turning = is_turning(mission)
+    change = jnp.mod(obs.heading - mission.heading + jnp.pi, 2.0 * jnp.pi) - jnp.pi
+    left = jnp.where(was_turning, mission.to_turn - change, mission.to_turn)
+    done = was_turning & (left < _TURNED)
+    left = jnp.where(raised, jnp.pi, jnp.where(done, 0.0, left))
+    after = dataclasses.replace(
+        mission,
+        direction=jnp.where(done, -1.0, mission.direction),
+        flagged=mission.flagged | raised,
+        to_turn=left,
+        heading=obs.heading,
+    )
+    return after, raised, done
+
+
+def turn_command(mission: Mission, params: EnvParams) -> Float[Array, "2"]:
+    """Returns the command of a turn on the spot, m/s and rad/s."""
+    rate = jnp.minimum(_TURN_RATE, mission.to_turn / params.vehicle.period)
+    return jnp.stack([jnp.full_like(rate, TURN_SPEED), rate])
 
 
 @struct.dataclass
 class Memory:
-    """What a navigator remembers.
+    """Memory of a navigator.
 
     Attributes:
         steering: Memory of the steering.
         localiser: Memory of the localiser.
-        mission: Where in the task.
+        mission: Progress in the task.
         command: Last command, m/s and rad/s.
     """
 
     steering: Any
     localiser: Any
-    mission: mission.Mission
+    mission: Mission
     command: Float[Array, "2"]
 
 
 @struct.dataclass
 class Navigator:
-    """Localises, decides how far to go, and steers there.
+    """An agent that localises itself, decides how far to go, and steers there.
 
     Attributes:
-        localiser: Knows the station.
+        localiser: Estimates the station.
         steering: Keeps between the walls.
         name: Name on the leaderboard.
-        uses_map: Whether the localiser needs the map.
+        uses_map: The localiser needs the map.
     """
 
     localiser: Localiser
@@ -49,40 +147,41 @@ class Navigator:
 
     @property
     def uses_lidar(self) -> bool:
-        """Whether the steering, or a localiser with a map, reads the ranges."""
+        """True where the steering, or a localiser with a map, reads the ranges."""
         return self.steering.uses_lidar or self.uses_map
 
     @property
     def privileged(self) -> bool:
-        """Whether the localiser is told the truth."""
+        """True where the localiser gets the truth."""
         return self.localiser.privileged
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
-        """At the believed start."""
+        """Begins at the believed start."""
         del key
         return Memory(
             steering=self.steering.begin(obs, params),
             localiser=self.localiser.begin(obs, params),
-            mission=mission.start_mission(obs),
+            mission=start_mission(obs),
             command=jnp.zeros(2),
         )
 
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Memory]:
-        """One control period."""
+        """Returns command and report of one control period, and the memory after it."""
         del key
         steering = self.steering.look(memory.steering, obs, memory.command, params)
-        now, raised, done = mission.watch(memory.mission, obs, params)
+        now, raised, done = watch(memory.mission, obs, params)
         driven = Driven(memory.command[0], self.steering.cosine(steering), memory.mission.direction, raised)
-        steering = jax.tree.map(lambda new, old: jnp.where(done, new, old), self.steering.turned(steering), steering)
+        mirrored = self.steering.turn_round(steering)
+        steering = jax.tree.map(lambda new, old: jnp.where(done, new, old), mirrored, steering)
         estimate, localiser = self.localiser.update(memory.localiser, obs, driven, params, known)
-        wanted = mission.wanted_speed(now, estimate, obs, params)
-        command = self.steering.steer(steering, wanted, params)
-        command = jnp.where(mission.turning(now), mission.turn_command(now, params), command)
+        target = target_speed(now, estimate, obs, params)
+        command = self.steering.steer(steering, target, params)
+        command = jnp.where(is_turning(now), turn_command(now, params), command)
         limit = jnp.stack([jnp.asarray(params.vehicle.speed_max), jnp.asarray(params.vehicle.yaw_rate_max)])
         command = jnp.clip(command, jnp.stack([jnp.zeros(()), -limit[1]]), limit)
-        after = Memory(steering, localiser, mission.arrived(now, wanted, command[0], params), command)
+        after = Memory(steering, localiser, check_arrival(now, target, command[0], params), command)
         ahead = command[0] * params.vehicle.period * self.steering.cosine(steering)
         report = jnp.stack([estimate.station + estimate.direction * ahead, estimate.log_sigma, estimate.direction])
         return jnp.concatenate([command, report]), after

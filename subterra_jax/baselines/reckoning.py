@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.drift import slip_sizes
+from subterra_jax.baselines.stations import slip_sizes
 from subterra_jax.parts.faults import MAX_DELAY
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams

@@ -1,9 +1,14 @@
-"""The baselines by name; others add theirs with `register`."""
+"""The baselines by name; `register` adds further agents."""
 
 from collections.abc import Callable
 from typing import Any
 
-from subterra_jax.baselines.agent import Agent
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
@@ -11,7 +16,6 @@ from subterra_jax.baselines.particle import particle_agent
 from subterra_jax.baselines.rings.grid import ring_filter
 from subterra_jax.baselines.rings.loop import RingCount
 from subterra_jax.baselines.scanmatch import scan_matching
-from subterra_jax.baselines.simple import Random
 from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine, HeadingHold, Pursuit
 from subterra_jax.host.errors import SubterraError
@@ -27,12 +31,38 @@ class AgentError(SubterraError):
     """There is no such agent, or its name is taken."""
 
 
+@struct.dataclass
+class Random:
+    """Draws uniform commands, and gives no estimate."""
+
+    name: str = struct.field(pytree_node=False, default="random")
+    uses_lidar: bool = struct.field(pytree_node=False, default=False)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Float[Array, ""]:
+        """Returns an empty memory."""
+        del key, obs, params
+        return jnp.zeros(())
+
+    def act(
+        self, key: PRNGKeyArray, memory: Float[Array, ""], obs: Observed, params: EnvParams, known: Known
+    ) -> tuple[Action, Float[Array, ""]]:
+        """Draws a command within the limits."""
+        del obs, known
+        share = jax.random.uniform(key, (3,))
+        speed = params.vehicle.speed_max * share[0]
+        yaw_rate = params.vehicle.yaw_rate_max * (2.0 * share[1] - 1.0)
+        no_estimate = jnp.full((), jnp.nan)
+        return jnp.stack([speed, yaw_rate, no_estimate, jnp.zeros(()), 2.0 * share[2] - 1.0]), memory
+
+
 def register(name: str, factory: Factory) -> None:
-    """Add an agent: a trained policy, a filter, a replayed trajectory.
+    """Adds an agent: a trained policy, a filter, a replayed trajectory.
 
     Args:
-        name: Its name on the leaderboard and the command line.
-        factory: Makes it for a task, from the task's params (a map, say).
+        name: Name on the leaderboard and the command line.
+        factory: Makes the agent from a task's params, its map for instance.
 
     Raises:
         AgentError: The name is taken.
@@ -43,15 +73,15 @@ def register(name: str, factory: Factory) -> None:
 
 
 def names() -> tuple[str, ...]:
-    """Names of all agents, in order of registration."""
+    """Returns the names of all agents, in order of registration."""
     return tuple(_FACTORIES)
 
 
 def make_agent(name: str, params: EnvParams) -> Agent:
-    """The agent of a name, for a task.
+    """Makes the agent of a name for a task.
 
     Raises:
-        AgentError: There is none.
+        AgentError: There is no such agent.
     """
     if name not in _FACTORIES:
         raise AgentError(f"no agent {name!r}; there are {', '.join(_FACTORIES)}")

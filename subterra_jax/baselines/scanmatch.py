@@ -14,11 +14,10 @@ from jaxtyping import Array, Bool, Float, Int
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
-from subterra_jax.baselines.corridor import first_look
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.stations import Driven, Station
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, find_walls
 from subterra_jax.lidar import bearings
 from subterra_jax.state import EnvParams
 
@@ -282,7 +281,7 @@ class ScanMatcher:
 
     def begin(self, obs: Observed, params: EnvParams) -> MatchMemory:
         """Begins at the believed start, on an axis that is taken to be straight."""
-        zero, corridor = jnp.zeros(()), first_look(obs.ranges, params)
+        zero, corridor = jnp.zeros(()), find_walls(obs.ranges, params)
         half_width = 0.5 * (corridor.left + corridor.right)
         pose = AxisPose(
             jnp.asarray(params.start.station, jnp.float32), corridor.offset, corridor.angle, zero, half_width

@@ -1,4 +1,4 @@
-"""Dead reckoning: where along the tunnel one is, from commands, from odometry, from both, or from the truth."""
+"""Estimates of the station by dead reckoning: from commands, from the odometer, or the truth; and their errors."""
 
 from typing import Any, Protocol
 
@@ -6,16 +6,63 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax.baselines import drift
 from subterra_jax.baselines.agent import Known, Observed
+from subterra_jax.parts.faults import FaultParams
+from subterra_jax.parts.slip import SlipParams
+from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
 
-_LEAST = 0.01  # m; nobody knows better
+_LEAST = 0.01  # m; smallest standard deviation of an estimate
+_NO_SLIP = SlipParams(gain_sigma=0.0, yaw_sigma=0.0, wander=WanderParams(sigma=0.0))
+_NO_FAULTS = FaultParams(wet_share=0.0, wet_loss=0.0)
+
+
+def slip_sizes(params: EnvParams) -> SlipParams:
+    """Return the nominal slip of the task; 0 where nothing slips."""
+    return params.parts.get("slip", _NO_SLIP)
+
+
+def fault_sizes(params: EnvParams) -> FaultParams:
+    """Return the nominal faults of the task; no wet rail where nothing fails."""
+    return params.parts.get("faults", _NO_FAULTS)
+
+
+def wander_variance(distance: Float[Array, ""], wander: WanderParams | None) -> Float[Array, ""]:
+    """Compute the variance of the integral of a wandering error over a distance, m².
+
+    Source: the double integral of the covariance σ² exp(-|u - v| / L).
+    """
+    if wander is None:
+        return jnp.zeros_like(distance)
+    length = jnp.asarray(wander.length)
+    rest = distance + length * jnp.expm1(-distance / length)
+    return 2.0 * wander.sigma * wander.sigma * length * jnp.maximum(rest, 0.0)
+
+
+def command_sigma(distance: Float[Array, ""], params: EnvParams) -> Float[Array, ""]:
+    """Compute the standard deviation of a distance counted from commands, m."""
+    slip = slip_sizes(params)
+    return jnp.sqrt((slip.gain_sigma * distance) ** 2 + wander_variance(distance, slip.wander))
+
+
+def odometry_sigma(distance: Float[Array, ""], steps: Float[Array, ""], params: EnvParams) -> Float[Array, ""]:
+    """Compute the standard deviation of a distance counted by the odometer in a number of steps, m."""
+    odometry = params.odometry
+    variance = steps * odometry.distance_sigma**2 + (odometry.distance_bias_sigma * distance) ** 2
+    return jnp.sqrt(variance + wander_variance(distance, odometry.wander))
+
+
+def believed_start(params: EnvParams) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the believed station of the start and its standard deviation, m; anywhere, where that is the task."""
+    if params.errand == "report":
+        room = params.tunnel.length - 2.0 * params.goal.margin
+        return 0.5 * params.tunnel.length, room / jnp.sqrt(12.0)
+    return jnp.asarray(params.start.station, jnp.float32), jnp.asarray(params.start.station_sigma, jnp.float32)
 
 
 @struct.dataclass
 class Station:
-    """An estimate.
+    """Estimate of the station.
 
     Attributes:
         station: Estimated station, m.
@@ -30,13 +77,13 @@ class Station:
 
 @struct.dataclass
 class Driven:
-    """What happened since the last estimate.
+    """Motion since the last estimate.
 
     Attributes:
-        speed: Speed that was commanded, m/s; 0 before the first command.
-        cosine: Of the angle between heading and axis, as the steering sees it.
+        speed: Commanded speed, m/s; 0 before the first command.
+        cosine: Cosine of the angle between heading and axis, by the steering.
         direction: 1 on the way out, -1 on the way back.
-        flagged: The flag has just been raised: the goal is `flag_reach` away.
+        flagged: True where the flag has just been raised: the goal is `flag_reach` away.
     """
 
     speed: Float[Array, ""]
@@ -46,28 +93,28 @@ class Driven:
 
 
 class Localiser(Protocol):
-    """Keeps an estimate of the station; a `flax.struct.dataclass` without state."""
+    """Estimates the station; a `flax.struct.dataclass` without state."""
 
     privileged: bool
 
     def begin(self, obs: Observed, params: EnvParams) -> Any:
-        """Its memory at the start."""
+        """Returns the memory at the start."""
 
     def update(
         self, memory: Any, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Any]:
-        """The estimate after a step, and the memory."""
+        """Returns the estimate after a step, and the memory."""
 
 
 @struct.dataclass
 class Count:
-    """Memory of one who counts.
+    """Memory of a localiser that sums distances.
 
     Attributes:
         station: Estimated station, m.
         start_sigma: Standard deviation of the station of the start, m.
-        distance: Distance counted, m.
-        steps: Steps driven.
+        distance: Summed distance, m.
+        steps: Number of steps.
         reading: Last reading of the odometer, m.
     """
 
@@ -78,7 +125,8 @@ class Count:
     reading: Float[Array, ""]
 
 
-def _counted(memory: Count, step: Float[Array, ""], driven: Driven, reading: Float[Array, ""]) -> Count:
+def _add_step(memory: Count, step: Float[Array, ""], driven: Driven, reading: Float[Array, ""]) -> Count:
+    """Adds the distance of a step, m."""
     return Count(
         station=memory.station + driven.direction * driven.cosine * step,
         start_sigma=memory.start_sigma,
@@ -89,68 +137,70 @@ def _counted(memory: Count, step: Float[Array, ""], driven: Driven, reading: Flo
 
 
 def _start(obs: Observed, params: EnvParams) -> Count:
+    """Begins at the believed start."""
     zero = jnp.zeros(())
-    return Count(*drift.believed_start(params), zero, zero, obs.distance)
+    return Count(*believed_start(params), zero, zero, obs.distance)
 
 
 def _station(memory: Count, sigma: Float[Array, ""], driven: Driven) -> Station:
+    """Returns the estimate with the errors of start and counting."""
     variance = jnp.maximum(sigma * sigma + memory.start_sigma * memory.start_sigma, _LEAST * _LEAST)
     return Station(memory.station, 0.5 * jnp.log(variance), driven.direction)
 
 
 @struct.dataclass
 class CommandCount:
-    """Sums its own commands: where slip acted on the odometer alone, this would be a perfect one."""
+    """Sums the commands. In a task without slip this is a perfect odometer."""
 
     privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> Count:
-        """At the believed start."""
+        """Begins at the believed start."""
         return _start(obs, params)
 
     def update(
         self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Count]:
-        """The sum so far."""
+        """Adds the command."""
         del known
-        memory = _counted(memory, driven.speed * params.vehicle.period, driven, obs.distance)
-        return _station(memory, drift.command_sigma(memory.distance, params), driven), memory
+        memory = _add_step(memory, driven.speed * params.vehicle.period, driven, obs.distance)
+        return _station(memory, command_sigma(memory.distance, params), driven), memory
 
 
 @struct.dataclass
 class OdometerCount:
-    """Follows the odometer."""
+    """Sums the odometer's readings."""
 
     privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> Count:
-        """At the believed start."""
+        """Begins at the believed start."""
         return _start(obs, params)
 
     def update(
         self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Count]:
-        """What it reads."""
+        """Adds the odometer's step."""
         del known
-        memory = _counted(memory, obs.distance - memory.reading, driven, obs.distance)
-        return _station(memory, drift.odometry_sigma(memory.distance, memory.steps, params), driven), memory
+        memory = _add_step(memory, obs.distance - memory.reading, driven, obs.distance)
+        return _station(memory, odometry_sigma(memory.distance, memory.steps, params), driven), memory
 
 
 @struct.dataclass
 class Truth:
-    """Is told the truth: the ceiling."""
+    """Knows the truth: the best possible localiser."""
 
     privileged: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, ""]:
-        """Nothing to remember."""
+        """Returns an empty memory."""
         del obs, params
         return jnp.zeros(())
 
     def update(
         self, memory: Float[Array, ""], obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, Float[Array, ""]]:
-        """The truth, claimed with the smallest standard deviation an action can hold."""
+        """Returns the truth, with the smallest standard deviation that an action can hold."""
         del obs, driven, params
         assert known is not None
         direction = jnp.where(known["heading_cos"] > 0.0, 1.0, -1.0)

@@ -1,42 +1,141 @@
-"""Steering along the tunnel: one controller for all who see walls, pure pursuit, and one for who sees nothing."""
+"""Finds the walls in a scan and steers along them: a centre-line controller, pure pursuit, and heading hold."""
 
 from typing import Any, Protocol
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.corridor import Corridor, first_look, look, moved, turned
-from subterra_jax.lidar import bearings
-from subterra_jax.parts.unicycle import wrap
+from subterra_jax.lidar import LidarParams, bearings
+from subterra_jax.parts.unicycle import VehicleParams, wrap
 from subterra_jax.state import EnvParams
+
+_SIDEWAYS = 0.65  # sine of a beam's bearing above which it meets a wall near by
+_GATE = 0.5  # m; a hit further than this from where the wall is expected is not the wall
+_TRUST, _TRUST_ANGLE = 0.5, 0.35  # weights of one scan
+_ECHO = 1e-3  # m below `range_max`: no echo
+
+
+class Robot(Protocol):
+    """The part of a task's params that finding walls and boxes needs."""
+
+    @property
+    def vehicle(self) -> VehicleParams:
+        """The vehicle."""
+
+    @property
+    def lidar(self) -> LidarParams:
+        """The LiDAR."""
+
+
+@struct.dataclass
+class Corridor:
+    """Position between the walls. It is tracked from scan to scan, so that some beams may fail.
+
+    Attributes:
+        left: Distance to the wall on the robot's left, m.
+        right: Distance to the wall on its right, m.
+        angle: Heading less the direction of travel along the axis, rad.
+    """
+
+    left: Float[Array, ""]
+    right: Float[Array, ""]
+    angle: Float[Array, ""]
+
+    @property
+    def offset(self) -> Float[Array, ""]:
+        """Distance to the left of the middle, m, as seen in the direction of travel."""
+        return 0.5 * (self.right - self.left)
+
+
+def find_walls(ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
+    """Finds the walls in the first scan: assumes a heading along the axis, then corrects it."""
+    bearing = bearings(ranges.shape[0])
+    side = np.abs(np.sin(bearing))
+    echo = (ranges < params.lidar.range_max - _ECHO) & (side > _SIDEWAYS)
+    across = ranges * jnp.asarray(side, jnp.float32)
+
+    def middle(is_left: Bool[np.ndarray, "n_beams"]) -> Float[Array, ""]:
+        median = jnp.nanmedian(jnp.where(echo & is_left, across, jnp.nan))
+        return jnp.where(jnp.isnan(median), 2.0, median)
+
+    corridor = Corridor(middle(np.sin(bearing) > 0.0), middle(np.sin(bearing) < 0.0), jnp.zeros(()))
+    for _ in range(3):
+        corridor = track_walls(corridor, ranges, params)
+    return corridor
+
+
+def predict_walls(corridor: Corridor, command: Float[Array, "2"], params: Robot) -> Corridor:
+    """Predicts the walls after a command, m/s and rad/s."""
+    period = params.vehicle.period
+    angle = corridor.angle + 0.5 * command[1] * period
+    aside = command[0] * period * jnp.sin(angle)
+    return Corridor(corridor.left - aside, corridor.right + aside, corridor.angle + command[1] * period)
+
+
+def mirror_walls(corridor: Corridor) -> Corridor:
+    """Returns the walls for the opposite direction of travel: left becomes right."""
+    return Corridor(corridor.right, corridor.left, wrap(corridor.angle - jnp.pi))
+
+
+def track_walls(corridor: Corridor, ranges: Float[Array, "n_beams"], params: Robot) -> Corridor:
+    """Corrects the walls by a scan; robust to beams without echo, to dust and to boxes at the wall."""
+    bearing = jnp.asarray(bearings(ranges.shape[0]), jnp.float32) + corridor.angle
+    along, across = ranges * jnp.cos(bearing), ranges * jnp.sin(bearing)
+    echo = (ranges < params.lidar.range_max - _ECHO) & (jnp.abs(jnp.sin(bearing)) > _SIDEWAYS)
+    left, left_moment, left_size = _side(along, across, echo & (across > 0.0), corridor.left)
+    right, right_moment, right_size = _side(along, -across, echo & (across < 0.0), corridor.right)
+    size = left_size + right_size
+    slope = jnp.where(size > 1.0, (left_moment - right_moment) / jnp.maximum(size, 1.0), 0.0)
+    return Corridor(left, right, corridor.angle - _TRUST_ANGLE * jnp.clip(slope, -0.5, 0.5))
+
+
+def _side(
+    along: Float[Array, "n_beams"],
+    across: Float[Array, "n_beams"],
+    hit: Bool[Array, "n_beams"],
+    expected: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Measures one wall: its distance (m), and the two moments (m²) whose ratio is its slope."""
+    near = hit & (jnp.abs(across - expected) < _GATE)
+    lost = (jnp.sum(near) < 2) & (jnp.sum(hit) >= 4)
+    used = jnp.where(lost, hit, near)
+    n = jnp.sum(used)
+    middle = jnp.nanmedian(jnp.where(used, across, jnp.nan))
+    trust = jnp.where(lost, 1.0, _TRUST)
+    distance = jnp.where(n > 0, expected + trust * (middle - expected), expected)
+    mean = lambda values: jnp.sum(jnp.where(used, values, 0.0)) / jnp.maximum(n, 1)  # noqa: E731
+    x, y = along - mean(along), across - mean(across)
+    usable = used & ~lost
+    return distance, jnp.sum(jnp.where(usable, x * y, 0.0)), jnp.sum(jnp.where(usable, x * x, 0.0))
 
 
 class Steering(Protocol):
-    """Turns a wanted speed into a command; a `flax.struct.dataclass` without state."""
+    """Turns a target speed into a command; a `flax.struct.dataclass` without state."""
 
     uses_lidar: bool
 
     def begin(self, obs: Observed, params: EnvParams) -> Any:
-        """Its memory at the start."""
+        """Returns the memory at the start."""
 
     def look(self, memory: Any, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> Any:
-        """Its memory after a command and the observation that followed."""
+        """Returns the memory after a command and the observation that followed."""
 
     def cosine(self, memory: Any) -> Float[Array, ""]:
-        """Of the angle between heading and axis."""
+        """Returns the cosine of the angle between heading and axis."""
 
     def steer(self, memory: Any, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Speed (m/s), not above the wanted one, and yaw rate (rad/s)."""
+        """Returns speed (m/s), at most `speed`, and yaw rate (rad/s)."""
 
-    def turned(self, memory: Any) -> Any:
-        """Its memory after it was turned round."""
+    def turn_round(self, memory: Any) -> Any:
+        """Returns the memory after the robot has turned round."""
 
 
 @struct.dataclass
 class CentreLine:
-    """PD control of offset and angle between the walls.
+    """PD controller of offset and angle between the walls.
 
     Attributes:
         offset_gain: Yaw rate for an offset, rad/s for each metre.
@@ -48,25 +147,25 @@ class CentreLine:
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: EnvParams) -> Corridor:
-        """The walls as first seen."""
-        return first_look(obs.ranges, params)
+        """Finds the walls in the first scan."""
+        return find_walls(obs.ranges, params)
 
     def look(self, memory: Corridor, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> Corridor:
-        """The walls tracked."""
-        return look(moved(memory, command, params), obs.ranges, params)
+        """Tracks the walls."""
+        return track_walls(predict_walls(memory, command, params), obs.ranges, params)
 
     def cosine(self, memory: Corridor) -> Float[Array, ""]:
-        """Of the tracked angle."""
+        """Returns the cosine of the tracked angle."""
         return jnp.cos(memory.angle)
 
     def steer(self, memory: Corridor, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Towards the middle."""
+        """Steers to the middle."""
         del params
         return jnp.stack([speed, -self.offset_gain * memory.offset - self.angle_gain * memory.angle])
 
-    def turned(self, memory: Corridor) -> Corridor:
-        """Left is right now."""
-        return turned(memory)
+    def turn_round(self, memory: Corridor) -> Corridor:
+        """Swaps left and right."""
+        return mirror_walls(memory)
 
 
 @struct.dataclass
@@ -74,8 +173,8 @@ class Pursuit:
     """Pure pursuit of a point midway between the walls, from one scan alone.
 
     Attributes:
-        beam: Which beam on either side gives the two points between which it lies, the first one left of straight ahead
-            being 1; 2 of 16 looks 45° to the side.
+        beam: Number of the beam on either side whose two hits the point lies between; 1 is the first to the left of
+            straight ahead, and 2 of 16 points 45° to the side.
 
     Source: Coulter 1992, Implementation of the Pure Pursuit Path Tracking Algorithm.
     """
@@ -84,65 +183,65 @@ class Pursuit:
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, "2"]:
-        """The point in the first scan."""
+        """Returns the point in the first scan."""
         return self.look(jnp.zeros(2), obs, jnp.zeros(2), params)
 
     def look(
         self, memory: Float[Array, "2"], obs: Observed, command: Float[Array, "2"], params: EnvParams
     ) -> Float[Array, "2"]:
-        """The point in this scan, ahead and to the left, m."""
+        """Returns the point in this scan, ahead and to the left, m."""
         del memory, command, params
         bearing = float(bearings(obs.ranges.shape[0])[self.beam])
         left, right = obs.ranges[self.beam], obs.ranges[-self.beam]
         return 0.5 * jnp.stack([(left + right) * jnp.cos(bearing), (left - right) * jnp.sin(bearing)])
 
     def cosine(self, memory: Float[Array, "2"]) -> Float[Array, ""]:
-        """It takes itself to be parallel to the axis."""
+        """Returns 1: it assumes a heading along the axis."""
         return jnp.ones_like(memory[0])
 
     def steer(self, memory: Float[Array, "2"], speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """On the circle through the point."""
+        """Follows the circle through the point."""
         del params
         square = memory[0] * memory[0] + memory[1] * memory[1]
         return jnp.stack([speed, 2.0 * jnp.maximum(speed, 0.1) * memory[1] / jnp.maximum(square, 0.01)])
 
-    def turned(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Nothing to keep."""
+    def turn_round(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Returns the memory unchanged; the next scan replaces it."""
         return memory
 
 
 @struct.dataclass
 class HeadingHold:
-    """Keeps the heading it began with, by the odometer; blind.
+    """Holds the heading of the start by the odometer, without LiDAR.
 
     Attributes:
-        gain: Yaw rate for an angle, 1/s; 0 drives straight on whatever the odometer says.
+        gain: Yaw rate for an angle, 1/s; 0 drives straight on and ignores the odometer.
     """
 
     gain: float = 2.0
     uses_lidar: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, "2"]:
-        """Heading and the one to hold, rad."""
+        """Returns the heading read and the heading to hold, rad."""
         del params
         return jnp.stack([obs.heading, obs.heading])
 
     def look(
         self, memory: Float[Array, "2"], obs: Observed, command: Float[Array, "2"], params: EnvParams
     ) -> Float[Array, "2"]:
-        """The heading read."""
+        """Reads the heading."""
         del command, params
         return jnp.stack([obs.heading, memory[1]])
 
     def cosine(self, memory: Float[Array, "2"]) -> Float[Array, ""]:
-        """It takes itself to be parallel to the axis."""
+        """Returns 1: it assumes a heading along the axis."""
         return jnp.ones_like(memory[0])
 
     def steer(self, memory: Float[Array, "2"], speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Back to the heading."""
+        """Steers back to the heading to hold."""
         del params
         return jnp.stack([speed, -self.gain * wrap(memory[0] - memory[1])])
 
-    def turned(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
-        """The opposite one from now on."""
+    def turn_round(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Holds the opposite heading from now on."""
         return jnp.stack([memory[0], wrap(memory[1] + jnp.pi)])

@@ -1,10 +1,10 @@
 """Trained policies that drive without the trainer.
 
-files (safetensors + JSON) ─► load ─► feedforward, recurrent, or belief, an Agent of `subterra_jax.baselines`
+files (safetensors + JSON) ─► load ─► networks or belief, an `Agent` of `subterra_jax.baselines`
 """
 
 from subterra_jax.policies.files import PolicyError, name_for, released
-from subterra_jax.policies.loading import PREFIX, check_fits, from_tensors, load, register_released, told
+from subterra_jax.policies.loading import PREFIX, check_fits, from_tensors, load, register_released, with_map
 
 __all__ = [
     "PREFIX",
@@ -15,5 +15,5 @@ __all__ = [
     "name_for",
     "register_released",
     "released",
-    "told",
+    "with_map",
 ]

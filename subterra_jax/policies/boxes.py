@@ -1,10 +1,12 @@
-"""Boxes as a network is shown them: what the baseline `Avoidance` remembers of them, and the lane it would take.
+"""The sense of boxes: what the baseline `Avoidance` remembers of them and which lane it would take, as network inputs.
 
-This sense is made by hand, like the counting of rings; learnt is what a policy does with it. It is that of a robot of
-the usual size with the usual LiDAR, whatever `params` say: what a sense computes is part of what a policy is.
+The sense is written by hand, like the counting of rings; a policy learns what to do with it. It computes for a robot of
+the usual size with the usual LiDAR, whatever the task's params are, because it is part of the policy.
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.avoidance import N_LANES, N_SCANS, Avoidance, Surroundings
-from subterra_jax.baselines.corridor import Corridor
+from subterra_jax.baselines.steering import Corridor
 from subterra_jax.lidar import LidarParams
 from subterra_jax.parts.unicycle import VehicleParams
 
@@ -21,7 +23,12 @@ N_FEATURES = N_LANES + 7
 
 @dataclasses.dataclass(frozen=True)
 class Nominal:
-    """The robot that the sense takes itself to be on."""
+    """The robot that the sense computes for.
+
+    Attributes:
+        vehicle: Vehicle of default size.
+        lidar: Default LiDAR.
+    """
 
     vehicle: VehicleParams
     lidar: LidarParams
@@ -32,7 +39,7 @@ _AVOIDANCE = Avoidance()
 
 
 def start(batch: tuple[int, ...], n_beams: int) -> Surroundings:
-    """A memory of the right shape; the first look replaces it."""
+    """Returns a memory of the right shape; the first look replaces its values."""
     zero, hits = jnp.zeros(batch), jnp.zeros((*batch, N_SCANS, n_beams))
     return Surroundings(Corridor(zero, zero, zero), hits, hits, jnp.zeros(batch, jnp.int32), zero)
 
@@ -44,33 +51,33 @@ def look(
     first: Bool[Array, "*env"],
     turned: Bool[Array, "*env"],
 ) -> Surroundings:
-    """Takes a scan in.
+    """Updates the memory with a scan.
 
     Args:
-        memory: Before.
+        memory: Memory before the scan.
         ranges: The scan, m.
-        action: What was done since the last one, m/s and rad/s.
-        first: The scan begins an episode.
-        turned: The robot has just turned round.
+        action: Action since the last scan, m/s and rad/s.
+        first: True where the scan begins an episode.
+        turned: True where the robot has just turned round.
     """
 
-    def one(memory: Surroundings, ranges: Array, action: Array, first: Array, turned: Array) -> Surroundings:
+    def look_once(memory: Surroundings, ranges: Array, action: Array, first: Array, turned: Array) -> Surroundings:
         zero = jnp.zeros(())
-        seen = Observed(flat=ranges, ranges=ranges, distance=zero, heading=zero)
-        # Else XLA works out the first look again wherever it is used, and compiles for minutes on a CPU.
-        memory = jax.lax.optimization_barrier(_where(first, _AVOIDANCE.begin(seen, ROBOT), memory))
-        # A robot does not back up.
-        driven = jnp.stack([jnp.maximum(action[0], 0.0), action[1]])
-        after = _AVOIDANCE.look(memory, seen, driven, ROBOT)
-        return _where(turned, _AVOIDANCE.turned(after), after)
+        obs = Observed(flat=ranges, ranges=ranges, distance=zero, heading=zero)
+        # Without the barrier XLA computes the first look wherever it is used, and compiles for minutes on a CPU.
+        memory = jax.lax.optimization_barrier(_where(first, _AVOIDANCE.begin(obs, ROBOT), memory))
+        # The robot cannot reverse.
+        command = jnp.stack([jnp.maximum(action[0], 0.0), action[1]])
+        after = _AVOIDANCE.look(memory, obs, command, ROBOT)
+        return _where(turned, _AVOIDANCE.turn_round(after), after)
 
-    return _over_batch(one, ranges.ndim - 1)(memory, ranges, action, first, turned)
+    return _over_batch(look_once, ranges.ndim - 1)(memory, ranges, action, first, turned)
 
 
 def features(memory: Surroundings) -> Float[Array, "*env n"]:
-    """How far each lane is free from right to left, the lane it would take and how to turn there, room ahead, walls."""
+    """Returns the free length of each lane from right to left, the lane to take, the room ahead and the walls."""
 
-    def one(memory: Surroundings) -> Array:
+    def features_of_one(memory: Surroundings) -> Array:
         walls = memory.corridor
         _, free = _AVOIDANCE.lanes(memory, ROBOT)
         room = _AVOIDANCE.room(memory, walls.angle, ROBOT)
@@ -85,16 +92,16 @@ def features(memory: Surroundings) -> Float[Array, "*env n"]:
         ]
         return jnp.concatenate([free / _AVOIDANCE.look_ahead, jnp.stack(single)])
 
-    return _over_batch(one, memory.lane.ndim)(memory)
+    return _over_batch(features_of_one, memory.lane.ndim)(memory)
 
 
 def cosine(memory: Surroundings) -> Float[Array, "*env"]:
-    """Of the angle between heading and axis."""
+    """Returns the cosine of the angle between heading and axis."""
     return jnp.cos(memory.corridor.angle)
 
 
-def _over_batch(function, n_axes: int):
-    """A function of one robot over leading axes."""
+def _over_batch(function: Callable[..., Any], n_axes: int) -> Callable[..., Any]:
+    """Maps a function of one robot over leading axes."""
     for _ in range(n_axes):
         function = jax.vmap(function)
     return function

@@ -11,13 +11,10 @@ import numpy as np
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
-from subterra_jax.policies import senses
-from subterra_jax.policies.belief import agent as belief
-from subterra_jax.policies.belief.agent import Belief
-from subterra_jax.policies.belief.memory import Habits
-from subterra_jax.policies.feedforward import FeedForward
+from subterra_jax.policies import belief, senses
+from subterra_jax.policies.belief import Belief, Habits
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
-from subterra_jax.policies.recurrent import Recurrent
+from subterra_jax.policies.networks import FeedForward, Recurrent
 from subterra_jax.state import EnvParams
 
 Agent = FeedForward | Recurrent | Belief
@@ -69,9 +66,9 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
 
 
-def told(agent: Any, params: EnvParams) -> Any:
-    """The agent with the map of a task, if it uses one; any other as it is."""
-    return agent.told(params) if isinstance(agent, Belief) else agent
+def with_map(agent: Any, params: EnvParams) -> Any:
+    """Returns the agent with the map of a task if it uses one, any other unchanged."""
+    return agent.with_map(params) if isinstance(agent, Belief) else agent
 
 
 def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
@@ -106,7 +103,7 @@ def register_released() -> tuple[str, ...]:
     names = tuple(PREFIX + name for name in released() if not name.startswith("B2"))
     for name in names:
         if name not in registry.names():
-            registry.register(name, lambda params, name=name: told(load(name.removeprefix(PREFIX))[0], params))  # type: ignore[misc]
+            registry.register(name, lambda params, name=name: with_map(load(name.removeprefix(PREFIX))[0], params))  # type: ignore[misc]
     return names
 
 

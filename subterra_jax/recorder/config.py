@@ -17,7 +17,7 @@ from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
 from subterra_jax.lidar3d import beams
-from subterra_jax.policies import check_fits, load, told
+from subterra_jax.policies import check_fits, load
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -171,7 +171,7 @@ def open_agent(config: RecorderConfig, world: World) -> Agent:
         return make_agent(config.agent, world.params)
     policy = load(config.policy)[0]
     check_fits(policy, dataclasses.replace(world.env, estimates=True), world.params, config.policy)
-    return told(policy, world.params)
+    return with_map(policy, world.params)
 
 
 def draw_episode(config: RecorderConfig, world: World) -> tuple[int, int | None]:

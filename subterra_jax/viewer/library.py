@@ -48,7 +48,7 @@ def register_agents(files: tuple[Path, ...]) -> tuple[str, ...]:
 
 def _register(name: str, agent: Any) -> None:
     if name not in registry.names():
-        registry.register(name, lambda params: policies.told(agent, params))
+        registry.register(name, lambda params: policies.with_map(agent, params))
 
 
 def drive_episode(

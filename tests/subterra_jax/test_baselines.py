@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.baselines import corridor, drift, mission
+from subterra_jax.baselines import navigator, stations, steering
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.avoidance import Avoidance
 from subterra_jax.baselines.registry import make_agent
@@ -40,14 +40,14 @@ def test_the_variance_of_a_wandering_error_is_its_double_integral():
     distance, wander = 70.0, WanderParams(sigma=0.02, length=30.0)
     u = (np.arange(1400) + 0.5) * distance / 1400
     numeric = 0.02**2 * np.exp(-np.abs(np.subtract.outer(u, u)) / 30.0).sum() * (distance / 1400) ** 2
-    np.testing.assert_allclose(drift.wander_variance(jnp.float32(distance), wander), numeric, rtol=1e-4)
+    np.testing.assert_allclose(stations.wander_variance(jnp.float32(distance), wander), numeric, rtol=1e-4)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.1, -0.1])
 def test_the_first_look_finds_both_walls_and_the_angle_between_them(params, angle):
-    look = jax.jit(corridor.look)
+    look = jax.jit(steering.track_walls)
     ranges = jnp.asarray(between_walls(2.5, 3.1, angle))
-    found = corridor.first_look(ranges, params)
+    found = steering.find_walls(ranges, params)
     for _ in range(20):
         found = look(found, ranges, params)
     np.testing.assert_allclose([found.left, found.right, found.angle], [2.5, 3.1, angle], atol=2e-3)
@@ -55,9 +55,9 @@ def test_the_first_look_finds_both_walls_and_the_angle_between_them(params, angl
 
 
 def test_beams_without_echo_and_beams_in_dust_do_not_move_the_walls(params):
-    look = jax.jit(corridor.look)
+    look = jax.jit(steering.track_walls)
     clean = between_walls(2.8, 2.8, 0.0)
-    found = corridor.first_look(jnp.asarray(clean), params)
+    found = steering.find_walls(jnp.asarray(clean), params)
     for i in range(30):
         spoilt = clean.copy()
         spoilt[(np.arange(6) + i) % 16] = 30.0
@@ -68,38 +68,38 @@ def test_beams_without_echo_and_beams_in_dust_do_not_move_the_walls(params):
 
 
 def test_a_command_moves_the_walls_as_it_moves_the_robot(params):
-    before = corridor.Corridor(jnp.float32(2.0), jnp.float32(3.0), jnp.float32(np.pi / 2))
-    after = corridor.moved(before, jnp.array([2.0, 0.0]), params)
+    before = steering.Corridor(jnp.float32(2.0), jnp.float32(3.0), jnp.float32(np.pi / 2))
+    after = steering.predict_walls(before, jnp.array([2.0, 0.0]), params)
     np.testing.assert_allclose([after.left, after.right], [1.8, 3.2], atol=1e-6)
-    back = corridor.turned(before)
+    back = steering.mirror_walls(before)
     np.testing.assert_allclose([back.left, back.right, back.angle], [3.0, 2.0, -np.pi / 2], atol=1e-6)
 
 
 def test_the_last_period_before_the_goal_just_reaches_it(params):
     obs = observation(goal=jnp.float32(40.0), ring_pitch=jnp.zeros(()))
-    start, speed = mission.start_mission(obs), []
+    start, speed = navigator.start_mission(obs), []
     for station in (30.0, 39.9, 40.5):
         estimate = Station(jnp.float32(station), jnp.zeros(()), jnp.ones(()))
-        speed.append(float(mission.wanted_speed(start, estimate, obs, params.replace(errand="stop"))))
+        speed.append(float(navigator.target_speed(start, estimate, obs, params.replace(errand="stop"))))
     np.testing.assert_allclose(speed, [2.0, 1.0, 0.0], atol=1e-4)
-    there = mission.arrived(start, jnp.float32(1.0), jnp.float32(1.0), params)
+    there = navigator.check_arrival(start, jnp.float32(1.0), jnp.float32(1.0), params)
     assert there.stopped
     # Slowed down by something else, it has not arrived.
-    assert not mission.arrived(start, jnp.float32(1.0), jnp.float32(0.5), params).stopped
+    assert not navigator.check_arrival(start, jnp.float32(1.0), jnp.float32(0.5), params).stopped
 
 
 def test_it_turns_by_half_a_turn_once_the_flag_is_up_and_never_stands_for_it(params):
     heading, flag = 3.0, 0.0
-    now = mission.start_mission(observation(heading=jnp.float32(heading), flag=jnp.zeros(()), goal=jnp.float32(9.0)))
+    now = navigator.start_mission(observation(heading=jnp.float32(heading), flag=jnp.zeros(()), goal=jnp.float32(9.0)))
     turned = 0.0
     for step in range(60):
         flag = 1.0 if step >= 5 else 0.0
         wrapped = (heading + np.pi) % (2 * np.pi) - np.pi
         obs = observation(heading=jnp.float32(wrapped), flag=jnp.float32(flag), goal=jnp.float32(9.0))
-        now, raised, _ = mission.watch(now, obs, params.replace(errand="return"))
+        now, raised, _ = navigator.watch(now, obs, params.replace(errand="return"))
         assert bool(raised) == (step == 5)
-        if mission.turning(now):
-            speed, rate = np.asarray(mission.turn_command(now, params))
+        if navigator.is_turning(now):
+            speed, rate = np.asarray(navigator.turn_command(now, params))
             assert speed > params.goal.still_speed
             heading, turned = heading + 0.1 * rate, turned + 0.1 * rate
     assert now.direction == -1.0

@@ -10,17 +10,16 @@ import pytest
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines.agent import observed
-from subterra_jax.policies.belief import grid
-from subterra_jax.policies.belief.agent import Belief
-from subterra_jax.policies.belief.memory import Habits
-from subterra_jax.policies.belief.scan import N_FEATURES
+from subterra_jax.policies import belief_grid as grid
+from subterra_jax.policies.belief import Belief, Habits
+from subterra_jax.policies.belief_scan import N_FEATURES
 from tests.subterra_jax import tunnels
 
 TASK = "Subterra/Relocalise-v0"
 LENGTH, POCKET = 70.0, 40.0
 CELL, N = 0.1, 512
-TAPE = jnp.asarray(grid.position(N, CELL))
-summary, turned_round, spread = (jax.jit(f) for f in (grid.summary, grid.turned_round, grid.spread))
+TAPE = jnp.asarray(grid.cell_positions(N, CELL))
+summarise, turn_round, spread = (jax.jit(f) for f in (grid.summarise, grid.turn_round, grid.spread))
 
 
 def one_pocket(plan_of):
@@ -47,7 +46,7 @@ def world(plan_of):
 
 @pytest.fixture(scope="module")
 def agent(world):
-    return untrained().told(world[1])
+    return untrained().with_map(world[1])
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +58,8 @@ def drive(world):
         """Station and direction facing, true and believed, while an agent drives for 6 s from a start of choice."""
         key = jax.random.key(3)
         drawn = env.draw_reset(key, (), params)
-        state = env.begin(dataclasses.replace(drawn, goal=jnp.stack([jnp.zeros(()), share, way])), params)
+        spread, _, offset = drawn["rule"]
+        state = env.begin({**drawn, "rule": (spread, jnp.stack([jnp.zeros(()), share, way]), offset)}, params)
         noise = env.draw_step(key, (), params)
         memory = agent.begin(key, observed(env, params, env.observe(state, noise, params)), params)
 
@@ -101,7 +101,7 @@ def test_a_released_policy_believes_the_same_to_the_last_bit(drive, agent, drive
     again = policies.from_tensors("belief", layout, tensors, agent.name)
     policies.check_fits(again, *world, "again")
     assert again.map is None
-    found = drive(policies.told(again, world[1]), 0.5, 1.0)
+    found = drive(policies.with_map(again, world[1]), 0.5, 1.0)
     np.testing.assert_array_equal(found[2][-1], driven[0][2][-1])
 
 
@@ -124,7 +124,7 @@ def at(way: int, place: float) -> jax.Array:
 
 @pytest.mark.parametrize(("way", "station"), [(0, 22.05), (1, 50.0 - 22.05)])
 def test_driving_on_leads_each_tape_its_own_way(way, station):
-    told = summary(at(way, 12.05), grid.stations(TAPE, jnp.float32(10.0), jnp.float32(50.0)), jnp.float32(0.8), CELL)
+    told = summarise(at(way, 12.05), grid.stations(TAPE, jnp.float32(10.0), jnp.float32(50.0)), jnp.float32(0.8), CELL)
     assert float(told.station) == pytest.approx(station, abs=1e-3)
     assert float(told.direction) == (1.0, -1.0)[way]
     assert float(told.mass) == pytest.approx(1.0)
@@ -133,9 +133,9 @@ def test_driving_on_leads_each_tape_its_own_way(way, station):
 @pytest.mark.parametrize("way", [0, 1])
 def test_turning_round_changes_the_direction_and_not_the_place(way):
     length, driven = jnp.float32(50.0), jnp.float32(10.03)
-    before = summary(at(way, 12.05), grid.stations(TAPE, driven, length), jnp.float32(0.8), CELL)
-    turned = turned_round(at(way, 12.05), driven, length, CELL)
-    after = summary(turned, grid.stations(TAPE, jnp.float32(0.0), length), jnp.float32(0.8), CELL)
+    before = summarise(at(way, 12.05), grid.stations(TAPE, driven, length), jnp.float32(0.8), CELL)
+    turned = turn_round(at(way, 12.05), driven, length, CELL)
+    after = summarise(turned, grid.stations(TAPE, jnp.float32(0.0), length), jnp.float32(0.8), CELL)
     assert float(after.station) == pytest.approx(float(before.station), abs=1e-3)
     assert float(after.direction) == -float(before.direction)
     assert float(jnp.sum(jnp.exp(turned))) == pytest.approx(1.0, abs=1e-5)
@@ -155,7 +155,7 @@ def test_dead_reckoning_spreads_the_belief_by_its_variance_and_a_leak_reaches_ev
 
 
 def test_a_start_anywhere_is_as_likely_everywhere_but_at_the_ends():
-    mass = np.exp(grid.evenly(TAPE, jnp.float32(50.0), jnp.float32(5.0)))
+    mass = np.exp(grid.uniform_log_mass(TAPE, jnp.float32(50.0), jnp.float32(5.0)))
     inside = (np.asarray(TAPE) > 5.0) & (np.asarray(TAPE) < 45.0)
     np.testing.assert_allclose(mass[:, inside], 1.0 / (2 * inside.sum()), rtol=1e-3)
     assert mass[:, ~inside].max() < 1e-9

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
-from subterra_jax.policies.belief.memory import Habits
+from subterra_jax.policies.belief import Habits
 from train.checks import at_least, not_negative, positive, share
 from train.config import TrainConfig, check_common, known_preset
 from train.errors import ConfigError

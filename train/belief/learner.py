@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
 from subterra_jax.baselines.wallmap import WallMap, wall_map
-from subterra_jax.policies.belief import scan as belief_scan
+from subterra_jax.policies import belief_scan
 from subterra_jax.rules import Relocalise
 from train.belief import lessons
 from train.belief.config import BeliefConfig, check
@@ -153,7 +153,7 @@ class BeliefLearner(parts.Whole):
 
         @jax.checkpoint
         def scan(ranges: Array, corridor: Any, station: Float[Array, "way"]) -> Float[Array, "way"]:
-            place = belief_scan.place_of(corridor, station, ways.forward)
+            place = belief_scan.pose_at(corridor, station, ways.forward)
             gain = belief_scan.score(tensors, walls, place, ranges, range_max)
             return jnp.where((station > 0.0) & (station < tunnel.length), gain, _OUTSIDE)
 

@@ -8,8 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Observed, observed
-from subterra_jax.baselines.corridor import Corridor
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, Corridor
 
 _NEAR = 1.5  # m: up to here a wrong way is a near one
 _PHASE_SIGMA = 0.1  # m about whole rings from the true way

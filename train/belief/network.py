@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
-from subterra_jax.policies.belief.agent import KIND
-from subterra_jax.policies.belief.scan import N_FEATURES
+from subterra_jax.policies.belief import KIND
+from subterra_jax.policies.belief_scan import N_FEATURES
 
 Weights = dict[str, Any]
 
@@ -22,7 +22,7 @@ class BeliefLayout:
         action_low: Smallest action, m/s and rad/s.
         action_high: Largest action, m/s and rad/s.
         hidden: Widths of the network.
-        habits: Fields of `subterra_jax.policies.belief.memory.Habits`.
+        habits: Fields of `subterra_jax.policies.belief.Habits`.
     """
 
     action_low: tuple[float, ...]
@@ -59,6 +59,6 @@ class BeliefNetworks:
 
 
 def named(weights: Weights) -> dict[str, Any]:
-    """The weights by the names that `subterra_jax.policies.belief.scan` knows."""
+    """The weights by the names that `subterra_jax.policies.belief_scan` knows."""
     layers = {f"scan.{name}.{part}": leaf for name, layer in weights["scan"].items() for part, leaf in layer.items()}
     return {**layers, "temper": weights["temper"], "nominal": weights["nominal"]}

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import ClassVar
 
-from subterra_jax.policies.trackers import TRACKERS
+from subterra_jax.policies.senses import TRACKERS
 from train.config import TrainConfig, at_least, check_common, known_preset, not_negative, positive, share
 from train.errors import ConfigError
 

@@ -123,7 +123,7 @@ class RecurrentNetworks:
         self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
         spread = math.log(math.expm1(layout.init_std - layout.min_std))
         self._offset = jnp.concatenate([jnp.zeros(n_action), jnp.full(n_action, spread)])
-        self.centres = senses.centres(layout.bins, layout.bin_width)
+        self.centres = senses.bin_centres(layout.bins, layout.bin_width)
 
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
         """Untrained weights."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from subterra_jax.baselines import navigator
 from subterra_jax.baselines.agent import Agent, shown
 from subterra_jax.episode import ask, in_tunnel, look
-from subterra_jax.policies import recurrent, senses
+from subterra_jax.policies import networks, senses
 
 
 def blank(env: Any, agent: Agent, params: Any, n_envs: int) -> Any:
@@ -72,8 +72,8 @@ def driven(before: Any, after: Any, action: Float[Array, "env 2"]) -> Any:
         # A robot does not back up: a speed below 0 is standing.
         driven = jnp.maximum(action, jnp.array([0.0, -jnp.inf]))
         return dataclasses.replace(after, command=driven, mission=mission)
-    if isinstance(after, recurrent.Memory):
-        return dataclasses.replace(after, reckoning=senses.instead(before.reckoning, after.reckoning, action))
+    if isinstance(after, networks.RecurrentMemory):
+        return dataclasses.replace(after, reckoning=senses.replace_action(before.reckoning, after.reckoning, action))
     return after
 
 

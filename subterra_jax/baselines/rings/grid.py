@@ -23,14 +23,13 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.drift import fault_sizes
 from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Delay, StepDistances, advance_delay, begin_delay, delayed_distance
 from subterra_jax.baselines.rings import bank
 from subterra_jax.baselines.rings.loop import RingMemory, begin_memory
 from subterra_jax.baselines.rings.walls import Bumps, Walls, begin_walls, track_walls
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven, Station, fault_sizes
 from subterra_jax.baselines.steering import CentreLine, Steering
 from subterra_jax.parts.faults import FaultParams
 from subterra_jax.state import EnvParams
@@ -313,9 +312,9 @@ class PacedSteering:
             speed = jnp.minimum(speed, jnp.where(memory.driven < self.learning, self.slow, self.cruise))
         return self.steering.steer(memory.steering, speed, params)
 
-    def turned(self, memory: PaceMemory) -> PaceMemory:
+    def turn_round(self, memory: PaceMemory) -> PaceMemory:
         """Return the memory after a turn by half a circle."""
-        return dataclasses.replace(memory, steering=self.steering.turned(memory.steering))
+        return dataclasses.replace(memory, steering=self.steering.turn_round(memory.steering))
 
 
 def ring_filter(params: EnvParams) -> Navigator:

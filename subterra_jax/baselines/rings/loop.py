@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.baselines import drift
+from subterra_jax.baselines import stations
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.fused import Belief, FusedCount
 from subterra_jax.baselines.reckoning import ODOMETER_SHARE
@@ -197,7 +197,7 @@ class RingMemory:
 
 def begin_memory(track: Any, obs: Observed, params: EnvParams) -> RingMemory:
     """Return the memory at the believed start."""
-    start = jnp.stack([jnp.asarray(value, jnp.float32) for value in drift.believed_start(params)])
+    start = jnp.stack([jnp.asarray(value, jnp.float32) for value in stations.believed_start(params)])
     return RingMemory(start, track, FusedCount().begin(obs, params))
 
 

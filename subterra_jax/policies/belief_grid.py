@@ -1,7 +1,7 @@
-"""A belief over where an episode began: one cell for each place and way to face, so that driving on moves nothing.
+"""A belief over where a drive began: one cell for each station and direction, so that driving moves no mass.
 
-A robot that began at tape position u and has driven D is at u + D, whatever u is; on the tape of those who face falling
-stations, positions count from the far mouth. What dead reckoning gets wrong is a slow spreading over neighbour cells.
+A robot that began at tape position u and has driven D is at u + D, whatever u is. On the tape of robots that face
+falling stations, positions count from the far mouth. Errors of dead reckoning slowly spread mass over neighbour cells.
 """
 
 import jax.numpy as jnp
@@ -14,11 +14,11 @@ FORWARD = np.array([[1.0], [-1.0]], np.float32)
 
 @struct.dataclass
 class Summary:
-    """What a belief says.
+    """Most likely place of a belief.
 
     Attributes:
         station: Mean station of the heaviest cluster, m.
-        sigma: Standard deviation of everything about it, m; who faces the other way counts by station.
+        sigma: Standard deviation of the whole belief about `station`, m, whatever the direction.
         mass: Share of the belief in that cluster.
         direction: 1 where it faces growing stations, else −1.
     """
@@ -29,30 +29,32 @@ class Summary:
     direction: Float[Array, ""]
 
 
-def position(n_cells: int, cell: float) -> Float[np.ndarray, "n_cells"]:
-    """Tape positions of the cells' middles, m."""
+def cell_positions(n_cells: int, cell: float) -> Float[np.ndarray, "n_cells"]:
+    """Returns the tape positions of the cells' centres, m."""
     return (cell * (np.arange(n_cells) + 0.5)).astype(np.float32)
 
 
-def evenly(tape: Float[Array, "n_cells"], length: Float[Array, ""], margin: Float[Array, ""]) -> Float[Array, "2 n"]:
-    """Log mass of a start anywhere but `margin` (m) from the ends, facing either way."""
+def uniform_log_mass(
+    tape: Float[Array, "n_cells"], length: Float[Array, ""], margin: Float[Array, ""]
+) -> Float[Array, "2 n"]:
+    """Returns the log mass of a start anywhere but `margin` (m) from the ends, in either direction."""
     inside = (tape >= margin) & (tape <= length - margin)
     mass = inside / jnp.maximum(2.0 * jnp.sum(inside), 1.0)
     return jnp.log(jnp.broadcast_to(mass, (2, len(tape))) + 1e-12)
 
 
 def stations(tape: Float[Array, "*n"], driven: Float[Array, ""], length: Float[Array, ""]) -> Float[Array, "2 *n"]:
-    """Stations of both tapes' cells after a drive, m."""
+    """Returns the stations of both tapes' cells after a drive, m."""
     here = tape + driven
     return jnp.stack([here, length - here])
 
 
 def spread(log_mass: Float[Array, "2 n"], variance: Float[Array, ""], leak: Float[Array, ""]) -> Float[Array, "2 n"]:
-    """The belief after some driving.
+    """Spreads a belief over neighbour cells after some driving.
 
     Args:
-        log_mass: Before; sums to 1.
-        variance: Of what dead reckoning has added, in squares of a cell, up to 0.5.
+        log_mass: Belief before; its mass sums to 1.
+        variance: Variance that dead reckoning has added, in squares of a cell, up to 0.5.
         leak: Share of the belief that is given to all cells alike, since anything may be wrong.
     """
     share, mass = 0.5 * jnp.minimum(variance, 0.5), jnp.exp(log_mass)
@@ -61,19 +63,19 @@ def spread(log_mass: Float[Array, "2 n"], variance: Float[Array, ""], leak: Floa
     return jnp.log((1.0 - leak) * mass + leak / mass.size + 1e-30)
 
 
-def weighed(log_mass: Float[Array, "2 n"], gain: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
-    """The belief after a scan of such log likelihoods; sums to 1."""
-    raw = log_mass + gain
+def add_evidence(log_mass: Float[Array, "2 n"], log_likelihood: Float[Array, "2 n"]) -> Float[Array, "2 n"]:
+    """Returns the belief after a scan with these log likelihoods; its mass sums to 1."""
+    raw = log_mass + log_likelihood
     raw = raw - jnp.max(raw)
     return raw - jnp.log(jnp.sum(jnp.exp(raw)))
 
 
-def turned_round(
+def turn_round(
     log_mass: Float[Array, "2 n"], driven: Float[Array, ""], length: Float[Array, ""], cell: float
 ) -> Float[Array, "2 n"]:
-    """The belief of a robot that has turned round where it stood: a new drive begins here, on the other tape."""
+    """Returns the belief of a robot that has turned round on the spot: a new drive begins here, on the other tape."""
     n = log_mass.shape[1]
-    # Who is now at p on one tape was at length - p on the other, having begun a drive earlier.
+    # Position p on one tape was length - p on the other, of a drive that began `driven` earlier.
     before = (length - driven) / cell - jnp.arange(n) - 1.0
     low = jnp.floor(before)
     share, first = before - low, low.astype(jnp.int32)
@@ -83,32 +85,32 @@ def turned_round(
     return jnp.log(mass / jnp.maximum(jnp.sum(mass), 1e-12) + 1e-12)
 
 
-def summary(
+def summarise(
     log_mass: Float[Array, "2 n"], station: Float[Array, "2 n"], reach: Float[Array, ""], cell: float
 ) -> Summary:
-    """What the belief says.
+    """Finds the heaviest cluster of a belief.
 
     Args:
-        log_mass: The belief; sums to 1.
-        station: Of the cells, m.
+        log_mass: The belief; its mass sums to 1.
+        station: Stations of the cells, m.
         reach: Half the length of a cluster, m.
         cell: Length of a cell, m.
     """
     mass = jnp.exp(log_mass)
-    near = _near(mass, jnp.maximum(jnp.round(reach / cell), 1.0).astype(jnp.int32))
-    # Of the many cells about a narrow peak that have it all within reach, the peak itself.
+    near = _mass_within(mass, jnp.maximum(jnp.round(reach / cell), 1.0).astype(jnp.int32))
+    # All cells about a narrow peak have it within reach; the small term picks the peak itself.
     best = jnp.argmax(near + 0.01 * mass)
     way, at = best // mass.shape[1], best % mass.shape[1]
     inside: Bool[Array, "2 n"] = jnp.abs(station - station[way, at]) <= reach + 0.5 * cell
-    chosen = mass * inside * (jnp.arange(2)[:, None] == way)
-    share = jnp.maximum(jnp.sum(chosen), 1e-12)
-    middle = jnp.sum(chosen * station) / share
+    cluster = mass * inside * (jnp.arange(2)[:, None] == way)
+    share = jnp.maximum(jnp.sum(cluster), 1e-12)
+    middle = jnp.sum(cluster * station) / share
     sigma = jnp.sqrt(jnp.sum(mass * (station - middle) ** 2))
     return Summary(middle, sigma, share, 1.0 - 2.0 * way)
 
 
-def _near(mass: Float[Array, "2 n"], reach: Array) -> Float[Array, "2 n"]:
-    """Mass within so many cells of each."""
+def _mass_within(mass: Float[Array, "2 n"], reach: Array) -> Float[Array, "2 n"]:
+    """Returns the mass within `reach` cells of each cell."""
     n = mass.shape[1]
     total = jnp.concatenate([jnp.zeros((2, 1)), jnp.cumsum(mass, axis=1)], axis=1)
     index = jnp.arange(n)

@@ -1,1 +1,0 @@
-"""A histogram filter on a known map, whose sensor is learnt."""

@@ -1,0 +1,198 @@
+"""Trained networks as agents: a multilayer perceptron over stacked observations, and a GRU that estimates its station.
+
+Both act by the mean of their distribution. Their weights are tensors by name, as a policy's file holds them.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.policies import senses
+from subterra_jax.state import EnvParams
+
+Tensors = dict[str, Float[Array, "..."]]
+_CLIP = 10.0  # standard deviations
+
+
+def dense(tensors: Tensors, name: str, x: Float[Array, "*batch n"]) -> Float[Array, "*batch m"]:
+    """Returns `x · <name>.kernel + <name>.bias`."""
+    return x @ tensors[f"{name}.kernel"] + tensors[f"{name}.bias"]
+
+
+def perceptron(
+    tensors: Tensors, name: str, x: Float[Array, "*batch n"], activation: Callable[[Array], Array]
+) -> Float[Array, "*batch m"]:
+    """Applies the layers `<name>.hidden_0`, `<name>.hidden_1`, …, with an activation between each two."""
+    index = 0
+    while True:
+        x = dense(tensors, f"{name}.hidden_{index}", x)
+        index += 1
+        if f"{name}.hidden_{index}.kernel" not in tensors:
+            return x
+        x = activation(x)
+
+
+def squash(mean: Float[Array, "*batch n"], low: Float[Array, "n"], high: Float[Array, "n"]) -> Float[Array, "*batch n"]:
+    """Maps a network's output to an action between `low` and `high`, m/s and rad/s, by a tanh."""
+    return low + 0.5 * (jnp.tanh(mean) + 1.0) * (high - low)
+
+
+@struct.dataclass
+class FeedForward:
+    """A multilayer perceptron. It estimates its station only where the task asks for a report.
+
+    Attributes:
+        tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `policy.hidden_<i>`.
+        low: Smallest action, m/s and rad/s.
+        high: Largest action, m/s and rad/s.
+        frames: Number of observations in its input.
+        name: Name on the leaderboard.
+        uses_lidar: Always true: it reads the ranges.
+        uses_map: Always false.
+        privileged: Always false: it gets no truth.
+    """
+
+    tensors: Tensors
+    low: Float[Array, "n_action"]
+    high: Float[Array, "n_action"]
+    frames: int = struct.field(pytree_node=False)
+    name: str = struct.field(pytree_node=False, default="ppo-mlp")
+    uses_lidar: bool = struct.field(pytree_node=False, default=True)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    @property
+    def n_observation(self) -> int:
+        """Length of one observation."""
+        return self.tensors["statistics.mean"].shape[0]
+
+    def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Float[Array, "frames n_obs"]:
+        """Returns the first observation, repeated."""
+        del key, params
+        return jnp.repeat(obs.flat[None], self.frames, axis=0)
+
+    def act(
+        self, key: PRNGKeyArray, memory: Float[Array, "frames n_obs"], obs: Observed, params: EnvParams, known: Known
+    ) -> tuple[Action, Float[Array, "frames n_obs"]]:
+        """Returns the action of one control period, and the stack with the newest observation."""
+        del key, params, known
+        stack = jnp.concatenate([memory[1:], obs.flat[None]])
+        return self.answer(stack), stack
+
+    def answer(self, stack: Float[Array, "frames n_obs"]) -> Action:
+        """Returns the action for a stack of observations, oldest first."""
+        inputs = (stack - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
+        parameters = perceptron(self.tensors, "policy", jnp.clip(inputs, -_CLIP, _CLIP).reshape(-1), jax.nn.swish)
+        n_action = len(self.low)
+        no_estimate = jnp.array([0.0, 0.0, jnp.nan, 0.0, 0.0])
+        return no_estimate.at[:n_action].set(squash(parameters[:n_action], self.low, self.high))
+
+
+@struct.dataclass
+class RecurrentMemory:
+    """Memory of a recurrent policy.
+
+    Attributes:
+        hidden: Hidden state of the GRU.
+        reckoning: Dead reckoning and counted rings since the start.
+    """
+
+    hidden: Float[Array, "hidden"]
+    reckoning: senses.Reckoning
+
+
+@struct.dataclass
+class Recurrent:
+    """A GRU with an estimation head, which drives towards a goal and says where it is.
+
+    Attributes:
+        tensors: Layers `memory.Dense_0` and `memory.Dense_1`, matrix `memory.recurrent`, layer `estimate`, and layers
+            `policy.hidden_<i>`.
+        low: Smallest action, m/s and rad/s.
+        high: Largest action, m/s and rad/s.
+        bin_width: Width of a bin of the estimation head, m.
+        shown: Choice of the network's inputs.
+        name: Name on the leaderboard.
+        uses_lidar: Always true: it reads the ranges.
+        uses_map: Always false.
+        privileged: Always false: it gets no truth.
+    """
+
+    tensors: Tensors
+    low: Float[Array, "2"]
+    high: Float[Array, "2"]
+    bin_width: float = struct.field(pytree_node=False)
+    shown: senses.Senses = struct.field(pytree_node=False, default=senses.PLAIN)
+    name: str = struct.field(pytree_node=False, default="ppo-gru")
+    uses_lidar: bool = struct.field(pytree_node=False, default=True)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    @property
+    def n_features(self) -> int:
+        """Number of the network's inputs."""
+        return self.tensors["memory.Dense_0.kernel"].shape[0]
+
+    @property
+    def n_beams(self) -> int:
+        """Number of beams of the scans that it was trained on."""
+        return self.shown.n_beams(self.n_features)
+
+    def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> RecurrentMemory:
+        """Returns an empty memory."""
+        del key, obs, params
+        return self.blank()
+
+    def blank(self) -> RecurrentMemory:
+        """Returns the memory before the first step."""
+        hidden = jnp.zeros(self.tensors["memory.recurrent"].shape[0])
+        return RecurrentMemory(hidden, senses.start((), self.n_beams, self.shown))
+
+    def act(
+        self, key: PRNGKeyArray, memory: RecurrentMemory, obs: Observed, params: EnvParams, known: Known
+    ) -> tuple[Action, RecurrentMemory]:
+        """Returns the action of one control period, and the memory after it."""
+        del key, known
+        return self.answer(memory, obs, jnp.asarray(params.start.station, jnp.float32))
+
+    def answer(self, memory: RecurrentMemory, obs: Observed, start: Float[Array, ""]) -> tuple[Action, RecurrentMemory]:
+        """Returns action and memory, from the observation and the believed start (m)."""
+        parts = {
+            "ranges": obs.ranges,
+            "odometry": jnp.stack([obs.distance, obs.heading]),
+            "goal": jnp.atleast_1d(obs.goal),
+            "ring_pitch": jnp.atleast_1d(obs.ring_pitch),
+            "flag": jnp.atleast_1d(obs.flag),
+        }
+        sight = senses.look(parts, start, memory.reckoning)
+        hidden = self._update_hidden(memory.hidden, sight.features)
+        error, log_sigma = self._estimate(hidden)
+        aim = senses.aim(sight.ahead - error, log_sigma)
+        parameters = perceptron(self.tensors, "policy", jnp.concatenate([hidden, aim]), jax.nn.swish)
+        action = squash(parameters[:2], self.low, self.high)
+        after = RecurrentMemory(hidden, senses.advance(sight.reckoning, action, False))
+        # The estimate is asked for the end of this control period.
+        direction = 1.0 - 2.0 * sight.reckoning.back
+        station = start + sight.station + error + direction * senses.PERIOD * jnp.maximum(action[0], 0.0)
+        return jnp.stack([action[0], action[1], station, log_sigma, direction]), after
+
+    def _update_hidden(self, before: Float[Array, "hidden"], features: Float[Array, "n"]) -> Float[Array, "hidden"]:
+        """Returns the hidden state one step later."""
+        encoded = jax.nn.swish(dense(self.tensors, "memory.Dense_0", features))
+        from_input = jnp.split(dense(self.tensors, "memory.Dense_1", encoded), 3)
+        from_hidden = jnp.split(before @ self.tensors["memory.recurrent"], 3)
+        reset = jax.nn.sigmoid(from_input[0] + from_hidden[0])
+        update = jax.nn.sigmoid(from_input[1] + from_hidden[1] + 1.0)
+        return update * before + (1.0 - update) * jnp.tanh(from_input[2] + reset * from_hidden[2])
+
+    def _estimate(self, hidden: Float[Array, "hidden"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Estimates true less tracked distance, m, and the log of its standard deviation."""
+        share = jax.nn.softmax(dense(self.tensors, "estimate", hidden))
+        centres = senses.bin_centres(share.shape[-1], self.bin_width)
+        error = jnp.sum(share * centres)
+        variance = jnp.sum(share * jnp.square(centres - error))
+        return error, 0.5 * jnp.log(variance + self.bin_width**2 / 12.0)
