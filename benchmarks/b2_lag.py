@@ -15,7 +15,7 @@ from subterra_jax.b2.film import Driver
 from subterra_jax.b2.gait import RELEASED
 from subterra_jax.b2.gym import B2Env
 from subterra_jax.b2.transfer import identify
-from train import cli
+from train.log import print_table
 
 _SPEEDS = (0.0, 0.3, 0.5, 0.8)  # m/s; one is drawn every 2 s
 _TURN = 0.3  # rad/s; largest noise of the yaw rate, drawn every 0.6 s
@@ -86,7 +86,7 @@ def command(arguments: Command) -> None:
     except ValueError as cause:
         raise BenchmarkError(f"gait {arguments.policy}: {cause}") from cause
     ended_early = sum(len(part) < arguments.steps for part, _ in walks)
-    cli.table(
+    print_table(
         f"gait {arguments.policy}", {**dataclasses.asdict(lag), "steps": len(commands), "ended_early": ended_early}
     )
 

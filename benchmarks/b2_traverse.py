@@ -21,8 +21,8 @@ from subterra_jax.b2.gait import RELEASED
 from subterra_jax.baselines import registry
 from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
-from train import cli
-from train.evaluate import open_agent
+from train.log import print_table
+from train.policies import open_agent
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def command(arguments: Command) -> None:
     figures = transfer.figures(*walks, params)
     print(file=sys.stderr)
     figures["wall_seconds"] = time.perf_counter() - started
-    cli.table(f"{arguments.robots} B2s, {arguments.engine}, gait {arguments.policy}, {arguments.agent}", figures)
+    print_table(f"{arguments.robots} B2s, {arguments.engine}, gait {arguments.policy}, {arguments.agent}", figures)
     if arguments.out is not None:
         arguments.out.write_text(json.dumps({**vars(arguments), **figures}, default=str, indent=1) + "\n")
 

@@ -1,12 +1,40 @@
-"""What a training run is told: frozen dataclasses, presets by task and machine, and the checks before compiling."""
+"""Settings of a training run: frozen dataclasses, presets by task and machine, and checks before compiling."""
 
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
+from subterra_jax.b2.gait import RELEASED
 from subterra_jax.tasks import TaskError, find
-from train.checks import at_least, not_negative, positive, share
 from train.errors import ConfigError
+
+
+def at_least(config: Any, least: int, *names: str) -> None:
+    """Raises `ConfigError` where one of the settings is less."""
+    for name in names:
+        if getattr(config, name) < least:
+            raise ConfigError(f"{name} must be at least {least}, got {getattr(config, name)}")
+
+
+def positive(config: Any, *names: str) -> None:
+    """Raises `ConfigError` where one of the settings is not above 0 and finite."""
+    for name in names:
+        if not 0.0 < getattr(config, name) < math.inf:
+            raise ConfigError(f"{name} must be positive, got {getattr(config, name)}")
+
+
+def not_negative(config: Any, *names: str) -> None:
+    """Raises `ConfigError` where one of the settings is below 0 or not finite."""
+    for name in names:
+        if not 0.0 <= getattr(config, name) < math.inf:
+            raise ConfigError(f"{name} must not be negative, got {getattr(config, name)}")
+
+
+def share(config: Any, *names: str) -> None:
+    """Raises `ConfigError` where one of the settings is no share."""
+    for name in names:
+        if not 0.0 <= getattr(config, name) <= 1.0:
+            raise ConfigError(f"{name} must lie between 0 and 1, got {getattr(config, name)}")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +158,7 @@ _OTHERS: dict[str, dict[str, float | int]] = {
 
 
 def make_config(task: str, preset: str = "cpu") -> PPOConfig:
-    """The settings that are known to learn a task on one kind of machine.
+    """Returns the settings that are known to learn a task on one kind of machine.
 
     Args:
         task: Task id, `Subterra/TraverseShort-v0` say.
@@ -155,7 +183,7 @@ def known_preset(preset: str) -> None:
 
 
 def check(config: PPOConfig) -> PPOConfig:
-    """The settings themselves, once they are known to make sense.
+    """Refuses settings that make no sense, and returns the others.
 
     Raises:
         ConfigError: Naming the first setting that does not, and its value.
@@ -190,3 +218,18 @@ def check_common(config: TrainConfig) -> None:
     share(config, "discount", "gae_lambda")
     if not 0.0 < config.min_std < config.init_std:
         raise ConfigError(f"min_std must lie between 0 and init_std = {config.init_std}, got {config.min_std}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Legs:
+    """The trial on four legs after training.
+
+    Attributes:
+        gait: A file, the name of a released gait, or `trot`.
+        robots: Number of robots; 0 leaves the trial out.
+        engine: `mjx`, or `mujoco` in C on the host.
+    """
+
+    gait: str = RELEASED
+    robots: int = 100
+    engine: Literal["mjx", "mujoco"] = "mjx"

@@ -15,10 +15,10 @@ import numpy as np
 import tyro
 
 from subterra_jax.host.command import parse, run_command
-from subterra_jax.host.files import require_file
+from subterra_jax.host.files import replace_file, require_file
 from train.errors import RunFolderError
-from train.run.episodes import WINDOW
-from train.run.log import EPISODES
+from train.log import EPISODES
+from train.snapshot import WINDOW
 
 GOAL = 0.9
 _COLUMNS = "episode,step,coverage_mean_100,success_mean_100"
@@ -28,7 +28,7 @@ Curve = dict[str, np.ndarray]
 
 
 def read_episodes(run: Path) -> Curve:
-    """The columns of a run folder's `episodes.csv`, one row per finished episode.
+    """Reads the columns of a run folder's `episodes.csv`, one row per finished episode.
 
     Raises:
         RunFolderError: There is none, or it cannot be read.
@@ -43,7 +43,7 @@ def read_episodes(run: Path) -> Curve:
 
 
 def rolling(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """Mean of each value and those before it, at most `window` of them in all."""
+    """Averages each value and those before it, at most `window` of them in all."""
     total = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
     end = np.arange(1, len(values) + 1)
     begin = np.maximum(end - window, 0)
@@ -55,7 +55,7 @@ def write_curve(runs: list[Path], png: Path) -> None:
 
     Args:
         runs: Run folders; each gets a `curve.csv` of its own.
-        png: Where the figure goes.
+        png: File of the figure.
 
     Raises:
         RunFolderError: One of them cannot be read; nothing is drawn then.
@@ -72,14 +72,13 @@ def write_curve(runs: list[Path], png: Path) -> None:
         name = column if shown == "coverage" else shown
         _draw(axes, [run.resolve().name for run in runs], curves, name, against)
     panels[0].legend(loc="lower right", fontsize=8)
-    fresh = png.with_name(f".{png.name}.partial")
-    figure.savefig(fresh, dpi=120, format="png")
-    fresh.replace(png)
+    with replace_file(png) as fresh:
+        figure.savefig(fresh, dpi=120, format="png")
     pyplot.close(figure)
 
 
 def measure(run: Path) -> str:
-    """What says how far a run has come: `coverage` where that is the task, else `success`."""
+    """Returns the measure of a run's progress: `coverage` where that is the task, else `success`."""
     try:
         task = json.loads((run / "config.json").read_text())["task"]
     except (OSError, ValueError, KeyError) as error:
@@ -88,20 +87,19 @@ def measure(run: Path) -> str:
 
 
 def _curve(rows: Curve) -> Curve:
-    """Episodes, steps, and the rolling means at each episode."""
+    """Returns episodes, steps, and the rolling means at each episode."""
     means = {name: rolling(rows[name]) for name in ("coverage", "success")}
     return {"episode": rows["episode"], "step": rows["step"], **means, "single": rows["coverage"]}
 
 
 def _write_table(run: Path, curve: Curve) -> None:
     table = np.column_stack([curve[name] for name in ("episode", "step", "coverage", "success")])
-    fresh = run / ".curve.csv.partial"
-    np.savetxt(fresh, table, fmt=["%d", "%d", "%.9g", "%.9g"], delimiter=",", header=_COLUMNS, comments="")
-    fresh.replace(run / "curve.csv")
+    with replace_file(run / "curve.csv") as fresh:
+        np.savetxt(fresh, table, fmt=["%d", "%d", "%.9g", "%.9g"], delimiter=",", header=_COLUMNS, comments="")
 
 
 def _draw(axes: Any, names: list[str], curves: list[Curve], name: str, against: str) -> None:
-    """One panel: a thin line a run, and the band of several."""
+    """Draws one panel: a thin line for a run, and the band of several."""
     for label, curve in zip(names, curves, strict=True):
         x = curve["episode"] if against == _EPISODE else curve["step"] / 1e6
         few = slice(None, None, max(1, len(x) // _POINTS))
@@ -118,7 +116,7 @@ def _draw(axes: Any, names: list[str], curves: list[Curve], name: str, against: 
 
 
 def _draw_band(axes: Any, curves: list[np.ndarray]) -> None:
-    """Mean ± standard deviation of several runs, as far as all of them go."""
+    """Draws mean ± standard deviation of several runs, as far as all of them go."""
     shortest = min(len(curve) for curve in curves)
     if shortest == 0:
         return
@@ -143,7 +141,7 @@ class Command:
 
 
 def command(arguments: Command) -> None:
-    """Draws."""
+    """Draws the curves."""
     if not arguments.runs:
         raise RunFolderError("no run folder was named")
     require_file(arguments.out, ".png")
@@ -151,7 +149,7 @@ def command(arguments: Command) -> None:
 
 
 def main() -> None:
-    """Entry point of `python -m train.curve`."""
+    """Runs `python -m train.curve`."""
     sys.exit(run_command(lambda: command(parse(_read))))
 
 

@@ -1,4 +1,4 @@
-"""What a user of this room can get wrong, as exceptions with one clear sentence."""
+"""Errors of training, each with one clear sentence."""
 
 from subterra_jax.host.command import EXIT_FAILED
 from subterra_jax.host.errors import SubterraError

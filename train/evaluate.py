@@ -14,12 +14,11 @@ from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
 from subterra_jax.evaluation.summary import summary
 from subterra_jax.host.command import parse, run_command
-from subterra_jax.policies.files import TENSORS
 from subterra_jax.policies.loading import Agent
-from train import cli, policies
-from train.agents import agent_of
 from train.errors import ConfigError
-from train.policies import World
+from train.log import print_table
+from train.policies import open_agent
+from train.world import World, open_world
 
 _BATCH = 500
 
@@ -33,11 +32,11 @@ def check_episodes(n: int, name: str = "episodes") -> None:
 
 
 def evaluate(world: World, agent: Agent, n_episodes: int) -> dict[str, Any]:
-    """Summary of the first listed episodes, as plain values.
+    """Evaluates an agent on the first listed episodes.
 
     Args:
         world: The task.
-        agent: Who drives.
+        agent: The driver.
         n_episodes: Episodes, 1 to 500.
 
     Returns:
@@ -56,7 +55,7 @@ def evaluate(world: World, agent: Agent, n_episodes: int) -> dict[str, Any]:
 
 
 def scores(records: Records) -> dict[str, Any]:
-    """The summary of some episodes."""
+    """Summarises episodes."""
     covered = records.coverage.min()
     return {
         **summary(records),
@@ -88,38 +87,14 @@ class Command:
     json: bool = False
 
 
-def open_agent(policy: Path | None, task: str | None) -> tuple[Agent, dict[str, Any]]:
-    """A policy by its file, folder or name, or the one released for a task.
-
-    Returns:
-        The agent and what was saved with it: `task` and `world` at least.
-
-    Raises:
-        ConfigError: Neither is given.
-        PolicyError: There is no such released policy, or it is damaged.
-        CheckpointError: The folder holds no checkpoint, or a damaged one.
-    """
-    if policy is None:
-        if task is None:
-            raise ConfigError("a task or a policy must be named")
-        policies.known_task(task)
-        policy = Path(released.name_for(task))
-    if policy.suffix == TENSORS or (str(policy) in released.released() and not policy.exists()):
-        return released.load(policy)
-    if not policy.exists() and policy.name == str(policy):
-        return released.load(policy)
-    networks, trained, facts = policies.load_policy(policy)
-    return agent_of(networks, trained), facts
-
-
 def command(arguments: Command) -> None:
-    """Evaluates and prints."""
+    """Evaluates the policy and prints its scores."""
     check_episodes(arguments.episodes)
     agent, facts = open_agent(arguments.policy, arguments.task)
     lining = arguments.lining
     if lining is None and arguments.tunnel is None:
         lining = facts["world"]["lining"]
-    world = policies.open_world(arguments.task or facts["task"], arguments.tunnel, lining)
+    world = open_world(arguments.task or facts["task"], arguments.tunnel, lining)
     source = arguments.policy or agent.name
     released.check_fits(agent, world.env, world.params, source)
     found = {**world.facts, **evaluate(world, agent, arguments.episodes)}
@@ -127,11 +102,11 @@ def command(arguments: Command) -> None:
         print(json.dumps(found))
     else:
         told = {name: value for name, value in found.items() if value is not None and name not in world.facts}
-        cli.table(f"{world.task}, {world.facts['tunnel']}, {world.facts['lining']}: {Path(source).name}", told)
+        print_table(f"{world.task}, {world.facts['tunnel']}, {world.facts['lining']}: {Path(source).name}", told)
 
 
 def main() -> None:
-    """Entry point of `python -m train.evaluate`."""
+    """Runs `python -m train.evaluate`."""
     sys.exit(run_command(lambda: command(parse(_read))))
 
 

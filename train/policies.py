@@ -1,23 +1,29 @@
-"""Policies and worlds by name: what a command line points at, opened and checked before anything is compiled."""
+"""Trained policies: read from run folders, turned into agents, and written for release."""
 
 import dataclasses
 import hashlib
-from importlib import metadata
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import subterra_jax as st
-from subterra_jax.host.versions import VERSION
-from subterra_jax.procedural import expand
-from subterra_jax.tasks import TaskError, find
-from subterra_jax.tunnel.sources import tunnel_digest
-from train.belief.network import BeliefLayout, BeliefNetworks
+import jax
+import numpy as np
+from safetensors.numpy import save
+
+from subterra_jax import policies as released
+from subterra_jax.host.files import replace_file
+from subterra_jax.policies import Conditions
+from subterra_jax.policies.files import FACTS as POLICY_FACTS
+from subterra_jax.policies.files import SCHEMA, TENSORS
+from subterra_jax.policies.loading import Agent
+from train.belief.learner import BeliefLayout, BeliefNetworks
 from train.errors import CheckpointError, ConfigError
 from train.feedforward.networks import Layout, Networks
+from train.folder import FACTS, load_checkpoint
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks
-from train.run import checkpoint
+from train.world import require_task
 
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
 AnyNetworks: TypeAlias = Networks | RecurrentNetworks | BeliefNetworks
 _KINDS: dict[str, Any] = {
     Networks.kind: (Layout, Networks),
@@ -26,95 +32,129 @@ _KINDS: dict[str, Any] = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class World:
-    """A task on a tunnel.
-
-    Attributes:
-        task: Task id.
-        env: The environment.
-        params: Its parameters.
-        facts: Task, lining, and the tunnel file's name, provenance and SHA-256: what identifies the world.
-    """
-
-    task: str
-    env: Any
-    params: Any
-    facts: dict[str, Any]
-
-
-def known_task(task: str) -> str:
-    """Return the id of a task; `FILE.py:ID` first runs a user's file.
-
-    Raises:
-        ConfigError: There is no such task, or this command does not learn it.
-    """
-    try:
-        task = find(task)
-    except TaskError as error:
-        raise ConfigError(str(error)) from error
-    if task not in st.TASKS:
-        raise ConfigError(f"{task} is not learnt by this command; there are {', '.join(st.TASKS)}")
-    return task
-
-
-def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) -> World:
-    """A task on a tunnel file or on one that goes by a name; the packaged tunnel, and the usual lining, where None.
-
-    `procedural:train:0-255` stands for several tunnels, of which each episode draws one.
-
-    Raises:
-        ConfigError: There is no such task, or the tunnel has no room for it.
-        TunnelError: The tunnel file is missing or wrong, or has no such lining.
-    """
-    task = known_task(task)
-    names = [tunnel] if tunnel is None else expand(str(tunnel))
-    plans = [st.load_tunnel(name) for name in names]
-    lining = lining or plans[0].default_lining
-    try:
-        env, params = st.make(task, tunnel=plans if len(plans) > 1 else plans[0], lining=lining)
-    except st.SubterraError:
-        raise
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
-    digests = [tunnel_digest(name) for name in names]
-    return World(
-        task,
-        env,
-        params,
-        {
-            "task": task,
-            "lining": lining,
-            "tunnel": plans[0].name if len(plans) == 1 else str(tunnel),
-            "tunnel_provenance": plans[0].provenance,
-            "tunnel_sha256": digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest(),
-        },
-    )
-
-
 def load_policy(folder: Path) -> tuple[AnyNetworks, Any, dict[str, Any]]:
-    """The policy of a run folder, or of one checkpoint in it.
+    """Reads the policy of a run folder, or of one checkpoint in it.
 
     Returns:
-        The networks it belongs to, the policy, and the facts saved with it.
+        Its networks, the policy, and the facts saved with it.
 
     Raises:
         CheckpointError: It is missing, damaged, or does not fit the network that it names itself.
     """
-    stored = checkpoint.load(folder)
-    layout_of, networks_of = _KINDS[stored.facts.get("kind", "mlp")]
+    stored = load_checkpoint(folder)
+    layout_type, networks_type = _KINDS[stored.facts.get("kind", "mlp")]
     try:
-        layout = layout_of(**{name: _tuples(value) for name, value in stored.facts["layout"].items()})
+        layout = layout_type(**{name: _tuples(value) for name, value in stored.facts["layout"].items()})
     except (KeyError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{stored.path}: field 'layout' of {checkpoint.FACTS} is missing or wrong") from error
-    networks = networks_of(layout)
+        raise CheckpointError(f"{stored.path}: field 'layout' of {FACTS} is missing or wrong") from error
+    networks = networks_type(layout)
     return networks, stored.restore("policy", networks.policy_shapes()), stored.facts
 
 
-def versions() -> dict[str, str]:
-    """Versions of the libraries that a result depends on."""
-    found = {package.metadata["Name"]: package.version for package in metadata.distributions()}
-    return {"subterra-jax": VERSION, **{name: found.get(name, "not installed") for name in _PACKAGES}}
+def open_agent(policy: Path | None, task: str | None) -> tuple[Agent, dict[str, Any]]:
+    """Opens a policy by its file, folder or name, or the one released for a task.
+
+    Returns:
+        The agent and the facts saved with it: `task` and `world` at least.
+
+    Raises:
+        ConfigError: Neither is given.
+        PolicyError: There is no such released policy, or it is damaged.
+        CheckpointError: The folder holds no checkpoint, or a damaged one.
+    """
+    if policy is None:
+        if task is None:
+            raise ConfigError("a task or a policy must be named")
+        task = require_task(task)
+        policy = Path(released.name_for(task))
+    if policy.suffix == TENSORS or (not policy.exists() and policy.name == str(policy)):
+        return released.load(policy)
+    networks, trained, facts = load_policy(policy)
+    return make_agent(networks, trained, conditions=Conditions.from_facts(facts)), facts
+
+
+def make_agent(
+    networks: AnyNetworks, policy: Any, name: str | None = None, conditions: Conditions | None = None
+) -> Agent:
+    """Makes an agent that drives without exploration noise.
+
+    Args:
+        networks: Networks of the policy.
+        policy: The policy.
+        name: Name on the leaderboard; `ppo-mlp` or `ppo-gru` if left out.
+        conditions: Conditions of its training; None: any.
+    """
+    layout = dataclasses.asdict(networks.layout)
+    tensors = policy_tensors(networks, policy)
+    return released.from_tensors(networks.kind, layout, tensors, name or f"ppo-{networks.kind}", conditions)
+
+
+def policy_tensors(networks: AnyNetworks, policy: Any) -> dict[str, np.ndarray]:
+    """Returns the arrays that driving needs of a policy, by the names that `subterra_jax.policies` knows."""
+    if networks.kind == "mlp":
+        parts = {"policy": policy.weights, "statistics": {"mean": policy.statistics.mean, "std": policy.statistics.std}}
+    else:
+        parts = policy
+    leaves = jax.tree_util.tree_flatten_with_path(jax.device_get(parts))[0]
+    return {_tensor_name(path): np.asarray(leaf, np.float32) for path, leaf in leaves}
+
+
+def policy_weights(networks: RecurrentNetworks, tensors: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """Returns the weights that have such tensors, from which training goes on; the inverse of `policy_tensors`.
+
+    Args:
+        networks: Networks that they must fit.
+        tensors: By name.
+        source: Origin of the tensors, for messages.
+
+    Raises:
+        ConfigError: They belong to another network.
+    """
+    leaves, tree = jax.tree_util.tree_flatten_with_path(networks.policy_shapes())
+    for path, leaf in leaves:
+        name = _tensor_name(path)
+        tensor = tensors.get(name)
+        if tensor is None or tensor.shape != leaf.shape:
+            shape = "missing" if tensor is None else f"{tensor.shape}"
+            raise ConfigError(f"begin_from = {source}: another network: {name} is {shape}, not {leaf.shape}")
+    return jax.tree_util.tree_unflatten(
+        tree, [np.asarray(tensors[_tensor_name(path)], np.float32) for path, _ in leaves]
+    )
+
+
+def write_policy(out: Path, networks: AnyNetworks, policy: Any, facts: dict[str, Any]) -> None:
+    """Writes a policy's two files, the tensors' first.
+
+    Args:
+        out: The tensors' file.
+        networks: Networks of the policy.
+        policy: The policy.
+        facts: At least `task` and `world`; name, kind, layout and hash are added.
+
+    Raises:
+        OutputError: They cannot be written.
+    """
+    tensors = save(dict(sorted(policy_tensors(networks, policy).items())))
+    whole = {
+        "schema": SCHEMA,
+        "name": out.name.removesuffix(TENSORS),
+        "kind": networks.kind,
+        "tensors_sha256": hashlib.sha256(tensors).hexdigest(),
+        "layout": dataclasses.asdict(networks.layout),
+        **facts,
+    }
+    for path, content in ((out, tensors), (facts_file(out), f"{json.dumps(whole, indent=1)}\n".encode())):
+        with replace_file(path) as fresh:
+            fresh.write_bytes(content)
+
+
+def facts_file(tensors: Path) -> Path:
+    """Returns the path of the facts that belong to tensors."""
+    return tensors.with_name(tensors.name.removesuffix(TENSORS) + POLICY_FACTS)
+
+
+def _tensor_name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".").replace(".params.", ".")
 
 
 def _tuples(value: Any) -> Any:

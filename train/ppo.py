@@ -1,28 +1,115 @@
-"""Training from start to end: `train` compiles one iteration, repeats it, and keeps the best policy.
+"""Training from settings to the last snapshot: builds the learner, compiles one iteration, and repeats it.
 
-The host only counts finished episodes and decides when to stop; what an iteration is stands in `learner.py`, and in
-`recurrent/learner.py` and `recurrent/distill.py` for networks with memory.
+The host only counts finished episodes, keeps the best policy and decides when to stop. An iteration stands in the
+`learner.py` of `feedforward`, `recurrent` and `belief`, and in `recurrent/distill.py`.
 """
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
-from train.config import PPOConfig, TrainConfig
-from train.devices import compiling
+from subterra_jax.baselines import registry
+from subterra_jax.baselines.agent import Agent
+from subterra_jax.policies import PolicyError, check_fits
+from train.belief.learner import BeliefConfig, BeliefLearner, check_belief
+from train.config import PPOConfig, TrainConfig, check
+from train.devices import PART, SPLIT, Parts, Spread, compiler_options
+from train.errors import CheckpointError, ConfigError
 from train.feedforward.learner import Learner
-from train.run.fetching import fetch
-from train.run.snapshot import Snapshot, Trainable, advance, finished, started, timing
+from train.policies import open_agent, policy_weights
+from train.recurrent.config import (
+    DistillConfig,
+    RecurrentConfig,
+    check_distill,
+    check_recurrent,
+)
+from train.recurrent.distill import DistillLearner
+from train.recurrent.drive import make_layout
+from train.recurrent.learner import RecurrentLearner
+from train.recurrent.network import RecurrentNetworks
+from train.report import fetch, fetch_all
+from train.snapshot import Snapshot, Trainable, advance, finished, started, timing
+from train.world import World
+
+
+def check_config(config: TrainConfig) -> None:
+    """Refuses settings that make no sense, before the tunnel is opened.
+
+    Raises:
+        ConfigError: Naming the first setting that does not, and its value.
+    """
+    if isinstance(config, DistillConfig):
+        check_distill(config)
+    elif isinstance(config, RecurrentConfig):
+        check_recurrent(config)
+    elif isinstance(config, BeliefConfig):
+        check_belief(config)
+    else:
+        assert isinstance(config, PPOConfig)
+        check(config)
+
+
+def make_learner(world: World, config: TrainConfig, axes: tuple[str, ...] = ()) -> Trainable:
+    """Makes the learner of a config on a world.
+
+    Raises:
+        ConfigError: A setting makes no sense, no such network can learn this task, or no such teacher knows it.
+    """
+    spreads = config.parts > 1
+    names: tuple[Parts, Parts] = ((PART,), SPLIT) if spreads else (axes, ())
+    learner: Any
+    if isinstance(config, DistillConfig):
+        teacher = open_teacher(config.teacher, world)
+        learner = DistillLearner(world.env, world.params, config, teacher, *names, begun=_begun(world, config))
+    elif isinstance(config, RecurrentConfig):
+        learner = RecurrentLearner(world.env, world.params, config, *names, begun=_begun(world, config))
+    elif isinstance(config, BeliefConfig):
+        learner = BeliefLearner(world.env, world.params, config, *names)
+    else:
+        assert isinstance(config, PPOConfig)
+        learner = Learner(world.env, world.params, config, *names)
+    return Spread(learner) if spreads else learner
+
+
+def _begun(world: World, config: RecurrentConfig) -> dict[str, Any] | None:
+    """Returns the weights of the policy to begin with."""
+    if config.begin_from is None:
+        return None
+    try:
+        agent, _ = open_agent(Path(config.begin_from), None)
+    except (PolicyError, CheckpointError) as error:
+        raise ConfigError(f"begin_from = {config.begin_from}: {error}") from error
+    networks = RecurrentNetworks(make_layout(world.env, world.params, config))
+    return policy_weights(networks, agent.tensors, config.begin_from)
+
+
+def open_teacher(name: str, world: World) -> Agent:
+    """Opens a baseline by its name, or a policy: released, or of a run folder.
+
+    Raises:
+        ConfigError: There is neither, or it cannot do this task.
+    """
+    if name in registry.names():
+        return registry.make_agent(name, world.params)
+    try:
+        agent, _ = open_agent(Path(name), None)
+        check_fits(agent, world.env, world.params, name)
+    except (PolicyError, CheckpointError) as error:
+        raise ConfigError(f"teacher = {name} is no baseline ({', '.join(registry.names())}): {error}") from error
+    return agent
+
 
 Watcher = Callable[[Snapshot], bool | None]
 
 
 def begin(learner: Trainable, params: Any) -> Snapshot:
-    """An untrained run."""
+    """Returns an untrained run."""
     key = learner.share(jax.random.PRNGKey(learner.config.seed))
-    state = jax.jit(learner.init, compiler_options=compiling.options())(key, learner.share(params))
+    state = jax.jit(learner.init, compiler_options=compiler_options())(key, learner.share(params))
     return started(learner, state)
 
 
@@ -43,9 +130,9 @@ def train(
         params: Its parameters.
         config: Settings.
         learner: Made of the same three; one without memory is built here if left out.
-        snapshot: Where to go on from; its state is used up. The beginning if left out.
+        snapshot: Snapshot to go on from; its state is used up. None is the beginning.
         watch: Called after every iteration; training ends early if it returns True.
-        deterministic: Whether one seed is to give one result on a GPU as well.
+        deterministic: One seed is to give one result on a GPU as well.
 
     Returns:
         The last snapshot. Its `policy` is the best one, which need not be the last.
@@ -62,7 +149,7 @@ def train(
         return snapshot
     params = learner.share(params)
     began = time.perf_counter()
-    options = compiling.options() if deterministic else None
+    options = compiler_options() if deterministic else None
     iterate = jax.jit(learner.iterate, donate_argnums=0).lower(snapshot.state, params).compile(options)
     compiled = time.perf_counter()
     while not finished(snapshot, config):
@@ -73,3 +160,89 @@ def train(
         if watch is not None and watch(snapshot):
             break
     return snapshot
+
+
+AXIS = "seed"
+
+
+def seed_axes() -> tuple[str, ...]:
+    """Returns the names of the axes along which learners of several seeds are vmapped."""
+    return () if jax.default_backend() == "cpu" else (AXIS,)
+
+
+def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Maps a function of a state (or a key) and params over stacked states.
+
+    An accelerator does all seeds together. A CPU, which one seed fills, does one after the other and so keeps the
+    branches that `vmap` would take both ways.
+    """
+    if seed_axes():
+        return jax.vmap(function, in_axes=(0, None), axis_name=AXIS)
+    return lambda states, params: jax.lax.map(lambda state: function(state, params), states)
+
+
+def train_seeds(
+    learners: list[Trainable],
+    params: Any,
+    snapshots: list[Snapshot | None],
+    watch: Callable[[int, Snapshot], None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> list[Snapshot]:
+    """Trains until each seed's goal has held for long enough, or its steps are used up.
+
+    A seed comes to the same numbers as if it were trained alone, but for the order of floating-point sums; once it is
+    done its numbers stand still while others go on.
+
+    Args:
+        learners: One for each seed, alike but for `config.seed`; those of several seeds know `seed_axes()`.
+        params: Parameters of the environment.
+        snapshots: Snapshots to go on from, all at one iteration but those that are done; None is the beginning.
+        watch: Called with the index of the seed after each of its iterations.
+        stop: Asked after each iteration whether to end early.
+
+    Returns:
+        The last snapshot of each seed.
+
+    Raises:
+        TrainingError: The loss of a seed is no longer finite.
+    """
+    first, options = learners[0], compiler_options()
+    if any(snapshot is None for snapshot in snapshots):
+        keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
+        states = jax.jit(over_seeds(first.init), compiler_options=options)(keys, params)
+        now = [started(learner, state) for learner, state in zip(learners, _apart(states, len(learners)), strict=True)]
+    else:
+        now = [snapshot for snapshot in snapshots if snapshot is not None]
+        states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
+    if all(map(_done, now, learners)):
+        return now
+    began = time.perf_counter()
+    iterate = jax.jit(over_seeds(first.iterate), donate_argnums=0).lower(states, params).compile(options)
+    compiled = time.perf_counter()
+    while not all(map(_done, now, learners)) and not stop():
+        before = time.perf_counter()
+        states, reports = iterate(states, params)
+        told = fetch_all(reports, len(learners))
+        timed = timing(began, compiled, before, first.config.steps_per_iteration * len(learners))
+        parts = _apart((states, reports.policy), len(learners))
+        for k, (learner, (state, policy), (ended, metrics)) in enumerate(zip(learners, parts, told, strict=True)):
+            if not _done(now[k], learner):
+                now[k] = advance(now[k], state, policy, ended, metrics, learner.config)
+                now[k].record["timing"] = timed
+                if watch is not None:
+                    watch(k, now[k])
+    return now
+
+
+def _done(snapshot: Snapshot, learner: Trainable) -> bool:
+    return finished(snapshot, learner.config)
+
+
+def _apart(tree: Any, n: int) -> list[Any]:
+    """Splits a stacked tree."""
+    return [_part(tree, k) for k in range(n)]
+
+
+@jax.jit
+def _part(tree: Any, k: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf[k], tree)

@@ -18,14 +18,11 @@ from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from subterra_jax.host.files import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
-from train import cli, ppo, seeds
-from train.b2.config import WalkConfig, make_config
-from train.b2.network import WalkLearner
-from train.b2.session import WalkSession
+from train.b2.walking import WalkConfig, WalkLearner, WalkSession, make_walk_config
 from train.config import check
 from train.errors import ConfigError
-from train.policies import World
-from train.run.log import Bar
+from train.session import check_seeds
+from train.world import World
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +57,7 @@ class Command:
 
 
 def read_command(arguments: list[str]) -> Command:
-    """The command line, with the defaults of the preset that it names itself.
+    """Reads a command line; defaults follow from the preset that it names.
 
     Raises:
         ConfigError: There is no such preset.
@@ -70,12 +67,12 @@ def read_command(arguments: list[str]) -> Command:
     named, _ = early.parse_known_args(arguments)
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
     on_cpu = {"robots": 64} if preset == "cpu" else {}
-    default = Command(out=tyro.MISSING, preset=preset, config=make_config(preset), **on_cpu)  # type: ignore[arg-type]
+    default = Command(out=tyro.MISSING, preset=preset, config=make_walk_config(preset), **on_cpu)  # type: ignore[arg-type]
     return tyro.cli(Command, args=arguments, default=default, prog="python -m train.walk")
 
 
 def open_world(tunnel: Path | None, scene: Path | None) -> World:
-    """The walking task on a tunnel, or in a built scene.
+    """Opens the walking task on a tunnel, or in a built scene.
 
     Raises:
         ConfigError: Both are given.
@@ -104,7 +101,7 @@ def command(arguments: Command) -> int:
         Exit status: 0, or 130 after Ctrl-C, with the checkpoint saved.
     """
     check(arguments.config)
-    seeds.check(arguments.seeds)
+    check_seeds(arguments.seeds)
     if arguments.robots < 1:
         raise ConfigError(f"robots must be at least 1, got {arguments.robots}")
     if arguments.release is not None:
@@ -112,50 +109,31 @@ def command(arguments: Command) -> int:
     world = open_world(arguments.tunnel, arguments.scene)
     for seed in arguments.seeds or (arguments.config.seed,):
         out = arguments.out / f"seed-{seed}" if arguments.seeds else arguments.out
-        if not _one(arguments, world, dataclasses.replace(arguments.config, seed=seed), out):
+        if not _train_seed(arguments, world, dataclasses.replace(arguments.config, seed=seed), out):
             return EXIT_INTERRUPTED
     return 0
 
 
-def _one(arguments: Command, world: World, config: WalkConfig, out: Path) -> bool:
-    """One seed; whether it came to its end."""
+def _train_seed(arguments: Command, world: World, config: WalkConfig, out: Path) -> bool:
+    """Trains, scores and releases one seed; False after Ctrl-C."""
     n_seen = dataclasses.replace(world.env, privileged=False).observation_size(world.params)
     session = WalkSession(out, world, WalkLearner(world.env, world.params, config, n_seen))
-    snapshot = session.folder.begin(resume=arguments.resume, overwrite=arguments.overwrite)
-    session.open(snapshot)
-    bar = Bar(config.steps, snapshot.iteration * config.steps_per_iteration if snapshot else 0)
-    with cli.deferred_interrupt() as interrupt:
-
-        def watch(now: ppo.Snapshot) -> bool:
-            bar.show(now.record, of=f"seed {config.seed}")
-            session.note(now, save=interrupt.wanted)
-            return interrupt.wanted
-
-        try:
-            last = ppo.train(
-                world.env,
-                world.params,
-                config,
-                learner=session.learner,
-                snapshot=snapshot,
-                watch=watch,
-                deterministic=config.deterministic,
-            )
-        finally:
-            bar.close()
-            session.close()
-        session.finish(last)
-        if interrupt.wanted:
-            print(f"interrupted after {last.iteration} iterations; go on with --resume", file=sys.stderr)
-            return False
-    found = session.score(last, arguments.robots)
+    last = session.train(
+        resume=arguments.resume,
+        overwrite=arguments.overwrite,
+        label=f"seed {config.seed}",
+        deterministic=config.deterministic,
+    )
+    if last is None:
+        return False
+    scores = session.score(last, arguments.robots)
     if arguments.release is not None:
-        session.release(arguments.release, last, found)
+        session.release(arguments.release, last, scores)
     return True
 
 
 def main() -> None:
-    """Entry point of `python -m train.walk`."""
+    """Runs `python -m train.walk`."""
     sys.exit(run_command(lambda: command(parse(read_command))))
 
 

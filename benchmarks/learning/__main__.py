@@ -15,10 +15,10 @@ from benchmarks.command import require_least, run_main
 from benchmarks.learning.runs import Curve, require_stable_baselines, train_ours, train_stable_baselines
 from benchmarks.results import environment_facts, png_bytes, version, write_file
 from subterra_jax.host.files import require_folder
-from train import policies
 from train.curve import GOAL, rolling
 from train.errors import ConfigError
-from train.run.episodes import WINDOW
+from train.snapshot import WINDOW
+from train.world import open_world, require_task
 
 _HEADINGS = ("", "episodes", "steps", "s", "compiled in", "steps/s")
 
@@ -52,11 +52,11 @@ def run(command: Command) -> None:
     Raises:
         ConfigError: The task or a number makes no sense, or stable-baselines3 is not installed.
     """
-    policies.known_task(command.task)
+    require_task(command.task)
     if "Traverse" not in command.task:
         raise ConfigError(f"task {command.task} is not one of coverage")
     require_least(command, steps=1, our_steps=1, seed=0)
-    policies.open_world(command.task, command.tunnel)
+    open_world(command.task, command.tunnel)
     require_folder(command.out)
     require_stable_baselines()
     curves = [

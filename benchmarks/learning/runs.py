@@ -12,8 +12,7 @@ from train import ppo
 from train.config import make_config
 from train.curve import GOAL, rolling
 from train.errors import ConfigError
-from train.run.episodes import WINDOW
-from train.run.snapshot import Snapshot
+from train.snapshot import WINDOW, Snapshot
 
 _FRAMES, _DISCOUNT = 4, 0.98  # as in ours
 

@@ -12,7 +12,7 @@ from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.figures.sheet import BLUE, INK, ORANGE
 from benchmarks.paper.sheet import COLUMN, Drawing
 from train.curve import GOAL, read_episodes, rolling
-from train.run.episodes import WINDOW
+from train.snapshot import WINDOW
 
 _COLOURS = {"coverage": BLUE, "success": ORANGE}
 _MOST_POINTS = 1500  # points of a line: more than its dots in print

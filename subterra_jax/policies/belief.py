@@ -21,7 +21,7 @@ from subterra_jax.baselines.steering import CentreLine, Corridor
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.policies import belief_grid, belief_scan
-from subterra_jax.policies.files import PolicyError
+from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.networks import Tensors
 from subterra_jax.state import EnvParams
 
@@ -129,6 +129,7 @@ class Belief:
         n_cells: Cells of either tape; 0 before `with_map`.
         habits: Settings of the filter.
         name: Name on the leaderboard.
+        conditions: Conditions of its training; None: any.
         uses_lidar: Always true: it reads the ranges.
         uses_map: Always true.
         privileged: Always false: it gets no truth.
@@ -141,6 +142,7 @@ class Belief:
     n_cells: int = struct.field(pytree_node=False, default=0)
     habits: Habits = struct.field(pytree_node=False, default=Habits())
     name: str = struct.field(pytree_node=False, default="belief")
+    conditions: Conditions | None = struct.field(pytree_node=False, default=None)
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
     uses_map: bool = struct.field(pytree_node=False, default=True)
     privileged: bool = struct.field(pytree_node=False, default=False)

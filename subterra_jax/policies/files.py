@@ -7,7 +7,7 @@ tensor, and their bytes. Only float32 is used here. Format: github.com/huggingfa
 import hashlib
 import json
 import struct
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -22,11 +22,48 @@ SCHEMA = "subterra.policy/1"
 AGAIN = "release it again from its run folder with `python -m train.release`"
 TENSORS, FACTS = ".safetensors", ".json"
 GAIT = "walk"  # the kind that moves legs and drives no task
+TRAINED_UNDER = "trained_under"  # field of the facts
+_PERIODS = {None: 0.1, "b2": 0.2}  # s, by embodiment, of files without `TRAINED_UNDER`
 _FACTS = ("name", "kind", "task", "layout", "tensors_sha256")
 
 
 class PolicyError(SubterraError):
     """A policy is missing, damaged, or does not fit the task."""
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions that a policy was trained under; it drives under no others.
+
+    Attributes:
+        task: Task id.
+        period: Control period, s.
+        n_beams: Beams of a scan; None: unknown.
+        fields: Names of the parts of the observation, in order; None: unknown.
+        constants: Digest of the benchmark's constants; None: unknown.
+    """
+
+    task: str
+    period: float
+    n_beams: int | None = None
+    fields: tuple[str, ...] | None = None
+    constants: str | None = None
+
+    @classmethod
+    def from_facts(cls, facts: dict[str, Any]) -> "Conditions":
+        """Reads them from the facts of a policy; files without them are of the planar robots' or the B2's period."""
+        known = dict(facts.get(TRAINED_UNDER, {}))
+        if not known:
+            embodiment = facts.get("world", {}).get("embodiment")
+            return cls(facts["task"], _PERIODS.get(embodiment, _PERIODS[None]))
+        fields = known.pop("fields", None)
+        return cls(facts["task"], **known, fields=None if fields is None else tuple(fields))
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what `from_facts` reads under `TRAINED_UNDER`."""
+        values = asdict(self)
+        del values["task"]
+        return {name: value for name, value in values.items() if value is not None}
 
 
 @dataclass(frozen=True)

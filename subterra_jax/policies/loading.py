@@ -1,5 +1,6 @@
 """From tensors and facts to an agent, and whether it fits a task."""
 
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.env import TunnelEnv
 from subterra_jax.policies import belief, senses
 from subterra_jax.policies.belief import Belief, Habits
-from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read, released
+from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.networks import FeedForward, Recurrent
 from subterra_jax.state import EnvParams
+from subterra_jax.tasks import constants_digest
 
 Agent = FeedForward | Recurrent | Belief
 KINDS = ("mlp", "gru", belief.KIND)
@@ -39,7 +41,9 @@ def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
     return _checked(file), file.facts
 
 
-def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], name: str) -> Agent:
+def from_tensors(
+    kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], name: str, conditions: Conditions | None = None
+) -> Agent:
     """An agent of tensors in memory.
 
     Args:
@@ -47,6 +51,7 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
         layout: `action_low`, `action_high`, and `frames`, `bin_width` or `habits`.
         tensors: By name, as the agent's class says.
         name: Name on the leaderboard.
+        conditions: Conditions of its training, which `check_fits` compares; None: any.
 
     Raises:
         KeyError: Something is missing in the layout.
@@ -55,14 +60,15 @@ def from_tensors(kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], 
     low, high = (jnp.asarray(layout[key], jnp.float32) for key in ("action_low", "action_high"))
     arrays = {key: jnp.asarray(value) for key, value in tensors.items()}
     if kind == "mlp":
-        return FeedForward(arrays, low, high, frames=int(layout["frames"]), name=name)
+        return FeedForward(arrays, low, high, frames=int(layout["frames"]), name=name, conditions=conditions)
     if kind == "gru":
         if (version := int(layout.get("senses", 1))) != senses.VERSION:
             raise ValueError(f"made for senses of version {version}, this release has {senses.VERSION}; train it anew")
         shown = senses.Senses(str(layout.get("tracker", "loop")), bool(layout.get("boxes", False)))
-        return Recurrent(arrays, low, high, bin_width=float(layout["bin_width"]), shown=shown, name=name)
+        width = float(layout["bin_width"])
+        return Recurrent(arrays, low, high, bin_width=width, shown=shown, name=name, conditions=conditions)
     if kind == belief.KIND:
-        return Belief(arrays, low, high, habits=Habits(**layout["habits"]), name=name)
+        return Belief(arrays, low, high, habits=Habits(**layout["habits"]), name=name, conditions=conditions)
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
 
 
@@ -75,7 +81,7 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
     """Refuses a policy that cannot drive here.
 
     Raises:
-        PolicyError: The observations or the actions are others than those it was made for.
+        PolicyError: Observations, actions, control period or constants are others than those it was trained with.
     """
     size, bounds = env.observation_size(params), env.action_space(params)
     if isinstance(agent, Recurrent):
@@ -89,9 +95,42 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
             raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
     elif agent.n_observation != size:
         raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")
+    if agent.conditions is not None:
+        _check_conditions(agent.conditions, training_conditions(env, params), source)
     high = np.asarray(agent.high)
     if not np.allclose(high, bounds.high[: len(high)]):
         raise PolicyError(f"{source}: made for actions up to {high.tolist()}, {env.id} has {bounds.high.tolist()}")
+
+
+def training_conditions(env: Any, params: Any) -> Conditions:
+    """Returns the conditions of an environment, as a policy that is trained in it carries them."""
+    fields, constants = tuple(env.fields(params)), constants_digest(env, params)
+    return Conditions(env.id, _period(params), int(params.lidar.n_beams), fields, constants)
+
+
+def _check_conditions(trained: Conditions, here: Conditions, source: str | Path) -> None:
+    """Refuses conditions that are others than those of the training, where those are known."""
+    _check_period(trained.period, here.period, source, here.task)
+    if trained.n_beams not in (None, here.n_beams):
+        raise PolicyError(f"{source}: trained with {trained.n_beams} beams, {here.task} has {here.n_beams}")
+    if trained.fields not in (None, here.fields):
+        names, present = ", ".join(trained.fields or ()), ", ".join(here.fields or ())
+        raise PolicyError(f"{source}: trained on the fields {names}; {here.task} has {present}")
+    # Another task has other constants, and it may be asked how a policy does there.
+    if trained.task == here.task and trained.constants not in (None, here.constants):
+        was, present = (trained.constants or "")[:12], (here.constants or "")[:12]
+        raise PolicyError(f"{source}: trained under constants {was} of {here.task}, which has {present} here")
+
+
+def _check_period(trained: float, here: float, source: str | Path, task: str) -> None:
+    """Refuses another control period: with half of it, dead reckoning would count every step double."""
+    if abs(trained - here) > 1e-6:
+        raise PolicyError(f"{source}: trained with a control period of {trained:g} s, {task} has {here:g} s")
+
+
+def _period(params: Any) -> float:
+    """Returns the control period of a task, s."""
+    return round(float(np.max(np.asarray(params.vehicle.period))), 6)
 
 
 def register_released() -> tuple[str, ...]:
@@ -103,15 +142,26 @@ def register_released() -> tuple[str, ...]:
     names = tuple(PREFIX + name for name in released() if not name.startswith("B2"))
     for name in names:
         if name not in registry.names():
-            registry.register(name, lambda params, name=name: with_map(load(name.removeprefix(PREFIX))[0], params))  # type: ignore[misc]
+            registry.register(name, functools.partial(_make_released, name.removeprefix(PREFIX)))
     return names
+
+
+def _make_released(name: str, params: EnvParams) -> Agent:
+    """Makes the agent of a released policy for a task.
+
+    Raises:
+        PolicyError: It was trained with another control period.
+    """
+    agent, _ = load(name)
+    _check_period(agent.conditions.period, _period(params), name, "this task")
+    return with_map(agent, params)
 
 
 def _checked(file: PolicyFile) -> Agent:
     """The agent of a file, driven once on paper so that a missing or misshapen tensor is found here."""
     facts = file.facts
     try:
-        agent = from_tensors(facts["kind"], facts["layout"], file.tensors, facts["name"])
+        agent = from_tensors(facts["kind"], facts["layout"], file.tensors, facts["name"], Conditions.from_facts(facts))
         _try(agent)
     except (KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"{file.path}: tensors and layout do not belong together ({error})") from error

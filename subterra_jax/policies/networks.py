@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
 from subterra_jax.policies import senses
+from subterra_jax.policies.files import Conditions
 from subterra_jax.state import EnvParams
 
 Tensors = dict[str, Float[Array, "..."]]
@@ -51,6 +52,7 @@ class FeedForward:
         high: Largest action, m/s and rad/s.
         frames: Number of observations in its input.
         name: Name on the leaderboard.
+        conditions: Conditions of its training; None: any.
         uses_lidar: Always true: it reads the ranges.
         uses_map: Always false.
         privileged: Always false: it gets no truth.
@@ -61,6 +63,7 @@ class FeedForward:
     high: Float[Array, "n_action"]
     frames: int = struct.field(pytree_node=False)
     name: str = struct.field(pytree_node=False, default="ppo-mlp")
+    conditions: Conditions | None = struct.field(pytree_node=False, default=None)
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
     uses_map: bool = struct.field(pytree_node=False, default=False)
     privileged: bool = struct.field(pytree_node=False, default=False)
@@ -117,6 +120,7 @@ class Recurrent:
         bin_width: Width of a bin of the estimation head, m.
         shown: Choice of the network's inputs.
         name: Name on the leaderboard.
+        conditions: Conditions of its training; None: any.
         uses_lidar: Always true: it reads the ranges.
         uses_map: Always false.
         privileged: Always false: it gets no truth.
@@ -128,6 +132,7 @@ class Recurrent:
     bin_width: float = struct.field(pytree_node=False)
     shown: senses.Senses = struct.field(pytree_node=False, default=senses.PLAIN)
     name: str = struct.field(pytree_node=False, default="ppo-gru")
+    conditions: Conditions | None = struct.field(pytree_node=False, default=None)
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
     uses_map: bool = struct.field(pytree_node=False, default=False)
     privileged: bool = struct.field(pytree_node=False, default=False)

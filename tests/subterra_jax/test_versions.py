@@ -21,9 +21,9 @@ from subterra_jax.viewer.config import ViewerError
 from subterra_jax.viewer.recording import load as load_episode
 from subterra_jax.viewer.recording import save as save_episode
 from tests.subterra_jax.viewer.episodes import straight
+from train import folder
 from train.errors import CheckpointError
-from train.policies import versions
-from train.run import checkpoint
+from train.world import library_versions
 
 ROOT = Path(__file__).parents[2]
 
@@ -45,9 +45,9 @@ def test_the_version_is_that_of_the_package():
 
 
 def test_what_is_released_from_a_bare_checkout_knows_its_version(monkeypatch):
-    monkeypatch.setattr("train.policies.metadata.distributions", lambda: [])
-    assert versions()["subterra-jax"] == VERSION
-    assert versions()["jax"] == "not installed"
+    monkeypatch.setattr("train.world.metadata.distributions", lambda: [])
+    assert library_versions()["subterra-jax"] == VERSION
+    assert library_versions()["jax"] == "not installed"
 
 
 @pytest.mark.parametrize(
@@ -108,13 +108,13 @@ def test_a_policy_of_another_version_says_what_to_do(tmp_path, number, says):
 
 
 def test_a_checkpoint_of_another_version_says_what_to_do(tmp_path):
-    checkpoint.save(tmp_path, 3, {"policy": {"w": np.zeros(2, np.float32)}}, {"task": "t"})
-    (facts,) = tmp_path.rglob(checkpoint.FACTS)
-    name, _, number = checkpoint.SCHEMA.rpartition("/")
+    folder.save_checkpoint(tmp_path, 3, {"policy": {"w": np.zeros(2, np.float32)}}, {"task": "t"})
+    (facts,) = tmp_path.rglob(folder.FACTS)
+    name, _, number = folder.SCHEMA.rpartition("/")
     for told, says in ((int(number) - 1, "older .*--overwrite"), (int(number) + 1, "newer .* --upgrade")):
         facts.write_text(json.dumps({**json.loads(facts.read_text()), "schema": f"{name}/{told}"}))
         with pytest.raises(CheckpointError, match=says):
-            checkpoint.load(tmp_path)
+            folder.load_checkpoint(tmp_path)
 
 
 def test_an_episode_of_another_version_says_what_to_do(tmp_path):

@@ -5,12 +5,13 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
+from tests.subterra_jax import checking
 from tests.train import corridor
 
 # Shapes in annotations are checked at run time, so that they cannot go stale. Not those of pytrees: jax also rebuilds
 # them around NumPy arrays, shapes and booleans.
-CHECKED = ("train.feedforward.frames", "train.gae", "train.feedforward.networks", "train.feedforward.normalize")
-with install_import_hook(CHECKED, "beartype.beartype"):
+CHECKED = ("train.learning", "train.feedforward.rollout", "train.feedforward.networks")
+with install_import_hook(CHECKED, f"{checking.__name__}.check_functions"):
     from train import navigate
 
 TASK = "Subterra/TraverseShort-v0"

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from subterra_jax import policies as released
-from train.agents import tensors_of
 from train.errors import CheckpointError, ConfigError
-from train.learners import make_learner
-from train.policies import open_world
-from train.recurrent.config import RecurrentConfig
-from train.recurrent.distill_config import DistillConfig
+from train.policies import policy_tensors
+from train.ppo import make_learner
+from train.recurrent.config import DistillConfig, RecurrentConfig
+from train.world import open_world
 
 NAME = "StopAtShort-v0"
 SIZE = {"n_envs": 2, "unroll": 4, "minibatches": 1}
@@ -32,7 +31,7 @@ def test_a_run_begins_with_the_weights_of_the_policy_that_it_is_told_to_begin_fr
     layout = {name: facts["layout"][name] for name in ("hidden", "bins", "bin_width")}
     learner = make_learner(world, config_type(begin_from=NAME, **SIZE, **layout))
     state = jax.jit(learner.init)(jax.random.PRNGKey(0), world.params)
-    begun = tensors_of(learner.networks, learner.policy_of(state))
+    begun = policy_tensors(learner.networks, learner.policy_of(state))
     assert set(begun) == set(agent.tensors)
     for name, tensor in begun.items():
         np.testing.assert_array_equal(tensor, agent.tensors[name])

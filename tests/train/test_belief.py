@@ -9,16 +9,20 @@ import pytest
 import subterra_jax as st
 from subterra_jax import policies as released
 from tests.train.conftest import call, log_without_timing
-from train import navigate, policies, release
-from train.agents import agent_of
+from train import navigate, policies
 from train.belief import lessons
-from train.belief.config import check, make_config
-from train.belief.learner import BeliefLearner
-from train.belief.network import BeliefLayout, BeliefNetworks
+from train.belief.learner import (
+    BeliefLayout,
+    BeliefLearner,
+    BeliefNetworks,
+    check_belief,
+    make_belief_config,
+)
 from train.errors import ConfigError
+from train.policies import make_agent
 
 TASK = "Subterra/RelocaliseShort-v0"
-CONFIG = make_config("cpu")
+CONFIG = make_belief_config("cpu")
 LENGTH, PITCH = 300.0, 1.5
 STATION = jnp.linspace(80.0, 92.0, 61)
 
@@ -72,13 +76,13 @@ def test_it_is_refused_where_one_knows_where_one_is():
 @pytest.mark.parametrize(("name", "value"), [("ways", 0), ("least_apart", 0.0), ("hidden", ()), ("minibatches", 3)])
 def test_a_setting_that_makes_no_sense_is_refused_by_name(name, value):
     with pytest.raises(ConfigError, match=name):
-        check(dataclasses.replace(CONFIG, **{name: value}))
+        check_belief(dataclasses.replace(CONFIG, **{name: value}))
 
 
 @pytest.mark.parametrize(("name", "value"), [("cell", 0.0), ("sure_mass", 1.5), ("drift", -1.0)])
 def test_so_is_a_habit_of_the_filter(name, value):
     with pytest.raises(ConfigError, match=name):
-        check(dataclasses.replace(CONFIG, habits=dataclasses.replace(CONFIG.habits, **{name: value})))
+        check_belief(dataclasses.replace(CONFIG, habits=dataclasses.replace(CONFIG.habits, **{name: value})))
 
 
 def test_an_untrained_sensor_is_the_nominal_one_and_survives_a_release(tmp_path):
@@ -86,14 +90,14 @@ def test_an_untrained_sensor_is_the_nominal_one_and_survives_a_release(tmp_path)
     networks = BeliefNetworks(layout)
     policy = networks.init(jax.random.PRNGKey(0))
     out = tmp_path / "mine.safetensors"
-    release.write(out, networks, policy, {"task": TASK, "world": {"lining": "pockets"}})
+    policies.write_policy(out, networks, policy, {"task": TASK, "world": {"lining": "pockets"}})
     agent, facts = released.load(out)
     assert (facts["kind"], agent.name, agent.habits) == ("belief", "mine", CONFIG.habits)
-    for name, tensor in agent_of(networks, policy).tensors.items():
+    for name, tensor in make_agent(networks, policy).tensors.items():
         np.testing.assert_array_equal(agent.tensors[name], tensor)
     assert float(jnp.max(jnp.abs(agent.tensors["scan.hidden_1.kernel"]))) == 0.0
     broken = {name: tensor for name, tensor in policy.items() if name != "temper"}
-    release.write(out, networks, broken, {"task": TASK, "world": {}})
+    policies.write_policy(out, networks, broken, {"task": TASK, "world": {}})
     with pytest.raises(released.PolicyError, match="do not belong together"):
         released.load(out)
 
@@ -120,7 +124,7 @@ def test_a_run_learns_is_scored_and_can_be_opened_again(run):
     assert facts["task"] == TASK
     # Weights that were 0 have learnt something.
     assert float(np.max(np.abs(policy["scan"]["hidden_1"]["kernel"]))) > 0.0
-    assert agent_of(networks, policy).habits == CONFIG.habits
+    assert make_agent(networks, policy).habits == CONFIG.habits
 
 
 def test_a_teacher_for_a_belief_is_refused(capsys):

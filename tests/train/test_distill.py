@@ -11,12 +11,11 @@ import subterra_jax as st
 from subterra_jax.baselines import registry
 from tests.subterra_jax.probes import PROBES
 from tests.train.conftest import call, log_without_timing
-from train import navigate
+from train import folder, navigate
 from train.errors import ConfigError
-from train.recurrent import teacher
+from train.recurrent import lessons
+from train.recurrent.config import DistillConfig, check_distill, make_distill_config
 from train.recurrent.distill import DistillLearner
-from train.recurrent.distill_config import DistillConfig, check, make_config
-from train.run import checkpoint
 
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = DistillConfig(steps=512, n_envs=4, unroll=32, minibatches=2, hidden=8, bins=9)
@@ -53,8 +52,8 @@ def test_a_teacher_gets_what_it_declares_and_no_more(learner, name):
     agent, speed = PROBES[name]
     env, params = learner[0].env.env, learner[1]
     observation, state = learner[0].env.reset(jax.random.key(0), params, 2)
-    memory = teacher.blank(env, agent, params, 2)
-    advise = jax.jit(lambda *seen: teacher.advise(env, agent, *seen, jnp.ones(2, bool), params))
+    memory = lessons.blank(env, agent, params, 2)
+    advise = jax.jit(lambda *seen: lessons.advise(env, agent, *seen, jnp.ones(2, bool), params))
     advice, _ = advise(jax.random.key(1), memory, observation, state)
     np.testing.assert_allclose(advice[:, 0], speed, rtol=1e-4)
 
@@ -62,15 +61,15 @@ def test_a_teacher_gets_what_it_declares_and_no_more(learner, name):
 def test_a_teacher_who_is_not_obeyed_remembers_what_was_done_and_has_not_arrived(learner):
     agent, env, params = learner[0].teacher, learner[0].env.env, learner[1]
     observation, state = learner[0].env.reset(jax.random.key(0), params, 2)
-    memory = teacher.blank(env, agent, params, 2)
+    memory = lessons.blank(env, agent, params, 2)
     # At the goal already, the oracle's advice is to stand; it is driven on all the same.
     there = observation.at[:, env.fields(params)["goal"]].set(state.station[:, None])
-    advise = jax.jit(lambda *seen: teacher.advise(env, agent, *seen, jnp.ones(2, bool), params))
+    advise = jax.jit(lambda *seen: lessons.advise(env, agent, *seen, jnp.ones(2, bool), params))
     advice, after = advise(jax.random.key(1), memory, there, state)
     np.testing.assert_allclose(advice[:, 0], 0.0, atol=1e-6)
     assert after.mission.stopped.all()
     done = jnp.array([[1.5, 0.1], [0.7, -0.2]])
-    told = teacher.driven(memory, after, done)
+    told = lessons.driven(memory, after, done)
     np.testing.assert_array_equal(told.command, done)
     assert not told.mission.stopped.any()
 
@@ -78,13 +77,13 @@ def test_a_teacher_who_is_not_obeyed_remembers_what_was_done_and_has_not_arrived
 @pytest.mark.parametrize(("name", "value"), [("handover", 1.5), ("imitation_weight", -1.0), ("minibatches", 3)])
 def test_a_setting_that_makes_no_sense_is_refused_by_name(name, value):
     with pytest.raises(ConfigError, match=name):
-        check(dataclasses.replace(CONFIG, **{name: value}))
+        check_distill(dataclasses.replace(CONFIG, **{name: value}))
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu"])
 def test_every_task_has_a_preset_that_makes_sense(preset):
     for task in st.TASKS:
-        check(make_config(task, preset))
+        check_distill(make_distill_config(task, preset))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +123,7 @@ def test_a_student_comes_closer_to_its_teacher_and_goes_on_after_a_kill_to_the_s
     shutil.rmtree(killed / "checkpoint" / "00000024")
     assert call(navigate.main, *line, "--out", str(killed), "--resume") == 0
     assert log_without_timing(killed) == log
-    assert checkpoint.load(killed).facts["digest"] == checkpoint.load(whole).facts["digest"]
+    assert folder.load_checkpoint(killed).facts["digest"] == folder.load_checkpoint(whole).facts["digest"]
     assert json.loads((whole / "config.json").read_text())["config"]["teacher"] == "oracle"
     capsys.readouterr()
     alone = tuple(word for word in line if word not in ("--teacher", "oracle", "--handover=1"))

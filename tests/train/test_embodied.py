@@ -10,9 +10,9 @@ from subterra_jax.b2.transfer import Lag, LaggedWheels
 from subterra_jax.policies import PolicyError
 from train import navigate
 from train.b2 import embodied
-from train.b2.legs import Legs
-from train.commandline import read_command
+from train.config import Legs
 from train.errors import ConfigError
+from train.navigate import read_command
 
 SHORT = "Subterra/TraverseShort-v0"
 NO_TRIAL = Legs(robots=0)

@@ -3,12 +3,10 @@ import json
 import jax.numpy as jnp
 import numpy as np
 
-from train import curve
-from train.feedforward import normalize
+from train import curve, learning
 from train.feedforward.networks import Policy
-from train.run.episodes import Best, EpisodeWindow
-from train.run.fetching import fetch
-from train.run.report import Finished, Report, in_a_row, report
+from train.report import Finished, Report, fetch, in_a_row, report
+from train.snapshot import Best, EpisodeWindow
 
 
 def finished(done, coverage, success, episode_return, length):
@@ -95,7 +93,7 @@ def full_window(success, episode_return):
 
 
 def named(name):
-    return Policy(weights=name, statistics=normalize.init(()))
+    return Policy(weights=name, statistics=learning.start_statistics(()))
 
 
 def test_the_best_policy_is_chosen_by_success_then_by_return_then_by_being_later():

@@ -10,9 +10,9 @@ from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.rules import StartParams
 from tests.train.conftest import TASK, call
-from train import evaluate
-from train.agents import agent_of
-from train.feedforward import networks, normalize
+from train import evaluate, learning
+from train.feedforward import networks
+from train.policies import make_agent
 
 
 @pytest.fixture(scope="module")
@@ -20,12 +20,12 @@ def straight_driver():
     """A policy that drives straight on at 1 m/s whatever it sees."""
     nets = networks.Networks(networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (4,), 0.5, 0.01))
     weights = jax.tree.map(lambda x: 0.0 * x, nets.init(jax.random.PRNGKey(0))["policy"])
-    return agent_of(nets, networks.Policy(weights, normalize.init((18,))))
+    return make_agent(nets, networks.Policy(weights, learning.start_statistics((18,))))
 
 
 def driven(agent, tunnel, **start):
     env, params = st.make(TASK, tunnel=tunnel, start=StartParams(**start))
-    return evaluate.scores(drive(env, params, agent, listed_episodes(TASK, params, 20)))
+    return evaluate.scores(drive(env, params, agent, listed_episodes(env, params, 20)))
 
 
 def test_a_drive_down_the_centreline_scores_what_geometry_says(straight_driver, tunnel):

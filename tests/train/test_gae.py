@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from train import gae
+from train import learning
 
 
 def slow_advantages(reward, value, last_value, final_value, terminated, truncated, discount, gae_lambda):
@@ -43,7 +43,7 @@ def random_rollout(rng, n_steps=40, n_envs=7):
 def test_advantages_equal_the_definition_with_both_ends_of_an_episode():
     for seed in range(3):
         data = random_rollout(np.random.default_rng(seed))
-        fast = gae.advantages(*(jnp.asarray(x) for x in data), discount=0.97, gae_lambda=0.9)
+        fast = learning.advantages(*(jnp.asarray(x) for x in data), discount=0.97, gae_lambda=0.9)
         np.testing.assert_allclose(fast, slow_advantages(*data, 0.97, 0.9), rtol=1e-4, atol=1e-5)
 
 
@@ -57,7 +57,7 @@ def one_env(**changes):
         "terminated": jnp.zeros((steps, 1), bool),
         "truncated": jnp.zeros((steps, 1), bool),
     }
-    return gae.advantages(**{**data, **changes}, discount=0.5, gae_lambda=1.0)[:, 0]
+    return learning.advantages(**{**data, **changes}, discount=0.5, gae_lambda=1.0)[:, 0]
 
 
 def test_an_unfinished_episode_is_worth_its_rewards_and_the_value_after_them():

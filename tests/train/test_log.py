@@ -5,11 +5,10 @@ import sys
 import numpy as np
 import pytest
 
-from train import curve
+from train import curve, log, session
 from train.errors import ConfigError
-from train.run import board, milestones
-from train.run.episodes import COLUMNS
-from train.run.log import RunLog
+from train.log import RunLog
+from train.snapshot import COLUMNS
 
 
 def record(iteration, success):
@@ -51,7 +50,7 @@ def test_iterations_after_the_last_checkpoint_are_forgotten_in_every_file(tmp_pa
 
 def test_tensorboard_gets_every_number_at_its_step(tmp_path):
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
-    written = board.Board(tmp_path)
+    written = log.Board(tmp_path)
     for iteration in (1, 2):
         written.write(record(iteration, None if iteration == 1 else 0.5))
     written.close()
@@ -76,7 +75,7 @@ def events(content, event_type):
 def test_tensorboard_without_its_library_is_a_clear_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ConfigError, match=r"needs tensorboardX: pip install 'subterra-jax\[logs\]'"):
-        board.check()
+        log.check_tensorboard()
 
 
 def runs(folder, coverages):
@@ -125,7 +124,7 @@ def test_the_table_of_seeds_has_a_line_each_and_their_mean_and_spread(tmp_path, 
         line = {"episodes": 120, "coverage_mean_100": 0.95, "success_mean_100": 1.0, "step": steps, "timing": timing}
         (run / "log.jsonl").write_text(json.dumps(line) + "\n")
         found.append(run)
-    milestones.tell(tmp_path / "out", found, [{"success": 1.0}, {"success": 0.5}])
+    session.write_summary(tmp_path / "out", found, [{"success": 1.0}, {"success": 0.5}])
     told = json.loads((tmp_path / "out" / "seeds.json").read_text())["mean_sd"]
     assert told["steps"] == pytest.approx([2000.0, 1000.0 * np.sqrt(2.0)])
     assert told["seconds_compiled"] == pytest.approx([15.0, 10.0 * np.sqrt(2.0)])

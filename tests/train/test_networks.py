@@ -2,14 +2,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from train.feedforward import networks, normalize
+from train import learning
+from train.feedforward import networks
 
 LAYOUT = networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16, 16), init_std=0.5, min_std=0.01)
 
 
 def fresh():
     nets = networks.Networks(LAYOUT)
-    return nets, nets.init(jax.random.PRNGKey(0)), normalize.init((18,))
+    return nets, nets.init(jax.random.PRNGKey(0)), learning.start_statistics((18,))
 
 
 def test_actions_never_leave_their_range():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.train.conftest import log_without_timing
-from train.run import checkpoint
-from train.run.log import read_log
+from train import folder
+from train.log import read_log
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_the_same_seed_logs_the_same_and_a_resumed_run_continues_bit_for_bit(tra
     assert log_without_timing(out) == log_without_timing(straight_through)
     for name in ("episodes.csv", "curve.csv", "evaluation.json"):
         assert (out / name).read_bytes() == (straight_through / name).read_bytes(), name
-    assert checkpoint.load(out).facts["digest"] == checkpoint.load(straight_through).facts["digest"]
+    assert folder.load_checkpoint(out).facts["digest"] == folder.load_checkpoint(straight_through).facts["digest"]
 
 
 def test_another_seed_logs_something_else(train_small, straight_through):

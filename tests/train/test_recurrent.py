@@ -9,14 +9,17 @@ import pytest
 
 import subterra_jax as st
 from tests.train.conftest import call, log_without_timing
-from train import navigate
+from train import folder, navigate
 from train.errors import ConfigError
-from train.recurrent import curriculum, estimation
-from train.recurrent.config import RecurrentConfig, check, make_config
-from train.recurrent.layout import make_layout
-from train.recurrent.learner import RecurrentLearner
-from train.recurrent.network import RecurrentNetworks
-from train.run import checkpoint
+from train.recurrent import drive
+from train.recurrent.config import (
+    RecurrentConfig,
+    check_recurrent,
+    make_recurrent_config,
+)
+from train.recurrent.drive import make_layout
+from train.recurrent.learner import RecurrentLearner, nearer
+from train.recurrent.network import RecurrentNetworks, estimation_loss
 
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = RecurrentConfig(steps=512, n_envs=8, unroll=32, minibatches=2, epochs=1, hidden=8, bins=9)
@@ -39,10 +42,27 @@ def test_memory_begins_anew_with_every_episode_and_goes_on_between_unrolls():
     assert np.abs(anew[0] - last[0]).max() > 1e-3
 
 
+def test_the_value_target_of_a_truncated_step_goes_on_with_the_value_it_had():
+    env, params = st.make(TASK, horizon=5)
+    learner = RecurrentLearner(env, params, CONFIG)
+    state = learner.init(jax.random.PRNGKey(0), params)
+    after, rollout, _, _ = drive.collect(
+        learner.env, params, learner.networks, state.weights, state.drive, jax.random.PRNGKey(1), CONFIG.unroll
+    )
+    scale = jnp.float32(2.0)
+    target = np.asarray(learner._lesson(state, rollout, after, params, scale).target)
+    value = np.asarray(learner.networks.value(state.weights, rollout.truth))
+    cut = np.asarray(rollout.truncated & ~rollout.terminated)
+    assert cut.sum() > 20
+    assert np.abs(value[cut]).min() > 1e-4
+    wanted = np.asarray(rollout.reward) / 2.0 + CONFIG.discount * value
+    np.testing.assert_allclose(target[cut], wanted[cut], atol=1e-5)
+
+
 def test_an_error_between_two_bins_is_shared_between_them():
     # Nine bins of 0.25 m about 0: the fifth has its middle at 0.
     logits = jnp.log(jnp.arange(1.0, 10.0) / 45.0)
-    missed = estimation.missed(jnp.tile(logits, (3, 1)), jnp.array([0.0, 0.0625, -99.0]), 0.25)
+    missed = estimation_loss(jnp.tile(logits, (3, 1)), jnp.array([0.0, 0.0625, -99.0]), 0.25)
     wanted = [np.log(45.0 / 5.0), 0.75 * np.log(45.0 / 5.0) + 0.25 * np.log(45.0 / 6.0), np.log(45.0)]
     np.testing.assert_allclose(missed, wanted, atol=2e-3)
 
@@ -50,7 +70,7 @@ def test_an_error_between_two_bins_is_shared_between_them():
 def test_goals_move_away_while_it_learns_and_end_where_the_task_has_them():
     _, params = st.make(TASK)
     near, far, end = (
-        curriculum.nearer(params, progress, CONFIG.curriculum).goal for progress in (0.0, 0.5 * CONFIG.curriculum, 1.0)
+        nearer(params, progress, CONFIG.curriculum).goal for progress in (0.0, 0.5 * CONFIG.curriculum, 1.0)
     )
     assert near.high < far.high < end.high
     assert float(end.high) == pytest.approx(float(params.goal.high))
@@ -70,13 +90,13 @@ def test_a_task_that_has_no_goal_is_refused_before_anything_compiles(task):
 )
 def test_a_setting_that_makes_no_sense_is_refused_by_name(name, value):
     with pytest.raises(ConfigError, match=name):
-        check(dataclasses.replace(CONFIG, **{name: value}))
+        check_recurrent(dataclasses.replace(CONFIG, **{name: value}))
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu"])
 @pytest.mark.parametrize("task", st.TASKS)
 def test_every_task_has_a_preset_that_makes_sense(task, preset):
-    check(make_config(task, preset))
+    check_recurrent(make_recurrent_config(task, preset))
 
 
 def test_a_run_that_was_killed_goes_on_to_the_same_bytes(tmp_path, capsys):
@@ -90,7 +110,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bytes(tmp_path, capsys):
     assert log_without_timing(killed) == log_without_timing(whole)
     assert len(log_without_timing(whole)) == 3
     assert (killed / "evaluation.json").read_bytes() == (whole / "evaluation.json").read_bytes()
-    assert checkpoint.load(killed).facts["digest"] == checkpoint.load(whole).facts["digest"]
+    assert folder.load_checkpoint(killed).facts["digest"] == folder.load_checkpoint(whole).facts["digest"]
     assert json.loads((whole / "config.json").read_text())["kind"] == "gru"
     # The schedule of goals and learning rate hangs on the steps.
     capsys.readouterr()

@@ -10,14 +10,16 @@ from safetensors.numpy import load_file
 
 import subterra_jax as st
 from subterra_jax import policies
+from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
+from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.policies import senses
 from tests.train.conftest import TASK, call
-from train import evaluate, release
-from train.agents import agent_of
-from train.feedforward import frames, networks, normalize
+from train import evaluate, learning, release
+from train.feedforward import networks, rollout
+from train.policies import facts_file, make_agent, open_agent, write_policy
 from train.recurrent.config import RecurrentConfig
-from train.recurrent.layout import make_layout
+from train.recurrent.drive import make_layout
 from train.recurrent.network import RecurrentNetworks, without_critic
 
 GOAL_TASK = "Subterra/StopAtShort-v0"
@@ -28,7 +30,7 @@ def perceptron():
     nets = networks.Networks(networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16, 8), 0.5, 0.01))
     data = 3.0 * jax.random.normal(jax.random.PRNGKey(0), (50, 18)) + 1.0
     weights = jax.tree.map(lambda x: x + 0.1, nets.init(jax.random.PRNGKey(1))["policy"])
-    return nets, networks.Policy(weights, normalize.update(normalize.init((18,)), data))
+    return nets, networks.Policy(weights, learning.update_statistics(learning.start_statistics((18,)), data))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +52,7 @@ def among_boxes():
 @pytest.fixture
 def released(gru, tmp_path):
     out = tmp_path / "mine.safetensors"
-    release.write(out, *gru, {"task": GOAL_TASK, "world": {"lining": "pockets"}})
+    write_policy(out, *gru, {"task": GOAL_TASK, "world": {"lining": "pockets"}})
     return out
 
 
@@ -66,10 +68,14 @@ def readings(n_steps):
 
 def test_a_perceptron_drives_without_the_trainer_as_it_does_with_it(perceptron):
     nets, policy = perceptron
-    agent, stack, memory = agent_of(nets, policy), None, None
+    agent, stack, memory = make_agent(nets, policy), None, None
     for obs in readings(6):
         seen = Observed(obs.flat[:18], obs.ranges, obs.distance, obs.heading)
-        stack = frames.start(seen.flat, 4) if stack is None else frames.push(stack, seen.flat, jnp.zeros((), bool))
+        stack = (
+            rollout.start_stack(seen.flat, 4)
+            if stack is None
+            else rollout.push_frame(stack, seen.flat, jnp.zeros((), bool))
+        )
         memory = agent.begin(None, seen, None) if memory is None else memory
         action, memory = agent.act(None, memory, seen, None, None)
         np.testing.assert_allclose(action[:2], nets.act(policy, stack), rtol=1e-5)
@@ -79,7 +85,7 @@ def test_a_perceptron_drives_without_the_trainer_as_it_does_with_it(perceptron):
 @pytest.mark.parametrize("trained", ["gru", "among_boxes"])
 def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(request, trained):
     nets, weights = request.getfixturevalue(trained)
-    agent, start = agent_of(nets, weights), jnp.float32(5.0)
+    agent, start = make_agent(nets, weights), jnp.float32(5.0)
     assert (agent.shown.boxes, agent.n_beams) == (trained == "among_boxes", 16)
     memory, hidden, reckoning = agent.blank(), jnp.zeros((1, 12)), senses.start((1,), 16, nets.layout.shown)
     answer, look, advance = jax.jit(agent.answer), jax.jit(senses.look), jax.jit(senses.advance)
@@ -111,12 +117,12 @@ def test_released_tensors_are_what_the_safetensors_library_reads_and_act_alike(g
     obs = next(readings(1))
     for one, other in zip(
         agent.answer(agent.blank(), obs, jnp.float32(0.0))[0],
-        agent_of(*gru).answer(agent.blank(), obs, jnp.float32(0.0))[0],
+        make_agent(*gru).answer(agent.blank(), obs, jnp.float32(0.0))[0],
         strict=True,
     ):
         assert one == other
     again = released.with_name("again.safetensors")
-    release.write(again, *gru, {"task": GOAL_TASK, "world": {}})
+    write_policy(again, *gru, {"task": GOAL_TASK, "world": {}})
     assert again.read_bytes() == released.read_bytes()
 
 
@@ -139,13 +145,13 @@ def test_a_policy_cut_short_is_a_clear_error(released, share):
 
 
 def test_tensors_that_are_not_those_of_the_facts_are_refused(released, perceptron):
-    facts = json.loads(release.facts_file(released).read_text())
-    release.write(released, *perceptron, {"task": TASK, "world": {}})
-    other = json.loads(release.facts_file(released).read_text())
-    release.facts_file(released).write_text(json.dumps(facts))
+    facts = json.loads(facts_file(released).read_text())
+    write_policy(released, *perceptron, {"task": TASK, "world": {}})
+    other = json.loads(facts_file(released).read_text())
+    facts_file(released).write_text(json.dumps(facts))
     with pytest.raises(policies.PolicyError, match="another SHA-256"):
         policies.load(released)
-    release.facts_file(released).write_text(json.dumps({**facts, "tensors_sha256": other["tensors_sha256"]}))
+    facts_file(released).write_text(json.dumps({**facts, "tensors_sha256": other["tensors_sha256"]}))
     with pytest.raises(policies.PolicyError, match="do not belong together"):
         policies.load(released)
 
@@ -157,7 +163,7 @@ def test_a_policy_is_refused_where_it_cannot_drive(released, perceptron):
         with pytest.raises(policies.PolicyError, match=f"which {task} does not ask for"):
             policies.check_fits(agent, *st.make(task), released)
     with pytest.raises(policies.PolicyError, match="observations of 18 numbers"):
-        policies.check_fits(agent_of(*perceptron), *st.make(GOAL_TASK), "mine")
+        policies.check_fits(make_agent(*perceptron), *st.make(GOAL_TASK), "mine")
 
 
 def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, tmp_path, capsys):
@@ -169,6 +175,63 @@ def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, 
     saved = json.loads((trained / "evaluation.json").read_text())
     saved.pop("schema")
     assert json.loads(capsys.readouterr().out) == saved
-    assert json.loads(release.facts_file(out).read_text())["scores"] == saved
+    assert json.loads(facts_file(out).read_text())["scores"] == saved
     assert call(release.main, str(trained), "--out", str(tmp_path / "corridor.bin")) == 2
     assert "must end in .safetensors" in capsys.readouterr().err
+
+
+def with_period(task: str, period: float):
+    return st.make(task, vehicle=VehicleParams(period=period))
+
+
+def test_a_policy_is_refused_where_the_control_period_is_another_than_it_was_trained_with(trained, tmp_path):
+    agent, _ = open_agent(trained, None)
+    constants = st.constants_digest(*st.make(TASK))
+    assert agent.conditions == policies.Conditions(TASK, 0.1, 16, ("ranges", "odometry"), constants)
+    policies.check_fits(agent, *st.make(TASK), "mine")
+    with pytest.raises(policies.PolicyError, match=r"mine: trained with a control period of 0\.1 s, .* has 0\.05 s"):
+        policies.check_fits(agent, *with_period(TASK, 0.05), "mine")
+    out = tmp_path / "mine.safetensors"
+    assert call(release.main, str(trained), "--out", str(out), "--episodes=1") == 0
+    assert json.loads(facts_file(out).read_text())["trained_under"]["period"] == 0.1
+    again, _ = policies.load(out)
+    assert again.conditions == agent.conditions
+    with pytest.raises(policies.PolicyError, match=r"0\.1 s, .* has 0\.05 s"):
+        policies.check_fits(again, *with_period(TASK, 0.05), out)
+
+
+@pytest.mark.parametrize(("name", "period"), [("StopAt-v0", 0.1), ("Traverse-v0", 0.1), ("B2Traverse-v0", 0.2)])
+def test_policies_released_before_conditions_were_kept_imply_their_period(name, period):
+    agent, facts = policies.load(name)
+    assert "trained_under" not in facts
+    assert agent.conditions.period == period
+    with pytest.raises(policies.PolicyError, match=f"control period of {period} s, .* has 0.05 s"):
+        policies.check_fits(agent, *with_period(facts["task"], 0.05), name)
+
+
+def test_a_released_policy_among_the_agents_is_refused_as_well():
+    policies.register_released()
+    _, params = with_period("Subterra/StopAt-v0", 0.05)
+    with pytest.raises(policies.PolicyError, match=r"StopAt-v0: trained with .* 0\.1 s, this task has 0\.05 s"):
+        registry.make_agent("policy:StopAt-v0", params)
+
+
+@pytest.mark.parametrize(
+    ("conditions", "message"),
+    [
+        ({"period": 0.1, "n_beams": 24}, "mine: trained with 24 beams, Subterra/TraverseShort-v0 has 16"),
+        (
+            {"period": 0.1, "constants": "0123456789abcdef"},
+            "mine: trained under constants 0123456789ab of Subterra/TraverseShort-v0, which has [0-9a-f]{12} here",
+        ),
+        (
+            {"period": 0.1, "fields": ["odometry", "ranges"]},
+            "mine: trained on the fields odometry, ranges; Subterra/TraverseShort-v0 has ranges, odometry",
+        ),
+    ],
+)
+def test_other_beams_and_fields_are_refused_with_both_sides_named(perceptron, conditions, message):
+    trained_under = policies.Conditions.from_facts({"task": TASK, "trained_under": conditions})
+    agent = make_agent(*perceptron, conditions=trained_under)
+    with pytest.raises(policies.PolicyError, match=message):
+        policies.check_fits(agent, *st.make(TASK), "mine")

@@ -7,11 +7,10 @@ import pytest
 
 import subterra_jax as st
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
-from train import navigate, ppo, seeds
+from train import navigate, ppo, session
 from train.config import PPOConfig
 from train.errors import ConfigError
 from train.feedforward.learner import Learner
-from train.run import milestones
 
 CONFIG = PPOConfig(steps=3 * 512, n_envs=16, unroll=32, minibatches=2, epochs=2, hidden=(8,), stop_coverage=2.0)
 
@@ -32,11 +31,11 @@ def alone(world):
 
 
 @pytest.mark.parametrize(
-    "axes", [(), pytest.param((seeds.AXIS,), marks=pytest.mark.slow)], ids=["one after the other", "vmapped"]
+    "axes", [(), pytest.param((ppo.AXIS,), marks=pytest.mark.slow)], ids=["one after the other", "vmapped"]
 )
 def test_a_seed_trained_with_others_comes_to_the_numbers_it_comes_to_alone(world, alone, axes, monkeypatch):
-    monkeypatch.setattr(seeds, "axes", lambda: axes)
-    together = seeds.train(learners(*world, axes), world[1], [None, None])
+    monkeypatch.setattr(ppo, "seed_axes", lambda: axes)
+    together = ppo.train_seeds(learners(*world, axes), world[1], [None, None])
     for one, other in zip(alone, together, strict=True):
         assert one.iteration == other.iteration == 3
         np.testing.assert_array_equal(one.window.last["step"], other.window.last["step"])
@@ -52,7 +51,7 @@ def test_a_seed_trained_with_others_comes_to_the_numbers_it_comes_to_alone(world
 def test_a_seed_that_is_done_stands_still_while_others_go_on(world):
     both, seen = learners(*world), []
     both[0].config = dataclasses.replace(both[0].config, steps=512)
-    first, second = seeds.train(both, world[1], [None, None], lambda k, now: seen.append((k, now.iteration)))
+    first, second = ppo.train_seeds(both, world[1], [None, None], lambda k, now: seen.append((k, now.iteration)))
     assert seen == [(0, 1), (1, 1), (1, 2), (1, 3)]
     assert (first.iteration, int(first.state.iteration), second.iteration) == (1, 1, 3)
 
@@ -60,7 +59,7 @@ def test_a_seed_that_is_done_stands_still_while_others_go_on(world):
 def test_seeds_below_zero_or_named_twice_are_refused():
     for wrong in ((0, -1), (3, 3)):
         with pytest.raises(ConfigError, match=r"negative, got -1|named 2 times"):
-            seeds.check(wrong)
+            session.check_seeds(wrong)
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +107,7 @@ def test_the_milestone_is_the_first_line_at_which_the_goal_holds(tmp_path):
     timing = {"seconds": 7.0, "compile_seconds": 5.0}
     text = "".join(json.dumps({**line, "timing": timing}) + "\n" for line in lines)
     (tmp_path / "log.jsonl").write_text(text)
-    found = milestones.reached(tmp_path)
+    found = session.reached(tmp_path)
     assert found == {"episodes": 220, "steps": 30, "seconds": 7.0, "seconds_compiled": 2.0}
     (tmp_path / "log.jsonl").write_text(text.splitlines()[0] + "\n")
-    assert milestones.reached(tmp_path) is None
+    assert session.reached(tmp_path) is None

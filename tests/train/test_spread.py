@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from tests.train.conftest import TASK, call, log_without_timing
-from train import navigate
-from train.devices import cluster
-from train.devices.cluster import Cluster
+from train import devices, navigate
+from train.devices import Cluster
 from train.errors import ConfigError
 
 SMALL = ("--n-envs=16", "--unroll=32", "--minibatches=2", "--epochs=1", "--hidden", "8", "--parts=2", "--steps=1536")
@@ -83,17 +82,17 @@ def test_parts_that_do_not_divide_the_environments_and_seeds_with_parts_are_refu
 
 
 def test_a_launcher_is_found_by_the_processes_it_says_it_started():
-    assert cluster.found({}) is None
-    assert cluster.found({"SLURM_JOB_ID": "7", "SLURM_STEP_NUM_TASKS": "1"}) is None
-    assert cluster.found({"SLURM_STEP_NUM_TASKS": "2"}) == "Slurm"
-    assert cluster.found({"OMPI_COMM_WORLD_SIZE": "4"}) == "Open MPI"
+    assert devices.find_launcher({}) is None
+    assert devices.find_launcher({"SLURM_JOB_ID": "7", "SLURM_STEP_NUM_TASKS": "1"}) is None
+    assert devices.find_launcher({"SLURM_STEP_NUM_TASKS": "2"}) == "Slurm"
+    assert devices.find_launcher({"OMPI_COMM_WORLD_SIZE": "4"}) == "Open MPI"
 
 
 def test_processes_by_hand_must_be_told_whole_and_in_range():
-    assert cluster.resolved(Cluster("a:1", 2), {"JOB_COMPLETION_INDEX": "1"}) == Cluster("a:1", 2, 1)
-    assert cluster.resolved(Cluster(), {"JOB_COMPLETION_INDEX": "1"}) == Cluster()
+    assert devices.resolve_cluster(Cluster("a:1", 2), {"JOB_COMPLETION_INDEX": "1"}) == Cluster("a:1", 2, 1)
+    assert devices.resolve_cluster(Cluster(), {"JOB_COMPLETION_INDEX": "1"}) == Cluster()
     for wrong in (Cluster("a:1"), Cluster(processes=2, process=0), Cluster("a:1", 2)):
         with pytest.raises(ConfigError, match="given together"):
-            cluster.resolved(wrong, {})
+            devices.resolve_cluster(wrong, {})
     with pytest.raises(ConfigError, match="got 2"):
-        cluster.resolved(Cluster("a:1", 2, 2), {})
+        devices.resolve_cluster(Cluster("a:1", 2, 2), {})

@@ -12,12 +12,17 @@ import subterra_jax as st
 from subterra_jax.b2 import gait as gaits
 from subterra_jax.host.errors import OutputError
 from subterra_jax.policies.files import PolicyError
-from train import release, walk
-from train.b2.config import WalkConfig, make_config
-from train.b2.network import WalkLayout, WalkNetworks
-from train.b2.score import score
+from train import walk
+from train.b2.walking import (
+    WalkConfig,
+    WalkLayout,
+    WalkNetworks,
+    make_walk_config,
+    score,
+)
 from train.errors import ConfigError
 from train.feedforward.networks import Policy
+from train.policies import write_policy
 
 N_SEEN, N_TRUTH = 56, 12
 
@@ -56,7 +61,7 @@ def test_the_policy_does_not_see_the_truth_and_the_critic_does(networks, policy)
 
 def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    release.write(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
+    write_policy(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
     loaded, facts = gaits.load_policy(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
     np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), networks.act(policy, seen[:, None]), atol=1e-6)
@@ -74,7 +79,7 @@ def test_a_missing_gait_is_refused_by_name(tmp_path):
 
 def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    release.write(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
+    write_policy(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
     facts = out.with_suffix(".json")
     facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "mlp"}))
     with pytest.raises(PolicyError, match="kind 'mlp', which is no gait"):
@@ -131,7 +136,7 @@ def test_the_critic_s_observation_is_the_policy_s_and_more():
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_it_learns_on_a_cpu(tmp_path):
-    config = dataclasses.replace(make_config("cpu"), steps=600_000)
+    config = dataclasses.replace(make_walk_config("cpu"), steps=600_000)
     assert walk.command(walk.Command(out=tmp_path / "run", robots=32, config=config)) == 0
     lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     paid = np.array([line["reward_velocity"] + line["reward_yaw_rate"] for line in lines])

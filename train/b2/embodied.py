@@ -8,13 +8,14 @@ import subterra_jax as st
 from subterra_jax.b2 import tasks, transfer
 from subterra_jax.parts.slip import SlipParams
 from subterra_jax.tunnel.sources import load_tunnel
-from train import cli, policies
-from train.agents import agent_of
-from train.b2.legs import Legs
+from train.config import Legs
 from train.errors import ConfigError
-from train.policies import World
-from train.run.session import Session
-from train.run.snapshot import Snapshot
+from train.log import print_table
+from train.policies import make_agent
+from train.session import Session
+from train.snapshot import Snapshot
+from train.world import World
+from train.world import open_world as open_planar_world
 
 B2 = "b2"
 ON_LEGS = "legs.json"  # what came of the trial, in the run folder
@@ -24,7 +25,7 @@ _SLIP = SlipParams(gain_sigma=0.1, yaw_sigma=0.02)
 
 
 def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: Legs) -> World:
-    """A task on the planar stand-in of the B2. What the trial needs is opened as well, so that it is known to be there.
+    """Opens a task on the planar stand-in of the B2, and checks that the trial on legs could be opened.
 
     Raises:
         ConfigError: The B2 does not do this task, or the tunnel is more than one.
@@ -34,7 +35,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
         raise ConfigError(f"the B2 does not do {task!r}; it does {', '.join(TASKS)}")
     if legs.robots < 0:
         raise ConfigError(f"robots must not be negative, got {legs.robots}")
-    planar = policies.open_world(task, tunnel, lining)
+    planar = open_planar_world(task, tunnel, lining)
     if planar.params.tunnel.count > 1:
         raise ConfigError(f"tunnel = {tunnel} is more than one; the B2 walks one")
     fields: dict[str, Any] = {"vehicle": tasks.VEHICLE, "start": tasks.START, "slip": _SLIP}
@@ -47,15 +48,15 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
 def score(session: Session, snapshot: Snapshot, tunnel: Path | str | None, legs: Legs) -> dict[str, float]:
     """Has robots walk under the policy that was kept; writes `legs.json` and prints the figures."""
     env, params = _mission(session.world, tunnel, legs)
-    agent = agent_of(session.learner.networks, snapshot.policy)
+    agent = make_agent(session.learner.networks, snapshot.policy)
     found = transfer.figures(*transfer.walk_robots(env, params, agent, legs.robots), params)
     session.folder.write_json(ON_LEGS, {**dataclasses.asdict(legs), **session.world.facts, **found})
-    cli.table(f"{session.world.task}: {legs.robots} B2s in {legs.engine}, gait {legs.gait}", found)
+    print_table(f"{session.world.task}: {legs.robots} B2s in {legs.engine}, gait {legs.gait}", found)
     return found
 
 
 def _mission(world: World, tunnel: Path | str | None, legs: Legs) -> tuple[Any, Any]:
-    """The same task on legs."""
+    """Opens the same task on legs."""
     plan = load_tunnel(tunnel)
     if (piece := st.TASKS[world.task].piece) is not None:
         start, length = piece

@@ -1,4 +1,4 @@
-"""What a lesson is made of: a stretch driven by the controller, and the ways that it might have been."""
+"""Lessons: a stretch driven by the controller, and the ways along the tunnel that it might have been."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ _PHASE_SIGMA = 0.1  # m about whole rings from the true way
 
 @struct.dataclass
 class Drive:
-    """Where the environments are between two unrolls.
+    """State of the environments between two unrolls.
 
     Attributes:
         env_state: State of the batch of environments.
@@ -35,14 +35,14 @@ class Drive:
 
 @struct.dataclass
 class Stretch:
-    """One unroll as it is stored, `(time, env, …)`.
+    """Storage of one unroll, `(time, env, …)`.
 
     Attributes:
         ranges: Scans, m.
         walls: Walls as tracked.
         station: True station, m.
         forward: 1 where the robot faces growing stations, else −1.
-        tunnel: Which tunnel of a stack.
+        tunnel: Index of the tunnel in a stack.
         same: No episode has ended since the stretch began.
     """
 
@@ -61,7 +61,7 @@ class Ways:
     Attributes:
         station: Station at each time, m.
         forward: 1 where one faces growing stations, else −1.
-        wrong: Whether to be taken for it would be a mistake.
+        wrong: To take it for the true way would be a mistake.
     """
 
     station: Float[Array, "time way"]
@@ -70,14 +70,14 @@ class Ways:
 
 
 def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int) -> Drive:
-    """Every environment at the start of an episode."""
+    """Starts an episode in every environment."""
     observation, state = env.reset(key, params, n_envs)
     walls = jax.vmap(lambda seen: CentreLine().begin(_seen(env, params, seen), params))(observation)
     return Drive(state, observation, walls, jnp.zeros((n_envs, 2)), jnp.ones(n_envs, bool))
 
 
 def collect(env: Any, params: Any, drive: Drive, key: PRNGKeyArray, n_steps: int) -> tuple[Drive, Stretch]:
-    """Drives on along the axis at full speed; whoever comes to an end begins anew somewhere else."""
+    """Drives on along the axis at full speed; a robot that comes to an end begins anew somewhere else."""
 
     def look(walls: Corridor, seen: Array, command: Array, first: Array) -> Corridor:
         obs = _seen(env, params, seen)
@@ -117,13 +117,13 @@ def ways(
     least_apart: float,
     jitter: float,
 ) -> Ways:
-    """The true way and `n` others, which are driven as far and begin elsewhere.
+    """Draws `n` ways beside the true one; they are as long and begin elsewhere.
 
     Three eighths of them face as the robot does, a whole number of rings away; one eighth begin up to 1.5 m off; the
     others face the other way.
 
     Args:
-        key: Source of what is drawn.
+        key: Source of the draws.
         station: True station at each time, m.
         forward: 1 where the robot faces growing stations, else −1.
         length: Of the tunnel, m.

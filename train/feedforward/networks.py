@@ -9,15 +9,15 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from train.brax_parts import MLP, NormalTanhDistribution
-from train.feedforward import normalize
+from train import learning
+from train.learning import MLP, NormalTanhDistribution
 
 Weights = Any  # nested dict of arrays, as flax makes it
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What fixes every array shape and the meaning of the outputs; a checkpoint carries it.
+    """Shapes of all arrays and meaning of the outputs; a checkpoint carries it.
 
     Attributes:
         n_observation: Floats in one observation.
@@ -40,7 +40,7 @@ class Layout:
 
 @struct.dataclass
 class Policy:
-    """All that is needed to act.
+    """Weights and statistics that acting needs.
 
     Attributes:
         weights: Of the policy network.
@@ -48,7 +48,7 @@ class Policy:
     """
 
     weights: Weights
-    statistics: normalize.Statistics
+    statistics: learning.Statistics
 
 
 class Networks:
@@ -74,39 +74,39 @@ class Networks:
         self._offset = jnp.concatenate([jnp.zeros(self.n_action), jnp.full(self.n_action, spread)])
 
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
-        """Untrained weights, under `policy` and `value`."""
+        """Returns untrained weights, under `policy` and `value`."""
         key_policy, key_value = jax.random.split(key)
         flat = jnp.zeros((1, self.layout.frames * self.layout.n_observation))
         return {"policy": self._policy.init(key_policy, flat), "value": self._value.init(key_value, flat)}
 
     def policy_shapes(self) -> Policy:
-        """A policy with shapes in place of arrays."""
+        """Returns a policy with shapes in place of arrays."""
         return jax.eval_shape(
-            lambda key: Policy(self.init(key)["policy"], normalize.init((self.layout.n_observation,))),
+            lambda key: Policy(self.init(key)["policy"], learning.start_statistics((self.layout.n_observation,))),
             jax.random.key(0),
         )
 
     def parameters(
-        self, weights: Weights, statistics: normalize.Statistics, stack: Float[Array, "*batch frames obs"]
+        self, weights: Weights, statistics: learning.Statistics, stack: Float[Array, "*batch frames obs"]
     ) -> Float[Array, "*batch parameters"]:
-        """Parameters of the action distribution before the tanh: means, then spreads."""
+        """Returns parameters of the action distribution before the tanh: means, then spreads."""
         return self._policy.apply(weights, self._flatten(stack, statistics)) + self._offset
 
     def value(
-        self, weights: Weights, statistics: normalize.Statistics, stack: Float[Array, "*batch frames obs"]
+        self, weights: Weights, statistics: learning.Statistics, stack: Float[Array, "*batch frames obs"]
     ) -> Float[Array, "*batch"]:
-        """Expected return, in units of the reward scale."""
+        """Estimates the return, in units of the reward scale."""
         return self._value.apply(weights, self._flatten(stack, statistics))[..., 0]
 
     def action(self, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
-        """The action in m/s and rad/s that belongs to a draw of the Gaussian."""
+        """Returns the action in m/s and rad/s for a draw of the Gaussian."""
         return self._low + 0.5 * (jnp.tanh(raw) + 1.0) * (self._high - self._low)
 
     def act(self, policy: Policy, stack: Float[Array, "*batch frames obs"]) -> Float[Array, "*batch action"]:
-        """The deterministic action: the centre of the distribution."""
+        """Returns the deterministic action, the centre of the distribution."""
         parameters = self.parameters(policy.weights, policy.statistics, stack)
         return self.action(parameters[..., : self.n_action])
 
-    def _flatten(self, stack: Array, statistics: normalize.Statistics) -> Array:
-        normalized = normalize.normalize(stack, statistics)
+    def _flatten(self, stack: Array, statistics: learning.Statistics) -> Array:
+        normalized = learning.normalize(stack, statistics)
         return normalized.reshape(*stack.shape[:-2], -1)

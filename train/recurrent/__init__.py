@@ -1,5 +1,1 @@
 """PPO with memory: a GRU that carries where it is, for tasks whose reward alone does not teach it."""
-
-from train.recurrent import config, learner
-
-__all__ = ["config", "learner"]

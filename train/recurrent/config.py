@@ -1,10 +1,18 @@
-"""What a recurrent training run is told."""
+"""Settings of a policy with memory: learnt by reward, or from a teacher."""
 
 import dataclasses
 from typing import ClassVar
 
 from subterra_jax.policies.senses import TRACKERS
-from train.config import TrainConfig, at_least, check_common, known_preset, not_negative, positive, share
+from train.config import (
+    TrainConfig,
+    at_least,
+    check_common,
+    known_preset,
+    not_negative,
+    positive,
+    share,
+)
 from train.errors import ConfigError
 
 
@@ -16,8 +24,7 @@ class RecurrentConfig(TrainConfig):
         hidden: Width of the GRU and of the layers around it.
         bins: Bins of the estimation head.
         bin_width: Their width, m.
-        tracker: Who counts rings for the network, `loop` or `careful`, which sees past what stands in the tunnel; if
-            left out, the second among boxes and the first elsewhere.
+        tracker: Ring counter, `loop` or `careful`; the second sees past boxes and is the default among them.
         estimate_weight: Weight of the estimation head's loss; with 0 reward alone teaches.
         begin_from: Policy to begin from, not from nothing: a run folder, a file, or the name of a released one. What a
             student has learnt from a teacher is made better by reward so.
@@ -55,8 +62,8 @@ _PRESETS: dict[str, dict[str, float | int]] = {
 _STEPS = {"Subterra/StopAt-v0": 400_000_000}
 
 
-def make_config(task: str, preset: str = "gpu") -> RecurrentConfig:
-    """The settings for a task on one kind of machine.
+def make_recurrent_config(task: str, preset: str = "gpu") -> RecurrentConfig:
+    """Returns the settings for a task on one kind of machine.
 
     Args:
         task: Task id.
@@ -70,8 +77,8 @@ def make_config(task: str, preset: str = "gpu") -> RecurrentConfig:
     return RecurrentConfig(**{**_PRESETS[preset], **steps})  # type: ignore[arg-type]
 
 
-def check(config: RecurrentConfig) -> RecurrentConfig:
-    """The settings themselves, once they are known to make sense.
+def check_recurrent(config: RecurrentConfig) -> RecurrentConfig:
+    """Refuses settings that make no sense, and returns the others.
 
     Raises:
         ConfigError: Naming the first setting that does not, and its value.
@@ -84,4 +91,52 @@ def check(config: RecurrentConfig) -> RecurrentConfig:
     if config.tracker is not None and config.tracker not in TRACKERS:
         raise ConfigError(f"tracker must be one of {', '.join(TRACKERS)}, got {config.tracker!r}")
     share(config, "curriculum", "warm_up")
+    return config
+
+
+@dataclasses.dataclass(frozen=True)
+class DistillConfig(RecurrentConfig):
+    """Settings of distillation; of PPO's own, neither advantage nor trust region is used.
+
+    Attributes:
+        teacher: A baseline by name (`oracle` is told the truth), a released policy, or a run folder.
+        handover: Share of the training after which the student drives every episode; until then more and more of them.
+        imitation_weight: Weight of the distance between the student's action and the teacher's.
+    """
+
+    steps: int = 200_000_000
+    n_envs: int = 4096  # more updates to the step than by reward: what a teacher says is hardly noise
+    epochs: int = 1
+    curriculum: float = 0.0
+    teacher: str = "oracle"
+    handover: float = 0.2
+    imitation_weight: float = 1.0
+
+
+_DISTILL_PRESETS: dict[str, dict[str, float | int]] = {
+    "gpu": {},
+    "cpu": {"steps": 10_000_000, "n_envs": 256, "hidden": 96, "minibatches": 8},
+}
+
+
+def make_distill_config(task: str, preset: str = "gpu") -> DistillConfig:
+    """Returns the settings for a task on one kind of machine.
+
+    Raises:
+        ConfigError: There is no preset of that name.
+    """
+    known_preset(preset)
+    del task
+    return DistillConfig(**_DISTILL_PRESETS[preset])  # type: ignore[arg-type]
+
+
+def check_distill(config: DistillConfig) -> DistillConfig:
+    """Refuses settings that make no sense, and returns the others.
+
+    Raises:
+        ConfigError: Naming the first setting that does not, and its value.
+    """
+    check_recurrent(config)
+    not_negative(config, "imitation_weight")
+    share(config, "handover")
     return config

@@ -11,14 +11,18 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
 from subterra_jax.baselines.agent import Agent
-from train.devices import parts
+from train import devices, learning
 from train.recurrent import drive as driving
 from train.recurrent import lessons
-from train.recurrent.distill_config import DistillConfig, check
-from train.recurrent.estimation import missed
-from train.recurrent.layout import make_layout, require_goal
-from train.recurrent.network import RecurrentNetworks, Weights, without_critic
-from train.run.report import Report, report
+from train.recurrent.config import DistillConfig, check_distill
+from train.recurrent.drive import make_layout, require_goal
+from train.recurrent.network import (
+    RecurrentNetworks,
+    Weights,
+    estimation_loss,
+    without_critic,
+)
+from train.report import Report, report
 
 # Beyond this an action counts as wrong by its distance before the tanh, not by the square of it: who does not know
 # whether the goal is passed then stops where that is as likely as not, and not where it has become certain.
@@ -31,13 +35,13 @@ _STANDS = 0.05  # m/s
 
 @struct.dataclass
 class TrainState:
-    """Everything that one iteration hands to the next.
+    """State of a run between two iterations.
 
     Attributes:
         weights: Of the networks.
         moments: State of the optimiser.
-        drive: Where the environments are.
-        key: For everything random from here on.
+        drive: State of the environments.
+        key: Source of all later randomness.
         iteration: Iterations done.
     """
 
@@ -48,16 +52,16 @@ class TrainState:
     iteration: Int[Array, ""]
 
 
-class DistillLearner(parts.Whole):
-    """The two pure functions of training, `init` and `iterate`, for one environment, teacher and config.
+class DistillLearner(devices.Whole):
+    """Distillation as two pure functions, `init` and `iterate`, for one environment, teacher and config.
 
     Args:
         env: An environment, as `st.make` returns it.
         params: Its parameters.
         config: Settings.
-        teacher: Who is asked.
+        teacher: The teacher.
         axes: Names of the axes along which `iterate` is vmapped.
-        split: Names of the axes along which environments are split; see `spread.py`.
+        split: Names of the axes along which environments are split; see `devices.Spread`.
         begun: Weights of a policy to begin with.
 
     Raises:
@@ -76,24 +80,22 @@ class DistillLearner(parts.Whole):
         params: Any,
         config: DistillConfig,
         teacher: Agent,
-        axes: parts.Parts = (),
-        split: parts.Parts = (),
+        axes: devices.Parts = (),
+        split: devices.Parts = (),
         begun: Mapping[str, Any] | None = None,
     ) -> None:
-        self.config, self.axes, self.split, self.begun = check(config), axes, split, begun or {}
+        self.config, self.axes, self.split, self.begun = check_distill(config), axes, split, begun or {}
         require_goal(env)
         self.env, self.teacher = st.batch.AutoReset(env, axes=axes), teacher
         self.networks = RecurrentNetworks(make_layout(env, params, config))
-        updates = config.iterations * config.epochs * config.minibatches
-        rate = optax.cosine_decay_schedule(config.learning_rate, updates, alpha=0.02)
-        self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
+        self.optimizer = learning.clipped_adam(config, final_share=0.02)
 
     def init(self, key: PRNGKeyArray, params: Any) -> TrainState:
-        """An untrained network and every environment at the start of an episode."""
+        """Makes an untrained network, and starts an episode in every environment."""
         key_weights, key_reset, key_rest = jax.random.split(key, 3)
         config, given = self.config, jax.tree.map(jnp.asarray, dict(self.begun))
         weights = {**self.networks.init(key_weights), **given}
-        key_own, layout = parts.own_key(key_reset, self.split), self.networks.layout
+        key_own, layout = devices.own_key(key_reset, self.split), self.networks.layout
         student = driving.begin(self.env, params, key_own, config.part_envs, layout)
         return TrainState(
             weights=weights,
@@ -104,7 +106,7 @@ class DistillLearner(parts.Whole):
         )
 
     def policy_of(self, state: TrainState) -> dict[str, Weights]:
-        """The policy that would drive next."""
+        """Returns the policy that would drive next."""
         return without_critic(state.weights)
 
     def iterate(self, state: TrainState, params: Any) -> tuple[TrainState, Report]:
@@ -120,51 +122,46 @@ class DistillLearner(parts.Whole):
             self.networks,
             state.weights,
             state.drive,
-            parts.own_key(key_drive, self.split),
+            devices.own_key(key_drive, self.split),
             config.unroll,
             taught,
         )
         (weights, moments), losses = self._learn_from(state, rollout, key_learn)
-        metrics = {**jax.tree.map(jnp.mean, losses), **parts.mean(terms, self.split)}
+        metrics = {**jax.tree.map(jnp.mean, losses), **devices.mean_over_parts(terms, self.split)}
         learnt = TrainState(weights, moments, after, key, state.iteration + 1)
         return learnt, report(finished, metrics, self.policy_of(state))
 
     def _learn_from(
         self, state: TrainState, rollout: lessons.Advised, key: PRNGKeyArray
     ) -> tuple[tuple[dict[str, Weights], Any], dict[str, Array]]:
-        config, begun = self.config, state.drive.student.hidden
+        begun = state.drive.student.hidden
 
-        def minibatch(now: tuple[Any, Any], chosen: Array) -> tuple[Any, dict[str, Array]]:
-            weights, moments = now
+        def minibatch(now: tuple[Any, Any], chosen: Array, _: None) -> tuple[Any, dict[str, Array]]:
             part = jax.tree.map(lambda x: x[:, chosen], rollout)
-            wrong = jax.grad(self._imitation, has_aux=True)(weights, begun[chosen], part)
-            gradients, losses = parts.mean(wrong, self.split)
-            updates, moments = self.optimizer.update(gradients, moments)
-            return (optax.apply_updates(weights, updates), moments), losses
+            gradients, losses = devices.mean_over_parts(
+                jax.grad(self._imitation, has_aux=True)(now[0], begun[chosen], part), self.split
+            )
+            return learning.descend(self.optimizer, now, gradients), losses
 
-        def epoch(now: tuple[Any, Any], key_now: PRNGKeyArray) -> tuple[Any, dict[str, Array]]:
-            order = jax.random.permutation(key_now, config.part_envs).reshape(config.minibatches, -1)
-            return jax.lax.scan(minibatch, now, order)
-
-        return jax.lax.scan(epoch, (state.weights, state.moments), jax.random.split(key, config.epochs))
+        return learning.run_epochs(minibatch, (state.weights, state.moments), self.config, key, make_keys=None)
 
     def _imitation(
         self, weights: dict[str, Weights], begun: Float[Array, "env hidden"], rollout: lessons.Advised
     ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-        """How far the student is from the teacher, and what the estimation heads got wrong."""
+        """Sums the student's distance from the teacher and the loss of the estimation head."""
         config, networks = self.config, self.networks
         _, hidden = networks.remember(weights, rollout.features, begun, rollout.first)
         thought = networks.think(weights, hidden, rollout.ahead)
         apart = thought.parameters[..., : networks.n_action] - self._before_tanh(rollout.advice)
         losses = {
             "imitation_loss": jnp.mean(optax.huber_loss(apart, delta=_KNEE)) / _KNEE,
-            "estimate_loss": jnp.mean(missed(thought.logits, rollout.error, config.bin_width)),
+            "estimate_loss": jnp.mean(estimation_loss(thought.logits, rollout.error, config.bin_width)),
         }
         total = config.imitation_weight * losses["imitation_loss"] + config.estimate_weight * losses["estimate_loss"]
         return total, losses
 
     def _before_tanh(self, advice: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
-        """The number before the tanh that makes such an action, or one that comes to the same."""
+        """Returns the number before the tanh that makes such an action, or an equivalent one."""
         layout = self.networks.layout
         low, high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
         # Who is to stand is taught to back up, which the robot reads as standing: the step between driving and standing

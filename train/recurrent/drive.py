@@ -1,4 +1,4 @@
-"""Driving every environment for one unroll with memory, and what is kept of it."""
+"""One unroll of every environment with memory, its storage, and the layout of the network it asks for."""
 
 from typing import Any
 
@@ -7,14 +7,17 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+import subterra_jax as st
 from subterra_jax.policies import senses
+from train.errors import ConfigError
+from train.recurrent.config import RecurrentConfig
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Weights
-from train.run.report import Finished
+from train.report import Finished
 
 
 @struct.dataclass
 class Drive:
-    """Where the environments are between two unrolls.
+    """State of the environments between two unrolls.
 
     Attributes:
         env_state: State of the batch of environments.
@@ -35,7 +38,7 @@ class Drive:
 
 @struct.dataclass
 class Rollout:
-    """One unroll as it is stored, `(time, env, …)`.
+    """Storage of one unroll, `(time, env, …)`.
 
     Attributes:
         features: Inputs of the network.
@@ -45,7 +48,7 @@ class Rollout:
         truth: Inputs of the critic.
         raw_action: The draw before the tanh.
         log_prob: Its log density when it was drawn.
-        reward: As the environment paid it.
+        reward: Reward of the environment.
         terminated: The episode ended for good.
         truncated: The episode ended by the clock.
     """
@@ -63,19 +66,19 @@ class Rollout:
 
 
 def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> senses.Sight:
-    """The inputs of the network for a batch of observations."""
+    """Returns the inputs of the network for a batch of observations."""
     part = {name: observation[..., where] for name, where in env.fields(params).items()}
     return senses.look(part, params.start.station, reckoning)
 
 
 def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Array, "env"]) -> Float[Array, "env n"]:
-    """What the critic is shown: the true state, and how wrong the agent's estimate of it is.
+    """Returns the critic's inputs: the true state, and the error of the agent's estimate of it.
 
     Args:
         env: The environment.
         params: Its params.
         state: Batched state.
-        view: What the agent sees.
+        view: The agent's inputs.
         error: The agent's own estimate of true less tracked distance, m.
     """
     known = jax.vmap(env.privileged, (0, None))(state, params)
@@ -98,7 +101,7 @@ def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Ar
 
 
 def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, layout: RecurrentLayout) -> Drive:
-    """Every environment at the start of an episode."""
+    """Starts an episode in every environment."""
     observation, state = env.reset(key, params, n_envs)
     return Drive(
         env_state=state,
@@ -122,7 +125,7 @@ def collect(
     """Drives `n_steps` control periods with the sampled policy.
 
     Returns:
-        Where the environments are afterwards, the stored unroll, the episodes that ended in it, and means per step: of
+        State of the environments afterwards, the stored unroll, the episodes that ended in it, and means per step: of
         every reward term, and of how far off estimate, ring tracker and dead reckoning are (m).
     """
 
@@ -168,3 +171,50 @@ def collect(
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
     return after, stored, finished, jax.tree.map(jnp.mean, terms)
+
+
+_SLACK = 0.25
+
+
+def require_goal(env: Any) -> None:
+    """Refuses a task that such a network cannot do.
+
+    Raises:
+        ConfigError: The task has no goal.
+    """
+    if env.rule.errand not in ("stop", "return"):
+        raise ConfigError(f"memory = gru learns to drive to a goal and stop, which {env.id} does not ask for")
+
+
+def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayout:
+    """Returns the layout that `config` asks for on this environment; compiles nothing."""
+    bounds, shown = env.action_space(params), senses_of(params, config)
+    observation = jax.ShapeDtypeStruct((1, env.observation_size(params)), jnp.float32)
+    batch = st.batch.AutoReset(env)
+    shapes = jax.eval_shape(lambda obs: _shapes(env, batch, params, obs, shown), observation)
+    return RecurrentLayout(
+        n_features=shapes[0].shape[-1],
+        n_truth=shapes[1].shape[-1],
+        # To stand must not lie at the end of a tanh; the environment reads a speed below 0 as 0.
+        action_low=(float(bounds.low[0]) - _SLACK * float(bounds.high[0]), float(bounds.low[1])),
+        action_high=tuple(float(bound) for bound in bounds.high[:2]),
+        hidden=config.hidden,
+        bins=config.bins,
+        bin_width=config.bin_width,
+        init_std=config.init_std,
+        min_std=config.min_std,
+        tracker=shown.tracker,
+        boxes=shown.boxes,
+    )
+
+
+def senses_of(params: Any, config: RecurrentConfig) -> senses.Senses:
+    """Chooses the network's inputs: those of the config, else those that suit the task."""
+    among_boxes = "obstacles" in params.parts
+    return senses.Senses(config.tracker or ("careful" if among_boxes else senses.PLAIN.tracker), among_boxes)
+
+
+def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Array, Array]:
+    _, state = batch.reset(jax.random.key(0), params, 1)
+    view = look(env, params, observation, senses.start((1,), params.lidar.n_beams, shown))
+    return view.features, truth(env, params, state, view, jnp.zeros(1))

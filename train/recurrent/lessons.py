@@ -1,5 +1,6 @@
-"""Driving every environment for one unroll, some by the teacher and some by the student, with the teacher's advice."""
+"""One unroll of every environment, some driven by the teacher and some by the student, with the teacher's advice."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -7,21 +8,96 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Agent
+from subterra_jax.baselines import navigator
+from subterra_jax.baselines.agent import Agent, shown
+from subterra_jax.episode import ask, in_tunnel, look
 from subterra_jax.policies import senses
+from subterra_jax.policies.networks import RecurrentMemory
 from train.recurrent import drive as driving
-from train.recurrent import teacher as teaching
 from train.recurrent.network import RecurrentNetworks, Weights
-from train.run.report import Finished
+from train.report import Finished
+
+
+def blank(env: Any, agent: Agent, params: Any, n_envs: int) -> Any:
+    """Returns empty memories; a first observation replaces them."""
+    observation = jax.ShapeDtypeStruct((env.observation_size(params),), jnp.float32)
+    key = jax.random.key(0)
+    shape = jax.eval_shape(lambda flat: _begin(env, agent, key, flat, params), observation)
+    return jax.tree.map(lambda leaf: jnp.zeros((n_envs, *leaf.shape), leaf.dtype), shape)
+
+
+def advise(
+    env: Any,
+    agent: Agent,
+    key: PRNGKeyArray,
+    memory: Any,
+    observation: Float[Array, "env obs"],
+    state: Any,
+    first: Bool[Array, "env"],
+    params: Any,
+) -> tuple[Float[Array, "env n_action"], Any]:
+    """Asks a teacher for its action.
+
+    Args:
+        env: The environment.
+        agent: The teacher.
+        key: Source of its randomness.
+        memory: Its memory of each environment.
+        observation: Its observation.
+        state: The environments' state; a privileged teacher is told the truth.
+        first: The observation begins an episode.
+        params: The task.
+
+    Returns:
+        Five numbers for each environment, as `Agent.act`, and its memory, to which `note_action` must add the action.
+    """
+
+    def one(key: PRNGKeyArray, memory: Any, flat: Array, state: Any, first: Array) -> tuple[Array, Any]:
+        here = in_tunnel(env, params, state.tunnel)
+        key_begin, key_act = jax.random.split(key)
+        memory = _where(first, _begin(env, agent, key_begin, flat, here), memory)
+        action, after = ask(env, agent, key_act, memory, look(env, agent, here, flat), state, here)
+        return action, _where(jnp.ones((), bool), after, memory)
+
+    return jax.vmap(one)(jax.random.split(key, len(first)), memory, observation, state, first)
+
+
+def driven(before: Any, after: Any, action: Float[Array, "env 2"]) -> Any:
+    """Corrects a teacher's memory of a step by the action that was taken, which need not be the one it advised.
+
+    Args:
+        before: Its memory before it advised.
+        after: Its memory since.
+        action: Action taken, m/s and rad/s.
+    """
+    if isinstance(after, navigator.Memory):
+        # It never takes itself to have arrived: it looks again, and says again how far to go.
+        mission = dataclasses.replace(after.mission, stopped=jnp.zeros_like(after.mission.stopped))
+        # A robot does not back up: a speed below 0 is standing.
+        driven = jnp.maximum(action, jnp.array([0.0, -jnp.inf]))
+        return dataclasses.replace(after, command=driven, mission=mission)
+    if isinstance(after, RecurrentMemory):
+        return dataclasses.replace(after, reckoning=senses.replace_action(before.reckoning, after.reckoning, action))
+    return after
+
+
+def _begin(env: Any, agent: Agent, key: PRNGKeyArray, flat: Float[Array, "obs"], params: Any) -> Any:
+    """Returns the memory at the start of an episode."""
+    return agent.begin(key, look(env, agent, params, flat), shown(params, agent.uses_map))
+
+
+def _where(condition: Bool[Array, ""], one: Any, other: Any) -> Any:
+    """Returns one of two memories, in the types of the second."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b).astype(b.dtype), one, other)
 
 
 @struct.dataclass
 class Classroom:
-    """Where the environments are between two unrolls.
+    """State of the environments between two unrolls.
 
     Attributes:
         student: As in training by reward.
-        teacher: What the teacher remembers of each environment.
+        teacher: The teacher's memory of each environment.
         taught: The teacher drives this episode.
     """
 
@@ -32,14 +108,14 @@ class Classroom:
 
 @struct.dataclass
 class Advised:
-    """One unroll as it is stored, `(time, env, …)`.
+    """Storage of one unroll, `(time, env, …)`.
 
     Attributes:
         features: Inputs of the network.
         first: The episode begins with this step.
         ahead: Goal less tracked distance, m.
         error: True less tracked distance, m.
-        advice: What the teacher would have done, m/s and rad/s.
+        advice: The teacher's action, m/s and rad/s.
     """
 
     features: Float[Array, "time env n"]
@@ -50,9 +126,9 @@ class Advised:
 
 
 def begin(env: Any, agent: Agent, params: Any, student: driving.Drive) -> Classroom:
-    """Every environment at the start of an episode, all driven by the teacher."""
+    """Starts an episode in every environment, all driven by the teacher."""
     n_envs = len(student.first)
-    return Classroom(student, teaching.blank(env, agent, params, n_envs), jnp.ones(n_envs, bool))
+    return Classroom(student, blank(env, agent, params, n_envs), jnp.ones(n_envs, bool))
 
 
 def collect(
@@ -74,13 +150,13 @@ def collect(
         agent: The teacher.
         networks: The student's.
         weights: The student's.
-        drive: Where the environments are.
+        drive: State of the environments.
         key: For environments, teacher, and who drives the next episode.
         n_steps: Length of the unroll.
         taught: Share of the episodes that begin now which the teacher drives.
 
     Returns:
-        Where the environments are afterwards, the stored unroll, the student's episodes that ended in it, and means per
+        State of the environments afterwards, the stored unroll, the student's episodes that ended in it, and means per
         step: the reward, and how far off estimate, ring tracker and dead reckoning are (m).
     """
     low, high = jnp.asarray(networks.layout.action_low), jnp.asarray(networks.layout.action_high)
@@ -91,7 +167,7 @@ def collect(
         view = driving.look(env.env, params, student.observation, student.reckoning)
         hidden, _ = networks.remember(weights, view.features[None], student.hidden, student.first[None])
         thought = networks.think(weights, hidden, view.ahead)
-        advice, memory = teaching.advise(
+        advice, memory = advise(
             env.env, agent, key_teacher, now.teacher, student.observation, state, student.first, params
         )
         advice = jnp.clip(advice[:, : networks.n_action], low, high)
@@ -120,7 +196,7 @@ def collect(
             episode_return=jnp.where(done, 0.0, total),
         )
         again = jax.random.uniform(key_who, done.shape) < taught
-        after = Classroom(following, teaching.driven(now.teacher, memory, action), jnp.where(done, again, now.taught))
+        after = Classroom(following, driven(now.teacher, memory, action), jnp.where(done, again, now.taught))
         return after, (stored, finished, terms)
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))

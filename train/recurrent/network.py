@@ -1,4 +1,4 @@
-"""A GRU with two heads (what to do, where one is) and a critic that sees the truth."""
+"""A GRU with two heads (action and position) and a critic that sees the truth."""
 
 import dataclasses
 import math
@@ -11,14 +11,14 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.policies import senses
 from subterra_jax.policies.senses import PLAIN, Senses
-from train.brax_parts import MLP, NormalTanhDistribution
+from train.learning import MLP, NormalTanhDistribution
 
 Weights = Any
 
 
 @dataclasses.dataclass(frozen=True)
 class RecurrentLayout:
-    """What fixes every array shape and the meaning of the outputs; a checkpoint carries it.
+    """Shapes of all arrays and meaning of the outputs; a checkpoint carries it.
 
     Attributes:
         n_features: Inputs of the network.
@@ -30,9 +30,9 @@ class RecurrentLayout:
         bin_width: Their width, m.
         init_std: Standard deviation of the untrained policy before the tanh.
         min_std: Its floor.
-        senses: Version of what it is shown.
-        tracker: Who counts rings for it.
-        boxes: Whether it is shown the boxes remembered.
+        senses: Version of its inputs.
+        tracker: Ring counter whose count it sees.
+        boxes: It sees the boxes that are remembered.
     """
 
     n_features: int
@@ -50,7 +50,7 @@ class RecurrentLayout:
 
     @property
     def shown(self) -> Senses:
-        """What it is shown."""
+        """Its inputs."""
         return Senses(self.tracker, self.boxes)
 
 
@@ -66,7 +66,7 @@ class Memory(nn.Module):
         state: Float[Array, "env hidden"],
         first: Bool[Array, "time env"],
     ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
-        """Last hidden state, and that of every step."""
+        """Returns the last hidden state, and that of every step."""
         encoded = nn.swish(nn.Dense(self.hidden)(features))
         # All that does not wait for the state before is done for the whole sequence at once.
         gates = nn.Dense(3 * self.hidden)(encoded)
@@ -86,7 +86,7 @@ class Memory(nn.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Thought:
-    """What the network makes of a step.
+    """Outputs of the heads for a step.
 
     Attributes:
         parameters: Of the action distribution, before the tanh.
@@ -126,7 +126,7 @@ class RecurrentNetworks:
         self.centres = senses.bin_centres(layout.bins, layout.bin_width)
 
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
-        """Untrained weights."""
+        """Returns untrained weights."""
         keys = jax.random.split(key, 4)
         layout = self.layout
         hidden = jnp.zeros((1, 1, layout.hidden))
@@ -139,19 +139,19 @@ class RecurrentNetworks:
         }
 
     def policy_shapes(self) -> dict[str, Weights]:
-        """What a policy is, the weights but the critic's, with shapes in place of arrays."""
+        """Returns a policy, the weights but the critic's, with shapes in place of arrays."""
         return without_critic(jax.eval_shape(self.init, jax.random.key(0)))
 
     def remember(
         self, weights: dict[str, Weights], features: Array, state: Array, first: Array
     ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
-        """Hidden states over time."""
+        """Returns the last hidden state, and those over time."""
         return self._memory.apply(weights["memory"], features, state, first)
 
     def think(
         self, weights: dict[str, Weights], hidden: Float[Array, "*batch hidden"], ahead: Float[Array, "*batch"]
     ) -> Thought:
-        """The heads.
+        """Applies the heads.
 
         Args:
             weights: Weights.
@@ -169,14 +169,34 @@ class RecurrentNetworks:
         return Thought(parameters, logits, error, log_sigma)
 
     def value(self, weights: dict[str, Weights], truth: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-        """Expected return, in units of the reward scale."""
+        """Estimates the return, in units of the reward scale."""
         return self._critic.apply(weights["critic"], truth)[..., 0]
 
     def action(self, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
-        """The action in m/s and rad/s that belongs to a draw of the Gaussian."""
+        """Returns the action in m/s and rad/s for a draw of the Gaussian."""
         return self._low + 0.5 * (jnp.tanh(raw) + 1.0) * (self._high - self._low)
 
 
 def without_critic(weights: dict[str, Weights]) -> dict[str, Weights]:
-    """The weights of which a policy is made."""
+    """Returns the weights that make up a policy."""
     return {name: part for name, part in weights.items() if name != "critic"}
+
+
+def estimation_loss(
+    logits: Float[Array, "*batch bins"], error: Float[Array, "*batch"], width: float
+) -> Float[Array, "*batch"]:
+    """Computes the cross entropy, the truth shared between its two nearest bins, whose middles lie evenly about 0.
+
+    Args:
+        logits: Of the bins.
+        error: True less reckoned distance, m; beyond the last bin it counts as in the last.
+        width: Of a bin, m.
+    """
+    bins = logits.shape[-1]
+    place = jnp.clip(error / width + 0.5 * (bins - 1), 0.0, bins - 1.001)
+    lower = jnp.floor(place).astype(jnp.int32)
+    share = (place - lower)[..., None]
+    log_share = jax.nn.log_softmax(logits)
+    low = jnp.take_along_axis(log_share, lower[..., None], axis=-1)
+    high = jnp.take_along_axis(log_share, lower[..., None] + 1, axis=-1)
+    return -((1.0 - share) * low + share * high)[..., 0]

@@ -1,13 +1,26 @@
-"""What a run says while it trains: a bar for people, a line per iteration as JSON and as CSV for programs."""
+"""Output of a run while it trains: a bar for people, a line per iteration for programs, and TensorBoard."""
 
 import json
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from subterra_jax.host.files import replace_file
+from train.errors import ConfigError
 
 LOG, TABLE, EPISODES = "log.jsonl", "log.csv", "episodes.csv"
 _HEADER = "episode,step,coverage,success,length,contact"
@@ -99,7 +112,7 @@ class Bar:
 
 
 def read_log(run: Path) -> list[dict[str, Any]]:
-    """Every line of a run's log."""
+    """Reads every line of a run's log."""
     return [json.loads(line) for line in (run / LOG).read_text().splitlines()]
 
 
@@ -116,6 +129,91 @@ def _keep_lines(path: Path, count: int) -> None:
     if not path.exists():
         return
     lines = path.read_text().splitlines(keepends=True)[:count]
-    fresh = path.with_name(f".{path.name}.partial")
-    fresh.write_text("".join(lines))
-    fresh.replace(path)
+    with replace_file(path) as fresh:
+        fresh.write_text("".join(lines))
+
+
+TENSORBOARD = "tensorboard"
+
+
+def check_tensorboard() -> None:
+    """Raises `ConfigError` where the library that writes such logs is not installed."""
+    _writer()
+
+
+class Board:
+    """Scalars of every iteration in `tensorboard/`, against environment steps.
+
+    Args:
+        run: The run folder.
+        step: Environment steps after which an earlier log is forgotten; 0 begins anew.
+
+    Raises:
+        ConfigError: tensorboardX is not installed.
+    """
+
+    def __init__(self, run: Path, step: int = 0) -> None:
+        # Iterations after the last checkpoint come again: TensorBoard then drops what it has from there on.
+        self._writer = _writer()(str(run / TENSORBOARD), purge_step=step + 1 if step else None)
+
+    def write(self, record: dict[str, Any]) -> None:
+        """Adds one iteration; scalars that are not known yet are left out."""
+        for name, value in record.items():
+            if value is not None and name not in ("step", "timing"):
+                self._writer.add_scalar(_tag(name), value, record["step"])
+        self._writer.add_scalar("time/steps_per_second", record["timing"]["steps_per_second"], record["step"])
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Closes the file."""
+        self._writer.close()
+
+
+def _tag(name: str) -> str:
+    """Returns the name with a group in front, by which TensorBoard sorts."""
+    for group in ("reward", "loss"):
+        if group in name:
+            return f"{group}/{name}"
+    return f"{'episodes' if name.endswith('_100') or name.startswith(('finished', 'episodes')) else 'learning'}/{name}"
+
+
+def _writer() -> Any:
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError as missing:
+        raise ConfigError("tensorboard = True needs tensorboardX: pip install 'subterra-jax[logs]'") from missing
+    return SummaryWriter
+
+
+class Interrupt:
+    """A request of the user, or of the machine's scheduler, to stop."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+
+
+@contextmanager
+def deferred_interrupt() -> Iterator[Interrupt]:
+    """Turns the first Ctrl-C (or SIGTERM) into a wish to stop at the next good moment; a second one stops at once."""
+    interrupt = Interrupt()
+
+    def note(number: int, frame: Any) -> None:
+        if interrupt.wanted:
+            raise KeyboardInterrupt
+        interrupt.wanted = True
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupt
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def print_table(title: str, values: dict[str, Any]) -> None:
+    """Prints names and values."""
+    console, grid = Console(), Table(show_header=False)
+    for name, value in values.items():
+        grid.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    console.print(title, highlight=False)
+    console.print(grid)

@@ -1,0 +1,283 @@
+"""The Unitree B2 learns to walk: settings, networks, scores, and the host's side of a run."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from subterra_jax.b2.gait import WalkPolicy
+from subterra_jax.b2.params import WalkParams
+from subterra_jax.b2.walk import WalkEnv
+from subterra_jax.policies.files import GAIT
+from train import learning
+from train.config import PPOConfig, known_preset
+from train.feedforward.learner import Learner, make_layout
+from train.feedforward.networks import Layout, Networks, Policy, Weights
+from train.log import LOG, print_table
+from train.policies import policy_tensors, write_policy
+from train.session import EVALUATION, Session
+from train.snapshot import Snapshot
+from train.world import library_versions
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkConfig(PPOConfig):
+    """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms.
+
+    Attributes:
+        deterministic: One seed gives one result on a GPU as well. MJX adds up by scattering, which a GPU then does one
+            after the other; two runs of one seed part otherwise.
+    """
+
+    steps: int = 150_000_000
+    n_envs: int = 8192
+    unroll: int = 24
+    epochs: int = 4
+    minibatches: int = 32
+    init_std: float = 0.3
+    min_std: float = 0.03
+    learning_rate: float = 1e-3
+    max_grad_norm: float = 1.0
+    discount: float = 0.98
+    entropy_weight: float = 5e-3
+    value_weight: float = 0.5
+    stop_coverage: float = 2.0
+    hidden: tuple[int, ...] = (512, 256, 128)
+    frames: int = 1
+    checkpoint_every: int = 100
+    deterministic: bool = False
+
+    # Pushes and commands make the rolling hundred too noisy to choose by.
+    KEEPS_BEST: ClassVar[bool] = False
+
+
+_PRESETS: dict[str, dict[str, int | tuple[int, ...]]] = {
+    "gpu": {},
+    # Shows that it learns, not how well: a hundredth of the steps.
+    "cpu": {"steps": 2_000_000, "n_envs": 256, "minibatches": 8, "hidden": (128, 128), "checkpoint_every": 20},
+}
+
+
+def make_walk_config(preset: str) -> WalkConfig:
+    """Returns the settings for one kind of machine.
+
+    Raises:
+        ConfigError: There is no preset of that name.
+    """
+    known_preset(preset)
+    return WalkConfig(**_PRESETS[preset])  # type: ignore[arg-type]
+
+
+@dataclasses.dataclass(frozen=True)
+class WalkLayout(Layout):
+    """Layout of the walking robot's networks; `Layout` explains the other fields.
+
+    Attributes:
+        n_seen: Numbers at the head of the observation that the policy sees.
+    """
+
+    n_seen: int = 0
+
+
+class WalkNetworks(Networks):
+    """A policy of the first numbers of the observation, and a value of all of them."""
+
+    kind = GAIT
+    layout: WalkLayout
+
+    def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
+        """Returns untrained weights, under `policy` and `value`."""
+        key_policy, key_value = jax.random.split(key)
+        frames, whole, seen = self.layout.frames, self.layout.n_observation, self.layout.n_seen
+        return {
+            "policy": self._policy.init(key_policy, jnp.zeros((1, frames * seen))),
+            "value": self._value.init(key_value, jnp.zeros((1, frames * whole))),
+        }
+
+    def parameters(
+        self, weights: Weights, statistics: learning.Statistics, stack: Float[Array, "*batch frames obs"]
+    ) -> Float[Array, "*batch parameters"]:
+        """Returns parameters of the action distribution before the tanh: means, then spreads."""
+        seen = learning.normalize(stack, statistics)[..., : self.layout.n_seen]
+        return self._policy.apply(weights, seen.reshape(*stack.shape[:-2], -1)) + self._offset
+
+    def tensors(self, policy: Policy) -> dict[str, Any]:
+        """Returns the arrays that walking needs, as a tree whose names `subterra_jax.b2.gait` knows."""
+        seen = slice(0, self.layout.n_seen)
+        statistics = {"mean": policy.statistics.mean[seen], "std": policy.statistics.std[seen]}
+        return {"policy": policy.weights, "statistics": statistics}
+
+
+class WalkLearner(Learner):
+    """PPO whose critic sees the truth.
+
+    Args:
+        env: A walking environment whose observation ends with the truth.
+        params: Its parameters.
+        config: Settings.
+        n_seen: Numbers of the observation that the policy sees.
+
+    Raises:
+        ConfigError: A setting makes no sense.
+    """
+
+    def __init__(self, env: Any, params: Any, config: WalkConfig, n_seen: int) -> None:
+        super().__init__(env, params, config)
+        layout = make_layout(env, params, config)
+        self.networks = WalkNetworks(WalkLayout(**dataclasses.asdict(layout), n_seen=n_seen))
+
+
+Act = Callable[[Float[Array, "robot obs"]], Float[Array, "robot 12"]]
+_STRIDE = 0.4  # s, over which velocities are averaged: the trunk sways with every stride
+_SETTLED = 1.0  # s, after which a start no longer counts
+
+
+def walker(
+    env: WalkEnv, act: Act, n_robots: int, n_steps: int, seed: int = 7
+) -> Callable[[WalkParams], dict[str, Float[np.ndarray, "..."]]]:
+    """Makes a function that walks robots for one episode each, pushed and commanded as its params say.
+
+    Args:
+        env: The environment; its observation is what `act` sees.
+        act: Observations to actions.
+        n_robots: Number of robots.
+        n_steps: Control periods.
+        seed: Of everything that is drawn.
+
+    Returns:
+        A function of params, whose result has every step's `velocity` and `asked` `(step, robot, 3)`, and `fall`,
+        `over` (the episode had ended before it), `contact` and `effort` `(step, robot)`.
+    """
+    start_key, walk_key = jax.random.split(jax.random.key(seed))
+    begin, advance = jax.vmap(env.begin, in_axes=(0, None)), jax.vmap(env.advance, in_axes=(0, 0, 0, None))
+    observe = jax.vmap(lambda state, params: env.observe(state, None, params), in_axes=(0, None))
+
+    @jax.jit
+    def run(params: WalkParams) -> dict[str, Array]:
+        state = begin(env.draw_reset(start_key, (n_robots,), params), params)
+
+        def step(carry: tuple[Any, Bool[Array, "robot"]], key: Array) -> tuple[Any, dict[str, Array]]:
+            state, over = carry
+            action = act(observe(state, params))
+            noise = env.draw_step(key, (n_robots,), params)
+            state, _, fallen, truncated, info = advance(state, action, noise, params)
+            kept = {name: info[name] for name in ("velocity", "asked", "fall", "effort", "contact")}
+            return (state, over | fallen | truncated), {**kept, "over": over}
+
+        over = jnp.zeros(n_robots, bool)
+        return jax.lax.scan(step, (state, over), jax.random.split(walk_key, n_steps))[1]
+
+    return lambda params: {name: np.asarray(values) for name, values in run(params).items()}
+
+
+def score(records: dict[str, np.ndarray], period: float) -> dict[str, float]:
+    """Figures of what a `walker` tells.
+
+    Returns:
+        `falls` (share of the robots that fell before the episode's end), `velocity_error` (m/s, mean distance in plan
+        between velocity and command), `yaw_rate_error` (rad/s, mean absolute), both averaged over a stride of 0.4 s
+        against the slewed command and from 1 s after the start, `contacts` (share of robots that touched a wall),
+        `power` (W, mean mechanical), and `robots`.
+    """
+    alive = ~records["over"]
+    width, first = round(_STRIDE / period), round(_SETTLED / period)
+    error = _mean(records["velocity"] - records["asked"], width)[first:]
+    whole = _mean(alive.astype(np.float32), width)[first:] > 0.999
+    plan, turn = np.hypot(error[..., 0], error[..., 1]), np.abs(error[..., 2])
+    return {
+        "falls": float((records["fall"] & alive).any(axis=0).mean()),
+        "velocity_error": float(plan[whole].mean()) if whole.any() else float("nan"),
+        "yaw_rate_error": float(turn[whole].mean()) if whole.any() else float("nan"),
+        "contacts": float((records["contact"] & alive).any(axis=0).mean()),
+        "power": float(records["effort"][alive].mean()),
+        "robots": int(alive.shape[1]),
+    }
+
+
+def _mean(values: Float[np.ndarray, "step ..."], width: int) -> Float[np.ndarray, "window ..."]:
+    """Averages all windows of `width` steps."""
+    total = np.cumsum(values, axis=0, dtype=np.float64)
+    total = np.concatenate([np.zeros_like(total[:1]), total])
+    return (total[width:] - total[:-width]) / width
+
+
+FIGURE = "curve.png"
+
+
+class WalkSession(Session):
+    """The host's side of one run of a gait."""
+
+    def score(self, snapshot: Snapshot, robots: int) -> dict[str, Any]:
+        """Evaluates the policy and the bare trot, writes `evaluation.json`, and prints the scores."""
+        env = dataclasses.replace(self.world.env, privileged=False)
+        params, period = self.world.params, env.physics.period
+        go = walker(env, self.policy(snapshot).act, robots, int(params.horizon))
+        # Offsets of nothing leave the trot as it is.
+        bare = dataclasses.replace(params, action_scale=jnp.zeros(3))
+        found = {name: score(go(given), period) for name, given in (("policy", params), ("trot", bare))}
+        self.folder.write_json(EVALUATION, {"schema": "subterra.evaluation/1", **self.world.facts, **found})
+        told = {f"{name}, {who}": value for who, figures in found.items() for name, value in figures.items()}
+        print_table(f"{self.world.task}, seed {self.learner.config.seed}: without exploration noise", told)
+        return found
+
+    def policy(self, snapshot: Snapshot) -> WalkPolicy:
+        """Returns the policy as the package loads it."""
+        return WalkPolicy({name: jnp.asarray(tensor) for name, tensor in self._tensors(snapshot).items()})
+
+    def release(self, out: Path, snapshot: Snapshot, found: dict[str, Any]) -> None:
+        """Writes the policy and its facts."""
+        config, networks = self.learner.config, self.learner.networks
+        facts = {
+            "task": self.world.task,
+            "world": self.world.facts,
+            "config": json.loads(json.dumps(dataclasses.asdict(config))),
+            "iteration": snapshot.iteration,
+            "steps": snapshot.iteration * config.steps_per_iteration,
+            "versions": library_versions(),
+            "scores": {**self.world.facts, **found},
+        }
+        write_policy(out, networks, networks.tensors(snapshot.policy), facts)
+        print(out)
+
+    def finish(self, snapshot: Snapshot) -> None:
+        """Writes the last checkpoint and the curve."""
+        self.folder.save(snapshot)
+        draw(self.folder.path)
+
+    def _tensors(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
+        networks = self.learner.networks
+        return policy_tensors(networks, networks.tensors(snapshot.policy))
+
+
+def draw(run: Path) -> None:
+    """Draws a run's rewards and the length of its episodes against steps, `curve.png`."""
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    records = [json.loads(line) for line in (run / LOG).read_text().splitlines()]
+    steps = [record["step"] / 1e6 for record in records]
+    first = records[0] if records else {}
+    names = sorted(name for name in first if name.startswith("reward_") and name != "reward_scale")
+    figure, (left, right) = pyplot.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    colours = pyplot.get_cmap("tab20")(np.arange(len(names)))  # there are more terms than usual colours
+    for name, colour in zip(names, colours, strict=True):
+        left.plot(
+            steps,
+            [record[name] * 50.0 for record in records],
+            label=name.removeprefix("reward_"),
+            color=colour,
+            linewidth=1,
+        )
+    right.plot(steps, [record["length_mean_100"] for record in records], linewidth=1)
+    left.set(xlabel="control periods, millions", ylabel="reward a second")
+    right.set(xlabel="control periods, millions", ylabel="length of the last 100 episodes")
+    left.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    figure.savefig(run / FIGURE, dpi=110, metadata={"Software": None})
+    pyplot.close(figure)

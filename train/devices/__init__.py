@@ -1,1 +1,0 @@
-"""One run on many devices, or in many processes."""

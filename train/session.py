@@ -1,0 +1,272 @@
+"""The host's side of a run, or of several seeds at once: folder, log, checkpoints, curve, evaluation and summary."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from subterra_jax.evaluation.episodes import SHA256
+from subterra_jax.host.command import EXIT_INTERRUPTED
+from subterra_jax.host.files import replace_file
+from train import devices
+from train.curve import GOAL, write_curve
+from train.errors import ConfigError
+from train.evaluate import evaluate
+from train.folder import RunFolder, iterations
+from train.log import (
+    Bar,
+    Board,
+    RunLog,
+    check_tensorboard,
+    deferred_interrupt,
+    print_table,
+    read_log,
+)
+from train.policies import make_agent
+from train.ppo import train, train_seeds
+from train.snapshot import WINDOW, Snapshot, Trainable, finished
+from train.world import World
+
+EVALUATION = "evaluation.json"
+
+
+class Session:
+    """One run, from the command to its figures.
+
+    Args:
+        path: Run folder.
+        world: World to train on.
+        learner: Learner to train.
+        tensorboard: Write the log for TensorBoard as well.
+
+    Raises:
+        ConfigError: The library that writes for TensorBoard is not installed.
+        OutputError: No folder can be written there.
+    """
+
+    def __init__(self, path: Path, world: World, learner: Trainable, *, tensorboard: bool = False) -> None:
+        self.folder, self.world, self.learner = RunFolder(path, world, learner), world, learner
+        self.log: RunLog | None = None
+        self.board: Board | None = None
+        self._tensorboard = tensorboard
+        if tensorboard:
+            check_tensorboard()
+
+    def open(self, snapshot: Snapshot | None) -> None:
+        """Begins to log, after a snapshot or from the beginning."""
+        iteration, episodes = (snapshot.iteration, snapshot.window.count) if snapshot else (0, 0)
+        if devices.leads():
+            self.log = RunLog(self.folder.path, iteration, episodes)
+            if self._tensorboard:
+                self.board = Board(self.folder.path, iteration * self.learner.config.steps_per_iteration)
+
+    def train(self, *, resume: bool, overwrite: bool, label: str = "", deterministic: bool = True) -> Snapshot | None:
+        """Trains the run to its end, then writes the last checkpoint and the curve.
+
+        Args:
+            resume: Go on from the folder's checkpoint.
+            overwrite: Throw away the run that the folder holds.
+            label: Name of the run in the progress bar.
+            deterministic: One seed is to give one result on a GPU as well.
+
+        Returns:
+            The last snapshot; None after Ctrl-C, with the checkpoint saved.
+        """
+        snapshot = self.folder.begin(resume=resume, overwrite=overwrite)
+        world, config = self.world, self.learner.config
+        self.open(snapshot)
+        bar = Bar(config.steps, snapshot.iteration * config.steps_per_iteration if snapshot else 0)
+        with deferred_interrupt() as interrupt:
+
+            def watch(now: Snapshot) -> bool:
+                # Processes that train together stop together: at the end.
+                stop = interrupt.wanted and jax.process_count() == 1
+                if devices.leads():
+                    bar.show(now.record, of=label)
+                self.note(now, save=stop)
+                return stop
+
+            try:
+                last = train(
+                    world.env,
+                    world.params,
+                    config,
+                    learner=self.learner,
+                    snapshot=snapshot,
+                    watch=watch,
+                    deterministic=deterministic,
+                )
+            finally:
+                bar.close()
+                self.close()
+            self.finish(last)
+            if interrupt.wanted:
+                print(f"interrupted after {last.iteration} iterations; go on with --resume", file=sys.stderr)
+                return None
+        return last
+
+    def note(self, now: Snapshot, *, save: bool = False) -> None:
+        """Logs an iteration; writes a checkpoint where one is due, or asked for."""
+        if self.log is not None:
+            self.log.write(now.record, now.rows)
+        if self.board is not None:
+            self.board.write(now.record)
+        if save or now.iteration % self.learner.config.checkpoint_every == 0:
+            self.folder.save(now)
+
+    def close(self) -> None:
+        """Closes the log."""
+        for open_log in (self.log, self.board):
+            if open_log is not None:
+                open_log.close()
+        self.log = self.board = None
+
+    def finish(self, snapshot: Snapshot) -> None:
+        """Writes the last checkpoint and the curve."""
+        self.folder.save(snapshot)
+        if not devices.leads():
+            return
+        write_curve([self.folder.path], self.folder.path / "curve.png")
+
+    def score(self, snapshot: Snapshot, episodes: int) -> dict[str, Any]:
+        """Evaluates the policy that was kept, writes `evaluation.json`, and prints the scores."""
+        agent = make_agent(self.learner.networks, snapshot.policy)
+        found = evaluate(self.world, agent, episodes)
+        self.folder.write_json(EVALUATION, {"schema": "subterra.evaluation/1", **self.world.facts, **found})
+        kept = "best" if self.learner.config.KEEPS_BEST else "last"
+        told = {name: value for name, value in found.items() if value is not None and value != SHA256}
+        print_table(f"{self.world.task}, seed {self.learner.config.seed}: {kept} policy, no exploration noise", told)
+        return found
+
+
+def check_seeds(seeds: tuple[int, ...]) -> None:
+    """Raises `ConfigError` for a seed below 0 or one that is named twice."""
+    for seed in seeds:
+        if seed < 0:
+            raise ConfigError(f"seeds must not be negative, got {seed}")
+        if seeds.count(seed) > 1:
+            raise ConfigError(f"seed {seed} is named {seeds.count(seed)} times")
+
+
+def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bool, episodes: int) -> int:
+    """Trains, draws and evaluates every seed; prints what each took to reach the goal.
+
+    Returns:
+        Exit status: 0, or 130 after Ctrl-C, with the checkpoints saved.
+    """
+    snapshots = (
+        resume_seeds(sessions) if resume else [s.folder.begin(resume=False, overwrite=overwrite) for s in sessions]
+    )
+    config = sessions[0].learner.config
+    for session, snapshot in zip(sessions, snapshots, strict=True):
+        session.open(snapshot)
+    bar = Bar(config.steps, max((s.iteration for s in snapshots if s), default=0) * config.steps_per_iteration)
+    with deferred_interrupt() as interrupt:
+
+        def watch(k: int, now: Snapshot) -> None:
+            bar.show(now.record, of=f"seed {sessions[k].learner.config.seed}")
+            sessions[k].note(now, save=interrupt.wanted)
+
+        try:
+            last = train_seeds(
+                [session.learner for session in sessions],
+                sessions[0].world.params,
+                snapshots,
+                watch,
+                lambda: interrupt.wanted,
+            )
+        finally:
+            bar.close()
+            for session in sessions:
+                session.close()
+        for session, snapshot in zip(sessions, last, strict=True):
+            session.finish(snapshot)
+        write_curve([session.folder.path for session in sessions], out / "curve.png")
+        if interrupt.wanted:
+            print("interrupted; go on with --resume", file=sys.stderr)
+            return EXIT_INTERRUPTED
+    found = [session.score(snapshot, episodes) for session, snapshot in zip(sessions, last, strict=True)]
+    write_summary(out, [session.folder.path for session in sessions], found)
+    return 0
+
+
+def resume_seeds(sessions: list[Session]) -> list[Snapshot | None]:
+    """Returns the snapshot of every seed; of those that are not done, the last iteration that they have in common.
+
+    Raises:
+        ConfigError: They have none.
+    """
+    found: list[Snapshot | None] = [session.folder.begin(resume=True, overwrite=False) for session in sessions]
+    behind = [k for k, s in enumerate(found) if s is not None and not finished(s, sessions[k].learner.config)]
+    common = set.intersection(*[set(iterations(sessions[k].folder.path)) for k in behind]) if behind else set()
+    if behind and not common:
+        raise ConfigError(f"{sessions[0].folder.path.parent}: the seeds have no iteration in common; resume each alone")
+    for k in behind:
+        found[k] = sessions[k].folder.resume(max(common))
+    return found
+
+
+SEEDS = "seeds.json"
+_UNIT = {"episodes": 1.0, "steps": 1e3, "seconds": 1.0, "seconds_compiled": 1.0}
+_WHAT = tuple(_UNIT)
+
+
+def reached(run: Path) -> dict[str, float] | None:
+    """Finds when the rolling hundred of a run first met the goal; None if it never did.
+
+    Returns:
+        `episodes` and `steps` until then, `seconds` with compilation and `seconds_compiled` without.
+    """
+    for line in read_log(run):
+        full = line["episodes"] >= WINDOW
+        if full and line["coverage_mean_100"] >= GOAL and line["success_mean_100"] == 1.0:
+            seconds = line["timing"]["seconds"]
+            return {
+                "episodes": line["episodes"],
+                "steps": line["step"],
+                "seconds": seconds,
+                "seconds_compiled": seconds - line["timing"]["compile_seconds"],
+            }
+    return None
+
+
+def write_summary(out: Path, runs: list[Path], scores: list[dict[str, Any]]) -> None:
+    """Prints a line for each seed and their mean ± standard deviation; writes `seeds.json`."""
+    rows: list[dict[str, Any]] = [
+        {"run": run.name, "reached": reached(run), "last": read_log(run)[-1], "evaluation": found}
+        for run, found in zip(runs, scores, strict=True)
+    ]
+    summary = _mean_and_spread(rows)
+    Console().print(_table(rows, summary))
+    with replace_file(out / SEEDS) as fresh:
+        content = {"schema": "subterra.seeds/1", "goal": GOAL, "mean_sd": summary, "runs": rows}
+        fresh.write_text(json.dumps(content) + "\n")
+
+
+def _table(rows: list[dict[str, Any]], summary: dict[str, tuple[float, float]]) -> Table:
+    """Makes a table with a line for each seed, narrow enough for 80 columns."""
+    grid = Table(title=f"to {100 * GOAL:.0f} % coverage and 100 % success of the last {WINDOW}; at the end")
+    for heading in ("run", "episodes", "k steps", "s", "s compiled", "coverage %", "success %"):
+        grid.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        when = [f"{row['reached'][name] / _UNIT[name]:,.1f}" for name in _WHAT] if row["reached"] else ["never"] * 4
+        covered = row["last"]["coverage_mean_100"]
+        last = "none yet" if covered is None else f"{100 * covered:.2f}"
+        grid.add_row(row["run"], *when, last, f"{100 * row['evaluation']['success']:.1f}")
+    grid.add_section()
+    spread = [[f"{summary[name][k] / _UNIT[name]:,.1f}" for name in summary] for k in (0, 1)]
+    grid.add_row("mean", *spread[0])
+    grid.add_row("± sd", *spread[1])
+    return grid
+
+
+def _mean_and_spread(rows: list[dict[str, Any]]) -> dict[str, tuple[float, float]]:
+    """Returns mean and standard deviation over the seeds that reached the goal; empty if none did."""
+    found = [row["reached"] for row in rows if row["reached"]]
+    spread = {name: np.array([row[name] for row in found], float) for name in _WHAT} if found else {}
+    return {name: (float(v.mean()), float(v.std(ddof=min(1, len(v) - 1)))) for name, v in spread.items()}
