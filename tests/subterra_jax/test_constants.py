@@ -8,6 +8,7 @@ with it, and scores from before are no longer comparable.
 import functools
 import hashlib
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -184,6 +185,7 @@ TABLE: dict[str, dict[str, Value]] = {
 # m: the whole packaged tunnel, or its first metres.
 LENGTHS = {"Subterra/TraverseShort-v0": 60.0} | {name: 65.0 for name in TABLE if "Short" in name and "Trav" not in name}
 SHA256 = "4b15c44cfe5a7868cd04351a9c76ef4636ff32a818d761decc365b4d8056280d"
+BENCHMARK_SHA256 = "83b420fe7ff1f64a0aee373733478697f68eade60d249f8c3393ff29f9b263bb"
 
 
 def canonical(table: dict[str, dict[str, Value]]) -> str:
@@ -197,6 +199,13 @@ def read(params: object, name: str) -> object:
         return functools.reduce(getattr, name.split("."), params)
     except AttributeError:
         return None
+
+
+def halved(node: Any, path: list[str]) -> Any:
+    """A number, or a tree of params with one of its numbers, half as large."""
+    if not path:
+        return node // 2 if np.issubdtype(np.asarray(node).dtype, np.integer) else node / 2
+    return node.replace(**{path[0]: halved(getattr(node, path[0]), path[1:])})
 
 
 def test_the_table_lists_every_task():
@@ -221,6 +230,33 @@ def test_a_task_has_the_constants_of_the_table(id):
         if not right:
             wrong[name] = (value if value is None else np.asarray(value).tolist(), expected)
     assert not wrong, f"{id}: constant: (in the code, in the table): {wrong}"
+
+
+def test_the_digest_of_the_benchmark_is_the_one_that_results_are_comparable_under():
+    assert st.constants_digest() == BENCHMARK_SHA256
+
+
+@pytest.mark.parametrize(
+    "id",
+    [
+        "Subterra/Traverse-v0",
+        "Subterra/StopAtOffsetShort-v0",
+        "Subterra/Return-v0",
+        "Subterra/Obstructed-v0",
+        "Subterra/Faulted-v0",
+        "Subterra/Relocalise-v0",
+    ],
+)
+def test_half_of_any_constant_is_another_digest(id):
+    env, params = st.make(id)
+    digest = st.constants_digest(env, params)
+    assert st.constants_digest(*st.make(id, tunnel=params.tunnel)) == digest
+    for name, value in TABLE[id].items():
+        if not value or name == "vehicle.radius":  # half a radius is refused
+            continue
+        field, *path = name.split(".")
+        changed = halved(getattr(params, field), path)
+        assert st.constants_digest(*st.make(id, tunnel=params.tunnel, **{field: changed})) != digest, name
 
 
 @pytest.mark.parametrize("id", sorted(LENGTHS))
