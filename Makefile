@@ -19,7 +19,7 @@ test: lint       ## linter, type checker, and every test that is not marked slow
 test-slow: $(STAMP)  ## the tests that take minutes
 	XLA_FLAGS= $(BIN)/python -m pytest -m slow
 
-reproduce: $(STAMP)  ## the README's numbers again, those that a CPU can, about 45 minutes; says which differ
+reproduce: $(STAMP)  ## the numbers of README and docs/results.md again, those that a CPU can measure, about 45 minutes; says which differ
 	$(BIN)/python -m benchmarks.reproduce --shared $(SHARED)
 
 figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores; goes on where it stopped

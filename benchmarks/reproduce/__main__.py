@@ -1,4 +1,4 @@
-"""Measures the README's numbers again, says which differ, and lists those that need a GPU or hours.
+"""Measures the numbers of README and docs/results.md again, says which differ, and lists those that need a GPU or hours.
 
 Example: python -m benchmarks.reproduce --jobs speed learning metro --out out/reproduce
 """
@@ -20,7 +20,7 @@ from benchmarks.results import constants_facts, environment_facts, write_file
 from subterra_jax.host.files import require_folder
 
 ROOT = Path(__file__).parents[2]
-README, MEASUREMENTS = ROOT / "README.md", ROOT / "docs" / "measurements.md"
+README, RESULTS, MEASUREMENTS = ROOT / "README.md", ROOT / "docs" / "results.md", ROOT / "docs" / "measurements.md"
 _QUICK = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)
 _MISSING = "not in the documents"
 
@@ -41,9 +41,10 @@ class ReproduceConfig:
 
 
 def result_rows() -> list[dict[str, str]]:
-    """Returns the rows of the README's tables, those of its results first, then of `docs/measurements.md`."""
-    readme = README.read_text()
-    return [*read_tables(readme, HEADING), *read_tables(readme), *read_tables(MEASUREMENTS.read_text())]
+    """Returns the rows of the tables of results, then of all tables of README, results and measurements."""
+    pages = [path.read_text() for path in (README, RESULTS, MEASUREMENTS)]
+    results = [row for page in pages[:2] for row in read_tables(page, HEADING)]
+    return [*results, *(row for page in pages for row in read_tables(page))]
 
 
 def verdict(claim: Claim, stated: float | None, measured: float | None) -> str:
