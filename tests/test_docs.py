@@ -1,5 +1,6 @@
 """The documentation runs as printed, and its site is built without a warning and without the net."""
 
+import argparse
 import os
 import re
 import runpy
@@ -16,9 +17,10 @@ import pytest
 import tyro
 
 from subterra_jax.baselines import registry
+from tests.test_extend import FILES
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted((ROOT / "docs" / "guide").glob("*.md")), ROOT / "docs" / "slam.md"]
+PAGES = [*sorted((ROOT / "docs" / "guide").glob("*.md")), *(ROOT / "docs" / name for name in ("slam.md", "results.md"))]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 SLOW = "<!-- slow -->\n"  # before a block: others do without it
@@ -46,11 +48,13 @@ def _commands() -> list[list[str]]:
 
 @pytest.fixture
 def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, where a scene has been built and agents may be registered."""
+    """A folder to work in with a built scene and the files that the pages print; agents may be registered."""
     built = tmp_path / "build" / "tunnel" / "tunnel.npz"
     built.parent.mkdir(parents=True)
     with resources.as_file(resources.files("subterra_jax") / "data" / "subterra-351.npz") as packaged:
         shutil.copy(packaged, built)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
     return tmp_path
@@ -107,7 +111,10 @@ def command_line() -> Callable[[list[str]], None]:
     def read(words: list[str]) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", words)
-            for room, name in ((tyro, "cli"), (tyro.extras, "subcommand_cli_from_dict")):
+            readers: list[tuple[Any, str]] = [(tyro, "cli"), (tyro.extras, "subcommand_cli_from_dict")]
+            if words[0] == "subterra_jax.b2.film":
+                readers = [(argparse.ArgumentParser, "parse_args")]
+            for room, name in readers:
                 patch.setattr(room, name, _stopping(getattr(room, name)))
             with pytest.raises(_Read):
                 runpy.run_module(words[0], run_name="__main__", alter_sys=False)
@@ -175,7 +182,11 @@ def test_tables_and_lists_of_the_pages_are_laid_out(site: Path):
 
 def test_the_reference_says_what_the_docstrings_say(site: Path):
     text = re.sub(r"<[^>]+>", "", (site / "api" / "environment.html").read_text())
-    for said in ("Make an environment and its params.", "Take one step. It does not reset", "Let a policy drive"):
+    for said in (
+        "Make an environment and its params.",
+        "Take one step, without a reset at its end",
+        "Let a policy drive",
+    ):
         assert said in text
 
 

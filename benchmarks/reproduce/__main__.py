@@ -1,4 +1,4 @@
-"""Measures the numbers of README and docs/results.md again, says which differ, and lists those that need a GPU or hours.
+"""Measures the numbers of README and docs/results.md again, says which differ, and lists the others with commands.
 
 Example: python -m benchmarks.reproduce --jobs speed learning metro --out out/reproduce
 """
