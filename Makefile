@@ -10,7 +10,7 @@ export XLA_PYTHON_CLIENT_PREALLOCATE ?= false
 help:            ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## */\t/' | expand -t 16
 
-demo: $(STAMP)   ## survey -> bag -> scene -> training -> out/demo/report.html, about 5 minutes on 2 cores
+demo: $(STAMP)   ## survey -> bag -> scene -> training -> out/demo/report.html; on 2 cores 5 minutes with set-up, 2 without
 	$(BIN)/python -m benchmarks.demo --out out/demo
 
 test: lint       ## linter, type checker, and every test that is not marked slow
