@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-README = (Path(__file__).parents[1] / "README.md").read_text()
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
@@ -26,5 +27,26 @@ def test_a_block_of_the_readme_runs(index):
 
 def test_every_command_of_the_readme_exists():
     for module in sorted(set(re.findall(r"python -m ((?:scene|train|benchmarks)[\w.]*)", README))):
-        path = Path(__file__).parents[1].joinpath(*module.split("."))
+        path = ROOT.joinpath(*module.split("."))
         assert path.with_suffix(".py").exists() or (path / "__main__.py").exists(), module
+    targets = set(re.findall(r"\bmake ([a-z-]+)(?=[ `])", README))
+    assert {"demo", "test"} <= targets
+    for target in targets:
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE), target
+
+
+def test_every_link_and_every_room_of_the_readme_exists():
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", README)
+    assert len(links) >= 10
+    for path in links:
+        assert (ROOT / path).exists(), path
+    rows = re.findall(r"^\| (`[^|]*/`[^|]*|its folders) \|(.*)\|$", README, re.MULTILINE)
+    assert len(rows) >= 6
+    room = ROOT
+    for where, rest in rows:
+        rooms = [ROOT / name for name in re.findall(r"`([\w/]+/)`", where)] or [room]
+        room = rooms[0]
+        for folder in rooms:
+            assert folder.is_dir(), folder
+        for name in re.findall(r"`(\w+(?:/|\.py))`", rest):
+            assert (room / name).exists(), f"{name} in {where}"
