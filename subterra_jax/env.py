@@ -223,7 +223,14 @@ class TunnelEnv:
 
         Returns:
             State, reward, terminated, truncated and info.
+
+        Raises:
+            ValueError: The action has another shape, seen when the step is traced.
         """
+        if jnp.shape(action) != (self.action_size,):
+            raise ValueError(
+                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {jnp.shape(action)}"
+            )
         tunnel = params.tunnel.pick(state.tunnel)
         command = self.motion.obey(action, state, params)
         drive = Drive(command, command)
