@@ -13,7 +13,7 @@ from subterra_jax.host.versions import VERSION
 if TYPE_CHECKING:
     from subterra_jax import batch, parts, procedural, rules, tasks, tunnel
     from subterra_jax.batch import AutoReset, rollout
-    from subterra_jax.env import Env, TunnelEnv
+    from subterra_jax.env import Env
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
     from subterra_jax.tasks import TASKS, constants_digest, make, register
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from subterra_jax.tunnel.plan import TunnelPlan
     from subterra_jax.tunnel.sources import load_tunnel
     from subterra_jax.tunnel.tunnel import stack
+    from subterra_jax.tunnel_env import TunnelEnv
 
 __version__ = VERSION
 
@@ -62,7 +63,7 @@ _HOMES = {
     "LogUniform": "randomization",
     "State": "state",
     "Tunnel": "tunnel",
-    "TunnelEnv": "env",
+    "TunnelEnv": "tunnel_env",
     "TunnelPlan": "tunnel.plan",
     "load_tunnel": "tunnel.sources",
     "make": "tasks",

@@ -18,8 +18,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Agent, Observed, observed, shown
-from subterra_jax.env import Info, TunnelEnv
+from subterra_jax.env import Info
 from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel_env import TunnelEnv
 
 
 @struct.dataclass

@@ -18,7 +18,6 @@ from flax.core import FrozenDict
 from subterra_jax import constants as c
 from subterra_jax.adapters import register_tasks
 from subterra_jax.b2 import MISSIONS, WALK
-from subterra_jax.env import TunnelEnv
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_module
 from subterra_jax.host.versions import no_task
@@ -31,6 +30,7 @@ from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.tunnel.blocks import LIDAR_GAP
 from subterra_jax.tunnel.sources import Source, resolve
+from subterra_jax.tunnel_env import TunnelEnv
 
 PLAIN: tuple[Part, ...] = (Odometer(), PlanarLidar())
 SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())

@@ -227,5 +227,7 @@ def test_an_action_of_another_shape_is_refused_in_one_sentence(shape, batched):
         env = batch
     else:
         _, state = env.reset(jax.random.key(0), params)
-    with pytest.raises(ValueError, match=r"an action of Subterra/TraverseShort-v0 has 2 numbers, got an array of shape"):
+    with pytest.raises(
+        ValueError, match=r"an action of Subterra/TraverseShort-v0 has 2 numbers, got an array of shape"
+    ):
         env.step(jax.random.key(1), state, jnp.zeros(shape), params)

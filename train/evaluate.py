@@ -12,7 +12,7 @@ from subterra_jax import policies as released
 from subterra_jax.evaluation import Records, listed_episodes
 from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
-from subterra_jax.evaluation.summary import summary
+from subterra_jax.evaluation.records import summarise
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.policies.loading import Agent
 from train.errors import ConfigError
@@ -40,7 +40,7 @@ def evaluate(world: World, agent: Agent, n_episodes: int) -> dict[str, Any]:
         n_episodes: Episodes, 1 to 500.
 
     Returns:
-        As `subterra_jax.evaluation.summary`, and `coverage_min`, `contacts` (episodes that ended at a wall) and
+        As `subterra_jax.evaluation.records.summarise`, and `coverage_min`, `contacts` (episodes ended at a wall) and
         `list_sha256`, of the list of episodes. What does not apply to the task is None.
 
     Raises:
@@ -58,7 +58,7 @@ def scores(records: Records) -> dict[str, Any]:
     """Summarises episodes."""
     covered = records.coverage.min()
     return {
-        **summary(records),
+        **summarise(records),
         "coverage_min": None if covered != covered else float(covered),
         "contacts": int(records.contact.sum()),
         "list_sha256": SHA256,

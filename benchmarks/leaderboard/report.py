@@ -15,7 +15,7 @@ from benchmarks.leaderboard.entries import Entry
 from benchmarks.results import png_bytes
 from subterra_jax.baselines.registry import CEILING, DEAD_RECKONING
 from subterra_jax.evaluation.episodes import SHA256
-from subterra_jax.evaluation.summary import grouped, interquartile_mean, interval, normalised, summary
+from subterra_jax.evaluation.records import grouped, interquartile_mean, interval, normalised, summarise
 
 _SEED = 0  # of the bootstrap
 
@@ -25,7 +25,7 @@ def scores(entries: list[Entry]) -> list[dict[str, Any]]:
     rows = []
     for entry in entries:
         row: dict[str, Any] = {"task": entry.task, "world": entry.world, "agent": entry.agent, **entry.traits}
-        row |= summary(entry.records, _SEED)
+        row |= summarise(entry.records, _SEED)
         floor, ceiling = _success_of(entries, entry, DEAD_RECKONING), _success_of(entries, entry, CEILING)
         row["bounds"], row["normalised"] = entry.bounds, None
         if floor is not None and ceiling is not None:

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.env import Box, Info, TunnelEnv
+from subterra_jax.env import Box, Info
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import make
+from subterra_jax.tunnel_env import TunnelEnv
 
 
 class SubterraGymnax:

@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Array, PRNGKeyArray, UInt32
 
-from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams
+from subterra_jax.tunnel_env import TunnelEnv
 
 
 def pack(tree: Any) -> UInt32[Array, "n_words"]:

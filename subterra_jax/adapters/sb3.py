@@ -8,9 +8,9 @@ from gymnasium.vector import AutoresetMode
 
 from subterra_jax.adapters.packing import Observation, as_observation
 from subterra_jax.adapters.vector import SubterraVectorEnv
-from subterra_jax.env import TunnelEnv
 from subterra_jax.host.errors import MissingLibraryError
 from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel_env import TunnelEnv
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv

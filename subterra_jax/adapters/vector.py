@@ -20,10 +20,10 @@ from jaxtyping import Array, Bool, Float
 from subterra_jax.adapters import packing
 from subterra_jax.adapters.packing import Observation, Report, as_observation, start_streams, take_key, unpacker
 from subterra_jax.adapters.views import make_view
-from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
+from subterra_jax.tunnel_env import TunnelEnv
 
 
 class Rows(NamedTuple):

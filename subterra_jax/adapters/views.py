@@ -10,13 +10,13 @@ import jax
 import numpy as np
 
 from subterra_jax.drawing import top_down, wall_points
-from subterra_jax.env import TunnelEnv
 from subterra_jax.host.errors import MissingLibraryError, SubterraError
 from subterra_jax.parts.boxes import Boxes
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_of
+from subterra_jax.tunnel_env import TunnelEnv
 
 VIEWS = ("top", "mujoco")
 SIZE = 480

@@ -19,7 +19,6 @@ from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.constants import DISTANCE_BIAS_SIGMA
-from subterra_jax.env import TunnelEnv
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.parts import Odometer
 from subterra_jax.parts.odometer import OdometryParams
@@ -30,6 +29,7 @@ from subterra_jax.tasks import collect_entries, make_params
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
+from subterra_jax.tunnel_env import TunnelEnv
 
 _MARGIN = 0.1  # to either side of the robot's envelope, m
 

@@ -14,12 +14,12 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.baselines.agent import Agent
-from subterra_jax.env import TunnelEnv
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.lidar import bearings
 from subterra_jax.parts import Noise, PlanarLidar, Sight, Unicycle
 from subterra_jax.parts.unicycle import clip_action
 from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel_env import TunnelEnv
 
 _CHUNK = 25  # steps between two looks at whether any robot is still on its way
 

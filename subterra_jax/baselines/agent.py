@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.env import TunnelEnv
 from subterra_jax.state import EnvParams
+from subterra_jax.tunnel_env import TunnelEnv
 
 Memory = Any
 Known = dict[str, Float[Array, ""]] | None

@@ -1,6 +1,6 @@
 """Scores of an agent on fixed episodes.
 
-episodes (which) ─► harness (drive) ─► tally (score as it goes) ─► records ─► summary (means, intervals, normalised)
+episodes (seeds) ─► harness (drive) ─► tally (running sums) ─► records (one each; means, intervals, normalised)
 """
 
 from subterra_jax.evaluation.episodes import Episodes, listed_episodes

@@ -9,10 +9,10 @@ from importlib import resources
 import numpy as np
 
 from subterra_jax.b2 import MISSIONS
-from subterra_jax.env import TunnelEnv
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS
+from subterra_jax.tunnel_env import TunnelEnv
 
 SCHEMA = "subterra.evaluation/1"
 SHA256 = "4ec196147f6aa4d6f4b3c656cf6d169295718eff9c50046f31743f6de138baa2"

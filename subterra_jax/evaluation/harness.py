@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Array
 
 from subterra_jax.baselines.agent import Agent
-from subterra_jax.env import TunnelEnv
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.evaluation.episodes import Episodes, EvaluationError
-from subterra_jax.evaluation.records import Records, finished
+from subterra_jax.evaluation.records import Records, make_records
 from subterra_jax.evaluation.tally import Tally, add_step, start_tally
 from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel_env import TunnelEnv
 
 _CHUNK = 200  # steps between two looks at whether any episode is still under way
 
@@ -51,7 +51,7 @@ def evaluate(env: TunnelEnv, params: EnvParams, agent: Agent, episodes: Episodes
             now = last
         tallies.append(jax.device_get(now.tally))
     tally = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(episodes)], *tallies)
-    return finished(tally, episodes, env, jax.device_get(params))
+    return make_records(tally, episodes, env, jax.device_get(params))
 
 
 @dataclasses.dataclass(frozen=True)

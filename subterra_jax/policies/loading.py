@@ -11,13 +11,13 @@ import numpy as np
 
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.env import TunnelEnv
 from subterra_jax.policies import belief, senses
 from subterra_jax.policies.belief import Belief, Habits
 from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.networks import FeedForward, Recurrent
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import constants_digest
+from subterra_jax.tunnel_env import TunnelEnv
 
 Agent = FeedForward | Recurrent | Belief
 KINDS = ("mlp", "gru", belief.KIND)

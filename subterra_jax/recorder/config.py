@@ -12,7 +12,6 @@ from jaxtyping import Float
 import subterra_jax as st
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import make_agent
-from subterra_jax.env import TunnelEnv
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
@@ -21,6 +20,7 @@ from subterra_jax.policies import check_fits, load
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel_env import TunnelEnv
 
 CloudName = Literal["none", "vlp16", "os1"]
 _BEAMS: dict[str, tuple[Callable[[int], np.ndarray], int]] = {"vlp16": (beams.vlp16, 16), "os1": (beams.os1, 64)}

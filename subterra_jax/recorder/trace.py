@@ -18,11 +18,11 @@ from scipy.spatial.transform import Rotation
 
 from subterra_jax import lidar3d
 from subterra_jax.baselines.agent import Agent
-from subterra_jax.env import TunnelEnv
 from subterra_jax.episode import Driver, Episode, Taken, concatenate
 from subterra_jax.lidar3d import Relief
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel_env import TunnelEnv
 
 _CHUNK = 200  # steps between two tests for the end of the episode
 

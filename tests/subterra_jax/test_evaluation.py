@@ -16,8 +16,8 @@ from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
 from subterra_jax.evaluation.bounds import stop_bounds
 from subterra_jax.evaluation.episodes import EvaluationError
-from subterra_jax.evaluation.estimates import add_estimate, crps, start_estimates
-from subterra_jax.evaluation.summary import area, interquartile_mean, interval, normalised, summary
+from subterra_jax.evaluation.records import area, interquartile_mean, interval, normalised, summarise
+from subterra_jax.evaluation.tally import add_estimate, crps, start_estimates
 from tests.subterra_jax import tunnels
 
 
@@ -193,7 +193,7 @@ def test_records_survive_json_and_nothing_measured_is_no_number():
     again = Records.from_columns(records.as_columns())
     for name, values in vars(records).items():
         np.testing.assert_array_equal(values, getattr(again, name))
-    found = summary(records)
+    found = summarise(records)
     assert found["success"] == 0.5
     assert found["axial_rms"] is None
     assert found["contacts_per_100m"] == 0.5

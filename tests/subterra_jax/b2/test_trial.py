@@ -10,7 +10,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.b2 import film, transfer
 from subterra_jax.b2.view import PictureError
-from subterra_jax.env import TunnelEnv
+from subterra_jax.tunnel_env import TunnelEnv
 from tests.subterra_jax import probes
 
 PARAMS = SimpleNamespace(

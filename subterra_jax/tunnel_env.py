@@ -1,0 +1,439 @@
+"""The environment of the planar tasks and of the walking robot: a motion, an ordered tuple of parts and one rule."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from subterra_jax.env import Box, Info, Stepped
+from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, Sight, Step, Unicycle
+from subterra_jax.parts.part import Batch, Bounds
+from subterra_jax.parts.unicycle import clearance, in_contact, wrap
+from subterra_jax.rules import Rule, Start, Traverse
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel import Tunnel, at_station, foot
+
+ESTIMATE, REPORT = 4, 5  # numbers in an action that holds an estimate, and in one that reports
+_NOTHING = Noise()
+
+
+@dataclasses.dataclass(frozen=True)
+class TunnelEnv:
+    """A robot in a tunnel: a motion, parts (sensors, errors, obstacles) and the rule of a task.
+
+    The observation holds 16 ranges (m; beam 0 straight ahead, the others counter-clockwise, evenly spaced), the
+    odometer's distance (m) and heading (rad), then the entries of the rule and of further parts: `fields` names them.
+    The action is forward speed (m/s) and yaw rate (rad/s). Where `action_size` is 4 or 5 there follow an estimate of
+    the station (m) and the log of its standard deviation, and at 5 the direction faced (growing station: above 0); none
+    of these moves the robot. An episode ends as its rule says, with failure at contact, and is truncated at the
+    horizon.
+
+    Attributes:
+        id: Gymnasium id.
+        rule: Rule of the task.
+        parts: Parts in the order in which they act.
+        motion: The part that moves the robot.
+        estimates: The action holds an estimate, scored in `info`, even where the task asks for none.
+    """
+
+    id: str
+    rule: Rule = dataclasses.field(default_factory=Traverse)
+    parts: tuple[Part, ...] = (Odometer(), PlanarLidar())
+    motion: Motion = dataclasses.field(default_factory=Unicycle)
+    estimates: bool = False
+
+    def reset(self, key: PRNGKeyArray, params: EnvParams) -> tuple[Float[Array, n_obs], State]:
+        """Begin an episode.
+
+        Args:
+            key: Source of everything that is drawn for the episode, and of the first scan's noise.
+            params: The task.
+
+        Returns:
+            First observation and state.
+        """
+        start_key, scan_key = jax.random.split(key)
+        state = self.begin(self.draw_reset(start_key, (), params), params)
+        return self.observe(state, self.draw_step(scan_key, (), params), params), state
+
+    def step(
+        self, key: PRNGKeyArray, state: State, action: Float[Array, n_action], params: EnvParams
+    ) -> tuple[Float[Array, n_obs], State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
+        """Take one step, without a reset at its end: `AutoReset` resets.
+
+        Args:
+            key: Source of everything random in the step.
+            state: State before.
+            action: Speed (m/s) and yaw rate (rad/s), and what `action_size` adds; clipped, NaN read as 0.
+            params: The task.
+
+        Returns:
+            Observation, state, reward, terminated, truncated and info. An episode that ends at the horizon with success
+            or contact is terminated, not truncated.
+        """
+        noise = self.draw_step(key, (), params)
+        state, reward, terminated, truncated, info = self.advance(state, action, noise, params)
+        return self.observe(state, noise, params), state, reward, terminated, truncated, info
+
+    def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> dict[str, Any]:
+        """Draw the random numbers of a batch of resets; see `Env`."""
+        sources: dict[str, Any] = {part.name: part for part in (self.motion, *self.parts)} | {"rule": self.rule}
+        streams = {name: _streams(source) for name, source in sources.items()}
+        numbers = [2, *(number for of_source in streams.values() for number in of_source)]
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.array(numbers, jnp.uint32))
+        draws, first = {}, 1
+        for name, source in sources.items():
+            count = len(streams[name])
+            own = keys[first] if count == 1 else keys[first : first + count]
+            draws[name], first = source.draw_reset(own, batch, params), first + count
+        if params.tunnel.count > 1:
+            draws["tunnel"] = jax.random.uniform(keys[0], batch)
+        return draws
+
+    def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> dict[str, Any]:
+        """Draw the random numbers of one step of a batch; see `Env`. All parts share one call of each kind."""
+        normals = {part.name: n for part in self.parts if (n := part.normals(params))}
+        uniforms = {part.name: n for part in self.parts if (n := part.uniforms(params))}
+        normal = _sliced(jax.random.normal(key, (*batch, sum(normals.values()))), normals) if normals else {}
+        uniform = {}
+        if uniforms:
+            count = sum(uniforms.values())
+            uniform = _sliced(jax.random.uniform(jax.random.fold_in(key, 1), (*batch, count)), uniforms)
+        noise: dict[str, Any] = {
+            name: Noise(normal.get(name, ()), uniform.get(name, ())) for name in {**normals, **uniforms}
+        }
+        return {**noise, self.motion.name: self.motion.draw_step(jax.random.fold_in(key, 2), batch, params)}
+
+    def begin(self, draws: Mapping[str, Any], params: EnvParams) -> State:
+        """Make the state at the start of an episode, before any scan."""
+        index = jnp.zeros((), jnp.int32)
+        if "tunnel" in draws:
+            count = params.tunnel.count
+            index = jnp.minimum((draws["tunnel"] * count).astype(jnp.int32), count - 1)
+        tunnel = params.tunnel.pick(index)
+        start = self.rule.start(draws["rule"], tunnel, params)
+        station = jnp.asarray(start.station, jnp.float32)
+        x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
+        heading = wrap(jnp.arctan2(tangent_y, tangent_x) + start.heading)
+        state = State(
+            position=jnp.stack([x - start.lateral * tangent_y, y + start.lateral * tangent_x]),
+            heading=wrap(heading + jnp.pi * start.backwards),
+            station=station,
+            lateral=jnp.asarray(start.lateral, jnp.float32),
+            furthest=station,
+            command=jnp.zeros(2),
+            steps=jnp.zeros((), jnp.int32),
+            tunnel=index,
+            parts={"goal": start.own},
+        )
+        for part in (*self.parts, self.motion):
+            own = part.begin(draws[part.name], state, params)
+            state = dataclasses.replace(state, parts={**state.parts, part.name: own})
+        return state
+
+    def advance(
+        self, state: State, action: Float[Array, n_action], noise: Mapping[str, Any], params: EnvParams
+    ) -> Stepped:
+        """Take one step but its observation: motion, contact, parts, reward and the end of the episode.
+
+        Args:
+            state: State before.
+            action: As for `step`.
+            noise: Random numbers of the step.
+            params: The task.
+
+        Returns:
+            State, reward, terminated, truncated and info.
+
+        Raises:
+            ValueError: The action has another shape, seen when the step is traced.
+        """
+        if jnp.shape(action) != (self.action_size,):
+            raise ValueError(
+                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {jnp.shape(action)}"
+            )
+        tunnel = params.tunnel.pick(state.tunnel)
+        command = self.motion.obey(action, state, params)
+        drive = Drive(command, command)
+        for part in self.parts:
+            drive = part.drive(state.parts[part.name], drive, state, params)
+        moved = self.motion.move(state, drive, noise[self.motion.name], tunnel, params)
+        place = foot(tunnel, moved.position, state.station)
+        clear, contact = self._contact(state, moved, place.station, tunnel, params)
+        step = Step(
+            before=state,
+            tunnel=tunnel,
+            place=place,
+            position=moved.position,
+            heading=moved.heading,
+            furthest=jnp.maximum(state.furthest, place.station),
+            contact=contact | moved.fallen,
+            command=command,
+            drive=moved.drive,
+            moved=jnp.abs(moved.drive.motion[0]) * jnp.asarray(params.vehicle.period),
+            report=self._report(action, params),
+            after={self.motion.name: moved.own},
+        )
+        step = self._advance_parts(step, noise, params)
+        verdict = self.rule.judge(step, params)
+        steps = state.steps + 1
+        terminated = step.contact | verdict.ended
+        info = {
+            **verdict.terms,
+            **verdict.info,
+            **moved.info,
+            **self._estimate_info(step),
+            "coverage": jnp.clip(step.furthest / tunnel.length, 0.0, 1.0),
+            "station": place.station,
+            "lateral": place.lateral,
+            "half_width": place.half_width,
+            "clearance": clear,
+            "contact": contact,
+            "success": verdict.success & ~jnp.asarray(moved.fallen),
+        }
+        for part in self.parts:
+            info |= part.info(state.parts[part.name])
+        after = State(
+            position=moved.position,
+            heading=moved.heading,
+            station=place.station,
+            lateral=place.lateral,
+            furthest=step.furthest,
+            command=command,
+            steps=steps,
+            tunnel=state.tunnel,
+            parts={**step.after, "goal": verdict.own},
+        )
+        reward = sum(verdict.terms.values(), jnp.zeros(()))
+        return after, reward, terminated, (steps >= params.horizon) & ~terminated, info
+
+    def observe(
+        self, state: State, noise: Mapping[str, Any], params: EnvParams, wanted: Any = True
+    ) -> Float[Array, n_obs]:
+        """Observe a state.
+
+        Args:
+            state: The state.
+            noise: Random numbers of the step.
+            params: The task.
+            wanted: Someone will read the observation; where not, ranges may be anything.
+
+        Returns:
+            Noisy ranges (m), dead-reckoned distance (m) and heading (rad), then the further entries of `fields`.
+        """
+        tunnel = params.tunnel.pick(state.tunnel)
+        sight = self._sight(state, noise, tunnel, params, wanted)
+        entries: dict[str, Array] = {}
+        for source in self._observers():
+            if isinstance(source, Rule):
+                entries |= source.observe(state, tunnel)
+            else:
+                own, of_part = state.parts[source.name], noise.get(source.name, _NOTHING)
+                entries |= source.observe(own, sight, of_part, params)
+        return jnp.concatenate([jnp.atleast_1d(entry) for entry in entries.values()])
+
+    def skips_unwanted(self, params: EnvParams) -> bool:
+        """Tell whether a batch of observations costs little for those that nobody wants."""
+        return any(part.skips_unwanted(params) for part in self.parts)
+
+    @property
+    def action_size(self) -> int:
+        """Count of numbers in one action."""
+        return REPORT if self.rule.reports else ESTIMATE if self.estimates else 2
+
+    def observation_size(self, params: EnvParams) -> int:
+        """Count the numbers of one observation."""
+        return sum(jnp.size(low) for low, _ in self._space(params).values())
+
+    def fields(self, params: EnvParams) -> dict[str, slice]:
+        """Return the place of each named entry in an observation."""
+        sizes = {name: jnp.size(low) for name, (low, _) in self._space(params).items()}
+        ends = np.cumsum(list(sizes.values())).tolist()
+        return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+
+    def observation_space(self, params: EnvParams) -> Box:
+        """Return the bounds of an observation."""
+        bounds = self._space(params).values()
+        low, high = (np.concatenate([np.ravel(np.asarray(bound[side])) for bound in bounds]) for side in (0, 1))
+        return Box(low.astype(np.float32), high.astype(np.float32))
+
+    def action_space(self, params: EnvParams) -> Box:
+        """Return the bounds of an action; `step` clips to them."""
+        speed, yaw_rate = (np.max(np.asarray(v)) for v in (params.vehicle.speed_max, params.vehicle.yaw_rate_max))
+        length = np.max(np.asarray(params.tunnel.length))
+        low, high = [0.0, -yaw_rate, 0.0, -5.0, -1.0], [speed, yaw_rate, length, 5.0, 1.0]
+        n = self.action_size
+        return Box(np.array(low[:n], np.float32), np.array(high[:n], np.float32))
+
+    def privileged(self, state: State, params: EnvParams) -> dict[str, Float[Array, ""]]:
+        """Return what only a teacher or a critic may know; no observation holds any of it.
+
+        Returns:
+            Station and lateral offset (m), offset over half-width, sine and cosine of the heading against the axis, and
+            what parts and rule add: the odometer's biases, slip, severity, way to the goal.
+        """
+        _, _, tangent_x, tangent_y, half_width = at_station(params.tunnel.pick(state.tunnel), state.station)
+        cos, sin = jnp.cos(state.heading), jnp.sin(state.heading)
+        known = {
+            "station": state.station,
+            "lateral": state.lateral,
+            "offset": state.lateral / half_width,
+            "heading_sin": sin * tangent_x - cos * tangent_y,
+            "heading_cos": cos * tangent_x + sin * tangent_y,
+        }
+        for part in self.parts:
+            known |= part.privileged(state.parts[part.name])
+        return known | self.rule.privileged(state)
+
+    def levels(self, params: EnvParams) -> range:
+        """Return the levels of difficulty that an evaluation goes through evenly; just 0 in most tasks."""
+        return next((levels for part in self.parts if (levels := part.levels(params))), range(1))
+
+    def at_level(self, params: EnvParams, level: Any) -> EnvParams:
+        """Return the params with one level of difficulty."""
+        for part in self.parts:
+            params = part.at_level(params, level)
+        return params
+
+    def boxes(self, state: State, params: EnvParams) -> list[Any]:
+        """Return the boxes near the robot, for pictures: a list of `parts.boxes.Boxes`."""
+        tunnel = params.tunnel.pick(state.tunnel)
+        return [b for part in self.parts for b in part.boxes(state.parts[part.name], state.station, tunnel, params)]
+
+    def check(self, params: EnvParams) -> None:
+        """Refuse parts and a rule that do not go together.
+
+        Raises:
+            ValueError: Two parts share a name or an observed entry, the rule needs a part that is missing, or its start
+                is malformed.
+        """
+        names = [part.name for part in (self.motion, *self.parts)]
+        if twice := {name for name in names if names.count(name) > 1}:
+            raise ValueError(f"{self.id}: two parts are called {min(twice)!r}; a name must be one part's own")
+        if missing := set(self.rule.needs) - set(names):
+            rule = type(self.rule).__name__
+            raise ValueError(f"{self.id}: the rule {rule} needs the part {min(missing)!r}; there are {sorted(names)}")
+        _check_start(self, params)
+        self._space(params)
+
+    def _observers(self) -> list[Part | Rule]:
+        """Parts and rule in the order of their entries in the observation."""
+        first = [part for part in sorted(self.parts, key=lambda part: part.place) if part.place < 2]
+        return [*first, self.rule, *(part for part in self.parts if part.place >= 2)]
+
+    def _space(self, params: EnvParams) -> dict[str, Bounds]:
+        space: dict[str, Bounds] = {}
+        owner: dict[str, str] = {}
+        for source in self._observers():
+            who = f"the rule {type(source).__name__}" if isinstance(source, Rule) else f"the part {source.name!r}"
+            for name, bounds in source.space(params).items():
+                if name in space:
+                    raise ValueError(f"{self.id}: both {owner[name]} and {who} observe {name!r}")
+                space[name], owner[name] = bounds, who
+        return space
+
+    def _contact(
+        self, state: State, moved: Moved, station: Array, tunnel: Tunnel, params: EnvParams
+    ) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        """Distance to the nearest wall or obstacle, m, exact up to 0.8 m; and whether the robot touches one."""
+        beside: Any = np.inf
+        for part in self.parts:
+            gap = part.clearance(state.parts[part.name], moved.position, station, tunnel, params)
+            beside = jnp.minimum(beside, gap)
+        if not self.motion.on_the_plan:
+            return jnp.minimum(moved.clearance, beside), moved.contact | (beside < params.vehicle.radius)
+        clear = jnp.minimum(clearance(tunnel, moved.position, station), beside)
+        return clear, in_contact(tunnel, clear, station, params.vehicle)
+
+    def _advance_parts(self, step: Step, noise: Mapping[str, Any], params: EnvParams) -> Step:
+        """Advance every part in turn; each sees the states of those before it."""
+        before = step.before
+        held = [part.holds_odometer(before.parts[part.name]) for part in self.parts]
+        for part in self.parts:
+            own = part.advance(before.parts[part.name], step, noise.get(part.name, _NOTHING), params)
+            if part.name == Odometer.name:
+                own = _hold(before.parts[part.name], own, held)
+            step = dataclasses.replace(step, after={**step.after, part.name: own})
+        return step
+
+    def _sight(self, state: State, noise: Mapping[str, Any], tunnel: Tunnel, params: EnvParams, wanted: Any) -> Sight:
+        """The moment that sensors show, and the obstacles and faults between them and the walls."""
+        sight = Sight(tunnel, state.position, state.heading, state.station, state.parts, wanted)
+        for part in self.parts:
+            sight = part.look_from(state.parts[part.name], sight, params)
+
+        def hits(directions: Array) -> Any:
+            nearest: Any = np.inf
+            for part in self.parts:
+                nearest = jnp.minimum(nearest, part.hits(state.parts[part.name], sight, directions, params))
+            return nearest
+
+        def spoil(ranges: Array) -> Array:
+            for part in self.parts:
+                own, of_part = state.parts[part.name], noise.get(part.name, _NOTHING)
+                ranges = part.spoil(own, ranges, of_part, params)
+            return ranges
+
+        return dataclasses.replace(sight, hits=hits, spoil=spoil)
+
+    def _report(self, action: Float[Array, n_action], params: EnvParams) -> Float[Array, 3]:
+        """Estimate, log of its standard deviation and direction in an action: clipped; 0 for a NaN and where absent."""
+        size = self.action_size
+        if size == 2:
+            return jnp.zeros(3)
+        low, high = jnp.array([0.0, -5.0, -1.0]), jnp.stack([jnp.max(jnp.asarray(params.tunnel.length)), 5.0, 1.0])
+        given = jnp.concatenate([action[2:size], jnp.zeros(REPORT - size)])
+        return jnp.clip(jnp.where(jnp.isnan(given), 0.0, given), low, high)
+
+    def _estimate_info(self, step: Step) -> Info:
+        if self.action_size == 2:
+            return {}
+        return {"estimate_error": step.report[0] - step.place.station, "estimate_log_sigma": step.report[1]}
+
+
+def _streams(source: Part | Rule) -> tuple[int, ...]:
+    return source.random_streams() if isinstance(source, Part) else source.streams
+
+
+def _sliced(values: Float[Array, "*batch n"], counts: Mapping[str, int]) -> dict[str, Float[Array, "*batch k"]]:
+    """One array as several, by name."""
+    ends = np.cumsum(list(counts.values())).tolist()
+    return {name: values[..., end - n : end] for (name, n), end in zip(counts.items(), ends, strict=True)}
+
+
+def _hold(before: Any, after: Any, held: list[Any]) -> Any:
+    """The odometer after a step; while a part holds it, its readings stay and its errors go on."""
+    for holds in held:
+        if holds is not False:
+            after = dataclasses.replace(
+                after,
+                distance=jnp.where(holds, before.distance, after.distance),
+                heading=jnp.where(holds, before.heading, after.heading),
+            )
+    return after
+
+
+def _check_start(env: TunnelEnv, params: EnvParams) -> None:
+    """Refuse a start that is not one, naming the rule and what it returned."""
+
+    def start() -> Any:
+        draws = env.draw_reset(jax.random.key(0), (), params)
+        made = env.rule.start(draws["rule"], params.tunnel.pick(0), params)
+        if not isinstance(made, Start):
+            raise ValueError(f"{name}.start must return a Start, got {type(made).__name__}")
+        return {field.name: getattr(made, field.name) for field in dataclasses.fields(Start)}
+
+    name = f"{env.id}: the rule {type(env.rule).__name__}"
+    try:
+        shapes = jax.eval_shape(start)
+    except TypeError as error:
+        raise ValueError(f"{name}.start returned something that is no array ({error})") from error
+    for field in ("station", "lateral", "heading", "backwards"):
+        if shapes[field].shape != ():
+            raise ValueError(f"{name}.start must return one number as {field}, got an array of {shapes[field].shape}")
