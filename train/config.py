@@ -5,8 +5,12 @@ import math
 from typing import Any, ClassVar, Literal
 
 from subterra_jax.b2.gait import RELEASED
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.tasks import TaskError, find
-from train.errors import ConfigError
+
+
+class ConfigError(SubterraError, ValueError):
+    """A setting, or a combination of settings, that no training run can have."""
 
 
 def at_least(config: Any, least: int, *names: str) -> None:

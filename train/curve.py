@@ -16,7 +16,7 @@ import tyro
 
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file, require_file
-from train.errors import RunFolderError
+from train.folder import RunFolderError
 from train.log import EPISODES
 from train.snapshot import WINDOW
 

@@ -15,7 +15,7 @@ from subterra_jax.evaluation.episodes import N_LISTED, SHA256
 from subterra_jax.evaluation.records import summarise
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.policies.loading import Agent
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.log import print_table
 from train.policies import open_agent
 from train.world import World, open_world

@@ -16,12 +16,12 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, require_folder
 from subterra_jax.host.versions import other_schema
 from subterra_jax.policies import TRAINED_UNDER, training_conditions
 from train import devices
-from train.config import TrainConfig
-from train.errors import CheckpointError, ConfigError, RunFolderError
+from train.config import ConfigError, TrainConfig
 from train.log import EPISODES, LOG, TABLE, TENSORBOARD
 from train.snapshot import Best, EpisodeWindow, Snapshot, Trainable
 from train.world import World, library_versions
@@ -29,6 +29,14 @@ from train.world import World, library_versions
 SCHEMA = "subterra.checkpoint/1"
 FOLDER, FACTS, ARRAYS = "checkpoint", "checkpoint.json", "arrays"
 _KEPT = 2
+
+
+class CheckpointError(SubterraError):
+    """A checkpoint is missing, damaged, or belongs to another network or run."""
+
+
+class RunFolderError(SubterraError):
+    """The output folder cannot be written, or already holds something else."""
 
 
 @dataclasses.dataclass(frozen=True)

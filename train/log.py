@@ -20,7 +20,7 @@ from rich.progress import (
 from rich.table import Table
 
 from subterra_jax.host.files import replace_file
-from train.errors import ConfigError
+from train.config import ConfigError
 
 LOG, TABLE, EPISODES = "log.jsonl", "log.csv", "episodes.csv"
 _HEADER = "episode,step,coverage,success,length,contact"

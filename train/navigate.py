@@ -18,9 +18,8 @@ import tyro
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from train import devices
 from train.belief.learner import BeliefConfig, make_belief_config
-from train.config import Legs, PPOConfig, make_config
+from train.config import ConfigError, Legs, PPOConfig, make_config
 from train.devices import Cluster
-from train.errors import ConfigError
 from train.evaluate import check_episodes
 from train.ppo import check_config, make_learner, seed_axes
 from train.recurrent.config import (

@@ -18,9 +18,9 @@ from subterra_jax.policies.files import FACTS as POLICY_FACTS
 from subterra_jax.policies.files import SCHEMA, TENSORS
 from subterra_jax.policies.loading import Agent
 from train.belief.learner import BeliefLayout, BeliefNetworks
-from train.errors import CheckpointError, ConfigError
+from train.config import ConfigError
 from train.feedforward.networks import Layout, Networks
-from train.folder import FACTS, load_checkpoint
+from train.folder import FACTS, CheckpointError, load_checkpoint
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks
 from train.world import require_task
 

@@ -16,10 +16,10 @@ from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.policies import PolicyError, check_fits
 from train.belief.learner import BeliefConfig, BeliefLearner, check_belief
-from train.config import PPOConfig, TrainConfig, check
+from train.config import ConfigError, PPOConfig, TrainConfig, check
 from train.devices import PART, SPLIT, Parts, Spread, compiler_options
-from train.errors import CheckpointError, ConfigError
 from train.feedforward.learner import Learner
+from train.folder import CheckpointError
 from train.policies import open_agent, policy_weights
 from train.recurrent.config import (
     DistillConfig,

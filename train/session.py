@@ -14,8 +14,8 @@ from subterra_jax.evaluation.episodes import SHA256
 from subterra_jax.host.command import EXIT_INTERRUPTED
 from subterra_jax.host.files import replace_file
 from train import devices
+from train.config import ConfigError
 from train.curve import GOAL, write_curve
-from train.errors import ConfigError
 from train.evaluate import evaluate
 from train.folder import RunFolder, iterations
 from train.log import (

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
+from subterra_jax.host.command import EXIT_FAILED
+from subterra_jax.host.errors import SubterraError
 from train.config import TrainConfig
-from train.errors import TrainingError
 from train.report import Ended, Report
 
 WINDOW = 100
@@ -24,6 +25,12 @@ COLUMNS = np.dtype(
         ("contact", np.bool_),
     ]
 )
+
+
+class TrainingError(SubterraError):
+    """Training came to a point from which it cannot go on."""
+
+    exit_status = EXIT_FAILED
 
 
 class EpisodeWindow:

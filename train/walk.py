@@ -19,8 +19,7 @@ from subterra_jax.host.files import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train.b2.walking import WalkConfig, WalkLearner, WalkSession, make_walk_config
-from train.config import check
-from train.errors import ConfigError
+from train.config import ConfigError, check
 from train.session import check_seeds
 from train.world import World
 

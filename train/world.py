@@ -11,7 +11,7 @@ from subterra_jax.host.versions import VERSION
 from subterra_jax.procedural import expand
 from subterra_jax.tasks import TaskError, find
 from subterra_jax.tunnel.sources import tunnel_digest
-from train.errors import ConfigError
+from train.config import ConfigError
 
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
 

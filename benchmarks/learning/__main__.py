@@ -15,8 +15,8 @@ from benchmarks.command import require_least, run_main
 from benchmarks.learning.runs import Curve, require_stable_baselines, train_ours, train_stable_baselines
 from benchmarks.results import environment_facts, png_bytes, version, write_file
 from subterra_jax.host.files import require_folder
+from train.config import ConfigError
 from train.curve import GOAL, rolling
-from train.errors import ConfigError
 from train.snapshot import WINDOW
 from train.world import open_world, require_task
 

@@ -9,9 +9,8 @@ from jaxtyping import Bool, Float, Int
 
 import subterra_jax as st
 from train import ppo
-from train.config import make_config
+from train.config import ConfigError, make_config
 from train.curve import GOAL, rolling
-from train.errors import ConfigError
 from train.snapshot import WINDOW, Snapshot
 
 _FRAMES, _DISCOUNT = 4, 0.98  # as in ours

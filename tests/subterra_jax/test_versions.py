@@ -22,7 +22,7 @@ from subterra_jax.viewer.recording import load as load_episode
 from subterra_jax.viewer.recording import save as save_episode
 from tests.subterra_jax.viewer.episodes import straight
 from train import folder
-from train.errors import CheckpointError
+from train.folder import CheckpointError
 from train.world import library_versions
 
 ROOT = Path(__file__).parents[2]

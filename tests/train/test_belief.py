@@ -18,7 +18,7 @@ from train.belief.learner import (
     check_belief,
     make_belief_config,
 )
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.policies import make_agent
 
 TASK = "Subterra/RelocaliseShort-v0"

@@ -9,9 +9,9 @@ import pytest
 
 from train import folder, learning, policies
 from train.config import PPOConfig
-from train.errors import CheckpointError
 from train.feedforward import networks
 from train.feedforward.learner import Learner
+from train.folder import CheckpointError
 from train.ppo import begin
 from train.world import open_world
 

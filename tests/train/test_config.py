@@ -3,8 +3,7 @@ import dataclasses
 import pytest
 
 import subterra_jax as st
-from train.config import PPOConfig, check, make_config
-from train.errors import ConfigError
+from train.config import ConfigError, PPOConfig, check, make_config
 
 WRONG = {
     "steps": 0,

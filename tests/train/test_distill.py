@@ -12,7 +12,7 @@ from subterra_jax.baselines import registry
 from tests.subterra_jax.probes import PROBES
 from tests.train.conftest import call, log_without_timing
 from train import folder, navigate
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.recurrent import lessons
 from train.recurrent.config import DistillConfig, check_distill, make_distill_config
 from train.recurrent.distill import DistillLearner

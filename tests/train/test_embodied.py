@@ -10,8 +10,7 @@ from subterra_jax.b2.transfer import Lag, LaggedWheels
 from subterra_jax.policies import PolicyError
 from train import navigate
 from train.b2 import embodied
-from train.config import Legs
-from train.errors import ConfigError
+from train.config import ConfigError, Legs
 from train.navigate import read_command
 
 SHORT = "Subterra/TraverseShort-v0"

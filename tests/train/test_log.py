@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from train import curve, log, session
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.log import RunLog
 from train.snapshot import COLUMNS
 

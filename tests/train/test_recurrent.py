@@ -10,7 +10,7 @@ import pytest
 import subterra_jax as st
 from tests.train.conftest import call, log_without_timing
 from train import folder, navigate
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.recurrent import drive
 from train.recurrent.config import (
     RecurrentConfig,

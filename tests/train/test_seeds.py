@@ -8,8 +8,7 @@ import pytest
 import subterra_jax as st
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
 from train import navigate, ppo, session
-from train.config import PPOConfig
-from train.errors import ConfigError
+from train.config import ConfigError, PPOConfig
 from train.feedforward.learner import Learner
 
 CONFIG = PPOConfig(steps=3 * 512, n_envs=16, unroll=32, minibatches=2, epochs=2, hidden=(8,), stop_coverage=2.0)

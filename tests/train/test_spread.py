@@ -8,8 +8,8 @@ import pytest
 
 from tests.train.conftest import TASK, call, log_without_timing
 from train import devices, navigate
+from train.config import ConfigError
 from train.devices import Cluster
-from train.errors import ConfigError
 
 SMALL = ("--n-envs=16", "--unroll=32", "--minibatches=2", "--epochs=1", "--hidden", "8", "--parts=2", "--steps=1536")
 MORE = ("--stop-coverage=2", "--checkpoint-every=1", "--evaluation-episodes=2", "--preset=cpu")

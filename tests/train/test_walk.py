@@ -20,7 +20,7 @@ from train.b2.walking import (
     make_walk_config,
     score,
 )
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.feedforward.networks import Policy
 from train.policies import write_policy
 

@@ -8,8 +8,7 @@ import subterra_jax as st
 from subterra_jax.b2 import tasks, transfer
 from subterra_jax.parts.slip import SlipParams
 from subterra_jax.tunnel.sources import load_tunnel
-from train.config import Legs
-from train.errors import ConfigError
+from train.config import ConfigError, Legs
 from train.log import print_table
 from train.policies import make_agent
 from train.session import Session

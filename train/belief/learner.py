@@ -18,6 +18,7 @@ from subterra_jax.rules import Relocalise
 from train import devices, learning
 from train.belief import lessons
 from train.config import (
+    ConfigError,
     TrainConfig,
     at_least,
     check_common,
@@ -26,7 +27,6 @@ from train.config import (
     positive,
     share,
 )
-from train.errors import ConfigError
 from train.report import Finished, Report, report
 
 

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 from subterra_jax.policies.senses import TRACKERS
 from train.config import (
+    ConfigError,
     TrainConfig,
     at_least,
     check_common,
@@ -13,7 +14,6 @@ from train.config import (
     positive,
     share,
 )
-from train.errors import ConfigError
 
 
 @dataclasses.dataclass(frozen=True)

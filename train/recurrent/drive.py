@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 import subterra_jax as st
 from subterra_jax.policies import senses
-from train.errors import ConfigError
+from train.config import ConfigError
 from train.recurrent.config import RecurrentConfig
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Weights
 from train.report import Finished
