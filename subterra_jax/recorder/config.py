@@ -16,7 +16,7 @@ from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
 from subterra_jax.lidar3d import beams
-from subterra_jax.policies import check_fits, load
+from subterra_jax.policies import check_fits, load, with_map
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find
 from subterra_jax.tunnel.plan import TunnelPlan
