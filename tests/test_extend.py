@@ -25,15 +25,17 @@ TASK = "keep_left.py:Mine/KeepLeft-v0"
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """A folder outside the package that holds the page's files."""
+    """A folder outside the package that holds the page's files; nothing that they register outlasts a test."""
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(tasks, "TASKS", tasks.TASKS)
     yield tmp_path
-    for name in FILES:
-        sys.modules.pop(Path(name).stem, None)
+    for stem in (Path(name).stem for name in FILES):
+        for loaded in [name for name in sys.modules if re.fullmatch(rf"{stem}(_[0-9a-f]{{12}})?", name)]:
+            del sys.modules[loaded]
+    for added in set(tasks.TASKS) - set(tasks.BUILT_IN):
+        del tasks.TASKS[added]
 
 
 def test_a_sensor_from_outside_is_observed_with_its_noise_and_its_bias(desk):
