@@ -135,7 +135,8 @@ def test_leaderboard_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
 def test_a_policy_is_trained_on_a_task_from_outside(desk):
     from train import navigate
 
-    status = call(navigate.main, "--task", TASK, *SMALL, "--out", "run")
+    few = ("--steps=16384", "--evaluation-episodes", "2")
+    status = call(navigate.main, "--task", TASK, *SMALL, *few, "--out", "run")
     assert status == 0
     assert (desk / "run" / "evaluation.json").exists()
 

@@ -1,6 +1,5 @@
 """Across the rooms: a scene built from a cloud, and the environment that runs in it."""
 
-import dataclasses
 import shutil
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from scene.fitting.lining import LiningConfig
 from scene.output import BuildConfig
 from scene.reconstruct import ReconstructConfig
 from subterra_jax.lidar import reference
+from subterra_jax.parts import Noise
 from tests.scene.clouds import curved_d_bore
 from tests.shared import METRO, needs_metro
 
@@ -36,8 +36,7 @@ def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np
 
     def scan(position, heading, station):
         here = state.replace(position=position, heading=heading, station=station)
-        noise = env.draw_step(jax.random.key(0), (), params)
-        return env.observe(here, dataclasses.replace(noise, ranges=jnp.zeros(16)), params)[:16]
+        return env.observe(here, {"lidar": Noise(jnp.zeros(16))}, params)[:16]
 
     return np.asarray(jax.jit(jax.vmap(scan))(poses.position, poses.heading, poses.station))
 

@@ -77,6 +77,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) 
         "lining": lining,
         "tunnel": plans[0].name if len(plans) == 1 else str(tunnel),
         "tunnel_provenance": plans[0].provenance,
+        "constants": st.constants_digest(env, params),
         "tunnel_sha256": digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest(),
     }
     return World(task, env, params, facts)

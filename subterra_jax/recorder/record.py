@@ -42,6 +42,7 @@ from subterra_jax.recorder.trace import (
     true_poses,
     tum_rows,
 )
+from subterra_jax.tasks import constants_digest
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -134,6 +135,7 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
         "frames": {"odom": "base_link at the start", "sensors": "turned like base_link, lidar_height above it"},
         "sensors": sensors,
         "topics": topics,
+        "constants": constants_digest(env, params),
         "versions": {name: version(name) for name in _LIBRARIES},
     }
 
