@@ -50,7 +50,7 @@ class Box:
 
 
 class Env(Protocol):
-    """What batches, adapters, evaluation, training, recorder and viewer ask of an environment.
+    """Contract of an environment with batches, adapters, evaluation, training, recorder and viewer.
 
     All functions are pure and jittable; batches come by `vmap`. `reset` and `step` are made of the others:
 

@@ -22,7 +22,7 @@ from scene.resume import Partial
 
 @dataclass(frozen=True)
 class Located:
-    """Where the LiDAR was, and what the manifest says of it."""
+    """Poses of the LiDAR, and their entries in the manifest."""
 
     # Poses of the LiDAR; in the control's frame where there was one, else level from the first sweep
     trajectory: Trajectory

@@ -25,7 +25,7 @@ _FLAG = tyro.conf.arg(prefix_name=False)
 
 @dataclass(frozen=True)
 class ReadingConfig:
-    """What a user says about an input instead of having it detected."""
+    """Facts about an input that the user gives, in place of detection."""
 
     topic: Annotated[str | None, _FLAG] = None  # LiDAR topic of a bag; found by its type where not given.
     # Format of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.

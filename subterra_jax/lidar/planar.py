@@ -49,7 +49,7 @@ def scan(
         heading: Its heading, rad.
         station: Its station, m; chooses the window of walls.
         params: The LiDAR.
-        wanted: Whether anybody will look at it; where not, the ranges may be anything.
+        wanted: Someone will read the scan; where not, the ranges may be anything.
 
     Returns:
         Ranges without noise, m, in [0, range_max]; exactly `range_max` where a beam meets no wall within it, as when it
@@ -65,7 +65,7 @@ def scan(
 
 
 def skips_unwanted(params: LidarParams) -> bool:
-    """Whether a batch of scans is cast by the fused kernels, which cost little for scans that nobody wants."""
+    """Tell whether the fused kernels cast a batch of scans; they cost little for scans that nobody wants."""
     return params.fused and fused.supported(params.n_beams)
 
 
@@ -114,7 +114,7 @@ _cast_by_kernels = rowwise(_cast, lambda what, *rows: _cast_rows(what, *rows))
 
 
 def bearings(n_beams: int) -> Float[np.ndarray, "n_beams"]:
-    """Of the beams from the heading, rad."""
+    """Return the angles of the beams from the heading, rad."""
     return np.arange(n_beams) * (2.0 * np.pi / n_beams)
 
 

@@ -103,7 +103,7 @@ def clearance(segments: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """How well ranges agree with the reference.
+    """Agreement of ranges with the reference.
 
     Attributes:
         n_rays: Rays compared.

@@ -128,7 +128,7 @@ class Reckoning:
 
 @struct.dataclass
 class Sight:
-    """What a look at an observation gives.
+    """Result of a look at an observation.
 
     Attributes:
         features: Inputs of the network, all of order 1.

@@ -40,7 +40,7 @@ class TurnBack(StopAt):
         return dataclasses.replace(start, own=goal)
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """As for `StopAt`, and the flag: 1 once the goal has been reached."""
+        """Add the flag to the entries of `StopAt`: 1 once the goal has been reached."""
         return {**super().space(params), "flag": (0.0, 1.0)}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
