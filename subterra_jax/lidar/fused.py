@@ -27,7 +27,7 @@ _MOST_BEAMS = 2
 
 
 def supported(n_beams: int) -> bool:
-    """Tell whether the kernels can run: on an NVIDIA GPU, with an even number of beams, as opposite ones share a line."""
+    """Tell whether the kernels can run: on an NVIDIA GPU, with an even number of beams (opposite ones share a line)."""
     return n_beams % 2 == 0 and jax.default_backend() == "gpu" and "nvidia" in jax.devices()[0].device_kind.lower()
 
 
