@@ -1,4 +1,4 @@
-"""What all readers share: damaged files, numbers in text, units and axes, and the cloud that a reader returns."""
+"""Shared by all readers: damaged files, numbers in text, units and axes, and the cloud that a reader returns."""
 
 import re
 import warnings

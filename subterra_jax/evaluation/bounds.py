@@ -1,4 +1,4 @@
-"""How often one can stop in time without looking at the walls: what the drift of the task allows, by theory.
+"""Theoretical success of a stop without a look at the walls, from the drift that the task states.
 
 float64 on the host, sharing no code with the simulator or the agents, so that an agent above its bound is a leak.
 """

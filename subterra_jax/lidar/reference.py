@@ -1,4 +1,4 @@
-"""What the LiDAR must agree with: float64 brute force against every segment of the tunnel's polylines.
+"""Reference for the LiDAR: float64 brute force against every segment of the tunnel's polylines.
 
 NumPy on the host, sharing no code with the casting on the device. Slow, and used by the tests and the benchmark alone.
 """
