@@ -1,6 +1,6 @@
-"""LiDAR in three dimensions, against every triangle of a built scene: for tilted and many-beam sensors."""
+"""LiDAR in three dimensions, against every triangle of a surface: for tilted and many-beam sensors."""
 
-from subterra_jax.lidar3d.casting import cast, rotate, scan
-from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.lidar3d.casting import cast, require_free, rotate, scan
+from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 
-__all__ = ["Relief", "cast", "rotate", "scan"]
+__all__ = ["Relief", "cast", "require_free", "rotate", "scan", "stack_reliefs"]

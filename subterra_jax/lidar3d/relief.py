@@ -1,248 +1,58 @@
-"""The inner surface of a bore on the device, as one pytree: the geometry that a tilted or many-beam LiDAR measures.
-
-The bore is cut into straight blocks, and its triangles are sorted into the voxels of each block, so that a ray meets
-only the few triangles near it. Voxels are long along the axis because walls are. This runs once, on the host, in
-float64. No triangle is simplified; each is listed in every voxel within `MARGIN` of it.
-"""
+"""The inner surface of one bore or of many on the device: the geometry that a tilted or many-beam LiDAR measures."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
-from scipy.ndimage import distance_transform_cdt
-from scipy.spatial import cKDTree
+from jaxtyping import Array, Float, Int
 
+from subterra_jax.lidar3d.cells import N_FACES, Cells, sort_triangles
 from subterra_jax.lidar3d.surface import SMALL, Axis, Triangles, read_axis, read_scene
+from subterra_jax.lidar3d.upright import CROWN, raise_walls
+from subterra_jax.tunnel.plan import TunnelPlan
 
-
-@dataclasses.dataclass(frozen=True)
-class Blocks:
-    """Straight blocks along the axis, each with its own frame.
-
-    Attributes:
-        centre: Origin of each frame, exactly representable in float32, m, `(b, 3)`.
-        turn: Axes of the frame as rows: along, left, up, exactly representable in float32, `(b, 3, 3)`.
-        back: Plane where the block begins, in its own frame, as a unit normal along the axis and an offset:
-            inside, `normal · point >= offset`; m, `(b, 4)`.
-        front: Plane where the block ends; inside, `normal · point <= offset`; m, `(b, 4)`.
-        ends: Stations of the two planes, m, `(b, 2)`.
-    """
-
-    centre: Float[np.ndarray, "b 3"]
-    turn: Float[np.ndarray, "b 3 3"]
-    back: Float[np.ndarray, "b 4"]
-    front: Float[np.ndarray, "b 4"]
-    ends: Float[np.ndarray, "b 2"]
-
-
-def cut_blocks(
-    station: Float[np.ndarray, "n"],
-    position: Float[np.ndarray, "n 3"],
-    tangent: Float[np.ndarray, "n 3"],
-    length: float,
-) -> Blocks:
-    """Cut the axis into blocks of about `length` m; one block if it is shorter."""
-    joint = np.linspace(0.0, station[-1], max(1, round(station[-1] / length)) + 1)
-
-    def at(values: np.ndarray) -> np.ndarray:
-        return np.stack([np.interp(joint, station, column) for column in values.T], axis=-1)
-
-    point, normal = at(position), at(tangent)
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    centre = _as_float32((point[1:] + point[:-1]) / 2)
-    along = point[1:] - point[:-1]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    left = np.cross([0.0, 0.0, 1.0], along)
-    left /= np.linalg.norm(left, axis=1, keepdims=True)
-    turn = _as_float32(np.stack([along, left, np.cross(along, left)], axis=1))
-
-    def plane(which: slice) -> np.ndarray:
-        facing = np.einsum("bij,bj->bi", turn, normal[which])
-        offset = np.einsum("bij,bj->bi", turn, point[which] - centre)
-        return np.column_stack([facing, np.sum(facing * offset, axis=1)])
-
-    ends = np.column_stack([joint[:-1], joint[1:]])
-    return Blocks(centre, turn, plane(slice(None, -1)), plane(slice(1, None)), ends)
-
-
-def _as_float32(values: np.ndarray) -> np.ndarray:
-    return values.astype(np.float32).astype(np.float64)
-
-
-# A ray may step this far over the face of a voxel without leaving what the voxel lists, m.
-MARGIN = 1e-3
-
-
-@dataclasses.dataclass(frozen=True)
-class Voxels:
-    """Triangles sorted by voxel.
-
-    Attributes:
-        low: Lower corner of every block's grid in its frame, m, `(3,)`.
-        cell: Sizes of a voxel, m, `(3,)`.
-        code: Number of each voxel's list by block and voxel; without a list, minus the Chebyshev distance in voxels to
-            the nearest voxel with one, `(b, nx, ny, nz)`.
-        first: Start of each list in `member`, and end of the last, `(k + 1,)`.
-        member: Rows of `triangle`, list after list, `(p,)`.
-        triangle: One corner and the two edges from it, in the block's frame, m, `(t, 9)`. A triangle in two blocks has
-            two rows.
-    """
-
-    low: Float[np.ndarray, "3"]
-    cell: Float[np.ndarray, "3"]
-    code: Int[np.ndarray, "b nx ny nz"]
-    first: Int[np.ndarray, "k1"]
-    member: Int[np.ndarray, "p"]
-    triangle: Float[np.ndarray, "t 9"]
-
-
-def fill_voxels(
-    blocks: Blocks,
-    station: Float[np.ndarray, "n"],
-    position: Float[np.ndarray, "n 3"],
-    vertices: Float[np.ndarray, "v 3"],
-    faces: Int[np.ndarray, "f 3"],
-    cell: tuple[float, float, float],
-) -> Voxels:
-    """Sort triangles into voxels.
-
-    Args:
-        blocks: The blocks.
-        station: Stations of the axis, m.
-        position: Positions of the axis, m.
-        vertices: Vertices of the triangles, m.
-        faces: Triangles as rows of `vertices`.
-        cell: Target size of a voxel along, across and upwards, m.
-
-    Raises:
-        ValueError: No triangle lies along the axis.
-    """
-    near = station[cKDTree(position).query(vertices)[1]][faces]
-    reach = np.linalg.norm(np.ptp(vertices[faces], axis=1), axis=1) + 2.0 * (station[1] - station[0])
-    low_station, high_station = near.min(axis=1) - reach, near.max(axis=1) + reach
-    parts = []
-    for k in range(len(blocks.centre)):
-        close = np.flatnonzero((high_station >= blocks.ends[k, 0]) & (low_station <= blocks.ends[k, 1]))
-        corner = (vertices[faces[close]] - blocks.centre[k]) @ blocks.turn[k].T
-        within = (corner @ blocks.front[k, :3] - blocks.front[k, 3]).min(axis=1) <= MARGIN
-        within &= (corner @ blocks.back[k, :3] - blocks.back[k, 3]).max(axis=1) >= -MARGIN
-        parts.append(corner[within])
-    extent = np.concatenate([part.reshape(-1, 3) for part in parts])
-    if not len(extent):
-        raise ValueError("no triangle lies along the axis")
-    low, high = extent.min(axis=0) - 0.01, extent.max(axis=0) + 0.01
-    # The ends of the grid reach to infinity, so along the axis it need not hold the ends of slanted triangles.
-    half = float(np.max(blocks.ends[:, 1] - blocks.ends[:, 0])) / 2
-    low[0], high[0] = -half, half
-    count = np.maximum(np.ceil((high - low) / np.asarray(cell)), 1).astype(int)
-    size = (high - low) / count
-    return _list_triangles(parts, low, size, count)
-
-
-def _list_triangles(parts: list[np.ndarray], low: np.ndarray, cell: np.ndarray, count: np.ndarray) -> Voxels:
-    """List the triangles of every voxel of all blocks."""
-    code, lengths, members = np.empty((len(parts), *count), np.int32), [], []
-    lists = triangles = 0
-    for k, corner in enumerate(parts):
-        triangle, voxel = _pairs(corner, low, cell, count)
-        order = np.lexsort([triangle, voxel])
-        taken, number = np.unique(voxel[order], return_counts=True)
-        free = np.ones(count.prod(), bool)
-        free[taken] = False
-        # The transform knows no distance where nothing is taken.
-        away = distance_transform_cdt(free.reshape(count), "chessboard") if len(taken) else np.full(count, count.max())
-        code[k] = -away
-        code[k].reshape(-1)[taken] = lists + np.arange(len(taken))
-        lengths.append(number)
-        members.append(triangles + triangle[order])
-        lists, triangles = lists + len(taken), triangles + len(corner)
-    corner = np.concatenate(parts)
-    rows = np.concatenate([corner[:, 0], corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]], axis=1)
-    first = np.concatenate([[0], np.cumsum(np.concatenate(lengths))])
-    return Voxels(low, cell, code, first, np.concatenate(members), rows)
-
-
-def _pairs(
-    corner: Float[np.ndarray, "t 3 3"], low: np.ndarray, cell: np.ndarray, count: np.ndarray
-) -> tuple[Int[np.ndarray, "p"], Int[np.ndarray, "p"]]:
-    """Pair triangles with the flat numbers of voxels near them; voxels at the grid's ends reach to infinity."""
-    start = _voxel_of(corner.min(axis=1) - MARGIN, low, cell, count)
-    stop = _voxel_of(corner.max(axis=1) + MARGIN, low, cell, count) + 1
-    span = stop - start
-    total = span.prod(axis=1)
-    triangle = np.repeat(np.arange(len(corner)), total)
-    place = np.arange(len(triangle)) - np.repeat(np.cumsum(total) - total, total)
-    of = span[triangle]
-    step = np.column_stack([place // (of[:, 1] * of[:, 2]), place // of[:, 2] % of[:, 1], place % of[:, 2]])
-    voxel = start[triangle] + step
-    # Only where a triangle spans several voxels can it miss one of them.
-    unsure = np.flatnonzero((span > 1).sum(axis=1)[triangle] > 1)
-    meets = np.ones(len(triangle), bool)
-    meets[unsure] = _meets(corner[triangle[unsure]], voxel[unsure], low, cell, count)
-    return triangle[meets], np.ravel_multi_index(tuple(voxel[meets].T), tuple(count))
-
-
-def _voxel_of(point: np.ndarray, low: np.ndarray, cell: np.ndarray, count: np.ndarray) -> np.ndarray:
-    return np.clip(np.floor((point - low) / cell), 0, count - 1).astype(int)
-
-
-def _meets(
-    corner: Float[np.ndarray, "p 3 3"],
-    voxel: Int[np.ndarray, "p 3"],
-    low: np.ndarray,
-    cell: np.ndarray,
-    count: np.ndarray,
-) -> Bool[np.ndarray, "p"]:
-    """Return whether triangles and voxels overlap.
-
-    Source: separating-axis theorem for convex bodies; of its 13 axes the caller has tested the box's own three.
-    """
-    half = cell / 2 + MARGIN
-    inner = np.all((voxel > 0) & (voxel < count - 1), axis=1)
-    centre = low + (voxel + 0.5) * cell
-    corner = corner - centre[:, None]
-    edge = np.roll(corner, -1, axis=1) - corner
-    apart = np.zeros(len(corner), bool)
-    normal = np.cross(edge[:, 0], edge[:, 1])
-    for axis in [normal, *(np.cross(edge[:, k], np.eye(3)[i]) for k in range(3) for i in range(3))]:
-        along = np.einsum("pki,pi->pk", corner, axis)
-        radius = np.abs(axis) @ half
-        apart |= (along.min(axis=1) > radius) | (along.max(axis=1) < -radius)
-    return ~(apart & inner)
+# Numbers of a block: origin (3, m), axes as rows (9), planes of its two ends as normal and offset in that frame (4 and
+# 4, m), least place along the axis (m), cells a metre, units of a vertex along and across the axis (1/m), upper end
+# of its boxes (m), prism.
+N_FRAME = 25 + N_FACES
+# Whole numbers of a block: the blocks behind and ahead, -1 at a mouth; first vertex, first cell, first box, boxes.
+N_LINK = 6
+ARRAYS = ("frame", "link", "cell", "entry", "vertex", "box")
 
 
 @struct.dataclass
 class Relief:
-    """Every triangle of a bore's surface, in voxels that follow its axis.
+    """Every triangle of a bore's surface, in cells around its axis; or of several bores.
 
     Two reliefs whose arrays have the same shapes share one compiled program; see `Relief.pad_to`.
 
     Attributes:
-        length: Length of the axis, m.
-        n_blocks: Blocks of the axis; further rows are padding.
-        frame: Frame of each block: origin (3, m), axes as rows (9), planes of its two ends as normal and offset in that
-            frame (4 and 4, m).
-        low: Lower corner of the voxels in a block's frame, m.
-        cell: Sizes of a voxel, m.
-        code: As in `Voxels`.
-        first: Start of each list in `member`.
-        member: Rows of `triangle`, list after list.
-        triangle: As in `Voxels`, m.
+        length: Length of the axis, m; `()`, or `(k,)` in a stack of k, as the next two.
+        first_block: First block of the axis.
+        n_blocks: Blocks of the axis.
+        frame: Numbers of each block, see `N_FRAME`.
+        link: Whole numbers of each block, see `N_LINK`.
+        cell: As in `Cells`.
+        entry: As in `Cells`.
+        vertex: As in `Cells`.
+        box: As in `Cells`.
+        n_x: Cells of a block along the axis.
     """
 
-    length: Float[Array, ""]
-    n_blocks: Int[Array, ""]
-    frame: Float[Array, "n_frames 20"]
-    low: Float[Array, "3"]
-    cell: Float[Array, "3"]
-    code: Int[Array, "n_frames nx ny nz"]
-    first: Int[Array, "n_lists"]
-    member: Int[Array, "n_members"]
-    triangle: Float[Array, "n_triangles 9"]
+    length: Float[Array, "*k"]
+    first_block: Int[Array, "*k"]
+    n_blocks: Int[Array, "*k"]
+    frame: Float[Array, "all_blocks n_frame"]
+    link: Int[Array, "all_blocks n_link"]
+    cell: Int[Array, "n_cells 2"]
+    entry: Int[Array, "n_entries"]
+    vertex: Int[Array, "n_vertices 2"]
+    box: Float[Array, "n_boxes 12"]
+    n_x: int = struct.field(pytree_node=False)
 
     @classmethod
     def from_scene(cls, folder: str | Path, lining: str = "pockets", *, leave_out: tuple[str, ...] = SMALL) -> "Relief":
@@ -261,59 +71,145 @@ class Relief:
         return cls.from_triangles(axis, read_scene(folder, lining, leave_out))
 
     @classmethod
-    def from_triangles(
-        cls,
-        axis: Axis,
-        surface: Triangles,
-        *,
-        block_length: float = 8.0,
-        cell: tuple[float, float, float] = (0.4, 0.15, 0.15),
-    ) -> "Relief":
+    def from_plan(cls, plan: TunnelPlan, lining: str | None = None, *, crown: float = CROWN) -> "Relief":
+        """Put a planar tunnel on the device, its walls upright between floor and crown; needs no scene folder.
+
+        A plan, from a `tunnel.npz` or generated, knows its walls at the LiDAR's height alone: this is no bore as
+        surveyed, but one in which level beams meet what the planar LiDAR meets.
+
+        Args:
+            plan: The tunnel.
+            lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
+            crown: Height of the crown above the ground, m.
+
+        Raises:
+            TunnelError: The plan does not have the lining, or the crown is not above its LiDAR.
+        """
+        return cls.from_triangles(*raise_walls(plan, lining, crown))
+
+    @classmethod
+    def from_triangles(cls, axis: Axis, surface: Triangles, *, block_length: float = 4.0, n_x: int = 12) -> "Relief":
         """Put a surface around an axis on the device.
 
         Args:
             axis: The axis; beyond its ends, the mouths, a ray hits nothing.
             surface: The triangles.
-            block_length: Target length of a block, m; affects speed alone.
-            cell: Target size of a voxel along, across and upwards, m; affects speed alone.
+            block_length: Target length of a block, m; affects speed and memory alone.
+            n_x: Cells of a block along the axis; affects speed and memory alone.
 
         Raises:
             ValueError: No triangle lies along the axis.
+            TunnelError: A quarter of a metre of the bore has too many triangles.
         """
-        blocks = cut_blocks(axis.station, axis.position, axis.tangent, block_length)
-        voxels = fill_voxels(blocks, axis.station, axis.position, surface.vertices, surface.faces, cell)
+        cells = sort_triangles(axis, surface, block_length, n_x)
+        n_blocks = len(cells.low)
         return cls(
-            length=jnp.float32(axis.station[-1]),
-            n_blocks=jnp.int32(len(blocks.centre)),
-            frame=jnp.asarray(_frames(blocks), jnp.float32),
-            **_arrays(voxels),
+            length=_put(axis.station[-1], np.float32),
+            first_block=_put(0, np.int32),
+            n_blocks=_put(n_blocks, np.int32),
+            frame=_put(_frames(cells), np.float32),
+            link=_put(_links(cells), np.int32),
+            cell=_put(cells.cell, np.int32),
+            entry=_put(cells.entry, np.int32),
+            vertex=_put(cells.vertex, np.int32),
+            box=_put(cells.box if len(cells.box) else np.zeros((1, 12)), np.float32),
+            n_x=n_x,
         )
+
+    @property
+    def count(self) -> int:
+        """Number of bores: 1, or k for a stack."""
+        return 1 if np.ndim(self.length) == 0 else self.length.shape[0]
+
+    def pick(self, index: Int[Array, ""] | int) -> "Relief":
+        """Return one bore of a stack, its large arrays shared; itself if there is only one.
+
+        Args:
+            index: Number of the bore, from 0 to `count - 1`; not checked.
+        """
+        if self.count == 1:
+            return self
+        return self._with_numbers(self.length[index], self.first_block[index], self.n_blocks[index])
+
+    @property
+    def shared(self) -> "Relief":
+        """The large arrays alone: in a batch that picks different bores of a stack they are one for all."""
+        return self._with_numbers(np.float32(0.0), np.int32(0), np.int32(0))
+
+    def _with_numbers(self, length: Any, first_block: Any, n_blocks: Any) -> "Relief":
+        return dataclasses.replace(self, length=length, first_block=first_block, n_blocks=n_blocks)
 
     def pad_to(self, other: "Relief") -> "Relief":
         """Pad the arrays to at least another relief's sizes; two reliefs padded by each other agree in shape."""
 
-        def grown(mine: Array, theirs: Array, fill: int | None) -> Array:
+        def grown(mine: Array, theirs: Array) -> Array:
             room = [(0, max(0, b - a)) for a, b in zip(mine.shape, theirs.shape, strict=True)]
-            return jnp.pad(mine, room, mode="edge") if fill is None else jnp.pad(mine, room, constant_values=fill)
+            return _put(np.pad(np.asarray(mine), room), mine.dtype)
 
-        return self.replace(  # type: ignore[attr-defined]
-            frame=grown(self.frame, other.frame, None),
-            code=grown(self.code, other.code, -1),
-            first=grown(self.first, other.first, None),
-            member=grown(self.member, other.member, None),
-            triangle=grown(self.triangle, other.triangle, None),
-        )
+        sizes: dict[str, Any] = {name: grown(getattr(self, name), getattr(other, name)) for name in ARRAYS}
+        return dataclasses.replace(self, **sizes)
 
     @property
     def n_bytes(self) -> int:
         """Memory on the device, bytes."""
-        return sum(leaf.nbytes for leaf in jax.tree.leaves(self))
+        return sum(np.asarray(leaf).nbytes if np.isscalar(leaf) else leaf.nbytes for leaf in jax.tree.leaves(self))
 
 
-def _frames(blocks: Blocks) -> np.ndarray:
-    return np.concatenate([blocks.centre, blocks.turn.reshape(-1, 9), blocks.back, blocks.front], axis=1)
+def stack_reliefs(reliefs: Sequence[Relief]) -> Relief:
+    """Join several bores into one `Relief`, whose `pick(i)` gives the i-th.
+
+    Args:
+        reliefs: One or more single bores, made with one `n_x`.
+
+    Returns:
+        The stack; a single bore is returned unchanged.
+
+    Raises:
+        ValueError: The list is empty, one of them is a stack itself, or their blocks have different numbers of cells.
+    """
+    if not reliefs:
+        raise ValueError("a stack needs at least one relief, got none")
+    for i, relief in enumerate(reliefs):
+        if relief.count > 1:
+            raise ValueError(f"relief {i} is a stack of {relief.count} reliefs itself")
+        if relief.n_x != reliefs[0].n_x:
+            raise ValueError(
+                f"relief {i} has {relief.n_x} cells along a block, the first {reliefs[0].n_x}: make both with one n_x"
+            )
+    if len(reliefs) == 1:
+        return reliefs[0]
+    parts = {name: [np.asarray(getattr(r, name)) for r in reliefs] for name in ARRAYS}
+    first = {name: np.cumsum([0, *(len(a) for a in arrays[:-1])]) for name, arrays in parts.items()}
+    if max(first[name][-1] + len(parts[name][-1]) for name in parts) >= 1 << 31:
+        raise ValueError(f"{len(reliefs)} reliefs have more than 2^31 entries together: stack fewer")
+    for i, link in enumerate(parts["link"]):
+        shift = np.array([first["frame"][i]] * 2 + [first["vertex"][i], first["cell"][i], first["box"][i], 0])
+        parts["link"][i] = np.where(link < 0, -1, link + shift)
+        parts["cell"][i] = parts["cell"][i] + np.array([first["entry"][i], 0])
+    return Relief(
+        length=_put(np.stack([np.asarray(r.length) for r in reliefs]), np.float32),
+        first_block=_put(first["frame"], np.int32),
+        n_blocks=_put(np.stack([np.asarray(r.n_blocks) for r in reliefs]), np.int32),
+        n_x=reliefs[0].n_x,
+        **{name: _put(np.concatenate(arrays), arrays[0].dtype) for name, arrays in parts.items()},
+    )
 
 
-def _arrays(voxels: Voxels) -> dict[str, Array]:
-    floats = {name: jnp.asarray(getattr(voxels, name), jnp.float32) for name in ("low", "cell", "triangle")}
-    return floats | {name: jnp.asarray(getattr(voxels, name), jnp.int32) for name in ("code", "first", "member")}
+def _put(values: Any, dtype: Any) -> Array:
+    """Put an array on the device; `jnp.asarray` would compile a program for each new shape."""
+    return jax.device_put(np.ascontiguousarray(values, dtype).reshape(np.shape(values)))
+
+
+def _frames(cells: Cells) -> Float[np.ndarray, "b n_frame"]:
+    blocks, n = cells.blocks, len(cells.low)
+    numbers = np.broadcast_to([1.0 / cells.pitch, *(1.0 / cells.unit)], (n, 3))
+    parts = [blocks.centre, blocks.turn.reshape(-1, 9), blocks.back, blocks.front, cells.low[:, None], numbers]
+    return np.concatenate([*parts, cells.box_top[:, None], cells.prism], axis=1)
+
+
+def _links(cells: Cells) -> Int[np.ndarray, "b n_link"]:
+    n = len(cells.low)
+    behind, ahead = np.arange(n) - 1, np.arange(n) + 1
+    ahead[-1] = -1
+    boxes = cells.first_box[:-1], np.diff(cells.first_box)
+    return np.stack([behind, ahead, cells.first_vertex, np.arange(n) * (len(cells.cell) // n), *boxes], axis=-1)

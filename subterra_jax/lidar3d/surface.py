@@ -21,9 +21,9 @@ LINING_KINDS = ("lining", "recess", "floor")  # first parts of the geoms' names
 # Bolts and clips of a few centimetres make up half of all triangles.
 SMALL = ("fastening", "nails")
 _LARGEST_SEEN_GROUP = 1
-_BOX_FACES = np.array([(0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5), (2, 3, 7), (2, 7, 6),
+BOX_FACES = np.array([(0, 1, 3), (0, 3, 2), (4, 7, 5), (4, 6, 7), (0, 5, 1), (0, 4, 5), (2, 3, 7), (2, 7, 6),
                        (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])  # fmt: skip
-_BOX_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+BOX_CORNERS = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _geom_triangles(model: "mujoco.MjModel", data: "mujoco.MjData", geom: int) -
         first, count = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
         faces = model.mesh_face[first : first + count].astype(np.int64)
     elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX:
-        vertices, faces = _BOX_CORNERS * model.geom_size[geom], _BOX_FACES
+        vertices, faces = BOX_CORNERS * model.geom_size[geom], BOX_FACES
     else:
         vertices, faces = np.empty((0, 3)), np.empty((0, 3), np.int64)
     return Triangles(vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom], faces)

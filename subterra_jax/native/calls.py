@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, no_type_check
 
@@ -52,15 +52,26 @@ def code_cache() -> Iterator[bool]:
 
 def _version() -> str:
     """Return a digest of all that the machine code depends on."""
-    sources = [file.read_bytes() for file in sorted(Path(__file__).parent.glob("*.py"))]
+    here = Path(__file__).parent  # the march takes constants from `lidar3d` into its code
+    files = [*sorted(here.glob("*.py")), *sorted((here.parent / "lidar3d").glob("*.py"))]
+    sources = [file.read_bytes() for file in files]
     features = llvmlite.binding.get_host_cpu_features().flatten()
     machine = f"{numba.__version__} {jaxlib.__version__} {llvmlite.binding.get_host_cpu_name()} {features}"
     return hashlib.sha256(b"".join([*sources, machine.encode()])).hexdigest()[:32]
 
 
-SCAN, CLEARANCE = "subterra_scan", "subterra_clearance"
 # Machine code lives as long as the object that made it.
 _alive: list[Any] = []
+
+
+def register(name: str, handler: Callable[..., int]) -> None:
+    """Compile the answer to a custom call, keep it on disk, and tell XLA its name."""
+    with code_cache() as writable:
+        _alive.append(cfunc(types.intp(types.intp), cache=writable)(handler))
+    jax.ffi.register_ffi_target(name, capsule(_alive[-1].address), platform="cpu")
+
+
+SCAN, CLEARANCE = "subterra_scan", "subterra_clearance"
 
 
 @njit
@@ -125,10 +136,8 @@ def _clearance_handler(frame):
     return 0
 
 
-with code_cache() as writable:
-    for _name, _handler in ((SCAN, _scan_handler), (CLEARANCE, _clearance_handler)):
-        _alive.append(cfunc(types.intp(types.intp), cache=writable)(_handler))
-        jax.ffi.register_ffi_target(_name, capsule(_alive[-1].address), platform="cpu")
+register(SCAN, _scan_handler)
+register(CLEARANCE, _clearance_handler)
 
 
 def scan(

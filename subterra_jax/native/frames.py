@@ -180,11 +180,28 @@ def _call_at(typing: Any, address: Any, argument: Any) -> Any:
     return signature(types.intp, types.intp, types.intp), emit
 
 
+def _named(name: str) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a function under a name of its own.
+
+    Numba numbers the functions of one name anew in every process. Code that two processes have put on disk is linked
+    by these names, so that a third process would take one function for another of the same name and number.
+    """
+
+    def compile_named(function: Callable[..., Any]) -> Any:
+        function.__name__ = f"{name}_{function.__name__}"
+        function.__qualname__ = f"{function.__qualname__}.{name}"
+        return njit(function)
+
+    return compile_named
+
+
 def _as_c_function(function: Callable[..., Any], name: str) -> Any:
     """Make a compiled function of one integer a C function of one pointer; return a function that gives its address."""
 
     def forward(job: Any) -> None:
         function(job)
+
+    forward.__qualname__ = f"{forward.__qualname__}.{name}"
 
     @intrinsic
     def address(typing: Any) -> Any:
@@ -225,7 +242,7 @@ def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
         name: Name of the helpers' code; must be unique.
     """
 
-    @njit
+    @_named(name)
     @no_type_check
     def take_chunks(job):
         frame, rows = read64(job + _FRAME), read64(job + _ROWS)
@@ -237,13 +254,13 @@ def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
             work(frame, begin, end)
             _fetch_add(job + _DONE, end - begin)
 
-    @njit
+    @_named(name)
     @no_type_check
     def leave(job):
         if _fetch_add(job + _HOLDERS, -1) == 1:
             _release(job)
 
-    @njit
+    @_named(name)
     @no_type_check
     def help_once(job):
         take_chunks(job)
@@ -251,7 +268,7 @@ def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
 
     helper = _as_c_function(help_once, name)
 
-    @njit
+    @_named(name)
     @no_type_check
     def run(frame, rows):
         api = read64(frame + _API)

@@ -1,6 +1,7 @@
 """Rays of both LiDARs against embree in a small built scene, and in a spoiled one."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.rays import speed
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
 from benchmarks.rays.casting import Agreement
 from scene.output import write_geometry
@@ -86,7 +88,7 @@ def test_what_a_scene_draws_holds_lining_and_track(scene: Path) -> None:
     assert len(drawn.faces) == len(lining.faces) + len(track.faces)
     # 41 sleepers of 12 triangles, and rails of six boxes for every 3 m.
     assert len(track.faces) == 12 * 41 + 12 * 6 * 9
-    assert Relief.from_scene(scene, "smooth").triangle.shape[1] == 9
+    assert Relief.from_scene(scene, "smooth").vertex.shape[1] == 2
 
 
 @pytest.mark.parametrize(
@@ -109,3 +111,12 @@ def test_a_users_mistake_is_one_sentence_and_status_2(
     assert len(said) == 1
     assert said[0].startswith("error: ")
     assert complaint in said[0]
+
+
+def test_the_speed_of_a_batch_is_printed_and_a_folder_that_is_no_scene_refused(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert speed.command(["--scene", str(scene), "--robots", "4", "--columns", "4", "--repeats", "1"]) == 0
+    assert re.search(r"4 robots x 64 beams: \S+ M rays/s .*surface \S+ MB", capsys.readouterr().out)
+    assert speed.command(["--scene", str(tmp_path)]) == 2
+    assert "is no built scene" in capsys.readouterr().err

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax import lidar, lidar3d
-from subterra_jax.lidar3d import beams, casting
-from subterra_jax.lidar3d.relief import Relief
+import subterra_jax as st
+from subterra_jax import lidar, lidar3d, native
+from subterra_jax.lidar3d import beams, casting, fused
+from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import Axis, Triangles
 from tests.subterra_jax import surfaces
 
@@ -158,12 +159,133 @@ def test_the_planar_lidars_noise_leaves_a_beam_without_echo_alone(reliefs):
     np.testing.assert_allclose(noisy[4], ranges[4] + 0.1, atol=1e-6)
 
 
-def test_a_batch_cast_in_chunks_gives_what_it_gives_in_one(reliefs, monkeypatch):
-    rng = np.random.default_rng(1)
-    origin = np.column_stack([rng.uniform(5.0, 40.0, 8), rng.uniform(-1.0, 1.0, (8, 2))]).astype(np.float32)
-    station = jnp.asarray(origin[:, 0])
-    beam = jnp.asarray(beams.planar(7), jnp.float32)
-    whole = jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["bend"], origin, beam, station, 30.0)
-    monkeypatch.setattr(casting, "CHUNK", 25)
-    parts = jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["bend"], origin, beam, station, 30.0)
-    np.testing.assert_array_equal(whole, parts)
+def bend_rays(axis, n: int, seed: int):
+    """Origins, directions and stations of rays in the bend, half of them nearly level."""
+    rng = np.random.default_rng(seed)
+    pick = rng.integers(2, len(axis["station"]) - 2, n)
+    origin = (axis["position"][pick] + rng.uniform(-0.8, 0.8, (n, 3))).astype(np.float32)
+    way = rng.normal(size=(n, 3)) * np.where(np.arange(n)[:, None] % 2, [1.0, 1.0, 1.0], [1.0, 1.0, 0.1])
+    way = (way / np.linalg.norm(way, axis=-1, keepdims=True)).astype(np.float32)
+    return origin, way, axis["station"][pick].astype(np.float32)
+
+
+def found_by(find, relief, origin, way, station):
+    """Hits of rays by one of the ways to march them."""
+    block = jax.vmap(casting.block_at, (None, 0, 0))(relief, origin, station)
+    return find(relief, jnp.asarray(origin), jnp.asarray(way), block, jnp.full(len(origin), 30.0))
+
+
+@pytest.mark.parametrize("name", ["bend", "things"])
+def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
+    rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 72, 4)
+    xla, kernel = (found_by(find, reliefs[name], *rays) for find in (casting._find_in_step, fused.find))
+    np.testing.assert_array_equal(xla.entry, kernel.entry)
+    np.testing.assert_allclose(xla.distance, kernel.distance, rtol=1e-6)
+
+
+@pytest.mark.skipif(not native.supported(), reason="needs numba")
+@pytest.mark.parametrize("name", ["bend", "things"])
+def test_machine_code_and_xla_give_the_same_ranges(bend, reliefs, name):
+    from subterra_jax.native import marchcall
+
+    rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 600, 5)
+    xla, code = (found_by(find, reliefs[name], *rays) for find in (casting._find_in_step, marchcall.find))
+    np.testing.assert_allclose(np.minimum(xla.distance, 30.0), np.minimum(code.distance, 30.0), atol=2e-5)
+    triangle = np.asarray(reliefs[name].entry)
+    # A ray may meet one triangle in the list of either of two cells.
+    assert (triangle[np.asarray(xla.entry)] == triangle[np.asarray(code.entry)]).mean() > 0.98
+
+
+def test_a_batch_marched_in_parts_gives_what_it_gives_in_one(bend, reliefs, monkeypatch):
+    rays = bend_rays(bend[0], 56, 6)
+    whole = found_by(casting._find_in_step, reliefs["bend"], *rays)
+    monkeypatch.setattr(casting, "_IN_STEP", 25)
+    np.testing.assert_array_equal(whole.distance, found_by(casting._find_in_step, reliefs["bend"], *rays).distance)
+
+
+def test_bores_picked_from_a_stack_give_what_each_gives_alone(bend, reliefs):
+    alone = [relief_of(*bend), reliefs["things"], reliefs["tube"]]
+    joined = stack_reliefs(alone)
+    assert joined.count == 3
+    origin, way, station = bend_rays(surfaces.axis_of(44.0), 48, 7)
+    which = np.arange(48) % 3
+
+    def one(i, o, d, s):
+        return lidar3d.cast(joined.pick(i), o, d[None], s, 30.0)[0]
+
+    ranges = np.asarray(jax.jit(jax.vmap(one))(which, origin, way, station))
+    for k, relief in enumerate(alone):
+        rows = which == k
+        expected = jax.vmap(lidar3d.cast, (None, 0, 0, 0, None))(
+            relief, origin[rows], way[rows][:, None], station[rows], 30.0
+        )
+        np.testing.assert_array_equal(ranges[rows], expected[:, 0])
+
+
+@pytest.mark.parametrize("name", ["bend", "things"])
+def test_derivatives_are_those_of_finite_differences_off_the_edges(bend, reliefs, name):
+    origin, way, station = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 5000, 8)
+
+    def reach(o, d, s):
+        return lidar3d.cast(reliefs[name], o, d[None], s, 30.0)[0]
+
+    reaches = jax.jit(jax.vmap(reach))
+    value = np.asarray(reaches(origin, way, station))
+    slopes = [np.asarray(leaf) for leaf in jax.jit(jax.vmap(jax.grad(reach, (0, 1))))(origin, way, station)]
+    for which, slope in enumerate(slopes):
+        for i in range(3):
+            step = 2e-3 * np.eye(3, dtype=np.float32)[i]
+            moved = [np.asarray(reaches(origin + e * (1 - which), way + e * which, station)) for e in (step, -step)]
+            # Off the edges: the ray stays on one triangle, the range all but linear; float32 leaves some 1e-5 m.
+            smooth = (value < 29.0) & (np.abs(moved[0] - 2.0 * value + moved[1]) < 1e-4 * value)
+            difference = (moved[0] - moved[1])[smooth] / 4e-3
+            error = np.abs(slope[smooth, i] - difference) / (1.0 + np.abs(difference))
+            assert smooth.mean() > 0.5
+            assert np.median(error) < 2e-3
+            assert np.percentile(error, 97.0) < 0.03
+    assert not any(slope[value == 30.0].any() for slope in slopes)
+
+
+def test_a_pose_is_found_by_descending_on_one_scan(reliefs):
+    beam = jnp.asarray(beams.spinning(np.deg2rad([-20.0, 0.0, 20.0]), 16))
+    turn = jnp.array([1.0, 0.0, 0.0, 0.0])
+    place = jnp.array([30.0, 0.4, -0.3])
+    scan = lidar3d.scan(reliefs["tube"], place, turn, place[0], beam, 30.0)
+
+    def misfit(p):
+        ranges = lidar3d.scan(reliefs["tube"], p, turn, p[0], beam, 30.0)
+        return jnp.sum(jnp.where((scan < 10.0) & (ranges < 10.0), ranges - scan, 0.0) ** 2)
+
+    guess, slope = jnp.array([30.0, 0.1, 0.1]), jax.jit(jax.grad(misfit))
+    for _ in range(60):
+        guess = guess - 0.005 * slope(guess)
+    np.testing.assert_allclose(guess[1:], place[1:], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "sentence"),
+    [
+        (np.zeros((0, 3), np.float32), "needs one or more beams"),
+        (np.float32([[1, 0, 0], [np.nan, 0, 0]]), "beam 1 of the pattern is no number"),
+        (np.float32([[1, 0, 0], [0, 2, 0]]), "beam 1 of the pattern is no unit vector"),
+    ],
+)
+def test_a_pattern_that_is_none_is_refused(reliefs, pattern, sentence):
+    place = jnp.array([30.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match=sentence):
+        lidar3d.scan(reliefs["tube"], place, jnp.array([1.0, 0.0, 0.0, 0.0]), place[0], pattern, 30.0)
+
+
+def test_a_sensor_in_the_wall_is_refused(reliefs):
+    lidar3d.require_free(reliefs["things"], [30.0, 0.5, 0.5], 30.0)
+    for inside in ([30.0, 2.2, 0.0], [20.0, 0.5, -1.0]):
+        with pytest.raises(st.SubterraError, match=r"the sensor at .* is inside the wall, or in a thing"):
+            lidar3d.require_free(reliefs["things"], inside, inside[0])
+
+
+def test_a_batch_that_cannot_fit_is_refused_with_what_would(reliefs, monkeypatch):
+    monkeypatch.setattr(casting, "device_memory", lambda: 1_000_000)
+    place = jnp.zeros((100, 3)).at[:, 0].set(30.0)
+    beam = beams.planar(512)
+    with pytest.raises(st.SubterraError, match=r"51,200 rays .* at most [0-9,]+ at once"):
+        jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["tube"], place, beam, place[:, 0], 30.0)

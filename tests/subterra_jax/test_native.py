@@ -189,3 +189,40 @@ def test_code_kept_by_one_process_serves_another_and_no_other_version(tmp_path):
     versions = list((tmp_path / "subterra" / "native").iterdir())
     assert len(versions) == 1
     assert list(versions[0].rglob("*.nbc"))
+
+
+def test_code_that_shares_rows_has_a_name_of_its_own():
+    # Numba links code from disk by name; numbers that tell equal names apart begin anew in every process.
+    from subterra_jax.native.frames import run_on_all_threads
+
+    first, second = (run_on_all_threads(lambda frame, begin, end: None, 1, name) for name in ("one", "other"))
+    assert first.py_func.__qualname__ != second.py_func.__qualname__
+    inner = [cell.cell_contents for cell in first.py_func.__closure__ or ()]
+    names = [code.py_func.__qualname__ for code in inner if hasattr(code, "py_func")]
+    assert names
+    assert all(name.endswith(".one") for name in names)
+
+
+@pytest.mark.slow
+def test_kernels_that_two_processes_compiled_run_in_a_third(tmp_path):
+    scan = """
+import jax
+import subterra_jax as st
+env, params = st.make("Subterra/TraverseShort-v0")
+print(float(st.AutoReset(env).reset(jax.random.key(0), params, 512)[0].sum()))
+"""
+    march = """
+import jax.numpy as jnp
+from subterra_jax import lidar3d, procedural
+plan = procedural.plan(4).slice(20.0, 60.0)
+relief = lidar3d.Relief.from_plan(plan)
+at = jnp.append(jnp.asarray(plan.centre[40]), plan.elevation[40] + 0.7)
+beams = jnp.tile(jnp.array([0.0, 1.0, 0.0]), (4096, 1))
+print(float(lidar3d.cast(relief, at, beams, plan.station[40], 30.0).sum()))
+"""
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}
+    for code in (scan, march, scan + march, scan + march):
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=280
+        )
+        assert done.returncode == 0, done.stderr[-2000:]

@@ -1,10 +1,10 @@
-"""Voxels list every triangle that comes near them, and files that are missing or spoiled are named."""
+"""Cells list every triangle that comes near them, and files that are missing or spoiled are named."""
 
 import numpy as np
 import pytest
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.lidar3d import relief, surface
+from subterra_jax.lidar3d import cells, relief, surface
 from subterra_jax.lidar3d.relief import Relief
 from tests.subterra_jax import surfaces
 
@@ -13,43 +13,89 @@ from tests.subterra_jax import surfaces
 def sorted_bend():
     axis = surfaces.axis_of(30.0, 1 / 60.0)
     vertices, faces = surfaces.tube(axis, 2.0, 24, 31)
-    blocks = relief.cut_blocks(axis["station"], axis["position"], axis["tangent"], 8.0)
-    filled = relief.fill_voxels(blocks, axis["station"], axis["position"], vertices, faces, (0.4, 0.3, 0.3))
-    return blocks, filled, vertices[faces]
+    return cells.sort_triangles(surface.Axis(**axis), surface.Triangles(vertices, faces), 8.0, 10), vertices[faces]
 
 
-def test_every_point_of_every_triangle_lies_in_a_voxel_that_lists_a_triangle_through_it(sorted_bend):
-    blocks, filled, corner = sorted_bend
+def listed_corners(found: cells.Cells, block: int, cell: int) -> np.ndarray:
+    """Corners of a cell's triangles in the block's frame, m."""
+    word = found.cell.astype(np.int64) & 0xFFFFFFFF
+    code = found.entry[word[cell, 0] : word[cell, 0] + (word[cell, 1] >> 16)].astype(np.int64) & 0xFFFFFFFF
+    first = found.first_vertex[block] + (code >> 20)
+    point = found.vertex[np.stack([first, first + ((code >> 10) & 1023), first + (code & 1023)], axis=-1)]
+    x = ((point[..., 0] & 1023) << 10 | (point[..., 1] & 1023)) - (1 << 19)
+    return np.concatenate([x[..., None] * found.unit[0], (point >> 10) * found.unit[1]], axis=-1)
+
+
+def test_every_point_of_every_triangle_lies_in_a_cell_that_lists_a_triangle_through_it(sorted_bend):
+    found, corner = sorted_bend
     share = np.random.default_rng(0).dirichlet(np.ones(3), len(corner))
     points = np.einsum("tk,tki->ti", share, corner)
-    found = np.zeros(len(points), bool)
+    seen, blocks = np.zeros(len(points), bool), found.blocks
+    n_x = len(found.cell) // (len(found.low) * cells.N_WEDGES)
     for k, (centre, turn) in enumerate(zip(blocks.centre, blocks.turn, strict=True)):
         local = (points - centre) @ turn.T
         inside = (local @ blocks.front[k, :3] <= blocks.front[k, 3]) & (local @ blocks.back[k, :3] >= blocks.back[k, 3])
-        shape = np.array(filled.code.shape[1:])
+        x = np.clip((local[:, 0] - found.low[k]) / found.pitch, 0, n_x - 1).astype(int)
+        wedge = cells.wedge_place(local[:, 1:]).astype(int)
         for p in np.flatnonzero(inside):
-            place = np.clip(np.floor((local[p] - filled.low) / filled.cell), 0, shape - 1).astype(int)
-            code = filled.code[(k, *place)]
-            assert code >= 0
-            rows = filled.triangle[filled.member[filled.first[code] : filled.first[code + 1]]]
-            normal = np.cross(rows[:, 3:6], rows[:, 6:9])
-            gap = np.einsum("ij,ij->i", local[p] - rows[:, :3], normal) / np.linalg.norm(normal, axis=1)
-            assert np.abs(gap).min() < 1e-9
-            found[p] = True
-    assert found.all()
+            cell = (k * n_x + x[p]) * cells.N_WEDGES + wedge[p]
+            rows = listed_corners(found, k, cell)
+            normal = np.cross(rows[:, 1] - rows[:, 0], rows[:, 2] - rows[:, 0])
+            gap = np.einsum("ij,ij->i", local[p] - rows[:, 0], normal) / np.linalg.norm(normal, axis=1)
+            assert np.abs(gap).min() < 2e-5
+            edges = cells.wedge_edge(np.array([wedge[p]])) + cells.wedge_edge(np.array([wedge[p] + 1]))
+            assert local[p, 1:] @ edges[0] >= (found.cell[cell, 1] & 0xFFFF) * cells.NEAR_UNIT
+            seen[p] = True
+    assert seen.all()
 
 
-def test_an_empty_voxel_knows_how_far_the_nearest_list_is(sorted_bend):
-    code = sorted_bend[1].code
-    rng = np.random.default_rng(1)
-    for k, *at in rng.integers(0, code.shape, (300, 4)):
-        if code[(k, *at)] < 0:
-            away = np.max(np.abs(np.argwhere(code[k] >= 0) - at), axis=1).min()
-            assert -code[(k, *at)] == away
+def test_no_triangle_reaches_into_the_empty_prism_and_it_is_nearly_as_wide_as_the_bore(sorted_bend):
+    found, corner = sorted_bend
+    for k, (centre, turn) in enumerate(zip(found.blocks.centre, found.blocks.turn, strict=True)):
+        local = (corner - centre) @ turn.T
+        near = np.abs(local[..., 0]).max(axis=1) < 4.0
+        out = np.einsum("tki,fi->tkf", local[near][..., 1:], cells.FACES).min(axis=1) > found.prism[k]
+        assert out.any(axis=1).all()
+    assert found.prism.min() > 1.75
+
+
+def test_boxes_are_told_from_other_triangles():
+    box = surface.Triangles(surface.BOX_CORNERS * [0.2, 0.3, 0.4] + [1.0, 2.0, 3.0], surface.BOX_FACES)
+    leaning = surface.Triangles(box.vertices + 0.5 * box.vertices[:, [1, 2, 0]], surface.BOX_FACES)
+    tube = surface.Triangles(*surfaces.tube(surfaces.axis_of(10.0), 2.0, 8, 5))
+    rest, boxes = cells.split_boxes(surface.join_surfaces([tube, box, leaning, box, tube]))
+    assert len(rest.faces) == 2 * len(tube.faces) + 12
+    np.testing.assert_allclose(boxes.centre, [[1.0, 2.0, 3.0]] * 2)
+    np.testing.assert_allclose(np.sort(np.abs(boxes.half).max(axis=1), axis=1), [[0.2, 0.3, 0.4]] * 2)
+
+
+def test_a_surface_too_fine_for_the_integers_gets_shorter_blocks_or_is_refused(monkeypatch):
+    axis = surface.Axis(**surfaces.axis_of(16.0))
+    tube = surface.Triangles(*surfaces.tube(surfaces.axis_of(16.0), 2.0, 64, 65))
+    monkeypatch.setattr(cells, "MOST_VERTICES", 600)
+    assert len(cells.sort_triangles(axis, tube, 4.0, 4).low) > 4
+    monkeypatch.setattr(cells, "MOST_VERTICES", 60)
+    with pytest.raises(TunnelError, match="too fine for the LiDAR: 8192 triangles over 16 m"):
+        cells.sort_triangles(axis, tube, 4.0, 4)
+
+
+def test_what_cannot_be_stacked_is_refused():
+    axis, tube = (
+        surface.Axis(**surfaces.axis_of(8.0)),
+        surface.Triangles(*surfaces.tube(surfaces.axis_of(8.0), 2.0, 8, 9)),
+    )
+    one, other = (Relief.from_triangles(axis, tube, n_x=n) for n in (4, 5))
+    with pytest.raises(ValueError, match="at least one relief"):
+        relief.stack_reliefs([])
+    with pytest.raises(ValueError, match="relief 1 has 5 cells along a block, the first 4"):
+        relief.stack_reliefs([one, other])
+    with pytest.raises(ValueError, match="relief 0 is a stack of 2"):
+        relief.stack_reliefs([relief.stack_reliefs([one, one])])
+    assert relief.stack_reliefs([one]) is one
 
 
 def test_planes_of_neighbouring_blocks_are_the_same(sorted_bend):
-    blocks = sorted_bend[0]
+    blocks = sorted_bend[0].blocks
     for k in range(len(blocks.centre) - 1):
         normal = blocks.turn[k].T @ blocks.front[k, :3]
         np.testing.assert_allclose(blocks.turn[k + 1].T @ blocks.back[k + 1, :3], normal, atol=1e-6)

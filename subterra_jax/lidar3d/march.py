@@ -1,0 +1,314 @@
+"""Marches a ray through a relief: from block to block, from cell to cell, until it meets a triangle.
+
+Written once, for many rays at a time, over the few operations that differ: XLA marches some thousand rays in step, a
+fused kernel as many as a warp has lanes. `native.marching` does the same for one ray after another on a CPU.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from subterra_jax.lidar3d.cells import FACES, MARGIN, N_WEDGES, NEAR_UNIT, STEP_BITS, X_BITS, YZ_BITS
+from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
+
+# Rays between two triangles must meet one of them although their edges are rounded apart; a share of a triangle's size.
+SEAM = 5e-5
+# A ray may have stepped past a triangle by so much, m.
+PAST = 2e-4
+# A vertex's coordinates across the axis are read with the bits below them: so much of their unit.
+FINE = 1 << (32 - YZ_BITS)
+_TINY = 1e-12
+
+Point = tuple[Array, Array, Array]
+
+
+class Tools(NamedTuple):
+    """Operations that a kernel does in its own way.
+
+    Attributes:
+        load: Reads elements of `frame`, `link`, `entry` or `box` of a relief, each flat, or pairs of `cell` or
+            `vertex`, by name and index; zeros where a mask is given and false.
+        fma: a · b + c.
+        reciprocal: 1 / a, to within the last bit.
+    """
+
+    load: Callable[..., Any]
+    fma: Callable[[Array, Any, Any], Array]
+    reciprocal: Callable[[Array], Array]
+
+    def dot(self, a: Any, b: Any) -> Array:
+        """Return the scalar product of two vectors of two or three components."""
+        total = a[-1] * b[-1]
+        for left, right in zip(a[-2::-1], b[-2::-1], strict=True):
+            total = self.fma(left, right, total)
+        return total
+
+    def minor(self, a: Array, b: Array, c: Array, d: Array) -> Array:
+        """Return a · b − c · d."""
+        return self.fma(a, b, -(c * d))
+
+    def cross(self, a: Any, b: Any) -> Point:
+        """Return the vector product."""
+        minor = self.minor
+        return minor(a[1], b[2], a[2], b[1]), minor(a[2], b[0], a[0], b[2]), minor(a[0], b[1], a[1], b[0])
+
+
+class Hits(NamedTuple):
+    """First triangles that rays meet.
+
+    Attributes:
+        distance: Distance to it, m; `inf` where there is none.
+        entry: Its entry in `Relief.entry`; -1 where there is none, and -2 less the number of a box.
+        block: Block of that entry.
+    """
+
+    distance: Float[Array, "n"]
+    entry: Int[Array, "n"]
+    block: Int[Array, "n"]
+
+
+class Rays(NamedTuple):
+    """Rays on their way through blocks.
+
+    Attributes:
+        block: Present block.
+        reached: Distance at which the ray enters it, m.
+        hits: First triangles met so far.
+        going: The ray may still meet a nearer one.
+    """
+
+    block: Int[Array, "n"]
+    reached: Float[Array, "n"]
+    hits: Hits
+    going: Bool[Array, "n"]
+
+
+def march(
+    tools: Tools, n_x: int, origin: Point, direction: Point, block: Int[Array, "n"], limit: Float[Array, "n"]
+) -> Hits:
+    """Find the first triangle that each ray meets within its limit.
+
+    Args:
+        tools: Operations of the kernel.
+        n_x: Cells of a block along the axis.
+        origin: Origins, tunnel frame, m, each `(n,)`.
+        direction: Unit vectors, tunnel frame, each `(n,)`.
+        block: Blocks around the origins.
+        limit: Largest distances of interest, m.
+    """
+
+    def one_block(rays: Rays) -> Rays:
+        return _cross_block(tools, n_x, origin, direction, limit, rays)
+
+    none = Hits(jnp.full_like(limit, jnp.inf), jnp.full_like(block, -1), block)
+    start = Rays(block, jnp.zeros_like(limit), none, limit >= 0.0)
+    return lax.while_loop(lambda rays: _any(rays.going), one_block, start).hits
+
+
+def _any(mask: Bool[Array, "n"]) -> Bool[Array, ""]:
+    return jnp.max(mask.astype(jnp.int32)) > 0
+
+
+def _cross_block(tools: Tools, n_x: int, origin: Point, direction: Point, limit: Array, rays: Rays) -> Rays:
+    """Take each ray that goes on through its block."""
+    row = rays.block * N_FRAME
+    frame = lambda i: tools.load("frame", row + i)  # noqa: E731
+    link = lambda i: tools.load("link", rays.block * N_LINK + i)  # noqa: E731
+    axes = [[frame(3 + 3 * i + j) for j in range(3)] for i in range(3)]
+    from_centre = [origin[i] - frame(i) for i in range(3)]
+    o, d = [tools.dot(axis, from_centre) for axis in axes], [tools.dot(axis, direction) for axis in axes]
+    back, front = (
+        _leaving(tools, [frame(first + i) for i in range(4)], o, d, way) for first, way in ((12, -1.0), (16, 1.0))
+    )
+    leave, following = jnp.minimum(back, front), jnp.where(front <= back, link(1), link(0))
+    # From where the ray stands, so that little is lost to rounding.
+    at = [tools.fma(rays.reached, d[i], o[i]) for i in range(3)]
+    lowest = tools.fma(jnp.maximum(jnp.minimum(leave, limit) - rays.reached, 0.0), jnp.minimum(d[2], 0.0), at[2])
+    count = jnp.where(rays.going & (lowest <= frame(24)), link(5), 0)
+    boxes = _meet_boxes(tools, link(4), count, at, d)
+    hits = _nearer(rays.hits, Hits(rays.reached + boxes[0], boxes[1], rays.block))
+    leap = _leap(tools, frame, at, d)
+    begin = jnp.minimum(rays.reached + leap, jnp.maximum(leave, rays.reached))
+    at = [tools.fma(begin - rays.reached, d[i], at[i]) for i in range(3)]
+    end = jnp.minimum(jnp.minimum(leave, limit), hits.distance) - begin
+    found, entry = _cross_cells(tools, n_x, frame, link, at, d, end, rays.going & (end >= 0.0))
+    hits = _nearer(hits, Hits(begin + found, entry, rays.block))
+    going = rays.going & (leave < jnp.minimum(limit, hits.distance)) & (following >= 0)
+    return Rays(jnp.where(going, following, rays.block), jnp.where(going, leave, rays.reached), hits, going)
+
+
+def _nearer(one: Hits, other: Hits) -> Hits:
+    """Return the nearer of two hits of each ray."""
+    nearer = other.distance < one.distance
+    return Hits(*(jnp.where(nearer, b, a) for a, b in zip(one, other, strict=True)))
+
+
+def _leaving(tools: Tools, plane: list[Array], o: list[Array], d: list[Array], way: float) -> Float[Array, "n"]:
+    """Return the distance at which a ray leaves through a plane, m; `inf` if it runs along it or the other way."""
+    speed, gap = tools.dot(plane[:3], d), plane[3] - tools.dot(plane[:3], o)
+    leaves = way * speed > 1e-9
+    return jnp.where(leaves, gap * tools.reciprocal(jnp.where(leaves, speed, 1.0)), jnp.inf)
+
+
+def _leap(tools: Tools, frame: Any, at: list[Array], d: list[Array]) -> Float[Array, "n"]:
+    """Return how far a ray stays in the block's prism, in which there is nothing, m; 0 if it is not in it."""
+    leave, room = jnp.full_like(at[0], 1e9), jnp.full_like(at[0], jnp.inf)
+    for i, (left, up) in enumerate(FACES.tolist()):
+        speed = tools.fma(d[1], left, d[2] * up)
+        gap = frame(25 + i) - tools.fma(at[1], left, at[2] * up)
+        room = jnp.minimum(room, gap)
+        leave = jnp.where(speed > _TINY, jnp.minimum(leave, gap * tools.reciprocal(speed)), leave)
+    return jnp.where(room >= 0.0, leave, 0.0)
+
+
+def wedge_edge(turn: Float[Array, "n"]) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Return the direction left and up at a share of 4 of a turn, as `cells.wedge_edge`."""
+    return jnp.abs(turn - 2.0) - 1.0, jnp.abs(turn + jnp.where(turn < 1.0, 1.0, -3.0)) - 1.0
+
+
+def wedge_at(tools: Tools, y: Float[Array, "n"], z: Float[Array, "n"]) -> Int[Array, "n"]:
+    """Return the wedge in which points lie, as `cells.wedge_place`."""
+    share = y * tools.reciprocal(jnp.maximum(jnp.abs(y) + jnp.abs(z), 1e-30))
+    turn = jnp.where(z >= 0.0, 1.0 - share, 3.0 + share)
+    return jnp.clip((turn * (N_WEDGES / 4)).astype(jnp.int32), 0, N_WEDGES - 1)
+
+
+class Step(NamedTuple):
+    """Rays on their way through the cells of a block; distances are from where they began there.
+
+    Attributes:
+        x: Cell along the axis.
+        wedge: Wedge.
+        reached: Distance at which the ray enters the cell, m.
+        hit: Distance to the nearest triangle met so far, m.
+        entry: Entry of that triangle.
+        going: The ray may still meet one in this block.
+    """
+
+    x: Int[Array, "n"]
+    wedge: Int[Array, "n"]
+    reached: Float[Array, "n"]
+    hit: Float[Array, "n"]
+    entry: Int[Array, "n"]
+    going: Bool[Array, "n"]
+
+
+def _cross_cells(
+    tools: Tools, n_x: int, frame: Any, link: Any, at: list[Array], d: list[Array], end: Array, going: Array
+) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
+    """Return the distance at which rays meet a triangle in their block, m, or `inf`, and its entry."""
+    along, across = frame(22), frame(23) * FINE
+    # Vertices count from 0 along the axis.
+    units = (tools.fma(at[0], along, 0.5 * (1 << X_BITS)), at[1] * across, at[2] * across)
+    speeds = (d[0] * along, d[1] * across, d[2] * across)
+    first_vertex, first_cell = link(2), link(3)
+    forward = jnp.where(d[0] > 0.0, 1, 0)
+    onward = tools.minor(at[1], d[2], at[2], d[1]) > 0.0
+    # In cells from the first.
+    x = (at[0] - frame(20)) * frame(21)
+    slope = tools.reciprocal(jnp.where(jnp.abs(d[0]) < 1e-9, 1e-9, d[0]) * frame(21))
+
+    def one_cell(step: Step) -> Step:
+        edge = step.x + forward
+        # The outermost cells reach to infinity.
+        leave_x = jnp.where((edge <= 0) | (edge >= n_x), jnp.inf, (edge.astype(jnp.float32) - x) * slope)
+        turn = step.wedge.astype(jnp.float32) * (4.0 / N_WEDGES)
+        (y0, z0), (y1, z1) = wedge_edge(turn), wedge_edge(turn + 4.0 / N_WEDGES)
+        y, z = jnp.where(onward, y1, y0), jnp.where(onward, z1, z0)
+        speed, side = tools.minor(y, d[2], z, d[1]), tools.minor(z, at[1], y, at[2])
+        turns = jnp.where(onward, speed, -speed) > _TINY
+        leave_wedge = jnp.where(turns, side * tools.reciprocal(jnp.where(turns, speed, 1.0)), jnp.inf)
+        leave = jnp.maximum(jnp.minimum(leave_x, leave_wedge), step.reached)
+        y, z = y0 + y1, z0 + z1
+        deeper = tools.dot((y, z), d[1:])
+        deepest = jnp.where(deeper > 0.0, jnp.minimum(leave, end), step.reached)
+        depth = tools.fma(deeper, deepest, tools.dot((y, z), at[1:]))
+        first, word = tools.load("cell", first_cell + step.x * N_WEDGES + step.wedge)
+        near = (word & 0xFFFF).astype(jnp.float32)
+        reaches = step.going & ((depth + MARGIN) * (1.0 / NEAR_UNIT) >= near)
+        count = jnp.where(reaches, lax.shift_right_logical(word, 16), 0)
+        hit, entry = _meet(tools, first, count, first_vertex, units, speeds, step.hit, step.entry)
+        going = step.going & (leave < end) & (hit > leave)
+        ends = leave_x <= leave_wedge
+        x_next = step.x + jnp.where(ends & going, 2 * forward - 1, 0)
+        wedge = step.wedge + jnp.where(ends | ~going, 0, jnp.where(onward, 1, -1))
+        wedge = jnp.where(wedge == N_WEDGES, 0, jnp.where(wedge < 0, N_WEDGES - 1, wedge))
+        return Step(x_next, wedge, jnp.where(going, leave, step.reached), hit, entry, going)
+
+    first_x = jnp.clip(x, 0.0, n_x - 1.0).astype(jnp.int32)
+    none = jnp.full_like(first_x, -1)
+    wedge = wedge_at(tools, at[1], at[2])
+    start = Step(first_x, wedge, jnp.zeros_like(end), jnp.full_like(end, jnp.inf), none, going)
+    step = lax.while_loop(lambda step: _any(step.going), one_cell, start)
+    return step.hit, step.entry
+
+
+def corners(
+    tools: Tools, entry: Int[Array, "n"], first_vertex: Int[Array, "n"], listed: Bool[Array, "n"]
+) -> tuple[Point, Point, Point]:
+    """Return the corners of triangles, in units of their relief along the axis, and a `FINE` part of them across it."""
+    code, low = tools.load("entry", entry, listed), (1 << STEP_BITS) - 1
+    number = first_vertex + lax.shift_right_logical(code, 2 * STEP_BITS)
+    numbers = number, number + (lax.shift_right_logical(code, STEP_BITS) & low), number + (code & low)
+    first, second, third = (_point(tools, number) for number in numbers)
+    return first, second, third
+
+
+def _point(tools: Tools, number: Int[Array, "n"]) -> Point:
+    one, two = tools.load("vertex", number)
+    half = X_BITS // 2
+    low = (1 << half) - 1
+    x = ((one & low) << half) | (two & low)
+    return x.astype(jnp.float32), one.astype(jnp.float32), two.astype(jnp.float32)
+
+
+def _meet(
+    tools: Tools, first: Array, count: Array, first_vertex: Array, at: Point, d: Point, hit: Array, entry: Array
+) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
+    """Compare rays with the triangles of a list each; return the nearest distance, m, and its entry.
+
+    Source: Möller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
+    """
+
+    def one_triangle(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        hit, entry = best
+        listed = i < count
+        p, second, third = corners(tools, first + i, first_vertex, listed)
+        a, b = ([q[j] - p[j] for j in range(3)] for q in (second, third))
+        gap = [at[j] - p[j] for j in range(3)]
+        across_b, across_a = tools.cross(d, b), tools.cross(gap, a)
+        det = tools.dot(a, across_b)
+        there = jnp.abs(det) > 0.0
+        inverse = tools.reciprocal(jnp.where(there, det, 1.0))
+        u, v, t = (tools.dot(*pair) * inverse for pair in ((gap, across_b), (d, across_a), (b, across_a)))
+        meets = listed & there & (jnp.minimum(u, v) >= -SEAM) & (u + v <= 1.0 + SEAM) & (t >= -PAST) & (t < hit)
+        return jnp.where(meets, t, hit), jnp.where(meets, first + i, entry)
+
+    return lax.fori_loop(0, jnp.max(count), one_triangle, (hit, entry))
+
+
+def _meet_boxes(
+    tools: Tools, first: Array, count: Array, at: list[Array], d: list[Array]
+) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
+    """Compare rays with the boxes of a list each; return the nearest distance, m, and -2 less the box's number."""
+
+    def one_box(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        hit, which = best
+        number = jnp.where(i < count, first + i, 0)
+        enter, leave = jnp.full_like(hit, -jnp.inf), jnp.full_like(hit, jnp.inf)
+        for side in range(3):
+            row = [tools.load("box", 12 * number + 4 * side + j) for j in range(4)]
+            speed = tools.dot(row[:3], d)
+            slope = tools.reciprocal(jnp.where(jnp.abs(speed) < _TINY, _TINY, speed))
+            middle, half = (row[3] - tools.dot(row[:3], at)) * slope, jnp.abs(slope)
+            enter, leave = jnp.maximum(enter, middle - half), jnp.minimum(leave, middle + half)
+        # From within a box one sees its inside.
+        t = jnp.where(enter >= -PAST, enter, leave)
+        meets = (i < count) & (enter <= leave) & (t >= -PAST) & (t < hit)
+        return jnp.where(meets, t, hit), jnp.where(meets, -2 - number, which)
+
+    start = jnp.full_like(at[0], jnp.inf), jnp.full_like(count, -1)
+    return lax.fori_loop(0, jnp.max(count), one_box, start)

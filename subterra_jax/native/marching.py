@@ -1,0 +1,232 @@
+"""The march of `lidar3d.march` for one ray after another on a CPU."""
+
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, NEAR_UNIT, STEP_BITS, X_BITS, YZ_BITS
+from subterra_jax.lidar3d.march import PAST, SEAM
+from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
+
+_F, _I = np.float32, np.int32
+_ZERO, _ONE, _FAR, _TINY = _F(0.0), _F(1.0), _F(np.inf), _F(1e-12)
+_PAST, _SEAM, _OVER, _MARGIN, _UNIT = _F(-PAST), _F(-SEAM), _F(1.0 + SEAM), _F(MARGIN), _F(NEAR_UNIT)
+_FACES = FACES.astype(np.float32)
+_QUARTER = N_WEDGES // 4
+_SHARE = _F(1.0 / _QUARTER)
+_HALF = X_BITS // 2
+_LOW_X, _SHIFT, _LOW_STEP = (1 << _HALF) - 1, 32 - YZ_BITS, (1 << STEP_BITS) - 1
+_MIDDLE = 1 << X_BITS - 1
+
+compiled = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
+
+
+@compiled
+@no_type_check
+def wedge_edge(number):
+    """Return the direction in which a wedge begins, as `cells.wedge_edge`."""
+    turn = number // _QUARTER
+    share = _F(number - turn * _QUARTER) * _SHARE
+    rest = _ONE - share
+    if turn == 0:
+        return rest, share
+    if turn == 1:
+        return -share, rest
+    if turn == 2:
+        return -rest, -share
+    return share, -rest
+
+
+@compiled
+@no_type_check
+def wedge_at(y, z):
+    """Return the wedge in which a point lies, as `cells.wedge_place`."""
+    size = max(abs(y) + abs(z), _F(1e-30))
+    turn = (0 if y > _ZERO else 1) if z >= _ZERO else (2 if y < _ZERO else 3)
+    part = abs(y) if turn & 1 else abs(z)
+    wedge = turn * _QUARTER + int(part / size * _F(_QUARTER))
+    return 0 if wedge >= N_WEDGES else wedge
+
+
+@compiled
+@no_type_check
+def leaving(frame, at, ox, oy, oz, dx, dy, dz, outwards):
+    """Return the distance at which a ray leaves through a plane, m; `inf` if it runs along it or the other way."""
+    speed = frame[at] * dx + frame[at + 1] * dy + frame[at + 2] * dz
+    if outwards * speed > _F(1e-9):
+        return (frame[at + 3] - (frame[at] * ox + frame[at + 1] * oy + frame[at + 2] * oz)) / speed
+    return _FAR
+
+
+@compiled
+@no_type_check
+def point(vertex, number):
+    """Return a vertex in units of its relief."""
+    one, two = vertex[2 * number], vertex[2 * number + 1]
+    x = ((one & _LOW_X) << _HALF) + (two & _LOW_X) - _MIDDLE
+    return _F(x), _F(one >> _SHIFT), _F(two >> _SHIFT)
+
+
+@compiled
+@no_type_check
+def meet(vertex, entry, first, count, first_vertex, ox, oy, oz, dx, dy, dz, hit, which):
+    """Compare a ray with the triangles of a list; return the nearest distance, m, and its entry."""
+    for i in range(first, first + count):
+        code = np.uint32(entry[i])
+        number = first_vertex + np.int64(code >> (2 * STEP_BITS))
+        x, y, z = point(vertex, number)
+        ax, ay, az = point(vertex, number + np.int64((code >> STEP_BITS) & _LOW_STEP))
+        bx, by, bz = point(vertex, number + np.int64(code & _LOW_STEP))
+        ax, ay, az, bx, by, bz = ax - x, ay - y, az - z, bx - x, by - y, bz - z
+        gx, gy, gz = ox - x, oy - y, oz - z
+        px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+        det = ax * px + ay * py + az * pz
+        u, size = gx * px + gy * py + gz * pz, abs(det)
+        if det < _ZERO:
+            u = -u
+        if not (u >= _SEAM * size and u <= _OVER * size and size > _ZERO):
+            continue
+        qx, qy, qz = gy * az - gz * ay, gz * ax - gx * az, gx * ay - gy * ax
+        inverse = _ONE / det
+        u, v = (gx * px + gy * py + gz * pz) * inverse, (dx * qx + dy * qy + dz * qz) * inverse
+        t = (bx * qx + by * qy + bz * qz) * inverse
+        if v >= _SEAM and u + v <= _OVER and t >= _PAST and t < hit:
+            hit, which = t, i
+    return hit, which
+
+
+@compiled
+@no_type_check
+def meet_boxes(box, first, count, ox, oy, oz, dx, dy, dz):
+    """Compare a ray with the boxes of a list; return the nearest distance, m, and the box's number."""
+    hit, which = _FAR, -1
+    for number in range(first, first + count):
+        enter, leave = -_FAR, _FAR
+        for side in range(3):
+            at = 12 * number + 4 * side
+            speed = box[at] * dx + box[at + 1] * dy + box[at + 2] * dz
+            slope = _ONE / (_TINY if abs(speed) < _TINY else speed)
+            middle = (box[at + 3] - (box[at] * ox + box[at + 1] * oy + box[at + 2] * oz)) * slope
+            enter, leave = max(enter, middle - abs(slope)), min(leave, middle + abs(slope))
+        t = enter if enter >= _PAST else leave
+        if enter <= leave and t >= _PAST and t < hit:
+            hit, which = t, number
+    return hit, which
+
+
+@compiled
+@no_type_check
+def march_rows(
+    begin, end, origin, direction, block, limit, frame, link, cell, entry, vertex, box, n_x, distance, found, home
+):
+    """March the rays `begin` to `end`; all arrays are flat, and as `march.march` has them.
+
+    Args:
+        begin: First ray to march.
+        end: One after the last.
+        origin: Origins, m.
+        direction: Unit vectors.
+        block: Blocks around the origins.
+        limit: Largest distances of interest, m.
+        frame: Of the relief, as the next five.
+        link: See `Relief`.
+        cell: See `Relief`.
+        entry: See `Relief`.
+        vertex: See `Relief`.
+        box: See `Relief`.
+        n_x: Cells of a block along the axis.
+        distance: Output, distances to the first triangle, m; `inf` where there is none.
+        found: Output, entries of these triangles; -1 where there is none.
+        home: Output, blocks of these entries.
+    """
+    for ray in range(begin, end):
+        here, reached, hit, which, at_home = np.int64(block[ray]), _ZERO, _FAR, -1, np.int64(block[ray])
+        farthest = limit[ray]
+        going = farthest >= _ZERO
+        while going:
+            f = here * N_FRAME
+            gx, gy, gz = (
+                origin[3 * ray] - frame[f],
+                origin[3 * ray + 1] - frame[f + 1],
+                origin[3 * ray + 2] - frame[f + 2],
+            )
+            hx, hy, hz = direction[3 * ray], direction[3 * ray + 1], direction[3 * ray + 2]
+            ox = frame[f + 3] * gx + frame[f + 4] * gy + frame[f + 5] * gz
+            oy = frame[f + 6] * gx + frame[f + 7] * gy + frame[f + 8] * gz
+            oz = frame[f + 9] * gx + frame[f + 10] * gy + frame[f + 11] * gz
+            dx = frame[f + 3] * hx + frame[f + 4] * hy + frame[f + 5] * hz
+            dy = frame[f + 6] * hx + frame[f + 7] * hy + frame[f + 8] * hz
+            dz = frame[f + 9] * hx + frame[f + 10] * hy + frame[f + 11] * hz
+            back = leaving(frame, f + 12, ox, oy, oz, dx, dy, dz, -_ONE)
+            front = leaving(frame, f + 16, ox, oy, oz, dx, dy, dz, _ONE)
+            leave, following = (front, link[N_LINK * here + 1]) if front <= back else (back, link[N_LINK * here])
+            enter, out = -_FAR, _FAR
+            for i in range(N_FACES):
+                speed = _FACES[i, 0] * dy + _FACES[i, 1] * dz
+                if abs(speed) < _TINY:
+                    speed = _TINY
+                crossing = (frame[f + 25 + i] - (_FACES[i, 0] * oy + _FACES[i, 1] * oz)) / speed
+                if speed > _ZERO:
+                    out = min(out, crossing)
+                else:
+                    enter = max(enter, crossing)
+            start = min(out, leave) if enter <= reached and out > reached else reached
+            px, py, pz = ox + start * dx, oy + start * dy, oz + start * dz
+            qz, farther = oz + reached * dz, max(min(leave, farthest) - reached, _ZERO)
+            if qz + farther * min(dz, _ZERO) <= frame[f + 24] and link[N_LINK * here + 5] > 0:
+                nearest, number = meet_boxes(
+                    box, np.int64(link[N_LINK * here + 4]), np.int64(link[N_LINK * here + 5]),
+                    ox + reached * dx, oy + reached * dy, qz, dx, dy, dz,
+                )  # fmt: skip
+                if reached + nearest < hit:
+                    hit, which, at_home = reached + nearest, -2 - number, here
+            stop = min(min(leave, farthest), hit) - start
+            low, per_cell, along, across = frame[f + 20], frame[f + 21], frame[f + 22], frame[f + 23]
+            pitch = _ONE / per_cell
+            ux, uy, uz, vx, vy, vz = px * along, py * across, pz * across, dx * along, dy * across, dz * across
+            first_vertex, first_cell = np.int64(link[N_LINK * here + 2]), np.int64(link[N_LINK * here + 3])
+            forward, onward = dx > _ZERO, py * dz - pz * dy > _ZERO
+            slope = _ONE / (_F(1e-9) if abs(dx) < _F(1e-9) else dx)
+            x = int(min(max(np.floor((px - low) * per_cell), _ZERO), _F(n_x - 1)))
+            wedge = wedge_at(py, pz)
+            place, best, chosen = _ZERO, _FAR, -1
+            inside = stop >= _ZERO
+            while inside:
+                edge = x + (1 if forward else 0)
+                leave_x = _FAR if edge <= 0 or edge >= n_x else (low + _F(edge) * pitch - px) * slope
+                y0, z0 = wedge_edge(wedge)
+                y1, z1 = wedge_edge(0 if wedge + 1 == N_WEDGES else wedge + 1)
+                y, z = (y1, z1) if onward else (y0, z0)
+                speed = y * dz - z * dy
+                leave_wedge = _FAR
+                if (speed if onward else -speed) > _TINY:
+                    leave_wedge = -(y * pz - z * py) / speed
+                away = max(min(leave_x, leave_wedge), place)
+                y, z = y0 + y1, z0 + z1
+                deeper = y * dy + z * dz
+                depth = y * py + z * pz + deeper * (min(away, stop) if deeper > _ZERO else place)
+                number = 2 * (first_cell + x * N_WEDGES + wedge)
+                word = np.uint32(cell[number + 1])
+                if depth + _MARGIN >= _F(word & np.uint32(0xFFFF)) * _UNIT:
+                    best, chosen = meet(
+                        vertex, entry, np.int64(cell[number]), np.int64(word >> np.uint32(16)), first_vertex,
+                        ux, uy, uz, vx, vy, vz, best, chosen,
+                    )  # fmt: skip
+                if not (away < stop and best > away):
+                    inside = False
+                elif leave_x <= leave_wedge:
+                    x += 1 if forward else -1
+                else:
+                    wedge += 1 if onward else -1
+                    if wedge == N_WEDGES:
+                        wedge = 0
+                    elif wedge < 0:
+                        wedge = N_WEDGES - 1
+                place = away
+            if start + best < hit:
+                hit, which, at_home = start + best, chosen, here
+            going = leave < min(farthest, hit) and following >= 0
+            if going:
+                here, reached = np.int64(following), leave
+        distance[ray], found[ray], home[ray] = hit, which, at_home
