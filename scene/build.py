@@ -14,6 +14,7 @@ import numpy as np
 import tyro
 
 from scene.errors import FitError, RecordingError
+from scene.judging.judge import DoubtError, Judgement
 from scene.output import BuildConfig, write_scene_folder
 from scene.poses.calibration import find_calibration
 from scene.progress import Stages
@@ -96,8 +97,9 @@ def build(
         with Stages() as progress:
             result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, partial)
         _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
+        print(_describe_stations(result), flush=True)
         with replace_folder(out) as folder:
-            write_scene_folder(folder, config.name or out.name, result, config)
+            judgement = _write(folder, source, config.name or out.name, result, config)
             _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
         partial.discard()
     except (RecordingError, FitError):
@@ -105,8 +107,27 @@ def build(
         raise
     finally:
         partial.close()
+    print(judgement.summary(), flush=True)
+    for warning in judgement.warnings:
+        print(f"warning: {warning.text}", file=sys.stderr, flush=True)
     print(f"{out / 'scene.xml'}")
     return result
+
+
+def _describe_stations(result: Reconstruction) -> str:
+    """Return where the stations begin and which way they grow, for people."""
+    x, y, z = result.bore.position[0] + result.origin
+    start = float(result.facts["chainage_start"])
+    chainage = f", chainage {start:g} m" if start else ""
+    return f"stations: 0 m{chainage} at ({x:.1f}, {y:.1f}, {z:.1f}); they grow {result.facts['chainage_grows']}"
+
+
+def _write(folder: Path, source: Path, name: str, result: Reconstruction, config: BuildConfig) -> Judgement:
+    """Writes the scene folder; an error of the fit names the source."""
+    try:
+        return write_scene_folder(folder, name, result, config)
+    except DoubtError as error:
+        raise DoubtError(f"{source}: {error}") from error
 
 
 def _print_time(started: float, text: str) -> None:

@@ -3,7 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,10 @@ import trimesh
 from scene.bore import Bore
 from scene.cloud import thin_cloud
 from scene.errors import FitError
+from scene.judging.judge import STATION, Judgement, JudgingConfig, judge_bore, require_trust
+from scene.judging.page import write_page
+from scene.judging.returns import TrackZone
+from scene.judging.sanity import doubt_bore
 from scene.poses.trajectory import save_tum
 from scene.reconstruct import ReconstructConfig, Reconstruction
 from scene.writing.furnished import furnish_bore, planar_segments
@@ -22,7 +26,7 @@ from scene.writing.furniture import count_pieces
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene
 from scene.writing.planar import cut_walls, save_tunnel
-from scene.writing.track import Track, TrackConfig, lay_track
+from scene.writing.track import Track, TrackConfig, describe_track, lay_track, track_provenance
 
 SCENES = ("scene.xml", "scene_furnished.xml")
 
@@ -111,12 +115,41 @@ class BuildConfig:
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)  # Steps from the input to a bore.
     track: TrackConfig = field(default_factory=TrackConfig)  # Standard by which the track is laid.
     scene: SceneConfig = field(default_factory=SceneConfig)  # Cutting and dressing of the scene.
+    judging: JudgingConfig = field(default_factory=JudgingConfig)  # Limits of what a bore may leave unexplained.
 
 
-def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> None:
-    """Writes the six parts of a scene folder and compiles the scene once."""
+def judge_reconstruction(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgement:
+    """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
+    odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
+    if result.everything is None:
+        judgement = Judgement(config.tolerance, ())
+    else:
+        spacing = float(result.facts.get("profile_spacing") or 0.0)
+        zone = _track_zone(track, result.bore)
+        judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed, spacing)
+    warnings = sorted([*odd, *judgement.warnings], key=lambda warning: not warning.refuses)
+    return replace(judgement, warnings=tuple(warnings))
+
+
+def _track_zone(track: Track, bore: Bore) -> TrackZone | None:
+    """Return the space between the ends of the sleepers, up to the rails' tops; `None` without a track."""
+    if not track.lines:
+        return None
+    widest = max(float(np.abs(line.offset).max()) for line in track.lines) + track.config.sleeper_length / 2
+    top = np.max([line.seat + line.rail_height for line in track.lines], axis=0)
+    return TrackZone(widest, top - bore.position[:, 2])
+
+
+def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> Judgement:
+    """Judges the bore, writes the parts of a scene folder, and compiles the scene once.
+
+    Raises `DoubtError` where the judgement refuses the bore and `config.judging.force` is not set, and `FitError` where
+    no scene can be made of it.
+    """
     bore = result.bore
-    track = lay_track(bore, config.track, result.seen.sleepers)
+    track = lay_track(bore, config.track, result.seen)
+    judgement = judge_reconstruction(result, track, config.judging)
+    require_trust(judgement, config.judging.force)
     count, furnished = write_geometry(folder, name, config.provenance, bore, track, config.scene)
     content = {
         "name": name,
@@ -137,16 +170,20 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
             "rings": len(bore.ring_station),
             "pockets": len(bore.pocket),
         },
-        "track": _track_facts(track, result),
+        "track": describe_track(track, result.seen),
         "provenance": {
             "bore": config.provenance,
             **furnished,
             **{
                 asset: kind.replace("measured", config.provenance)
-                for asset, kind in {**_track_provenance(track, result), **result.provenance}.items()
+                for asset, kind in {**track_provenance(track, result.seen), **result.provenance}.items()
             },
         },
     }
+    content["judgement"] = judgement.facts
+    content["removed"] = [{**vars(part), "warning": part.warning} for part in result.removed]
+    write_stations(folder / "stations.csv", judgement)
+    write_page(folder / "build.html", name, result.bore, judgement, content)
     write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
         trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
@@ -157,26 +194,12 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
             mujoco.MjModel.from_xml_path(str(folder / scene))
         except ValueError as error:
             raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
+    return judgement
 
 
-def _track_facts(track: Track, result: Reconstruction) -> dict[str, Any]:
-    rails = result.seen.rails
-    return {
-        "least_clearance": float(track.clearance.min()) if len(track.clearance) else None,
-        "slab": track.raised,
-        "sleepers_seen": int(track.measured.sum()),
-        "protrusion": track.config.protrusion,
-        "gauge": track.config.gauge,
-        "gauge_seen": rails.gauge if rails else None,
-        "rail_top_seen": rails.top if rails else None,
-    }
-
-
-def _track_provenance(track: Track, result: Reconstruction) -> dict[str, str]:
-    if not len(track.sleeper_station):
-        return {"track": "none: the bore is too low for it"}
-    return {
-        "sleepers": "measured" if track.measured.any() else "by standard",
-        "rails": "by standard" + (", seen in the survey" if result.seen.rails else ""),
-        "fasteners": "by standard",
-    }
+def write_stations(path: Path, judgement: Judgement) -> None:
+    """Writes what was seen, cut and filled, metre by metre; a ring survey gives a header alone."""
+    names = STATION.names or ()
+    table = np.empty(0, STATION) if judgement.stations is None else judgement.stations
+    rows = (",".join(f"{row[name]:.4g}" for name in names) for row in table)
+    path.write_text("\n".join([",".join(names), *rows]) + "\n")

@@ -1,21 +1,25 @@
 """From any input to a bore: recording, cloud file or ring survey."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from scene.bore import Bore
+from scene.cleaning.clean import CleaningConfig, clean_cloud
+from scene.cleaning.crop import ExtentConfig, crop_cloud, describe_chainage, keep_stations, turn_round
+from scene.cleaning.removed import Removed
 from scene.cloud import Cloud
 from scene.errors import FitError, RecordingError, require_input
 from scene.fitting.assemble import bore_from_sections, describe_bore
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.centreline import CentrelineConfig
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
 from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
 from scene.fitting.section import fit_sections
 from scene.fitting.trackseen import SeenTrack, find_track
 from scene.poses.calibration import UNCALIBRATED, Calibration
+from scene.poses.consistency import check_poses, reorder
 from scene.poses.locate import Located, locate_by_control, locate_by_odometry, locate_given
 from scene.poses.registration import register_scans
 from scene.poses.trajectory import Control, Trajectory, load_control, load_tum
@@ -24,6 +28,7 @@ from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, describe, detect, own_readers
 from scene.reading.recording import Recording
 from scene.reading.ringsurvey import read_ring_survey
+from scene.reading.tables import parse_columns
 from scene.resume import Partial, input_record, resume_key, total_bytes
 
 
@@ -61,7 +66,7 @@ def register_recording(
         record = hash_inputs([path] if known is None else [path, known.path], progress)
         partial.open(resume_key(record, voxel, reading, calibration, type(known).__name__, own_readers()))
         if isinstance(known, Trajectory):
-            located = locate_given(known)
+            located = _locate_checked(recording, known, reading)
         elif isinstance(known, Control):
             located = locate_by_control(recording, known, calibration, progress, partial)
         else:
@@ -75,6 +80,21 @@ def register_recording(
             **located.facts,
         }
     return Registered(cloud, record, facts, located)
+
+
+def _locate_checked(recording: Recording, given: Trajectory, reading: ReadingConfig) -> Located:
+    """Takes given poses after a look at what they make of some scans, with quaternions in the order that fits."""
+    told = reading.quaternion
+    poses = reorder(given) if told == "wxyz" else given
+    check = check_poses(recording, poses)
+    order = "xyzw (by default)" if told is None else f"{told} (by flag)"
+    if check is not None and check.wxyz and told is None:
+        poses, order = reorder(given), "wxyz (detected: as xyzw they blur the walls)"
+        print(f"quaternions of {given.source}: {order}", flush=True)
+        check = check_poses(recording, poses)
+    located = locate_given(poses)
+    facts = {**located.facts, "quaternions": order, **({} if check is None else check.facts)}
+    return replace(located, facts=facts)
 
 
 def load_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages, partial: Partial) -> Registered:
@@ -95,6 +115,8 @@ class ReconstructConfig:
 
     voxel: float = 0.04  # Thinning of the cloud, m.
     reading: ReadingConfig = field(default_factory=ReadingConfig)  # What the user says instead of having it detected.
+    extent: ExtentConfig = field(default_factory=ExtentConfig)  # Part that is built, and how its stations count.
+    cleaning: CleaningConfig = field(default_factory=CleaningConfig)  # Search for what is not the bore.
     centreline: CentrelineConfig = field(default_factory=CentrelineConfig)  # Search for the axis.
     lining: LiningConfig = field(default_factory=LiningConfig)  # Lining by standard, where the survey can show none.
 
@@ -109,8 +131,11 @@ class Reconstruction:
     facts: dict[str, Any]  # Facts for the manifest
     provenance: dict[str, str]  # Provenance of lining features, for the manifest
     odometry: Trajectory | None = None  # The estimated poses, where there was no trajectory to be given
-    cloud: Cloud | None = None  # The registered cloud, where there was one
-    seen: SeenTrack = field(default_factory=lambda: SeenTrack(None, None))  # Track that the cloud shows
+    cloud: Cloud | None = None  # The bore's part of the registered cloud, where there was one
+    everything: Cloud | None = None  # The registered cloud before cleaning
+    removed: tuple[Removed, ...] = ()  # What cleaning cut away, by station of the bore, m
+    cause: np.ndarray | None = None  # Index into `scene.cleaning.removed.CAUSES` of each point of `everything`, `(n,)`
+    seen: SeenTrack = field(default_factory=SeenTrack)  # Tracks that the cloud shows
 
 
 def reconstruct(
@@ -151,7 +176,7 @@ def reconstruct(
         if kind == "recording":
             known = load_tum(trajectory) if trajectory else load_control(control) if control else None
             parts = (config.voxel, config.reading, progress, partial)
-            return _fit_cloud(register_recording(detected.path, known, calibration, *parts), config, progress)
+            return _fit_recording(register_recording(detected.path, known, calibration, *parts), config, progress)
         if kind == "cloud":
             cloud = load_cloud(detected.path, config.voxel, config.reading, progress, partial)
             return _fit_cloud(cloud, config, progress)
@@ -160,25 +185,44 @@ def reconstruct(
         raise FitError(str(error) if str(source) in str(error) else f"{source}: {error}") from error
 
 
+def _fit_recording(registered: Registered, config: ReconstructConfig, progress: Stages) -> Reconstruction:
+    """Fits a recording's cloud; where none can be fitted and the poses are in doubt, the error says so first."""
+    try:
+        return _fit_cloud(registered, config, progress)
+    except FitError as error:
+        doubt = registered.facts.get("pose_doubt")
+        raise FitError(f"{doubt}; no bore can be fitted to them ({error})" if doubt else str(error)) from error
+
+
+_ARBITRARY = "arbitrarily: a registered cloud tells no direction, and --reverse turns it"
+
+
 def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stages) -> Reconstruction:
-    cloud, located = registered.cloud, registered.located
+    located = registered.located
     stage = progress.start("fitting the bore", 4)
-    axis = fit_centreline(cloud.points, config.centreline, cloud.origin)
+    everything = crop_cloud(registered.cloud, config.extent.crop)
+    cleaned = clean_cloud(everything, config.cleaning, config.centreline)
+    backwards = False
     if located is not None:
-        ends = axis.local(located.trajectory.positions[[0, -1]] - cloud.origin)[0]
-        if ends[1] < ends[0]:  # stations grow the way the sensor went
-            axis = axis.reversed()
+        ends = cleaned.axis.local(located.trajectory.positions[[0, -1]] - everything.origin)[0]
+        backwards = bool(ends[1] < ends[0])  # stations grow the way the sensor went
+    if backwards != config.extent.reverse:
+        cleaned = turn_round(cleaned)
+    cleaned, everything, first = keep_stations(cleaned, everything, config.extent)
+    cloud, axis, removed = cleaned.cloud, cleaned.axis, cleaned.removed
     stage.advance()
     sections = fit_sections(cloud, axis)
     stage.advance()
     smooth = bore_from_sections(axis, sections)
+    removed = tuple(part.shifted(-sections.grid.start) for part in removed)
     bore, provenance = add_lining(smooth, sections, cloud, config.lining)
     stage.advance()
-    seen = find_track(cloud, bore) if sections.flat_floor else SeenTrack(None, None)
+    seen = find_track(cloud, bore, sections.flat_floor)
     stage.advance()
     facts = {
         "length_fixed_by": "registered cloud as given",
         **registered.facts,
+        **describe_chainage(config.extent, first, _ARBITRARY if located is None else "with the trajectory"),
         "returns": cloud.returns,
         "points": len(cloud.points),
         "flat_floor": sections.flat_floor,
@@ -186,11 +230,16 @@ def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stag
         **describe_bore(bore),
     }
     odometry = located.trajectory if located is not None and located.estimated else None
-    return Reconstruction(bore, cloud.origin, registered.record, facts, provenance, odometry, cloud, seen)
+    return Reconstruction(
+        bore, cloud.origin, registered.record, facts, provenance, odometry, cloud,
+        everything, removed, cleaned.cause, seen,
+    )  # fmt: skip
 
 
 def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:
-    survey = read_ring_survey(path, config.reading.unit)
+    survey = read_ring_survey(path, config.reading.unit, _ring_columns(path, config.reading.columns))
+    if config.extent.reverse:
+        survey = survey.reversed()
     print(f"detected: {describe({'kind': 'ring survey', **survey.facts})}", flush=True)
     fit = fit_rings(survey)
     origin = np.floor(np.median(fit.centre, axis=0))
@@ -206,8 +255,17 @@ def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) ->
         "radius_sd": float(fit.radius.std()),
         **describe_bore(bore),
         "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
+        **describe_chainage(config.extent, 0.0, "with the order of the rings in the file"),
         "largest_target_offset": float(max(offset.max() for offset in survey.offsets)),
         "flat_floor": False,
         **({} if survey.design is None else compare_with_design(fit, survey.design)),
     }
     return Reconstruction(bore, origin, hash_inputs([path], progress), facts, provenance)
+
+
+def _ring_columns(path: Path, columns: str | None) -> dict[str, str] | None:
+    """Return the columns that a user names; raises `RecordingError` where they are none."""
+    try:
+        return parse_columns(columns) or None
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error

@@ -45,7 +45,7 @@ def track_of(model: mujoco.MjModel, manifest: dict[str, Any]) -> Track:
     for geom in range(model.ngeom):
         name = model.geom(geom).name
         kind = name.split("_")[0].removesuffix("s")
-        if kind not in parts:
+        if kind not in parts or "_2_" in name:  # a second track is not judged
             continue
         mesh = geom_mesh(model, data, geom)
         parts[kind].append(mesh)

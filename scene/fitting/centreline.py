@@ -4,6 +4,7 @@ The first guess comes from distances *along* the surface, so that no orientation
 pulled to the middle of the sections a few times.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,6 +104,7 @@ def _bridges(nodes: np.ndarray, labels: np.ndarray) -> list[np.ndarray]:
 _HERE = np.zeros(3)
 _OVERRUN = 6.0
 _FULL_SHARE = 0.5
+_UNUSUAL = 0.3  # m from the usual section
 _SPACING = 1.0
 _PASSES = 4
 _COARSE_ANGLES = 72
@@ -129,22 +131,43 @@ def fit_centreline(
     Raises `FitError` for a cloud that is too short, nothing like a tunnel, or with a branch or a room. `origin` is that
     of the points' frame in the input's, m, so that an error can name the place.
     """
-    axis = _smooth_axis(surface_skeleton(points, config.min_length, origin), config.cutoff)
-    stride = max(1, int(len(points) / (axis.length * _POINTS_PER_METRE)))
-    sample = points[::stride].astype(np.float64)
-    for _ in range(_PASSES):
-        axis = _smooth_axis(_section_middles(sample, axis), config.cutoff)
-    if axis.length < config.min_length:
-        raise FitError(f"the tunnel is {axis.length:.1f} m long; at least {config.min_length:g} m are needed")
-    across = 2 * float(np.median(np.hypot(*axis.local(sample[:: max(1, len(sample) // 20_000)])[1:])))
+    axis = smooth_axis(surface_skeleton(points, config.min_length, origin), config.cutoff)
+    axis = centre_axis(points, axis, config)
+    across = 2 * float(np.median(np.hypot(*axis.local(points[:: max(1, len(points) // 20_000)])[1:])))
     if axis.length < _ELONGATION * across:
         raise FitError(f"{axis.length:.0f} m long and {across:.0f} m across: a room, not a tunnel")
     require_no_fold(axis, across, origin)
     return axis
 
 
-def _section_middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]:
-    """Middle of each section seen well enough, one a metre."""
+def centre_axis(
+    points: Float[np.ndarray, "n 3"],
+    axis: Axis,
+    config: CentrelineConfig,
+    usual: Callable[[Axis], Float[np.ndarray, "k rays"]] | None = None,
+) -> Axis:
+    """Pulls an axis to the middle of the sections a few times; see `section_middles`.
+
+    Raises `FitError` where it ends up too short.
+    """
+    stride = max(1, int(len(points) / (axis.length * _POINTS_PER_METRE)))
+    sample = points[::stride].astype(np.float64)
+    for _ in range(_PASSES):
+        axis = smooth_axis(section_middles(sample, axis, usual), config.cutoff)
+    if axis.length < config.min_length:
+        raise FitError(f"the tunnel is {axis.length:.1f} m long; at least {config.min_length:g} m are needed")
+    return axis
+
+
+def section_middles(
+    points: np.ndarray, axis: Axis, usual: Callable[[Axis], Float[np.ndarray, "k rays"]] | None = None
+) -> Float[np.ndarray, "k 3"]:
+    """Return the middle of each section seen well enough, one a metre.
+
+    `usual` returns the usual radii at stations of an axis. They stand in for directions in which nothing was seen, or
+    something 30 cm off: a niche, a lay-by, a flare. Without it, an unseen direction is interpolated from its neighbours
+    in the section, and a section that is hardly seen is left out.
+    """
     extended = axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, _SPACING))
     station, lateral, upward = extended.local(points)
     index = np.rint((station - extended.station[0]) / _SPACING).astype(np.intp)
@@ -155,9 +178,15 @@ def _section_middles(points: np.ndarray, axis: Axis) -> Float[np.ndarray, "k 3"]
     bounds = np.searchsorted(index[order], np.arange(len(extended.station) + 1))
     middles = []
     full = _FULL_SHARE * np.median(np.diff(bounds)[np.diff(bounds) > 0])
-    for k in np.flatnonzero(np.diff(bounds) >= max(full, 1)):
+    enough = np.flatnonzero(np.diff(bounds) >= max(full, 1))
+    if usual is not None:
+        stand_in = usual(extended)
+        enough = np.arange(enough[0], enough[-1] + 1)
+    for k in enough:
         rows = order[bounds[k] : bounds[k + 1]]
         medians = _bin_medians(bins[rows], radius[rows])
+        if usual is not None:
+            medians = np.where(np.abs(medians - stand_in[k]) < _UNUSUAL, medians, stand_in[k])
         seen = np.isfinite(medians)
         if seen.mean() < _MIN_SEEN:
             continue
@@ -185,7 +214,7 @@ def _bin_medians(bins: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, " m"
     return np.where(count > 0, radius[order][middle], np.nan)
 
 
-def _smooth_axis(centres: np.ndarray, cutoff: float) -> Axis:
+def smooth_axis(centres: np.ndarray, cutoff: float) -> Axis:
     """Return a least-squares cubic spline by chord length with two knots per `cutoff`.
 
     A smoothing spline would straighten its ends, by 2 cm on an arc of 150 m; this one has no end condition.

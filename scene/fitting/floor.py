@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d, median_filter
+from scipy.ndimage import binary_opening, gaussian_filter1d, median_filter
 
+from scene.bore import Axis
 from scene.fitting.unroll import Grid
 
 # What lies a little above the line may be track or clutter; what lies below is noise.
@@ -43,6 +44,72 @@ def fit_floor_line(lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, "
     return line if explained.mean() > _FLAT_SHARE and support > 0.3 else None
 
 
+_STRIPS = 24  # that the width between the walls is divided into
+_OUT = 0.97  # of the half width
+_LAYER = 0.02  # m
+_SLOPES = np.linspace(-0.06, 0.06, 7)
+_LEAST_SHARE = 0.1  # of the returns of a strip of floor, in a strip that shows it
+_LEAST_EXTENT, _MOST_DEEPER = 0.15, 0.2  # of the strips, shown on the floor and below it: a drain is narrower
+_BESIDE_PLATFORM, _FLOOR_BESIDE = 0.6, 0.35  # of the strips, near the floor and on it, where a platform stands on it
+_LOWER = 0.05  # m
+_NEAR = 0.04  # m
+
+
+def find_lower_line(
+    lateral: Float[np.ndarray, " n"], upward: Float[np.ndarray, " n"], above: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Finds the lowest flat surface of one section, under a line that `fit_floor_line` found, if it found one.
+
+    Sleepers and ballast may hide most of a floor, and ghosts of people return more than it does. What tells it is how
+    much of the width it is seen on, whatever the number of returns, with nothing flat below. Returns `(a, b)` as
+    `fit_floor_line`; `None` where there is no such surface.
+    """
+    half_width = np.percentile(np.abs(lateral), 95) if len(lateral) >= _MIN_POINTS else 0.0
+    low = (upward < 0) & (np.abs(lateral) < _OUT * half_width)
+    y, z = lateral[low], upward[low]
+    if len(y) < _MIN_POINTS:
+        return None
+    strip = np.minimum(((y / (_OUT * half_width) + 1) * _STRIPS / 2).astype(np.intp), _STRIPS - 1)
+    best, extent_found, bottoms = (0.0, 0.0, 0.0), 0.0, np.empty(0)
+    for slope in _SLOPES:
+        layer = np.floor((z - slope * y) / _LAYER).astype(np.intp)
+        first = layer.min()
+        layers = max(int(layer.max() - first) + 1, 8)
+        count = np.bincount(strip * layers + layer - first, minlength=_STRIPS * layers).reshape(_STRIPS, layers)
+        thick = count.copy()  # three layers
+        thick[:, 1:] += count[:, :-1]
+        thick[:, :-1] += count[:, 1:]
+        shown = thick >= max(2.0, _LEAST_SHARE * float(np.median(thick.max(axis=1))))
+        bottom = np.where(shown.any(axis=1), np.argmax(shown, axis=1), layers)
+        lowest = np.bincount(bottom, minlength=layers + 1)[:layers] / _STRIPS
+        extent = np.convolve(lowest, np.ones(3), mode="same")
+        total = np.concatenate([np.zeros(3), np.cumsum(lowest), np.full(4, lowest.sum())])
+        deeper, close = total[:layers], total[7:] - total[4:-3]  # more than 5 cm below; 3 to 9 cm above
+        worth = extent - 3 * deeper - close - abs(slope)
+        worth[(extent < _LEAST_EXTENT) | (deeper > _MOST_DEEPER)] = 0.0
+        found = int(np.argmax(worth))
+        if worth[found] > best[0]:
+            best = (float(worth[found]), (first + found + 1.5) * _LAYER, float(slope))
+            extent_found, bottoms = float(extent[found]), np.where(bottom < layers, (bottom - found) * _LAYER, np.inf)
+    if not best[0]:
+        return None
+    line, slope = best[1:], 0.0 if above is None else above[1]
+    if above is not None and line[0] > above[0] - _LOWER:
+        return None
+    for _ in range(3):
+        keep = np.abs(z - line[0] - line[1] * y) < _NEAR
+        if keep.sum() < _MIN_POINTS // 2:
+            return None
+        if np.ptp(y[keep]) > half_width:
+            line = _fit_through(y[keep], z[keep])
+        else:  # seen in the middle alone, as between two tracks
+            line = (float(np.mean(z[keep] - slope * y[keep])), slope)
+    inner = bottoms[np.abs(np.arange(_STRIPS) - (_STRIPS - 1) / 2) < _INNER * _STRIPS / 2]
+    clutter = float(((inner > -0.06) & (inner < _CLUTTER)).mean())
+    flat = clutter > _FLAT_SHARE or (clutter > _BESIDE_PLATFORM and extent_found > _FLOOR_BESIDE)
+    return line if flat and (above is None or line[0] < above[0] - _LOWER) else None
+
+
 def _fit_through(y: np.ndarray, z: np.ndarray) -> tuple[float, float]:
     slope, height = np.polyfit(y, z, 1)
     return float(height), float(slope)
@@ -69,7 +136,7 @@ _NEWTON, _CONVERGED = 6, 0.01
 class Floors:
     """Floor lines of sections."""
 
-    station: Float[np.ndarray, " k"]  # m
+    station: Float[np.ndarray, " k"]  # m; a section in which no floor is seen is left out
     height: Float[np.ndarray, " k"]  # On the axis, m
     slope: Float[np.ndarray, " k"]  # Rise for each metre to the left
 
@@ -82,28 +149,86 @@ class Floors:
 
 
 def find_floors(
-    station: np.ndarray, lateral: np.ndarray, upward: np.ndarray, start: float, end: float
+    station: np.ndarray, lateral: np.ndarray, upward: np.ndarray, start: float, end: float, axis: Axis | None = None
 ) -> Floors | None:
-    """Return a floor line every half metre, smoothed along; `None` where fewer than half of the sections have one."""
+    """Return a floor line every half metre, smoothed along; `None` where fewer than half of the sections have one.
+
+    A section may show several surfaces: the floor, sleepers on it, a vehicle's roof. Those are taken that run on
+    evenly from section to section, the lower before the higher. Where none is seen the floor runs on straight, even
+    where the axis does not: what hides a floor may move the axis, too.
+    """
     count = max(int((end - start) / _FLOOR_STEP), 1)
     middle = start + (np.arange(count) + 0.5) * (end - start) / count
     order = np.argsort(station, kind="stable")
     bounds = np.searchsorted(station[order], start + np.arange(count + 1) * (end - start) / count)
-    lines = []
+    lines: list[list[tuple[float, float]]] = []
     for k in range(count):
         rows = order[bounds[k] : bounds[k + 1]]
         rows = rows[:: max(1, len(rows) // 4000)]
-        line = fit_floor_line(lateral[rows], upward[rows])
-        if line is not None:
-            lines.append((middle[k], *line))
-    if len(lines) < 0.5 * count:
+        upper = fit_floor_line(lateral[rows], upward[rows])
+        lower = find_lower_line(lateral[rows], upward[rows], upper)
+        lines.append([line for line in (lower, upper) if line is not None])
+    sway = np.zeros(count) if axis is None else _sway(np.interp(middle, axis.station, axis.position[:, 2]), middle)
+    chosen = _even_run([[line[0] + sway[k] for line in section] for k, section in enumerate(lines)])
+    if len(chosen) < 0.5 * count:
         return None
-    at, height, slope = np.asarray(lines).T
+    seen = np.array([k for k, _ in chosen])
+    at = middle[seen]
+    height, slope = np.array([lines[k][which] for k, which in chosen]).T
+    if np.diff(seen).max(initial=1) > _GAP:
+        height = np.interp(middle, at, height + sway[seen]) - sway
+        slope, at = np.interp(middle, at, slope), middle
     sigma = _FLOOR_SIGMA / (end - start) * count
     height, slope = (
         gaussian_filter1d(median_filter(v, 3, mode="nearest"), sigma, mode="nearest") for v in (height, slope)
     )
     return Floors(at, height, slope)
+
+
+_GAP = 4  # sections without a floor beyond which it runs on by itself, not beside the axis
+_TREND = 12.0  # m
+
+
+def _sway(height: np.ndarray, station: np.ndarray) -> np.ndarray:
+    """Height of the axis above its own smooth course, m: what hides a floor from view moves it."""
+    trend = np.polynomial.Polynomial.fit(station, height, 1)(station) if len(station) > 1 else height
+    rest = height - trend
+    sigma = _TREND / _FLOOR_STEP
+    return rest - gaussian_filter1d(median_filter(rest, round(4 * sigma) + 1, mode="nearest"), sigma, mode="nearest")
+
+
+_SKIP, _HIGHER = 0.6, 0.5  # cost of a section left out, of a surface above another one
+_STEADY, _JUMP = 0.03, 0.02  # m that two neighbours may differ by; m beyond it that cost 1
+_LONGEST_SKIP = 80  # sections
+
+
+def _even_run(heights: list[list[float]]) -> list[tuple[int, int]]:
+    """Choose at most one of the heights of each section, lowest first, m, so that they run on evenly.
+
+    Returns section and index of each that was chosen, by the shortest path through all of them.
+    """
+    nodes = [(k, which, height) for k, section in enumerate(heights) for which, height in enumerate(section)]
+    if not nodes:
+        return []
+    section, which, height = (np.array(column) for column in zip(*nodes, strict=True))
+    cost, before = np.empty(len(nodes)), np.full(len(nodes), -1)
+    first = np.searchsorted(section, section - _LONGEST_SKIP)
+    for i in range(len(nodes)):
+        j = np.arange(first[i], np.searchsorted(section, section[i]))
+        cost[i] = _SKIP * section[i]
+        if len(j):
+            jump = np.maximum(np.abs(height[i] - height[j]) - _STEADY, 0.0) / _JUMP
+            path = cost[j] + jump + _SKIP * (section[i] - section[j] - 1)
+            k = int(np.argmin(path))
+            if path[k] < cost[i]:
+                cost[i], before[i] = path[k], j[k]
+        cost[i] += _HIGHER * which[i]
+    i = int(np.argmin(cost + _SKIP * (len(heights) - 1 - section)))
+    chosen = []
+    while i >= 0:
+        chosen.append((int(section[i]), int(which[i])))
+        i = int(before[i])
+    return chosen[::-1]
 
 
 def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarray) -> np.ndarray:
@@ -117,8 +242,8 @@ def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarr
     slope = np.interp(grid.station, floors.station, floors.slope)[:, None]
     above = upward - (height + slope * lateral)
     on_floor = floors.radius(grid)
-    # Between the feet the floor itself will do, whatever sleepers and rails stand on it.
-    under = (np.abs(np.cos(grid.angle)) < _BETWEEN) & (np.sin(grid.angle) < 0) & (above < _FOOT)
+    # Between the feet the floor itself will do, whatever stands on it.
+    under = (np.abs(np.cos(grid.angle)) < _BETWEEN) & (np.sin(grid.angle) < 0)
     result = np.where(under, 2 * wall, wall)
     for side in (1, -1):
         facing = side * np.cos(grid.angle) > _BETWEEN
@@ -133,8 +258,29 @@ def extend_to_floor(wall: np.ndarray, grid: Grid, floors: Floors, seen: np.ndarr
         foot = np.where(np.isnan(foot) & inside, 2 * wall, foot)
         climb = foot * np.sin(grid.angle) - (height + slope * foot * np.cos(grid.angle))
         low = facing & (np.sin(grid.angle) < 0) & (foot > 0) & (climb < _FOOT)
+        low &= ~_has_walkway(above, out, facing & (np.sin(grid.angle) < 0), grid)[:, None]
         result = np.where(low & known[:, None], foot, result)
     return result
+
+
+_WALKWAY = (0.08, 1.4)  # of its top above the floor, m
+_LEVEL = 0.35  # rise for each metre across
+_BROAD, _LONG = 0.3, 4.0  # m
+_AT_WALL = 0.25  # m
+
+
+def _has_walkway(above: np.ndarray, out: np.ndarray, facing: np.ndarray, grid: Grid) -> Bool[np.ndarray, " rows"]:
+    """Return the rows in which a level strip lies between floor and wall on one side, for some metres along."""
+    columns = np.flatnonzero(facing)
+    columns = columns[np.argsort(np.abs(grid.angle[columns] + np.pi / 2), kind="stable")]  # from below outwards
+    h, y = above[:, columns], out[:, columns]
+    rise, run = np.diff(h, axis=1), np.diff(y, axis=1)
+    level = (np.abs(rise) < _LEVEL * np.abs(run)) & (run > 0)
+    level &= (h[:, 1:] > _WALKWAY[0]) & (h[:, 1:] < _WALKWAY[1]) & (h[:, :-1] > _WALKWAY[0])
+    wall = np.where(h < _WALKWAY[1], y, 0.0).max(axis=1, initial=0.0)
+    reaches = (level & (y[:, 1:] > wall[:, None] - np.maximum(run, _AT_WALL))).any(axis=1)  # columns are half a metre
+    broad = np.where(level, run, 0.0).sum(axis=1) > _BROAD
+    return binary_opening(reaches & broad, np.ones(max(round(_LONG / grid.step), 1), bool))
 
 
 def _fit_parabolas(above: np.ndarray, out: np.ndarray, band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,6 +13,7 @@ from scipy.ndimage import maximum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
+from scene.fitting.evidence import more_than_chance, open_rims
 from scene.fitting.section import Sections
 from scene.fitting.unroll import Grid
 
@@ -125,6 +126,7 @@ _NOISE_SHARE = 0.25  # of the depth
 _SIDE = 0.5
 _RIB = 0.02  # least wall left between two pockets, m
 _OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
+_OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
@@ -132,7 +134,7 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     """Finds the pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints between them, m.
 
     Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and at a
-    pitch of rings are no pockets: both results are empty then.
+    pitch of rings, have no rims, or could be chance are no pockets: both results are empty then.
     """
     grid = sections.grid
     nothing = np.empty(0, POCKET), np.empty(0)
@@ -148,16 +150,19 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     slope = _slopes(sections, holes)
     length, width = _common_size(deficit, sections, holes, slope)
     depth = _common_depth(sections, holes, slope)
+    radius = float(np.median(sections.radius))
+    rim = open_rims(deficit, grid, row, column, (length, width), radius)
     inside = (station > grid.start + length) & (station < grid.start + grid.rows * grid.step - length)
-    if inside.sum() < _MIN_POCKETS:
+    if np.median(rim) > _USUAL_RIM or (inside & (rim < _OPEN_RIM)).sum() < _MIN_POCKETS:
         return nothing
+    inside &= rim < _OPEN_RIM
     pockets = np.zeros(int(inside.sum()), POCKET)
     pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
-    pockets = pockets[_drop_overlaps(pockets, float(np.median(sections.radius)))]
+    pockets = pockets[_drop_overlaps(pockets, radius)]
     joints = find_ring_joints(pockets["station"], grid.rows * grid.step)
-    return (pockets, joints) if len(joints) else nothing
+    return (pockets, joints) if more_than_chance(pockets, joints, _PITCHES, radius) else nothing
 
 
 def _drop_overlaps(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import binary_opening, uniform_filter1d
 
 from scene.bore import Axis
 from scene.cloud import Cloud
@@ -89,11 +89,17 @@ def _share_seen(seen: np.ndarray, step: float) -> float:
 
 
 _COARSE_ANGLES = 120
+_THIN_STEPS = (0.5, 1.0)  # m; rows of the first wall where a cloud is too thin for shorter ones
 _FINE = (0.05, N_ANGLES)
 _MEDIAN_WINDOW = (1.25, 5)  # m along, 3° columns around: a pocket fills less than a tenth of it
 _SIGMA = (0.15, 1.5)  # m along, columns around
 _NEAR_WALL = 0.05  # cells further than this from the first wall are pockets or clutter
 _ON_WALL = 0.035
+_LARGE_HOLE = 4.0  # cells
+_ALONG = 1.25  # m before and behind a cell that tell an edge from a pocket
+_MOSTLY, _MIN_CELLS = 0.7, 6  # share of the cells seen, and how many
+_WIDE = 6  # columns
+_STEEP, _EDGE = 0.25, 1.0  # of the radius, within 4 columns; m that the first wall may be off there
 _DEEPEST = 0.40  # further out is no recess of a lining, m
 _SEEN_WEIGHT = 0.02  # returns a cell: with fewer around, the first wall stands
 _MIN_COVERAGE = 0.5
@@ -145,9 +151,12 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     points = _Points(station, np.arctan2(upward, lateral), np.hypot(lateral, upward), cloud.weights)
     start, end = visible_span(station, points.angle, axis)
     step = profile_spacing(station, start, end)
-    floors = find_floors(station, lateral, upward, start, end)
+    floors = find_floors(station, lateral, upward, start, end, axis)
     fine = Grid.over(start, end, *_FINE)
-    wall = _first_wall(points, Grid.over(start, end, step, _COARSE_ANGLES), fine, floors)
+    steps = [step, *(longer for longer in _THIN_STEPS if longer > step)]
+    grids = [Grid.over(start, end, length, _COARSE_ANGLES) for length in steps]
+    coarse = next((grid for grid in grids if _share_of_cells(points, grid) >= _MIN_COVERAGE), grids[0])
+    wall = _first_wall(points, coarse, fine, floors)
     _require_open_middle(points, fine, wall)
     if step > DENSE_STEP:
         kriged = krige_profiles(points.station, points.angle, points.radius, fine)
@@ -161,10 +170,16 @@ def fit_sections(cloud: Cloud, axis: Axis) -> Sections:
     )
 
 
+def _share_of_cells(points: _Points, grid: Grid) -> float:
+    cell = grid.cell(points.station, points.angle)
+    return float((np.bincount(cell[cell >= 0], minlength=grid.rows * grid.columns) > 0).mean())
+
+
 def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None) -> np.ndarray:
     wall = unroll.cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
+    wall = unroll.fill_holes(wall, _LARGE_HOLE)
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
     along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
     wall = unroll.median_smooth(unroll.fill_nearest(wall), window)
@@ -187,6 +202,10 @@ def _follow_wall(
     """Return the wall at the half-metre scale, and the cells that it was fitted to."""
     cell, outward = points.outward_of(first, fine)
     residual, weight = unroll.cell_means(fine, cell, outward, points.weight)
+    corner = _cut_corners(first, residual, weight, fine)
+    if floors is not None:
+        corner[is_floor(first, fine, floors)] = 0.0
+    first, residual = first + corner, residual - corner
     inlier = (weight > 0) & (np.abs(residual) < _NEAR_WALL)
     weight = np.where(inlier, np.minimum(weight, 50.0), 0.0)
     correction, support = unroll.smooth_cells(residual, weight, (_SIGMA[0] / fine.step, _SIGMA[1]))
@@ -194,6 +213,32 @@ def _follow_wall(
     if floors is not None:
         correction[is_floor(first, fine, floors)] = 0.0
     return first + correction, inlier
+
+
+def _cut_corners(first: np.ndarray, residual: np.ndarray, weight: np.ndarray, fine: Grid) -> np.ndarray:
+    """Return how far the first wall cuts off edges that run along the bore, m.
+
+    There the returns of one direction lie to one side of it in most of the cells along 2.5 m, which those of pockets do
+    not. What is in front of it must be wider than rails and cables, but where the wall nearly follows the ray.
+    """
+    size = 2 * round(_ALONG / fine.step) + 1
+
+    def along(field: np.ndarray) -> np.ndarray:
+        return uniform_filter1d(field.astype(float), size, axis=0, mode="nearest")
+
+    steep = np.abs(np.roll(first, 2, axis=1) - np.roll(first, -2, axis=1)) > _STEEP * first
+    known = (weight > 0) & (np.abs(residual) < np.where(steep, _EDGE, _DEEPEST))
+    seen = along(known)
+    result = np.zeros_like(residual)
+    for side in (1, -1):
+        there = known & (side * residual > _ON_WALL)
+        share = along(there)
+        edge = (share > _MOSTLY * seen) & (seen * size >= _MIN_CELLS)
+        if side < 0:
+            wrapped = np.concatenate([edge, edge[:, :_WIDE]], axis=1)
+            edge &= steep | binary_opening(wrapped, np.ones((1, _WIDE), bool))[:, : fine.columns]
+        result[edge] = (along(np.where(there, residual, 0.0)) / np.maximum(share, 1e-9))[edge]
+    return result
 
 
 def _measure_wall(

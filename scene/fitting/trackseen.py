@@ -1,105 +1,28 @@
-"""Sleepers and rails where the cloud shows them: on the floor between the walls, above the ballast."""
+"""The tracks that a cloud shows: their rails, and the sleepers that stand out of floor or ballast."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.ndimage import gaussian_filter1d
 
 from scene.bore import Bore
 from scene.cloud import Cloud
-
-_RAIL_BAND = (0.60, 0.95)  # from the axis, m
-_RAIL_LOW, _RAIL_HIGH = 0.12, 0.40  # above the bed, m
-_HEAD_LAYER = 0.02  # above and below the most frequent height, m
-_FACE = (0.012, 0.045)  # below the top of the head, m; gauge is measured 14 to 16 mm below it
-_FACE_BAND = (0.66, 0.80)  # from the axis, m
-_FACE_BLUR = 0.003  # m
-_SWAY_BLOCK = 1.0  # m
-_MIN_RAIL = 0.5  # share of the metres along which a rail must be seen
-_MIN_RETURNS = 10  # returns a metre
-
-
-@dataclass(frozen=True)
-class SeenRails:
-    """Both rails."""
-
-    gauge: float  # Distance of the heads' inner faces, 12 to 45 mm below their tops, m
-    centre: float  # Distance of the track to the left of the axis, m
-    top: float  # Height of the heads' tops above the bed, m
-
-
-def find_rails(station: np.ndarray, lateral: np.ndarray, height: np.ndarray) -> SeenRails | None:
-    """Finds both rails among points by station, offset to the left of the axis and height above the bed, m.
-
-    `None` where they are seen along too little of the bore.
-    """
-    heads = [_find_head(station, side * lateral, height) for side in (1, -1)]
-    left, right = heads
-    if left is None or right is None:
-        return None
-    sway = _sway(station, lateral, left, right)
-    tops = [float(np.median(height[head])) for head in heads]
-    faces = [_inner_face(side * (lateral - sway), height - top) for side, top in zip((1, -1), tops, strict=True)]
-    return SeenRails(faces[0] + faces[1], (faces[0] - faces[1]) / 2, float(np.mean(tops)))
-
-
-def _find_head(station: np.ndarray, across: np.ndarray, height: np.ndarray) -> Bool[np.ndarray, " n"] | None:
-    """Returns on the top of one rail; `None` where it is seen along too little of the bore."""
-    band = (across > _RAIL_BAND[0]) & (across < _RAIL_BAND[1]) & (height > _RAIL_LOW) & (height < _RAIL_HIGH)
-    if len(np.unique(station[band].astype(int))) < _MIN_RAIL * max(np.ptp(station), 1.0):
-        return None
-    return band & (np.abs(height - _most_frequent(height[band])) < _HEAD_LAYER)
-
-
-def _sway(station: np.ndarray, lateral: np.ndarray, left: np.ndarray, right: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Distance of the track to the left of its mean place under the axis, metre by metre, m.
-
-    Both rails sway together: the axis follows the walls, and poses are a centimetre off here and there. Unless it is
-    taken out it blurs the edges of the heads.
-    """
-    block = (station / _SWAY_BLOCK).astype(np.intp)
-    blocks = int(block.max()) + 1
-    middles = np.full((2, blocks), np.nan)
-    for k, head in enumerate((left, right)):
-        order = np.argsort(block[head], kind="stable")
-        at, bounds = lateral[head][order], np.searchsorted(block[head][order], np.arange(blocks + 1))
-        for i in range(blocks):
-            if bounds[i + 1] - bounds[i] >= _MIN_RETURNS:
-                middles[k, i] = np.median(at[bounds[i] : bounds[i + 1]])
-    middle = middles.mean(axis=0)
-    known = np.isfinite(middle)
-    if known.sum() < 2:
-        return np.zeros(len(station))
-    at = (np.flatnonzero(known) + 0.5) * _SWAY_BLOCK
-    return np.interp(station, at, middle[known] - np.median(middle[known]))
-
-
-def _most_frequent(height: np.ndarray) -> float:
-    count, edges = np.histogram(height, np.arange(_RAIL_LOW, _RAIL_HIGH, 0.004))
-    return float(edges[np.convolve(count, np.ones(3), mode="same").argmax()] + 0.002)
-
-
-def _inner_face(across: np.ndarray, below: np.ndarray) -> float:
-    """Lateral distance where most returns from the side of the head lie, m.
-
-    The side, not the edge of the top: poses that are a little off blur both, and a blurred edge moves outwards, while a
-    blurred face stays where it is.
-    """
-    step = 0.001
-    side = (below < -_FACE[0]) & (below > -_FACE[1])
-    count, edges = np.histogram(across[side], np.arange(*_FACE_BAND, step))
-    smooth = gaussian_filter1d(count.astype(float), _FACE_BLUR / step)
-    k = int(np.clip(smooth.argmax(), 1, len(smooth) - 2))
-    bend = 2 * (smooth[k - 1] - 2 * smooth[k] + smooth[k + 1])
-    return float(edges[k] + step / 2 + (step * (smooth[k - 1] - smooth[k + 1]) / bend if bend else 0.0))
-
+from scene.fitting.rails import SeenRails, find_rails
 
 _BIN = 0.01  # m along
 _SMOOTH = 0.09  # m, box; well below a sleeper's width
 _BETWEEN_RAILS = 0.58  # m each side of the axis
 _STEP = 0.03  # a return this far above the bed is on a sleeper, m
 _HIGHEST = 0.15
+_LOW_TOP = 0.10  # tops up to here stand out of ballast that lies even, m
+_TOPMOST = 0.45  # above the floor, m
+_RAIL_LEAST = 0.09  # from the top of a sleeper to that of the rail, m
+_LEVEL_BIN = 0.01
+_LAYER_SHARE = 0.3  # of the returns of the fullest layer
+_WALL = 0.25  # m
+_ASIDE = 0.05  # m
+_FOOT = 0.15  # from the middle of a rail, m
+_MISSING = 1.65  # times the usual distance
 _WIDTHS = (0.10, 0.40)
 _TOP_LAYER = 0.012
 _MIN_TOP = 10
@@ -117,39 +40,84 @@ class SeenSleepers:
 
 
 @dataclass(frozen=True)
-class SeenTrack:
-    """Track that the cloud shows; `None` for what it does not."""
+class SeenLine:
+    """One track that the cloud shows; `None` for what it does not show of it."""
 
     sleepers: SeenSleepers | None
     rails: SeenRails | None
+    bed: float = 0.0  # Median height of what is seen between the rails, above the floor, m
 
 
-def find_track(cloud: Cloud, bore: Bore) -> SeenTrack:
-    """Finds sleepers and rails on the flat floor of a bore; a track on a round invert is not looked for."""
-    station, lateral, height = _above_floor(cloud, bore)
-    return SeenTrack(_find_sleepers(station, lateral, height, bore.length), find_rails(station, lateral, height))
+@dataclass(frozen=True)
+class SeenTrack:
+    """All tracks that a survey shows."""
+
+    lines: tuple[SeenLine, ...] = ()  # From the right to the left
+    sought: bool = False  # False where the survey could not show any, as rings of points on the wall
 
 
-def _above_floor(cloud: Cloud, bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Station, lateral offset and height above the floor of the points low in the bore, m."""
+def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
+    """Finds the tracks in a bore by their rails; where there is no rail, one on its axis by sleepers.
+
+    On a round invert nothing is looked for but rails.
+    """
+    station, lateral, upward, height = _above_floor(cloud, bore)
+    lines = []
+    for rails in find_rails(station, lateral, height, upward):
+        # Sleepers need no better than 5 cm, and so depend on little else.
+        across = lateral - np.round(rails.offset_at(station) / _ASIDE) * _ASIDE
+        inside = np.abs(across) < min(_BETWEEN_RAILS, rails.apart / 2 - _FOOT)
+        between = height[inside]
+        sleepers = _find_sleepers(station[inside], between, bore.length, rails.top) if flat_floor else None
+        lines.append(SeenLine(sleepers, rails, float(np.median(between)) if len(between) else 0.0))
+    if not lines and flat_floor:
+        inside = np.abs(lateral) < _BETWEEN_RAILS
+        sleepers = _find_sleepers(station[inside], height[inside], bore.length, None)
+        lines = [SeenLine(sleepers, None)] if sleepers is not None else []
+    return SeenTrack(tuple(lines), sought=True)
+
+
+def _above_floor(cloud: Cloud, bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Station, lateral offset, and height above the axis and the floor of the points low in the bore, m."""
     station, lateral, upward = bore.axis.local(cloud.points.astype(np.float64))
-    low = (upward < 0) & (np.abs(lateral) < 1.5) & (station > 0) & (station < bore.length)
+    widest = float(np.median(bore.width)) / 2 - _WALL
+    low = (upward < 0) & (np.abs(lateral) < widest) & (station > 0) & (station < bore.length)
     station, lateral, upward = station[low], lateral[low], upward[low]
     angle, radius = np.arctan2(upward, lateral), np.hypot(lateral, upward)
     row = np.clip(np.rint(station / (bore.station[1] - bore.station[0])).astype(np.intp), 0, len(bore.station) - 1)
     column = np.floor((angle + np.pi) / (2 * np.pi) * len(bore.angle)).astype(np.intp) % len(bore.angle)
     lean = angle - bore.angle[column]
     floor = bore.radius[row, column] * np.sin(bore.angle[column]) / np.sin(bore.angle[column] + lean)
-    return station, lateral, (floor - radius) * -np.sin(angle)
+    return station, lateral, upward, (floor - radius) * -np.sin(angle)
 
 
-def _find_sleepers(station: np.ndarray, lateral: np.ndarray, height: np.ndarray, length: float) -> SeenSleepers | None:
-    near = (np.abs(lateral) < _BETWEEN_RAILS) & (height > -_HIGHEST) & (height < _HIGHEST)
+def _top_level(height: np.ndarray, rail_top: float | None) -> float:
+    """Height of the uppermost layer between the rails that many returns lie in, m; 0 without one."""
+    highest = min(_TOPMOST, np.inf if rail_top is None else rail_top - _RAIL_LEAST)
+    count, edges = np.histogram(height, np.arange(_STEP, highest + _LEVEL_BIN, _LEVEL_BIN))
+    if not count.sum():
+        return 0.0
+    near = np.convolve(count, np.ones(2), mode="same")
+    layers = np.flatnonzero(near >= _LAYER_SHARE * near.max())
+    top = int(layers[-1])
+    top -= int(np.argmax(near[max(top - 2, 0) : top + 1][::-1]))
+    return float(edges[top])
+
+
+def _find_sleepers(
+    station: np.ndarray, height: np.ndarray, length: float, rail_top: float | None
+) -> SeenSleepers | None:
+    """Finds sleepers among points between the rails, by station and height above the floor, m."""
+    level = _top_level(height, rail_top)
+    step, highest = (level - _STEP, level + _HIGHEST - _LOW_TOP) if level > _LOW_TOP else (_STEP, _HIGHEST)
+    near = (height > -_HIGHEST) & (height < highest)
+    if not near.any():
+        return None
     bins = max(int(np.ceil(length / _BIN)), 1)
     index = np.minimum((station[near] / _BIN).astype(np.intp), bins - 1)
     box = np.ones(round(_SMOOTH / _BIN))
     total = np.convolve(np.bincount(index, minlength=bins), box, mode="same")
-    raised = np.convolve(np.bincount(index[height[near] > _STEP], minlength=bins), box, mode="same")
+    raised = np.convolve(np.bincount(index[height[near] > step], minlength=bins), box, mode="same")
     share = np.divide(raised, total, out=np.zeros(bins), where=total > 2)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (share > 0.5).astype(int), [0]])))
     first, last = edges[::2], edges[1::2]
@@ -157,15 +125,21 @@ def _find_sleepers(station: np.ndarray, lateral: np.ndarray, height: np.ndarray,
     if wide.sum() < 3:
         return None
     centre = (first[wide] + last[wide]) / 2 * _BIN
-    spacing = float(np.median(np.diff(centre)))
+    spacing = _usual_spacing(centre)
     if not _SPACINGS[0] < spacing < _SPACINGS[1] or wide.sum() < _MIN_SEEN * length / spacing:
         return None
     owner = _nearest_sleeper(centre, station[near])
-    on_top = (np.abs(station[near] - centre[owner]) < 0.06) & (height[near] > _STEP)
+    on_top = (np.abs(station[near] - centre[owner]) < 0.06) & (height[near] > step)
     protrusion = float(np.median(height[near][on_top]))
     middles = _sleeper_middles(centre, station[near], height[near], protrusion)
     place, measured = _complete_sleepers(middles, spacing, length)
     return SeenSleepers(place, measured, protrusion)
+
+
+def _usual_spacing(centre: np.ndarray) -> float:
+    """Return the mean distance of neighbours, m; those with a sleeper between them that was not seen do not count."""
+    apart = np.diff(centre)
+    return float(np.mean(apart[apart < _MISSING * np.median(apart)]))
 
 
 def _nearest_sleeper(centre: np.ndarray, station: np.ndarray) -> np.ndarray:
@@ -192,7 +166,7 @@ def _complete_sleepers(centre: np.ndarray, spacing: float, length: float) -> tup
     places, measured = [float(centre[0])], [True]
     for following in centre[1:]:
         gap = following - places[-1]
-        missing = round(gap / spacing) - 1
+        missing = round(gap / spacing) - 1 if gap > _MISSING * spacing else 0
         if gap < 0.6 * spacing:
             continue
         for k in range(missing):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, median_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, label, median_filter
 from scipy.special import erf
 
 _RADIUS_STEP = 1.0 / (1 << 14)  # 0.06 mm, so that a cell and a radius fit one sortable word
@@ -81,6 +81,30 @@ def fill_nearest(field: Float[np.ndarray, "rows cols"]) -> Float[np.ndarray, "ro
     wrapped = np.concatenate([field, field, field], axis=1)
     nearest = distance_transform_edt(np.isnan(wrapped), return_distances=False, return_indices=True)
     return wrapped[tuple(nearest)][:, columns : 2 * columns]
+
+
+_EVEN = 9  # cells along the bore
+
+
+def fill_holes(field: Float[np.ndarray, "rows cols"], reach: float) -> Float[np.ndarray, "rows cols"]:
+    """Fills holes of NaN that are deeper than `reach` cells from what was seen before and behind, linearly.
+
+    A wall goes on along the bore; what is nearest to the middle of a large hole may be floor or crown. A direction that
+    was seen nowhere stays NaN, and so do small holes.
+    """
+    unknown = np.isnan(field)
+    depth = distance_transform_edt(unknown)
+    patch, count = label(unknown)
+    large = np.zeros(count + 1, bool)
+    large[np.unique(patch[unknown & (depth > reach)])] = True
+    hole = large[patch] & unknown
+    rows, result = np.arange(len(field)), field.copy()
+    for column in np.flatnonzero(hole.any(axis=0) & ~unknown.all(axis=0)):
+        seen = ~unknown[:, column]
+        at = hole[:, column]
+        even = median_filter(field[seen, column], _EVEN, mode="nearest")  # one cell at the rim may be off
+        result[at, column] = np.interp(rows[at], rows[seen], even)
+    return result
 
 
 def median_smooth(field: Float[np.ndarray, "rows cols"], window: tuple[int, int]) -> Float[np.ndarray, "rows cols"]:

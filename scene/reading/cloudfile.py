@@ -9,10 +9,12 @@ import numpy as np
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import RecordingError
 from scene.progress import Stage
-from scene.reading.formats import ReadingConfig, detect
-from scene.reading.source import CloudSource, choose_frame, refuse_damage
+from scene.reading.formats import Format, ReadingConfig, detect
+from scene.reading.source import CloudSource, choose_frame, needs_local_points, refuse_damage
+from scene.reading.tables import parse_columns
 from scene.resume import Partial
 
+_TABLES = ("table", "parquet")
 _MOST_OUTSIDE = 0.5  # share of the points that may lie too far from the first to be thinned
 
 
@@ -37,9 +39,11 @@ def read_cloud(
     if (known := partial.load("cloud")) is not None:
         thinned, (read, skip) = VoxelMean.restored(voxel, known), (int(n) for n in known["read"])
     with refuse_damage(path, f"a readable {detected.format.label} cloud", RecordingError):
-        source: CloudSource = detected.format.open(path)
+        source: CloudSource = _open_cloud(path, detected.format, config.columns)
+        local = next(source.chunks(), None) if config.unit is None and needs_local_points(source) else None
+        whole = source.sample if len(source.sample) or local is None else local
         try:
-            frame = choose_frame(source.sample, source.unit, config.unit, config.axes)
+            frame = choose_frame(whole, source.unit, config.unit, config.axes, local)
         except ValueError as error:
             raise RecordingError(f"{path}: {error}") from error
         if stage is not None:
@@ -65,3 +69,15 @@ def read_cloud(
         )
     facts = {"kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
     return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
+
+
+def _open_cloud(path: Path, row: Format, columns: str | None) -> CloudSource:
+    """Opens a cloud; raises `RecordingError` for columns that are none, and for a format that has no columns."""
+    if columns is None:
+        return row.open(path)
+    if row.name not in _TABLES:
+        raise RecordingError(f"{path}: --columns goes with a table, but this is {row.label}")
+    try:
+        return row.open(path, parse_columns(columns))
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error

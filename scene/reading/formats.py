@@ -30,10 +30,14 @@ class ReadingConfig:
     topic: Annotated[str | None, _FLAG] = None  # LiDAR topic of a bag; found by its type where not given.
     # Format of the input: bag, rosbag2, mcap, db3, scans, ply, pcd, las, e57, table, parquet, rings.
     format: Annotated[str | None, _FLAG] = None
-    # Unit of a registered cloud or a ring survey: m, mm, ft or us-ft.
+    # Unit of a registered cloud or a ring survey: m, cm, mm, ft or us-ft.
     unit: Annotated[str | None, _FLAG] = None
     # Axes of a registered cloud that point east, north and up, such as xyz, xzy or -yxz.
     axes: Annotated[str | None, _FLAG] = None
+    # Order of the quaternions of a trajectory: xyzw, as TUM has it, or wxyz; found by the scans where not given.
+    quaternion: Annotated[Literal["xyzw", "wxyz"] | None, _FLAG] = None
+    # Columns of a table or a ring survey by what they hold, as x=Rechtswert,y=Hochwert,z=Hoehe,ring=Ring,point=Punkt.
+    columns: Annotated[str | None, _FLAG] = None
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class Format:
     label: str  # Name for people
     kind: Kind  # `recording`, `cloud` or `rings`
     # Opens a file: a recording as `(path, topic) -> ScanSource`, a cloud as `path -> CloudSource`, rings as `(path,
-    # unit) -> RingSurvey`
+    # unit) -> RingSurvey`; tables and ring surveys take the user's columns as well
     open: Callable[..., Any]
     suffixes: tuple[str, ...] = ()  # Endings of file names, lower case
     magic: tuple[bytes, ...] = ()  # First bytes of a file, at most 64; any of them

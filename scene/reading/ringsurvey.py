@@ -8,7 +8,7 @@ rings is the design axis.
 import csv
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from scene.errors import RecordingError
 from scene.reading.source import UNIT_NAMES, UNITS, cause, refuse_damage
-from scene.reading.tables import find_xyz, plain_name
+from scene.reading.tables import find_column, find_xyz, is_map_name, plain_name
 
 TABLE_SUFFIXES = (".csv", ".txt", ".xlsx")
 _MOST_CELLS = 64
@@ -88,6 +88,10 @@ class RingSurvey:
     design: Float[np.ndarray, "d 4"] | None
     facts: dict[str, str]  # Detected facts, for people and the manifest
 
+    def reversed(self) -> "RingSurvey":
+        """Return the same survey with its rings in the opposite order."""
+        return replace(self, names=self.names[::-1], points=self.points[::-1], offsets=self.offsets[::-1])
+
 
 @dataclass(frozen=True)
 class _RingColumns:
@@ -111,8 +115,8 @@ def is_ring_survey(path: Path) -> bool:
         return False
 
 
-def read_ring_survey(path: Path, unit: str | None = None) -> RingSurvey:
-    """Reads a ring survey, CSV or XLSX; `unit`, a key of `UNITS`, overrides the header.
+def read_ring_survey(path: Path, unit: str | None = None, told: dict[str, str] | None = None) -> RingSurvey:
+    """Reads a ring survey, CSV or XLSX; `unit`, a key of `UNITS`, and the columns `told` override the header.
 
     In the layout with `POINT` this must be text, since `0.10` is not `0.1`. Raises `RecordingError`, which names the
     file and the line, or the sheet and row.
@@ -124,7 +128,7 @@ def read_ring_survey(path: Path, unit: str | None = None) -> RingSurvey:
     with refuse_damage(path, "a readable survey", RecordingError), open_sheets(path) as tables:
         for sheet in tables:
             headers.append(",".join(sheet.header))
-            if columns is None and (columns := _find_ring_columns(sheet.header)) is not None:
+            if columns is None and (columns := _find_ring_columns(sheet.header, told)) is not None:
                 _read_rings(path, sheet, columns, rings)
             elif design is None and (at := _find_design_columns(sheet.header)) is not None:
                 design = _read_design(path, sheet, at)
@@ -139,19 +143,26 @@ def read_ring_survey(path: Path, unit: str | None = None) -> RingSurvey:
     return RingSurvey(path, list(rings), [r[:, :3] for r in rows], [r[:, 3] for r in rows], design, facts)
 
 
-def _find_ring_columns(header: tuple[str, ...]) -> _RingColumns | None:
+_RING = ("ring no", "ring", "ring number", "ring nr", "ringnr", "anneau", "anillo", "anello")
+_POINT = ("point", "point no", "point number", "punkt", "punktnr", "punkt nr", "punto", "pt")
+_OFFSET = ("offset", "target offset", "prism offset")
+
+
+def _find_ring_columns(header: tuple[str, ...], told: dict[str, str] | None = None) -> _RingColumns | None:
     names = [plain_name(name)[0] for name in header]
-    columns = find_xyz(header)
-    if columns is None or "chainage" in names or "easting" not in names:
+    columns = find_xyz(header, told)
+    if columns is None or (not told and ("chainage" in names or not is_map_name(header[columns[0][0]]))):
         return None
 
-    def at(*options: str) -> int | None:
+    def at(key: str, options: tuple[str, ...]) -> int | None:
+        if told and key in told:
+            return find_column(header, told[key])
         return next((names.index(name) for name in options if name in names), None)
 
-    ring, point = at("ring no", "ring", "ring number"), at("point", "point no", "point number")
-    if point is None:
-        return None
-    return _RingColumns(*columns, point, ring, at("offset", "target offset", "prism offset"))
+    ring, point = at("ring", _RING), at("point", _POINT)
+    if point is None or (ring is None and not told and names[columns[0][0]] != "easting"):
+        return None  # a cloud with numbers of points
+    return _RingColumns(*columns, point, ring, at("offset", _OFFSET))
 
 
 def _find_design_columns(header: tuple[str, ...]) -> list[int] | None:

@@ -146,11 +146,14 @@ class Lines:
 
 
 # Metres of each. Source: NIST SP 811, B.6: the international foot, and the US survey foot of 1200/3937 m.
-UNITS = {"m": 1.0, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200 / 3937}
-UNIT_NAMES = "m, mm, ft or us-ft"
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048, "us-ft": 1200 / 3937}
+UNIT_NAMES = "m, cm, mm, ft or us-ft"
 _AXES = re.compile(r"(-?[xyz])(-?[xyz])(-?[xyz])")
 # The least extent of a tunnel's box is a height: at most some 100 m in m, at least some 1000 in mm.
 _MM_FROM = 500.0
+_NOT_SURELY_M = 50.0  # least extent from which the heights of columns are asked
+_CM_FROM, _MM_HEIGHT_FROM = 50.0, 1600.0  # heights of columns: tunnels are some 5 m high, 500 cm or 5000 mm
+_IN_COLUMN = 60  # points
 _LYING = 3.0  # a tunnel longer along "up" than this many times both other extents is not z up
 _LYING_LENGTH = 30.0  # m
 _Y_UP = "x-zy"
@@ -170,11 +173,57 @@ class Frame:
         return points[:, order] * (signs * UNITS[self.unit])
 
 
-def choose_frame(sample: np.ndarray, declared: str | None, unit: str | None, axes: str | None) -> Frame:
+def needs_local_points(source: CloudSource) -> bool:
+    """Return whether points that lie close together must be read before the unit of a cloud can be told."""
+    if source.unit not in (None, "m"):
+        return False
+    finite = source.sample[np.isfinite(source.sample).all(axis=1)]
+    return len(finite) < 2 or float(np.ptp(finite, axis=0).min()) > _NOT_SURELY_M
+
+
+def column_height(points: Float[np.ndarray, "n 3"]) -> float | None:
+    """Return the median height of narrow upright columns of points, as stored; `None` for too few points.
+
+    It is near the height of a tunnel whatever its length and grade.
+    """
+    if len(points) < 20 * _IN_COLUMN:
+        return None
+    plan = points[:, :2] - points[:, :2].min(axis=0)
+    size = float(plan.max())
+    for _ in range(16):
+        cell = np.floor(plan / max(size, 1e-9)).astype(np.int64)
+        key = cell[:, 0] * (1 << 31) + cell[:, 1]
+        order = np.lexsort((points[:, 2], key))
+        starts = np.flatnonzero(np.concatenate([[True], np.diff(key[order]) != 0]))
+        counts = np.diff(np.append(starts, len(key)))
+        if np.median(np.repeat(counts, counts)) <= _IN_COLUMN:
+            break
+        size /= 2
+    full = counts >= _IN_COLUMN // 3
+    if not full.any():
+        return None
+    low, high = (order[starts[full] + (share * (counts[full] - 1)).astype(np.intp)] for share in (0.05, 0.95))
+    return float(np.median(points[high, 2] - points[low, 2]))
+
+
+def _detect_unit(least: float, height: float | None) -> str:
+    """Return `m`, `cm` or `mm` by the least extent of a cloud and the height of its columns, as stored."""
+    if least <= (_MM_FROM if height is None else _NOT_SURELY_M):
+        return "m"
+    if height is None:
+        return "mm"
+    return "m" if height < _CM_FROM else "cm" if height < _MM_HEIGHT_FROM else "mm"
+
+
+def choose_frame(
+    sample: np.ndarray, declared: str | None, unit: str | None, axes: str | None, local: np.ndarray | None = None
+) -> Frame:
     """Return the frame of a cloud; flags (`unit`, `axes`) come before declarations, declarations before detection.
 
-    `sample` holds points from all over the cloud, as stored; few or none where the file declares the unit. Raises
-    `ValueError` for a flag that is no unit or no order of axes, and where the file declares another unit.
+    `sample` holds points from all over the cloud, as stored; few or none where the file declares the unit. `local`
+    holds points that lie close together, by which cm are told from mm; a declaration of metres that would make a
+    tunnel over 500 m high and wide is not believed. Raises `ValueError` for a flag that is no unit or no order of axes,
+    and where the file declares another unit.
     """
     if unit is not None and unit not in UNITS:
         raise ValueError(f"unit {unit!r} is none of {UNIT_NAMES}")
@@ -187,9 +236,12 @@ def choose_frame(sample: np.ndarray, declared: str | None, unit: str | None, axe
     if len(finite):
         low, high = np.percentile(finite, [1, 99], axis=0) if len(finite) > 2 else (finite.min(0), finite.max(0))
         extent = high - low
-    detected = "mm" if extent.min() > _MM_FROM else "m"
-    chosen = unit or declared or detected
+    detected = _detect_unit(float(extent.min()), None if local is None else column_height(local))
+    absurd = declared == "m" and detected != "m" and extent.min() > _MM_FROM
+    chosen = unit or (detected if absurd else declared) or detected
     how = "by flag" if unit else "declared" if declared else f"detected: least extent {extent.min():.4g}"
+    if absurd and not unit:
+        how = f"detected: declared m, but its least extent is {extent.min():.4g}"
     metres = extent * UNITS[chosen]
     lying = metres[2] > max(_LYING * metres[:2].max(), _LYING_LENGTH)
     order = axes or (_Y_UP if lying else "xyz")

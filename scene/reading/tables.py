@@ -8,17 +8,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from scene.reading.source import BATCH, CloudSource, Lines
+from scene.reading.source import BATCH, UNITS, CloudSource, Lines
 
+# English, German, Spanish, French and Italian surveyors' words; the first one is that of a cloud, not of a map.
 _XYZ_NAMES = (
-    ("x", "easting", "east", "e"),
-    ("y", "northing", "north", "n"),
-    ("z", "elevation", "elev", "height", "altitude", "h"),
+    ("x", "easting", "east", "e", "rechtswert", "rechts", "ostwert", "ost", "este", "est"),
+    ("y", "northing", "north", "n", "hochwert", "hoch", "nordwert", "nord", "norte"),
+    ("z", "elevation", "elev", "height", "altitude", "h", "hoehe", "höhe", "kote", "cota", "quota", "level", "rl"),
 )
-_COLUMN_UNIT = re.compile(
-    r"[\s_]*[(\[]?\s*\b(mm|millimet(?:er|re)s?|m|met(?:er|re)s?|us[ -]?ft|ft|feet|foot)\b\.?\s*[)\]]?$", re.IGNORECASE
-)
-_UNIT_STARTS = (("mm", "mm"), ("milli", "mm"), ("m", "m"), ("us", "us-ft"), ("f", "ft"))
+_UNIT_WORDS = "mm|millimet(?:er|re)s?|cm|centimet(?:er|re)s?|m|met(?:er|re)s?|us[ -]?ft|ft|feet|foot"
+_COLUMN_UNIT = re.compile(rf"[\s_]*[(\[]?\s*\b({_UNIT_WORDS})\b\.?\s*[)\]]?$", re.IGNORECASE)
+_UNIT_STARTS = (("mm", "mm"), ("milli", "mm"), ("c", "cm"), ("m", "m"), ("us", "us-ft"), ("f", "ft"))
 
 
 def plain_name(name: str) -> tuple[str, str | None]:
@@ -37,16 +37,48 @@ def plain_name(name: str) -> tuple[str, str | None]:
     return base.strip(" _.").lower(), unit
 
 
-def find_xyz(names: Sequence[str]) -> tuple[list[int], str | None] | None:
+def is_map_name(name: str) -> bool:
+    """Return whether a column's name is a map's word for east, such as `Easting` or `Rechtswert`."""
+    return plain_name(name)[0] in _XYZ_NAMES[0][1:]
+
+
+def parse_columns(text: str | None) -> dict[str, str]:
+    """Return the columns that a user names, `x=Rechtswert,y=Hochwert,z=Hoehe`, by what they hold.
+
+    Keys are x, y, z, ring, point and offset; a column is its name in the header, or its number from 1. Raises
+    `ValueError` for any other text.
+    """
+    pairs = [part.partition("=") for part in (text or "").split(",") if part.strip()]
+    columns = {key.strip().lower(): name.strip() for key, _, name in pairs}
+    if set(columns) - set(COLUMN_KEYS) or not all(columns.values()) or len(columns) < len(pairs):
+        raise ValueError(f"columns {text!r} are not pairs such as x=Rechtswert,y=Hochwert,z=Hoehe ({COLUMN_KEYS})")
+    return columns
+
+
+COLUMN_KEYS = ("x", "y", "z", "ring", "point", "offset")
+
+
+def find_column(names: Sequence[str], told: str) -> int | None:
+    """Return the index of a column that a user names by its header or its number from 1; `None` without one."""
+    wanted = plain_name(told)[0]
+    for index, name in enumerate(names):
+        if name.strip() == told or plain_name(name)[0] == wanted:
+            return index
+    return int(told) - 1 if told.isdigit() and 0 < int(told) <= len(names) else None
+
+
+def find_xyz(names: Sequence[str], told: dict[str, str] | None = None) -> tuple[list[int], str | None] | None:
     """Finds the columns of x, y and z, and their declared unit; `None` where one is missing.
 
-    Raises `ValueError` where the three declare different units.
+    `told` names columns as `parse_columns` returns them. Raises `ValueError` where the three declare different units.
     """
     known = [plain_name(name) for name in names]
     bare = [name for name, _ in known]
     at = []
-    for options in _XYZ_NAMES:
+    for key, options in zip("xyz", _XYZ_NAMES, strict=True):
         index = next((bare.index(name) for name in options if name in bare), None)
+        if told and key in told:
+            index = find_column(names, told[key])
         if index is None:
             return None
         at.append(index)
@@ -61,10 +93,11 @@ _PROBES = 16
 _DELIMITERS = ((";", "semicolon"), ("\t", "tab"), (",", "comma"))
 
 
-def open_table(path: Path) -> CloudSource:
-    """Opens a text table: columns by the names of its header, or the first three.
+def open_table(path: Path, told: dict[str, str] | None = None) -> CloudSource:
+    """Opens a text table: columns that the user named, by the names of its header, or the first three.
 
-    Raises `ValueError` where it is no text, or no line near its start holds three numbers.
+    `told` is what `parse_columns` returns. Raises `ValueError` where it is no text, or no line near its start holds
+    three numbers.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -73,7 +106,7 @@ def open_table(path: Path) -> CloudSource:
     lines = head.decode("utf-8-sig", "replace").splitlines()
     delimiter, name = _find_delimiter(lines)
     comma = delimiter == ";" and any("," in line for line in lines) and not any("." in line for line in lines[1:])
-    skip, columns, unit = _find_columns(lines, delimiter, comma)
+    skip, columns, unit = _find_columns(lines, delimiter, comma, told)
     start = sum(len(line) for line in head.splitlines(keepends=True)[:skip])
     text = Lines(path, tuple(columns), delimiter, start, skip + 1, None, comma)
     return CloudSource(f"text, {name} between columns", text.rows, _sample_lines(text), unit)
@@ -88,14 +121,20 @@ def _find_delimiter(lines: list[str]) -> tuple[str | None, str]:
     return None, "white space"
 
 
-def _find_columns(lines: list[str], delimiter: str | None, comma: bool) -> tuple[int, list[int], str | None]:
+def _find_columns(
+    lines: list[str], delimiter: str | None, comma: bool, told: dict[str, str] | None
+) -> tuple[int, list[int], str | None]:
     """Number of lines before the numbers, columns of x, y and z, and the unit that a header declares."""
     columns, unit = None, None
+    if told and all(told.get(key, "").isdigit() for key in "xyz"):
+        columns = [int(told[key]) - 1 for key in "xyz"]
     for index, line in enumerate(lines):
         words = [word.strip() for word in line.split(delimiter)]
+        if told and columns is None and _numeric(words[:3], comma):
+            raise ValueError(f"no line of names before line {index + 1} holds the columns {', '.join(told.values())}")
         if _numeric(words[:3], comma) or (columns and _numeric([words[i] for i in columns if i < len(words)], comma)):
             return index, columns or [0, 1, 2], unit
-        named = find_xyz(words) if len(words) >= 3 else None
+        named = find_xyz(words, told) if len(words) >= 3 else None
         if named is not None:
             columns, unit = named
         elif index and not line.startswith(("#", "/")) and line.strip() and columns:
@@ -128,14 +167,14 @@ def _sample_lines(text: Lines) -> np.ndarray:
     return np.concatenate(points)
 
 
-def open_parquet(path: Path) -> CloudSource:
+def open_parquet(path: Path, told: dict[str, str] | None = None) -> CloudSource:
     """Opens the columns x, y, z (or easting, northing, elevation) of a Parquet file.
 
     Raises `ValueError` for damage, missing columns, or columns that hold no numbers.
     """
     with pq.ParquetFile(path) as file:
         names, rows = file.schema_arrow.names, file.metadata.num_rows
-        xyz = find_xyz(names)
+        xyz = find_xyz(names, told)
         if xyz is None:
             raise ValueError(f"no columns x, y, z among {', '.join(names)}")
         columns = [names[index] for index in xyz[0]]
@@ -163,4 +202,4 @@ def _read_batches(file: pq.ParquetFile, columns: list[str], groups: list[int]) -
 def _field_unit(field: pa.Field) -> str | None:
     """Unit from the column's own metadata, key `unit`."""
     unit = (field.metadata or {}).get(b"unit", b"").decode("utf-8", "replace")
-    return unit if unit in ("m", "mm") else None
+    return unit if unit in UNITS else None

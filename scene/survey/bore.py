@@ -7,9 +7,22 @@ import numpy as np
 
 from scene.survey.alignment import Alignment, Elements, draw_grade, draw_railway, draw_s_bend, lay_out, metro_elements
 from scene.survey.config import TruthName
-from scene.survey.furniture import Furniture, draw_furniture
+from scene.survey.furniture import SLEEPER_RISE, Furniture, draw_furniture
 from scene.survey.mesh import Mesh, join_meshes, nail_mesh, surface_mesh, track_mesh
-from scene.survey.section import Section, Shape, Trend, arch, circle, d_shape, draw_field, ellipse, horseshoe
+from scene.survey.section import (
+    Section,
+    Shape,
+    Trend,
+    arch,
+    circle,
+    d_shape,
+    draw_field,
+    ellipse,
+    horseshoe,
+    rectangle,
+    vault,
+)  # fmt: skip
+from scene.survey.surroundings import Cutting, Thing, box_thing, cutting_mesh, draw_cutting, round_thing, thing_mesh
 
 _IRREGULAR_SIGMA = 0.13  # m, standard deviation of the walls
 _CROSSFALL = 0.02  # of the irregular bore's floor
@@ -23,11 +36,17 @@ class Bore:
     alignment: Alignment
     section: Section
     furniture: Furniture
+    things: tuple[Thing, ...] = ()  # What stands or hangs in it
+    cutting: Cutting | None = None  # The ground before its last mouth
+    strays: float = 0.0  # Share of the returns that come from behind the wall, by whatever the wall is made of
 
     def mesh(self) -> Mesh:
         """Return every surface that a ray can meet."""
         parts = (self.alignment, self.section, self.furniture)
-        mesh = join_meshes([surface_mesh(*parts), track_mesh(*parts), nail_mesh(*parts)])
+        meshes = [surface_mesh(*parts), track_mesh(*parts), nail_mesh(*parts)]
+        meshes += [thing_mesh(self.alignment, self.section, thing) for thing in self.things]
+        meshes += [cutting_mesh(self.alignment, self.section, self.cutting)] if self.cutting else []
+        mesh = join_meshes(meshes)
         # To the micrometre, so that the last bits of a matrix product do not decide about the bytes of a survey.
         return replace(mesh, vertices=np.round(mesh.vertices, 6))
 
@@ -44,6 +63,71 @@ def _flared_end(length: float) -> Trend:
     return Trend(tuple(length - 6.0 + 6.0 * share), tuple(3.0 * share**2))
 
 
+def _flared_portal(length: float) -> Trend:
+    """Return a mouth 2.5 m wider at the last end, opening with the square of the distance over 8 m."""
+    share = np.linspace(0.0, 1.0, 9)
+    return Trend(tuple(length - 8.0 + 8.0 * share), tuple(2.5 * share**2))
+
+
+def _one_sided(start: float, end: float, ramp: float, width: float) -> Trend:
+    """Return a widening between two stations, with ramps outside them, m."""
+    return Trend((start - ramp, start, end, end + ramp), (0.0, width, width, 0.0))
+
+
+def _station_platform(length: float) -> Trend:
+    return _one_sided(0.35 * length, 0.65 * length, min(4.0, 0.1 * length), 3.0)
+
+
+def _lay_by(length: float) -> Trend:
+    return _one_sided(0.4 * length, 0.6 * length, min(4.0, 0.1 * length), 2.5)
+
+
+def _alcoves(length: float) -> Trend:
+    """Return two alcoves 2 m long and 60 cm deep."""
+    first, second = 0.3 * length, 0.7 * length
+    knots = [(s + d, v) for s in (first, second) for d, v in ((-0.1, 0.0), (0.0, 0.6), (2.0, 0.6), (2.1, 0.0))]
+    return Trend(tuple(k for k, _ in knots), tuple(v for _, v in knots))
+
+
+def _works_things(rng: np.random.Generator, length: float) -> tuple[Thing, ...]:
+    """Return a parked vehicle of up to 7.5 m on one side, and two people on the other."""
+    side, at = rng.choice([-1.0, 1.0]), rng.uniform(0.25, 0.4) * length
+    run = min(7.5, 0.3 * length)
+    vehicle = [
+        box_thing("vehicle", (at, at + run), (side * 0.85, side * 2.4), (0.35, 1.2)),
+        box_thing("vehicle", (at + 0.25 * run, at + run), (side * 0.85, side * 2.4), (1.15, 2.3)),
+        *(
+            box_thing("vehicle", (at + s * run, at + s * run + 0.6), (side * 0.9, side * 2.3), (0.0, 0.4))
+            for s in (0.1, 0.8)
+        ),
+    ]
+    stands = at + run * np.array([-0.8, 1.6]) + rng.uniform(-0.5, 0.5, 2)
+    people = [box_thing("person", (s, s + 0.35), (-side * 1.2, -side * 1.7), (0.0, 1.75)) for s in stands]
+    return (*vehicle, *people)
+
+
+def _platform_things(rng: np.random.Generator, length: float) -> tuple[Thing, ...]:
+    """Return a platform 1 m high along the widening."""
+    return (box_thing("platform", (0.35 * length, 0.65 * length), (1.75, 6.2), (0.0, 1.0)),)
+
+
+def _road_things(rng: np.random.Generator, length: float) -> tuple[Thing, ...]:
+    """Return walkways on both sides, and pairs of jet fans under the crown every 25 m."""
+    walkways = [box_thing("walkway", (0.0, length), (s * 4.0, s * 7.8), (0.0, 0.25)) for s in (-1.0, 1.0)]
+    at = np.arange(rng.uniform(0.1, 0.3) * length, 0.9 * length - 3.0, 25.0)
+    fans = [round_thing("jet fan", (s, s + 3.0), left, 5.9, 0.35) for s in at for left in (-1.3, 1.3)]
+    return (*walkways, *fans)
+
+
+def _corridor_things(rng: np.random.Generator, length: float) -> tuple[Thing, ...]:
+    """Return pipes and cable trays under the ceiling, and cabinets along the right wall."""
+    pipes = [round_thing("pipe", (0.0, length), left, 3.75, 0.16) for left in (-1.1, -0.6)]
+    trays = [box_thing("tray", (0.0, length), (left, left + 0.5), (3.5, 3.6)) for left in (0.4, 1.3)]
+    at = np.sort(rng.uniform(0.1, 0.9, max(2, int(length / 8.0)))) * length
+    cabinets = [box_thing("cabinet", (s, s + 0.8), (-2.2, -2.75), (0.0, 1.9)) for s in at]
+    return (*pipes, *trays, *cabinets)
+
+
 @dataclass(frozen=True)
 class _Class:
     section_type: str
@@ -51,6 +135,15 @@ class _Class:
     elements: Callable[[np.random.Generator, float], Elements] = draw_railway
     widening: Callable[[float], Trend] = lambda length: Trend()
     rough: bool = False
+    aside: Callable[[float], Trend] = lambda length: Trend()
+    roughness: float = 0.01  # m, standard deviation of the walls that are not irregular
+    rings: bool = True
+    tracks: tuple[float, ...] = (0.0,)  # m to the left
+    rise: float = SLEEPER_RISE  # m
+    things: Callable[[np.random.Generator, float], tuple[Thing, ...]] = lambda rng, length: ()
+    cutting: bool = False
+    dark: float = 0.0  # m of lining that give no echo
+    strays: float = 0.0
 
 
 _CLASSES: dict[TruthName, _Class] = {
@@ -63,7 +156,19 @@ _CLASSES: dict[TruthName, _Class] = {
     "grade": _Class("D", elements=draw_grade),
     "irregular": _Class("irregular", arch, widening=_flared_end, rough=True),
     "circle": _Class("circle", circle),
-}
+    "portal": _Class(
+        "horseshoe", lambda: vault(8.7, 6.6, 3.0, 0.3), widening=_flared_portal, roughness=0.04, rings=False,
+        tracks=(2.0, -2.0), cutting=True,
+    ),
+    "corridor": _Class(
+        "rectangle", lambda: rectangle(5.1, 4.4), aside=_alcoves, roughness=0.003, rings=False, tracks=(),
+        things=_corridor_things,
+    ),
+    "works": _Class("D", rings=False, things=_works_things, dark=4.0, strays=0.03),
+    "platform": _Class("D, widening", arch, aside=_station_platform, rings=False, things=_platform_things),
+    "road": _Class("road", lambda: vault(9.6, 7.0, 2.6), aside=_lay_by, rings=False, tracks=(), things=_road_things),
+    "slabtrack": _Class("horseshoe", lambda: vault(5.1, 5.5, 3.0, 0.25), rings=False, rise=0.22),
+}  # fmt: skip
 
 
 def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correlation: float) -> Section:
@@ -74,12 +179,13 @@ def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correla
         height_field=draw_field(rng, 0.05, rng.uniform(8.0, 15.0)),
         roughness=draw_field(
             rng,
-            _IRREGULAR_SIGMA if kind.rough else 0.01,
+            _IRREGULAR_SIGMA if kind.rough else kind.roughness,
             correlation if kind.rough else rng.uniform(1.0, 2.0),
             dims=2,
             terms=256,
         ),
         widening=kind.widening(length),
+        aside=kind.aside(length),
         crossfall=_CROSSFALL if kind.rough else 0.0,
     )
 
@@ -91,11 +197,15 @@ def draw_bore(
 
     `correlation` is the length in which the walls of `irregular` decorrelate, m; the others do not use it.
     """
-    first, second, third = (np.random.default_rng(s) for s in seed.spawn(3))
+    first, second, third, fourth = (np.random.default_rng(s) for s in seed.spawn(4))
     kind = _CLASSES[truth]
-    return Bore(
-        kind.section_type,
-        lay_out(first, length, kind.elements(first, length)),
-        _draw_section(second, kind, length, correlation),
-        draw_furniture(third, length, rings=not kind.rough),
-    )
+    alignment = lay_out(first, length, kind.elements(first, length))
+    section = _draw_section(second, kind, length, correlation)
+    furniture = draw_furniture(third, length, rings=kind.rings and not kind.rough)
+    things = kind.things(fourth, length)
+    begin = fourth.uniform(0.65, 0.75) * length
+    furniture = replace(furniture, tracks=kind.tracks, rise=kind.rise, dark=(begin, begin + kind.dark))
+    if not kind.tracks:
+        furniture = replace(furniture, sleepers=np.empty(0))
+    cutting = draw_cutting(fourth, 0.5 * float(section.width(np.array([length]))[0])) if kind.cutting else None
+    return Bore(kind.section_type, alignment, section, furniture, things, cutting, kind.strays)

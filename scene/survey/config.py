@@ -9,7 +9,8 @@ import tyro
 
 LidarName = Literal["avia", "vlp16", "os1"]
 TruthName = Literal[
-    "paper", "metro", "ellipse", "widening", "horseshoe", "s-bend", "grade", "irregular", "circle"
+    "paper", "metro", "ellipse", "widening", "horseshoe", "s-bend", "grade", "irregular", "circle",
+    "portal", "corridor", "works", "platform", "road", "slabtrack",
 ]  # fmt: skip
 METRO_LENGTH = 351.0  # m of the real alignment that are at hand
 
@@ -30,6 +31,8 @@ class SensorErrors:
     distortion: bool = True
     imu_noise: bool = True  # White noise of accelerometer and gyroscope, and wander of the orientation.
     imu_bias: bool = True  # A constant bias and its random walk.
+    # Share of the returns that come from further away than the surface met, by up to 6 m.
+    strays: float = 0.0
     prism_noise: float = 0.0025  # Standard deviation of the total station in each axis, m.
 
 
@@ -41,7 +44,8 @@ class SurveyConfig:
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]  # Folder to write to; made if missing.
-    # Kind of bore: the paper's D-section; the same on a real metro's alignment; or one outside that class.
+    # Kind of bore: the paper's D-section; the same on a real metro's alignment; one outside that class; or a place as
+    # scanners meet them, from `portal` on.
     truth: TruthName = "paper"
     length: float = 60.0  # Length of the bore along its centreline, m.
     seed: int = 0  # Draws the bore, the walk and all noise. The same seed gives the same bytes.
@@ -95,7 +99,7 @@ def _check_errors(errors: SensorErrors) -> None:
         value = getattr(errors, name)
         if not 0.0 <= value < math.inf:
             raise ValueError(f"errors.{name} must not be negative, got {value:g}")
-    for name in ("mixed_pixels", "lost"):
+    for name in ("mixed_pixels", "lost", "strays"):
         value = getattr(errors, name)
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"errors.{name} must lie between 0 and 1, got {value:g}")

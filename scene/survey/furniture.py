@@ -36,7 +36,6 @@ RAIL_HALF = 1e-3 * np.array([
 ])  # fmt: skip
 RAIL_HEIGHT = 0.176  # m
 RAIL_AXIS = 0.5 * (GAUGE + 0.073)  # m from the track's axis to the rail's: half the gauge and half a head
-RAIL_TOP = SLEEPER_RISE + PAD[2] + RAIL_HEIGHT  # m above the floor
 
 
 N_ROWS = 8  # longitudinal rows of pockets: four on the left side from the floor up, four on the right
@@ -52,6 +51,14 @@ class Furniture:
     depth: np.ndarray  # Depth of each pocket, m
     nails: np.ndarray  # Pairs that a nail bridges; false where a pocket is filled
     sleepers: np.ndarray  # Stations of the sleepers' middles, m
+    tracks: tuple[float, ...] = (0.0,)  # Middles of the tracks to the left of the axis, m; empty where there is none
+    rise: float = SLEEPER_RISE  # Top of the sleepers above the floor, m
+    dark: tuple[float, float] = (0.0, 0.0)  # Stations between which the lining gives no echo, m
+
+    @property
+    def rail_top(self) -> float:
+        """Height of the rails' tops above the floor, m."""
+        return self.rise + PAD[2] + RAIL_HEIGHT
 
 
 def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True) -> Furniture:

@@ -24,6 +24,9 @@ class Part(IntEnum):
     SLEEPER = 5
     RAIL = 6
     FASTENING = 7
+    THING = 8
+    TERRAIN = 9
+    DARK = 10
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ def join_meshes(meshes: Sequence[Mesh]) -> Mesh:
         np.concatenate([m.station for m in meshes]),
     )
 
+
+EMPTY = Mesh(np.empty((0, 3)), np.empty((0, 3), int), np.empty(0, np.uint8), np.empty(0))
 
 # Corners of a box of half-size one (along, lateral, up) and its twelve triangles, normals outwards.
 _CORNERS = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
@@ -75,37 +80,46 @@ def _copy_shape(
 
 def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> Mesh:
     """Return sleepers, rails, pads and clips; each sleeper lies in the section of its own station."""
-    s = furniture.sleepers
+    if not furniture.tracks:
+        return EMPTY
+    return join_meshes([_one_track(alignment, section, furniture, offset) for offset in furniture.tracks])
+
+
+def _one_track(alignment: Alignment, section: Section, furniture: Furniture, offset: float) -> Mesh:
+    """Return a track whose middle runs `offset` m to the left of the axis."""
+    s, rise = furniture.sleepers, furniture.rise
     frames = alignment.frames(s)
     floor = -0.5 * section.height(s)
 
     def boxes(shape: np.ndarray, across: float, above: float, part: Part) -> Mesh:
-        return _copy_shape(shape, _BOX, frames.point(np.full_like(s, across), floor + above), frames.matrix, part, s)
+        return _copy_shape(
+            shape, _BOX, frames.point(np.full_like(s, offset + across), floor + above), frames.matrix, part, s
+        )
 
     # Down to just under the floor only: from outside the mouth, one would see the buried part beneath it.
-    tall = fur.SLEEPER_RISE + _BURIED + 0.5 * fur.SLEEPER_LENGTH * abs(section.crossfall)
+    tall = rise + _BURIED + 0.5 * fur.SLEEPER_LENGTH * abs(section.crossfall)
     low = fur.SLEEPER_TOP + (fur.SLEEPER_BOTTOM - fur.SLEEPER_TOP) * tall / fur.SLEEPER_HEIGHT
     sleeper = 0.5 * _CORNERS * (1.0, fur.SLEEPER_LENGTH, tall)
     sleeper[:, 0] *= np.where(sleeper[:, 2] > 0, fur.SLEEPER_TOP, low)
-    meshes = [boxes(sleeper, 0.0, fur.SLEEPER_RISE - 0.5 * tall, Part.SLEEPER)]
+    meshes = [boxes(sleeper, 0.0, rise - 0.5 * tall, Part.SLEEPER)]
     for rail in (fur.RAIL_AXIS, -fur.RAIL_AXIS):
-        meshes.append(boxes(0.5 * _CORNERS * fur.PAD, rail, fur.SLEEPER_RISE + 0.5 * fur.PAD[2], Part.FASTENING))
+        meshes.append(boxes(0.5 * _CORNERS * fur.PAD, rail, rise + 0.5 * fur.PAD[2], Part.FASTENING))
         for side in (-1, 1):
             across = rail + side * (fur.CLIP_INNER + 0.5 * fur.CLIP[1])
-            above = fur.SLEEPER_RISE + 0.5 * fur.CLIP[2]
+            above = rise + 0.5 * fur.CLIP[2]
             meshes.append(boxes(0.5 * _CORNERS * fur.CLIP, across, above, Part.FASTENING))
-        meshes.append(_rail_mesh(alignment, section, rail))
+        meshes.append(_rail_mesh(alignment, section, offset + rail, rise))
     return join_meshes(meshes)
 
 
-def _rail_mesh(alignment: Alignment, section: Section, across: float) -> Mesh:
-    """One rail from mouth to mouth, `across` to the left of the axis."""
+def _rail_mesh(alignment: Alignment, section: Section, across: float, rise: float) -> Mesh:
+    """One rail from mouth to mouth, `across` to the left of the axis, on sleepers that rise above the floor."""
     stations = np.linspace(0.0, alignment.length, int(np.ceil(alignment.length / _RAIL_STEP)) + 1)
     half = fur.RAIL_HALF
     # Half at negative `lateral` upwards, the middle of the head, the other half downwards: normals come out outwards.
     outline = np.concatenate([half * (-1, 1), [(0.0, fur.RAIL_HEIGHT)], half[::-1]])
     k, n = len(outline), len(stations)
-    base = fur.SLEEPER_RISE + fur.PAD[2] - 0.5 * section.height(stations)[:, None]
+    base = rise + fur.PAD[2] - 0.5 * section.height(stations)[:, None]
     y, z = np.broadcast_to(outline[:, 0] + across, (n, k)), outline[:, 1] + base
     vertices = alignment.frames(stations).point(y, z).reshape(-1, 3)
 
@@ -193,6 +207,7 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
     part = np.full(quads.shape[:2], Part.LINING, np.uint8)
     middle = 0.5 * (rows[1:] + rows[:-1])
     part[np.min(abs(middle[:, None] - furniture.joints), axis=1, initial=np.inf) < _JOINT_HALF] = Part.JOINT
+    part[(middle > furniture.dark[0]) & (middle < furniture.dark[1])] = Part.DARK
     keep = np.ones(quads.shape[:2], bool)
     pockets = []
     for j, r, side in np.argwhere(furniture.pocketed[:, None, None] & ~furniture.filled):

@@ -1,6 +1,7 @@
 """The true section by station: an outline of varying size, with roughness along its normals, on a straight floor."""
 
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -101,13 +102,16 @@ class DShape(Shape):
         return np.stack([y * ratio, np.where(z > self.spring, spring + (z - self.spring) * ratio, wall)], axis=-1)
 
 
+S = TypeVar("S", bound=Shape)
+
+
 def _arc(centre: tuple[float, float], radius: float, begin: float, end: float) -> Float[np.ndarray, "n 2"]:
     angle = np.linspace(begin, end, int(np.ceil(radius * abs(end - begin) / _OUTLINE_STEP)) + 1)
     return np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _sample_half(half: Float[np.ndarray, "n 2"], breaks: tuple[float, ...] = ()) -> dict[str, object]:
-    """Fields of the shape whose left half, foot to crown, is a dense outline (lateral, above the floor), m.
+def _sample_half(kind: type[S], half: Float[np.ndarray, "n 2"], breaks: tuple[float, ...] = ()) -> S:
+    """Return the shape whose left half, foot to crown, is a dense outline (lateral, above the floor), m.
 
     Nodes lie at the heights `breaks` above the floor, m.
     """
@@ -126,14 +130,14 @@ def _sample_half(half: Float[np.ndarray, "n 2"], breaks: tuple[float, ...] = ())
     rows = np.array([[int(np.argmin(abs(girth - e))) for e in row] for row in edges])
     total = 2 * len(girth) - 1
     mirror = (-1.0, 1.0)
-    return {
-        "width": 2.0 * float(half[:, 0].max()),
-        "height": float(height),
-        "nodes": np.concatenate([left, left[-2::-1] * mirror]),
-        "normal": np.concatenate([normal, normal[-2::-1] * mirror]),
-        "girth": np.concatenate([girth, 2.0 * along[-1] - girth[-2::-1]]),
-        "rows": np.concatenate([rows, total - 1 - rows[:, ::-1]]),
-    }
+    return kind(
+        width=2.0 * float(half[:, 0].max()),
+        height=float(height),
+        nodes=np.concatenate([left, left[-2::-1] * mirror]),
+        normal=np.concatenate([normal, normal[-2::-1] * mirror]),
+        girth=np.concatenate([girth, 2.0 * along[-1] - girth[-2::-1]]),
+        rows=np.concatenate([rows, total - 1 - rows[:, ::-1]]),
+    )
 
 
 def _d_half() -> Float[np.ndarray, "n 2"]:
@@ -143,31 +147,47 @@ def _d_half() -> Float[np.ndarray, "n 2"]:
 
 def d_shape() -> DShape:
     """Return the paper's D, 5.65 m by 6.36 m: flat floor, vertical walls, semicircular crown."""
-    return DShape(**_sample_half(_d_half(), (2.6, 3.535)))  # type: ignore[arg-type]
+    return _sample_half(DShape, _d_half(), (2.6, 3.535))
 
 
 def arch() -> Shape:
     """Return the same D, whose crown becomes elliptical where the width changes."""
-    return Shape(**_sample_half(_d_half()))  # type: ignore[arg-type]
+    return _sample_half(Shape, _d_half())
 
 
 def ellipse() -> Shape:
     """Return an upright ellipse with half-axes of 2.8 and 3.3 m, filled flat 0.6 m above its lowest point."""
     begin = np.arcsin(0.6 / 3.3 - 1.0)
     angle = np.linspace(begin, 0.5 * np.pi, 8001)
-    return Shape(**_sample_half(np.stack([2.8 * np.cos(angle), 2.7 + 3.3 * np.sin(angle)], axis=-1)))  # type: ignore[arg-type]
+    return _sample_half(Shape, np.stack([2.8 * np.cos(angle), 2.7 + 3.3 * np.sin(angle)], axis=-1))
 
 
 def horseshoe() -> Shape:
     """Return a semicircular crown of 2.9 m on walls that draw in, along arcs of 6 m, to 4.19 m at the floor."""
     wall = _arc((2.9 - 6.0, 3.0), 6.0, -np.arcsin(3.0 / 6.0), 0.0)
-    return Shape(**_sample_half(np.concatenate([wall, _arc((0.0, 3.0), 2.9, 0.0, 0.5 * np.pi)])))  # type: ignore[arg-type]
+    return _sample_half(Shape, np.concatenate([wall, _arc((0.0, 3.0), 2.9, 0.0, 0.5 * np.pi)]))
+
+
+def rectangle(width: float, height: float) -> Shape:
+    """Return a box section, m."""
+    wall = np.stack([np.full(2001, 0.5 * width), np.linspace(0.0, height, 2001)], axis=-1)
+    roof = np.stack([np.linspace(0.5 * width, 0.0, 2001), np.full(2001, height)], axis=-1)
+    return _sample_half(Shape, np.concatenate([wall, roof]))
+
+
+def vault(width: float, height: float, spring: float, foot: float = 0.0) -> Shape:
+    """Return an elliptic crown on walls that draw in by `foot` m towards the floor, m."""
+    rise = np.linspace(0.0, spring, 2001)
+    wall = np.stack([0.5 * width - foot * (1.0 - rise / spring) ** 2, rise], axis=-1)
+    turn = np.linspace(0.0, 0.5 * np.pi, 4001)
+    crown = np.stack([0.5 * width * np.cos(turn), spring + (height - spring) * np.sin(turn)], axis=-1)
+    return _sample_half(Shape, np.concatenate([wall, crown]))
 
 
 def circle() -> Shape:
     """Return a shield bore of 2.898 m radius, as the real metro's rings, its invert filled flat to a depth of 0.9 m."""
     radius, fill = 2.898, 0.9
-    return Shape(**_sample_half(_arc((0.0, radius - fill), radius, np.arcsin(fill / radius - 1.0), 0.5 * np.pi)))  # type: ignore[arg-type]
+    return _sample_half(Shape, _arc((0.0, radius - fill), radius, np.arcsin(fill / radius - 1.0), 0.5 * np.pi))
 
 
 @dataclass(frozen=True)
@@ -202,11 +222,12 @@ class Section:
     height_field: Field  # Slow deviation from its height, m
     roughness: Field  # Deviation along the outward normal by station and girth, m
     widening: Trend = field(default_factory=Trend)  # Further width by station, m
+    aside: Trend = field(default_factory=Trend)  # Further width by station on the left of the axis alone, m
     # Rise of the floor towards the left, m/m; on the axis it lies half the height below the centreline
     crossfall: float = 0.0
 
     def width(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """Return the largest width between the smooth walls, m."""
+        """Return the largest width between the smooth walls, `aside` left out, m."""
         return self.shape.width + self.width_field.along(station) + self.widening(station)
 
     def height(self, station: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
@@ -222,6 +243,8 @@ class Section:
         height = self.height(station)
         nodes = self.shape.scaled(self.width(station), height)
         nodes[..., 1] -= 0.5 * height[:, None]
+        left = 1.0 + 2.0 * self.aside(station)[:, None] / self.width(station)[:, None]
+        nodes[..., 0] *= np.where(nodes[..., 0] > 0.0, left, 1.0)
         self._on_floor(nodes, height)
         return nodes
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +104,7 @@ def simulate(config: SurveyConfig, console: Console) -> str:
     """Writes the survey of `config`; returns a line that says what was written."""
     of_bore, of_walk, of_prism, of_profiles, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
     bore = draw_bore(of_bore, config.length, config.truth, config.correlation)
+    config = replace(config, errors=replace(config.errors, strays=max(config.errors.strays, bore.strays)))
     mesh = bore.mesh()
     walk = draw_walk(np.random.default_rng(of_walk), bore, config.speed, SCAN_PERIOD)
     config.out.mkdir(parents=True, exist_ok=True)

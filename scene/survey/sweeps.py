@@ -6,7 +6,7 @@ import numpy as np
 
 from scene.survey.bore import Bore
 from scene.survey.carrier import CARRY_HEIGHT, Carried, rotate
-from scene.survey.cast import Caster, Hits, draw_reflectivity, draw_returns, mix_pixels, noise_sigma
+from scene.survey.cast import Caster, Hits, draw_reflectivity, draw_returns, draw_strays, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
 from scene.survey.write import CloudWriter
@@ -46,6 +46,7 @@ def sweeps(
         distance = hits.distance
         if errors.mixed_pixels > 0.0:
             distance = mix_pixels(rng, lidar, errors.mixed_pixels, caster, poses.position, heading, hits)
+        distance = draw_strays(rng, errors.strays, distance)
         sigma = noise_sigma(errors, distance, hits.cosine)
         # Rounded once, here: the cloud and the bag then hold the same point.
         seen = np.where(valid, distance + sigma * rng.standard_normal(len(ray), np.float32), 0.0).astype(np.float32)
@@ -108,6 +109,7 @@ def _cast_turns(
     distance = hits.distance
     if config.errors.mixed_pixels > 0.0:
         distance = mix_pixels(rng, _SCANNER, config.errors.mixed_pixels, caster, origin, heading, hits)
+    distance = draw_strays(rng, config.errors.strays, distance)
     distance = distance + noise_sigma(config.errors, distance, hits.cosine) * rng.standard_normal(len(distance))
     bright = draw_reflectivity(rng, hits.cosine, hits.part)
     return (origin + np.where(valid, distance, 0.0)[:, None] * heading)[valid], bright[valid]

@@ -125,6 +125,11 @@ _DEFINITIONS = {
     "height": "floor to crown on the axis, roughness included; width_smooth and height_smooth leave roughness out",
     "middle": "of the actual section, along lateral and up from position: half way between the walls where the width "
     "is largest, half way from floor to crown",
+    "aside": "further width on the left of the axis alone; position leaves it out, width_smooth has it in it",
+    "sleepers, rails": "of all tracks; tracks: middles to the left of the axis",
+    "things": "what stands or hangs in the bore: boxes by station, left of the axis and above the floor",
+    "cutting": "ground before the last mouth: length, half-width of its bottom, run over rise and height of its slopes",
+    "dark": "stations between which the lining gives no echo; strays: share of returns from behind the surface met",
     "floor": "ballast surface, straight across, half of height_smooth below position; crossfall: its rise to the left",
     "angle": "rad about position, from lateral towards up",
     "pockets.depth": "along the normal of the smooth section at the pocket's middle",
@@ -155,10 +160,16 @@ def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
         "tangent": _rounded(frames.tangent, 9),
         "width": _rounded(actual.width),
         "height": _rounded(actual.height),
-        "width_smooth": _rounded(section.width(station)),
+        "width_smooth": _rounded(section.width(station) + section.aside(station)),
         "height_smooth": _rounded(section.height(station)),
         "middle": _rounded(actual.middle),
         "crossfall": section.crossfall,
+        "aside": _rounded(section.aside(station)),
+        "tracks": list(furniture.tracks),
+        "things": [thing.describe() for thing in bore.things],
+        "cutting": bore.cutting.describe() if bore.cutting else None,
+        "dark": _rounded(np.array(furniture.dark)) if furniture.dark[0] < furniture.dark[1] else None,
+        "strays": bore.strays,
         "rings": {"width": fur.RING_WIDTH, "station": _rounded(furniture.joints)},
         "pockets": _describe_pockets(bore),
         "nails": {"diameter": fur.NAIL_DIAMETER, "depth": fur.NAIL_DEPTH, "count": int(furniture.nails.sum())},
@@ -192,22 +203,28 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
 
 
 def _describe_sleepers(bore: Bore) -> dict[str, Any]:
-    station = bore.furniture.sleepers
-    top = fur.SLEEPER_RISE - 0.5 * bore.section.height(station)
+    station, tracks = bore.furniture.sleepers, bore.furniture.tracks
+    top = bore.furniture.rise - 0.5 * bore.section.height(station)
+    frames = bore.alignment.frames(station)
+    places = [frames.point(np.full_like(top, track), top) for track in tracks]
     return {
-        "station": _rounded(station),
-        "position": _rounded(bore.alignment.frames(station).point(np.zeros_like(top), top)),
+        "station": _rounded(np.tile(station, len(tracks))),
+        "position": _rounded(np.concatenate(places) if places else np.empty((0, 3))),
         "spacing": fur.SLEEPER_SPACING, "length": fur.SLEEPER_LENGTH, "top_width": fur.SLEEPER_TOP,
-        "bottom_width": fur.SLEEPER_BOTTOM, "height": fur.SLEEPER_HEIGHT, "top_above_floor": fur.SLEEPER_RISE,
+        "bottom_width": fur.SLEEPER_BOTTOM, "height": fur.SLEEPER_HEIGHT, "top_above_floor": bore.furniture.rise,
     }  # fmt: skip
 
 
 def _describe_rails(bore: Bore, station: np.ndarray) -> dict[str, Any]:
-    frames = bore.alignment.frames(station)
-    top = fur.RAIL_TOP - 0.5 * bore.section.height(station)
+    frames, tracks = bore.alignment.frames(station), bore.furniture.tracks
+    top = bore.furniture.rail_top - 0.5 * bore.section.height(station)
+
+    def lines(side: float) -> list[Any]:
+        places = [frames.point(np.full_like(top, track + side * fur.RAIL_AXIS), top) for track in tracks]
+        return _rounded(np.concatenate(places) if places else np.empty((0, 3)))
+
     return {
         "profile": "CHN60", "gauge": fur.GAUGE, "height": fur.RAIL_HEIGHT, "pad": fur.PAD[2],
-        "axis_offset": fur.RAIL_AXIS, "top_above_floor": fur.RAIL_TOP, "inclination": 0.0,
-        "left": _rounded(frames.point(np.full_like(top, fur.RAIL_AXIS), top)),
-        "right": _rounded(frames.point(np.full_like(top, -fur.RAIL_AXIS), top)),
+        "axis_offset": fur.RAIL_AXIS, "top_above_floor": bore.furniture.rail_top, "inclination": 0.0,
+        "left": lines(1.0), "right": lines(-1.0),
     }  # fmt: skip

@@ -16,6 +16,7 @@ from scene.writing.markup import rotation_along
 from scene.writing.track import Track, wall_offset
 
 _ROBOT_HEIGHT = 1.0
+_ASIDE = 0.3  # m: a third rail by standard belongs to a track on the axis
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,11 @@ class TunnelSpace:
         near = offset[int(start / step) : int(np.ceil(end / step)) + 1]
         return float(near.min()), float(near.max())
 
+    @property
+    def track_reach(self) -> float:
+        """Largest distance of the middle of a track from the axis, m."""
+        return max((float(np.abs(line.offset).max()) for line in self.track.lines), default=0.0)
+
     @lru_cache(maxsize=64)  # noqa: B019 a place lives as long as it is furnished
     def _offset(self, height: float, side: int) -> Float[np.ndarray, " n"]:
         return wall_offset(self.bore, self.track.elevation + height - self.bore.position[:, 2], side)
@@ -113,7 +119,7 @@ def place_furniture(space: TunnelSpace) -> list[Piece]:
         pieces += _walkway(space)
     if config.cables:
         pieces += _cables(space)
-    if config.third_rail and len(space.track.sleeper_station):
+    if config.third_rail and len(space.track.sleeper_station) and space.track_reach < _ASIDE:
         pieces += _third_rail(space)
     if config.plates:
         pieces += _plates(space)
@@ -136,10 +142,15 @@ def _stretches(space: TunnelSpace, spacing: float) -> list[tuple[float, float]]:
     return list(zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True))
 
 
+def _rounded(reach: float) -> float:
+    return reach if reach > _ASIDE else 0.0
+
+
 def _walkway(space: TunnelSpace) -> list[Piece]:
     config, pieces = space.config, []
-    least = max(config.gauge, space.track.config.sleeper_length / 2 + 0.05)
-    foot, top = -space.track.config.protrusion, config.walkway_height
+    laid = bool(len(space.track.sleeper_station))
+    least = max(config.gauge, _rounded(space.track_reach) + space.track.config.sleeper_length / 2 + 0.05)
+    foot, top = -space.track.config.protrusion if laid else 0.0, config.walkway_height
     rail, half = top + config.handrail_height, config.post_size / 2
     for start, end in _stretches(space, config.post_spacing):
         near, far = space.wall(start, end, top, 1)

@@ -61,9 +61,13 @@ def write_scene(
     count["wall_panels"] = add_patches(world, bore, track, openings)
     count["low_wall_panels"] = add_low_panels(world, walls, bore, track, furnished.niches if furnished else [])
     add_slabs(world, bore, track)
-    if len(track.sleeper_station):
+    if track.lines:
         add_track(parts, bore.axis, track)
-        count |= {"rails": 2, "pads": 2 * len(track.sleeper_station), "fasteners": 4 * len(track.sleeper_station)}
+        count |= {
+            "rails": 2 * len(track.lines),
+            "pads": 2 * len(track.sleeper_station),
+            "fasteners": 4 * len(track.sleeper_station),
+        }
     count["nails"] = add_nails(parts, bore, config.chunk_length)
     if furnished:
         _add_furniture(world, furnished)

@@ -1,17 +1,23 @@
-"""Sleepers, rails, pads and fasteners, placed by standard and checked against the bore."""
+"""Sleepers, rails, pads and fasteners: as the survey shows them, by standard where it does not, fitted to the bore."""
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float
 from scipy.ndimage import gaussian_filter1d
 
 from scene.bore import Bore
 from scene.errors import FitError
-from scene.fitting.trackseen import SeenSleepers
+from scene.fitting.rails import SeenRails
+from scene.fitting.trackseen import SeenLine, SeenTrack
 
 _FLAT = 0.10  # a bed this little above the lowest point of the bore is its floor
 _SMOOTHING = 1.0  # m
+_OTHER_PROFILE = 0.015  # m from the standard's rail height that a survey must show to be believed
+_LEAST_RAIL = 0.08  # m
+_BARE = 0.10  # m under a standard sleeper's top, where sleepers would be seen if there were any
 
 
 @dataclass(frozen=True)
@@ -34,6 +40,9 @@ class RailProfile:
 class TrackConfig:
     """Standard-gauge track on concrete monoblock sleepers, m."""
 
+    # Tracks that are laid: those that the survey shows (one by standard where it could show none, as rings of points),
+    # none, or one by standard on the axis.
+    lay: Annotated[Literal["auto", "none", "standard"], tyro.conf.arg(name="")] = "auto"
     gauge: float = 1.435  # Distance of the inner faces of the heads. Source: the paper and every standard.
     sleeper_spacing: float = 0.6  # Spacing of the sleepers. Source: the paper.
     sleeper_length: float = 2.5  # Length of a sleeper. Source: suppliers' tables for standard gauge.
@@ -54,52 +63,118 @@ class TrackConfig:
 
 
 @dataclass(frozen=True)
-class Track:
-    """The track of one bore."""
+class Line:
+    """One track; arrays over the stations of the bore unless said otherwise."""
 
-    config: TrackConfig  # Standard by which it was laid
-    bed: Float[np.ndarray, " n"]  # z of the ballast or slab at each station of the bore, m
-    elevation: Float[np.ndarray, " n"]  # z of the top of the sleepers, of the floor where there is no track, m
-    sleeper_station: Float[np.ndarray, " k"]  # m; empty where the bore is too narrow for a track
-    # Sleepers that the survey shows; the others lie where the spacing asks for one
-    measured: Bool[np.ndarray, " k"]
+    gauge: float  # m
+    gauge_measured: bool  # False where it is the standard's
+    offset: Float[np.ndarray, " n"]  # Of the middle of the track to the left of the axis, m
+    cant: Float[np.ndarray, " n"]  # Rise of the left rail over the right one, m
+    seat: Float[np.ndarray, " n"]  # z of the top of the sleepers in the middle of the track, m
+    rail_height: float  # From the top of the sleepers to that of the rails, m
+    footing: float  # What stands under the rails where no sleepers do, m
+    # Stations of the sleepers, m; empty where the floor is seen between the rails, and no sleeper
+    sleeper_station: Float[np.ndarray, " k"]
+    measured: Bool[np.ndarray, " k"]  # Sleepers that the survey shows; the others lie where the spacing asks for one
     clearance: Float[np.ndarray, " k"]  # Distance of each sleeper's nearer end to the wall, m
+
+    def rail_offset(self, rail: RailProfile) -> float:
+        """Distance from the middle of the track to that of a rail's head, m; the gauge itself is face to face."""
+        return (self.gauge + rail.head_width) / 2
+
+
+@dataclass(frozen=True)
+class Track:
+    """The tracks of one bore."""
+
+    config: TrackConfig  # Standard by which they were laid
+    bed: Float[np.ndarray, " n"]  # z of the ballast or slab at each station of the bore, m
+    elevation: Float[np.ndarray, " n"]  # z of the top of the sleepers, of the floor where there are none, m
+    lines: tuple[Line, ...]  # The tracks, from the right to the left
     raised: bool  # True where the bed is a slab above the floor (a round bore)
+    why: str = ""  # Reason for which there is no track; empty where there is one
+
+    @property
+    def sleeper_station(self) -> Float[np.ndarray, " k"]:
+        """Stations of the sleepers of all tracks, one track after another, m."""
+        return np.concatenate([np.empty(0), *(line.sleeper_station for line in self.lines)])
+
+    @property
+    def measured(self) -> Bool[np.ndarray, " k"]:
+        """True for the sleepers that the survey shows."""
+        return np.concatenate([np.empty(0, bool), *(line.measured for line in self.lines)])
+
+    @property
+    def clearance(self) -> Float[np.ndarray, " k"]:
+        """Distance of each sleeper's nearer end to the wall, m."""
+        return np.concatenate([np.empty(0), *(line.clearance for line in self.lines)])
 
 
-def lay_track(bore: Bore, config: TrackConfig, seen: SeenSleepers | None = None) -> Track:
-    """Lays the track on the flat floor, or on a bed just wide enough where the bore is round.
+def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) -> Track:
+    """Lays the tracks on the flat floor, or one on a bed just wide enough where the bore is round.
 
-    Sleepers that the survey shows are taken as they lie, and stand out as far as they do. Raises `FitError` where a
-    sleeper would come closer to the wall than the margin.
+    Rails and sleepers that the survey shows are taken as they lie, and stand out as far as they do. Raises `FitError`
+    where a sleeper would come closer to the wall than the margin, if it is not the survey that shows it there.
     """
     half_width = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]
     chord = bore.position[:, 2] + _lowest_chord(bore, half_width)
-    raised = bool(np.median(chord - floor) > _FLAT)
+    sought = config.lay == "auto" and seen is not None and seen.sought
+    lines = seen.lines if seen is not None and sought else (SeenLine(None, None),)
+    shown = sought and bool(lines)
+    raised = not shown and bool(np.median(chord - floor) > _FLAT)
     bed = chord if raised else floor
     sigma = _SMOOTHING / (bore.station[1] - bore.station[0])
     smooth = gaussian_filter1d(bed, sigma, mode="nearest")
-    if np.median(floor + bore.height - bed) < config.min_headroom:
+    why = ""
+    if config.lay == "none":
+        why = "none: as asked for"
+    elif sought and not lines:
+        why = "none: the survey shows no rails"
+    elif np.median(floor + bore.height - bed) < config.min_headroom and not shown:
+        why = "none: the bore is too low for it"
+    if why:
         level = gaussian_filter1d(floor, sigma, mode="nearest")
-        return Track(config, level, level, np.empty(0), np.empty(0, bool), np.empty(0), False)
-    if seen is None:
-        station = np.arange(int(bore.length / config.sleeper_spacing + 1e-6) + 1) * config.sleeper_spacing
-        measured = np.zeros(len(station), bool)
-    else:
-        station, measured, config = seen.station, seen.measured, replace(config, protrusion=seen.protrusion)
-    elevation = smooth + config.protrusion
-    level = elevation - bore.position[:, 2]
-    nearer = np.minimum(wall_offset(bore, level, 1), wall_offset(bore, level, -1))
-    row = np.clip(np.rint(station / bore.station[1]).astype(int), 0, len(bore.station) - 1)
+        return Track(config, level, level, (), False, why)
+    if shown and lines[0].sleepers is not None:
+        config = replace(config, protrusion=lines[0].sleepers.protrusion)
+    laid = tuple(_lay_line(bore, config, smooth, line) for line in lines)
+    seats = [line.seat for line in laid if len(line.sleeper_station)]
+    return Track(config, smooth, seats[0] if len(seats) == 1 else np.mean(seats or [smooth], axis=0), laid, raised)
+
+
+def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) -> Line:
+    rails, sleepers, count = seen.rails, seen.sleepers, len(bore.station)
+    station = np.arange(int(bore.length / config.sleeper_spacing + 1e-6) + 1) * config.sleeper_spacing
+    measured, protrusion = np.zeros(len(station), bool), config.protrusion
+    standard = rail_height = config.pad_thickness + config.rail.height
+    footing = 0.0
+    if sleepers is not None:
+        station, measured, protrusion = sleepers.station, sleepers.measured, sleepers.protrusion
+        if rails is not None and abs(rails.top - protrusion - standard) > _OTHER_PROFILE:
+            rail_height = max(rails.top - protrusion, _LEAST_RAIL)
+    elif rails is not None:
+        protrusion = max(rails.top - standard, 0.0)
+        if protrusion - seen.bed > _BARE:  # where sleepers would lie, the survey shows nothing
+            station, measured, footing = station[:0], measured[:0], protrusion
+    offset, cant = np.zeros(count), np.zeros(count)
+    if rails is not None:
+        offset = rails.offset_at(bore.station)
+        cant = np.interp(bore.station, rails.station, rails.cant)
+    seat = bed + protrusion
+    level = seat - bore.position[:, 2]
+    nearer = np.minimum(wall_offset(bore, level, 1) - offset, wall_offset(bore, level, -1) + offset)
+    row = np.clip(np.rint(station / bore.station[1]).astype(int), 0, count - 1)
     clearance = nearer[row] - config.sleeper_length / 2
-    if (clearance < config.margin).any():
+    if (clearance < config.margin).any() and rails is None:
         worst = int(np.argmin(clearance))
         raise FitError(
             f"the sleeper at {station[worst]:.1f} m comes within {clearance[worst]:.2f} m of the wall; "
-            f"{config.margin:g} m are needed"
+            f"{config.margin:g} m are needed; `--track none` lays no track"
         )
-    return Track(config, smooth, elevation, station, measured, clearance, raised)
+    known = rails is not None and rails.measured
+    gauge = rails.gauge if rails is not None and known else config.gauge
+    return Line(gauge, known, offset, cant, seat, rail_height, footing, station, measured, clearance)
 
 
 def _radius_down(bore: Bore) -> np.ndarray:
@@ -137,3 +212,57 @@ def wall_offset(bore: Bore, level: Float[np.ndarray, " n"], side: int) -> Float[
     crosses = (upward < level) != (next_upward < level)
     share = np.where(crosses, (level - upward) / np.where(crosses, next_upward - upward, 1.0), 0.0)
     return np.where(crosses, across + share * (next_across - across), 0.0).max(axis=1)
+
+
+def describe_track(track: Track, seen: SeenTrack) -> dict[str, Any]:
+    """Return what the manifest says of the tracks: of the first one, then of each in `lines`."""
+    shown = seen.lines if len(seen.lines) == len(track.lines) else (SeenLine(None, None),) * len(track.lines)
+    lines = [_describe_line(line, of.rails) for line, of in zip(track.lines, shown, strict=True)]
+    first: dict[str, Any] = lines[0] if lines else {}
+    return {
+        "lay": track.config.lay,
+        "laid": track.why
+        or ("as the survey shows it" if any(of.rails or of.sleepers for of in shown) else "by standard"),
+        "least_clearance": float(track.clearance.min()) if len(track.clearance) else None,
+        "slab": track.raised,
+        "sleepers_seen": int(track.measured.sum()),
+        "protrusion": track.config.protrusion if len(track.sleeper_station) else None,
+        "gauge": first.get("gauge"),
+        "gauge_seen": first.get("gauge_seen"),
+        "gauge_spread": first.get("gauge_spread"),
+        "rail_top_seen": first.get("rail_top_seen"),
+        "lines": lines,
+    }
+
+
+def _describe_line(line: Line, rails: SeenRails | None) -> dict[str, Any]:
+    known = rails is not None and rails.measured
+    return {
+        "gauge": line.gauge,
+        "gauge_from": "measured" if line.gauge_measured else "by standard",
+        "gauge_seen": rails.gauge if rails is not None and known else None,
+        "gauge_spread": rails.spread if rails is not None and known else None,
+        "gauge_pieces": rails.pieces if rails is not None else 0,
+        "rail_top_seen": rails.top if rails is not None else None,
+        "rail_height": line.rail_height,
+        "offset": [float(line.offset.min()), float(line.offset.max())],
+        "cant_mean": float(np.mean(line.cant)),
+        "cant_spread": float(np.std(line.cant)),
+        "cant_from": "measured" if rails is not None else "by standard",
+        "sleepers": len(line.sleeper_station),
+        "sleepers_seen": int(line.measured.sum()),
+    }
+
+
+def track_provenance(track: Track, seen: SeenTrack) -> dict[str, str]:
+    """Return how each asset of the track came about, for the manifest."""
+    if not track.lines:
+        return {"track": track.why}
+    sleepers = "measured" if track.measured.any() else "by standard"
+    shown = seen.sought and any(line.rails for line in seen.lines) and track.config.lay == "auto"
+    gauge = "gauge measured" if any(line.gauge_measured for line in track.lines) else "gauge by standard"
+    return {
+        "sleepers": sleepers if len(track.sleeper_station) else "none: the floor is seen between the rails",
+        "rails": f"profile by standard, place measured, {gauge}" if shown else "by standard",
+        "fasteners": "by standard" if len(track.sleeper_station) else "none",
+    }

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scene.bore import Axis, Bore
 from scene.writing import markup
 from scene.writing.markup import DECK, GROUND, SOLID, SceneParts, add_box, add_element
-from scene.writing.track import RailProfile, Track, TrackConfig
+from scene.writing.track import Line, RailProfile, Track, TrackConfig
 from scene.writing.unrolled import wall_points
 
 # Engineering defaults, not sourced: plan size of a pad; cast shoulder; a clip of 20 mm bar, e-shaped from above, from
@@ -45,14 +45,17 @@ def rail_boxes(profile: RailProfile) -> list[tuple[float, float, float]]:
     ]
 
 
-def fastening_mesh(config: TrackConfig) -> trimesh.Trimesh:
-    """Return the pads, shoulders and clips of one sleeper, about the middle of its top, m."""
-    parts = []
+def fastening_mesh(config: TrackConfig, rail_offset: float | None = None) -> trimesh.Trimesh:
+    """Return the pads, shoulders and clips of one sleeper, about the middle of its top, m.
+
+    Rails lie `rail_offset` m from it, as the configuration says where that is not given.
+    """
+    parts, aside = [], config.rail_offset if rail_offset is None else rail_offset
     for side in (1, -1):
         pad = trimesh.creation.box((*_PAD, config.pad_thickness))
-        parts.append(pad.apply_translation((0, side * config.rail_offset, config.pad_thickness / 2)))
+        parts.append(pad.apply_translation((0, side * aside, config.pad_thickness / 2)))
         for edge in (1, -1):
-            foot = side * config.rail_offset + edge * config.rail.foot_width / 2
+            foot = side * aside + edge * config.rail.foot_width / 2
             shoulder = trimesh.creation.box(_SHOULDER)
             parts.append(shoulder.apply_translation((0, foot + edge * _SHOULDER_AT, _SHOULDER[2] / 2)))
             path = _CLIP * [edge, edge, 1.0] + [0.0, foot, config.pad_thickness + config.rail.foot_height]
@@ -128,33 +131,51 @@ def add_slabs(world: ET.Element, bore: Bore, track: Track) -> None:
 
 
 def add_track(parts: SceneParts, axis: Axis, track: Track) -> None:
-    """Adds sleepers, their fastenings, and rails."""
-    for name, mesh in (("sleeper", sleeper_mesh(track.config)), ("fastening", fastening_mesh(track.config))):
-        text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=5, header=None)
-        (parts.meshes / f"{name}.obj").write_text(text)
-        add_element(
-            parts.asset, "mesh", name=name, file=f"{name}.obj", **({} if name == "sleeper" else {"inertia": "shell"})
-        )
-    at = axis.at(track.sleeper_station)
-    for k, z in enumerate(np.interp(track.sleeper_station, axis.station, track.elevation)):
-        frame = Rotation.from_matrix(
-            np.stack([at.tangent[k], at.lateral[k], np.cross(at.tangent[k], at.lateral[k])], axis=1)
-        )
+    """Adds sleepers, their fastenings, and rails; names of a second track have a 2 in them."""
+    _add_part(parts, "sleeper", sleeper_mesh(track.config))
+    for number, line in enumerate(track.lines, 1):
+        mark = "" if number == 1 else f"{number}_"
+        mesh = fastening_mesh(track.config, line.rail_offset(track.config.rail))
+        _add_part(parts, f"fastening{mark.rstrip('_')}", mesh, inertia="shell")
+        _add_sleepers(parts, axis, line, mark)
+        _add_rails(parts.world, axis, line, track.config, mark)
+
+
+def _add_part(parts: SceneParts, name: str, mesh: trimesh.Trimesh, **attributes: str) -> None:
+    text = trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=5, header=None)
+    (parts.meshes / f"{name}.obj").write_text(text)
+    add_element(parts.asset, "mesh", name=name, file=f"{name}.obj", **attributes)
+
+
+def _add_sleepers(parts: SceneParts, axis: Axis, line: Line, mark: str) -> None:
+    at = axis.at(line.sleeper_station)
+    offset = np.interp(line.sleeper_station, axis.station, line.offset)
+    tilt = np.interp(line.sleeper_station, axis.station, line.cant / _heads_apart(line))
+    for k, z in enumerate(np.interp(line.sleeper_station, axis.station, line.seat)):
+        across = at.lateral[k]
+        if tilt[k]:
+            across = across + np.array([0.0, 0.0, tilt[k]])
+            across -= (across @ at.tangent[k]) * at.tangent[k]
+            across /= np.linalg.norm(across)
+        frame = Rotation.from_matrix(np.stack([at.tangent[k], across, np.cross(at.tangent[k], across)], axis=1))
         place = {
-            "pos": markup.format_numbers([*at.position[k, :2], z]),
+            "pos": markup.format_numbers([*(at.position[k, :2] + offset[k] * at.lateral[k, :2]), z]),
             "quat": markup.format_quaternion(frame),
             "conaffinity": "0",
             "group": "1",
         }
         add_element(
-            parts.world, "geom", name=f"sleeper_{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
+            parts.world, "geom", name=f"sleeper_{mark}{k:04d}", type="mesh", mesh="sleeper", material="sleeper",
             contype=str(SOLID | GROUND), **place,
         )  # fmt: skip
         add_element(
-            parts.world, "geom", name=f"fastening_{k:04d}", type="mesh", mesh="fastening", material="bolt", contype="0",
-            **place,
+            parts.world, "geom", name=f"fastening_{mark}{k:04d}", type="mesh", mesh=f"fastening{mark.rstrip('_')}",
+            material="bolt", contype="0", **place,
         )  # fmt: skip
-    _add_rails(parts.world, axis, track)
+
+
+def _heads_apart(line: Line) -> float:
+    return line.gauge + 0.07  # about, m
 
 
 def add_nails(parts: SceneParts, bore: Bore, chunk: float) -> int:
@@ -167,21 +188,29 @@ def add_nails(parts: SceneParts, bore: Bore, chunk: float) -> int:
     return len(bore.nail)
 
 
-def _add_rails(world: ET.Element, axis: Axis, track: Track) -> None:
+def _add_rails(world: ET.Element, axis: Axis, line: Line, config: TrackConfig, mark: str) -> None:
     """Adds rails as boxes (foot, web, head) over stretches short enough for the curve."""
-    config = track.config
     station = np.linspace(0.0, axis.length, max(int(np.ceil(axis.length / _RAIL_LENGTH)), 1) + 1)
     at = axis.at(station)
-    base = np.interp(station, axis.station, track.elevation) + config.pad_thickness
+    rail = config.rail
+    taller = line.rail_height - config.pad_thickness - rail.height  # than the standard's
+    foot_box, web, head = rail_boxes(rail)
+    boxes = (
+        (foot_box[0], foot_box[1] - line.footing, foot_box[2]),
+        (web[0], web[1], web[2] + taller),
+        (head[0], head[1] + taller, head[2] + taller),
+    )
+    base = np.interp(station, axis.station, line.seat) + config.pad_thickness
+    offset, cant = (np.interp(station, axis.station, values) for values in (line.offset, line.cant))
     for side, name in ((1, "left"), (-1, "right")):
-        foot = at.position + side * config.rail_offset * at.lateral
-        foot[:, 2] = base
+        foot = at.position + (offset + side * line.rail_offset(rail))[:, None] * at.lateral
+        foot[:, 2] = base + side * cant / 2
         for k in range(len(station) - 1):
             rotation = markup.rotation_along(foot[k], foot[k + 1])
             half = float(np.linalg.norm(foot[k + 1] - foot[k])) / 2
-            for part, (width, low, high) in zip(("foot", "web", "head"), rail_boxes(config.rail), strict=True):
+            for part, (width, low, high) in zip(("foot", "web", "head"), boxes, strict=True):
                 middle = (foot[k] + foot[k + 1]) / 2 + rotation.apply([0, 0, (low + high) / 2])
                 material = "rail_head" if part == "head" else "steel"
                 size = (half, width / 2, (high - low) / 2)
-                name_part = f"rail_{name}_{k:03d}_{part}"
+                name_part = f"rail_{name}_{mark}{k:03d}_{part}"
                 add_box(world, name_part, size, middle, rotation, SOLID | GROUND, group="1", material=material)

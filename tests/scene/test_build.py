@@ -49,8 +49,8 @@ def test_the_scene_folder_holds_everything_the_format_asks_for(scene):
         assert (scene / name).stat().st_size > 0
     manifest = json.loads((scene / "manifest.json").read_text())
     assert manifest["schema"] == "subterra.manifest/1"
-    assert manifest["provenance"]["sleepers"] == "by standard"
-    assert manifest["count"]["sleepers"] == 41
+    assert manifest["provenance"]["track"] == "none: the survey shows no rails"
+    assert manifest["count"]["sleepers"] == 0
     assert len(manifest["inputs"][0]["sha256"]) == 64
     lining = (scene / "meshes" / "lining.ply").read_bytes()
     assert manifest["files"]["meshes/lining.ply"] == hashlib.sha256(lining).hexdigest()

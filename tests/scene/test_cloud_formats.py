@@ -111,7 +111,7 @@ def test_a_long_climbing_tunnel_in_metres_is_not_taken_for_millimetres():
 
 @pytest.mark.parametrize(
     ("config", "sentence"),
-    [({"unit": "yd"}, "unit 'yd' is none of m, mm, ft or us-ft"), ({"axes": "xxz"}, "axes 'xxz' are not"),
+    [({"unit": "yd"}, "unit 'yd' is none of m, cm, mm, ft or us-ft"), ({"axes": "xxz"}, "axes 'xxz' are not"),
      ({"format": "docx"}, "format 'docx' is none of"), ({"format": "las"}, "not a readable LAS cloud")],
 )  # fmt: skip
 def test_a_wrong_flag_is_named(tmp_path, config, sentence):

@@ -76,7 +76,7 @@ REFUSED = {
 def test_other_units_are_refused_by_name_unless_a_flag_overrides(tmp_path, name):
     record, said = REFUSED[name]
     path = write_las(tmp_path / "a.las", POINTS, record)
-    with pytest.raises(RecordingError, match=rf"a\.las: its coordinates are in {said}, not in m, mm, ft or us-ft"):
+    with pytest.raises(RecordingError, match=rf"a\.las: its coordinates are in {said}, not in m, cm, mm, ft or us-ft"):
         read_cloud(path, 0.1)
     assert read_cloud(path, 0.1, ReadingConfig(unit="m"))[1]["unit"] == "m (by flag)"
 

@@ -1,0 +1,150 @@
+"""The steps of cleaning, in order: leave out strays, look for places inside a bore, follow it, sort the returns."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from scene.bore import Axis
+from scene.cleaning.follow import Course, follow_bore
+from scene.cleaning.refusal import name_cloud
+from scene.cleaning.removed import KEPT, Cleaned, list_removed, part_of_cloud
+from scene.cleaning.seeds import Seed, find_seeds
+from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
+from scene.cleaning.tube import Tube, measure_tube
+from scene.cloud import Cloud, thin_cloud
+from scene.errors import FitError
+from scene.fitting.centreline import CentrelineConfig, centre_axis, fit_centreline, smooth_axis
+
+_COARSE = 0.15  # m, voxel of the cloud that is followed
+_REACH = 3.0  # times the template: as far as the wall is looked for
+_STRETCH = 3.0  # m between two stretches of what was removed
+_LITTLE = 0.002  # share of the points: with less to remove, the cloud is clean
+_SAME = 0.10  # m between two axes of one bore
+_FEWEST = 200  # points
+_TRIED = 8  # seeds followed
+_ENCLOSED = 0.65  # share of the directions
+_ELONGATION = 1.4  # least length over width
+_ABOVE, _CROWN, _STREET = 0.8, 0.15, 7.0  # sine of directions above; share of them matched; m
+
+
+@dataclass(frozen=True)
+class CleaningConfig:
+    """Settings of the search for what is not the bore."""
+
+    strict: Annotated[bool, tyro.conf.arg(prefix_name=False)] = False  # Refuse a cloud with a branch.
+
+
+def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConfig) -> Cleaned:
+    """Finds the axis of the bore in a registered cloud and cuts away what does not belong to it.
+
+    Raises `FitError` where no bore can be seen, naming the cause, and with `config.strict` where it has a branch.
+    """
+    supported = has_support(cloud.points)
+    coarse = thin_cloud(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE).astype(np.float64)
+    if len(coarse) < _FEWEST:
+        return _as_it_is(cloud, centreline)  # which says what is missing
+    seeds = find_seeds(coarse)
+    course = longest_course(coarse, seeds)
+    if course is None or course.length < max(centreline.min_length, _ELONGATION * course.width):
+        raise FitError(name_cloud(coarse, seeds, course, centreline.min_length))
+    axis = smooth_axis(course.position, centreline.cutoff)
+    reach = _REACH * float(np.nanmax(np.nanmedian(course.radius, axis=0)))
+    for _ in range(2):
+        tube, ends, own = _sorted_coarse(coarse, axis, reach)
+        axis = centre_axis(coarse[own], axis, centreline, _usual_section(axis, tube))
+    tube, ends, _own = _sorted_coarse(coarse, axis, reach)
+    require_crown(tube)
+    points = cloud.points.astype(np.float64)
+    around = look_around(points, axis)
+    behind, cause = sort_points(around, tube, supported, ends)
+    cause = name_bodies(points, cause, behind, supported)
+    if (cause != KEPT).mean() < _LITTLE:
+        try:
+            whole = _as_it_is(cloud, centreline)
+        except FitError:
+            whole = None
+        if whole is not None and _agree(whole.axis, axis):
+            return whole
+    kept = part_of_cloud(cloud, np.flatnonzero(cause == KEPT))
+    usual = _usual_section(axis, tube)
+    axis = axis.at(np.linspace(*ends, int(np.ptp(ends)) + 1))
+    axis = centre_axis(kept.points, axis, centreline, usual)
+    removed = list_removed(cloud, cause, look_around(points, axis).station, _STRETCH, behind)
+    warning = next((part.warning for part in removed if part.warning), "")
+    if config.strict and warning:
+        raise FitError(warning)
+    return Cleaned(kept, axis, removed, cause)
+
+
+def _sorted_coarse(
+    coarse: np.ndarray, axis: Axis, reach: float
+) -> tuple[Tube, tuple[float, float], Bool[np.ndarray, " n"]]:
+    """Return the tube about an axis, its ends, and which points are the bore's."""
+    around = look_around(coarse, axis)
+    tube = measure_tube(around.station, around.angle, around.radius, axis.length, reach)
+    ends = end_stations(tube, around)
+    return tube, ends, sort_points(around, tube, np.ones(len(coarse), bool), ends)[1] == KEPT
+
+
+def require_crown(tube: Tube) -> None:
+    """Refuses a wide tube that nearly no station shows from above; raises `FitError`."""
+    above = np.sin(tube.grid.angle) > _ABOVE
+    sides = np.abs(np.cos(tube.grid.angle)) > _ABOVE
+    width = 2 * float(np.median(tube.usual[:, sides]))
+    if width > _STREET and tube.matched[:, above].mean() < _CROWN:
+        raise FitError(f"no tunnel in the cloud: open above and {width:.0f} m wide, so a street or a cutting")
+
+
+def _agree(one: Axis, other: Axis) -> bool:
+    """Return whether two axes are the same but for noise; where a wall was not seen, they may not be."""
+    station, lateral, upward = other.local(one.position)
+    inside = (station > 0) & (station < other.length)
+    return bool(np.hypot(lateral, upward)[inside].max(initial=0.0) < _SAME)
+
+
+def _as_it_is(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
+    axis = fit_centreline(cloud.points, centreline, cloud.origin)
+    return Cleaned(cloud, axis, (), np.zeros(len(cloud.points), np.int8))
+
+
+def longest_course(points: Float[np.ndarray, "n 3"], seeds: list[Seed]) -> Course | None:
+    """Follows the likeliest places and returns the longest bore; `None` where no place is enclosed."""
+    tree = cKDTree(points)
+    courses: list[Course] = []
+    for seed in seeds:
+        if seed.enclosed < _ENCLOSED or len(courses) >= _TRIED:
+            continue
+        if any(_holds(course, seed.position) for course in courses):
+            continue
+        courses.append(follow_bore(points, tree, seed))
+    return max(courses, key=lambda course: course.length, default=None)
+
+
+def _holds(course: Course, position: np.ndarray) -> bool:
+    off, nearest = cKDTree(course.position).query(position)
+    return bool(off < 1.5 * np.median(course.radius[nearest]))
+
+
+def _usual_section(axis: Axis, tube: Tube) -> Callable[[Axis], Float[np.ndarray, "k rays"]]:
+    return lambda at: stand_in(tube, axis, at)
+
+
+def stand_in(tube: Tube, axis: Axis, at: Axis) -> Float[np.ndarray, "k rays"]:
+    """Return the tube's usual wall about the stations of another axis nearby, in 72 directions, m."""
+    station, lateral, upward = axis.local(at.position)
+    rows = np.clip(((station - tube.grid.start) / tube.grid.step).astype(np.intp), 0, tube.grid.rows - 1)
+    turn = tube.grid.angle
+    centres = -np.pi + 2 * np.pi * (np.arange(72) + 0.5) / 72
+    result = np.empty((len(rows), 72))
+    for k, row in enumerate(rows):
+        y = tube.usual[row] * np.cos(turn) - lateral[k]
+        z = tube.usual[row] * np.sin(turn) - upward[k]
+        angle = np.arctan2(z, y)
+        order = np.argsort(angle)
+        result[k] = np.interp(centres, angle[order], np.hypot(y, z)[order], period=2 * np.pi)
+    return result

@@ -1,0 +1,198 @@
+"""Follows a bore from a place inside it, metre by metre, both ways, until nothing encloses the way any more.
+
+Each section is laid on the template of the last few metres by what fits it. A niche, a vehicle or a wall in shadow fits
+nothing and so moves nothing; a section that changes over several metres becomes the template.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from scene.cleaning.seeds import N_RAYS, Seed, frame_of
+
+STEP = 1.0  # m
+_HALF_SLAB = 0.75  # m
+_GATE = 0.5  # m from the template: further is another thing
+_REMEMBERED = 12  # sections in the template
+_RECENT = 3  # sections in the template of a section that changes fast
+_HEADED = 8  # m of way that give the direction
+_ENCLOSED = 0.62  # share of the directions matched
+_OPEN = 0.45  # share with any return near the template's size: less is no bore
+_SIZE = 2.2  # times the template
+_LONGEST_GAP = 15  # m without an enclosing section
+_PULL = 3.0  # bins that the prediction counts for
+_MIN_RETURNS = 12  # in a slab; fewer are a gap
+_ROUNDS = 3
+_AROUND = 10  # sections on each side of unsteady ones that tell where they are
+_LEVEL = 0.9  # cosine of the directions that count as left and right
+_TURN = -np.pi + 2 * np.pi * (np.arange(N_RAYS) + 0.5) / N_RAYS
+
+
+@dataclass(frozen=True)
+class Course:
+    """A bore followed from end to end."""
+
+    position: Float[np.ndarray, "n 3"]  # Middle of each section, m
+    steady: Bool[np.ndarray, " n"]  # The section fits those of the last 12 m; elsewhere the middle is interpolated
+    radius: Float[np.ndarray, "n rays"]  # Template about the middle, m
+
+    @property
+    def length(self) -> float:
+        """Length of the polygon, m."""
+        return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+
+    @property
+    def width(self) -> float:
+        """Distance of the walls to the left and right of the middle from each other, m."""
+        usual = _filled(np.nanmedian(self.radius, axis=0))
+        side = np.abs(np.cos(_TURN)) > _LEVEL
+        return 2 * float(np.mean(usual[side]))
+
+
+def follow_bore(points: Float[np.ndarray, "n 3"], tree: cKDTree, seed: Seed) -> Course:
+    """Follows the bore of a seed to both of its ends."""
+    ahead = _follow(points, tree, seed, seed.direction)
+    back = _follow(points, tree, seed, -seed.direction)
+    both = [*back[::-1], *ahead[1:]]
+    steady = np.array([step[1] for step in both])
+    return Course(_bridged(np.array([step[0] for step in both]), steady), steady, np.array([step[2] for step in both]))
+
+
+def _bridged(position: np.ndarray, steady: np.ndarray) -> np.ndarray:
+    """Replaces the middles of unsteady sections: by a cubic through those around, by a line beyond the last one."""
+    at = np.arange(len(position), dtype=float)
+    edges = np.flatnonzero(np.diff(np.concatenate([[1], steady.astype(int), [1]])))
+    result = position.copy()
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        before, behind = (np.flatnonzero(steady[:first])[-_AROUND:], last + np.flatnonzero(steady[last:])[:_AROUND])
+        rows = np.concatenate([before, behind])
+        if len(rows) < 2:
+            continue
+        degree = min(3, len(rows) - 1) if len(before) and len(behind) else 1
+        middle = at[rows].mean()
+        fitted = np.polyfit(at[rows] - middle, position[rows], degree)
+        result[first:last] = np.stack([np.polyval(fitted[:, k], at[first:last] - middle) for k in range(3)], axis=1)
+    return result
+
+
+def _follow(
+    points: np.ndarray, tree: cKDTree, seed: Seed, direction: np.ndarray
+) -> list[tuple[np.ndarray, bool, np.ndarray]]:
+    mirrored = direction @ seed.direction < 0
+    first = seed.radius[(N_RAYS // 2 - 1 - np.arange(N_RAYS)) % N_RAYS] if mirrored else seed.radius
+    template = _filled(first)
+    history = [template] * 2
+    steps = [(seed.position, True, seed.radius)]
+    position, lost = seed.position, 0
+    while lost <= _LONGEST_GAP and len(steps) < 100_000:
+        position = position + STEP * direction
+        recent = np.median(history[-_RECENT:], axis=0)
+        shift, matched, steady, section = _lay(points, tree, position, direction, template, recent)
+        left, up = frame_of(direction)
+        if matched >= _ENCLOSED:
+            lost = 0
+            position = position + shift[0] * left + shift[1] * up
+            history = [*history, section][-_REMEMBERED:]
+            template = np.median(history, axis=0)
+        else:
+            lost += 1
+        seen = template[(N_RAYS // 2 - 1 - np.arange(N_RAYS)) % N_RAYS] if mirrored else template
+        steps.append((position, matched >= _ENCLOSED and steady >= _ENCLOSED, seen))
+        if lost == 0:
+            direction = _heading([step[0] for step in steps[-_HEADED:]], direction)
+    return steps[: len(steps) - lost]
+
+
+def _heading(places: Sequence[np.ndarray], before: np.ndarray) -> np.ndarray:
+    """Direction of the last few middles; while they are few, mostly the one before."""
+    at = np.asarray(places)
+    if len(at) < 3:
+        return before
+    centred = at - at.mean(axis=0)
+    along = np.arange(len(at)) - (len(at) - 1) / 2
+    fitted = along @ centred / (along @ along)
+    share = min(len(at) / _HEADED, 1.0) * 0.5
+    mixed = share * fitted / max(float(np.linalg.norm(fitted)), 1e-9) + (1 - share) * before
+    return mixed / np.linalg.norm(mixed)
+
+
+def _lay(
+    points: np.ndarray,
+    tree: cKDTree,
+    position: np.ndarray,
+    direction: np.ndarray,
+    template: np.ndarray,
+    recent: np.ndarray,
+) -> tuple[np.ndarray, float, float, np.ndarray]:
+    """Return how far a section's middle is to the left and above of a place, and the section about it.
+
+    Between them: the share of its directions that match either template, and the share that match the longer one.
+    """
+    reach = _SIZE * float(template.max())
+    near = points[tree.query_ball_point(position, reach)] - position
+    slab = near[np.abs(near @ direction) < _HALF_SLAB]
+    none = np.zeros(2), 0.0, 0.0, template
+    if len(slab) < _MIN_RETURNS:
+        return none
+    left, up = frame_of(direction)
+    place = np.stack([slab @ left, slab @ up], axis=1)
+    shift = np.zeros(2)
+    best = template
+    for _ in range(_ROUNDS):
+        bins, radius = _polar(place - shift)
+        off = [_bin_off(bins, radius - shape[bins]) for shape in (template, recent)]
+        best = template if np.isfinite(off[0]).sum() >= np.isfinite(off[1]).sum() else recent
+        e = off[0] if best is template else off[1]
+        fits = np.isfinite(e)
+        if fits.mean() < 0.3:
+            break
+        normal = _normals(best)[fits]
+        shift = shift + np.linalg.solve(normal.T @ normal + _PULL * np.eye(2), normal.T @ e[fits])
+    bins, radius = _polar(place - shift)
+    long, brief = (np.isfinite(_bin_off(bins, radius - shape[bins])) for shape in (template, recent))
+    return shift, float((long | brief).mean()), float(long.mean()), _section(bins, radius, best)
+
+
+def _polar(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    turn = np.arctan2(place[:, 1], place[:, 0])
+    return np.floor((turn + np.pi) / (2 * np.pi) * N_RAYS).astype(np.intp) % N_RAYS, np.hypot(*place.T)
+
+
+def _bin_off(bins: np.ndarray, off: np.ndarray) -> np.ndarray:
+    """Median distance from the template of what is near it in each direction, m; NaN where nothing is."""
+    near = np.abs(off) < _GATE
+    return _medians(bins[near], off[near])
+
+
+def _section(bins: np.ndarray, radius: np.ndarray, template: np.ndarray) -> np.ndarray:
+    """Radius in each direction: of what is near the template, else of all that is there, else the template's."""
+    near = np.abs(radius - template[bins]) < _GATE
+    best, any_ = _medians(bins[near], radius[near]), _medians(bins, radius)
+    return np.where(np.isfinite(best), best, np.where(np.isfinite(any_), any_, template))
+
+
+def _medians(bins: np.ndarray, value: np.ndarray) -> np.ndarray:
+    order = np.lexsort((value, bins))
+    bounds = np.searchsorted(bins[order], np.arange(N_RAYS + 1))
+    count = np.diff(bounds)
+    result = np.full(N_RAYS, np.nan)
+    some = count > 0
+    result[some] = value[order][bounds[:-1][some] + count[some] // 2]
+    return result
+
+
+def _normals(radius: np.ndarray) -> np.ndarray:
+    """Outward unit normals of the ring, divided by what they make of a radial distance, `(rays, 2)`."""
+    slope = (np.roll(radius, -1) - np.roll(radius, 1)) / (4 * np.pi / N_RAYS) / radius
+    slope = np.clip(slope, -1.0, 1.0)  # d(log r): the ring leans so much
+    radial = np.stack([np.cos(_TURN), np.sin(_TURN)], axis=1)
+    around = np.stack([-np.sin(_TURN), np.cos(_TURN)], axis=1)
+    return radial - slope[:, None] * around
+
+
+def _filled(radius: np.ndarray) -> np.ndarray:
+    seen = np.isfinite(radius)
+    return np.interp(_TURN, _TURN[seen], radius[seen], period=2 * np.pi)

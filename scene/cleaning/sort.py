@@ -1,0 +1,195 @@
+"""Sorts returns by where they lie about a bore: on its wall, inside, behind, beyond its mouths, or alone."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_dilation
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from scene.bore import Axis
+from scene.cleaning.removed import BEHIND, BEYOND, BRANCH, ELSEWHERE, INSIDE, KEPT, SCATTERED
+from scene.cleaning.tube import Tube
+
+_OVERRUN = 60.0  # m beyond the axis that points have stations
+_BEHIND = 0.45  # m behind the wall: further is no recess of a lining
+_INSIDE = 0.30  # m
+_ALONE = 0.15  # m from the wall at which a return without neighbours is a stray
+_TRACK = 0.60  # m above the floor: lower is track, kerb or walkway
+_FOOT = 1.2  # m: what has a part between these heights stands on the floor
+_CELL = 0.25  # m
+_ABOVE = 0.08  # m
+_END_ENCLOSED = 0.4  # share of the directions with wall
+_RIM = 1.0  # m
+_FEW = 2e-4  # share of the points
+_USUAL = 0.5  # share of the rows that show a direction
+_ABOVE_SPRINGING, _MIN_ABOVE = 0.3, 8  # sine of the direction; directions
+_ELSEWHERE = 4.0  # times the wall
+
+
+@dataclass(frozen=True)
+class Around:
+    """Points about an axis."""
+
+    station: Float[np.ndarray, " n"]  # m
+    lateral: Float[np.ndarray, " n"]  # m
+    upward: Float[np.ndarray, " n"]  # m
+
+    @property
+    def angle(self) -> Float[np.ndarray, " n"]:
+        """Direction from the axis, rad."""
+        return np.arctan2(self.upward, self.lateral)
+
+    @property
+    def radius(self) -> Float[np.ndarray, " n"]:
+        """Distance from the axis, m."""
+        return np.hypot(self.lateral, self.upward)
+
+
+def look_around(points: Float[np.ndarray, "n 3"], axis: Axis) -> Around:
+    """Return points about an axis that runs on straight beyond its ends."""
+    return Around(*axis.at(np.arange(-_OVERRUN, axis.length + _OVERRUN, 0.25)).local(points))
+
+
+def end_stations(tube: Tube, around: Around) -> tuple[float, float]:
+    """Return the first and last station at which the lining was seen, m.
+
+    Floor and walls may go on into a cutting: the directions above the springing decide, where they were seen at all.
+    """
+    turn = tube.grid.angle
+    usual = tube.closed.mean(axis=0) > _USUAL
+    above = usual & (np.sin(turn) > _ABOVE_SPRINGING)
+    decide = above if above.sum() >= _MIN_ABOVE else usual
+    near = binary_dilation(tube.closed, np.ones((1, 3), bool))[:, decide]
+    full = np.flatnonzero(near.mean(axis=1) >= _END_ENCLOSED) if decide.any() else np.empty(0, int)
+    first, last = tube.grid.start, tube.grid.start + tube.grid.rows * tube.grid.step
+    if not len(full):
+        return first, last
+    angle, radius = around.angle, around.radius
+    out, _ = tube.off(around.station, angle, radius)
+    column = np.floor((angle + np.pi) / (2 * np.pi) * tube.grid.columns).astype(np.intp) % tube.grid.columns
+    on = (out < _BEHIND) & decide[column]
+
+    def outermost(end: float, way: int) -> float:
+        """Station up to which 40 % of the directions show the lining."""
+        ahead = way * (around.station - end)
+        rows = on & (np.abs(ahead) < 2 * tube.grid.step)
+        last_seen = np.full(tube.grid.columns, -np.inf)
+        np.maximum.at(last_seen, column[rows], ahead[rows])
+        return end + way * float(np.quantile(last_seen[decide], 1 - _END_ENCLOSED, method="nearest"))
+
+    first, last = first + full[0] * tube.grid.step, first + (full[-1] + 1) * tube.grid.step
+    first, last = outermost(first, -1), outermost(last, 1)
+    # Where nothing lies beyond a mouth there is nothing to cut, and its rim stays whole.
+    few = _FEW * len(around.station)
+    if (around.station < first - _RIM).sum() <= few:
+        first -= _RIM
+    if (around.station > last + _RIM).sum() <= few:
+        last += _RIM
+    return first, last
+
+
+def sort_points(
+    around: Around, tube: Tube, supported: Bool[np.ndarray, " n"], ends: tuple[float, float]
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """Return how far each point is behind the wall, m, and its index into `CAUSES`."""
+    angle, radius = around.angle, around.radius
+    out, within = tube.off(around.station, angle, radius)
+    cause = np.full(len(radius), KEPT, np.int8)
+    cause[out > _BEHIND] = BEHIND
+    height = _height_above_floor(around, tube)
+    inside = (within > _INSIDE) & (height > _TRACK)
+    cause[inside] = INSIDE
+    cause[_footprint(around, inside & (height < _TRACK + _FOOT)) & (height > _ABOVE) & (within > _ALONE)] = INSIDE
+    cause[~supported & (np.maximum(out, within) > _ALONE)] = SCATTERED
+    beyond = (around.station < ends[0]) | (around.station > ends[1])
+    cause[beyond] = BEYOND
+    cause[~beyond & supported & (radius > _ELSEWHERE * np.median(tube.wall))] = ELSEWHERE
+    return out, cause
+
+
+def _height_above_floor(around: Around, tube: Tube) -> Float[np.ndarray, " n"]:
+    """Height above the tube's floor under each point, m; infinite over no floor."""
+    rows = np.clip(((around.station - tube.grid.start) / tube.grid.step).astype(np.intp), 0, tube.grid.rows - 1)
+    turn = tube.grid.angle
+    low = np.sin(turn) < -0.3
+    y = tube.wall[:, low] * np.cos(turn[low])
+    z = tube.wall[:, low] * np.sin(turn[low])
+    step = 0.1
+    edges = np.arange(y.min(), y.max() + step, step)
+    floor = np.stack(
+        [np.interp(edges, y[row][np.argsort(y[row])], z[row][np.argsort(y[row])]) for row in range(len(y))]
+    )
+    column = np.clip(((around.lateral - edges[0]) / step).astype(np.intp), 0, len(edges) - 1)
+    return around.upward - floor[rows, column]
+
+
+def _footprint(around: Around, standing: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Return the points over or under what stands on the floor."""
+    if not standing.any():
+        return standing
+    x, y = (np.floor(v / _CELL).astype(np.int64) for v in (around.station, around.lateral))
+    key = x * 100_003 + y
+    return np.isin(key, np.unique(key[standing]))
+
+
+_NEIGHBOURS = 4
+_SAMPLE = 20_000
+_FURTHER = 3.0  # times the usual distance to that neighbour
+_LEAST = 0.15  # m
+
+
+def has_support(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+    """Return whether each point has its fourth neighbour within three times the usual distance, at least 15 cm.
+
+    Profiles some way apart are no strays: their points have neighbours in their own profile.
+    """
+    if len(points) <= _NEIGHBOURS:
+        return np.ones(len(points), bool)
+    tree = cKDTree(points)
+    sample = points[:: max(1, len(points) // _SAMPLE)]
+    usual = float(np.median(tree.query(sample, _NEIGHBOURS + 1, workers=-1)[0][:, -1]))
+    limit = max(_FURTHER * usual, _LEAST)
+    return np.isfinite(tree.query(points, _NEIGHBOURS + 1, distance_upper_bound=limit, workers=-1)[0][:, -1])
+
+
+_VOXEL = 0.4  # m
+_JOINED = 1.0  # m between two voxels of one body
+_BODY = 15  # voxels; smaller is clutter
+_TOUCHING = 1.5  # m from the wall
+_DEEP = 1.5  # m behind the wall: a recess
+
+
+def name_bodies(
+    points: Float[np.ndarray, "n 3"],
+    cause: Int[np.ndarray, " n"],
+    behind: Float[np.ndarray, " n"],
+    supported: Bool[np.ndarray, " n"],
+) -> Int[np.ndarray, " n"]:
+    """Return the causes, with connected returns off the bore told apart by depth and distance.
+
+    `behind` is how far each point is behind the wall, m.
+    """
+    off = np.flatnonzero(np.isin(cause, (BEHIND, BEYOND, ELSEWHERE)) & supported)
+    if not len(off):
+        return cause
+    cells, voxel = np.unique(np.floor(points[off] / _VOXEL).astype(np.int64), axis=0, return_inverse=True)
+    voxel = voxel.ravel()
+    pairs = cKDTree(cells * _VOXEL).query_pairs(_JOINED, output_type="ndarray")
+    links = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
+    count, body = connected_components(links, directed=False)
+    of_point = body[voxel]
+    depth, nearest = np.full(count, -np.inf), np.full(count, np.inf)
+    np.maximum.at(depth, of_point, behind[off])
+    np.minimum.at(nearest, of_point, behind[off])
+    beyond = np.bincount(of_point, cause[off] == BEYOND, count) / np.bincount(of_point, minlength=count)
+    voxels = np.bincount(body, minlength=count)
+    named = np.full(count, BEHIND)
+    named[(voxels >= _BODY) & (depth > _DEEP) & (nearest < _TOUCHING)] = BRANCH
+    named[(voxels >= _BODY) & (nearest >= _TOUCHING)] = ELSEWHERE
+    named[beyond > 0.5] = BEYOND
+    result = cause.copy()
+    result[off] = np.where((cause[off] == BEYOND) & (named[of_point] != ELSEWHERE), BEYOND, named[of_point])
+    return result

@@ -1,0 +1,172 @@
+"""The wall of a bore as most of its stations show it, and what lies inside, behind and beyond it.
+
+A wall goes on along the bore; what is short or sparse is something else. For each station and direction the wall is
+the outermost distance at which the rows around keep having returns. Over 50 m this gives the usual section, over 8 m
+the present one. Where they differ, the present one is a real change if it goes on for a lay-by's length or all around
+at once; otherwise something stands in the bore, or opens beside it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.ndimage import (
+    binary_closing,
+    binary_opening,
+    label,
+    maximum_filter,
+    minimum_filter,
+    uniform_filter1d,
+)
+
+from scene.fitting.unroll import Grid, fill_nearest
+
+ROW = 0.5  # m
+_OVERRUN = 4.0  # m beyond the axis that may still be bore
+COLUMNS = 120
+_BIN = 0.1  # m of radius
+_USUAL, _PRESENT, _BRIEF = 40.0, 4.0, 1.0  # m before and behind a station
+_PERSISTENT = 0.4  # share of the rows seen
+_MOSTLY = 0.5  # the same for the usual section
+_LEAST_ROWS = 3
+_DIFFERENT = 0.3  # m
+_LAYBY = 7.0  # m: shorter is a niche
+_WIDEST = 2.0  # times the usual radius
+_AROUND = 0.5  # share of the directions that change at once where the section changes
+_HIDDEN = 0.3  # share of the directions with returns behind: what is in front stands inside
+_JUMP = 0.4  # m from one direction to the next
+
+
+@dataclass(frozen=True)
+class Tube:
+    """The wall about an axis."""
+
+    grid: Grid  # Stations and directions
+    wall: Float[np.ndarray, "rows cols"]  # Distance from the axis, m; nowhere NaN
+    usual: Float[np.ndarray, "rows cols"]  # The same as most of 80 m show it, m
+    seen: Bool[np.ndarray, "rows cols"]  # A row around showed it
+    matched: Bool[np.ndarray, "rows cols"]  # This row itself has returns on it
+    closed: Bool[np.ndarray, "rows cols"]  # This row has returns no further than a flare may open
+
+    def off(
+        self, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " n"], radius: Float[np.ndarray, " n"]
+    ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return how far points are behind the wall of the cells around theirs, and how far inside, m; negative if not.
+
+        Beyond the ends the last row counts.
+        """
+        cell = self.grid.cell(np.clip(station, self.grid.start, self._end - 1e-6), angle)
+        furthest = maximum_filter(self.wall, 3, mode=("nearest", "wrap")).ravel()[cell]
+        nearest = minimum_filter(self.wall, 3, mode=("nearest", "wrap")).ravel()[cell]
+        return radius - furthest, nearest - radius
+
+    @property
+    def _end(self) -> float:
+        return self.grid.start + self.grid.rows * self.grid.step
+
+
+def measure_tube(
+    station: Float[np.ndarray, " n"],
+    angle: Float[np.ndarray, " n"],
+    radius: Float[np.ndarray, " n"],
+    length: float,
+    reach: float,
+) -> Tube:
+    """Return the wall that persists along an axis of some length, m, within `reach` m of it."""
+    grid = Grid.over(-_OVERRUN, length + _OVERRUN, ROW, COLUMNS)
+    cell = grid.cell(station, angle)
+    good = (cell >= 0) & (radius < reach)
+    bins = int(np.ceil(reach / _BIN)) + 1
+    flat = np.zeros((grid.rows * COLUMNS, bins), bool)
+    flat[cell[good], (radius[good] / _BIN).astype(np.intp)] = True
+    hit = flat.reshape(grid.rows, COLUMNS, bins)
+    wide = hit.copy()  # a wall wavers by a bin
+    wide[..., 1:] |= hit[..., :-1]
+    wide[..., :-1] |= hit[..., 1:]
+    usual, present, brief = (
+        _outermost(wide, hit, window, share)
+        for window, share in ((_USUAL, _MOSTLY), (_PRESENT, _PERSISTENT), (_BRIEF, _PERSISTENT))
+    )
+    usual = fill_nearest(usual)
+    wall = _decide(usual, present, brief, wide)
+    row, column, index = np.nonzero(hit)
+    on = np.abs((index + 0.5) * _BIN - wall[row, column]) < _DIFFERENT
+    matched = np.zeros(wall.shape, bool)
+    matched[row[on], column[on]] = True
+    nearest = np.where(hit.any(axis=2), hit.argmax(axis=2) * _BIN, np.inf)
+    closed = nearest < np.maximum(wall + _DIFFERENT, _WIDEST * usual)
+    return Tube(grid, wall, usual, np.isfinite(present), matched, closed)
+
+
+def _outermost(wide: np.ndarray, hit: np.ndarray, window: float, share: float) -> Float[np.ndarray, "rows cols"]:
+    """Outermost distance with returns in enough of the rows seen within `window` m, m; NaN where there is none."""
+    size = 2 * round(window / ROW) + 1
+    seen = uniform_filter1d(hit.any(axis=2).astype(np.float32), size, axis=0, mode="constant") * size
+    result = np.full(hit.shape[:2], np.nan)
+    for column in range(hit.shape[1]):
+        rows = uniform_filter1d(wide[:, column].astype(np.float32), size, axis=0, mode="constant") * size
+        needed = np.maximum(share * seen[:, column], min(_LEAST_ROWS, size / 4) - 0.01)
+        enough = (rows >= needed[:, None]) & (rows > 0.5)
+        some = enough.any(axis=1)
+        last = enough.shape[1] - 1 - enough[:, ::-1].argmax(axis=1)
+        # `wide` reaches one bin too far out
+        result[some, column] = (last[some] - 0.5) * _BIN
+    return result
+
+
+def _decide(
+    usual: np.ndarray, present: np.ndarray, brief: np.ndarray, wide: np.ndarray
+) -> Float[np.ndarray, "rows cols"]:
+    wall = usual.copy()
+    # Wider for a lay-by's length: the bore is wider here.
+    wider = (present > usual + _DIFFERENT) & (present < _WIDEST * usual)
+    rows = round(_LAYBY / ROW)
+    line = np.ones((rows, 1), bool)
+    padded = np.pad(wider, ((rows, rows), (0, 0)), mode="edge")
+    lasting = binary_opening(binary_closing(padded, np.ones((5, 1), bool)), line)[rows:-rows]
+    lasting &= wider
+    wall[lasting] = present[lasting]
+    # Wider or narrower all around at once: the section changes, or flares open.
+    for found in (present, brief):
+        known = np.isfinite(found)
+        for changed in ((found > usual + _DIFFERENT) & (found < _WIDEST * usual), found < usual - _DIFFERENT):
+            share = changed.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+            at_once = (share > _AROUND) & (known.mean(axis=1) > _AROUND)
+            if found is present:
+                at_once &= _nothing_behind(found, changed, wide)
+            cells = at_once[:, None] & changed
+            wall[cells] = found[cells]
+    # Narrower in some directions, without an edge that the wall goes on behind: a platform, a walkway.
+    narrower = (present < wall - _DIFFERENT) & np.isfinite(present)
+    wall = np.where(_attached(narrower, present, wall), present, wall)
+    return wall
+
+
+def _nothing_behind(found: np.ndarray, changed: np.ndarray, wide: np.ndarray) -> Bool[np.ndarray, " rows"]:
+    """Rows in which hardly a changed direction has returns behind what was found."""
+    bins = np.arange(wide.shape[2]) * _BIN
+    behind = (wide & (bins > np.nan_to_num(found, nan=np.inf)[..., None] + 2 * _DIFFERENT)).any(axis=2)
+    return (behind & changed).sum(axis=1) < _HIDDEN * np.maximum(changed.sum(axis=1), 1)
+
+
+def _attached(narrower: np.ndarray, present: np.ndarray, wall: np.ndarray) -> Bool[np.ndarray, "rows cols"]:
+    """Patches of a narrower section that run into the wall on at least one side, and are longer than a lay-by."""
+    patches, count = label(np.concatenate([narrower, narrower], axis=1))
+    result = np.zeros(narrower.shape, bool)
+    columns = narrower.shape[1]
+    for k in range(1, count + 1):
+        row, column = np.nonzero(patches == k)
+        if np.ptp(row) * ROW < _LAYBY or len(np.unique(column)) >= columns:
+            continue
+        edges = []
+        for side in (-1, 1):
+            outermost: dict[int, int] = {}
+            for r, c in zip(row.tolist(), column.tolist(), strict=True):
+                outermost[r] = max(outermost.get(r, side * c), side * c)
+            at = np.array([(r, side * c) for r, c in outermost.items()])
+            inside = present[at[:, 0], at[:, 1] % columns]
+            beyond = wall[at[:, 0], (at[:, 1] + side) % columns]
+            edges.append(float(np.median(beyond - inside)))
+        if min(edges) < _JUMP:
+            result[row, column % columns] = True
+    return result & narrower

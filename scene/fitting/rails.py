@@ -1,0 +1,252 @@
+"""Rails where the cloud shows them: two narrow ridges of one height, side by side all along the bore."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import gaussian_filter1d, grey_opening, median_filter
+
+_WINDOWS = (2.0, 6.0)  # m along: so long that a bin of one holds some points
+_POINTS = 8
+_BIN = 0.02  # m across
+_LOW = (-0.10, 0.80)  # above the floor, m
+_NARROW = 9  # bins: what is broader is a sleeper, a kerb or a walkway
+_RIDGE = 0.07  # m that a rail stands over what is beside it
+_APART = (0.95, 1.80)  # of the middles of two heads, m
+_CANT = 0.16  # difference of two heads' heights, m
+_ALIKE = 0.04  # m that the distance of two rails may differ by from window to window
+_MIN_SEEN = 0.5  # share of the windows in which both rails must be seen
+_BESIDE = 2.5  # least distance of two tracks, m
+_DRIFT = 0.5  # m that a track's place under the axis may change by from window to window
+_HEAD = 0.06  # m to each side of the middle of a head
+_HEAD_LAYER = 0.02  # above and below the most frequent height, m
+_FACE = (0.012, 0.045)  # below the top of the head, m; gauge is measured 14 to 16 mm below it
+_TOP = 0.010  # above and below the top of the head, m
+_FACE_BAND = 0.015  # m between the edge of the top and the face below it
+_FACE_BLUR = 0.004  # m
+_FACE_RETURNS = 12
+_PIECE = 8.0  # m of track of which one gauge is measured
+_LEAST_PIECES = 2
+_SURE = 0.003  # standard error of a gauge that counts as measured, m
+
+
+@dataclass(frozen=True)
+class SeenRails:
+    """Both rails of one track."""
+
+    station: Float[np.ndarray, " k"]  # m
+    offset: Float[np.ndarray, " k"]  # Of the middle of the track to the left of the axis there, m
+    cant: Float[np.ndarray, " k"]  # Height of the left head over the right one, m
+    apart: float  # Distance of the middles of the heads, about, m
+    gauge: float  # Distance of the heads' inner faces, 12 to 45 mm below their tops, m; NaN where too few are seen
+    spread: float  # Standard deviation of the gauge from piece to piece, m
+    pieces: int  # Pieces of track that show a gauge
+    top: float  # Median height of the heads' tops above the floor, m
+
+    @property
+    def measured(self) -> bool:
+        """True where the gauge is known within a few millimetres."""
+        return bool(self.pieces >= _LEAST_PIECES and self.spread / np.sqrt(self.pieces) < _SURE)
+
+    def offset_at(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Return the place of the track's middle to the left of the axis, m."""
+        return np.interp(station, self.station, self.offset)
+
+
+def find_rails(
+    station: Float[np.ndarray, " n"],
+    lateral: Float[np.ndarray, " n"],
+    height: Float[np.ndarray, " n"],
+    upward: Float[np.ndarray, " n"],
+) -> list[SeenRails]:
+    """Finds pairs of rails among points by station, offset to the left of the axis and height above the floor, m.
+
+    `upward` is their height above the axis, which cant is measured in. Returns one entry for each track, from the
+    right to the left; none where no pair is seen along half of the bore.
+    """
+    low = (height > _LOW[0]) & (height < _LOW[1])
+    station, lateral, height, upward = station[low], lateral[low], height[low], upward[low]
+    if len(station) < 100:
+        return []
+    a_metre = len(station) / max(np.ptp(station), 1.0) * _BIN / np.ptp(lateral)
+    count = max(int(np.ptp(station) / np.clip(_POINTS / a_metre, *_WINDOWS)), 1)
+    edges = np.linspace(station.min(), station.max() + 1e-6, count + 1)
+    order = np.argsort(station, kind="stable")
+    bounds = np.searchsorted(station[order], edges)
+    pairs = []
+    for k in range(count):
+        rows = order[bounds[k] : bounds[k + 1]]
+        pairs += [(k, *pair) for pair in _pairs_of(*_ridges(lateral[rows], height[rows]))]
+    if not pairs:
+        return []
+    window, middle, apart, top = np.array(pairs).T
+    highest_of = np.full(count, -np.inf)
+    np.maximum.at(highest_of, window.astype(np.intp), top)
+    usual_top = float(np.median(highest_of[np.isfinite(highest_of)]))
+    highest = np.abs(top - usual_top) < _CANT / 2  # sleepers half in shadow look like rails, but lie lower
+    window, middle, apart = window[highest], middle[highest], apart[highest]
+    usual = _most_frequent(apart)
+    alike = np.abs(apart - usual) < _ALIKE
+    tracks = []
+    for rows in _follow(window[alike], middle[alike]):
+        index = window[alike][rows].astype(np.intp)
+        if len(index) >= _MIN_SEEN * count:
+            at = (edges[index] + edges[index + 1]) / 2
+            offset = median_filter(middle[alike][rows], 3, mode="nearest")
+            tracks.append(_measure(station, lateral, height, upward, at, offset, float(usual)))
+    tracks.sort(key=lambda track: -len(track.station))
+    alone = [
+        track for k, track in enumerate(tracks)
+        if all(np.abs(np.median(track.offset_at(other.station) - other.offset)) > _BESIDE for other in tracks[:k])
+    ]  # fmt: skip
+    return sorted(alone, key=lambda track: float(np.median(track.offset)))
+
+
+def _ridges(lateral: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return place across and height of narrow ridges in one window, m."""
+    if len(lateral) < 20:
+        return np.empty(0), np.empty(0)
+    first = lateral.min()
+    bins = ((lateral - first) / _BIN).astype(np.intp)
+    order = np.lexsort((height, bins))
+    used, start, count = np.unique(bins[order], return_index=True, return_counts=True)
+    top = np.full(int(used[-1]) + 1, np.nan)
+    top[used] = height[order][start + (0.9 * (count - 1)).astype(np.intp)]
+    known = np.flatnonzero(np.isfinite(top))
+    place = np.searchsorted(known, np.arange(len(top)))
+    left = top[known[np.clip(place - 1, 0, len(known) - 1)]]
+    right = top[known[np.clip(place, 0, len(known) - 1)]]
+    top = np.where(np.isnan(top), np.minimum(left, right), top)  # behind a rail nothing is seen
+    padded = np.pad(top, _NARROW, mode="edge")
+    high = (padded - grey_opening(padded, _NARROW))[_NARROW:-_NARROW] > _RIDGE
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], high.astype(int), [0]])))
+    middles = [first + (a + b) / 2 * _BIN for a, b in zip(ends[::2], ends[1::2], strict=True)]
+    tops = [float(np.median(top[a:b])) for a, b in zip(ends[::2], ends[1::2], strict=True)]
+    return np.array(middles), np.array(tops)
+
+
+def _pairs_of(middle: np.ndarray, top: np.ndarray) -> list[tuple[float, float, float]]:
+    """Return middle, distance and mean height of two ridges that may be the rails of one track, m."""
+    apart, rise = middle[None] - middle[:, None], np.abs(top[None] - top[:, None])
+    a, b = np.nonzero((apart > _APART[0]) & (apart < _APART[1]) & (rise < _CANT))
+    return [
+        (float(middle[i] + middle[j]) / 2, float(middle[j] - middle[i]), float(top[i] + top[j]) / 2)
+        for i, j in zip(a, b, strict=True)
+    ]
+
+
+def _most_frequent(apart: np.ndarray) -> float:
+    count, edges = np.histogram(apart, np.arange(_APART[0] - 0.1, _APART[1] + 0.1, 0.01))
+    best = edges[np.convolve(count, np.ones(5), mode="same").argmax()] + 0.005
+    return float(np.median(apart[np.abs(apart - best) < _ALIKE]))
+
+
+def _follow(window: np.ndarray, middle: np.ndarray) -> list[np.ndarray]:
+    """Return the rows of each track: pairs of rails that follow on one another from window to window."""
+    tracks: list[list[int]] = []
+    for row in np.lexsort((middle, window)):
+        ends = [(abs(middle[row] - middle[track[-1]]), k) for k, track in enumerate(tracks)]
+        near = [(gap, k) for gap, k in ends if window[tracks[k][-1]] < window[row]]
+        gap, k = min(near, default=(np.inf, -1))
+        if gap < _DRIFT:
+            tracks[k].append(int(row))
+        else:
+            tracks.append([int(row)])
+    return [np.array(track) for track in tracks]
+
+
+def _measure(
+    station: np.ndarray,
+    lateral: np.ndarray,
+    height: np.ndarray,
+    upward: np.ndarray,
+    at: np.ndarray,
+    offset: np.ndarray,
+    apart: float,
+) -> SeenRails:
+    """Measures gauge, cant and height of one track, whose middle lies at `offset` where `at` says, m."""
+    for _ in range(2):
+        across = lateral - np.interp(station, at, offset)
+        block = np.clip(np.searchsorted((at[1:] + at[:-1]) / 2, station), 0, len(at) - 1)
+        near = {side: np.abs(side * across - apart / 2) < _HEAD for side in (1, -1)}
+        tops = {side: _block_tops(height, block, rows, len(at)) for side, rows in near.items()}
+        heads = {side: rows & (np.abs(height - tops[side][block]) < _HEAD_LAYER) for side, rows in near.items()}
+        shift = np.mean([_block_medians(across, block, rows, len(at)) for rows in heads.values()], axis=0)
+        offset = offset + np.where(np.isfinite(shift), shift, 0.0)
+    offset = gaussian_filter1d(offset, 1.0, mode="nearest")
+    across = lateral - np.interp(station, at, offset)
+    pieces = np.clip((station - at[0]) / _PIECE, 0, max(int(np.ptp(at) / _PIECE) - 1, 0)).astype(np.intp)
+    gauges = []
+    for piece in range(int(pieces.max()) + 1):
+        faces = []
+        for side in (1, -1):
+            inside = (pieces == piece) & near[side]
+            below = (height - tops[side][block])[inside]
+            faces.append(_inner_edge((side * across)[inside], below))
+        gauges.append(sum(faces))
+    gauge = np.array(gauges)[np.isfinite(gauges)]
+    levels = [_block_medians(upward, block, rows, len(at)) for rows in heads.values()]
+    cant = levels[0] - levels[1]
+    known = np.isfinite(cant)
+    smooth = (
+        median_filter(np.interp(at, at[known], cant[known]), 5, mode="nearest") if known.any() else np.zeros(len(at))
+    )
+    return SeenRails(
+        at, offset, smooth, apart, float(np.median(gauge)) if len(gauge) else np.nan,
+        _robust_spread(gauge), len(gauge),
+        float(np.nanmedian(np.concatenate(list(tops.values())))),
+    )  # fmt: skip
+
+
+def _robust_spread(values: np.ndarray) -> float:
+    """Standard deviation by the median distance from the median; NaN for fewer than two values."""
+    return float(1.4826 * np.median(np.abs(values - np.median(values)))) if len(values) > 1 else np.nan
+
+
+def _block_tops(height: np.ndarray, block: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """Most frequent height near the top of each block's points, m."""
+    result = np.full(count, np.nan)
+    order = np.flatnonzero(rows)[np.argsort(block[rows], kind="stable")]
+    bounds = np.searchsorted(block[order], np.arange(count + 1))
+    for k in range(count):
+        one = height[order[bounds[k] : bounds[k + 1]]]
+        if len(one) >= 5:
+            upper = one[one > np.percentile(one, 90) - 0.04]
+            result[k] = np.median(upper[upper > np.percentile(upper, 30)])
+    known = np.isfinite(result)
+    return np.interp(np.arange(count), np.flatnonzero(known), result[known]) if known.any() else np.zeros(count)
+
+
+def _block_medians(value: np.ndarray, block: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """Median of each block's values, less the middle of both sides where it is an offset; NaN where few are there."""
+    result = np.full(count, np.nan)
+    order = np.flatnonzero(rows)[np.argsort(block[rows], kind="stable")]
+    bounds = np.searchsorted(block[order], np.arange(count + 1))
+    for k in range(count):
+        if bounds[k + 1] - bounds[k] >= 5:
+            result[k] = np.median(value[order[bounds[k] : bounds[k + 1]]])
+    return result
+
+
+def _inner_edge(across: np.ndarray, above: np.ndarray) -> float:
+    """Distance from the track's middle where a head ends on its inner side, m; NaN where too few returns show it.
+
+    It is where most returns from the side of the head lie. The edge of the top, where that side is out of sight, would
+    be up to a centimetre off: poses that are a little off move it outwards, while a blurred face stays where it is.
+    """
+    top = across[np.abs(above) < _TOP]
+    if len(top) < _FACE_RETURNS:
+        return np.nan
+    edge = float(np.mean(top) - np.sqrt(3.0) * np.std(top))  # of what is spread evenly over a head
+    side = across[(above < -_FACE[0]) & (above > -_FACE[1])]
+    side = side[np.abs(side - edge) < _FACE_BAND]
+    if len(side) < _FACE_RETURNS:
+        return np.nan
+    step = 0.001
+    count, edges = np.histogram(side, np.arange(side.min() - 0.01, side.max() + 0.01, step))
+    smooth = gaussian_filter1d(count.astype(float), _FACE_BLUR / step)
+    mode = edges[smooth.argmax()] + step / 2
+    for _ in range(5):
+        weight = np.exp(-0.5 * ((side - mode) / (1.5 * _FACE_BLUR)) ** 2)
+        mode = float(np.sum(weight * side) / np.sum(weight))
+    return mode

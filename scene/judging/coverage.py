@@ -1,0 +1,102 @@
+"""The wall that nobody saw: parts of the built surface without returns on them, and where they lie."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import label
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+
+from scene.bore import Bore
+from scene.judging.returns import EXPLAINED, Returns
+from scene.judging.words import name_sides
+
+ROW = 1.0  # m
+SECTORS = 36
+_SPARSE = 0.03  # of the usual number of returns of a cell: with fewer it was not seen, as stray returns are everywhere
+_MIN_AREA = 3.0  # m² of wall in one piece: a smaller one is a shadow that its neighbours tell about
+_MIN_LENGTH, _MIN_GIRTH = 1.5, 0.9  # m
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """One piece of wall without returns."""
+
+    start: float  # First station, m
+    end: float  # Last station, m
+    area: float  # m²
+    sides: str  # Where it lies about the axis, in words
+    share: float  # Of the girth, in the mean over its stations
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Cells of the built wall, along the bore and around it."""
+
+    start: Float[np.ndarray, " r"]  # First station of each row of cells, m
+    end: Float[np.ndarray, " r"]  # Last station, m
+    seen: Bool[np.ndarray, "r c"]  # True where enough returns lie on the wall
+    pieces: tuple[Unseen, ...]  # Unseen pieces of some size, the largest first
+
+    @property
+    def share(self) -> float:
+        """Share of the cells that were seen."""
+        return float(self.seen.mean())
+
+
+def find_unseen(bore: Bore, returns: Returns, spacing: float = 0.0) -> Coverage:
+    """Finds the parts of a bore's wall on which hardly a return lies.
+
+    Args:
+        bore: The bore as built.
+        returns: All returns about it.
+        spacing: Distance of the survey's profiles, m; 0 for a dense survey.
+    """
+    step = max(ROW, 2.5 * spacing)
+    rows = max(round(bore.length / step), 1)
+    edges = np.linspace(0.0, bore.length, rows + 1)
+    on_wall = (returns.kind == EXPLAINED) & (returns.station >= 0) & (returns.station <= bore.length)
+    row = np.minimum((returns.station[on_wall] / bore.length * rows).astype(np.intp), rows - 1)
+    column = np.floor((returns.angle[on_wall] + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    count = np.bincount(row * SECTORS + column, minlength=rows * SECTORS).reshape(rows, SECTORS)
+    area = _cell_areas(bore, edges)
+    density = count / area
+    usual = float(np.median(density[count > 0])) if (count > 0).any() else 1.0
+    seen = density > _SPARSE * usual
+    return Coverage(edges[:-1], edges[1:], seen, _list_pieces(seen, area, edges))
+
+
+def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:
+    """Area of wall in each cell, m²."""
+    y, z = bore.radius * np.cos(bore.angle), bore.radius * np.sin(bore.angle)
+    girth = np.hypot(np.roll(y, -1, axis=1) - y, np.roll(z, -1, axis=1) - z)
+    column = np.floor((bore.angle + np.pi + 1e-9) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    around = np.stack([girth[:, column == k].sum(axis=1) for k in range(SECTORS)], axis=1)
+    middle = np.clip(np.rint((edges[1:] + edges[:-1]) / 2 / bore.station[1]).astype(np.intp), 0, len(bore.station) - 1)
+    return np.maximum(around[middle], 1e-3) * np.diff(edges)[:, None]
+
+
+def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple[Unseen, ...]:
+    labels = _label_around(~seen)
+    centres = -np.pi + (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
+    pieces = []
+    for index in range(1, int(labels.max(initial=0)) + 1):
+        row, column = np.nonzero(labels == index)
+        if not len(row):
+            continue
+        size = float(area[row, column].sum())
+        start, end = float(edges[row.min()]), float(edges[row.max() + 1])
+        if size < _MIN_AREA or end - start < _MIN_LENGTH or size / (end - start) < _MIN_GIRTH:
+            continue
+        across = float(area[row.min() : row.max() + 1].sum())
+        pieces.append(Unseen(start, end, size, name_sides(centres[column], area[row, column]), size / across))
+    return tuple(sorted(pieces, key=lambda piece: (-piece.area, piece.start)))
+
+
+def _label_around(cells: np.ndarray) -> Int[np.ndarray, "r c"]:
+    """Number the connected parts of a grid from 1, 0 elsewhere; the last column is beside the first."""
+    labels, count = label(cells)
+    both = cells[:, 0] & cells[:, -1]
+    joins = csr_matrix((np.ones(both.sum()), (labels[both, 0], labels[both, -1])), shape=(count + 1, count + 1))
+    return connected_components(joins, directed=False)[1][labels]

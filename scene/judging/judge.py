@@ -1,0 +1,241 @@
+"""The built bore against all that was registered: shares, places, unseen wall, and whether to warn or to refuse."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float, Shaped
+
+from scene.bore import Bore
+from scene.cleaning.removed import CAUSES, KEPT, Removed
+from scene.cloud import Cloud
+from scene.errors import FitError
+from scene.judging.coverage import Coverage, find_unseen
+from scene.judging.places import Place, find_places
+from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
+from scene.judging.words import name_span
+
+_FLAG = tyro.conf.arg(prefix_name=False)
+_CUT_OUTSIDE = tuple(k for k, cause in enumerate(CAUSES) if any(
+    word in cause for word in ("beyond a mouth", "branch", "apart from the bore")))  # fmt: skip
+_LISTED = 10  # places and worst stations that are listed
+_WINDOW = 2.0  # m of bore that one worst station stands for
+_WARN_LOCAL = 0.05  # of the returns at a place's stations: a place with fewer is listed without a warning
+_WARN_UNSEEN = 0.10  # of the girth
+STATION = np.dtype([
+    ("start", "f8"), ("end", "f8"), ("width", "f8"), ("height", "f8"), ("seen", "f8"), ("explained", "f8"),
+    ("inside", "f8"), ("behind", "f8"), ("returns", "f8"), ("cut", "f8"), ("filled", "f8"), ("confidence", "f8"),
+])  # fmt: skip
+
+
+class DoubtError(FitError):
+    """A bore was built, but it explains too little of what the scanner saw, or cannot be a tunnel."""
+
+
+@dataclass(frozen=True)
+class JudgingConfig:
+    """Limits by which a built bore is judged against all returns."""
+
+    tolerance: float = 0.10  # A return this near to the model is explained by it, m.
+    warn_above: float = 0.05  # Share of unexplained returns between the ends above which the build warns.
+    refuse_above: float = 0.35  # Share above which it fails; what was cut away as another bore or terrain is left out.
+    force: Annotated[bool, _FLAG] = False  # Build all the same where the judgement would refuse.
+
+
+@dataclass(frozen=True)
+class Warned:
+    """One thing that a user must know."""
+
+    code: str  # Word for programs, such as `unseen`
+    text: str  # Sentence for people
+    start: float | None = None  # First station, m; `None` where it concerns the whole bore
+    end: float | None = None  # Last station, m
+    refuses: bool = False  # True where the build fails without `--force`
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Returns that the model explains, wall that nobody saw, and warnings for the user."""
+
+    tolerance: float  # Distance up to which a return is explained, m
+    warnings: tuple[Warned, ...]  # The gravest first
+    returns: Returns | None = None  # All returns about the bore; `None` for a ring survey
+    coverage: Coverage | None = None  # Unseen wall
+    places: tuple[Place, ...] = ()  # Unexplained returns, the largest place first
+    scattered: float = 0.0  # Share of the returns between the ends that are unexplained and belong to no place
+    stations: Shaped[np.ndarray, " r"] | None = None  # Table by metres, of `STATION`
+    worst: tuple[tuple[float, float, float], ...] = ()  # First and last station, m, and share unexplained
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Shares of the returns: `explained`, `inside` and `behind` of those between the ends, `beyond` of all."""
+        kinds = {"explained": EXPLAINED, "inside": INSIDE, "behind": BEHIND, "beyond_ends": BEYOND}
+        return {} if self.returns is None else {name: self.returns.share(kind) for name, kind in kinds.items()}
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Entries for the manifest."""
+        result: dict[str, Any] = {"warnings": [_entry(warning) for warning in self.warnings]}
+        if self.returns is None or self.coverage is None:
+            return result
+        return {
+            **result,
+            "tolerance": self.tolerance,
+            "returns": float(self.returns.weight.sum()),
+            "share": {**self.shares, "scattered": self.scattered},
+            "wall_seen": self.coverage.share,
+            "unseen": [vars(piece) for piece in self.coverage.pieces[:_LISTED]],
+            "places": [vars(place) for place in self.places[:_LISTED]],
+            "worst_stations": [{"start": a, "end": b, "unexplained": share} for a, b, share in self.worst],
+        }
+
+    def summary(self) -> str:
+        """Return the shares in one line for people."""
+        if self.returns is None:
+            return "judged: a ring survey holds no returns to judge by"
+        share = self.shares
+        text = (
+            f"judged: {share['explained']:.1%} of {self.returns.weight.sum():,.0f} returns within "
+            f"{100 * self.tolerance:.0f} cm of the model, {share['inside']:.1%} inside, {share['behind']:.1%} behind "
+            f"the wall, {share['beyond_ends']:.1%} beyond the ends"
+        )
+        return f"{text}; worst {name_span(*self.worst[0][:2])} ({self.worst[0][2]:.0%})" if self.worst else text
+
+
+def _entry(warning: Warned) -> dict[str, Any]:
+    place = {} if warning.start is None else {"start": warning.start, "end": warning.end}
+    return {"code": warning.code, "text": warning.text, **place}
+
+
+def judge_bore(
+    bore: Bore,
+    everything: Cloud,
+    config: JudgingConfig,
+    track: TrackZone | None = None,
+    cause: np.ndarray | None = None,
+    removed: tuple[Removed, ...] = (),
+    spacing: float = 0.0,
+) -> Judgement:
+    """Judges a bore against every return of the registered cloud, before anything was cut from it.
+
+    Args:
+        bore: The bore as built.
+        everything: The registered cloud before cleaning, in the bore's frame.
+        config: Limits.
+        track: Space of the track; `None` where none was laid.
+        cause: Index into `CAUSES` of each point of `everything`, `(n,)`; `None` where nothing was cut.
+        removed: Stretches that were cut away.
+        spacing: Distance of the survey's profiles, m; 0 for a dense survey.
+    """
+    returns = compare_returns(bore, everything, config.tolerance, track)
+    coverage = find_unseen(bore, returns, spacing)
+    places, strays = find_places(bore, returns)
+    inside = float(returns.weight[returns.in_span].sum())
+    stations = _tabulate(bore, returns, coverage, cause)
+    worst = _worst_windows(bore, returns)
+    warnings = [
+        *_warn_of_share(returns, cause, places, worst, config),
+        *(Warned("cut", part.warning, part.start, part.end) for part in removed if part.warning),
+        *_warn_of_unseen(coverage),
+        *_warn_of_places(places, config.tolerance),
+    ]
+    scattered = float(returns.weight[strays].sum()) / max(inside, 1e-9)
+    return Judgement(config.tolerance, tuple(warnings), returns, coverage, places, scattered, stations, worst)
+
+
+def _warn_of_share(
+    returns: Returns,
+    cause: np.ndarray | None,
+    places: tuple[Place, ...],
+    worst: tuple[tuple[float, float, float], ...],
+    config: JudgingConfig,
+) -> list[Warned]:
+    counted = returns.in_span
+    if cause is not None:
+        counted = counted & ~np.isin(cause, _CUT_OUTSIDE)
+    total = float(returns.weight[counted].sum())
+    inside, behind = (
+        float(returns.weight[counted & (returns.kind == kind)].sum()) / max(total, 1e-9) for kind in (INSIDE, BEHIND)
+    )
+    result = []
+    if inside + behind > config.warn_above:
+        where = f", most {name_span(*worst[0][:2])}" if worst else ""
+        look = f", where it looks like {places[0].look}" if places else ""
+        result.append(Warned(
+            "unexplained",
+            f"{inside + behind:.0%} of the returns lie further than {100 * config.tolerance:.0f} cm from the tunnel "
+            f"that was built ({inside:.0%} inside it, {behind:.0%} behind its wall){where}{look}",
+            refuses=inside + behind > config.refuse_above,
+        ))  # fmt: skip
+    return result
+
+
+def _warn_of_unseen(coverage: Coverage) -> list[Warned]:
+    return [
+        Warned(
+            "unseen",
+            f"{name_span(piece.start, piece.end)} hardly a return lies on the {piece.sides} "
+            f"({piece.share:.0%} of the girth, {piece.area:.0f} m²): the wall there is a guess",
+            piece.start, piece.end,
+        )
+        for piece in coverage.pieces[:_LISTED] if piece.share > _WARN_UNSEEN
+    ]  # fmt: skip
+
+
+def _warn_of_places(places: tuple[Place, ...], tolerance: float) -> list[Warned]:
+    return [
+        Warned(
+            "place",
+            f"{name_span(place.start, place.end)}, {place.sides}: {place.share:.0%} of the returns there are not the "
+            f"wall that was built, up to {place.furthest:.1f} m {'behind' if place.behind else 'inside'} it: "
+            f"{place.look}",
+            place.start, place.end,
+        )
+        for place in places[:_LISTED] if place.share > _WARN_LOCAL and place.furthest > tolerance
+    ]  # fmt: skip
+
+
+def _worst_windows(bore: Bore, returns: Returns) -> tuple[tuple[float, float, float], ...]:
+    """Windows with the largest share of unexplained returns, which do not touch."""
+    count = max(int(bore.length / _WINDOW), 1)
+    edges = np.linspace(0.0, bore.length, count + 1)
+    total, wrong = (
+        np.histogram(returns.station[rows], edges, weights=returns.weight[rows])[0]
+        for rows in (returns.in_span, (returns.kind == INSIDE) | (returns.kind == BEHIND))
+    )
+    share = wrong / np.maximum(total, 1e-9)
+    result: list[int] = []
+    for k in np.argsort(-share, kind="stable"):
+        if share[k] <= 0.0 or len(result) == _LISTED:
+            break
+        if all(abs(int(k) - other) > 1 for other in result):
+            result.append(int(k))
+    return tuple((float(edges[k]), float(edges[k + 1]), float(share[k])) for k in result)
+
+
+def _tabulate(bore: Bore, returns: Returns, coverage: Coverage, cause: np.ndarray | None) -> Shaped[np.ndarray, " r"]:
+    edges = np.append(coverage.start, coverage.end[-1])
+    middle = (edges[1:] + edges[:-1]) / 2
+
+    def weigh(rows: np.ndarray) -> Float[np.ndarray, " r"]:
+        return np.histogram(returns.station[rows], edges, weights=returns.weight[rows])[0]
+
+    total = weigh(returns.in_span)
+    table = np.zeros(len(middle), STATION)
+    table["start"], table["end"], table["returns"] = edges[:-1], edges[1:], total
+    table["seen"] = coverage.seen.mean(axis=1)
+    for name, kind in (("explained", EXPLAINED), ("inside", INSIDE), ("behind", BEHIND)):
+        table[name] = weigh(returns.kind == kind) / np.maximum(total, 1e-9)
+    table["cut"] = 0.0 if cause is None else weigh((cause != KEPT) & returns.in_span) / np.maximum(total, 1e-9)
+    for name, values in (("width", bore.width), ("height", bore.height), ("confidence", bore.confidence)):
+        table[name] = np.interp(middle, bore.station, values)
+    table["filled"] = np.interp(middle, bore.station, bore.filled.astype(float))
+    return table
+
+
+def require_trust(judgement: Judgement, force: bool) -> None:
+    """Raises `DoubtError` where a warning refuses the bore and `force` is not set."""
+    grave = [warning for warning in judgement.warnings if warning.refuses]
+    if grave and not force:
+        raise DoubtError(f"{grave[0].text}; --force builds it all the same")

@@ -1,0 +1,177 @@
+"""Sizes, grades and sections that no tunnel has, each with its likely cause: unit, axes, poses or clock."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import ConvexHull
+
+from scene.bore import Bore
+from scene.judging.judge import Warned
+from scene.judging.words import name_sides, name_span
+
+_SIZES = (1.0, 30.0)  # m, widths and heights of bores that people make
+_HIGH = 11.0  # m; higher are caverns and stations, and common tunnels in feet
+_USUAL = (2.0, 12.0)  # m, sizes by which another unit is proposed
+_UNITS = {"mm": 1e-3, "cm": 1e-2, "ft": 0.3048, "m": 1.0}
+_STEEP, _LYING = 0.20, 0.80  # grade: no road or railway climbs more than a fifth; at 40° it is no tunnel to drive in
+_FLAT, _ROUND = 0.02, 0.10  # m: departure of a side from a straight line that is a floor's, and a crown's
+_DENT, _DENT_LENGTH = 0.25, 3.0  # m inwards, and along the bore: deeper and longer than roughness and noise
+_FACING = np.deg2rad(35)  # to each side of a direction
+
+
+def doubt_bore(bore: Bore, facts: dict[str, Any], provenance: dict[str, str], surveyed: bool) -> list[Warned]:
+    """Return what is odd about a bore as a tunnel, and what nobody measured.
+
+    Args:
+        bore: The bore as built.
+        facts: Facts of reading and posing, for the manifest.
+        provenance: Provenance of the lining's parts.
+        surveyed: True where returns of a scanner were at hand; nobody expects a ring survey to show pockets.
+    """
+    return [
+        *_doubt_size(bore, str(facts.get("unit", "m"))),
+        *_doubt_grade(bore, str(facts.get("axes", "xyz"))),
+        *_doubt_lying(bore),
+        *_doubt_dents(bore),
+        *_doubt_poses(facts),
+        *(_tell_standard(bore, provenance) if surveyed else []),
+    ]
+
+
+def _doubt_size(bore: Bore, unit: str) -> list[Warned]:
+    width, height = float(np.median(bore.width)), float(np.median(bore.height))
+    size = f"the bore would be {width:.3g} m wide and {height:.3g} m high"
+    told = "by flag" in unit
+    if not all(_SIZES[0] <= value <= _SIZES[1] for value in (width, height)):
+        return [Warned("size", f"{size}, and no tunnel is; {_propose_unit(width, height, unit)}", refuses=True)]
+    if height > _HIGH and not told:
+        return [Warned("size", f"{size}: a cavern, or is the unit another? {_propose_unit(width, height, unit)}")]
+    return []
+
+
+def _propose_unit(width: float, height: float, unit: str) -> str:
+    """Return the units that would make the sizes usual, in words; `unit` begins with the one that was taken."""
+    taken = _UNITS.get(unit.split(" ")[0], 1.0)
+    options = []
+    for name, metres in _UNITS.items():
+        sizes = [value / taken * metres for value in (width, height)]
+        if metres != taken and all(_USUAL[0] <= size <= _USUAL[1] for size in sizes):
+            options.append(f"--unit {name} makes it {sizes[0]:.2g} m by {sizes[1]:.2g} m")
+    return " or ".join(options) or f"was its unit read rightly ({unit})?"
+
+
+def _doubt_grade(bore: Bore, axes: str) -> list[Warned]:
+    grade = bore.axis.grade
+    steep = np.abs(grade) > _STEEP
+    if not steep.any():
+        return []
+    usual, worst = float(np.median(np.abs(grade))), float(np.abs(grade).max())
+    rows = np.flatnonzero(steep)
+    start, end = float(bore.station[rows[0]]), float(bore.station[rows[-1]])
+    lying = usual > _LYING
+    climbs = f"{name_span(start, end)} the bore climbs at up to {worst:.0%}"
+    cause = (
+        f"z is not up in this file (axes {axes.split(' ')[0]}); {_propose_axes(bore)}"
+        if lying
+        else "is z up (--axes), and were the poses levelled (roll and pitch of the mount)?"
+    )
+    return [Warned("grade", f"{climbs}, where no road or railway climbs at more than 20 %: {cause}", start, end, lying)]
+
+
+def _propose_axes(bore: Bore) -> str:
+    run = bore.position[-1] - bore.position[0]
+    names = {0: "--axes yzx", 1: "--axes x-zy"}
+    for axis in (1, 0):
+        if abs(run[axis]) < _STEEP * float(np.linalg.norm(np.delete(run, axis))):
+            return f"{names[axis]} takes {'xy'[axis]} as up"
+    return "--axes says which axis is"
+
+
+def _doubt_lying(bore: Bore) -> list[Warned]:
+    """Warn of a section whose flat side is a wall and whose round side is the other: a tunnel that lies on its side."""
+    section = np.median(bore.radius, axis=0)
+    for name, angle in (("left", 0.0), ("right", np.pi)):
+        if _bend(bore.angle, section, angle) < _FLAT and _bend(bore.angle, section, angle + np.pi) > _ROUND:
+            floor, crown = (_bend(bore.angle, section, side * np.pi / 2) for side in (-1, 1))
+            if min(floor, crown) > _FLAT or abs(floor - crown) < _FLAT:
+                return [Warned(
+                    "lying",
+                    f"the section is flat on the {name} and round on the other side, as a tunnel on its side is: is z "
+                    "up? --axes x-zy or --axes yzx takes another axis as up",
+                )]  # fmt: skip
+    return []
+
+
+def _doubt_dents(bore: Bore) -> list[Warned]:
+    """Warn of a section that is dented inwards over some metres: what hangs before a wall was taken for the wall.
+
+    The depth is that of the section below its convex hull, along the radius.
+    """
+    y, z = bore.radius * np.cos(bore.angle), bore.radius * np.sin(bore.angle)
+    depth = np.zeros_like(bore.radius)
+    for row in range(len(bore.station)):
+        corners = ConvexHull(np.column_stack([y[row], z[row]])).vertices
+        corners = corners[np.argsort(bore.angle[corners])]
+        depth[row] = _hull_radius(bore.angle, bore.angle[corners], bore.radius[row, corners]) - bore.radius[row]
+    dented = np.concatenate([[0], (depth.max(axis=1) > _DENT).astype(int), [0]])
+    result = []
+    for first, last in zip(np.flatnonzero(np.diff(dented) > 0), np.flatnonzero(np.diff(dented) < 0) - 1, strict=True):
+        start, end = float(bore.station[first]), float(bore.station[last])
+        if end - start < _DENT_LENGTH:
+            continue
+        here = depth[first : last + 1]
+        deepest, sides = here.max(), name_sides(bore.angle, np.maximum(here.mean(axis=0) - _DENT / 2, 0.0))
+        result.append(Warned(
+            "dent",
+            f"{name_span(start, end)} the section is dented inwards by up to {deepest:.1f} m at the {sides}: a duct, "
+            "pipes, a platform or cabinets may have been taken for the wall",
+            start, end,
+        ))  # fmt: skip
+    return result
+
+
+def _hull_radius(
+    angle: Float[np.ndarray, " m"], at: Float[np.ndarray, " c"], radius: Float[np.ndarray, " c"]
+) -> Float[np.ndarray, " m"]:
+    """Distance along each direction to the sides of a convex polygon with corners in the order of their angle, m."""
+    right = np.searchsorted(at, angle, side="right")
+    low, high = (right - 1) % len(at), right % len(at)
+    y0, z0, y1, z1 = (f(at[k]) * radius[k] for k in (low, high) for f in (np.cos, np.sin))
+    across, along = y1 - y0, z1 - z0
+    turn = np.cos(angle) * along - np.sin(angle) * across
+    return np.where(np.abs(turn) > 1e-9, (y0 * along - z0 * across) / np.where(turn == 0, 1.0, turn), radius[low])
+
+
+def _bend(angle: Float[np.ndarray, " m"], radius: Float[np.ndarray, " m"], facing: float) -> float:
+    """RMS departure of the side that faces a direction from a straight line, m."""
+    turn = np.angle(np.exp(1j * (angle - facing)))
+    near = np.abs(turn) < _FACING
+    across, along = (radius * np.sin(turn))[near], (radius * np.cos(turn))[near]
+    return float(np.sqrt(np.mean((along - np.polyval(np.polyfit(across, along, 1), across)) ** 2)))
+
+
+def _doubt_poses(facts: dict[str, Any]) -> list[Warned]:
+    result = []
+    if str(facts.get("calibration", "")).startswith("none"):
+        result.append(Warned(
+            "calibration",
+            "--control came without --calibration, so the prism was taken for the LiDAR itself: the whole scene is "
+            "off by the distance between the two; --calibration x,y,z tells it",
+        ))  # fmt: skip
+    if facts.get("pose_doubt"):
+        result.append(Warned("poses", str(facts["pose_doubt"])))
+    if "nothing measured" in str(facts.get("length_fixed_by", "")):
+        result.append(Warned("length", "nothing measured the length: along smooth walls LiDAR odometry does not"))
+    return result
+
+
+def _tell_standard(bore: Bore, provenance: dict[str, str]) -> list[Warned]:
+    if provenance.get("pockets") != "by standard" or not len(bore.pocket):
+        return []
+    return [Warned(
+        "by_standard",
+        f"the returns can show neither ring joints nor pockets, so {len(bore.ring_station)} rings and "
+        f"{len(bore.pocket)} pockets stand where a standard lining has them, and none of them was seen; "
+        "--reconstruct.lining.no-by-standard leaves them out",
+    )]  # fmt: skip

@@ -1,0 +1,146 @@
+"""Poses against their scans: walls that several sweeps saw are thin where the poses are right, and thick where not.
+
+The thickness of walls in sweeps put together is compared with that in single sweeps. Where it is larger, likely
+mistakes are undone one by one: another order of the quaternion, clocks apart, a mount turned. The one that makes the
+walls thin is named.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from scene.poses.registration import deskew
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import ReadPosition, Recording
+from scene.reading.scans import Scan
+
+_PLACES = (0.25, 0.5, 0.75)  # of the recording
+_SCANS, _EVERY = 5, 15  # sweeps at each place, and how far apart
+_POINTS = 2500  # of each sweep
+_QUERIES, _NEIGHBOURS = 300, 16
+_LONGEST = 25.0  # m; returns further away are far apart
+_BLURRED, _LEAST = 1.3, 0.012  # times the thickness in a sweep, and m, from which walls count as blurred
+_EXPLAINS = 0.7  # a mistake that is named brings the thickness below this share
+_MIN_GAIN = 0.004  # m
+_SHIFTS = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # s
+_TURNS = (1.0, 2.0, 3.0, 5.0)  # deg
+_AXES = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class PoseCheck:
+    """Agreement of poses with their scans."""
+
+    thickness: float  # Of walls in several sweeps together, m, standard deviation
+    expected: float  # Of walls in single sweeps, m
+    cause: str = ""  # The mistake that explains the difference, in words; empty where none was found
+    wxyz: bool = False  # True where the quaternions are in the order w, x, y, z
+
+    @property
+    def blurred(self) -> bool:
+        """True where the poses make the walls thicker than the scanner does."""
+        return self.thickness > max(_BLURRED * self.expected, _LEAST)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Entries for the manifest."""
+        return {"wall_thickness": self.thickness, "wall_thickness_in_a_sweep": self.expected, "pose_doubt": self.words}
+
+    @property
+    def words(self) -> str | None:
+        """Sentence for the user; `None` where nothing is wrong."""
+        if not self.blurred:
+            return None
+        likely = self.cause or "the poses, their clock or the mount of the LiDAR may be wrong"
+        return (
+            f"the poses blur the walls: {1000 * self.thickness:.0f} mm thick where a single sweep has "
+            f"{1000 * self.expected:.0f} mm; {likely}"
+        )
+
+
+def check_poses(recording: Recording, trajectory: Trajectory) -> PoseCheck | None:
+    """Compares poses with some sweeps of a recording; `None` where they share too few sweeps to tell.
+
+    Raises `RecordingError` where a scan is damaged.
+    """
+    places = [group for group in _sample_scans(recording, trajectory) if len(group) >= 2]
+    if not places:
+        return None
+
+    def thickness(poses: Trajectory, turn: Rotation | None = None, single: bool = False) -> float:
+        return _measure(places, poses, turn, single)
+
+    expected, given = thickness(trajectory, single=True), thickness(trajectory)
+    check = PoseCheck(given, expected)
+    return _find_cause(check, trajectory, thickness) if check.blurred else check
+
+
+def reorder(trajectory: Trajectory) -> Trajectory:
+    """Return the poses with quaternions read as w, x, y, z instead of x, y, z, w."""
+    wxyz = trajectory.rotations.as_quat()
+    rotations = Rotation.from_quat(wxyz[:, [1, 2, 3, 0]])
+    return Trajectory(trajectory.times, trajectory.positions, rotations, trajectory.source)
+
+
+def _sample_scans(recording: Recording, trajectory: Trajectory) -> Iterator[list[Scan]]:
+    """Yields a few sweeps from each place, thinned; those without poses are left out."""
+    for place in _PLACES:
+        first = int(place * max(recording.scan_count - _SCANS * _EVERY, 0))
+        group = []
+        for scan in islice(recording.scans(ReadPosition(first)), 0, _SCANS * _EVERY, _EVERY):
+            distance = np.linalg.norm(scan.points, axis=1)
+            rows = np.flatnonzero((distance > 1.0) & (distance < _LONGEST))
+            rows = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(np.intp)]
+            if len(rows) > 10 * _NEIGHBOURS and trajectory.covers(scan.stamp, scan.stamp + float(scan.times.max())):
+                group.append(Scan(scan.stamp, scan.points[rows], scan.times[rows]))
+        yield group
+
+
+def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None, single: bool) -> float:
+    """Median thickness of the walls, m: in each sweep by itself, or in all sweeps of a place."""
+    result = []
+    for group in places:
+        clouds = [
+            deskew(scan if turn is None else Scan(scan.stamp, turn.apply(scan.points), scan.times), poses)
+            for scan in group
+        ]
+        if single:
+            result.append(np.concatenate([_thickness(cloud, _QUERIES // len(clouds)) for cloud in clouds]))
+        else:
+            result.append(_thickness(np.concatenate(clouds), _QUERIES))
+    return float(np.median(np.concatenate(result)))
+
+
+def _thickness(points: np.ndarray, queries: int) -> Float[np.ndarray, " q"]:
+    """Standard deviation of neighbouring points across the plane through them, m."""
+    pick = np.linspace(0, len(points) - 1, queries).astype(np.intp)
+    near = points[cKDTree(points).query(points[pick], _NEIGHBOURS)[1]]
+    offset = near - near.mean(axis=1, keepdims=True)
+    spread = np.linalg.eigvalsh(np.einsum("qni,qnj->qij", offset, offset) / _NEIGHBOURS)
+    return np.sqrt(np.maximum(spread[:, 0], 0.0))
+
+
+def _find_cause(check: PoseCheck, poses: Trajectory, thickness: Callable[..., float]) -> PoseCheck:
+    """Undo likely mistakes one by one, and name the one that makes the walls thin."""
+    limit = min(_EXPLAINS * check.thickness, check.thickness - _MIN_GAIN)
+    other = reorder(poses)
+    found = [(thickness(other), "the quaternions are in the order w, x, y, z", True)]
+    for shift in (sign * size for size in _SHIFTS for sign in (1, -1)):
+        side = "later" if shift > 0 else "earlier"
+        words = f"with the poses {abs(shift):g} s {side} they are thin: two clocks differ"
+        moved = Trajectory(poses.times + shift, poses.positions, poses.rotations, poses.source)
+        found.append((thickness(moved), words, False))
+    for axis, name in enumerate(_AXES):
+        for angle in (sign * size for size in _TURNS for sign in (1, -1)):
+            words = f"with the LiDAR turned by {angle:+g}° in {name} they are thin: the extrinsic is off"
+            found.append((thickness(poses, Rotation.from_euler("xyz"[axis], angle, degrees=True)), words, False))
+    best, words, wxyz = min(found, key=lambda row: row[0])
+    if best > limit:
+        return check
+    return PoseCheck(check.thickness, check.expected, words, wxyz)

@@ -1,0 +1,60 @@
+"""Strays and the shadows of pillars make no pockets; without the tests of evidence they would."""
+
+import numpy as np
+import pytest
+
+from scene.bore import POCKET
+from scene.fitting import pockets
+from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.evidence import more_than_chance
+from scene.fitting.section import fit_sections
+from tests.scene.clouds import curved_d_bore
+from tests.scene.scanned import arch, pillar, scan, with_outliers
+from tests.scene.test_reconstruction import thin
+
+PITCHES = (0.9, 2.1)
+
+
+def pillared() -> np.ndarray:
+    row = [pillar(x, y, 0.2) for x in np.arange(3, 24, 3.0) for y in (-2.5, 2.5)]
+    return scan([arch(9, 7, 24), *row], np.arange(2, 24, 6.0), 200_000)
+
+
+def strewn() -> np.ndarray:
+    known = curved_d_bore(60, per_metre=4000, radius=1e6, grade=0.0, yaw=0.0, offset=(0.0, 0.0, 0.0))
+    return with_outliers(known.points, 0.01)
+
+
+@pytest.mark.parametrize("cloud", [pillared, strewn])
+def test_no_ring_and_no_pocket_is_measured_where_there_is_none(cloud, monkeypatch):
+    thinned = thin(cloud())
+    sections = fit_sections(thinned, fit_centreline(thinned.points, CentrelineConfig(), thinned.origin))
+    found, joints = pockets.find_pockets(sections)
+    assert len(found) == len(joints) == 0
+    monkeypatch.setattr(pockets, "open_rims", lambda deficit, grid, row, *rest: np.zeros(len(row)))
+    monkeypatch.setattr(pockets, "more_than_chance", lambda found, joints, *rest: len(joints) > 0)
+    assert len(pockets.find_pockets(sections)[0]) > 0, "this cloud does not try the evidence at all"
+
+
+def lining(rng: np.random.Generator, keep: float) -> np.ndarray:
+    places = [(j + side * 0.22, a) for j in np.arange(0.75, 60, 1.5) for side in (-1, 1) for a in (0.1, 1.0, 2.0, 3.0)]
+    result = np.zeros(len(places), POCKET)
+    result["station"], result["angle"] = np.transpose(places)
+    return result[rng.random(len(places)) < keep]
+
+
+@pytest.mark.parametrize("keep", [1.0, 0.5])
+def test_a_lining_with_half_its_pockets_unseen_is_no_chance(keep):
+    found = lining(np.random.default_rng(0), keep)
+    assert more_than_chance(found, pockets.find_ring_joints(found["station"], 60.0), PITCHES, 2.75)
+
+
+@pytest.mark.parametrize("count", [10, 40, 300])
+def test_random_stations_are_chance_whatever_pitch_suits_them_best(count):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        found = np.zeros(count, POCKET)
+        found["station"], found["angle"] = rng.uniform(0, 60, count), rng.choice([0.1, 1.0, 2.0], count)
+        wave = np.arange(0.0, 60.0, 1.5)
+        joints = pockets.find_ring_joints(found["station"], 60.0)
+        assert not more_than_chance(found, joints if len(joints) else wave, PITCHES, 2.75)

@@ -1,0 +1,173 @@
+"""Cleaning cuts away by place and cause, moves nothing, and refuses by its name a cloud without a bore."""
+
+import numpy as np
+import pytest
+
+from scene.cleaning.clean import CleaningConfig, clean_cloud
+from scene.cleaning.removed import BEYOND, BRANCH, CAUSES, ELSEWHERE, INSIDE, SCATTERED, Cleaned
+from scene.errors import FitError
+from scene.fitting.centreline import CentrelineConfig
+from scene.fitting.unroll import fill_holes, fill_nearest
+from tests.scene.shapes import PLACE, Box, Tube, cavity, placed
+from tests.scene.test_reconstruction import thin
+
+LENGTH, MIDDLE = 30.0, 2.75  # m; mid-height of `Tube`
+MAIN = Tube((0, 0), (LENGTH, 0))
+ORIENTATION = (0.4, 0.1)
+
+
+def cleaned(points: np.ndarray, strict: bool = False) -> Cleaned:
+    return clean_cloud(thin(points), CleaningConfig(strict), CentrelineConfig())
+
+
+def arch(*others: Tube | Box) -> np.ndarray:
+    """The arch along x with its floor at 0, m."""
+    return cavity(MAIN, *others) - PLACE
+
+
+def turned(points: np.ndarray) -> np.ndarray:
+    return placed(points, *ORIENTATION)
+
+
+def axis_offsets(result: Cleaned) -> np.ndarray:
+    """Station, lateral and upward place of the axis in the arch's own frame, `(n, 3)`, m."""
+    back = np.stack([placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)])
+    return (result.axis.position + result.cloud.origin - PLACE) @ back.T
+
+
+def causes(result: Cleaned) -> dict[str, int]:
+    return {CAUSES[index]: int((result.cause == index).sum()) for index in np.unique(result.cause)}
+
+
+def require_axis_in_the_middle(result: Cleaned, within: float = 0.03) -> None:
+    station, aside, up = axis_offsets(result).T
+    inner = (station > 2) & (station < LENGTH - 2)
+    assert inner.sum() > LENGTH - 8
+    assert np.abs(aside[inner]).max() < within
+    assert np.abs(up[inner] - MIDDLE).max() < within
+
+
+def box(rng: np.random.Generator, low: tuple, high: tuple, count: int) -> np.ndarray:
+    """Points on the sides and top of a box, m."""
+    points = rng.uniform(low, high, (count, 3))
+    face = rng.integers(0, 5, count)
+    for axis in range(3):
+        points[face == axis, axis] = low[axis] if axis < 2 else high[axis]
+    for axis in (0, 1):
+        points[face == 3 + axis, axis] = high[axis]
+    return points
+
+
+def cutting(rng: np.random.Generator) -> np.ndarray:
+    """Ground of 10 m beyond the far mouth, with slopes on both sides that begin at the walls."""
+    x, y = rng.uniform(LENGTH, LENGTH + 10, 15_000), rng.uniform(-8, 8, 15_000)
+    return np.stack([x, y, np.maximum(np.abs(y) - 2.5, 0.0) + rng.normal(0, 0.05, len(x))], axis=1)
+
+
+def test_strays_anywhere_move_neither_axis_nor_ends():
+    points = arch()
+    rng = np.random.default_rng(1)
+    strays = rng.uniform(points.min(axis=0) - 4, points.max(axis=0) + 4, (len(points) // 20, 3))
+    result = cleaned(turned(np.concatenate([points, strays])))
+    require_axis_in_the_middle(result)
+    assert causes(result)[CAUSES[SCATTERED]] > 0.5 * len(strays)
+    station = axis_offsets(result)[:, 0]
+    assert np.ptp(station) == pytest.approx(LENGTH, abs=1.6)  # sections stand a metre apart
+
+
+def test_a_cutting_is_cut_off_where_the_lining_ends_and_reported():
+    result = cleaned(turned(np.concatenate([arch(), cutting(np.random.default_rng(2))])))
+    require_axis_in_the_middle(result)
+    kept = (result.cloud.points + result.cloud.origin - PLACE) @ np.stack([
+        placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)
+    ]).T  # fmt: skip
+    assert kept[:, 0].max() == pytest.approx(LENGTH, abs=0.3)
+    parts = [part for part in result.removed if part.cause == CAUSES[BEYOND]]
+    assert sum(part.points for part in parts) > 5_000
+    assert any(min(abs(part.end - part.start - 10), 99) < 1.5 for part in parts)
+
+
+def test_a_parked_vehicle_is_taken_out_and_leaves_the_floor():
+    rng = np.random.default_rng(3)
+    points = np.concatenate([arch(), box(rng, (12, -1, 0), (18, 1, 1.8), 12_000)])
+    result = cleaned(turned(points))
+    require_axis_in_the_middle(result)
+    assert causes(result)[CAUSES[INSIDE]] > 4_000
+    (part,) = [part for part in result.removed if part.cause == CAUSES[INSIDE] and part.points > 1_000]
+    along = sorted(min(part.start - s, part.end - s, key=abs) for s in (12, 18))
+    assert part.end - part.start == pytest.approx(6.0, abs=0.6), along
+
+
+@pytest.mark.parametrize("depth", [1.0, 2.5, 5.0])
+def test_a_niche_or_a_stub_does_not_pull_the_axis_aside(depth):
+    result = cleaned(turned(arch(Box((13, 0), (16, 2.5 + depth), 2.5))))
+    require_axis_in_the_middle(result)
+    warnings = [part.warning for part in result.removed if part.warning]
+    assert len(warnings) == (depth > 3)
+
+
+def test_a_branch_is_cut_at_its_mouth_with_its_place_and_refused_when_strict():
+    points = turned(arch(Tube((15, 0), (15, 14), 4.0, 4.5)))
+    result = cleaned(points)
+    require_axis_in_the_middle(result, within=0.05)
+    (part,) = [part for part in result.removed if part.warning]
+    assert part.cause == CAUSES[BRANCH]
+    assert "branch" in part.warning
+    there = turned(np.array([[15.0, 8.0, 2.0]]))[0]
+    assert np.linalg.norm(np.subtract(part.place, there)) < 3.0
+    with pytest.raises(FitError, match="branch"):
+        cleaned(points, strict=True)
+
+
+def test_of_two_tunnels_the_longer_is_built_with_a_warning():
+    shorter = cavity(Tube((4, 20), (24, 20))) - PLACE
+    result = cleaned(turned(np.concatenate([arch(), shorter])))
+    require_axis_in_the_middle(result)
+    (part,) = [part for part in result.removed if part.warning]
+    assert part.cause == CAUSES[ELSEWHERE]
+
+
+def test_an_unseen_wall_does_not_move_the_axis():
+    points = arch()
+    unseen = (points[:, 1] > 1.5) & (points[:, 2] > 0.05) & (np.abs(points[:, 0] - 15) < 6)
+    require_axis_in_the_middle(cleaned(turned(points[~unseen])))
+
+
+def street(rng: np.random.Generator) -> np.ndarray:
+    x, y = rng.uniform(0, 60, 60_000), rng.uniform(-6, 6, 60_000)
+    wall = rng.random(60_000) < 0.6
+    y = np.where(wall, np.sign(y) * 6, y)
+    return np.stack([x, y, np.where(wall, rng.uniform(0, 9, len(x)), 0.0)], axis=1) + rng.normal(0, 0.02, (len(x), 3))
+
+
+def shaft(rng: np.random.Generator) -> np.ndarray:
+    turn = rng.uniform(-np.pi, np.pi, 60_000)
+    return np.stack([3 * np.cos(turn), 3 * np.sin(turn), rng.uniform(0, 25, len(turn))], axis=1)
+
+
+def plane(rng: np.random.Generator) -> np.ndarray:
+    return np.column_stack([rng.uniform(0, 40, (60_000, 2)), rng.normal(0, 0.02, 60_000)])
+
+
+def room(_rng: np.random.Generator) -> np.ndarray:
+    return cavity(Box((0, 0), (14, 11), 4)) - PLACE
+
+
+@pytest.mark.parametrize(
+    ("make", "reason"), [(street, "street"), (shaft, "shaft"), (plane, "plane"), (room, "room, not a tunnel")]
+)
+def test_what_is_no_bore_is_refused_by_its_name(make, reason):
+    with pytest.raises(FitError, match=reason):
+        cleaned(make(np.random.default_rng(4)) + PLACE)
+
+
+def test_a_wall_unseen_beside_a_train_goes_on_as_before_and_behind():
+    field = np.tile(np.linspace(2.0, 3.0, 60), (100, 1))
+    field += np.random.default_rng(5).normal(0, 0.005, field.shape)
+    seen = field.copy()
+    field[30:80, 10:50] = np.nan
+    field[5, 5] = np.nan
+    filled = fill_holes(field, 4.0)
+    assert np.abs(filled - seen)[30:80, 10:50].max() < 0.03
+    assert np.isnan(filled[5, 5])  # small holes are filled from all around
+    assert np.nanmax(np.abs(fill_nearest(field) - seen)) > 0.2  # which would bulge here

@@ -1,0 +1,175 @@
+"""Bores that no tunnel is like are named with the likely cause; the report of a build says so and stands alone."""
+
+import hashlib
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene.bore import STATION_STEP, Bore, axis_through
+from scene.build import build
+from scene.cleaning.crop import ExtentConfig
+from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
+from scene.judging.page import write_page
+from scene.judging.sanity import doubt_bore
+from scene.output import BuildConfig
+from scene.reconstruct import ReconstructConfig
+from tests.scene.clouds import curved_d_bore
+from tests.scene.conftest import arc_bore
+from tests.scene.test_judging import about, block, cloud_of, on_wall
+
+METRES = {"unit": "m (detected: least extent 6)", "axes": "xyz (by default, z up)"}
+
+
+def codes(bore: Bore, facts: dict | None = None, provenance: dict | None = None) -> dict[str, str]:
+    found = doubt_bore(bore, facts or METRES, provenance or {}, surveyed=True)
+    return {warning.code: warning.text + (" REFUSES" if warning.refuses else "") for warning in found}
+
+
+def scaled(bore: Bore, by: float) -> Bore:
+    return replace(
+        bore, width=bore.width * by, height=bore.height * by, radius=bore.radius * by, position=bore.position * by,
+        station=bore.station * by,
+    )  # fmt: skip
+
+
+def climbing(grade: float) -> Bore:
+    flat = arc_bore(grade=0.0, radius=1e5)
+    points = np.outer(np.linspace(0, 24, 30), [0.6, 0.8, grade])
+    axis = axis_through(points, STATION_STEP)
+    rows = np.zeros(len(axis.station), int)
+    sizes = {
+        name: getattr(flat, name)[rows] for name in ("width", "height", "radius", "filled", "coverage", "confidence")
+    }
+    return replace(
+        flat, station=axis.station, position=axis.position, tangent=axis.tangent, lateral=axis.lateral, up=axis.up,
+        **sizes,
+    )  # fmt: skip
+
+
+def test_a_common_tunnel_raises_no_doubt(bore):
+    assert codes(bore) == {}
+
+
+@pytest.mark.parametrize(
+    ("by", "said"),
+    [(1 / 0.3048, r"--unit ft makes it 5\.6 m by 6 m"), (100, r"--unit cm makes .* REFUSES"),
+     (1000, r"--unit mm makes .* REFUSES"), (0.01, "REFUSES")],
+)  # fmt: skip
+def test_sizes_of_no_tunnel_name_the_unit_that_would_make_one(bore, by, said):
+    assert re.search(said, codes(scaled(bore, by))["size"])
+
+
+def test_a_cm_cloud_taken_as_mm_is_told_by_its_size(bore):
+    told = codes(scaled(bore, 0.1), {"unit": "mm (detected: least extent 550)"})["size"]
+    assert "--unit cm makes it 5.6 m by 6 m" in told
+
+
+def test_a_size_that_the_user_told_is_not_doubted(bore):
+    assert codes(scaled(bore, 2.2), {"unit": "m (by flag)"}) == {}
+
+
+def test_grades_over_a_fifth_are_named_and_a_tunnel_on_end_is_refused():
+    assert codes(climbing(0.15)) == {}
+    steep = codes(climbing(0.27))["grade"]
+    assert "27%" in steep
+    assert "levelled" in steep
+    assert "REFUSES" not in steep
+    lying = codes(climbing(3.1))["grade"]
+    assert "z is not up" in lying
+    assert lying.endswith("REFUSES")
+
+
+def test_a_section_on_its_side_is_noticed(bore):
+    turned = replace(bore, radius=np.roll(bore.radius, 90, axis=1))  # its floor is now to the left
+    assert "flat on the left" in codes(turned)["lying"]
+
+
+def test_a_duct_that_was_taken_for_the_crown_dents_the_section(bore):
+    dented = bore.radius.copy()
+    near = np.abs(bore.angle - np.pi / 2) < 0.2
+    dented[20:60, near] -= 0.9
+    told = codes(replace(bore, radius=dented))["dent"]
+    assert re.search(r"from 5 to 15 m the section is dented inwards by up to 0\.[89] m at the crown", told)
+    shallow = bore.radius.copy()
+    shallow[20:60, near] -= 0.1
+    assert codes(replace(bore, radius=shallow)) == {}
+    short = bore.radius.copy()
+    short[20:28, near] -= 0.9
+    assert codes(replace(bore, radius=short)) == {}
+
+
+def test_what_nobody_measured_is_said(bore):
+    facts = {**METRES, "calibration": "none: the control is taken for the LiDAR's own origin"}
+    assert "--calibration" in codes(bore, facts)["calibration"]
+    assert "nothing measured the length" in codes(bore, {"length_fixed_by": "odometry; nothing measured it"})["length"]
+    told = codes(bore, METRES, {"pockets": "by standard", "rings": "by standard"})["by_standard"]
+    assert f"{len(bore.ring_station)} rings and {len(bore.pocket)} pockets" in told
+    assert not doubt_bore(bore, METRES, {"pockets": "by standard"}, surveyed=False)
+
+
+def test_the_page_shows_warnings_and_worst_stations_and_needs_nothing_else(bore, tmp_path):
+    cloud = cloud_of(about(bore, *on_wall(bore)), block(bore, (9, 15), (-1, 1), (-3.1, -1.0)))
+    judgement = judge_bore(bore, cloud, JudgingConfig())
+    pages = []
+    for name in ("a", "b"):
+        write_page(tmp_path / name, "<bore> & co", bore, judgement, {"provenance": {"bore": "measured"}})
+        pages.append((tmp_path / name).read_text())
+    assert pages[0] == pages[1]
+    page = pages[0]
+    assert "&lt;bore&gt; &amp; co" in page
+    assert not re.search(r"https?:|<script|\bsrc=|\bhref=|url\(", page)
+    assert len(page) < 600_000
+    assert page.count("<figure>") == len([window for window in judgement.worst if window[2] > 0.002])
+    assert 'class="warn' in page
+    assert "vehicle" in page
+
+
+@pytest.fixture(scope="module")
+def with_vehicle(tmp_path_factory):
+    known = curved_d_bore(length=24, radius=1e6, grade=0.0, yaw=0.0, per_metre=3000, offset=(0.0, 0.0, 0.0))
+    rng = np.random.default_rng(4)
+    hanging = np.column_stack([rng.uniform(8, 14, 9000), rng.uniform(-0.5, 0.5, 9000), rng.uniform(0.2, 1.2, 9000)])
+    path = tmp_path_factory.mktemp("cloud") / "vehicle.ply"
+    trimesh.PointCloud(np.concatenate([known.points, hanging])).export(path)
+    return path
+
+
+def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys):
+    out = tmp_path / "bore"
+    build(with_vehicle, out)
+    shown = capsys.readouterr()
+    assert re.search(r"judged: \d+\.\d% of .* returns within 10 cm", shown.out)
+    manifest = json.loads((out / "manifest.json").read_text())
+    judgement = manifest["judgement"]
+    assert 0.0 < judgement["share"]["explained"] < 1.0
+    for warning in judgement["warnings"]:
+        assert f"warning: {warning['text']}" in shown.err
+    assert judgement["warnings"]
+    for name in ("build.html", "stations.csv"):
+        assert manifest["files"][name] == hashlib.sha256((out / name).read_bytes()).hexdigest()
+    table = np.genfromtxt(out / "stations.csv", delimiter=",", names=True)
+    assert len(table) == round(manifest["bore"]["length"])
+    assert table["inside"][8:13].mean() > table["inside"][:6].mean() + 0.05
+
+
+def test_a_build_that_explains_too_little_leaves_nothing_and_force_builds_it(with_vehicle, tmp_path):
+    config = BuildConfig(judging=JudgingConfig(refuse_above=0.01))
+    with pytest.raises(DoubtError, match=r"vehicle\.ply: \d+% of the returns .* --force builds it all the same"):
+        build(with_vehicle, tmp_path / "bore", config=config)
+    assert not list(tmp_path.iterdir())
+    forced = replace(config, judging=replace(config.judging, force=True))
+    build(with_vehicle, tmp_path / "bore", config=forced)
+    assert (tmp_path / "bore" / "build.html").exists()
+
+
+def test_a_build_says_where_its_stations_begin_and_which_way_they_grow(with_vehicle, tmp_path, capsys):
+    extent = ExtentConfig(first=2.0, last=9.0, start_chainage=1200.0)
+    build(with_vehicle, tmp_path / "bore", config=BuildConfig(reconstruct=ReconstructConfig(extent=extent)))
+    shown = capsys.readouterr().out
+    assert re.search(r"stations: 0 m, chainage 1202 m at \(\d.*\); they grow arbitrarily: a registered cloud", shown)
+    detected = json.loads((tmp_path / "bore" / "manifest.json").read_text())["detected"]
+    assert detected["chainage_start"] == 1202.0

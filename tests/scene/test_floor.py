@@ -1,0 +1,121 @@
+"""The floor is the floor, whatever stands on it, hides it, or lies along its walls."""
+
+import numpy as np
+import pytest
+
+from scene.bore import Bore
+from scene.fitting import floor
+from scene.fitting.assemble import bore_from_sections
+from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.section import fit_sections
+from tests.scene import railway
+from tests.scene.railway import World, arch, thinned
+from tests.scene.shapes import PLACE
+
+L = 26.0
+SPACED = np.arange(0.3, L - 0.2, 0.6)
+PROUD = [*railway.sleepers(SPACED, 0.22), *railway.rails(L, 0.23)]
+BALLASTED = [
+    box
+    for aside in (-2.1, 2.1)
+    for box in [
+        (0.0, L, aside - 1.6, aside + 1.6, 0.0, 0.14),
+        *railway.sleepers(SPACED, 0.22, aside),
+        *railway.rails(L, 0.23, aside),
+    ]
+]
+DRAINED = np.concatenate([arch(5.5, 6.0, 3.2), [(-0.25, 0), (-0.25, -0.3), (0.25, -0.3), (0.25, 0)]])
+SCANS = {
+    "vlp16": lambda world: world.scan(railway.vlp16(), railway.carried(world.length, 1.5, 0.5), 0.012),
+    "os1": lambda world: world.scan(railway.os1(), railway.carried(world.length, 1.2, 0.8), 0.012),
+    "terrestrial": lambda world: world.scan(railway.terrestrial(), railway.stations(world.length), 0.004),
+}
+
+
+def built(points: np.ndarray, voxel: float) -> tuple[Bore, np.ndarray]:
+    """The bore, and how much its floor on the axis lies too high at each station, m."""
+    cloud = thinned(points, voxel)
+    axis = fit_centreline(cloud.points, CentrelineConfig())
+    bore = bore_from_sections(axis, fit_sections(cloud, axis))
+    down = np.array([np.interp(-np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
+    foot = bore.position - down[:, None] * bore.up + cloud.origin - PLACE
+    return bore, foot[:, 2] - 0.01 * foot[:, 0]
+
+
+@pytest.mark.parametrize(
+    ("world", "sensor"),
+    [
+        (World(arch(5.1, 5.5, 3.0), L, PROUD), "vlp16"),
+        (World(arch(5.1, 5.5, 3.0), L, PROUD), "os1"),
+        (World(arch(5.1, 5.5, 3.0), L, PROUD), "terrestrial"),
+        (World(arch(8.7, 6.6, 3.0), L, BALLASTED), "vlp16"),
+        (World(arch(8.7, 6.6, 3.0), L, BALLASTED), "terrestrial"),
+        (World(arch(9.6, 7.0, 4.0), L, [(0, L, 3.8, 4.8, 0, 0.2), (0, L, -4.8, -3.8, 0, 0.2)]), "terrestrial"),
+        (World(arch(5.5, 6.0, 3.2), L, [(0, L, 1.75, 2.75, 0, 0.9)]), "vlp16"),
+        (World(arch(8.5, 6.0, 3.2), L, [(0, L, 1.75, 4.25, 0, 1.05)]), "terrestrial"),
+        (World(DRAINED, L), "terrestrial"),
+    ],
+    ids=["proud-vlp16", "proud-os1", "proud", "double-vlp16", "double", "kerbs", "walkway", "platform", "drain"],
+)
+def test_floor_and_height_are_right_under_track_and_beside_walkways(world, sensor):
+    bore, error = built(SCANS[sensor](world), 0.07 if sensor == "terrestrial" else 0.04)
+    within = slice(8, -8)  # a carried scanner sees no floor at a mouth
+    assert np.abs(error[within]).max() < 0.03
+    assert np.median(bore.height) == pytest.approx(world.outline[:, 1].max(), abs=0.03)
+    assert np.median(bore.width) == pytest.approx(np.ptp(world.outline[:, 0]), abs=0.03)
+
+
+def test_ghosts_of_a_walker_do_not_lift_the_floor():
+    points, rng = SCANS["vlp16"](World(arch(5.5, 6.0, 3.2), L)), np.random.default_rng(1)
+    count = int(0.12 * len(points))
+    x = rng.uniform(0, L, count)
+    ghosts = np.column_stack([x, rng.normal(0, 0.25, count), rng.uniform(0.1, 1.8, count) + 0.01 * x]) + PLACE
+    assert np.abs(built(np.concatenate([points, ghosts]), 0.04)[1]).max() < 0.03
+
+
+def test_the_floor_runs_on_straight_under_a_train_and_through_a_gap():
+    train = World(arch(5.5, 6.0, 3.2), 40.0, [(14, 26, -1.3, 1.3, 0.3, 3.7)])
+    beside = railway.stations(40.0) - [0.0, 2.0, 0.0]
+    for points in (
+        train.scan(railway.terrestrial(), beside, 0.004),
+        SCANS["terrestrial"](World(arch(5.5, 6.0, 3.2), 40.0, hole=(14.0, 24.0))),
+    ):
+        assert np.abs(built(points, 0.07)[1]).max() < 0.05
+
+
+def test_a_walkway_stays_beside_the_floor_and_what_stands_there_for_a_metre_goes():
+    sides = [(0, L, 3.8, 4.8, 0, 0.2)]
+    kerbed, _ = built(SCANS["terrestrial"](World(arch(9.6, 7.0, 4.0), L, sides)), 0.07)
+    boxed, _ = built(SCANS["terrestrial"](World(arch(9.6, 7.0, 4.0), L, [(12, 13, 3.8, 4.8, 0, 0.2)])), 0.07)
+
+    def foot(bore: Bore) -> float:
+        """Height above the floor 4.3 m aside, on the higher side, m."""
+        middle = bore.radius[len(bore.station) // 2]
+        y, z = middle * np.cos(bore.angle), middle * np.sin(bore.angle)
+        return max(float(np.interp(4.3, side * y[z < 0][::side], z[z < 0][::side])) for side in (1, -1)) - z.min()
+
+    assert foot(kerbed) == pytest.approx(0.2, abs=0.03)
+    assert foot(boxed) == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_round_invert_is_no_floor():
+    turn = np.linspace(-np.pi, np.pi, 200)[:-1]
+    tube = World(np.column_stack([2.7 * np.cos(turn), 2.7 + 2.7 * np.sin(turn)]), L)
+    cloud = thinned(SCANS["vlp16"](tube))
+    axis = fit_centreline(cloud.points, CentrelineConfig())
+    assert not fit_sections(cloud, axis).flat_floor
+
+
+def test_an_even_run_leaves_out_what_stands_on_the_floor_and_takes_the_lower_of_two():
+    floor_and_top = [[-3.0, -2.8]] * 10
+    assert [which for _, which in floor._even_run(floor_and_top)] == [0] * 10
+    hidden = [[-3.0]] * 10 + [[-2.3]] * 10 + [[-3.0]] * 10
+    assert [k for k, _ in floor._even_run(hidden)] == [*range(10), *range(20, 30)]
+    assert [k for k, _ in floor._even_run([[], [-3.0], [], [-3.01]])] == [1, 3]
+    assert floor._even_run([[], []]) == []
+
+
+def test_without_the_search_below_the_floor_would_be_a_plateau_over_the_track(monkeypatch):
+    monkeypatch.setattr(floor, "find_lower_line", lambda *_: None)
+    _, error = built(SCANS["vlp16"](World(arch(5.1, 5.5, 3.0), L, PROUD)), 0.04)
+    assert np.median(error) > 0.1

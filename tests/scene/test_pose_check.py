@@ -1,0 +1,87 @@
+"""Poses that do not belong to their scans are noticed by the walls, and the mistake is named."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scene.judging.sanity import doubt_bore
+from scene.poses.consistency import check_poses, reorder
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import Recording
+from tests.scene.bags import write_bag
+
+RATE, COUNT, RAYS = 10.0, 90, 3000
+
+
+def pose(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
+    """A walker at 0.8 m/s who sways by 4° and turns by 40° in all."""
+    sway = 0.07 * np.sin(2 * np.pi * 0.9 * time)
+    position = np.column_stack([0.8 * time, 0.05 * np.sin(3.0 * time), 1.5 + 0.03 * np.sin(6.0 * time)])
+    return position, Rotation.from_euler("zyx", np.column_stack([0.07 * time, sway, 0.04 * np.cos(5.0 * time)]))
+
+
+def walls(start: np.ndarray, ray: np.ndarray) -> np.ndarray:
+    """Distance to a duct of 5 m by 5 m along x, m."""
+    with np.errstate(divide="ignore"):
+        sides = [((np.sign(ray[:, k]) * 2.5 + offset) - start[:, k]) / ray[:, k] for k, offset in ((1, 0.0), (2, 1.0))]
+    return np.minimum(*sides)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    rng = np.random.default_rng(0)
+    scans = []
+    for k in range(COUNT):
+        position, attitude = pose(k / RATE + 0.1 * np.arange(RAYS) / RAYS)  # the writer spreads them over 0.1 s
+        ray = rng.standard_normal((RAYS, 3))
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        distance = walls(position, attitude.apply(ray)) + rng.normal(0, 0.01, RAYS)
+        scans.append((100.0 + k / RATE, (distance[:, None] * ray).astype(np.float32)))
+    path = write_bag(tmp_path_factory.mktemp("bag") / "walk.bag", scans)
+    with Recording(path) as opened:
+        yield opened
+
+
+def trajectory(late: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Trajectory:
+    time = np.arange(-20, RATE * 12 * 2) / (2 * RATE)
+    position, attitude = pose(time)
+    return Trajectory(100.0 + time + late, position, attitude * Rotation.from_euler("xyz", turn, degrees=True), "t.tum")
+
+
+def test_right_poses_leave_walls_as_thin_as_a_sweep_does(recording):
+    check = check_poses(recording, trajectory())
+    assert not check.blurred
+    assert check.words is None
+    assert check.facts["pose_doubt"] is None
+
+
+WRONG = {
+    "late": (trajectory(late=0.1), "0.1 s earlier they are thin: two clocks differ"),
+    "early": (trajectory(late=-0.5), "0.5 s later they are thin: two clocks differ"),
+    "pitched": (trajectory(turn=(0.0, 3.0, 0.0)), "-3° in pitch they are thin: the extrinsic is off"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_clock_and_a_wrong_mount_are_named(recording, name, bore):
+    poses, said = WRONG[name]
+    check = check_poses(recording, poses)
+    assert check.blurred
+    assert said in check.words
+    warnings = doubt_bore(bore, check.facts, {}, surveyed=True)
+    assert [warning.code for warning in warnings] == ["poses"]
+
+
+def test_quaternions_in_the_other_order_are_found(recording):
+    right = trajectory()
+    wrong = Trajectory(
+        right.times, right.positions, Rotation.from_quat(right.rotations.as_quat()[:, [3, 0, 1, 2]]), "t.tum"
+    )
+    check = check_poses(recording, wrong)
+    assert check.wxyz
+    assert "w, x, y, z" in check.words
+    assert not check_poses(recording, reorder(wrong)).blurred
+
+
+def test_poses_of_another_time_tell_nothing(recording):
+    assert check_poses(recording, trajectory(late=1000.0)) is None

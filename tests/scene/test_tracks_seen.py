@@ -1,0 +1,181 @@
+"""Tracks as a cloud shows them: none in a road, two where there are two, with the gauge and sleepers that they have."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scene.bore import Bore
+from scene.cloud import Cloud
+from scene.fitting import rails as rails_seen
+from scene.fitting.assemble import bore_from_sections
+from scene.fitting.centreline import CentrelineConfig, fit_centreline
+from scene.fitting.section import fit_sections
+from scene.fitting.trackseen import SeenTrack, find_track
+from scene.output import write_geometry
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import TrackConfig, describe_track, lay_track, track_provenance
+from subterra_jax.b2.track import TrackError, read_scene_track
+from subterra_jax.tunnel.sources import load_tunnel
+from tests.scene import railway
+from tests.scene.railway import World, arch, thinned
+from tests.scene.shapes import PLACE
+
+L = 26.0
+STATIONS = np.arange(0.3, L - 0.2, 0.6) + np.random.default_rng(4).normal(0, 0.01, 43)
+
+
+def track(seat: float, aside: float = 0.0, gauge: float = 1.435, cant: float = 0.0) -> list[railway.Box]:
+    return [*railway.sleepers(STATIONS, seat, aside), *railway.rails(L, seat + 0.01, aside, gauge, cant)]
+
+
+WORLDS = {
+    "proud": World(arch(5.1, 5.5, 3.0), L, track(0.22)),
+    "ballast": World(arch(5.6, 6.4, 3.6), L, [(0.0, L, -1.6, 1.6, 0.0, 0.14), *track(0.24)]),
+    "metre gauge": World(arch(5.1, 5.5, 3.0), L, track(0.22, gauge=1.0)),
+    "double": World(arch(8.7, 6.6, 3.0), L, [*track(0.22, -2.1), *track(0.22, 2.1)]),
+    "bare rails": World(arch(5.1, 5.5, 3.0), L, railway.rails(L, 0.22)),
+    "road": World(arch(9.6, 7.0, 4.0), L, [(0, L, 3.8, 4.8, 0, 0.2), (0, L, -4.8, -3.8, 0, 0.2)]),
+    "corridor": World(arch(4.5, 4.0, 3.5), L, [(5, 7, 1.5, 2.25, 0, 1.8), (0, L, -2.2, -1.9, 0.3, 0.5)]),
+    "canted": World(arch(5.1, 5.5, 3.0), L, track(0.24, cant=0.08)),
+}
+
+
+def scanned(name: str, sensor: str = "os1") -> tuple[Cloud, Bore]:
+    world = WORLDS[name]
+    if sensor == "terrestrial":
+        cloud = thinned(world.scan(railway.terrestrial(), railway.stations(L), 0.004), 0.07)
+    else:
+        rays = railway.os1() if sensor == "os1" else railway.vlp16()
+        cloud = thinned(world.scan(rays, railway.carried(L, 1.4, 0.5), 0.012))
+    axis = fit_centreline(cloud.points, CentrelineConfig())
+    return cloud, bore_from_sections(axis, fit_sections(cloud, axis))
+
+
+def f1(bore: Bore, cloud: Cloud, stations: np.ndarray) -> float:
+    """F1 of sleepers within 15 cm of a true one."""
+    built = bore.axis.at(stations).position[:, 0] + cloud.origin[0] - PLACE[0]
+    near = np.abs(built[:, None] - STATIONS) < 0.15
+    return 2 * near.any(axis=1).sum() / (len(built) + len(STATIONS))
+
+
+@pytest.mark.parametrize(
+    ("name", "sensor", "gauge"),
+    [
+        ("proud", "vlp16", 1.435), ("proud", "os1", 1.435), ("proud", "terrestrial", 1.435), ("ballast", "os1", 1.435),
+        ("metre gauge", "os1", 1.0),
+    ],
+)  # fmt: skip
+def test_proud_sleepers_and_the_gauge_are_found(name, sensor, gauge):
+    cloud, bore = scanned(name, sensor)
+    (line,) = find_track(cloud, bore).lines
+    assert line.rails.measured
+    assert line.rails.gauge == pytest.approx(gauge, abs=0.005)
+    assert line.sleepers.protrusion == pytest.approx(0.24 if name == "ballast" else 0.22, abs=0.015)
+    assert f1(bore, cloud, line.sleepers.station) >= 0.9
+    laid = lay_track(bore, TrackConfig(), SeenTrack((line,), True))
+    assert laid.lines[0].gauge == line.rails.gauge
+    assert describe_track(laid, SeenTrack((line,), True))["gauge_seen"] == line.rails.gauge
+
+
+def test_two_tracks_are_two_and_a_gauge_that_no_face_shows_is_not_seen():
+    cloud, bore = scanned("double")
+    seen = find_track(cloud, bore)
+    assert [float(np.median(line.rails.offset)) for line in seen.lines] == pytest.approx([-2.1, 2.1], abs=0.03)
+    assert all(f1(bore, cloud, line.sleepers.station) >= 0.9 for line in seen.lines)
+    laid = lay_track(bore, TrackConfig(), seen)
+    facts = describe_track(laid, seen)
+    assert [line["gauge_seen"] for line in facts["lines"]] == [None, None]
+    assert [line["gauge_from"] for line in facts["lines"]] == ["by standard"] * 2
+    assert facts["gauge"] == 1.435
+
+
+@pytest.mark.parametrize("name", ["road", "corridor"])
+def test_no_railway_is_found_where_there_is_none(name):
+    cloud, bore = scanned(name, "terrestrial")
+    seen = find_track(cloud, bore)
+    assert not seen.lines
+    laid = lay_track(bore, TrackConfig(), seen)
+    assert not laid.lines
+    np.testing.assert_array_equal(laid.elevation, laid.bed)
+    assert track_provenance(laid, seen) == {"track": "none: the survey shows no rails"}
+
+
+def test_cant_is_measured():
+    cloud, bore = scanned("canted")
+    (line,) = find_track(cloud, bore).lines
+    turned = 1 if bore.tangent[0, 0] > 0 else -1  # left is the other side for who goes back
+    assert np.median(line.rails.cant) == pytest.approx(turned * 0.08, abs=0.01)
+
+
+def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor():
+    cloud, bore = scanned("bare rails")
+    seen = find_track(cloud, bore)
+    laid = lay_track(bore, TrackConfig(), seen)
+    assert len(laid.lines) == 1
+    assert not len(laid.sleeper_station)
+    np.testing.assert_array_equal(laid.elevation, laid.bed)
+    top = laid.lines[0].seat + laid.lines[0].rail_height - laid.bed
+    assert np.median(top) == pytest.approx(0.22 + 0.176, abs=0.015)
+    assert track_provenance(laid, seen)["sleepers"] == "none: the floor is seen between the rails"
+
+
+def test_the_user_may_want_none_or_the_standard_and_rings_get_the_standard():
+    cloud, bore = scanned("proud")
+    seen = find_track(cloud, bore)
+    none = lay_track(bore, TrackConfig(lay="none"), seen)
+    assert (none.lines, none.why) == ((), "none: as asked for")
+    for config, shown in ((TrackConfig(lay="standard"), seen), (TrackConfig(), SeenTrack())):
+        standard = lay_track(bore, config, shown)
+        assert standard.lines[0].gauge == 1.435
+        assert not standard.measured.any()
+        assert len(standard.sleeper_station) == int(bore.length / 0.6) + 1
+        assert track_provenance(standard, shown)["sleepers"] == "by standard"
+
+
+def test_a_face_read_a_centimetre_off_is_no_gauge(monkeypatch):
+    cloud, bore = scanned("proud")
+    monkeypatch.setattr(rails_seen, "_FACE", (0.06, 0.12))  # the web in place of the head's side
+    (line,) = find_track(cloud, bore).lines
+    assert not (line.rails.measured and abs(line.rails.gauge - 1.435) < 0.005)
+
+
+@pytest.mark.parametrize("name", ["road", pytest.param("double", marks=pytest.mark.slow)])
+def test_what_is_written_agrees_and_a_scene_without_track_loads(name, tmp_path):
+    cloud, bore = scanned(name, "terrestrial")
+    seen = find_track(cloud, bore)
+    laid = lay_track(bore, TrackConfig(), seen)
+    count, _ = write_geometry(tmp_path, name, "simulated", bore, laid, SceneConfig())
+    text = (tmp_path / "scene.xml").read_text()
+    plan = load_tunnel(tmp_path / "tunnel.npz")
+    np.testing.assert_allclose(plan.elevation, laid.elevation)
+    assert (
+        text.count('name="sleeper_') - text.count('mesh name="sleeper_')
+        >= count["sleepers"]
+        == len(laid.sleeper_station)
+    )
+    assert json.dumps(describe_track(laid, seen))
+    if name == "road":
+        assert count["rails"] == 0
+        floor = bore.position[:, 2] - np.array(
+            [np.interp(-np.pi / 2, bore.angle, r, period=2 * np.pi) for r in bore.radius]
+        )
+        assert np.abs(plan.elevation - floor).max() < 0.03
+        with pytest.raises(TrackError, match="no track to walk on"):
+            read_scene_track(tmp_path, plan)
+    else:
+        assert count["rails"] == 4
+        walked = read_scene_track(tmp_path, plan)
+        assert len(walked.station) == len(laid.lines[0].sleeper_station)
+        assert np.asarray(walked.protrusion) == pytest.approx(0.22, abs=0.02)
+
+
+def test_sleepers_of_uneven_pitch_are_not_filled_up():
+    uneven = np.cumsum([0.5, 0.5, 0.75] * 15)[:-1]
+    _, bore = scanned("proud")
+    world = replace(WORLDS["proud"], boxes=[*railway.sleepers(uneven + 0.3, 0.22), *railway.rails(L, 0.23)])
+    cloud = thinned(world.scan(railway.os1(), railway.carried(L, 1.4, 0.5), 0.012))
+    (line,) = find_track(cloud, bore).lines
+    inside = (uneven + 0.3 < L).sum()
+    assert abs(len(line.sleepers.station) - inside) <= 2

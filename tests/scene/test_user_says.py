@@ -1,0 +1,164 @@
+"""A user's settings for an input: extent, direction, chainage, unit and columns; and units found without them."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene.cleaning.crop import ExtentConfig, crop_cloud, parse_box
+from scene.cloud import Cloud
+from scene.errors import FitError, RecordingError
+from scene.progress import Stages
+from scene.reading.cloudfile import read_cloud
+from scene.reading.formats import ReadingConfig, detect
+from scene.reading.ringsurvey import read_ring_survey
+from scene.reconstruct import ReconstructConfig, Reconstruction, reconstruct
+from tests.scene.clouds import curved_d_bore
+from tests.scene.files import write_e57, write_las, write_parquet, write_ply, write_text
+
+KNOWN = curved_d_bore(length=24, per_metre=4000, offset=(12.0, -3.0, 2.0))
+
+
+@pytest.fixture(scope="module")
+def cloud_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cloud") / "bore.ply"
+    trimesh.PointCloud(KNOWN.points).export(path)
+    return path
+
+
+def rebuilt(path, **extent) -> Reconstruction:
+    with Stages() as progress:
+        return reconstruct(path, None, ReconstructConfig(extent=ExtentConfig(**extent)), progress)
+
+
+@pytest.fixture(scope="module")
+def whole(cloud_file):
+    return rebuilt(cloud_file)
+
+
+def test_from_and_to_keep_the_stations_that_the_whole_build_counts(cloud_file, whole):
+    part = rebuilt(cloud_file, first=6.0, last=18.0, start_chainage=1200.0)
+    assert part.bore.length == pytest.approx(12.0, abs=0.1)
+    for row, station in ((0, 6.0), (-1, 18.0)):
+        expected = whole.bore.axis.at(np.array([station])).position[0] + whole.origin
+        assert np.linalg.norm(part.bore.position[row] + part.origin - expected) < 0.12
+    assert part.facts["chainage_start"] == 1206.0
+    assert "arbitrarily" in part.facts["chainage_grows"]
+    assert len(part.everything.points) < 0.6 * len(whole.everything.points)
+    assert len(part.cause) == len(part.everything.points)
+
+
+def test_reverse_counts_from_the_other_end(cloud_file, whole):
+    turned = rebuilt(cloud_file, reverse=True)
+    np.testing.assert_allclose(
+        turned.bore.position[0] + turned.origin, whole.bore.position[-1] + whole.origin, atol=0.06
+    )
+    assert turned.facts["chainage_grows"].startswith("against this, by --reverse")
+
+
+def test_stations_that_leave_nothing_are_refused(cloud_file):
+    with pytest.raises(FitError, match=r"--from 22 and --to 24 leave 2\.0 m of a tunnel of 24\.0 m"):
+        rebuilt(cloud_file, first=22.0)
+
+
+def test_a_box_keeps_what_is_inside_it_in_the_frame_of_the_input():
+    points = np.array([[0, 0, 0], [5, 0, 0], [5, 5, 9]], np.float32)
+    cloud = Cloud(points, np.ones(3, np.float32), np.array([100.0, 200.0, 0.0]), 3, 0.04)
+    assert len(crop_cloud(cloud, None).points) == 3
+    np.testing.assert_array_equal(crop_cloud(cloud, "106,198,104,206").points, points[1:])  # in plan, corners any way
+    np.testing.assert_array_equal(crop_cloud(cloud, "104,198,-1,106,206,5").points, points[1:2])
+    with pytest.raises(FitError, match=r"holds no point; the cloud spans x 100\.0 to 105\.0"):
+        crop_cloud(cloud, "0,0,9,9")
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "a,b,c,d", "1,2,1,5", "nan,0,1,1"])
+def test_a_box_that_is_none_is_refused(text):
+    with pytest.raises(FitError, match="--crop"):
+        parse_box(text)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("cm", 100), ("mm", 1000), ("m", 1)])
+@pytest.mark.parametrize("write", [write_ply, write_las, write_text, write_e57])
+def test_cm_and_mm_are_told_by_the_height_of_the_bore_even_where_a_file_says_metres(tmp_path, write, unit, scale):
+    name = {write_ply: "a.ply", write_las: "a.las", write_text: "a.xyz", write_e57: "a.e57"}[write]
+    path = write(tmp_path / name, (KNOWN.points[::4] - [12, -3, 2]) * scale)
+    cloud, facts = read_cloud(path, 0.04)
+    assert facts["unit"].split(" ")[0] == unit
+    np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(KNOWN.points, axis=0), atol=0.15)
+
+
+def test_a_long_climbing_tunnel_in_metres_is_no_tunnel_in_cm(tmp_path):
+    """700 m by 700 m in plan, 600 m in height: no extent tells the unit, the height of its columns does."""
+    rng = np.random.default_rng(0)
+    along, turn = rng.random(40_000) * 990, rng.uniform(-np.pi, np.pi, 40_000)
+    points = np.column_stack([0.7 * along, 0.7 * along + 2.7 * np.cos(turn), 0.6 * along + 2.7 * np.sin(turn)])
+    assert read_cloud(write_ply(tmp_path / "a.ply", points), 0.04)[1]["unit"].startswith("m ")
+
+
+HEADERS = {
+    "Rechtswert;Hochwert;Hoehe": (0, 1, 2),
+    "Hochwert;Rechtswert;Höhe": (1, 0, 2),
+    "Hoehe [m];Rechtswert [m];Hochwert [m]": (1, 2, 0),
+    "Ost;Nord;Kote": (0, 1, 2),
+    "Este;Norte;Cota": (0, 1, 2),
+    "Est;Nord;Altitude": (0, 1, 2),
+    "Northing;Easting;RL": (1, 0, 2),
+}
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_headers_that_surveyors_use_are_read_in_any_order(tmp_path, header):
+    points = np.random.default_rng(1).uniform(0, 1, (50, 3)) * [90.0, 20.0, 15.0]
+    columns = np.empty_like(points)
+    for axis, column in enumerate(HEADERS[header]):
+        columns[:, column] = points[:, axis]
+    cloud, _ = read_cloud(write_text(tmp_path / "a.csv", columns, ";", header), 1e-4)
+    np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(points, axis=0), atol=1e-3)
+
+
+@pytest.mark.parametrize("columns", ["x=A,y=B,z=C", "x=2,y=3,z=4"])
+def test_columns_that_the_user_names_are_read(tmp_path, columns):
+    rows = np.random.default_rng(2).uniform(0, 1, (60, 4)) * [1, 90, 20, 15]
+    path = tmp_path / "a.csv"
+    path.write_text("Id,A,B,C\n" + "\n".join(",".join(f"{v:.5f}" for v in row) for row in rows))
+    cloud, _ = read_cloud(path, 1e-3, ReadingConfig(columns=columns))
+    np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(rows[:, 1:], axis=0), atol=1e-3)
+    parquet = write_parquet(tmp_path / "a.parquet", rows[:, 1:], ("A", "B", "C"))
+    assert len(read_cloud(parquet, 1e-3, ReadingConfig(columns="x=A,y=B,z=C"))[0].points) == 60
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [("x=A,y=B", r"a\.csv: .*no .*columns"), ("x=Q,y=B,z=C", r"a\.csv: .*"), ("q=A", r"columns 'q=A' are not pairs")],
+)
+def test_columns_that_are_not_there_are_refused(tmp_path, columns, said):
+    path = tmp_path / "a.csv"
+    path.write_text("Id,A,B,C\n" + "\n".join("1,2,3,4" for _ in range(9)))
+    with pytest.raises(RecordingError, match=said):
+        read_cloud(path, 0.04, ReadingConfig(columns=columns))
+    with pytest.raises(RecordingError, match="--columns goes with a table"):
+        read_cloud(write_ply(tmp_path / "a.ply", KNOWN.points[:50]), 0.04, ReadingConfig(columns="x=A,y=B,z=C"))
+
+
+def ring_rows() -> list[str]:
+    return [
+        f"{ring};{k};{10 * ring + 2.7 * 0:.3f};{2.7 * np.cos(k):.3f};{2.7 * np.sin(k):.3f}"
+        for ring in range(6) for k in range(7)
+    ]  # fmt: skip
+
+
+def test_a_ring_survey_in_german_and_one_whose_columns_are_named(tmp_path):
+    path = tmp_path / "rings.csv"
+    path.write_text("\n".join(["Ring;Punkt;Rechtswert;Hochwert;Hoehe", *ring_rows()]))
+    assert detect(path).format.kind == "rings"
+    assert len(read_ring_survey(path).names) == 6
+    assert read_ring_survey(path).reversed().names == ["5", "4", "3", "2", "1", "0"]
+    odd = tmp_path / "odd.csv"
+    odd.write_text("\n".join(["R;P;U;V;W", *ring_rows()]))
+    told = {"x": "U", "y": "V", "z": "W", "ring": "R", "point": "P"}
+    np.testing.assert_array_equal(read_ring_survey(odd, told=told).points, read_ring_survey(path).points)
+
+
+def test_a_cloud_with_numbers_of_points_is_no_ring_survey(tmp_path):
+    path = tmp_path / "cloud.csv"
+    path.write_text("\n".join(["Punkt;Rechtswert;Hochwert;Hoehe", *(row.partition(";")[2] for row in ring_rows())]))
+    assert detect(path).format.kind == "cloud"
