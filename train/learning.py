@@ -16,12 +16,16 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from subterra_jax.host.errors import MissingLibraryError
 from train import devices
 
-with contextlib.redirect_stdout(io.StringIO()):
-    from brax.training.acme import running_statistics
-    from brax.training.distribution import NormalTanhDistribution
-    from brax.training.networks import MLP
+try:
+    with contextlib.redirect_stdout(io.StringIO()):
+        from brax.training.acme import running_statistics
+        from brax.training.distribution import NormalTanhDistribution
+        from brax.training.networks import MLP
+except ImportError as missing:
+    raise MissingLibraryError(__name__, "brax", "train") from missing
 
 __all__ = [
     "MLP",

@@ -21,6 +21,7 @@ from train.belief.learner import BeliefConfig, make_belief_config
 from train.config import ConfigError, Legs, PPOConfig, make_config
 from train.devices import Cluster
 from train.evaluate import check_episodes
+from train.options import insert_file, reward_of, settings_of, with_weights
 from train.ppo import check_config, make_learner, seed_axes
 from train.recurrent.config import (
     DistillConfig,
@@ -29,8 +30,9 @@ from train.recurrent.config import (
     make_recurrent_config,
 )
 from train.session import Session, check_seeds, run_seeds
+from train.sinks import Logs
 from train.snapshot import Snapshot
-from train.world import World, open_world, require_task
+from train.world import World, open_world, require_task, task_reward, with_reward
 
 _DEFAULT_TASK = "Subterra/TraverseShort-v0"
 _MEMORIES = ("none", "gru", "map")
@@ -53,14 +55,15 @@ class Command:
             with `--teacher oracle` (any baseline, policy file or run folder) from a teacher. `map`: a belief over every
             place of a known tunnel, for Relocalise; what a scan says of a place is learnt.
         preset: `cpu` or `gpu`; what jax runs on if left out.
-        seeds: Train these seeds at once, into `out/seed-<k>`, and draw them together.
-        resume: Go on from the checkpoint in `out`.
+        seeds: Train these seeds at once, each into `out/seed-<k>`.
+        resume: Go on from the newest checkpoint, or from the beginning.
         overwrite: Throw away the run that `out` holds.
-        tensorboard: Write the log for TensorBoard as well.
-        evaluation_episodes: Episodes of the evaluation after training, the first of the task's 500.
+        evaluation_episodes: Episodes of the evaluation after training, of 500.
         embodiment: `scout`, the round robot of the tasks; or `b2`: learnt on a planar robot that obeys as late as the
             walking one does, then tried on four legs.
+        settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
         legs: The trial of `--embodiment b2`.
+        logs: Further places to log to.
         cluster: Other processes to train with.
         config: Settings of PPO.
     """
@@ -74,10 +77,11 @@ class Command:
     seeds: tuple[int, ...] = ()
     resume: bool = False
     overwrite: bool = False
-    tensorboard: bool = False
     evaluation_episodes: int = 200
     embodiment: Literal["scout", "b2"] = "scout"
+    settings: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     legs: Legs = dataclasses.field(default_factory=Legs)
+    logs: Annotated[Logs, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Logs)
     cluster: Annotated[Cluster, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Cluster)
     config: Annotated[PPOConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=PPOConfig)
 
@@ -113,8 +117,13 @@ def read_command(arguments: list[str]) -> Command:
     """Reads a command line; defaults follow from the task, memory and preset that it names.
 
     Raises:
-        ConfigError: There is no such task, memory or preset.
+        ConfigError: There is no such task, memory or preset; or the file that `--config` names is wrong.
     """
+    return _read_words(insert_file(arguments, _read_words))
+
+
+def _read_words(arguments: list[str]) -> Command:
+    """Reads a command line without looking into the file that it may name."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--task", default=_DEFAULT_TASK)
     early.add_argument("--memory", default=_MEMORIES[0])
@@ -126,7 +135,7 @@ def read_command(arguments: list[str]) -> Command:
     named, _ = early.parse_known_args(arguments)
     devices.join_cluster(Cluster(named.coordinator, named.processes, named.process))
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
-    default = _default(named.task, named.memory, named.teacher, preset)
+    default = with_weights(_default(named.task, named.memory, named.teacher, preset), task_reward(named.task))
     return tyro.cli(
         type(default),
         args=arguments,
@@ -166,10 +175,11 @@ def command(arguments: Command) -> int:
     check_config(config)
     check_episodes(arguments.evaluation_episodes, "evaluation_episodes")
     check_seeds(arguments.seeds)
-    world = _world(arguments)
+    world = with_reward(_world(arguments), reward_of(arguments))
     if arguments.seeds:
         return _several(arguments, world)
-    session = Session(arguments.out, world, make_learner(world, config), tensorboard=arguments.tensorboard)
+    learner = make_learner(world, config)
+    session = Session(arguments.out, world, learner, logs=arguments.logs, command=settings_of(arguments))
     return _train_and_score(session, arguments)
 
 
@@ -205,7 +215,8 @@ def _several(arguments: Command, world: World) -> int:
     for seed in arguments.seeds:
         config = dataclasses.replace(arguments.config, seed=seed)
         learner, out = make_learner(world, config, seed_axes()), arguments.out / f"seed-{seed}"
-        sessions.append(Session(out, world, learner, tensorboard=arguments.tensorboard))
+        alone = settings_of(dataclasses.replace(arguments, config=config))
+        sessions.append(Session(out, world, learner, logs=arguments.logs, command=alone))
     return run_seeds(
         arguments.out,
         sessions,

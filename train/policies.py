@@ -14,17 +14,17 @@ from safetensors.numpy import save
 from subterra_jax import policies as released
 from subterra_jax.host.files import replace_file
 from subterra_jax.policies import Conditions
+from subterra_jax.policies.files import CHECKPOINT_POLICY, GAIT, SCHEMA, TENSORS
 from subterra_jax.policies.files import FACTS as POLICY_FACTS
-from subterra_jax.policies.files import SCHEMA, TENSORS
 from subterra_jax.policies.loading import Agent
 from train.belief.learner import BeliefLayout, BeliefNetworks
+from train.checkpoint import FACTS, CheckpointError, load_checkpoint
 from train.config import ConfigError
 from train.feedforward.networks import Layout, Networks
-from train.folder import FACTS, CheckpointError, load_checkpoint
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks
 from train.world import require_task
 
-AnyNetworks: TypeAlias = Networks | RecurrentNetworks | BeliefNetworks
+AnyNetworks: TypeAlias = Any  # Networks | RecurrentNetworks | BeliefNetworks, or those of a gait
 _KINDS: dict[str, Any] = {
     Networks.kind: (Layout, Networks),
     RecurrentNetworks.kind: (RecurrentLayout, RecurrentNetworks),
@@ -91,7 +91,9 @@ def make_agent(
 
 def policy_tensors(networks: AnyNetworks, policy: Any) -> dict[str, np.ndarray]:
     """Returns the arrays that driving needs of a policy, by the names that `subterra_jax.policies` knows."""
-    if networks.kind == "mlp":
+    if networks.kind == GAIT:
+        parts = networks.tensors(policy)
+    elif networks.kind == "mlp":
         parts = {"policy": policy.weights, "statistics": {"mean": policy.statistics.mean, "std": policy.statistics.std}}
     else:
         parts = policy
@@ -129,7 +131,7 @@ def write_policy(out: Path, networks: AnyNetworks, policy: Any, facts: dict[str,
         out: The tensors' file.
         networks: Networks of the policy.
         policy: The policy.
-        facts: At least `task` and `world`; name, kind, layout and hash are added.
+        facts: At least `task` and `world`; name (in a checkpoint that of the kind), kind, layout and hash are added.
 
     Raises:
         OutputError: They cannot be written.
@@ -137,7 +139,7 @@ def write_policy(out: Path, networks: AnyNetworks, policy: Any, facts: dict[str,
     tensors = save(dict(sorted(policy_tensors(networks, policy).items())))
     whole = {
         "schema": SCHEMA,
-        "name": out.name.removesuffix(TENSORS),
+        "name": f"ppo-{networks.kind}" if out.stem == CHECKPOINT_POLICY else out.stem,
         "kind": networks.kind,
         "tensors_sha256": hashlib.sha256(tensors).hexdigest(),
         "layout": dataclasses.asdict(networks.layout),

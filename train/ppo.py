@@ -16,10 +16,10 @@ from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.policies import PolicyError, check_fits
 from train.belief.learner import BeliefConfig, BeliefLearner, check_belief
+from train.checkpoint import CheckpointError
 from train.config import ConfigError, PPOConfig, TrainConfig, check
 from train.devices import PART, SPLIT, Parts, Spread, compiler_options
 from train.feedforward.learner import Learner
-from train.folder import CheckpointError
 from train.policies import open_agent, policy_weights
 from train.recurrent.config import (
     DistillConfig,
@@ -32,6 +32,7 @@ from train.recurrent.drive import make_layout
 from train.recurrent.learner import RecurrentLearner
 from train.recurrent.network import RecurrentNetworks
 from train.report import fetch, fetch_all
+from train.sinks import Log
 from train.snapshot import Snapshot, Trainable, advance, finished, started, timing
 from train.world import World
 
@@ -121,6 +122,7 @@ def train(
     learner: Trainable | None = None,
     snapshot: Snapshot | None = None,
     watch: Watcher | None = None,
+    log: Log | None = None,
     deterministic: bool = True,
 ) -> Snapshot:
     """Trains until the goal has held for long enough, or the steps are used up.
@@ -132,6 +134,7 @@ def train(
         learner: Made of the same three; one without memory is built here if left out.
         snapshot: Snapshot to go on from; its state is used up. None is the beginning.
         watch: Called after every iteration; training ends early if it returns True.
+        log: Called after every iteration with its line of the log, a dictionary, before `watch`.
         deterministic: One seed is to give one result on a GPU as well.
 
     Returns:
@@ -157,6 +160,8 @@ def train(
         state, report = iterate(snapshot.state, params)
         snapshot = advance(snapshot, state, report.policy, *fetch(report), config)
         snapshot.record["timing"] = timing(began, compiled, before, config.steps_per_iteration)
+        if log is not None:
+            log(snapshot.record)
         if watch is not None and watch(snapshot):
             break
     return snapshot
@@ -210,10 +215,11 @@ def train_seeds(
     if any(snapshot is None for snapshot in snapshots):
         keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
         states = jax.jit(over_seeds(first.init), compiler_options=options)(keys, params)
-        now = [started(learner, state) for learner, state in zip(learners, _apart(states, len(learners)), strict=True)]
+        untrained = _apart(states, len(learners))
+        now = [s or started(learner, state) for s, learner, state in zip(snapshots, learners, untrained, strict=True)]
     else:
         now = [snapshot for snapshot in snapshots if snapshot is not None]
-        states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
+    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
     if all(map(_done, now, learners)):
         return now
     began = time.perf_counter()

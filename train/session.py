@@ -1,5 +1,6 @@
 """The host's side of a run, or of several seeds at once: folder, log, checkpoints, curve, evaluation and summary."""
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -14,21 +15,21 @@ from subterra_jax.evaluation.episodes import SHA256
 from subterra_jax.host.command import EXIT_INTERRUPTED
 from subterra_jax.host.files import replace_file
 from train import devices
+from train.checkpoint import iterations
 from train.config import ConfigError
 from train.curve import GOAL, write_curve
 from train.evaluate import evaluate
-from train.folder import RunFolder, iterations
+from train.folder import RunFolder
 from train.log import (
     Bar,
-    Board,
     RunLog,
-    check_tensorboard,
     deferred_interrupt,
     print_table,
     read_log,
 )
 from train.policies import make_agent
 from train.ppo import train, train_seeds
+from train.sinks import NO_LOGS, Logs, Sink
 from train.snapshot import WINDOW, Snapshot, Trainable, finished
 from train.world import World
 
@@ -42,28 +43,29 @@ class Session:
         path: Run folder.
         world: World to train on.
         learner: Learner to train.
-        tensorboard: Write the log for TensorBoard as well.
+        logs: Further places to log to.
+        command: As for `RunFolder`.
 
     Raises:
-        ConfigError: The library that writes for TensorBoard is not installed.
+        ConfigError: A library that `logs` asks for is not installed.
         OutputError: No folder can be written there.
     """
 
-    def __init__(self, path: Path, world: World, learner: Trainable, *, tensorboard: bool = False) -> None:
-        self.folder, self.world, self.learner = RunFolder(path, world, learner), world, learner
+    def __init__(
+        self, path: Path, world: World, learner: Trainable, *, logs: Logs = NO_LOGS, command: Any = None
+    ) -> None:
+        self.folder, self.world, self.learner = RunFolder(path, world, learner, command), world, learner
         self.log: RunLog | None = None
-        self.board: Board | None = None
-        self._tensorboard = tensorboard
-        if tensorboard:
-            check_tensorboard()
+        self._logs = logs.checked()
+        self._sinks: list[Sink] = []
 
     def open(self, snapshot: Snapshot | None) -> None:
         """Begins to log, after a snapshot or from the beginning."""
         iteration, episodes = (snapshot.iteration, snapshot.window.count) if snapshot else (0, 0)
         if devices.leads():
             self.log = RunLog(self.folder.path, iteration, episodes)
-            if self._tensorboard:
-                self.board = Board(self.folder.path, iteration * self.learner.config.steps_per_iteration)
+            step = iteration * self.learner.config.steps_per_iteration
+            self._sinks = self._logs.open(self.folder.path, step, dataclasses.asdict(self.learner.config))
 
     def train(self, *, resume: bool, overwrite: bool, label: str = "", deterministic: bool = True) -> Snapshot | None:
         """Trains the run to its end, then writes the last checkpoint and the curve.
@@ -114,21 +116,22 @@ class Session:
         """Logs an iteration; writes a checkpoint where one is due, or asked for."""
         if self.log is not None:
             self.log.write(now.record, now.rows)
-        if self.board is not None:
-            self.board.write(now.record)
+        for sink in self._sinks:
+            sink.write(now.record)
         if save or now.iteration % self.learner.config.checkpoint_every == 0:
             self.folder.save(now)
 
     def close(self) -> None:
         """Closes the log."""
-        for open_log in (self.log, self.board):
+        for open_log in (self.log, *self._sinks):
             if open_log is not None:
                 open_log.close()
-        self.log = self.board = None
+        self.log, self._sinks = None, []
 
     def finish(self, snapshot: Snapshot) -> None:
-        """Writes the last checkpoint and the curve."""
-        self.folder.save(snapshot)
+        """Writes the last checkpoint, unless it has been written, and the curve."""
+        if not self.folder.has(snapshot.iteration):
+            self.folder.save(snapshot)
         if not devices.leads():
             return
         write_curve([self.folder.path], self.folder.path / "curve.png")
@@ -198,16 +201,15 @@ def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bo
 def resume_seeds(sessions: list[Session]) -> list[Snapshot | None]:
     """Returns the snapshot of every seed; of those that are not done, the last iteration that they have in common.
 
-    Raises:
-        ConfigError: They have none.
+    They begin at the beginning where they have none: a kill came between their first checkpoints.
     """
     found: list[Snapshot | None] = [session.folder.begin(resume=True, overwrite=False) for session in sessions]
-    behind = [k for k, s in enumerate(found) if s is not None and not finished(s, sessions[k].learner.config)]
+    behind = [k for k, s in enumerate(found) if s is None or not finished(s, sessions[k].learner.config)]
     common = set.intersection(*[set(iterations(sessions[k].folder.path)) for k in behind]) if behind else set()
-    if behind and not common:
-        raise ConfigError(f"{sessions[0].folder.path.parent}: the seeds have no iteration in common; resume each alone")
     for k in behind:
-        found[k] = sessions[k].folder.resume(max(common))
+        if not common:
+            sessions[k].folder.start()
+        found[k] = sessions[k].folder.resume(max(common)) if common else None
     return found
 
 

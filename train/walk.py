@@ -14,14 +14,17 @@ import jax
 import tyro
 
 from subterra_jax.b2 import WALK, tasks
+from subterra_jax.b2.params import WalkRewardParams
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from subterra_jax.host.files import require_file
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train.b2.walking import WalkConfig, WalkLearner, WalkSession, make_walk_config
 from train.config import ConfigError, check
+from train.options import insert_file, reward_of, settings_of, with_weights
 from train.session import check_seeds
-from train.world import World
+from train.sinks import Logs
+from train.world import World, with_reward
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,10 +39,13 @@ class Command:
         scene: Built scene folder, whose own sleepers are walked on; instead of a tunnel.
         preset: `cpu` or `gpu`; what jax runs on if left out.
         seeds: Train these seeds, one after the other, into `out/seed-<k>`; one run of `--seed` if left out.
-        resume: Go on from the checkpoint in `out`; only the limits on training may differ.
+        resume: Go on from the newest checkpoint in `out`; from the beginning where there is none yet. Only the limits
+            on training may differ.
         overwrite: Throw away the run that `out` holds.
         robots: Robots of the evaluation after training, an episode of 20 s each.
         release: Write the policy of the last seed there, a `.safetensors` file.
+        settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
+        logs: Further places to log to.
         config: Settings of PPO.
     """
 
@@ -52,6 +58,8 @@ class Command:
     overwrite: bool = False
     robots: int = 1000
     release: Path | None = None
+    settings: Annotated[Path | None, tyro.conf.arg(name="config")] = None
+    logs: Annotated[Logs, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=Logs)
     config: Annotated[WalkConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=WalkConfig)
 
 
@@ -59,15 +67,21 @@ def read_command(arguments: list[str]) -> Command:
     """Reads a command line; defaults follow from the preset that it names.
 
     Raises:
-        ConfigError: There is no such preset.
+        ConfigError: There is no such preset, or the file that `--config` names is wrong.
     """
+    return _read_words(insert_file(arguments, _read_words))
+
+
+def _read_words(arguments: list[str]) -> Command:
+    """Reads a command line without looking into the file that it may name."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset", default=None)
     named, _ = early.parse_known_args(arguments)
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
     on_cpu = {"robots": 64} if preset == "cpu" else {}
     default = Command(out=tyro.MISSING, preset=preset, config=make_walk_config(preset), **on_cpu)  # type: ignore[arg-type]
-    return tyro.cli(Command, args=arguments, default=default, prog="python -m train.walk")
+    default = with_weights(default, WalkRewardParams())
+    return tyro.cli(type(default), args=arguments, default=default, prog="python -m train.walk", description=__doc__)
 
 
 def open_world(tunnel: Path | None, scene: Path | None) -> World:
@@ -105,7 +119,7 @@ def command(arguments: Command) -> int:
         raise ConfigError(f"robots must be at least 1, got {arguments.robots}")
     if arguments.release is not None:
         require_file(arguments.release, TENSORS)
-    world = open_world(arguments.tunnel, arguments.scene)
+    world = with_reward(open_world(arguments.tunnel, arguments.scene), reward_of(arguments))
     for seed in arguments.seeds or (arguments.config.seed,):
         out = arguments.out / f"seed-{seed}" if arguments.seeds else arguments.out
         if not _train_seed(arguments, world, dataclasses.replace(arguments.config, seed=seed), out):
@@ -116,7 +130,9 @@ def command(arguments: Command) -> int:
 def _train_seed(arguments: Command, world: World, config: WalkConfig, out: Path) -> bool:
     """Trains, scores and releases one seed; False after Ctrl-C."""
     n_seen = dataclasses.replace(world.env, privileged=False).observation_size(world.params)
-    session = WalkSession(out, world, WalkLearner(world.env, world.params, config, n_seen))
+    learner = WalkLearner(world.env, world.params, config, n_seen)
+    alone = settings_of(dataclasses.replace(arguments, config=config))
+    session = WalkSession(out, world, learner, logs=arguments.logs, command=alone)
     last = session.train(
         resume=arguments.resume,
         overwrite=arguments.overwrite,

@@ -2,17 +2,23 @@
 
 import dataclasses
 import hashlib
+import math
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
+
 import subterra_jax as st
 from subterra_jax.host.versions import VERSION
+from subterra_jax.policies import TRAINED_UNDER, training_conditions
 from subterra_jax.procedural import expand
 from subterra_jax.tasks import TaskError, find
 from subterra_jax.tunnel.sources import tunnel_digest
 from train.config import ConfigError
 
+REWARD = "reward"  # fact of a world with other weights than the task's
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
 
 
@@ -25,12 +31,62 @@ class World:
         env: The environment.
         params: Its parameters.
         facts: Task, lining, and the tunnel file's name, provenance and SHA-256: the identity of the world.
+        unchanged: Its params before `with_reward`; None where nothing was changed.
     """
 
     task: str
     env: Any
     params: Any
     facts: dict[str, Any]
+    unchanged: Any = None
+
+    @property
+    def task_params(self) -> Any:
+        """Params of the task as it is scored: with its own reward."""
+        return self.params if self.unchanged is None else self.unchanged
+
+    @property
+    def trained_under(self) -> dict[str, Any]:
+        """Conditions of a training here, as facts of its policies; none for a robot that is taught to walk."""
+        if not hasattr(self.env, "rule"):
+            return {}
+        return {TRAINED_UNDER: training_conditions(self.env, self.task_params).to_json()}
+
+
+def task_reward(task: str) -> Any:
+    """Returns the weights of a task's reward, a dataclass of numbers; None for a task without.
+
+    Raises:
+        ConfigError: As `require_task`.
+    """
+    entry = st.TASKS[require_task(task)]
+    weights = {**entry.rule.defaults(), **entry.params}.get(REWARD)
+    return weights if dataclasses.is_dataclass(weights) else None
+
+
+def with_reward(world: World, weights: Mapping[str, float]) -> World:
+    """Returns a world with other weights of the reward; it remembers those that differ from the task's.
+
+    Raises:
+        ConfigError: The task has no such weight, or it is not finite.
+    """
+    usual = getattr(world.params, "reward", None) if weights else None
+    known = [field.name for field in dataclasses.fields(usual)] if usual is not None else []
+    changed = {}
+    for name, weight in weights.items():
+        if name not in known:
+            raise ConfigError(f"{world.task} has no weight reward.{name}; there are {', '.join(known) or 'none'}")
+        if not math.isfinite(weight):
+            raise ConfigError(f"reward.{name} must be finite, got {weight}")
+        if jnp.float32(weight) != getattr(usual, name):
+            changed[name] = weight
+    if not changed:
+        return world
+    reward: Any = usual
+    params = world.params.replace(reward=reward.replace(**{name: jnp.float32(w) for name, w in changed.items()}))
+    return dataclasses.replace(
+        world, params=params, facts={**world.facts, REWARD: changed}, unchanged=world.task_params
+    )
 
 
 def require_task(task: str) -> str:

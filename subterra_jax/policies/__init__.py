@@ -1,28 +1,37 @@
 """Trained policies that drive without the trainer.
 
 files (safetensors + JSON) ─► load ─► networks or belief, an `Agent` of `subterra_jax.baselines`
+any agent ─► load_policy ─► a function of observation and memory
 """
 
 from subterra_jax.policies.files import TRAINED_UNDER, Conditions, PolicyError, name_for, released
+from subterra_jax.policies.function import DrivingPolicy, Policy, load_policy
 from subterra_jax.policies.loading import (
     PREFIX,
     check_fits,
+    check_task,
     from_tensors,
     load,
     register_released,
     training_conditions,
     with_map,
 )
+from subterra_jax.policies.opening import open_agent
 
 __all__ = [
     "PREFIX",
     "TRAINED_UNDER",
     "Conditions",
+    "DrivingPolicy",
+    "Policy",
     "PolicyError",
     "check_fits",
+    "check_task",
     "from_tensors",
     "load",
+    "load_policy",
     "name_for",
+    "open_agent",
     "register_released",
     "released",
     "training_conditions",

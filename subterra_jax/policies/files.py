@@ -21,6 +21,7 @@ from subterra_jax.host.versions import other_schema
 SCHEMA = "subterra.policy/1"
 AGAIN = "release it again from its run folder with `python -m train.release`"
 TENSORS, FACTS = ".safetensors", ".json"
+CHECKPOINTS, CHECKPOINT_POLICY = "checkpoint", "policy"  # of a run folder: numbered checkpoints, a policy in each
 GAIT = "walk"  # the kind that moves legs and drives no task
 TRAINED_UNDER = "trained_under"  # field of the facts
 _PERIODS = {None: 0.1, "b2": 0.2}  # s, by embodiment, of files without `TRAINED_UNDER`
@@ -99,25 +100,57 @@ def name_for(task: str) -> str:
     return task.removeprefix("Subterra/")
 
 
+def is_policy(source: str) -> bool:
+    """Returns True for the name of a released policy, for what ends in `.safetensors`, and for a folder."""
+    return source in released() or source.endswith(TENSORS) or Path(source).is_dir()
+
+
 def read(source: str | Path) -> PolicyFile:
     """Reads a policy.
 
     Args:
-        source: A `.safetensors` file with its `.json` beside it, or the name of a released policy.
+        source: A `.safetensors` file with its `.json` beside it; a run folder of `train`, or one checkpoint in it; or
+            the name of a released policy.
 
     Raises:
         PolicyError: It is missing, damaged, or its two files do not belong together.
     """
-    packaged, place = released(), str(source)
-    if place in packaged:
-        tensors: Traversable = packaged[place]
-        facts = _folder() / (place + FACTS)
-    else:
-        tensors, facts = Path(place), Path(place.removesuffix(TENSORS) + FACTS)
-    if not tensors.is_file():
-        raise PolicyError(f"{source}: no such policy; released are {', '.join(packaged) or 'none'}")
+    tensors, facts = _find(str(source))
     content = tensors.read_bytes()
     return PolicyFile(str(source), _facts(facts, content), parse(content, str(source)))
+
+
+def read_facts(source: str | Path) -> dict[str, Any]:
+    """Reads the facts of a policy; `source` and errors as for `read`."""
+    tensors, facts = _find(str(source))
+    return _facts(facts, tensors.read_bytes())
+
+
+def _find(source: str) -> tuple[Traversable, Traversable]:
+    """Returns the files of tensors and facts.
+
+    Raises:
+        PolicyError: There are none.
+    """
+    packaged = released()
+    if source in packaged:
+        return packaged[source], _folder() / (source + FACTS)
+    tensors = Path(source)
+    if tensors.is_dir():
+        tensors = _newest_checkpoint(tensors) / (CHECKPOINT_POLICY + TENSORS)
+        if not tensors.is_file():
+            raise PolicyError(f"{source}: holds no {CHECKPOINT_POLICY}{TENSORS}; {AGAIN}")
+    if not tensors.is_file():
+        raise PolicyError(f"{source}: no such policy; released are {', '.join(packaged) or 'none'}")
+    return tensors, tensors.with_name(tensors.name.removesuffix(TENSORS) + FACTS)
+
+
+def _newest_checkpoint(folder: Path) -> Path:
+    """Returns the newest checkpoint of a run folder; itself where it is one, or holds none."""
+    for place in (folder / CHECKPOINTS, folder):
+        if numbered := [entry for entry in place.glob("*") if entry.name.isdigit()]:
+            return max(numbered, key=lambda entry: int(entry.name))
+    return folder
 
 
 def parse(content: bytes, name: str) -> dict[str, np.ndarray]:

@@ -11,12 +11,13 @@ import numpy as np
 
 from subterra_jax.baselines import registry
 from subterra_jax.baselines.agent import Observed
+from subterra_jax.compiled import in_32_bits
 from subterra_jax.policies import belief, senses
 from subterra_jax.policies.belief import Belief, Habits
 from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
 from subterra_jax.policies.networks import FeedForward, Recurrent
 from subterra_jax.state import EnvParams
-from subterra_jax.tasks import constants_digest
+from subterra_jax.tasks import TASKS, constants_digest
 from subterra_jax.tunnel_env import TunnelEnv
 
 Agent = FeedForward | Recurrent | Belief
@@ -24,11 +25,12 @@ KINDS = ("mlp", "gru", belief.KIND)
 PREFIX = "policy:"  # of the names of released policies among the agents
 
 
+@in_32_bits()
 def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
     """A policy and its facts: an `Agent`, or of a gait the `WalkPolicy` of `subterra_jax.b2.gait`.
 
     Args:
-        source: A `.safetensors` file, or the name of a released policy.
+        source: A `.safetensors` file, a run folder of `train`, or the name of a released policy.
 
     Raises:
         PolicyError: It is missing or damaged.
@@ -78,25 +80,40 @@ def with_map(agent: Any, params: EnvParams) -> Any:
 
 
 def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
-    """Refuses a policy that cannot drive here.
+    """Refuses a policy that cannot drive here, or was trained under other conditions.
 
     Raises:
-        PolicyError: Observations, actions, control period or constants are others than those it was trained with.
+        PolicyError: As `check_task`; or control period, beams, fields or constants are others than in training.
     """
-    size, bounds = env.observation_size(params), env.action_space(params)
+    check_task(agent, env, params, source)
+    if agent.conditions is not None:
+        _check_conditions(agent.conditions, training_conditions(env, params), source)
+
+
+def check_task(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+    """Refuses a policy of another task: one that cannot read the observation, or has learnt something else.
+
+    Raises:
+        PolicyError: Observations, errand, actions or control period are others than those it was trained with.
+    """
+    size, bounds, errand = env.observation_size(params), env.action_space(params), env.rule.errand
     if isinstance(agent, Recurrent):
-        if env.rule.errand not in ("stop", "return"):
+        if errand not in ("stop", "return"):
             raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
         wanted, made_for = params.lidar.n_beams, agent.n_beams
         if wanted != made_for:
             raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
     elif isinstance(agent, Belief):
-        if not env.rule.errand == "report":
+        if errand != "report":
             raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
     elif agent.n_observation != size:
         raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")
-    if agent.conditions is not None:
-        _check_conditions(agent.conditions, training_conditions(env, params), source)
+    conditions = agent.conditions
+    if conditions is not None:
+        _check_period(conditions.period, _period(params), source, env.id)
+        learnt = TASKS[conditions.task].rule.errand if conditions.task in TASKS else errand
+        if learnt != errand:
+            raise PolicyError(f"{source}: has learnt {conditions.task} (to {learnt}); {env.id} asks to {errand}")
     high = np.asarray(agent.high)
     if not np.allclose(high, bounds.high[: len(high)]):
         raise PolicyError(f"{source}: made for actions up to {high.tolist()}, {env.id} has {bounds.high.tolist()}")
@@ -110,7 +127,6 @@ def training_conditions(env: Any, params: Any) -> Conditions:
 
 def _check_conditions(trained: Conditions, here: Conditions, source: str | Path) -> None:
     """Refuses conditions that are others than those of the training, where those are known."""
-    _check_period(trained.period, here.period, source, here.task)
     if trained.n_beams not in (None, here.n_beams):
         raise PolicyError(f"{source}: trained with {trained.n_beams} beams, {here.task} has {here.n_beams}")
     if trained.fields not in (None, here.fields):

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from subterra_jax import policies as released
+from train.checkpoint import CheckpointError
 from train.config import ConfigError
-from train.folder import CheckpointError
 from train.policies import policy_tensors
 from train.ppo import make_learner
 from train.recurrent.config import DistillConfig, RecurrentConfig

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from train import folder, learning, policies
+from train import checkpoint, folder, learning, policies
+from train.checkpoint import CheckpointError
 from train.config import PPOConfig
 from train.feedforward import networks
 from train.feedforward.learner import Learner
-from train.folder import CheckpointError
 from train.ppo import begin
 from train.world import open_world
 
@@ -28,7 +28,7 @@ def policy_of(seed):
 
 @pytest.fixture
 def saved(tmp_path):
-    folder.save_checkpoint(tmp_path / "run", 7, {"policy": policy_of(0)[1]}, FACTS)
+    checkpoint.save_checkpoint(tmp_path / "run", 7, {"policy": policy_of(0)[1]}, FACTS)
     return tmp_path / "run"
 
 
@@ -42,21 +42,21 @@ def test_a_policy_read_back_acts_the_same_to_the_bit(saved):
 
 def test_a_checkpoint_can_be_named_by_its_run_its_folder_or_itself(saved):
     for place in (saved, saved / "checkpoint", saved / "checkpoint" / "00000007"):
-        assert folder.load_checkpoint(place).path.name == "00000007"
+        assert checkpoint.load_checkpoint(place).path.name == "00000007"
 
 
 def test_the_last_two_checkpoints_are_kept_and_the_newest_is_read(saved):
     for iteration in (8, 20, 100):
-        folder.save_checkpoint(saved, iteration, {"policy": policy_of(iteration)[1]}, FACTS)
+        checkpoint.save_checkpoint(saved, iteration, {"policy": policy_of(iteration)[1]}, FACTS)
     assert sorted(path.name for path in (saved / "checkpoint").iterdir()) == ["00000020", "00000100"]
-    assert folder.load_checkpoint(saved).path.name == "00000100"
+    assert checkpoint.load_checkpoint(saved).path.name == "00000100"
 
 
 def test_what_a_kill_leaves_behind_is_never_read(saved):
     shutil.copytree(saved / "checkpoint" / "00000007", saved / "checkpoint" / ".00000009.partial")
-    assert folder.load_checkpoint(saved).path.name == "00000007"
-    folder.save_checkpoint(saved, 9, {"policy": policy_of(1)[1]}, FACTS)
-    assert folder.load_checkpoint(saved).path.name == "00000009"
+    assert checkpoint.load_checkpoint(saved).path.name == "00000007"
+    checkpoint.save_checkpoint(saved, 9, {"policy": policy_of(1)[1]}, FACTS)
+    assert checkpoint.load_checkpoint(saved).path.name == "00000009"
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a thread of the storage library's
@@ -86,23 +86,23 @@ def test_a_truncated_checkpoint_is_a_clear_error_whichever_file_it_is(saved, tmp
 
 def test_an_array_that_was_changed_is_refused(saved, tmp_path):
     other = tmp_path / "other"
-    folder.save_checkpoint(other, 7, {"policy": policy_of(1)[1]}, FACTS)
+    checkpoint.save_checkpoint(other, 7, {"policy": policy_of(1)[1]}, FACTS)
     arrays = saved / "checkpoint" / "00000007" / "arrays"
     shutil.rmtree(arrays)
     shutil.copytree(other / "checkpoint" / "00000007" / "arrays", arrays)
     with pytest.raises(CheckpointError, match="not those that were written"):
-        folder.load_checkpoint(saved)
+        checkpoint.load_checkpoint(saved)
 
 
 def test_a_missing_checkpoint_is_a_clear_error(tmp_path):
     with pytest.raises(CheckpointError, match="no such folder"):
-        folder.load_checkpoint(tmp_path / "nowhere")
+        checkpoint.load_checkpoint(tmp_path / "nowhere")
     with pytest.raises(CheckpointError, match="holds no checkpoint"):
-        folder.load_checkpoint(tmp_path)
+        checkpoint.load_checkpoint(tmp_path)
 
 
 def test_the_checkpoint_of_another_network_is_refused_with_both_shapes(saved):
-    facts = saved / "checkpoint" / "00000007" / folder.FACTS
+    facts = saved / "checkpoint" / "00000007" / checkpoint.FACTS
     values = json.loads(facts.read_text())
     values["layout"]["hidden"] = [24]
     facts.write_text(json.dumps(values))
@@ -111,7 +111,7 @@ def test_the_checkpoint_of_another_network_is_refused_with_both_shapes(saved):
 
 
 def test_a_file_of_another_schema_is_refused_by_field(saved):
-    facts = saved / "checkpoint" / "00000007" / folder.FACTS
+    facts = saved / "checkpoint" / "00000007" / checkpoint.FACTS
     facts.write_text('{"schema": "subterra.tunnel/1"}')
     with pytest.raises(CheckpointError, match="'schema'"):
         policies.load_policy(saved)
@@ -121,6 +121,6 @@ def test_a_resumed_run_knows_for_how_long_the_goal_has_held(tunnel, tmp_path):
     world = open_world("Subterra/TraverseShort-v0", tunnel)
     learner = Learner(world.env, world.params, PPOConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
     run = folder.RunFolder(tmp_path / "run", world, learner)
-    run.start(overwrite=False)
+    run.start()
     run.save(dataclasses.replace(begin(learner, world.params), iteration=9, solved_for=3))
     assert (run.resume().iteration, run.resume().solved_for) == (9, 3)

@@ -11,7 +11,7 @@ import subterra_jax as st
 from subterra_jax.baselines import registry
 from tests.subterra_jax.probes import PROBES
 from tests.train.conftest import call, log_without_timing
-from train import folder, navigate
+from train import checkpoint, navigate
 from train.config import ConfigError
 from train.recurrent import lessons
 from train.recurrent.config import DistillConfig, check_distill, make_distill_config
@@ -123,7 +123,7 @@ def test_a_student_comes_closer_to_its_teacher_and_goes_on_after_a_kill_to_the_s
     shutil.rmtree(killed / "checkpoint" / "00000024")
     assert call(navigate.main, *line, "--out", str(killed), "--resume") == 0
     assert log_without_timing(killed) == log
-    assert folder.load_checkpoint(killed).facts["digest"] == folder.load_checkpoint(whole).facts["digest"]
+    assert checkpoint.load_checkpoint(killed).facts["digest"] == checkpoint.load_checkpoint(whole).facts["digest"]
     assert json.loads((whole / "config.json").read_text())["config"]["teacher"] == "oracle"
     capsys.readouterr()
     alone = tuple(word for word in line if word not in ("--teacher", "oracle", "--handover=1"))

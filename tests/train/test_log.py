@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from train import curve, log, session
+from train import curve, session, sinks
 from train.config import ConfigError
 from train.log import RunLog
 from train.snapshot import COLUMNS
@@ -50,7 +50,7 @@ def test_iterations_after_the_last_checkpoint_are_forgotten_in_every_file(tmp_pa
 
 def test_tensorboard_gets_every_number_at_its_step(tmp_path):
     event_pb2 = pytest.importorskip("tensorboardX.proto.event_pb2")
-    written = log.Board(tmp_path)
+    written = sinks.Board(tmp_path)
     for iteration in (1, 2):
         written.write(record(iteration, None if iteration == 1 else 0.5))
     written.close()
@@ -75,7 +75,7 @@ def events(content, event_type):
 def test_tensorboard_without_its_library_is_a_clear_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
     with pytest.raises(ConfigError, match=r"needs tensorboardX: pip install 'subterra-jax\[logs\]'"):
-        log.check_tensorboard()
+        sinks.check_tensorboard()
 
 
 def runs(folder, coverages):

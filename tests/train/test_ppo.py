@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.train.conftest import log_without_timing
-from train import folder
+from train import checkpoint
 from train.log import read_log
 
 
@@ -53,7 +53,9 @@ def test_the_same_seed_logs_the_same_and_a_resumed_run_continues_bit_for_bit(tra
     assert log_without_timing(out) == log_without_timing(straight_through)
     for name in ("episodes.csv", "curve.csv", "evaluation.json"):
         assert (out / name).read_bytes() == (straight_through / name).read_bytes(), name
-    assert folder.load_checkpoint(out).facts["digest"] == folder.load_checkpoint(straight_through).facts["digest"]
+    assert (
+        checkpoint.load_checkpoint(out).facts["digest"] == checkpoint.load_checkpoint(straight_through).facts["digest"]
+    )
 
 
 def test_another_seed_logs_something_else(train_small, straight_through):

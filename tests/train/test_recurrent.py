@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from tests.train.conftest import call, log_without_timing
-from train import folder, navigate
+from train import checkpoint, navigate
 from train.config import ConfigError
 from train.recurrent import drive
 from train.recurrent.config import (
@@ -110,7 +110,7 @@ def test_a_run_that_was_killed_goes_on_to_the_same_bytes(tmp_path, capsys):
     assert log_without_timing(killed) == log_without_timing(whole)
     assert len(log_without_timing(whole)) == 3
     assert (killed / "evaluation.json").read_bytes() == (whole / "evaluation.json").read_bytes()
-    assert folder.load_checkpoint(killed).facts["digest"] == folder.load_checkpoint(whole).facts["digest"]
+    assert checkpoint.load_checkpoint(killed).facts["digest"] == checkpoint.load_checkpoint(whole).facts["digest"]
     assert json.loads((whole / "config.json").read_text())["kind"] == "gru"
     # The schedule of goals and learning rate hangs on the steps.
     capsys.readouterr()

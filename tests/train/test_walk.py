@@ -61,7 +61,7 @@ def test_the_policy_does_not_see_the_truth_and_the_critic_does(networks, policy)
 
 def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    write_policy(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
+    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v0", "world": {}})
     loaded, facts = gaits.load_policy(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
     np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), networks.act(policy, seen[:, None]), atol=1e-6)
@@ -79,7 +79,7 @@ def test_a_missing_gait_is_refused_by_name(tmp_path):
 
 def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    write_policy(out, networks, networks.tensors(policy), {"task": "Subterra/B2Walk-v0", "world": {}})
+    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v0", "world": {}})
     facts = out.with_suffix(".json")
     facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "mlp"}))
     with pytest.raises(PolicyError, match="kind 'mlp', which is no gait"):

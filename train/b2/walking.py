@@ -243,17 +243,17 @@ class WalkSession(Session):
             "versions": library_versions(),
             "scores": {**self.world.facts, **found},
         }
-        write_policy(out, networks, networks.tensors(snapshot.policy), facts)
+        write_policy(out, networks, snapshot.policy, facts)
         print(out)
 
     def finish(self, snapshot: Snapshot) -> None:
         """Writes the last checkpoint and the curve."""
-        self.folder.save(snapshot)
+        if not self.folder.has(snapshot.iteration):
+            self.folder.save(snapshot)
         draw(self.folder.path)
 
     def _tensors(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
-        networks = self.learner.networks
-        return policy_tensors(networks, networks.tensors(snapshot.policy))
+        return policy_tensors(self.learner.networks, snapshot.policy)
 
 
 def draw(run: Path) -> None:

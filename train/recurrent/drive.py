@@ -11,7 +11,7 @@ import subterra_jax as st
 from subterra_jax.policies import senses
 from train.config import ConfigError
 from train.recurrent.config import RecurrentConfig
-from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Weights
+from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Thought, Weights
 from train.report import Finished
 
 
@@ -113,6 +113,52 @@ def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, layout: Recurre
     )
 
 
+def think(
+    env: Any, params: Any, networks: RecurrentNetworks, weights: dict[str, Weights], now: Drive
+) -> tuple[senses.Sight, Float[Array, "env hidden"], Thought]:
+    """Returns the inputs of the network, its memory after them, and its answer."""
+    view = look(env.env, params, now.observation, now.reckoning)
+    hidden, _ = networks.remember(weights, view.features[None], now.hidden, now.first[None])
+    return view, hidden, networks.think(weights, hidden, view.ahead)
+
+
+def mean_errors(station: Float[Array, "env"], view: senses.Sight, thought: Thought) -> dict[str, Float[Array, ""]]:
+    """Averages how far off estimate, ring tracker and dead reckoning are, m; `station` is true, from the start."""
+    error = station - view.station
+    return {
+        "estimate_error": jnp.mean(jnp.abs(error - thought.error)),
+        "tracking_error": jnp.mean(jnp.abs(error)),
+        "reckoning_error": jnp.mean(jnp.abs(station - view.reckoning.rings.reckoned)),
+    }
+
+
+def follow(
+    now: Drive, stepped: Any, view: senses.Sight, hidden: Float[Array, "env hidden"], action: Float[Array, "env action"]
+) -> tuple[Drive, Finished]:
+    """Returns the environments after a step, and the episodes that it ended.
+
+    Args:
+        now: Before the step.
+        stepped: Result of the step of the batch.
+        view: Inputs that the action was chosen by.
+        hidden: Memory after them.
+        action: Action taken.
+    """
+    observation, state, reward, terminated, truncated, info = stepped
+    done, total = terminated | truncated, now.episode_return + reward
+    length = now.env_state.steps + 1
+    finished = Finished(done, info["coverage"], info["success"], info["contact"], total, length)
+    after = Drive(
+        env_state=state,
+        observation=observation,
+        reckoning=senses.advance(view.reckoning, action, done),
+        hidden=hidden,
+        first=done,
+        episode_return=jnp.where(done, 0.0, total),
+    )
+    return after, finished
+
+
 def collect(
     env: Any,
     params: Any,
@@ -131,13 +177,11 @@ def collect(
 
     def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, Finished, dict[str, Array]]]:
         key_action, key_env = jax.random.split(key_now)
-        view = look(env.env, params, now.observation, now.reckoning)
-        hidden, _ = networks.remember(weights, view.features[None], now.hidden, now.first[None])
-        thought = networks.think(weights, hidden, view.ahead)
+        view, hidden, thought = think(env, params, networks, weights, now)
         raw = networks.distribution.sample_no_postprocessing(thought.parameters, key_action)
         action = networks.action(raw)
-        observation, state, reward, terminated, truncated, info = env.step(key_env, now.env_state, action, params)
-        done = terminated | truncated
+        stepped = env.step(key_env, now.env_state, action, params)
+        _, _, reward, terminated, truncated, info = stepped
         station = now.env_state.station - params.start.station
         stored = Rollout(
             features=view.features,
@@ -152,21 +196,10 @@ def collect(
             truncated=truncated,
         )
         terms = {
-            "estimate_error": jnp.mean(jnp.abs(stored.error - thought.error)),
-            "tracking_error": jnp.mean(jnp.abs(stored.error)),
-            "reckoning_error": jnp.mean(jnp.abs(station - view.reckoning.rings.reckoned)),
+            **mean_errors(station, view, thought),
             **{name: jnp.mean(value) for name, value in info.items() if name.startswith("reward_")},
         }
-        total, length = now.episode_return + reward, now.env_state.steps + 1
-        finished = Finished(done, info["coverage"], info["success"], info["contact"], total, length)
-        after = Drive(
-            env_state=state,
-            observation=observation,
-            reckoning=senses.advance(view.reckoning, action, done),
-            hidden=hidden,
-            first=done,
-            episode_return=jnp.where(done, 0.0, total),
-        )
+        after, finished = follow(now, stepped, view, hidden, action)
         return after, (stored, finished, terms)
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))

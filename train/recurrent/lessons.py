@@ -164,37 +164,24 @@ def collect(
     def step(now: Classroom, key_now: PRNGKeyArray) -> tuple[Classroom, tuple[Advised, Finished, dict[str, Array]]]:
         key_teacher, key_env, key_who = jax.random.split(key_now, 3)
         student, state = now.student, now.student.env_state
-        view = driving.look(env.env, params, student.observation, student.reckoning)
-        hidden, _ = networks.remember(weights, view.features[None], student.hidden, student.first[None])
-        thought = networks.think(weights, hidden, view.ahead)
+        view, hidden, thought = driving.think(env, params, networks, weights, student)
         advice, memory = advise(
             env.env, agent, key_teacher, now.teacher, student.observation, state, student.first, params
         )
         advice = jnp.clip(advice[:, : networks.n_action], low, high)
         own = networks.action(thought.parameters[:, : networks.n_action])
         action = jnp.where(now.taught[:, None], advice, own)
-        observation, state, reward, terminated, truncated, info = env.step(key_env, state, action, params)
-        done = terminated | truncated
+        stepped = env.step(key_env, state, action, params)
         station = student.env_state.station - params.start.station
         stored = Advised(view.features, student.first, view.ahead, station - view.station, advice)
         terms = {
-            "estimate_error": jnp.mean(jnp.abs(stored.error - thought.error)),
-            "tracking_error": jnp.mean(jnp.abs(stored.error)),
-            "reckoning_error": jnp.mean(jnp.abs(station - view.reckoning.rings.reckoned)),
-            "reward": jnp.mean(reward),
+            **driving.mean_errors(station, view, thought),
+            "reward": jnp.mean(stepped[2]),
             "taught": jnp.mean(now.taught),
         }
-        total, length = student.episode_return + reward, student.env_state.steps + 1
-        own_done = done & ~now.taught
-        finished = Finished(own_done, info["coverage"], info["success"], info["contact"], total, length)
-        following = driving.Drive(
-            env_state=state,
-            observation=observation,
-            reckoning=senses.advance(view.reckoning, action, done),
-            hidden=hidden,
-            first=done,
-            episode_return=jnp.where(done, 0.0, total),
-        )
+        following, finished = driving.follow(student, stepped, view, hidden, action)
+        done = following.first
+        finished = dataclasses.replace(finished, done=done & ~now.taught)
         again = jax.random.uniform(key_who, done.shape) < taught
         after = Classroom(following, driven(now.teacher, memory, action), jnp.where(done, again, now.taught))
         return after, (stored, finished, terms)

@@ -1,0 +1,192 @@
+"""Settings from a file, weights of the reward from the command line, and logs of one's own."""
+
+import json
+import sys
+import types
+
+import jax
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.policies import load_policy
+from tests.train.conftest import SMALL, TASK, call, log_without_timing
+from train import navigate, sinks
+from train.config import ConfigError, PPOConfig
+from train.navigate import read_command
+from train.options import read_settings, reward_of, settings_of
+from train.ppo import train
+from train.sinks import Logs
+from train.world import open_world, with_reward
+
+pytestmark = pytest.mark.door
+
+YAML = """
+task: Subterra/StopAtShort-v0
+memory: gru
+teacher: oracle
+hidden: 48
+bin_width: 0.25
+reward: {jerk: 0.5}
+"""
+TOML = "task = 'Subterra/TraverseShort-v0'\nhidden = [24, 12]\nframes = 2\n[reward]\nlateral = 0.7\n"
+
+
+def test_a_file_sets_what_the_command_line_sets_and_the_command_line_has_the_last_word(tmp_path):
+    (tmp_path / "mine.yaml").write_text(YAML)
+    command = read_command(["--config", str(tmp_path / "mine.yaml"), "--out", "o", "--hidden", "32"])
+    assert (type(command).__name__, command.task) == ("DistillCommand", "Subterra/StopAtShort-v0")
+    assert (command.config.hidden, command.config.bin_width, command.config.teacher) == (32, 0.25, "oracle")
+    assert reward_of(command)["jerk"] == 0.5
+    (tmp_path / "mine.toml").write_text(TOML)
+    command = read_command([f"--config={tmp_path / 'mine.toml'}", "--out", "o", "--reward.jerk", "0"])
+    assert (command.config.hidden, command.config.frames) == ((24, 12), 2)
+    assert reward_of(command) == {"terminal": 1.0, "coverage": 100.0, "lateral": 0.7, "jerk": 0.0}
+
+
+@pytest.mark.parametrize(
+    "words", [(), ("--memory", "gru"), ("--memory", "gru", "--teacher", "fused"), ("--memory=map",)]
+)
+def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
+    task = "Subterra/Relocalise-v0" if "--memory=map" in words else "Subterra/StopAtShort-v0"
+    given = ["--task", task, *words, "--n-envs=96", "--reward.miss", "3.5", "--out", "o", "--log", "json:dumps"]
+    command = read_command(given)
+    (tmp_path / "config.json").write_text(json.dumps({"schema": "subterra.run/1", "command": settings_of(command)}))
+    again = read_command(["--config", str(tmp_path / "config.json"), "--out", "o"])
+    assert settings_of(again) == settings_of(command)
+    assert (again.config, type(again).__name__) == (command.config, type(command).__name__)
+    assert reward_of(again)["miss"] == 3.5
+
+
+@pytest.mark.slow
+def test_a_run_is_done_again_from_its_own_config(train_small, tmp_path):
+    (tmp_path / "told.py").write_text("lines = []\ndef keep(line):\n    lines.append(line)\n")
+    few = ("--steps=8192", "--stop-coverage=2", "--frames", "2", "--reward.coverage", "7", "--evaluation-episodes", "5")
+    status, first = train_small(*few, "--log", f"{tmp_path / 'told.py'}:keep")
+    assert status == 0
+    assert call(navigate.main, "--config", str(first / "config.json"), "--out", str(tmp_path / "again")) == 0
+    assert log_without_timing(tmp_path / "again") == log_without_timing(first)
+    (module,) = [module for name, module in sys.modules.items() if name.startswith("told_")]
+    assert [line["iteration"] for line in module.lines] == [1, 2, 1, 2]
+    told = json.loads((first / "config.json").read_text())
+    assert told["reward"] == {"coverage": 7.0}
+    # The reward is how it was taught, and no condition under which it drives.
+    env, params = st.make(TASK)
+    assert load_policy(first, env, params).agent.frames == 2
+    assert load_policy(first, env, params).agent.conditions.constants == st.constants_digest(env, params)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("mine.ini", "", "mine.ini: must end in .yaml, .yml, .toml, .json"),
+        ("mine.json", None, "mine.json: cannot be read (No such file or directory)"),
+        ("mine.json", "{", "mine.json: cannot be read (Expecting property name"),
+        ("mine.yaml", "a: [", "mine.yaml: cannot be read (while parsing"),
+        ("mine.toml", "a = ", "mine.toml: cannot be read (Invalid value"),
+        ("mine.yaml", "- 1", "mine.yaml: must hold settings by name"),
+        ("mine.yaml", "step_size: 3", "mine.yaml: Unrecognized options: --step-size, 3"),
+        ("mine.yaml", "steps: many", "mine.yaml: Error parsing --steps: invalid literal for int()"),
+        ("mine.yaml", "task: Fly-v0", "mine.yaml: no task 'Fly-v0'"),
+        ("mine.yaml", "reward: {speed: 2}", "mine.yaml: Unrecognized options: --reward.speed, 2"),
+        ("config.json", '{"schema": "subterra.run/1"}', "config.json: has no field 'command'"),
+    ],
+)
+def test_a_file_that_is_wrong_is_one_sentence_that_names_it(tmp_path, monkeypatch, capsys, name, text, message):
+    monkeypatch.chdir(tmp_path)
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    assert call(navigate.main, "--config", name, "--out", "run") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {message}")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_yaml_without_its_library_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "yaml", None)
+    (tmp_path / "mine.yaml").write_text(YAML)
+    with pytest.raises(ConfigError, match="need pyyaml, which is not installed: pip install pyyaml"):
+        read_settings(tmp_path / "mine.yaml")
+
+
+def test_a_reward_of_other_weights_is_the_reward_that_is_trained_on(tunnel):
+    usual = open_world(TASK, tunnel)
+    world = with_reward(usual, {"coverage": 3.0, "jerk": float(usual.params.reward.jerk)})
+    assert world.facts["reward"] == {"coverage": 3.0}
+    assert world.task_params is usual.params
+    _, state = usual.env.reset(jax.random.key(0), usual.params)
+    earned = [
+        float(w.env.step(jax.random.key(1), state, np.array([2.0, 0.0]), w.params)[5]["reward_coverage"])
+        for w in (usual, world)
+    ]
+    assert earned[0] > 0.0
+    assert earned[1] == pytest.approx(earned[0] * 3.0 / float(usual.params.reward.coverage), rel=1e-5)
+    with pytest.raises(ConfigError, match=r"has no weight reward\.speed; there are terminal, coverage, lateral, jerk"):
+        with_reward(usual, {"speed": 1.0})
+    with pytest.raises(ConfigError, match=r"reward\.jerk must be finite, got nan"):
+        with_reward(usual, {"jerk": float("nan")})
+
+
+def test_a_function_of_ones_own_gets_every_line_of_the_log(tmp_path, monkeypatch):
+    (tmp_path / "keeper.py").write_text(
+        "lines = []\ndef keep(line):\n    lines.append(line)\ndef fail(line):\n    1 / 0\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    (sink,) = Logs(log="keeper.py:keep").checked().open(tmp_path / "run", 0, {})
+    sink.write({"iteration": 3, "timing": {}})
+    (module,) = [
+        m for name, m in sys.modules.items() if name.startswith("keeper_") and str(tmp_path) in str(m.__file__)
+    ]
+    assert module.lines == [{"run": str(tmp_path / "run"), "iteration": 3, "timing": {}}]
+    (sink,) = Logs(log="keeper.py:fail").checked().open(tmp_path / "run", 0, {})
+    with pytest.raises(ConfigError, match=r"^log = keeper.py:fail: ZeroDivisionError: division by zero$"):
+        sink.write({})
+
+
+def test_training_from_python_calls_a_function_with_every_line_of_the_log(tunnel):
+    world, told = open_world(TASK, tunnel), []
+    config = PPOConfig(n_envs=64, unroll=64, minibatches=4, hidden=(32, 32), steps=4096)
+    train(world.env, world.params, config, log=told.append)
+    assert [line["step"] for line in told] == [4096]
+
+
+@pytest.mark.parametrize(
+    ("logs", "message"),
+    [
+        (Logs(log="nothing"), "log must be module:function or FILE.py:function, got 'nothing'"),
+        (Logs(log="math:pi"), "log = math:pi is no function, but float"),
+        (Logs(wandb="tunnels"), "wandb = PROJECT needs wandb, which is not installed: pip install wandb"),
+    ],
+)
+def test_a_log_that_cannot_be_written_is_refused_in_one_sentence(logs, message, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(ConfigError) as refused:
+        logs.checked()
+    assert str(refused.value) == message
+
+
+def test_weights_and_biases_gets_every_number_at_its_step(tmp_path, monkeypatch):
+    calls = []
+    run = types.SimpleNamespace(
+        log=lambda values, step: calls.append((step, values)), finish=lambda: calls.append("end")
+    )
+    wandb = types.ModuleType("wandb")
+    wandb.init = lambda **options: calls.append(options) or run  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    (sink,) = Logs(wandb="tunnels").open(tmp_path / "run-3", 0, {"seed": 3})
+    timing = {"steps_per_second": 7}
+    sink.write({"iteration": 1, "step": 100, "success_mean_100": None, "policy_loss": 0.5, "timing": timing})
+    sink.close()
+    options, (step, values), end = calls
+    assert (options["project"], options["name"], options["config"]) == ("tunnels", "run-3", {"seed": 3})
+    assert step == 100
+    assert values == {"learning/iteration": 1, "loss/policy_loss": 0.5, "learning/steps_per_second": 7}
+    assert end == "end"
+    assert sinks.NO_LOGS.open(tmp_path, 0, {}) == []
+
+
+def test_every_kind_of_network_names_its_size_on_the_command_line():
+    assert read_command(["--out", "o", "--hidden", "8", "4", "--frames", "3"]).config.hidden == (8, 4)
+    assert read_command(["--out", "o", "--task", "Subterra/StopAt-v0", "--memory=gru", "--hidden=8"]).config.hidden == 8
+    assert SMALL[-2:] == ("32", "32")

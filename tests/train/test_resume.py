@@ -1,0 +1,220 @@
+"""A run that was killed goes on with `--resume`, whenever the kill came, and ends as if nothing had happened."""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+import time
+import types
+
+import numpy as np
+import pytest
+
+from subterra_jax.policies import load
+from tests.train.conftest import SMALL, TASK, call, log_without_timing
+from train import checkpoint, folder, navigate, session
+
+pytestmark = pytest.mark.door
+
+FEW = ("--steps=12288", "--stop-coverage=2", "--checkpoint-every=2", "--evaluation-episodes", "5")  # three iterations
+
+
+@pytest.fixture(scope="module")
+def whole(train_small):
+    """A run that nobody killed."""
+    status, out = train_small(*FEW)
+    assert status == 0
+    return out
+
+
+def digest(run):
+    return checkpoint.load_checkpoint(run).facts["digest"]
+
+
+def cut(whole, out, *kept):
+    """What a kill before the first checkpoint leaves: some files, the logs longer than any checkpoint knows."""
+    out.mkdir()
+    for name in kept:
+        shutil.copy(whole / name, out / name)
+    return out
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        None,
+        pytest.param((), marks=pytest.mark.slow),
+        pytest.param(("config.json",), marks=pytest.mark.slow),
+        ("config.json", "log.jsonl", "log.csv", "episodes.csv"),
+    ],
+    ids=["no-folder", "empty", "settings", "logs"],
+)
+def test_before_the_first_checkpoint_a_run_begins_again(whole, train_small, tmp_path, kept, capsys):
+    out = tmp_path / "run" if kept is None else cut(whole, tmp_path / "run", *kept)
+    if kept:
+        (out / "checkpoint" / ".00000002.partial").mkdir(parents=True)
+    status, _ = train_small(*FEW, "--resume", out=out)
+    assert status == 0
+    assert "no checkpoint yet; begins at the beginning" in capsys.readouterr().err
+    assert log_without_timing(out) == log_without_timing(whole)
+    assert (out / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
+    assert digest(out) == digest(whole)
+    assert sorted(path.name for path in (out / "checkpoint").iterdir()) == ["00000002", "00000003"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--hidden", "16"), "was trained with hidden = [32, 32], not [16]"),
+        (("--reward.jerk", "0.5"), "was trained with reward = None, not {'jerk': 0.5}"),
+        (("--lining", "smooth"), "was trained with lining = pockets, not smooth"),
+    ],
+)
+def test_another_run_that_was_killed_before_its_first_checkpoint_is_not_gone_on_with(
+    whole, train_small, tmp_path, words, message, capsys
+):
+    out = cut(whole, tmp_path / "run", "config.json")
+    assert train_small(*FEW, *words, "--resume", out=out)[0] == 2
+    assert message in capsys.readouterr().err
+    (out / "config.json").write_text("{")
+    assert train_small(*FEW, "--resume", out=out)[0] == 2
+    assert "config.json: cannot be read; --overwrite begins anew" in capsys.readouterr().err
+
+
+def test_a_run_that_was_killed_after_its_last_checkpoint_is_scored(whole, train_small, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(whole, out)
+    (out / "evaluation.json").unlink()
+    assert train_small(*FEW, "--resume", out=out)[0] == 0
+    assert (out / "evaluation.json").exists()
+    assert log_without_timing(out) == log_without_timing(whole)
+
+
+def test_a_checkpoint_stays_whole_while_it_is_written_again(whole, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    newest = checkpoint.load_checkpoint(run)
+
+    def look(place):
+        assert place.name != newest.path.name
+        assert digest(run) == newest.facts["digest"]
+
+    trees = {"policy": {"w": np.zeros(3, np.float32)}}
+    checkpoint.save_checkpoint(run, newest.facts["iteration"], trees, {"task": "t"}, look)
+    assert digest(run) != newest.facts["digest"]
+
+
+def test_a_folder_that_is_removed_is_never_found_by_half(tmp_path, monkeypatch):
+    place = tmp_path / "checkpoint" / "00000007"
+    (place / "arrays").mkdir(parents=True)
+
+    class KilledError(Exception):
+        """In place of a kill while the content is being deleted."""
+
+    def kill(path, ignore_errors=False):
+        if path.exists():
+            raise KilledError
+
+    monkeypatch.setattr(checkpoint.shutil, "rmtree", kill)
+    with pytest.raises(KilledError):
+        checkpoint.remove_folder(place)
+    assert checkpoint.iterations(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("kept", "done", "at"),
+    [
+        ([[2, 3], [2]], [], [2, 2]),
+        ([[2], []], [], [None, None]),
+        ([[2, 3], [3, 4]], [], [3, 3]),
+        ([[3], []], [0], [3, None]),
+    ],
+)
+def test_seeds_go_on_from_the_newest_checkpoint_that_all_have(monkeypatch, kept, done, at):
+    def seed(k):
+        folder = types.SimpleNamespace(path=k, start=lambda: kept[k].clear())
+        folder.begin = lambda **_: types.SimpleNamespace(iteration=kept[k][-1], k=k) if kept[k] else None
+        folder.resume = lambda iteration: types.SimpleNamespace(iteration=iteration)
+        return types.SimpleNamespace(folder=folder, learner=types.SimpleNamespace(config=None))
+
+    monkeypatch.setattr(session, "iterations", lambda k: kept[k])
+    monkeypatch.setattr(session, "finished", lambda snapshot, config: snapshot.k in done)
+    found = session.resume_seeds([seed(0), seed(1)])
+    assert [None if one is None else one.iteration for one in found] == at
+    assert all(kept[k] == [] for k in (0, 1) if at[k] is None)
+
+
+@pytest.mark.slow
+def test_of_several_seeds_those_without_a_common_checkpoint_begin_again(tunnel, tmp_path):
+    line = ("--task", TASK, "--tunnel", str(tunnel), "--preset", "cpu", *SMALL, *FEW, "--seeds", "0", "1")
+    assert call(navigate.main, *line, "--out", str(tmp_path / "whole")) == 0
+    shutil.copytree(tmp_path / "whole", tmp_path / "run")
+    # Killed between the first checkpoints: seed 0 has one, seed 1 none.
+    (tmp_path / "run" / "seeds.json").unlink()
+    shutil.rmtree(tmp_path / "run" / "seed-0" / "checkpoint" / "00000003")
+    shutil.rmtree(tmp_path / "run" / "seed-1" / "checkpoint")
+    assert call(navigate.main, *line, "--resume", "--out", str(tmp_path / "run")) == 0
+    for name in ("seed-0", "seed-1"):
+        assert log_without_timing(tmp_path / "run" / name) == log_without_timing(tmp_path / "whole" / name)
+        assert digest(tmp_path / "run" / name) == digest(tmp_path / "whole" / name)
+
+
+def test_an_overwritten_run_loses_its_checkpoints_before_anything_else(whole, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    half = folder.RunFolder(run, None, None)  # type: ignore[arg-type]
+    monkeypatch.setattr(half, "_write_config", lambda: None)
+    monkeypatch.setattr(folder.shutil, "rmtree", lambda *a, **k: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        half.start()
+    assert not checkpoint.has_checkpoint(run)
+
+
+def test_every_checkpoint_holds_its_policy_as_the_package_loads_it(whole):
+    agent, facts = load(whole)
+    assert (agent.name, facts["task"], facts["iteration"]) == ("ppo-mlp", TASK, 3)
+    older, _ = load(whole / "checkpoint" / "00000002")
+    assert older.n_observation == agent.n_observation == 18
+
+
+def lines_of(run):
+    """Lines that the log of a run has; -1 where there is none yet."""
+    log = run / "log.jsonl"
+    return log.read_bytes().count(b"\n") if log.exists() else -1
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_a_run_survives_sigkill_at_random_moments(tunnel, tmp_path):
+    """Kills the process a dozen times: before it has begun, while it compiles, and in and between checkpoints."""
+    line = [sys.executable, "-m", "train.navigate", "--task", TASK, "--tunnel", str(tunnel), "--preset", "cpu", *SMALL]
+    line += ["--steps=204800", "--stop-coverage=2", "--checkpoint-every=1", "--evaluation-episodes", "5"]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    subprocess.run([*line, "--out", str(tmp_path / "whole")], env=environment, check=True, capture_output=True)
+    draw, out, reached = random.Random(16), tmp_path / "run", []
+    for kill in range(12):
+        process = subprocess.Popen([*line, "--out", str(out), "--resume"], env=environment, stderr=subprocess.DEVNULL)
+        before, more = lines_of(out), draw.randrange(4)
+        early = time.monotonic() + draw.uniform(0.0, 4.0)
+        while process.poll() is None:
+            if kill < 3 and time.monotonic() > early:
+                break
+            if kill >= 3 and lines_of(out) > before + more:
+                time.sleep(draw.uniform(0.0, 0.2))
+                break
+            time.sleep(0.002)
+        process.kill()
+        assert process.wait() == -9
+        reached.append(checkpoint.iterations(out)[-1:])
+    done = subprocess.run([*line, "--out", str(out), "--resume"], env=environment, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    print(reached)
+    assert [] in reached, "no kill came before the first checkpoint"
+    assert len({tuple(one) for one in reached}) > 4, "the kills came at few moments"
+    assert log_without_timing(out) == log_without_timing(tmp_path / "whole")
+    assert (out / "episodes.csv").read_bytes() == (tmp_path / "whole" / "episodes.csv").read_bytes()
+    assert digest(out) == digest(tmp_path / "whole")
+    scores = [json.loads((run / "evaluation.json").read_text()) for run in (out, tmp_path / "whole")]
+    assert scores[0] == scores[1]
