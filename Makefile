@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 export XLA_PYTHON_CLIENT_PREALLOCATE ?= false
 
-.PHONY: demo test test-slow reproduce figures docs lint setup tunnels clean help
+.PHONY: demo test test-slow doors reproduce figures docs lint setup tunnels clean help
 
 help:            ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## */\t/' | expand -t 16
@@ -18,6 +18,9 @@ test: lint       ## linter, type checker, and every test that is not marked slow
 
 test-slow: $(STAMP)  ## the tests that take minutes
 	XLA_FLAGS= $(BIN)/python -m pytest -m slow
+
+doors: $(STAMP)    ## modes of JAX, adapters, policies and training; a part of the tests
+	$(BIN)/python -m pytest -m 'door and not slow'
 
 reproduce: $(STAMP)  ## the numbers of README and docs/results.md again, those that a CPU can measure, about 45 minutes; says which differ
 	$(BIN)/python -m benchmarks.reproduce --shared $(SHARED)

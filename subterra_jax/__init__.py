@@ -13,7 +13,9 @@ from subterra_jax.host.versions import VERSION
 if TYPE_CHECKING:
     from subterra_jax import batch, parts, procedural, rules, tasks, tunnel
     from subterra_jax.batch import AutoReset, rollout
+    from subterra_jax.compiled import cache_programs
     from subterra_jax.env import Env
+    from subterra_jax.policies import load_policy
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
     from subterra_jax.tasks import TASKS, constants_digest, make, register
@@ -38,7 +40,9 @@ __all__ = [
     "TunnelError",
     "TunnelPlan",
     "batch",
+    "cache_programs",
     "constants_digest",
+    "load_policy",
     "load_tunnel",
     "make",
     "parts",
@@ -57,6 +61,7 @@ _HOMES = {
     "TASKS": "tasks",
     "AutoReset": "batch",
     "Env": "env",
+    "cache_programs": "compiled",
     "constants_digest": "tasks",
     "register": "tasks",
     "EnvParams": "state",
@@ -65,6 +70,7 @@ _HOMES = {
     "Tunnel": "tunnel",
     "TunnelEnv": "tunnel_env",
     "TunnelPlan": "tunnel.plan",
+    "load_policy": "policies",
     "load_tunnel": "tunnel.sources",
     "make": "tasks",
     "randomize": "randomization",

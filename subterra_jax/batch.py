@@ -2,12 +2,14 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from subterra_jax.compiled import compiled, run_compiled
 from subterra_jax.env import Env, Info
 
 # Those of a `TunnelEnv`, or of another `Env`: the walking robot's, say.
@@ -15,7 +17,7 @@ EnvParams: TypeAlias = Any
 State: TypeAlias = Any
 StepNoise: TypeAlias = Any
 Obs = Float[Array, "n_envs n_obs"]
-Policy = Callable[[PRNGKeyArray, Obs], Float[Array, "n_envs n_action"]]
+Policy: TypeAlias = Any  # a callable of key and observations, or a `subterra_jax.policies.Policy` with memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +38,7 @@ class AutoReset:
     params_axes: Any = None
     axes: tuple[str, ...] = ()
 
+    @compiled("n_envs")
     def reset(self, key: PRNGKeyArray, params: EnvParams, n_envs: int) -> tuple[Obs, State]:
         """Begin an episode in each of `n_envs` environments.
 
@@ -47,6 +50,7 @@ class AutoReset:
         noise = self.env.draw_step(scan_key, (n_envs,), params)
         return self._vmap(self.env.observe, 2)(state, noise, params), state
 
+    @compiled()
     def step(
         self, key: PRNGKeyArray, state: State, action: Float[Array, "n_envs n_action"], params: EnvParams
     ) -> tuple[Obs, State, Float[Array, "n_envs"], Bool[Array, "n_envs"], Bool[Array, "n_envs"], Info]:
@@ -62,7 +66,11 @@ class AutoReset:
             As `TunnelEnv.step`, batched. Observation and state are those of the new episode where one began. Reward,
             flags and info are those of the step taken; `info["final_observation"]` is what that step's own state looks
             like, and equals the observation wherever no episode ended.
+
+        Raises:
+            ValueError: The actions have another shape, seen when the step is traced.
         """
+        action = self._checked(action, state)
         step_key, start_key = jax.random.split(key)
         n_envs = action.shape[0]
         noise = self.env.draw_step(step_key, (n_envs,), params)
@@ -74,6 +82,16 @@ class AutoReset:
         )
         obs, info["final_observation"] = self._observe(done, merged, stepped, noise, params)
         return obs, merged, reward, terminated, truncated, info
+
+    def _checked(self, action: Any, state: State) -> Array:
+        """Actions as an array with one row for each environment."""
+        action, n_envs = jnp.asarray(action), jax.tree.leaves(state)[0].shape[0]
+        if action.ndim != 2 or action.shape[0] != n_envs:
+            wanted = f"({n_envs}, {getattr(self.env, 'action_size', 'n_action')})"
+            raise ValueError(
+                f"actions of {n_envs} environments must have shape {wanted}, got an array of shape {action.shape}"
+            )
+        return action
 
     def _observe(
         self,
@@ -146,28 +164,54 @@ def rollout(
     state: State,
     params: EnvParams,
     n_steps: int,
+    memory: Any = None,
 ) -> tuple[Obs, State, dict[str, Any]]:
-    """Let a policy drive for a number of steps, in one `lax.scan`.
+    """Let a policy drive for a number of steps, in one compiled program.
+
+    The program is kept: a further call with the same batch, shapes and policy compiles nothing, and neither does one
+    with other weights. Inside a function that is compiled or differentiated itself it becomes a part of that.
 
     Args:
         env: The batch.
-        policy: Key and observations to actions `(n_envs, n_action)`; pure.
+        policy: Key and observations to actions `(n_envs, n_action)`, pure; or a policy with memory, from `load_policy`
+            or of one's own after `subterra_jax.policies.Policy`. Its memory begins anew with every episode. It is
+            traced once in each call.
         key: Source of the policy's and the environments' randomness.
         obs: Observations to begin with.
         state: State to begin with.
         params: The task.
         n_steps: Steps to take.
+        memory: Memory to begin with, `memory` of an earlier call; None where the episodes begin here.
 
     Returns:
         Last observations, last state, and every step's `obs` (before the step), `action`, `reward`, `terminated`,
-        `truncated` and `info`, each with the steps as first axis.
+        `truncated` and `info`, each with the steps as first axis. Of a policy with memory also `memory`, the one after
+        the last step.
     """
+    return run_compiled(partial(_roll, env, policy, n_steps), key, obs, state, params, memory)
 
-    def one_step(carry: tuple[Obs, State], step_key: PRNGKeyArray) -> tuple[tuple[Obs, State], dict[str, Any]]:
-        obs, state = carry
+
+def _roll(
+    env: AutoReset,
+    policy: Policy,
+    n_steps: int,
+    key: PRNGKeyArray,
+    obs: Obs,
+    state: State,
+    params: EnvParams,
+    memory: Any,
+) -> tuple[Obs, State, dict[str, Any]]:
+    """Scan over the steps of a rollout."""
+    remembers = hasattr(policy, "initial_memory")
+    if remembers and memory is None:
+        memory = policy.initial_memory(jax.random.fold_in(key, n_steps), obs.shape[0])
+
+    def one_step(carry: tuple[Obs, State, Any], step_key: PRNGKeyArray) -> tuple[tuple[Obs, State, Any], Any]:
+        obs, state, memory = carry
         policy_key, env_key = jax.random.split(step_key)
-        action = policy(policy_key, obs)
+        action, memory = policy(obs, memory, state) if remembers else (policy(policy_key, obs), memory)
         next_obs, state, reward, terminated, truncated, info = env.step(env_key, state, action, params)
+        memory = policy.restart(memory, terminated | truncated) if remembers else memory
         record = {
             "obs": obs,
             "action": action,
@@ -176,7 +220,7 @@ def rollout(
             "truncated": truncated,
             "info": info,
         }
-        return (next_obs, state), record
+        return (next_obs, state, memory), record
 
-    (obs, state), records = jax.lax.scan(one_step, (obs, state), jax.random.split(key, n_steps))
-    return obs, state, records
+    (obs, state, memory), records = jax.lax.scan(one_step, (obs, state, memory), jax.random.split(key, n_steps))
+    return obs, state, {**records, "memory": memory} if remembers else records

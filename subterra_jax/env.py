@@ -34,19 +34,25 @@ class Box:
 
     def sample(self, key: PRNGKeyArray) -> Float[Array, "*shape"]:
         """Draw an element: uniform between bounds, exponential beyond a single one, normal where there are none."""
-        has_low, has_high = np.isfinite(self.low), np.isfinite(self.high)
-        low, high = np.where(has_low, self.low, 0.0), np.where(has_high, self.high, 0.0)
-        keys = jax.random.split(key, 3)
-        inside = low + jax.random.uniform(keys[0], self.shape) * (high - low)
-        tail, bell = jax.random.exponential(keys[1], self.shape), jax.random.normal(keys[2], self.shape)
-        open_ended = jnp.where(has_low, low + tail, jnp.where(has_high, high - tail, bell))
-        return jnp.where(has_low & has_high, jnp.clip(inside, low, high), open_ended).astype(jnp.float32)
+        return _sample(key, self.low, self.high)
 
     def contains(self, x: Any) -> Bool[Array, ""]:
         """Tell whether an array has the shape of the space and every number lies within bounds; False for a NaN."""
         if jnp.shape(x) != self.shape:
             return jnp.zeros((), bool)
         return jnp.all((x >= self.low) & (x <= self.high))
+
+
+@jax.jit
+def _sample(key: PRNGKeyArray, low: Float[Array, "*shape"], high: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    has_low, has_high = jnp.isfinite(low), jnp.isfinite(high)
+    low, high = jnp.where(has_low, low, 0.0), jnp.where(has_high, high, 0.0)
+    keys = jax.random.split(key, 3)
+    inside = low + jax.random.uniform(keys[0], low.shape, jnp.float32) * (high - low)
+    tail = jax.random.exponential(keys[1], low.shape, jnp.float32)
+    bell = jax.random.normal(keys[2], low.shape, jnp.float32)
+    open_ended = jnp.where(has_low, low + tail, jnp.where(has_high, high - tail, bell))
+    return jnp.where(has_low & has_high, jnp.clip(inside, low, high), open_ended)
 
 
 class Env(Protocol):

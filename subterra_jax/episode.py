@@ -18,6 +18,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Agent, Observed, observed, shown
+from subterra_jax.compiled import in_32_bits
 from subterra_jax.env import Info
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
@@ -119,6 +120,7 @@ class Driver:
     add: Add = until_the_end
     keep: Keep = keep_nothing
 
+    @in_32_bits()
     def begin(self, params: EnvParams, agent: Agent, seed: Any, tunnel: Any = 0, level: Any = None) -> Episode:
         """Begin one episode, or one for each of an array of seeds.
 
@@ -133,6 +135,7 @@ class Driver:
         whole = lambda value: jnp.broadcast_to(jnp.asarray(value, jnp.int32), seed.shape)  # noqa: E731
         return _begin(self, agent, params, seed, whole(tunnel), whole(-1 if level is None else level))
 
+    @in_32_bits()
     def go(self, params: EnvParams, agent: Agent, now: Episode, first: int, n_steps: int) -> tuple[Episode, Any]:
         """Take `n_steps` steps after step `first`; steps after an episode's end leave it as it is.
 
@@ -153,6 +156,7 @@ class Driver:
                 return
 
 
+@in_32_bits()
 def ask(
     env: TunnelEnv, agent: Agent, key: PRNGKeyArray, memory: Any, obs: Observed, state: State, here: EnvParams
 ) -> tuple[Float[Array, 5], Any]:
@@ -218,7 +222,7 @@ def _go(
     def step(now: Episode, t: Int[Array, ""]) -> tuple[Episode, Any]:
         return (jax.vmap(one, (0, None)) if now.over.ndim else one)(now, t)
 
-    return jax.lax.scan(step, now, first + jnp.arange(1, n_steps + 1))
+    return jax.lax.scan(step, now, first + jnp.arange(1, n_steps + 1, dtype=jnp.int32))
 
 
 def _step_one(driver: Driver, agent: Agent, params: EnvParams, now: Episode, t: Array) -> tuple[Episode, Any]:

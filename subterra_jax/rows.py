@@ -1,11 +1,16 @@
-"""A function of one row that, batched by any number of `vmap`s, becomes one call of a kernel for many rows."""
+"""A function of one row that, batched by any number of `vmap`s, becomes one call of a kernel for many rows.
+
+And derivatives of what kernels compute, which JAX cannot see through.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
 
 
 def rowwise(single: Callable[..., jax.Array], many: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
@@ -36,6 +41,55 @@ def rowwise(single: Callable[..., jax.Array], many: Callable[..., jax.Array]) ->
         return flat.reshape(axis_size, -1, *flat.shape[1:]), True
 
     return one
+
+
+def axes_of(*trees: Any) -> frozenset[str]:
+    """Axes of a `jax.shard_map` along which any array of some pytrees varies; none outside of one."""
+    kinds = [jax.typeof(leaf) for leaf in jax.tree.leaves(trees)]
+    # JAX 0.9 has it as `vma`.
+    return frozenset().union(*(kind.vma if hasattr(kind, "vma") else kind.manual_axis_type.varying for kind in kinds))
+
+
+def vary_like(tree: Any, *others: Any) -> Any:
+    """Declare that every array varies along the axes of a `jax.shard_map` along which it or the others do."""
+    wanted = axes_of(tree, *others)
+    if not wanted:
+        return tree
+
+    def one(leaf: Any) -> Any:
+        missing = tuple(wanted - axes_of(leaf))
+        return jax.lax.pcast(leaf, missing, to="varying") if missing else leaf
+
+    return jax.tree.map(one, tree)
+
+
+def slope_along(function: Callable[..., jax.Array], primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> jax.Array:
+    """Derivative of a function along tangents of which some are symbolic zeros, as `custom_jvp` hands them over.
+
+    An argument that does not move at all is held, so that nothing is computed for it.
+    """
+    still = [all(isinstance(leaf, SymbolicZero) for leaf in jax.tree.leaves(tangent)) for tangent in tangents]
+    if all(still):
+        return jnp.zeros_like(jax.eval_shape(function, *primals))
+    moving = [i for i, holds in enumerate(still) if not holds]
+
+    def of_moving(*values: Any) -> jax.Array:
+        every = list(primals)
+        for i, value in zip(moving, values, strict=True):
+            every[i] = value
+        return function(*every)
+
+    moves = [jax.tree.map(_instantiate, primals[i], tangents[i]) for i in moving]
+    return jax.jvp(of_moving, tuple(primals[i] for i in moving), tuple(moves))[1]
+
+
+def _instantiate(primal: Any, tangent: Any) -> Any:
+    """A symbolic zero as an array of zeros."""
+    if not isinstance(tangent, SymbolicZero):
+        return tangent
+    if not jnp.issubdtype(jnp.result_type(primal), jnp.floating):
+        return np.zeros(jnp.shape(primal), jax.dtypes.float0)
+    return jnp.zeros_like(primal)
 
 
 def axes(batched: Any) -> tuple[Any, ...]:

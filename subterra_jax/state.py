@@ -11,10 +11,55 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from flax.core import FrozenDict
 from jaxtyping import Array, Float, Int
 
+from subterra_jax.rows import vary_like
 from subterra_jax.tunnel import Tunnel
+
+
+def as_array(value: Any, like: Any = None) -> Any:
+    """Make a number an array of 32 bits with a type of its own: a weakly typed one would compile a function anew.
+
+    Args:
+        value: A number or an array; anything else is returned unchanged, and so is an array of random keys.
+        like: Array whose type is wanted; None makes integers int32 and everything else float32.
+    """
+    if not isinstance(value, _NUMBERS) or jax.dtypes.issubdtype(jnp.result_type(value), jax.dtypes.extended):
+        return value
+    whole = jnp.issubdtype(jnp.result_type(value), jnp.integer)
+    wanted = (jnp.int32 if whole else jnp.float32) if like is None else like.dtype
+    return jax.lax.convert_element_type(value, wanted)
+
+
+def make_alike(tree: Any) -> Any:
+    """Give each leaf a type of its own of at most 32 bits and, inside `jax.shard_map`, all leaves the same axes.
+
+    A `lax.scan` asks for both of what it carries.
+    """
+
+    def one(leaf: Any) -> Any:
+        kind = jnp.result_type(leaf)
+        if jax.dtypes.issubdtype(kind, jax.dtypes.extended):
+            return leaf
+        wide = kind.itemsize == 8 and not jnp.issubdtype(kind, jnp.complexfloating)
+        return jax.lax.convert_element_type(leaf, f"{kind.name[:-2]}32" if wide else kind)
+
+    return vary_like(jax.tree.map(one, tree))
+
+
+_NUMBERS: Any = (bool, int, float, np.ndarray, np.generic, jax.Array)
+
+
+def _like(old: Any, new: Any) -> Any:
+    """Make the numbers of a new value arrays of the old one's types; a tree of axes, which has no arrays, stays."""
+    if not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(old)):
+        return new
+    if jax.tree.structure(old) == jax.tree.structure(new):  # type: ignore[operator]
+        return jax.tree.map(lambda was, leaf: as_array(leaf, was) if isinstance(was, jax.Array) else leaf, old, new)
+    return jax.tree.map(as_array, new)
 
 
 class _Named:
@@ -33,6 +78,9 @@ class _Named:
     def replace(self, **updates: Any) -> Any:
         """Return a copy with other fields, or other parts of names that are there.
 
+        Python numbers become arrays of the types that were there, so that what is compiled for the old fields serves
+        the new ones.
+
         Raises:
             ValueError: There is no such field or part.
         """
@@ -41,6 +89,7 @@ class _Named:
             raise ValueError(
                 f"no {sorted(unknown)} in {type(self).__name__}; there are {sorted(own | set(self.parts))}"
             )
+        updates = {name: _like(getattr(self, name), value) for name, value in updates.items()}
         fields = {name: value for name, value in updates.items() if name in own}
         parts = {name: value for name, value in updates.items() if name not in own}
         if parts:

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax.core import FrozenDict
 
@@ -26,7 +25,7 @@ from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.wander import WanderParams
 from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
 from subterra_jax.rules.rule import ERRANDS
-from subterra_jax.state import EnvParams
+from subterra_jax.state import EnvParams, as_array
 from subterra_jax.tunnel import CONTACT_REACH
 from subterra_jax.tunnel.blocks import LIDAR_GAP
 from subterra_jax.tunnel.sources import Source, resolve
@@ -237,7 +236,8 @@ def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, A
 def make_params(env: TunnelEnv, tunnel: Any, horizon: Any, entries: Mapping[str, Any]) -> EnvParams:
     """Make params whose every leaf is a 32-bit array; a weakly typed one would compile each function a second time."""
     params = EnvParams(tunnel=tunnel, horizon=horizon, parts=FrozenDict(entries), errand=env.rule.errand)
-    return jax.tree.map(_as_array, params, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
+    as_leaf = lambda leaf: as_array(np.asarray(leaf) if isinstance(leaf, tuple) else leaf)  # noqa: E731
+    return jax.tree.map(as_leaf, params, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
 
 
 def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None) -> str:
@@ -277,11 +277,6 @@ def _figures(env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
 
 def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _as_array(leaf: Any) -> jax.Array:
-    leaf = jnp.asarray(leaf)
-    return leaf.astype(jnp.int32 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.float32)
 
 
 def _check_robot(entries: Mapping[str, Any]) -> None:

@@ -11,12 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from subterra_jax.compiled import compiled
 from subterra_jax.env import Box, Info, Stepped
 from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, Sight, Step, Unicycle
 from subterra_jax.parts.part import Batch, Bounds
 from subterra_jax.parts.unicycle import clearance, in_contact, wrap
+from subterra_jax.rows import vary_like
 from subterra_jax.rules import Rule, Start, Traverse
-from subterra_jax.state import EnvParams, State
+from subterra_jax.state import EnvParams, State, make_alike
 from subterra_jax.tunnel import Tunnel, at_station, foot
 
 ESTIMATE, REPORT = 4, 5  # numbers in an action that holds an estimate, and in one that reports
@@ -48,6 +50,7 @@ class TunnelEnv:
     motion: Motion = dataclasses.field(default_factory=Unicycle)
     estimates: bool = False
 
+    @compiled()
     def reset(self, key: PRNGKeyArray, params: EnvParams) -> tuple[Float[Array, n_obs], State]:
         """Begin an episode.
 
@@ -62,6 +65,7 @@ class TunnelEnv:
         state = self.begin(self.draw_reset(start_key, (), params), params)
         return self.observe(state, self.draw_step(scan_key, (), params), params), state
 
+    @compiled()
     def step(
         self, key: PRNGKeyArray, state: State, action: Float[Array, n_action], params: EnvParams
     ) -> tuple[Float[Array, n_obs], State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]:
@@ -93,31 +97,35 @@ class TunnelEnv:
             own = keys[first] if count == 1 else keys[first : first + count]
             draws[name], first = source.draw_reset(own, batch, params), first + count
         if params.tunnel.count > 1:
-            draws["tunnel"] = jax.random.uniform(keys[0], batch)
+            draws["tunnel"] = jax.random.uniform(keys[0], batch, jnp.float32)
         return draws
 
     def draw_step(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> dict[str, Any]:
         """Draw the random numbers of one step of a batch; see `Env`. All parts share one call of each kind."""
         normals = {part.name: n for part in self.parts if (n := part.normals(params))}
         uniforms = {part.name: n for part in self.parts if (n := part.uniforms(params))}
-        normal = _sliced(jax.random.normal(key, (*batch, sum(normals.values()))), normals) if normals else {}
+        normal = (
+            _sliced(jax.random.normal(key, (*batch, sum(normals.values())), jnp.float32), normals) if normals else {}
+        )
         uniform = {}
         if uniforms:
             count = sum(uniforms.values())
-            uniform = _sliced(jax.random.uniform(jax.random.fold_in(key, 1), (*batch, count)), uniforms)
+            uniform = _sliced(jax.random.uniform(jax.random.fold_in(key, 1), (*batch, count), jnp.float32), uniforms)
         noise: dict[str, Any] = {
             name: Noise(normal.get(name, ()), uniform.get(name, ())) for name in {**normals, **uniforms}
         }
         return {**noise, self.motion.name: self.motion.draw_step(jax.random.fold_in(key, 2), batch, params)}
 
     def begin(self, draws: Mapping[str, Any], params: EnvParams) -> State:
-        """Make the state at the start of an episode, before any scan."""
+        """Make the state at the start of an episode, before any scan; `draws["choice"]` may hold a `Choice`."""
         index = jnp.zeros((), jnp.int32)
         if "tunnel" in draws:
             count = params.tunnel.count
             index = jnp.minimum((draws["tunnel"] * count).astype(jnp.int32), count - 1)
         tunnel = params.tunnel.pick(index)
         start = self.rule.start(draws["rule"], tunnel, params)
+        if "choice" in draws:
+            start = self.rule.place(start, draws["choice"])
         station = jnp.asarray(start.station, jnp.float32)
         x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
         heading = wrap(jnp.arctan2(tangent_y, tangent_x) + start.heading)
@@ -127,7 +135,7 @@ class TunnelEnv:
             station=station,
             lateral=jnp.asarray(start.lateral, jnp.float32),
             furthest=station,
-            command=jnp.zeros(2),
+            command=jnp.zeros(2, jnp.float32),
             steps=jnp.zeros((), jnp.int32),
             tunnel=index,
             parts={"goal": start.own},
@@ -135,7 +143,7 @@ class TunnelEnv:
         for part in (*self.parts, self.motion):
             own = part.begin(draws[part.name], state, params)
             state = dataclasses.replace(state, parts={**state.parts, part.name: own})
-        return state
+        return make_alike(state)
 
     def advance(
         self, state: State, action: Float[Array, n_action], noise: Mapping[str, Any], params: EnvParams
@@ -154,10 +162,12 @@ class TunnelEnv:
         Raises:
             ValueError: The action has another shape, seen when the step is traced.
         """
-        if jnp.shape(action) != (self.action_size,):
+        action = jnp.asarray(action)
+        if action.shape != (self.action_size,):
             raise ValueError(
-                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {jnp.shape(action)}"
+                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {action.shape}"
             )
+        action = action.astype(state.command.dtype)
         tunnel = params.tunnel.pick(state.tunnel)
         command = self.motion.obey(action, state, params)
         drive = Drive(command, command)
@@ -210,8 +220,8 @@ class TunnelEnv:
             tunnel=state.tunnel,
             parts={**step.after, "goal": verdict.own},
         )
-        reward = sum(verdict.terms.values(), jnp.zeros(()))
-        return after, reward, terminated, (steps >= params.horizon) & ~terminated, info
+        reward = sum(verdict.terms.values(), jnp.zeros_like(place.station))
+        return vary_like(after), reward, terminated, (steps >= params.horizon) & ~terminated, info
 
     def observe(
         self, state: State, noise: Mapping[str, Any], params: EnvParams, wanted: Any = True
@@ -386,9 +396,11 @@ class TunnelEnv:
         """Estimate, log of its standard deviation and direction in an action: clipped; 0 for a NaN and where absent."""
         size = self.action_size
         if size == 2:
-            return jnp.zeros(3)
-        low, high = jnp.array([0.0, -5.0, -1.0]), jnp.stack([jnp.max(jnp.asarray(params.tunnel.length)), 5.0, 1.0])
-        given = jnp.concatenate([action[2:size], jnp.zeros(REPORT - size)])
+            return jnp.zeros(3, action.dtype)
+        length = jnp.max(jnp.asarray(params.tunnel.length)).astype(action.dtype)
+        low = jnp.array([0.0, -5.0, -1.0], action.dtype)
+        high = jnp.concatenate([length[None], jnp.array([5.0, 1.0], action.dtype)])
+        given = jnp.concatenate([action[2:size], jnp.zeros(REPORT - size, action.dtype)])
         return jnp.clip(jnp.where(jnp.isnan(given), 0.0, given), low, high)
 
     def _estimate_info(self, step: Step) -> Info:

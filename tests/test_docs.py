@@ -1,6 +1,7 @@
 """The documentation runs as printed, and its site is built without a warning and without the net."""
 
 import argparse
+import json
 import os
 import re
 import runpy
@@ -23,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [*sorted((ROOT / "docs" / "guide").glob("*.md")), *(ROOT / "docs" / name for name in ("slam.md", "results.md"))]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
+YAML = re.compile(r"```yaml\n(.*?)```", re.DOTALL)
 SLOW = "<!-- slow -->\n"  # before a block: others do without it
 OURS = ("scene", "train", "benchmarks", "subterra_jax")
 ELSEWHERE = re.compile(r"""<(?:script|link|img|iframe)\b[^>]*?\b(?:src|href)=["']?(?:https?:)?//[^"' >]+""")
@@ -55,6 +57,12 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         shutil.copy(packaged, built)
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
+    settings = YAML.search((ROOT / "docs" / "guide" / "train.md").read_text())
+    assert settings is not None
+    (tmp_path / "mine.yaml").write_text(settings[1])
+    run = {"schema": "subterra.run/1", "command": {"task": "Subterra/TraverseShort-v0", "config": {"hidden": [64, 64]}}}
+    (tmp_path / "out" / "short").mkdir(parents=True)
+    (tmp_path / "out" / "short" / "config.json").write_text(json.dumps(run))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
     return tmp_path

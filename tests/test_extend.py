@@ -18,6 +18,8 @@ from subterra_jax.parts import Part
 from subterra_jax.rules import Rule, Start, StopAt, Traverse, Verdict
 from tests.train.conftest import SMALL, call
 
+pytestmark = pytest.mark.door
+
 PAGE = Path(__file__).parents[1] / "docs" / "guide" / "extend.md"
 FILES = dict(re.findall(r"`(\w+\.py)`:?\s*\n\s*```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
 TASK = "keep_left.py:Mine/KeepLeft-v0"

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import inspect
 import json
 import re
 from dataclasses import dataclass
@@ -21,13 +20,13 @@ from subterra_jax.evaluation.bounds import stop_bounds
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
 from subterra_jax.host.files import require_folder
 from subterra_jax.host.loading import file_digest, load_file, load_object, source_digest
-from subterra_jax.policies.files import TENSORS
+from subterra_jax.policies.files import is_policy, read_facts
+from subterra_jax.policies.opening import FORMS, TRAITS, names_code, policy_source
 from subterra_jax.tasks import find
 from subterra_jax.tunnel.plan import TunnelPlan
 
 SCHEMA = "subterra.leaderboard-entry/1"
 OWN_POLICY = "released-policy"  # the policy released for the task at hand
-TRAITS = ("uses_lidar", "uses_map", "privileged")
 _digests: dict[str, str] = {}  # SHA-256 of the user's file that registered a task or an agent
 
 
@@ -37,8 +36,8 @@ class LeaderboardConfig:
 
     Attributes:
         tasks: Task ids, as `Subterra/StopAt-v0`, `StopAt` or `FILE.py:ID`; all tasks if not given.
-        agents: Agents: a baseline; `policy:NAME` or `policy:FILE`; `released-policy`, the one released for the task;
-            `module:Class` or `FILE.py:Class`. All baselines and `released-policy` if not given.
+        agents: Agents: a baseline; `policy:NAME`, `policy:FILE` or `policy:RUN-FOLDER`; `released-policy`, the one
+            released for the task; `module:Class` or `FILE.py:Class`. All baselines and `released-policy` if not given.
         load: Python files to run first; they register tasks or agents of your own.
         tunnels: Tunnel files, or names of packaged tunnels.
         linings: Variants of the walls; a tunnel with only one variant, as `control`, is driven with that.
@@ -119,33 +118,7 @@ def load_files(paths: tuple[Path, ...]) -> None:
 def code_digests(task: str, agent: str) -> dict[str, str]:
     """Returns the SHA-256 of the user's files that define a task or an agent; empty for those of the package."""
     digests = {name: _digests[name] for name in (task, agent) if name in _digests}
-    return {**digests, agent: source_digest(load_object(agent))} if _is_object(agent) else digests
-
-
-def make_driver(name: str, params: st.EnvParams) -> Any:
-    """Makes an agent for a task.
-
-    Args:
-        name: A baseline, `policy:NAME`, `policy:FILE`, `module:Class` or `FILE.py:Class`. A class, or a function that
-            makes an agent, is called with the task's params where it has a parameter without a default.
-        params: Params of the task.
-
-    Raises:
-        BenchmarkError: The result is no agent.
-        UserCodeError: The class cannot be loaded.
-    """
-    if name in registry.names():
-        return registry.make_agent(name, params)
-    if name.startswith(policies.PREFIX):
-        agent = policies.with_map(policies.load(name.removeprefix(policies.PREFIX))[0], params)
-    else:
-        factory = load_object(name)
-        parameters = inspect.signature(factory).parameters.values()
-        needs_params = any(one.default is one.empty for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD)
-        agent = factory(params) if needs_params else factory()
-    if missing := [one for one in (*TRAITS, "begin", "act") if not hasattr(agent, one)]:
-        raise BenchmarkError(f"agent {name!r} has no {', '.join(missing)}")
-    return agent
+    return {**digests, agent: source_digest(load_object(agent))} if names_code(agent) else digests
 
 
 def agents_for(config: LeaderboardConfig, task: str) -> tuple[str, ...]:
@@ -174,17 +147,11 @@ def load_worlds(config: LeaderboardConfig) -> list[World]:
 
 def _require_agent(name: str) -> None:
     """Refuses an unknown agent, and a class that cannot be loaded."""
-    if name in (*registry.names(), OWN_POLICY) or (name.startswith(policies.PREFIX) and name.endswith(TENSORS)):
+    if name in (*registry.names(), OWN_POLICY) or is_policy(name.removeprefix(policies.PREFIX)):
         return
-    if not _is_object(name):
-        known = ", ".join(registry.names())
-        raise BenchmarkError(f"no agent {name!r}; there are {known}; or policy:FILE, module:Class, FILE.py:Class")
+    if not names_code(name):
+        raise BenchmarkError(f"no agent {name!r}; there are {', '.join(registry.names())}; or {FORMS}")
     load_object(name)
-
-
-def _is_object(agent: str) -> bool:
-    """Returns whether an agent is given as `module:Class` or `FILE.py:Class`."""
-    return ":" in agent and agent not in registry.names() and not agent.startswith(policies.PREFIX)
 
 
 def _full_task(name: str) -> str:
@@ -240,6 +207,7 @@ def make_entry(folder: Path, task: str, world: World, agent: str, episodes: int,
     Raises:
         OutputError: The folder cannot be written.
         PolicyError: A policy was made for another task.
+        AgentError: The class makes no agent.
     """
     name = policies.PREFIX + policies.name_for(task) if agent == OWN_POLICY else agent
     inputs = {
@@ -260,9 +228,7 @@ def make_entry(folder: Path, task: str, world: World, agent: str, episodes: int,
         records = Records.from_columns(kept["records"])
         return Entry(task, world.title, agent, kept["traits"], records, kept.get("bounds")), True
     env, params = st.make(task, world.plan, world.lining, estimates=True)
-    driver = make_driver(name, params)
-    if name.startswith(policies.PREFIX):
-        policies.check_fits(driver, env, params, name)
+    driver = policies.open_agent(name, env, params)
     traits = {trait: bool(getattr(driver, trait)) for trait in TRAITS}
     records = evaluate(env, params, driver, listed_episodes(env, params, episodes), batch)
     plain = env.rule.errand == "stop" and not {"obstacles", "faults"} & set(params.parts)
@@ -283,8 +249,8 @@ def _read(path: Path, inputs: dict[str, Any]) -> dict[str, Any] | None:
 
 def _weights(agent: str) -> dict[str, str]:
     """Returns the digest of a policy's weights: other weights under the same name are driven again."""
-    policy = agent.removeprefix(policies.PREFIX)
-    return {} if policy == agent else {"policy": policies.load(policy)[1]["tensors_sha256"]}
+    policy = policy_source(agent)
+    return {} if policy is None else {"policy": read_facts(policy)["tensors_sha256"]}
 
 
 def _digest(world: World) -> str:

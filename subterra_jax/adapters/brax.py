@@ -1,16 +1,18 @@
-"""Brax: a `brax.envs.base.Env`, and a wrapper that begins each episode with a fresh draw.
+"""Brax: a `brax.envs.base.Env` for Brax's trainers, and a wrapper that begins each episode with a fresh draw.
 
 Brax's own `AutoResetWrapper` restores the first state at every reset. The draws of an episode (the start pose, the
 odometer's bias, the goal) would then never change. Use `wrap` from here instead of `brax.envs.training.wrap`; both run.
+Brax up to 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 removed: its trainers run inside `jax_for_brax()`.
 """
 
 import contextlib
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from subterra_jax.adapters.packing import take_key
 from subterra_jax.host.errors import MissingLibraryError
@@ -23,7 +25,11 @@ try:
         from brax.envs.base import Env, State, Wrapper
         from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 except ImportError as missing:
-    raise MissingLibraryError(__name__, "brax") from missing
+    raise MissingLibraryError(__name__, "brax", "brax") from missing
+
+_MISSED = "device_put_replicated"
+# From params to those of a batch and their `vmap` axes.
+Randomization = Callable[[EnvParams], tuple[EnvParams, Any]]
 
 
 class SubterraBraxEnv(Env):
@@ -42,6 +48,15 @@ class SubterraBraxEnv(Env):
     def __init__(self, task: str = "Subterra/Traverse-v0", params: EnvParams | None = None, **options: Any):
         self.env, made = make(task, **options)
         self.params = made if params is None else params
+
+    @property
+    def sys(self) -> EnvParams:
+        """The params under the name by which Brax's domain randomisation takes and replaces them."""
+        return self.params
+
+    @sys.setter
+    def sys(self, params: EnvParams) -> None:
+        self.params = params
 
     @property
     def observation_size(self) -> int:
@@ -71,20 +86,22 @@ class SubterraBraxEnv(Env):
 
     def reset(self, rng: jax.Array) -> State:
         """Begin an episode; `rng` may be a key of either kind."""
-        key, stream = take_key(jax.random.bits(rng, (2,)))
+        key, stream = take_key(jax.random.bits(rng, (2,), jnp.uint32))
         obs, state = self.env.reset(key, self.params)
         # Brax wants the metrics of every step at a reset too: they are 0.
-        action = jnp.zeros(self.action_size)
+        action = jnp.zeros(self.action_size, jnp.float32)
         _, _, _, _, _, info = jax.eval_shape(self.env.step, key, state, action, self.params)
-        metrics = {name: jnp.zeros(leaf.shape) for name, leaf in info.items()}
-        zero = jnp.zeros(())
+        metrics = {name: jnp.zeros(leaf.shape, jnp.float32) for name, leaf in info.items()}
+        zero = jnp.zeros((), jnp.float32)
         return State(pipeline_state=state, obs=obs, reward=zero, done=zero, metrics=metrics, info={"rng": stream})
 
     def step(self, state: State, action: jax.Array) -> State:
         """Take one step of 0.1 s; the action is clipped."""
         key, stream = take_key(state.info["rng"])
         obs, after, reward, terminated, _, info = self.env.step(key, state.pipeline_state, action, self.params)
-        metrics = {name: jnp.asarray(value, jnp.float32) for name, value in info.items()}
+        own = {name: jnp.asarray(value, jnp.float32) for name, value in info.items()}
+        # What wrappers have put there stays: Brax's `EvalWrapper` keeps the reward among the metrics.
+        metrics = {**state.metrics, **own}
         return state.replace(
             pipeline_state=after,
             obs=obs,
@@ -138,16 +155,90 @@ class FreshResetWrapper(Wrapper):
         return stepped.replace(pipeline_state=pipeline_state, obs=obs, info=info)
 
 
-def wrap(env: SubterraBraxEnv, episode_length: int | None = None, action_repeat: int = 1) -> Wrapper:
+class RandomizedVmapWrapper(Wrapper):
+    """Batches environments that differ in their params, in place of Brax's `DomainRandomizationVmapWrapper`.
+
+    Brax's own steps the innermost environment and so leaves out every wrapper in between, `RescaleAction` among them.
+
+    Args:
+        env: One environment, or a wrapper around one.
+        randomization_fn: As for `wrap`.
+    """
+
+    def __init__(self, env: Env, randomization_fn: Randomization):
+        super().__init__(env)
+        self._batch, self._axes = randomization_fn(self.unwrapped.sys)
+
+    def reset(self, rng: jax.Array) -> State:
+        """Begin an episode in each environment."""
+        return jax.vmap(self._under(self.env.reset), (self._axes, 0))(self._batch, rng)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take one step in each environment."""
+        return jax.vmap(self._under(self.env.step), (self._axes, 0, 0))(self._batch, state, action)
+
+    def _under(self, function: Callable[..., State]) -> Callable[..., State]:
+        """Return a function that takes the params first, and calls another while the environment has them."""
+
+        def call(params: EnvParams, *arguments: Any) -> State:
+            inner = self.unwrapped
+            before, inner.sys = inner.sys, params
+            try:
+                return function(*arguments)
+            finally:
+                inner.sys = before
+
+        return call
+
+
+def wrap(
+    env: SubterraBraxEnv,
+    episode_length: int | None = None,
+    action_repeat: int = 1,
+    randomization_fn: Randomization | None = None,
+) -> Wrapper:
     """Wrap an environment as `brax.envs.training.wrap` does, with a fresh draw at each reset.
+
+    Brax's trainers take it as `wrap_env_fn`.
 
     Args:
         env: One environment, or a wrapper around one.
         episode_length: Steps after which an episode is truncated; `None` is the task's horizon.
         action_repeat: Steps for which each action is held.
+        randomization_fn: Function of the params that returns those of a batch and their `vmap` axes, as
+            `subterra_jax.randomize` does. Brax's trainers bind its second argument, `rng`, to one key for each
+            environment.
     """
     length = env.unwrapped.episode_length if episode_length is None else episode_length
-    return FreshResetWrapper(EpisodeWrapper(VmapWrapper(env), length, action_repeat))
+    many = VmapWrapper(env) if randomization_fn is None else RandomizedVmapWrapper(env, randomization_fn)
+    return FreshResetWrapper(EpisodeWrapper(many, length, action_repeat))
+
+
+@contextlib.contextmanager
+def jax_for_brax() -> Iterator[None]:
+    """Lend JAX the function that Brax's trainers miss, and take it back at the end of the `with` block.
+
+        with jax_for_brax():
+            ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length, ...)
+
+    Brax up to 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 removed. Where JAX has it, nothing changes.
+    Inside the block every thread of the process sees the function; outside nothing does.
+    """
+    if hasattr(jax, _MISSED):
+        yield
+        return
+    setattr(jax, _MISSED, _put_replicated)
+    try:
+        yield
+    finally:
+        delattr(jax, _MISSED)
+
+
+def _put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
+    """Return a pytree whose leaves have the devices as a new first axis, one copy on each."""
+    mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
+    split = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
+    return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), split), tree)
 
 
 def _where(done: jax.Array) -> Callable[[jax.Array, jax.Array], jax.Array]:

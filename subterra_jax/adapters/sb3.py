@@ -1,6 +1,6 @@
 """Stable-Baselines3: a `VecEnv` over the batch, `PPO("MlpPolicy", SubterraVecEnv(256))`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -91,12 +91,26 @@ class SubterraVecEnv(VecEnv):
         self.metadata["render_fps"] = self._envs.metadata["render_fps"]
 
     def reset(self) -> Observation:
-        """Begin an episode everywhere; seeds given by `seed` are used once."""
-        obs, _ = self._envs.reset(seed=list(self._seeds))
+        """Begin an episode everywhere; seeds given by `seed` and options given by `set_options` are used once.
+
+        Raises:
+            OptionError: The task has no such thing, or a robot cannot stand there.
+        """
+        obs, _ = self._envs.reset(seed=list(self._seeds), options=self._gathered_options())
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return obs
+
+    def _gathered_options(self) -> dict[str, Any]:
+        """Join the options of each environment: arrays in which NaN leaves what is drawn."""
+        names = {name for options in self._options for name in options}
+        gathered: dict[str, Any] = {name: [options.get(name, np.nan) for options in self._options] for name in names}
+        if "start" in gathered and any(isinstance(start, Mapping) for start in gathered["start"]):
+            starts = [start if isinstance(start, Mapping) else {"station": start} for start in gathered["start"]]
+            places = {name for start in starts for name in start}
+            gathered["start"] = {name: [start.get(name, np.nan) for start in starts] for name in places}
+        return gathered
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for `step_wait`."""

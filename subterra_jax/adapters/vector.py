@@ -5,137 +5,22 @@ whatever its neighbours do. `AutoReset` shares one key and is quicker inside a g
 """
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Array, Bool, Float
 
 from subterra_jax.adapters import packing
-from subterra_jax.adapters.packing import Observation, Report, as_observation, start_streams, take_key, unpacker
+from subterra_jax.adapters.batch import Batch
+from subterra_jax.adapters.choosing import read_choice
+from subterra_jax.adapters.moments import Moment, refuse_fork
+from subterra_jax.adapters.packing import Observation, Report, as_observation, start_streams
 from subterra_jax.adapters.views import make_view
-from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
-from subterra_jax.tunnel_env import TunnelEnv
-
-
-class Rows(NamedTuple):
-    """Streams, states and observations of all environments.
-
-    Attributes:
-        stream: Streams of keys, `(n, 2)` uint32.
-        state: States.
-        obs: Observations, `(n, n_obs)`.
-    """
-
-    stream: Any
-    state: Any
-    obs: Any
-
-
-class Batch:
-    """Compiled reset and step of `n_envs` environments.
-
-    Args:
-        env: The environment.
-        params: Params of all environments.
-        n_envs: Number of environments.
-        mode: Time at which finished environments begin again.
-    """
-
-    def __init__(self, env: TunnelEnv, params: EnvParams, n_envs: int, mode: AutoresetMode):
-        if n_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {n_envs}")
-        self.env, self.params, self.n_envs, self.mode = env, params, n_envs, mode
-        self._state, self._report = packing.report_shapes(env, params)
-        self._read = unpacker(self._report)
-        self.rows: Rows | None = None
-
-    def reset(self, stream: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Begin an episode in the environments of a mask; the others stay as they are.
-
-        Args:
-            stream: Streams to draw from, `(n_envs, 2)`.
-            mask: Environments to reset, `(n_envs,)`; all of them the first time.
-
-        Returns:
-            Observations of all environments, `(n_envs, n_obs)`.
-        """
-        others = self._empty() if self.rows is None else self.rows
-        self.rows = _reset(self.env, mask, stream, others, self.params)
-        return np.array(self.rows.obs)
-
-    def step(self, action: np.ndarray, pending: np.ndarray) -> tuple[np.ndarray, Report]:
-        """Step all environments.
-
-        Args:
-            action: Actions, `(n_envs, n_action)`.
-            pending: Environments whose last step ended an episode, `(n_envs,)`; used by `NEXT_STEP` only.
-
-        Returns:
-            Observations to act on next, `(n_envs, n_obs)`, and the report of the steps, whose own observation is from
-            before any reset. The report of an environment that is reset instead of stepping is meaningless.
-        """
-        if action.shape != (self.n_envs, self.env.action_size):
-            raise ValueError(f"actions must have shape {(self.n_envs, self.env.action_size)}, got {action.shape}")
-        if (before := self.rows) is None:
-            raise error.ResetNeeded("reset() must come before step()")
-        after, words = _step(self.env, before, action.astype(np.float32), self.params)
-        step = self._read(np.asarray(words))
-        if self.mode == AutoresetMode.NEXT_STEP and pending.any():
-            after = _reset(self.env, pending, before.stream, after, self.params)
-        elif self.mode == AutoresetMode.SAME_STEP and (done := step.terminated | step.truncated).any():
-            after = _reset(self.env, done, after.stream, after, self.params)
-        self.rows = after
-        return np.array(after.obs), step
-
-    def _empty(self) -> Rows:
-        """Return rows of zeros for the first reset to fill."""
-        zeros = lambda leaf: jnp.zeros((self.n_envs, *leaf.shape), leaf.dtype)  # noqa: E731
-        return jax.tree.map(zeros, Rows(jax.ShapeDtypeStruct((2,), np.uint32), self._state, self._report.obs))
-
-    @property
-    def stream(self) -> np.ndarray | None:
-        """Present streams; `None` before the first reset."""
-        return None if self.rows is None else np.asarray(self.rows.stream)
-
-    def state(self, index: int) -> Any:
-        """Return the state of one environment on the host; `None` before the first reset."""
-        return jax.tree.map(lambda leaf: np.asarray(leaf[index]), self.rows.state) if self.rows else None
-
-
-@partial(jax.jit, static_argnums=0)
-def _reset(env: TunnelEnv, mask: Bool[Array, "n"], stream: Array, others: Rows, params: EnvParams) -> Rows:
-    """Reset the rows of a mask from their streams; take the other rows from `others`.
-
-    A reset costs a scan, and few environments finish in one step: so a few at a time are gathered and reset.
-    """
-    n_envs = mask.shape[0]
-    n_few = max(1, n_envs // 32)
-
-    def some(carry: tuple[Array, Rows]) -> tuple[Array, Rows]:
-        left, rows = carry
-        (index,) = jnp.nonzero(left, size=n_few, fill_value=n_envs)
-        key, after = jax.vmap(take_key)(jnp.take(stream, index, axis=0, mode="clip"))
-        obs, state = jax.vmap(env.reset, (0, None))(key, params)
-        rows = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), rows, Rows(after, state, obs))
-        return left.at[index].set(False, mode="drop"), rows
-
-    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), some, (mask, others))[1]
-
-
-@partial(jax.jit, static_argnums=0)
-def _step(env: TunnelEnv, before: Rows, action: Float[Array, "n n_action"], params: EnvParams) -> tuple[Rows, Array]:
-    key, stream = jax.vmap(take_key)(before.stream)
-    words, state = jax.vmap(partial(packing.step_and_pack, env), (0, 0, 0, None))(key, before.state, action, params)
-    return Rows(stream, state, unpacker(packing.report_shapes(env, params)[1])(words).obs), words
 
 
 def mask_info(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
@@ -213,6 +98,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     ):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        refuse_fork()
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": self.autoreset_mode}
@@ -229,21 +115,28 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode in every environment, or in those that `options["reset_mask"]` names.
+        """Begin an episode in every environment, or in those that `options["reset_mask"]` marks.
 
         Args:
             seed: An int seeds environment i with seed + i; a sequence holds one seed for each. With `None` an
                 environment goes on with its stream.
-            options: `reset_mask`: a bool array `(num_envs,)`; the other environments stay as they are.
+            options: `reset_mask`: a bool array `(num_envs,)`; the other environments stay as they are. `goal` and
+                `start` as for `SubterraEnv`, for these episodes alone; one number for all environments, or an array
+                `(num_envs,)` in which NaN leaves what is drawn.
 
         Returns:
             Observations of all environments, and an empty info.
+
+        Raises:
+            OptionError: The task has no such thing, or a robot cannot stand there.
         """
-        super().reset(seed=seed if isinstance(seed, int) else None)
+        refuse_fork()
         mask = self._reset_mask(options)
-        streams = self._streams(seed, mask)
+        wishes = {name: wish for name, wish in (options or {}).items() if name != "reset_mask"}
+        choice = read_choice(self.batch.env, self.batch.params, wishes, self.num_envs)
+        super().reset(seed=seed if isinstance(seed, int) else None)
+        self._obs = self.batch.reset(self._streams(seed, mask), mask, choice)
         self._pending = self._pending & ~mask
-        self._obs = self.batch.reset(streams, mask)
         return as_observation(self._obs, self.fields), {}
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -272,6 +165,28 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
             self._pending = terminated | truncated
         return as_observation(self._obs, self.fields), reward, terminated, truncated, step
+
+    def get_state(self) -> Moment:
+        """Return all that changes, to be set again later; see `SubterraEnv.get_state`."""
+        if (words := self.batch.words()) is None:
+            raise error.ResetNeeded("reset() must come before get_state()")
+        return Moment(self.batch.env.id, words, self._obs.copy(), self._pending.copy())
+
+    def set_state(self, moment: Moment) -> Observation:
+        """Go back to a moment; what follows has the same bits as it had then.
+
+        Returns:
+            The observations of that moment.
+
+        Raises:
+            MomentError: It belongs to another task, or to another number of environments.
+        """
+        n_obs = self.batch.env.observation_size(self.batch.params)
+        moment.check(self.batch.env.id, (self.num_envs, self.batch.n_words), (self.num_envs, n_obs))
+        self.batch.set_words(moment.words, moment.obs)
+        self._obs = moment.obs.copy()
+        self._pending = np.zeros(self.num_envs, bool) if moment.pending is None else moment.pending.copy()
+        return as_observation(self._obs, self.fields)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a picture of each environment, `(480, 480, 3)` uint8; `None` without `rgb_array`."""

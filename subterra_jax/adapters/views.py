@@ -118,7 +118,7 @@ class MujocoView:
     """
 
     def __init__(self, scene: Path):
-        self._mujoco = _import_mujoco()
+        self._mujoco, self._scene = _import_mujoco(), scene
         path = scene / "scene.xml" if scene.is_dir() else scene
         self.tunnel: Path | None = tunnel_of(scene)
         for needed in (path, self.tunnel):
@@ -155,6 +155,10 @@ class MujocoView:
         self._renderer.update_scene(self._data, camera)
         self._add_robot(middle, facing, float(params.vehicle.radius))
         return self._renderer.render().copy()
+
+    def __reduce__(self) -> tuple[Any, tuple[Path]]:
+        """Open the scene anew in a copy or another process: neither module nor renderer can be copied."""
+        return type(self), (self._scene,)
 
     def close(self) -> None:
         """Release the renderer."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
@@ -204,6 +204,23 @@ class WalkPolicy:
         scaled = (observation - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
         parameters = perceptron(self.tensors, "policy", jnp.clip(scaled, -_CLIP, _CLIP), jax.nn.swish)
         return jnp.tanh(parameters[..., : parameters.shape[-1] // 2])
+
+    def initial_memory(self, key: PRNGKeyArray | None = None, n_envs: int | None = None) -> tuple[()]:
+        """Return no memory; for `subterra_jax.policies.Policy`."""
+        del key, n_envs
+        return ()
+
+    def restart(self, memory: tuple[()], done: Bool[Array, "*env"]) -> tuple[()]:
+        """Return no memory."""
+        del done
+        return memory
+
+    def __call__(
+        self, obs: Float[Array, "*batch n_obs"], memory: tuple[()] = (), state: Any = None
+    ) -> tuple[Float[Array, "*batch 12"], tuple[()]]:
+        """Return action and no memory."""
+        del state
+        return self.act(obs), memory
 
 
 def load_policy(source: str | Path = RELEASED) -> tuple[WalkPolicy, dict[str, Any]]:

@@ -65,7 +65,13 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins an episode; the same seed begins the same sequence of episodes. There are no options."""
+        """Begins an episode; the same seed begins the same sequence of episodes.
+
+        Raises:
+            ValueError: There are options; a robot on legs takes none.
+        """
+        if options:
+            raise ValueError(f"a reset of {self.env.id} takes no options, got {sorted(options)[0]!r}")
         super().reset(seed=seed)
         if seed is not None or self._stream is None:
             self._stream = start_streams([seed], self.np_random)[0]

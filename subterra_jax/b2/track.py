@@ -102,7 +102,7 @@ def read_scene_track(folder: Path, plan: TunnelPlan) -> Track:
     sleepers, beds = [], []
     for geom in geoms:
         name = geom.get("name", "")
-        if name.startswith("sleeper_"):
+        if name.startswith("sleeper_") and not name.startswith("sleeper_2_"):  # of two tracks it walks on the first
             sleepers.append(_geom_pose(geom))
         elif name.startswith("bed_"):
             beds.append((*_geom_pose(geom), float(geom.get("size", "0 0 0").split()[2])))

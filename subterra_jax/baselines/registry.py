@@ -18,6 +18,7 @@ from subterra_jax.baselines.rings.loop import RingCount
 from subterra_jax.baselines.scanmatch import scan_matching
 from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
 from subterra_jax.baselines.steering import CentreLine, HeadingHold, Pursuit
+from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
 
@@ -77,6 +78,7 @@ def names() -> tuple[str, ...]:
     return tuple(_FACTORIES)
 
 
+@in_32_bits()
 def make_agent(name: str, params: EnvParams) -> Agent:
     """Makes the agent of a name for a task.
 

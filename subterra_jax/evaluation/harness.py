@@ -12,13 +12,17 @@ from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.evaluation.episodes import Episodes, EvaluationError
 from subterra_jax.evaluation.records import Records, make_records
 from subterra_jax.evaluation.tally import Tally, add_step, start_tally
+from subterra_jax.policies import DrivingPolicy, check_task
+from subterra_jax.policies.loading import Agent as Trained
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
 
 _CHUNK = 200  # steps between two looks at whether any episode is still under way
 
 
-def evaluate(env: TunnelEnv, params: EnvParams, agent: Agent, episodes: Episodes, batch: int = 500) -> Records:
+def evaluate(
+    env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolicy, episodes: Episodes, batch: int = 500
+) -> Records:
     """Drive episodes to their ends.
 
     An episode depends on its seed, its tunnel and its severity alone, neither on the others nor on `batch`. Where
@@ -27,7 +31,7 @@ def evaluate(env: TunnelEnv, params: EnvParams, agent: Agent, episodes: Episodes
     Args:
         env: The environment; it need not have been made with `estimates`.
         params: The task, not batched.
-        agent: The agent that drives.
+        agent: The agent that drives, or a policy from `load_policy`, whose params must be these.
         episodes: Episodes, from `listed_episodes`.
         batch: Episodes driven at the same time; memory and speed alone depend on it.
 
@@ -36,11 +40,15 @@ def evaluate(env: TunnelEnv, params: EnvParams, agent: Agent, episodes: Episodes
 
     Raises:
         EvaluationError: `batch` is not positive.
+        PolicyError: It is the policy of another task.
     """
     if batch < 1:
         raise EvaluationError(f"batch must be at least 1, got {batch}")
+    agent = agent.agent if isinstance(agent, DrivingPolicy) else agent
+    if isinstance(agent, Trained):
+        check_task(agent, env, params, agent.name)
     env = dataclasses.replace(env, estimates=True)
-    driver = Driver(env, start=_Count(env).start, add=_Count(env).add)
+    driver = Driver(env, start=_Start(env), add=_Add(env))
     tallies = []
     for first in range(0, len(episodes), batch):
         # The last batch is filled up with its last episode, or it would be compiled anew.
@@ -54,16 +62,24 @@ def evaluate(env: TunnelEnv, params: EnvParams, agent: Agent, episodes: Episodes
     return make_records(tally, episodes, env, jax.device_get(params))
 
 
+# Two of one environment are equal, as two bound methods would not be, so that evaluations share a compiled program.
 @dataclasses.dataclass(frozen=True)
-class _Count:
-    """Counts the steps of an episode; hashable, so that two evaluations of one task share their compiled program."""
+class _Start:
+    """Starts the count of an episode."""
 
     env: TunnelEnv
 
-    def start(self, state: State, here: EnvParams) -> Tally:
+    def __call__(self, state: State, here: EnvParams) -> Tally:
         return start_tally(self.env, state, here)
 
-    def add(self, now: Episode, taken: Taken, here: EnvParams) -> tuple[Tally, Array]:
+
+@dataclasses.dataclass(frozen=True)
+class _Add:
+    """Counts the steps of an episode."""
+
+    env: TunnelEnv
+
+    def __call__(self, now: Episode, taken: Taken, here: EnvParams) -> tuple[Tally, Array]:
         """Count a step; a success by coverage stops the count, and the robot drives on to the far mouth."""
         ended = taken.terminated | taken.truncated
         counted = add_step(now.tally, taken, self.env.rule.tolerance(here), here.tunnel.ring_pitch)

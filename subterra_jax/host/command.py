@@ -46,7 +46,7 @@ def parse(read: Callable[[list[str]], T], words: list[str] | None = None, groups
             return read(["--help" if word == "--help-all" else word for word in words])
     except SystemExit as ended:
         if ended.code:
-            print(f"error: {_complaint_sentence(complaint.getvalue())}", file=sys.stderr)
+            print(f"error: {complaint_sentence(complaint.getvalue())}", file=sys.stderr)
         else:
             print(page.getvalue().rstrip() if "--help-all" in words else _short_help(page.getvalue(), groups))
         raise
@@ -141,7 +141,7 @@ def _wrap(line: str) -> list[str]:
     return textwrap.wrap(line, shutil.get_terminal_size().columns)
 
 
-def _complaint_sentence(complaint: str) -> str:
+def complaint_sentence(complaint: str) -> str:
     """Returns the mistake in a complaint of tyro or argparse, without the help texts around it."""
     lines = [line.rstrip() for line in complaint.splitlines()]
     if plain := [line.partition("error: ")[2] for line in lines if "error: " in line]:

@@ -25,7 +25,9 @@ class MissingLibraryError(SubterraError, ImportError):
     Args:
         module: The module that needs the library.
         package: The library's name for pip.
+        extra: The optional dependencies of this package that bring it; None where it has to be installed by itself.
     """
 
-    def __init__(self, module: str, package: str):
-        super().__init__(f"{module} needs {package}, which is not installed: pip install {package}", name=package)
+    def __init__(self, module: str, package: str, extra: str | None = None):
+        install = package if extra is None else f"'subterra-jax[{extra}]'"
+        super().__init__(f"{module} needs {package}, which is not installed: pip install {install}", name=package)

@@ -1,4 +1,4 @@
-"""Where beams meet the walls, exactly.
+"""Casts beams against the walls, exactly.
 
 Walls come in short blocks, each in a thin box. Every beam is tested against all boxes of a window with a few products,
 and then meets the true segments of the few blocks that it enters first. Nothing about the walls is approximated; the
@@ -64,7 +64,7 @@ def candidates(
         found = []
         for _ in range(tunnel.n_candidates):
             found.append(jnp.min(rest, axis=0))
-            rest = jnp.where(rest > found[-1], rest, NOTHING)
+            rest = jnp.where(rest > found[-1][None], rest, NOTHING)
         nearest.append(jnp.stack(found, axis=-1))
     block = first + (jnp.concatenate(nearest) & jnp.int32((1 << n_bits) - 1))
     return jnp.minimum(block, tunnel.box.shape[1] - 1)
@@ -105,7 +105,7 @@ def _entries(
     distance = to_face / (jnp.abs(facing) + 1e-20)
     # Distances are not negative, so their bits sort like integers, and the last bits can carry the block's number: one
     # minimum finds the nearest box and which it is.
-    key = lax.bitcast_convert_type(distance, jnp.int32) & jnp.int32(-(1 << n_bits)) | number
+    key = lax.bitcast_convert_type(distance.astype(jnp.float32), jnp.int32) & jnp.int32(-(1 << n_bits)) | number
     key = jnp.where(beside <= jnp.abs(facing) + thickness, key, NOTHING)
     return jnp.where(facing > least, key, NOTHING), jnp.where(-facing > least, key, NOTHING)
 
@@ -127,6 +127,20 @@ def hits(
     Returns:
         Distance to the nearest segment of each block, m; `inf` where the beam meets none.
     """
+    distance = _distances(tunnel, block, position, direction)
+    # As integers, because a minimum of floats must look out for NaN, which costs a quarter of this function on a CPU.
+    as_bits = jnp.dtype(f"int{8 * distance.dtype.itemsize}")
+    bits = lax.bitcast_convert_type(distance, as_bits)
+    return lax.bitcast_convert_type(jnp.min(bits, axis=-1), distance.dtype)
+
+
+def _distances(
+    tunnel: Tunnel,
+    block: Int[Array, "n_beams n_blocks"],
+    position: Float[Array, "2"],
+    direction: Float[Array, "n_beams 2"],
+) -> Float[Array, "n_beams n_blocks n_segments"]:
+    """Distance at which each beam meets each segment of its blocks, m; `inf` where it does not."""
     m_x, m_y = tunnel.box[0, block] - position[0], tunnel.box[1, block] - position[1]
     d_x, d_y = direction[:, 0, None], direction[:, 1, None]
     # Middle first, then vertices from it: large coordinates cancel before anything is rounded.
@@ -141,6 +155,33 @@ def hits(
     meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
     share = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
     distance = ahead[..., :-1] + share * (ahead[..., 1:] - ahead[..., :-1])
-    bits = lax.bitcast_convert_type(jnp.where(meets & (distance >= 0.0), distance, jnp.inf), jnp.int32)
-    # As integers, because a minimum of floats must look out for NaN, which costs a quarter of this function on a CPU.
-    return lax.bitcast_convert_type(jnp.min(bits, axis=-1), jnp.float32)
+    return jnp.where(meets & (distance >= 0.0), distance, jnp.inf)
+
+
+def met(
+    tunnel: Tunnel, first: Int[Array, ""], position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
+) -> tuple[Int[Array, "n_beams"], Int[Array, "n_beams"]]:
+    """Block and first vertex of the segment that each beam meets first; any segment for a beam that meets none."""
+    block = candidates(tunnel, first, position, direction)
+    distance = _distances(tunnel, block, position, direction)
+    n_segments = distance.shape[2]
+    nearest = jnp.argmin(distance.reshape(len(direction), -1), axis=-1).astype(jnp.int32)
+    return jnp.take_along_axis(block, nearest[:, None] // n_segments, axis=1)[:, 0], nearest % n_segments
+
+
+def to_segment(
+    tunnel: Tunnel,
+    block: Int[Array, "n_beams"],
+    vertex: Int[Array, "n_beams"],
+    position: Float[Array, "2"],
+    direction: Float[Array, "n_beams 2"],
+) -> Float[Array, "n_beams"]:
+    """Distance from the LiDAR to the line through a given segment, along each beam, m.
+
+    Its derivatives are those of a range. With the wall's normal n, that by the position is -n / (n · direction).
+    """
+    middle = tunnel.box[:2, block].T - position[None]
+    a, b = middle + tunnel.wall[block, :, vertex], middle + tunnel.wall[block, :, vertex + 1]
+    edge = b - a
+    beside = direction[:, 0] * edge[:, 1] - direction[:, 1] * edge[:, 0]
+    return (a[:, 0] * edge[:, 1] - a[:, 1] * edge[:, 0]) / jnp.where(beside == 0.0, 1.0, beside)

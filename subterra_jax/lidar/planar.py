@@ -2,6 +2,8 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants, native
 from subterra_jax.lidar import cast, fused
-from subterra_jax.rows import rowwise
+from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.tunnel import Tunnel, node_at
 
 
@@ -57,10 +59,11 @@ def scan(
     """
     first = tunnel.scan_first[node_at(tunnel, station)]
     by_kernels = skips_unwanted(params) or (params.fused and native.supported())
-    take: Callable[..., Array] = _cast_by_kernels if by_kernels else _cast
     # Nothing that may differ within a batch but the rows themselves, or the kernels could not serve it.
     beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
-    ranges = take((tunnel.walls, beams), position, heading, first, jnp.asarray(wanted))
+    # The kernels know 32 bits.
+    by_kernels = by_kernels and position.dtype == jnp.float32
+    ranges = _true_ranges(by_kernels, (tunnel.walls, beams), position, heading, first, jnp.asarray(wanted))
     return jnp.minimum(ranges, params.range_max)
 
 
@@ -104,13 +107,45 @@ def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
     ) -> Array:
         tunnel, params = what
         limit = jnp.asarray(params.range_max)
-        return kernel(tunnel, position, heading, first, wanted, limit, bearings(params.n_beams))
+        ranges = kernel(tunnel, position, heading, first, wanted, limit, bearings(params.n_beams))
+        return vary_like(ranges, position, heading, first)
 
     return cast_rows
 
 
 # One scan is cast by XLA; a batch of them in one tunnel by the kernels, however many `vmap`s made it.
 _cast_by_kernels = rowwise(_cast, lambda what, *rows: _cast_rows(what, *rows))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _true_ranges(
+    by_kernels: bool,
+    what: tuple[Tunnel, LidarParams],
+    position: Float[Array, "2"],
+    heading: Float[Array, ""],
+    first: Int[Array, ""],
+    wanted: Bool[Array, ""],
+) -> Float[Array, "n_beams"]:
+    """`scan` of a known window, differentiable by the pose and by the walls."""
+    take: Callable[..., Array] = _cast_by_kernels if by_kernels else _cast
+    return take(what, position, heading, first, wanted)
+
+
+def _range_slopes(by_kernels: bool, primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """Ranges, and how they change: the wall that a beam meets stays the same."""
+    (tunnel, params), position, heading, first, _ = primals
+    (along_tunnel, _), *along_pose = tangents[:3]
+    block, vertex = cast.met(tunnel, first, position, beam_directions(heading, params.n_beams))
+    ranges = _true_ranges(by_kernels, *primals)
+
+    def measured(tunnel: Tunnel, position: Array, heading: Array) -> Array:
+        return cast.to_segment(tunnel, block, vertex, position, beam_directions(heading, params.n_beams))
+
+    slope = slope_along(measured, (tunnel, position, heading), (along_tunnel, *along_pose))
+    return ranges, jnp.where(ranges < params.range_max, slope, 0.0)
+
+
+_true_ranges.defjvp(_range_slopes, symbolic_zeros=True)
 
 
 def bearings(n_beams: int) -> Float[np.ndarray, "n_beams"]:

@@ -69,7 +69,7 @@ def boxes_near(
         tunnel: The tunnel they stand in.
         params: Their sizes.
     """
-    slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n)
+    slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n, dtype=jnp.int32)
     return boxes_in(seed, slot, tunnel, params)
 
 
@@ -80,10 +80,10 @@ def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, par
     trolley = slot == 1 + jnp.floor(uniform(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
     side = 0.5 * (params.size_min + (params.size_max - params.size_min) * jnp.stack([u(0), u(1)], axis=-1))
     parked = 0.5 * jnp.stack([jnp.asarray(params.trolley_length), jnp.asarray(params.trolley_width)])
-    half = jnp.where(trolley[:, None], parked, side)
+    half = jnp.where(trolley[:, None], parked[None], side)
     turn = jnp.where(trolley, 0.0, jnp.pi * u(2))
     # A margin of a trolley's half at both ends keeps the boxes of two slots apart.
-    station = PITCH * slot + 1.5 + (PITCH - 3.0) * u(3)
+    station = PITCH * slot.astype(jnp.float32) + 1.5 + (PITCH - 3.0) * u(3)
     x, y, tangent_x, tangent_y, half_width = jax.vmap(at_station, (None, 0), 1)(tunnel, station)
     cos, sin = jnp.cos(turn), jnp.sin(turn)
     across = jnp.abs(sin) * half[:, 0] + jnp.abs(cos) * half[:, 1]
@@ -102,8 +102,8 @@ def distance_along(
     boxes: Boxes, position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
 ) -> Float[Array, "n_beams"]:
     """Measure where each beam first meets a box, m; `inf` where it meets none, 0 from inside one."""
-    p_x, p_y = _in_frame(boxes, position - boxes.centre)
-    axis_x, axis_y = boxes.axis[:, 0], boxes.axis[:, 1]
+    p_x, p_y = _in_frame(boxes, position[None] - boxes.centre)
+    axis_x, axis_y = boxes.axis[None, :, 0], boxes.axis[None, :, 1]
     d_x, d_y = direction[:, 0, None], direction[:, 1, None]
     ahead_x, ahead_y = d_x * axis_x + d_y * axis_y, d_y * axis_x - d_x * axis_y
     near_x, far_x = _slab(p_x, ahead_x, boxes.half[:, 0])
@@ -122,9 +122,12 @@ def clearance(
 ) -> Float[Array, ""]:
     """Measure the distance from a point to the nearest box, m; 0 inside; exact up to 0.8 m."""
     boxes = boxes_near(seed, station, 3.0, _N_NEAR, tunnel, params)
-    p_x, p_y = _in_frame(boxes, position - boxes.centre)
+    p_x, p_y = _in_frame(boxes, position[None] - boxes.centre)
     out_x, out_y = (jnp.maximum(jnp.abs(p) - boxes.half[:, i], 0.0) for i, p in enumerate((p_x, p_y)))
-    return jnp.min(jnp.sqrt(out_x * out_x + out_y * out_y))
+    apart = jnp.min(out_x * out_x + out_y * out_y)
+    # The root has no derivative at 0, inside a box.
+    outside = apart > 0.0
+    return jnp.where(outside, jnp.sqrt(jnp.where(outside, apart, 1.0)), 0.0)
 
 
 def segments(boxes: Boxes) -> Float[Array, "n 4 4"]:
@@ -147,7 +150,7 @@ def _slab(
     """Return where beams enter and leave the strip |x| ≤ half."""
     tiny = jnp.where(ahead < 0.0, -1e-12, 1e-12)
     inverse = 1.0 / jnp.where(jnp.abs(ahead) < 1e-12, tiny, ahead)
-    a, b = (-half - origin) * inverse, (half - origin) * inverse
+    a, b = (-half - origin)[None] * inverse, (half - origin)[None] * inverse
     return jnp.minimum(a, b), jnp.maximum(a, b)
 
 
@@ -165,7 +168,7 @@ class Obstacles(Part):
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
         """Draw random bits, the first of two words: the second is that of the faults."""
         del params
-        return jax.random.bits(key, (*batch, 2))
+        return jax.random.bits(key, (*batch, 2), jnp.uint32)
 
     def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> UInt32[Array, ""]:
         """Return the seed."""

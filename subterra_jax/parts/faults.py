@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, UInt32
 
 from subterra_jax import constants
 from subterra_jax.parts.hashing import uniform
@@ -92,10 +92,10 @@ def start_faults(
     draw: Float[Array, ""], seed: UInt32[Array, ""], seen: Float[Array, "6"], params: FaultParams
 ) -> FaultState:
     """Begin an episode without faults; `draw` is uniform in [0, 1) and gives the severity."""
-    low, high = jnp.asarray(params.severity_low), jnp.asarray(params.severity_high)
-    zero = jnp.zeros(())
+    low, high = (jnp.asarray(bound).astype(draw.dtype) for bound in (params.severity_low, params.severity_high))
+    zero = jnp.zeros_like(draw)
     return FaultState(
-        severity=jnp.minimum(low + jnp.floor(draw * (high - low + 1)), high).astype(jnp.float32),
+        severity=jnp.minimum(low + jnp.floor(draw * (high - low + 1)), high),
         seed=seed,
         seen=jnp.broadcast_to(seen, (MAX_DELAY + 1, 6)),
         dropout_left=zero,
@@ -161,7 +161,7 @@ def spoil(
 
 
 def _dropped(state: FaultState, n_beams: int) -> Bool[Array, "n_beams"]:
-    beam: Int[Array, n_beams] = jnp.arange(n_beams)
+    beam: Float[Array, n_beams] = jnp.arange(n_beams, dtype=state.dropout_first.dtype)
     behind = jnp.mod(beam - state.dropout_first, n_beams)
     return (state.dropout_left > 0.0) & (behind < state.dropout_count)
 
@@ -189,7 +189,7 @@ class Faults(Part):
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, Array]:
         """Draw random bits `(*batch, 2)`, of which the second word counts, and a uniform number `(*batch,)`."""
         del params
-        return jax.random.bits(key[0], (*batch, 2)), jax.random.uniform(key[1], batch)
+        return jax.random.bits(key[0], (*batch, 2), jnp.uint32), jax.random.uniform(key[1], batch, jnp.float32)
 
     def uniforms(self, params: EnvParams) -> int:
         """Count the numbers of a step."""

@@ -133,7 +133,7 @@ class Odometer(Part):
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch n"]:
         """Draw standard normal numbers."""
-        return jax.random.normal(key, (*batch, params.odometry.n_reset_noise))
+        return jax.random.normal(key, (*batch, params.odometry.n_reset_noise), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
         """Two or three, as `OdometryParams` says."""

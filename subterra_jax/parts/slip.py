@@ -81,7 +81,7 @@ class Slip(Part):
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 3"]:
         """Draw standard normal numbers."""
         del params
-        return jax.random.normal(key, (*batch, 3))
+        return jax.random.normal(key, (*batch, 3), jnp.float32)
 
     def normals(self, params: EnvParams) -> int:
         """One, for the wandering error."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -12,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants, native
 from subterra_jax.parts.part import Drive, Motion, Moved
-from subterra_jax.rows import rowwise
+from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at
 
@@ -88,21 +89,28 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
         Distance, m; exact up to 0.8 m, and exactly that where the truth is beyond.
     """
     first = tunnel.contact_first[node_at(tunnel, station)]
-    take: Callable[..., Array] = _gap_by_kernel if native.supported() else _gap
-    return take(tunnel.walls, position, first)
+    # The kernel knows 32 bits.
+    return _measured_gap(native.supported() and position.dtype == jnp.float32, tunnel.walls, position, first)
 
 
 def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> Float[Array, ""]:
     """Compute `clearance` in a known window, by XLA."""
-    window = first + jnp.arange(tunnel.n_contact)
-    vertex = (tunnel.box[:2, window].T - position)[:, :, None] + tunnel.wall[window]
+    near_x, near_y = _nearest_points(tunnel, position, first)
+    return jnp.minimum(jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y)), CONTACT_REACH)
+
+
+def _nearest_points(
+    tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]
+) -> tuple[Float[Array, "n_contact n_segments"], Float[Array, "n_contact n_segments"]]:
+    """Return x and y of the nearest point of each segment in a window, from a position, m."""
+    window = first + jnp.arange(tunnel.n_contact, dtype=jnp.int32)
+    vertex = (tunnel.box[:2, window].T - position[None])[:, :, None] + tunnel.wall[window]
     x0, y0, x1, y1 = vertex[:, 0, :-1], vertex[:, 1, :-1], vertex[:, 0, 1:], vertex[:, 1, 1:]
     edge_x, edge_y = x1 - x0, y1 - y0
     size = edge_x * edge_x + edge_y * edge_y
     # Padding repeats a vertex: a segment of length 0, whose nearest point is its start.
     share = jnp.clip(-(x0 * edge_x + y0 * edge_y) / jnp.where(size > 0.0, size, 1.0), 0.0, 1.0)
-    near_x, near_y = x0 + share * edge_x, y0 + share * edge_y
-    return jnp.minimum(jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y)), CONTACT_REACH)
+    return x0 + share * edge_x, y0 + share * edge_y
 
 
 def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
@@ -110,10 +118,41 @@ def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, "
     from subterra_jax.native import calls  # numba is optional
 
     by_xla: Callable[..., Array] = jax.vmap(_gap, in_axes=(None, 0, 0))
-    return lax.platform_dependent(tunnel, position, first, cpu=calls.clearance, default=by_xla)
+
+    def by_kernel(tunnel: Tunnel, position: Array, first: Array) -> Array:
+        return vary_like(calls.clearance(tunnel, position, first), position, first)
+
+    return lax.platform_dependent(tunnel, position, first, cpu=by_kernel, default=by_xla)
 
 
 _gap_by_kernel = rowwise(_gap, _gap_rows)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _measured_gap(
+    by_kernel: bool, tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]
+) -> Float[Array, ""]:
+    """Compute `clearance` in a known window, differentiable by the position and by the walls."""
+    take: Callable[..., Array] = _gap_by_kernel if by_kernel else _gap
+    return take(tunnel, position, first)
+
+
+def _gap_slope(by_kernel: bool, primals: Any, tangents: Any) -> tuple[Array, Array]:
+    """Return the clearance, and how it changes: the nearest point stays the nearest."""
+    gap = _measured_gap(by_kernel, *primals)
+    first = primals[2]
+    x, y = _nearest_points(*primals)
+    nearest = jnp.argmin((x * x + y * y).reshape(-1))
+
+    def measured(tunnel: Tunnel, position: Array) -> Array:
+        x, y = (part.reshape(-1)[nearest] for part in _nearest_points(tunnel, position, first))
+        size = x * x + y * y
+        return jnp.sqrt(jnp.where(size > 0.0, size, 1.0))
+
+    return gap, jnp.where(gap < CONTACT_REACH, slope_along(measured, primals[:2], tangents[:2]), 0.0)
+
+
+_measured_gap.defjvp(_gap_slope, symbolic_zeros=True)
 
 
 def in_contact(

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Float
 
 import subterra_jax as st
+from subterra_jax import policies
 from subterra_jax.baselines.agent import Agent
-from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
 from subterra_jax.lidar3d import beams
-from subterra_jax.policies import check_fits, load, with_map
+from subterra_jax.policies import PREFIX
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -37,8 +37,9 @@ class RecorderConfig:
     Attributes:
         out: Folder to make; `recording/` and `truth/` go into it.
         task: Task id, as `Subterra/StopAt-v0` or `StopAt`.
-        agent: Name of the driver, as on the leaderboard.
-        policy: Policy that drives instead: a `.safetensors` file or the name of a released one.
+        agent: Driver, as on the leaderboard: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`,
+            `module:Class` or `FILE.py:Class`.
+        policy: Policy that drives instead: a `.safetensors` file, a run folder, or the name of a released one.
         seed: Seed of everything random in the episode.
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
         tunnel: Tunnel file or name; the packaged tunnel if left out.
@@ -167,11 +168,8 @@ def open_agent(config: RecorderConfig, world: World) -> Agent:
     Raises:
         SubterraError: The agent or policy does not exist, or the policy does not fit the task.
     """
-    if config.policy is None:
-        return make_agent(config.agent, world.params)
-    policy = load(config.policy)[0]
-    check_fits(policy, dataclasses.replace(world.env, estimates=True), world.params, config.policy)
-    return with_map(policy, world.params)
+    source = config.agent if config.policy is None else PREFIX + config.policy
+    return policies.open_agent(source, dataclasses.replace(world.env, estimates=True), world.params)
 
 
 def draw_episode(config: RecorderConfig, world: World) -> tuple[int, int | None]:

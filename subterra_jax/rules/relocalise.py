@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.parts.part import Bounds, Step
-from subterra_jax.rules.rule import Start, Verdict, spread
+from subterra_jax.rules.rule import Choice, Rule, Start, Verdict, spread
 from subterra_jax.rules.stop import GoalState, StopAt, count_still, goal_terms
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
@@ -31,15 +31,21 @@ class Relocalise(StopAt):
     """Success is a right report at the stop: the one in the action of the step that makes it a stop."""
 
     errand: ClassVar[str] = "report"
+    chooses_goal: ClassVar[bool] = False
     reports: ClassVar[bool] = True
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
         """Start anywhere but at the ends, facing either way."""
         room = jnp.maximum(tunnel.length - 2.0 * params.goal.margin, 0.0)
         station = params.goal.margin + room * draw[1][1]
-        backwards = (draw[1][2] < 0.5).astype(jnp.float32)
-        goal = RelocaliseState(station, jnp.zeros((), jnp.int32), jnp.zeros(()))
+        backwards = (draw[1][2] < 0.5).astype(station.dtype)
+        goal = RelocaliseState(station, jnp.zeros((), jnp.int32), jnp.zeros_like(station))
         return Start(station, **spread(draw[0], params), backwards=backwards, own=goal)
+
+    def place(self, start: Start, choice: Choice) -> Start:
+        """Return a start with a chosen place; there is no goal."""
+        start = Rule.place(self, start, choice)
+        return dataclasses.replace(start, own=dataclasses.replace(start.own, station=start.station))
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Distance between rings of the lining, m; 0 where there are none."""
@@ -69,7 +75,7 @@ class Relocalise(StopAt):
             stopped=stopped & direction_right,
             failed=step.contact | overdue,
             error=error,
-            nearer=jnp.zeros(()),
+            nearer=jnp.zeros_like(error),
         )
         after = dataclasses.replace(goal, still=still, travelled=travelled)
         info = {"goal_error": error, "stopped": stopped, "direction_right": direction_right}
@@ -78,4 +84,4 @@ class Relocalise(StopAt):
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
         """Return NaN: how far one has to drive depends on what there is to be seen."""
         del state, tunnel, params
-        return jnp.full((), jnp.nan)
+        return jnp.full((), jnp.nan, jnp.float32)

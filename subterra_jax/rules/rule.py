@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +55,22 @@ class Start:
     own: Any = ()
 
 
+class Choice(NamedTuple):
+    """A start and a goal chosen by the caller in place of drawn ones; NaN leaves what was drawn.
+
+    Attributes:
+        station: Station of the start, m.
+        lateral: Distance of the start to the left of the centreline, m.
+        heading: Angle of the start to the centreline, rad; 0 faces growing stations.
+        goal: Station of the goal, m.
+    """
+
+    station: Any = jnp.nan
+    lateral: Any = jnp.nan
+    heading: Any = jnp.nan
+    goal: Any = jnp.nan
+
+
 @dataclasses.dataclass(frozen=True)
 class Verdict:
     """A rule's judgement of a step.
@@ -83,6 +99,7 @@ class Rule(abc.ABC):
         errand: What agents are asked to do: `cover` (drive on), `stop` (at the observed `goal`), `return` (to the start
             once the observed `flag` is raised) or `report` (stop and say where).
         reports: The action holds an estimate that counts.
+        chooses_goal: An episode has a goal, which a caller may choose.
         covers: Success is coverage. An evaluation then drives on after success, and counts how far the robot comes.
         needs: Names of the parts that the rule cannot do without.
         streams: Numbers of its random streams at a reset, one key each.
@@ -90,6 +107,7 @@ class Rule(abc.ABC):
 
     errand: ClassVar[str] = "cover"
     reports: ClassVar[bool] = False
+    chooses_goal: ClassVar[bool] = False
     covers: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     streams: ClassVar[tuple[int, ...]] = (0,)
@@ -101,12 +119,22 @@ class Rule(abc.ABC):
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Any:
         """Draw what a start needs, for a whole batch at once; by default two numbers in [-1, 1] for `spread`."""
         del params
-        return jax.random.uniform(key, (*batch, 2), minval=-1.0)
+        return jax.random.uniform(key, (*batch, 2), jnp.float32, minval=-1.0)
 
     def start(self, draw: Any, tunnel: Tunnel, params: EnvParams) -> Start:
         """Choose the start of an episode; by default `params.start`, facing growing stations."""
         del tunnel
         return Start(jnp.asarray(params.start.station, jnp.float32), **spread(draw, params))
+
+    def place(self, start: Start, choice: Choice) -> Start:
+        """Return a start with what a caller has chosen; rules whose state depends on the start bring it along."""
+        return dataclasses.replace(
+            start,
+            station=chosen(choice.station, start.station),
+            lateral=chosen(choice.lateral, start.lateral),
+            heading=chosen(choice.heading, start.heading),
+            backwards=jnp.where(jnp.isnan(choice.heading), start.backwards, 0.0),
+        )
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Names and bounds of the numbers that the rule adds to the observation."""
@@ -141,6 +169,11 @@ class Rule(abc.ABC):
         """Return the length of the shortest tunnel that has room for the task, m."""
         del params
         return 0.0
+
+
+def chosen(choice: Any, drawn: Any) -> Array:
+    """Return a caller's choice, or what was drawn where that is NaN."""
+    return jnp.where(jnp.isnan(choice), drawn, choice)
 
 
 def spread(draw: Float[Array, "2"], params: EnvParams) -> dict[str, Array]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants
 from subterra_jax.parts.part import Batch, Bounds, Keys, Step
-from subterra_jax.rules.rule import Rule, Start, Terms, Verdict, jerk, spread
+from subterra_jax.rules.rule import Choice, Rule, Start, Terms, Verdict, chosen, jerk, spread
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
@@ -86,6 +86,7 @@ class StopAt(Rule):
     """Success is a stop within the tolerance of the goal; any stop ends the episode."""
 
     errand: ClassVar[str] = "stop"
+    chooses_goal: ClassVar[bool] = True
     streams: ClassVar[tuple[int, ...]] = (0, 4, 5)
 
     def defaults(self) -> dict[str, Any]:
@@ -96,8 +97,8 @@ class StopAt(Rule):
         """Draw numbers for `spread`, three in [0, 1) for goal, place and direction, and a normal one for the start."""
         return (
             super().draw_reset(key[0], batch, params),
-            jax.random.uniform(key[1], (*batch, 3)),
-            jax.random.normal(key[2], batch),
+            jax.random.uniform(key[1], (*batch, 3), jnp.float32),
+            jax.random.normal(key[2], batch, jnp.float32),
         )
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
@@ -106,6 +107,12 @@ class StopAt(Rule):
         offset = params.start.station_sigma * jnp.clip(draw[2], -3.0, 3.0)
         # Not outside of the mouth.
         return Start(jnp.maximum(params.start.station + offset, 0.0), **spread(draw[0], params), own=goal)
+
+    def place(self, start: Start, choice: Choice) -> Start:
+        """Return a start with a chosen place and goal."""
+        start = super().place(start, choice)
+        own = dataclasses.replace(start.own, station=chosen(choice.goal, start.own.station))
+        return dataclasses.replace(start, own=own)
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Station of the goal (m), and distance between rings of the lining (m; 0 where there are none)."""
@@ -184,11 +191,12 @@ def goal_terms(
         nearer: Length by which the way to go has become shorter, m.
     """
     weights, size = params.reward, jnp.abs(error)
+    succeeds, stops, fails, ends = (flag.astype(size.dtype) for flag in (success, stopped, failed, stopped | failed))
     return {
-        "reward_terminal": weights.terminal * success,
-        "reward_precision": weights.precision * stopped * jnp.exp(-size / jnp.asarray(params.goal.tolerance)),
-        "reward_miss": -weights.miss * (stopped | failed) * size,
-        "reward_crash": -weights.crash * failed,
+        "reward_terminal": weights.terminal * succeeds,
+        "reward_precision": weights.precision * stops * jnp.exp(-size / jnp.asarray(params.goal.tolerance)),
+        "reward_miss": -weights.miss * ends * size,
+        "reward_crash": -weights.crash * fails,
         "reward_progress": weights.progress * nearer,
         "reward_time": -weights.time * jnp.ones_like(size),
         "reward_lateral": -weights.lateral * jnp.abs(step.place.lateral) / step.place.half_width,

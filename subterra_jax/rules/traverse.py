@@ -88,7 +88,7 @@ def reward_terms(
     Source: paper, Eq. 1.
     """
     return {
-        "reward_terminal": params.terminal * success,
+        "reward_terminal": params.terminal * success.astype(newly_covered.dtype),
         "reward_coverage": params.coverage * newly_covered / length,
         "reward_lateral": -params.lateral * jnp.abs(lateral) / half_width,
         "reward_jerk": -params.jerk * jerk(command, previous),

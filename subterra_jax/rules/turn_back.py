@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.parts.part import Bounds, Step
-from subterra_jax.rules.rule import Start, Verdict
+from subterra_jax.rules.rule import Choice, Start, Verdict
 from subterra_jax.rules.stop import GoalState, StopAt, count_still, goal_terms
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
@@ -36,8 +36,13 @@ class TurnBack(StopAt):
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
         """Start as for `StopAt`, the flag down."""
         start = super().start(draw, tunnel, params)
-        goal = ReturnState(start.own.station, start.own.still, start.station, jnp.zeros(()))
+        goal = ReturnState(start.own.station, start.own.still, start.station, jnp.zeros_like(start.station))
         return dataclasses.replace(start, own=goal)
+
+    def place(self, start: Start, choice: Choice) -> Start:
+        """Return a start with a chosen place, which is where the way back ends, and goal."""
+        start = super().place(start, choice)
+        return dataclasses.replace(start, own=dataclasses.replace(start.own, start=start.station))
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
         """Add the flag to the entries of `StopAt`: 1 once the goal has been reached."""

@@ -1,5 +1,6 @@
 """Tunnels by name: packaged ones, files and generated ones. A complaint about a file names the file and the field."""
 
+import dataclasses
 import hashlib
 import re
 import zipfile
@@ -37,7 +38,9 @@ class _Fields:
             with np.load(path, allow_pickle=False) as data:
                 self.data = {name: data[name] for name in data.files}
         except FileNotFoundError as error:
-            raise TunnelError(f"{path}: no such tunnel file") from error
+            by_name = f"; by name there are {', '.join(PACKAGED)}, control and procedural:SPLIT:INDEX"
+            a_name = path.parent == Path() and not path.suffix
+            raise TunnelError(f"{path}: no such tunnel file{by_name if a_name else ''}") from error
         except Exception as error:  # zipfile, zlib and NumPy each raise their own for a damaged archive
             raise TunnelError(f"{path}: not a readable .npz archive ({describe_damage(path, error)})") from error
 
@@ -93,9 +96,12 @@ def read_tunnel(path: Path) -> TunnelPlan:
     step = np.diff(station)
     if station[0] != 0.0 or np.any(step <= 0.0) or np.any(np.abs(step - step.mean()) > 1e-6 * station[-1]):
         raise fields.fail("station", "must be a uniform, growing grid that starts at 0")
-    tangent = fields.numbers("tangent", n, 2)
+    centre, tangent = fields.numbers("centre", n, 2), fields.numbers("tangent", n, 2)
     if np.any(np.abs(np.linalg.norm(tangent, axis=1) - 1.0) > 1e-3):
         raise fields.fail("tangent", "must hold unit vectors")
+    against = np.sum(np.gradient(centre, axis=0) * tangent, axis=1) <= 0.0
+    if np.any(against):
+        raise fields.fail("tangent", f"is flipped at index {np.argmax(against)}: it points against the centreline")
     half_width = fields.numbers("half_width", n)
     if np.any(half_width <= 0.0):
         raise fields.fail("half_width", "must be positive")
@@ -108,11 +114,11 @@ def read_tunnel(path: Path) -> TunnelPlan:
         raise fields.fail("lining", "is missing")
     if names.ndim != 1 or names.dtype.kind != "U" or len(names) == 0:
         raise fields.fail("lining", f"must be a list of names, is {names.dtype} of shape {names.shape}")
-    return TunnelPlan(
+    plan = TunnelPlan(
         name=fields.text("name"),
         provenance=fields.text("provenance"),
         station=station,
-        centre=fields.numbers("centre", n, 2),
+        centre=centre,
         tangent=tangent,
         elevation=fields.numbers("elevation", n),
         half_width=half_width,
@@ -125,6 +131,21 @@ def read_tunnel(path: Path) -> TunnelPlan:
         },
         ring_pitch=ring_pitch,
     )
+    for name, lining in plan.linings.items():
+        for side, wall, sign in (("left", lining.left, 1.0), ("right", lining.right, -1.0)):
+            if np.median(sign * _lateral(plan, wall)) <= 0.0:
+                raise fields.fail(
+                    f"{side}_{name}", f"lies to the other side of the centreline: {side} means its {side}"
+                )
+    return plan
+
+
+def _lateral(plan: TunnelPlan, wall: Wall) -> np.ndarray:
+    """Return the distances of a wall's vertices to the left of the centreline, m."""
+    x, y, tangent_x, tangent_y = (
+        np.interp(wall.station, plan.station, column) for column in (*plan.centre.T, *plan.tangent.T)
+    )
+    return tangent_x * (wall.vertex[:, 1] - y) - tangent_y * (wall.vertex[:, 0] - x)
 
 
 def tunnel_of(scene: Path) -> Path:
@@ -208,6 +229,8 @@ def resolve(
         return stack([resolve(each, lining, piece, reach) for each in tunnel])
     plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
     if piece is not None:
+        name = lining or plan.default_lining
+        plan = dataclasses.replace(plan, linings={name: plan.lining(name)})  # no more than is needed is cut
         start, length = piece
         plan = plan.slice(start, min(length, plan.length - start))
     return Tunnel.from_plan(plan, lining, reach=reach)

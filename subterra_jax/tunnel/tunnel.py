@@ -174,15 +174,16 @@ class Foot:
 
 def node_at(tunnel: Tunnel, station: Float[Array, ""]) -> Int[Array, ""]:
     """Return the row of `grid` nearest to a station; beyond a mouth, the last node."""
-    node = jnp.clip(jnp.round(station / tunnel.spacing), 0, tunnel.n_nodes - 1)
+    place = station / tunnel.spacing
+    node = jnp.clip(jnp.round(place), 0, (tunnel.n_nodes - 1).astype(place.dtype))
     return tunnel.first_node + node.astype(jnp.int32)
 
 
 def at_station(tunnel: Tunnel, station: Float[Array, ""]) -> Float[Array, "5"]:
     """Return centre x, y (m), unit tangent x, y and half width (m) at a station; straight on beyond the mouths."""
     place = station / tunnel.spacing
-    index = jnp.clip(jnp.floor(place), 0, tunnel.n_nodes - 2).astype(jnp.int32)
-    share = place - index
+    node = jnp.clip(jnp.floor(place), 0, (tunnel.n_nodes - 2).astype(place.dtype))
+    index, share = node.astype(jnp.int32), place - node
     row = tunnel.first_node + index
     lower, upper = tunnel.grid[row], tunnel.grid[row + 1]
     return lower + share * (upper - lower)

@@ -29,8 +29,9 @@ def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
     add("--tunnel", action="append", default=[], metavar="NAME|FILE", help="offer another tunnel; may be repeated")
     add("--lining", default=default.lining, metavar="NAME", help="pockets (default), smooth or furnished")
     add("--task", default=default.task, metavar="ID", help="first task, as StopAt or Subterra/StopAt-v0 (the default)")
-    add("--driver", default=default.agent, metavar="NAME", help="first driver: a baseline, or policy:StopAt-v0")
-    add("--policy", action="append", default=[], type=Path, metavar="FILE", help="offer this .safetensors as driver")
+    drivers = "first driver: a baseline, policy:NAME|FILE|RUN-FOLDER, module:Class or FILE.py:Class"
+    add("--driver", default=default.agent, metavar="NAME", help=drivers)
+    add("--policy", action="append", default=[], type=Path, metavar="FILE", help="offer this policy as driver too")
     add("--seed", type=int, default=default.seed, metavar="N", help="seed of the first episode")
     add(
         "--recordings",

@@ -26,8 +26,9 @@ class ViewerConfig:
         scene: Scene folder with the lining, track and tunnel to show; `None`: no scene.
         tunnels: Further tunnel files, or names as for `load_tunnel`.
         task: Id of the first task, as `Subterra/StopAt-v0` or `StopAt`.
-        agent: Name of the first driver.
-        policies: Trained policies, `.safetensors` files, offered beside the baselines.
+        agent: First driver: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`, `module:Class` or
+            `FILE.py:Class`.
+        policies: Trained policies, `.safetensors` files or run folders, offered beside the baselines.
         lining: First variant of the walls.
         seed: Seed of the first episode.
         recordings: Folder for saved episodes and pictures.

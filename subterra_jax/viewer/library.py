@@ -13,7 +13,8 @@ from subterra_jax import policies, tasks
 from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines import registry
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.policies.loading import Agent
+from subterra_jax.host.loading import load_object
+from subterra_jax.policies.opening import FORMS, call_factory, names_code, policy_source
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest
 from subterra_jax.viewer.config import ViewerConfig, ViewerError
@@ -32,7 +33,7 @@ def register_agents(files: tuple[Path, ...]) -> tuple[str, ...]:
     """Register all released policies and those of the command line; return the names of all agents.
 
     Args:
-        files: Trained policies, registered as `file:STEM`.
+        files: Trained policies, as files or run folders, registered as `file:STEM`.
 
     Raises:
         PolicyError: A file is missing or damaged.
@@ -44,6 +45,22 @@ def register_agents(files: tuple[Path, ...]) -> tuple[str, ...]:
         agent, _ = policies.load(path)
         _register(f"file:{path.stem}", agent)
     return registry.names()
+
+
+def offer_driver(name: str) -> None:
+    """Offer the driver of the command line beside the registered ones, where it is a policy or a class.
+
+    Raises:
+        PolicyError: The policy is missing or damaged.
+        UserCodeError: The class cannot be loaded.
+    """
+    if name in registry.names():
+        return
+    if (source := policy_source(name)) is not None:
+        _register(name, policies.load(source)[0])
+    elif names_code(name):
+        factory = load_object(name)
+        registry.register(name, lambda params: call_factory(factory, params))
 
 
 def _register(name: str, agent: Any) -> None:
@@ -71,9 +88,7 @@ def drive_episode(
     """
     legs: dict[str, Any] = {"engine": "mujoco"} if task in MISSIONS else {}
     env, params = st.make(task, tunnel=plan, lining=lining, **legs)
-    driver = registry.make_agent(agent, params)
-    if isinstance(driver, Agent):
-        policies.check_fits(driver, env, params, agent)
+    driver = policies.open_agent(agent, env, params)
     names = {"tunnel": title, "tunnel_sha256": digest, "lining": lining, "agent": agent}
     yield from drive(env, params, driver, seed, names)
 
@@ -122,9 +137,11 @@ class Library:
             self.tunnels.setdefault(source, TunnelEntry(source, source))
         for source in config.tunnels:
             self.plan(source)
-        self.agents = register_agents(config.policies)
+        register_agents(config.policies)
+        offer_driver(config.agent)
+        self.agents = registry.names()
         if config.agent not in self.agents:
-            raise ViewerError(f"no driver {config.agent!r}; there are {', '.join(self.agents)}")
+            raise ViewerError(f"no driver {config.agent!r}; there are {', '.join(self.agents)}; or {FORMS}")
 
     def plan(self, title: str) -> TunnelPlan:
         """Return a tunnel, read at its first use.

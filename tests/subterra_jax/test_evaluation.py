@@ -10,6 +10,7 @@ import pytest
 from flax import struct
 
 import subterra_jax as st
+from subterra_jax import episode
 from subterra_jax.baselines.agent import observed, shown
 from subterra_jax.baselines.registry import AgentError, make_agent, register
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
@@ -101,7 +102,9 @@ def test_coverage_ends_at_nine_tenths_as_published_and_progress_goes_on_to_the_m
     assert ((through.coverage >= 0.9) & (through.coverage < 0.905)).all()
     assert (through.progress == 1.0).all()
     assert (through.time < 29.0).all()
+    compiled = episode._go._cache_size()
     short = evaluate(env, params, Dawdler(stop=30.0), episodes)
+    assert episode._go._cache_size() == compiled, "a second evaluation of a task compiles nothing"
     assert not short.success.any()
     np.testing.assert_allclose(short.progress, 0.5, atol=0.01)
     np.testing.assert_array_equal(short.progress, short.coverage)

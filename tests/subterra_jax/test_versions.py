@@ -21,8 +21,8 @@ from subterra_jax.viewer.config import ViewerError
 from subterra_jax.viewer.recording import load as load_episode
 from subterra_jax.viewer.recording import save as save_episode
 from tests.subterra_jax.viewer.episodes import straight
-from train import folder
-from train.folder import CheckpointError
+from train import checkpoint
+from train.checkpoint import CheckpointError
 from train.world import library_versions
 
 ROOT = Path(__file__).parents[2]
@@ -108,13 +108,13 @@ def test_a_policy_of_another_version_says_what_to_do(tmp_path, number, says):
 
 
 def test_a_checkpoint_of_another_version_says_what_to_do(tmp_path):
-    folder.save_checkpoint(tmp_path, 3, {"policy": {"w": np.zeros(2, np.float32)}}, {"task": "t"})
-    (facts,) = tmp_path.rglob(folder.FACTS)
-    name, _, number = folder.SCHEMA.rpartition("/")
+    checkpoint.save_checkpoint(tmp_path, 3, {"policy": {"w": np.zeros(2, np.float32)}}, {"task": "t"})
+    (facts,) = tmp_path.rglob(checkpoint.FACTS)
+    name, _, number = checkpoint.SCHEMA.rpartition("/")
     for told, says in ((int(number) - 1, "older .*--overwrite"), (int(number) + 1, "newer .* --upgrade")):
         facts.write_text(json.dumps({**json.loads(facts.read_text()), "schema": f"{name}/{told}"}))
         with pytest.raises(CheckpointError, match=says):
-            folder.load_checkpoint(tmp_path)
+            checkpoint.load_checkpoint(tmp_path)
 
 
 def test_an_episode_of_another_version_says_what_to_do(tmp_path):

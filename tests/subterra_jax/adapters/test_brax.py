@@ -7,7 +7,10 @@ import pytest
 from brax.envs import base
 from brax.envs.wrappers import training
 
-from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, wrap
+import subterra_jax as st
+from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, jax_for_brax, wrap
+
+pytestmark = pytest.mark.door
 
 LENGTH, N_STEPS = 26, 60
 # In [-1, 1]: two drive straight on to the horizon, two round in a circle that touches the wall before it.
@@ -94,3 +97,96 @@ def test_actions_between_minus_and_plus_one_span_the_bounds(env, states):
     low, high = env.action_bounds
     np.testing.assert_allclose(states.pipeline_state.command[1, 0], 0.5 * (low + high), atol=1e-6)
     np.testing.assert_allclose(states.pipeline_state.command[1, 2], high, atol=1e-6)
+
+
+def randomized(params, rng):
+    """A `randomization_fn` as Brax's trainers call it: `rng` holds one raw key for each environment."""
+    return st.randomize(jax.random.wrap_key_data(rng[0]), params, {"lidar.range_sigma": (0.0, 0.1)}, len(rng))
+
+
+def test_what_a_wrapper_keeps_among_the_metrics_stays_there(env):
+    """Brax's evaluation keeps the reward there; its trainers scan over steps, so no entry may come or go."""
+    watched = training.EvalWrapper(wrap(RescaleAction(env)))
+    state = jax.eval_shape(watched.reset, KEYS)
+    stepped = jax.eval_shape(watched.step, state, ACTION)
+    assert "reward" in stepped.metrics
+    assert jax.tree.structure(state) == jax.tree.structure(stepped)
+
+
+def test_each_environment_of_a_randomised_batch_has_its_own_params_and_no_wrapper_is_left_out(env):
+    class ShowSigma(RescaleAction):
+        def reset(self, rng):
+            return self.with_sigma(super().reset(rng))
+
+        def step(self, state, action):
+            return self.with_sigma(super().step(state, action))
+
+        def with_sigma(self, state):
+            return state.replace(metrics={**state.metrics, "sigma": self.unwrapped.sys.lidar.range_sigma})
+
+    before = env.params
+    wrapped = wrap(ShowSigma(env), LENGTH, randomization_fn=lambda params: randomized(params, KEYS))
+    stepped = jax.jit(wrapped.step)(jax.jit(wrapped.reset)(KEYS), ACTION)
+    np.testing.assert_array_equal(stepped.metrics["sigma"], randomized(before, KEYS)[0].lidar.range_sigma)
+    assert len(np.unique(stepped.metrics["sigma"])) == 4
+    low, high = env.action_bounds
+    np.testing.assert_allclose(stepped.pipeline_state.command[0], 0.5 * (low + high), atol=1e-6)
+    assert env.params is before, "the environment is left as it was"
+
+
+def test_braxs_own_randomisation_runs_on_the_bare_environment(env):
+    wrapped = training.wrap(env, LENGTH, randomization_fn=lambda params: randomized(params, KEYS))
+    assert jax.eval_shape(wrapped.step, jax.eval_shape(wrapped.reset, KEYS), ACTION).obs.shape == (4, 18)
+
+
+def test_what_jax_no_longer_has_is_lent_for_the_block_alone():
+    had = hasattr(jax, "device_put_replicated")
+    with jax_for_brax(), jax_for_brax():
+        copies = jax.device_put_replicated({"a": jnp.arange(3.0), "b": 2}, jax.local_devices())
+        doubled = jax.pmap(lambda tree: jax.tree.map(lambda leaf: 2 * leaf, tree))(copies)
+    assert hasattr(jax, "device_put_replicated") == had
+    n = jax.local_device_count()
+    np.testing.assert_array_equal(doubled["a"], [[0.0, 2.0, 4.0]] * n)
+    np.testing.assert_array_equal(doubled["b"], [4] * n)
+
+
+def test_what_was_lent_is_taken_back_after_an_error():
+    had = hasattr(jax, "device_put_replicated")
+    with pytest.raises(ValueError, match="trainer"), jax_for_brax():
+        raise ValueError("the trainer failed")
+    assert hasattr(jax, "device_put_replicated") == had
+
+
+def test_a_jax_that_has_it_is_left_alone(monkeypatch):
+    monkeypatch.setattr(jax, "device_put_replicated", "its own", raising=False)
+    with jax_for_brax():
+        assert jax.device_put_replicated == "its own"
+    assert jax.device_put_replicated == "its own"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ppo", "sac"])
+def test_braxs_own_trainers_run_and_report_the_tasks_metrics(env, name):
+    from brax.training.agents.ppo import train as ppo
+    from brax.training.agents.sac import train as sac
+
+    settings = {"unroll_length": 8, "batch_size": 8, "num_minibatches": 2} if name == "ppo" else {"min_replay_size": 32}
+    rescaled = RescaleAction(env)
+    with jax_for_brax():
+        make_policy, weights, metrics = {"ppo": ppo, "sac": sac}[name].train(
+            environment=rescaled,
+            wrap_env_fn=wrap,
+            episode_length=LENGTH,
+            num_timesteps=256,
+            num_envs=4,
+            num_eval_envs=4,
+            normalize_observations=True,
+            randomization_fn=randomized,
+            **settings,
+        )
+    assert metrics["eval/episode_reward_jerk"] < 0.0
+    assert 0.0 <= metrics["eval/episode_success"] <= 1.0
+    assert 1 <= metrics["eval/avg_episode_length"] <= LENGTH
+    action, _ = make_policy(weights, deterministic=True)(jnp.zeros((3, 18)), jax.random.PRNGKey(0))
+    assert action.shape == (3, 2)
+    assert (jnp.abs(action) <= 1.0).all()

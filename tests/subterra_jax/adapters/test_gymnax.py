@@ -1,18 +1,28 @@
-"""The view with Gymnax's methods; Gymnax's own wrappers run on it where Gymnax is installed."""
+"""Both forms of Gymnax's methods; Gymnax's own wrappers and rejax run on them where they are installed."""
+
+import sys
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from subterra_jax.adapters.gymnax import SubterraGymnax
+from subterra_jax.adapters.gymnax import SubterraGymnax, SubterraGymnax5
 
-HORIZON = 5
+pytestmark = pytest.mark.door
+
+TASK, HORIZON = "Subterra/TraverseShort-v0", 5
 
 
 @pytest.fixture(scope="module")
 def env():
-    return SubterraGymnax("Subterra/TraverseShort-v0", horizon=HORIZON)
+    return SubterraGymnax(TASK, horizon=HORIZON)
+
+
+@pytest.fixture(scope="module")
+def older():
+    return SubterraGymnax5(TASK, horizon=HORIZON)
 
 
 def episode(step, key, state, n_steps):
@@ -64,18 +74,105 @@ def test_spaces_hold_what_is_drawn_from_them_and_what_is_observed(env):
     assert not env.action_space().contains(jnp.array([jnp.nan, 0.0]))
 
 
-def test_gymnax_wrappers_run_on_it(env):
-    pytest.importorskip("gymnax", reason="Gymnax 1.0 asks for an older Gymnasium; pip install --no-deps gymnax")
-    from gymnax.wrappers.compat import LegacyStepAPIWrapper
-    from gymnax.wrappers.purerl import LogWrapper
+def test_the_older_form_returns_five_and_tells_the_horizon_from_an_end(env, older):
+    """Straight on to the horizon, then into the wall; the six say the same of the same keys."""
+    _, state = older.reset(jax.random.key(0))
+    for action, n_steps in ((jnp.array([1.0, 0.0]), HORIZON), (jnp.array([2.0, 1.5]), 60)):
+        params = env.default_params.replace(max_steps_in_episode=n_steps)
+        for k in range(n_steps):
+            key = jax.random.fold_in(jax.random.key(1), k)
+            obs, after, reward, done, info = older.step(key, state, action, params)
+            six = env.step(key, state, action, params)
+            np.testing.assert_allclose(obs, six[0], atol=1e-3)  # another program rounds in another order
+            assert reward == pytest.approx(float(six[2]), abs=1e-5)
+            assert done == six[3] | six[4]
+            assert (info["terminated"], info["truncated"], info["discount"]) == (six[3], six[4], 1.0 - six[3])
+            state = after
+            if done:
+                break
+        if n_steps == HORIZON:
+            assert (k + 1, bool(info["truncated"]), float(info["discount"])) == (HORIZON, True, 1.0)
+        else:
+            assert (bool(info["contact"]), float(info["discount"])) == (True, 0.0)
 
+
+def test_the_horizon_goes_by_gymnaxs_name(env):
     params = env.default_params
-    logged = LogWrapper(env)
+    assert params.max_steps_in_episode == params.horizon == HORIZON
+    shorter = params.replace(max_steps_in_episode=2)
+    assert (shorter.horizon.dtype, int(shorter.max_steps_in_episode)) == (jnp.int32, 2)
+    assert jax.tree.structure(shorter) == jax.tree.structure(params)
+    with pytest.raises(ValueError, match="wheels"):
+        params.replace(wheels=2)
+
+
+def test_spaces_can_be_asked_for_inside_a_jitted_loop(older):
+    params = older.default_params
+
+    @jax.jit
+    def act(key):
+        space = older.action_space(params)
+        return jnp.clip(space.sample(key), space.low, space.high), jnp.zeros(older.observation_space(params).shape)
+
+    action, blank = act(jax.random.key(0))
+    np.testing.assert_allclose(action, older.action_space().sample(jax.random.key(0)), rtol=1e-6)
+    assert blank.shape == (18,)
+
+
+def test_a_caller_who_has_gymnax_gets_spaces_of_its_class(env, monkeypatch):
+    """Wrappers of purejaxrl and stoix ask for the class; the bounds of an odometer are open, the draws finite."""
+
+    class TheirBox:
+        def __init__(self, low, high, shape, dtype):
+            self.low, self.high, self.shape, self.dtype = low, high, shape, dtype
+
+    theirs = ModuleType("gymnax.environments.spaces")
+    theirs.Box = TheirBox
+    monkeypatch.setitem(sys.modules, "gymnax.environments.spaces", theirs)
+    for space in (env.action_space(env.default_params), env.observation_space(env.default_params)):
+        assert isinstance(space, TheirBox)
+        drawn = space.sample(jax.random.key(0))
+        assert (drawn.shape, drawn.dtype) == (space.shape, space.dtype)
+        assert np.isfinite(drawn).all()
+        assert space.contains(drawn)
+
+
+def test_gymnax_wrappers_run_on_it(env, older):
+    pytest.importorskip("gymnax", reason="Gymnax asks for an older Gymnasium; pip install --no-deps gymnax six")
+    from gymnax.environments import spaces
+    from gymnax.wrappers.purerl import FlattenObservationWrapper, LogWrapper
+
+    try:
+        from gymnax.wrappers.compat import LegacyStepAPIWrapper
+    except ImportError:  # before 1.0
+        form, n_returned = older, 5
+    else:
+        form, n_returned = env, 6
+        legacy = LegacyStepAPIWrapper(env)
+        _, state = legacy.reset(jax.random.key(5), env.default_params)
+        assert len(legacy.step(jax.random.key(6), state, jnp.zeros(2), env.default_params)) == 5
+    params = form.default_params
+    logged = LogWrapper(FlattenObservationWrapper(form))
+    assert isinstance(logged.observation_space(params), spaces.Box)
     _, state = logged.reset(jax.random.key(5), params)
     outs = episode(lambda key, state: logged.step(key, state, jnp.ones(2), params), jax.random.key(6), state, HORIZON)
-    info = outs[-1][5]
+    assert len(outs[-1]) == n_returned
+    info = outs[-1][-1]
     assert info["returned_episode_lengths"] == HORIZON
     assert info["returned_episode_returns"] == pytest.approx(sum(float(out[2]) for out in outs), abs=1e-5)
-    legacy = LegacyStepAPIWrapper(env)
-    _, state = legacy.reset(jax.random.key(5), params)
-    assert len(legacy.step(jax.random.key(6), state, jnp.zeros(2), params)) == 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["PPO", "SAC"])
+def test_rejax_trains_on_the_older_form(older, name):
+    rejax = pytest.importorskip("rejax", reason="pip install --no-deps rejax 'gymnax<1' distrax")
+    many = {"num_envs": 4, "num_steps": 16, "num_minibatches": 2}
+    one = {"fill_buffer": 64, "batch_size": 16, "buffer_size": 256}
+    settings = many if name == "PPO" else one
+    trainer = getattr(rejax, name).create(
+        env=older, env_params=older.default_params, total_timesteps=256, eval_freq=128, **settings
+    )
+    _, (lengths, returns) = jax.jit(trainer.train)(jax.random.PRNGKey(0))
+    assert lengths.shape == returns.shape == (3, 128)
+    assert (lengths == HORIZON).all()
+    assert np.isfinite(returns).all()

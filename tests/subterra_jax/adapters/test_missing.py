@@ -13,7 +13,7 @@ from subterra_jax.adapters.views import make_view
     ("adapter", "library", "package"),
     [
         ("sb3", "stable_baselines3.common.vec_env.base_vec_env", "stable-baselines3"),
-        ("brax", "brax.envs.base", "brax"),
+        ("brax", "brax.envs.base", r"'subterra-jax\[brax\]'"),
     ],
 )
 def test_a_missing_library_is_named_with_the_command_that_installs_it(adapter, library, package, monkeypatch):

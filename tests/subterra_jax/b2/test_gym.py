@@ -68,6 +68,11 @@ def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env
     assert env.metadata["render_fps"] == 5
 
 
+def test_a_chosen_start_is_refused_in_one_sentence(env):
+    with pytest.raises(ValueError, match="a reset of Subterra/B2Traverse-v0 takes no options, got 'start'"):
+        env.unwrapped.reset(options={"start": 5.0})
+
+
 def test_told_to_walk_it_walks_and_its_legs_know_how_far(env):
     told = drive(env, (0.6, 0.0), 20)
     start, info, obs = told[4][4]["station"], told[-1][4], told[-1][0]

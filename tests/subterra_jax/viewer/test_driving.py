@@ -58,7 +58,7 @@ def test_an_episode_grows_from_its_start_and_keeps_what_it_had(parts):
 def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
     few = FeedForward({"statistics.mean": jnp.zeros(3)}, jnp.zeros(2), jnp.ones(2), frames=1)
-    monkeypatch.setattr(library.registry, "make_agent", lambda name, params: few)
+    monkeypatch.setitem(library.registry._FACTORIES, "few", lambda params: few)
     with pytest.raises(SubterraError, match="few: made for observations of 3 numbers, Subterra/Traverse-v0 has 18"):
         next(library.drive_episode(plan, "0", "t", "smooth", "Subterra/Traverse-v0", "few", 0))
 

@@ -1,0 +1,160 @@
+"""Compiles the methods of an environment, and policies that drive a batch, at their first use; modes of JAX."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import os
+import platform
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+
+from subterra_jax.host.errors import SubterraError
+
+_Method = TypeVar("_Method", bound=Callable[..., Any])
+
+
+def compiled(*static: str) -> Callable[[_Method], _Method]:
+    """Compile a method at its first use, for all objects that are equal.
+
+    Inside a function that is compiled itself nothing changes. An object that cannot be hashed, as one with a part that
+    is no frozen dataclass, runs without.
+
+    Args:
+        *static: Names of arguments that are part of the program.
+    """
+
+    def decorate(method: _Method) -> _Method:
+        program = jax.jit(method, static_argnames=("self", *static), inline=True)
+
+        @functools.wraps(method)
+        def call(self: Any, *args: Any, **kwargs: Any) -> Any:
+            return (program if hashable(self) else method)(self, *args, **kwargs)
+
+        return call  # type: ignore[return-value]
+
+    return decorate
+
+
+@contextlib.contextmanager
+def in_32_bits() -> Iterator[None]:
+    """Compute as JAX does by default, whatever the mode; agents do. Also a decorator."""
+    with jax.enable_x64(False):
+        yield
+
+
+def cache_programs(folder: str | Path | None = None) -> Path:
+    """Keep compiled programs on disk, so that the next process need not compile them again.
+
+    This switches JAX's persistent cache on, for all programs of this process that take 0.1 s or more to compile.
+    Importing the package does not. The folder may be deleted at any time, and nothing limits its size: the programs of
+    one task take about 1 MB.
+
+    Args:
+        folder: Where to keep them. None is `JAX_COMPILATION_CACHE_DIR` if it is set, else a folder for this kind of
+            processor under `~/.cache/subterra`, or `XDG_CACHE_HOME`.
+
+    Returns:
+        The folder.
+
+    Raises:
+        SubterraError: The folder cannot be written.
+    """
+    config: Any = jax.config
+    if folder is None and config.jax_compilation_cache_dir:
+        return Path(config.jax_compilation_cache_dir)
+    if folder is None:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        folder = base / "subterra" / "compiled" / _processor()
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SubterraError(f"{folder}: cannot be written ({error.strerror})") from error
+    if not os.access(folder, os.W_OK):
+        raise SubterraError(f"{folder}: cannot be written")
+    config.update("jax_compilation_cache_dir", str(folder))
+    config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    compilation_cache.reset_cache()  # JAX asks once, at the first program, whether there is a folder
+    return folder
+
+
+def _processor() -> str:
+    """Return a name of this machine's kind of processor: machine code for one need not run on another."""
+    features = platform.processor()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        features += next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
+    return f"{platform.machine()}-{hashlib.sha256(features.encode()).hexdigest()[:12]}"
+
+
+def hashable(value: Any) -> bool:
+    """Tell whether a value can be a static argument."""
+    try:
+        hash(value)
+    except TypeError:
+        return False
+    return True
+
+
+def run_compiled(function: Callable[..., Any], *args: Any) -> Any:
+    """Run a function of arrays compiled; equal programs are compiled once, whatever function they come from.
+
+    The function is traced at each call. So it may take from outside what changes between calls, such as the weights of
+    a policy, and `jax.jit`'s rule that a function is the same as long as its name is does not apply. Where JAX is
+    transforming already, the function becomes a part of that.
+
+    Args:
+        function: Function of pytrees of arrays that returns one.
+        *args: Its arguments.
+    """
+    if _is_traced(args):
+        return function(*args)
+    program, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+    if _is_traced(program.consts):
+        return function(*args)
+    traced = _Program(str(program.jaxpr), tuple(map(id, _held_arrays(program.jaxpr))), program.jaxpr)
+    flat = _run(traced, program.consts, jax.tree.leaves(args))
+    return jax.tree.unflatten(jax.tree.structure(shape), flat)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Program:
+    """A traced function, as a static argument.
+
+    Attributes:
+        text: The program, printed.
+        held: Identities of arrays that compiled functions inside of it hold; the program keeps them alive.
+        program: The program, without the arrays that it takes from outside.
+    """
+
+    text: str
+    held: tuple[int, ...]
+    program: Any = dataclasses.field(compare=False)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _run(traced: _Program, constants: list[Any], leaves: list[Any]) -> list[Any]:
+    return jax.core.eval_jaxpr(traced.program, constants, *leaves)
+
+
+def _is_traced(tree: Any) -> bool:
+    """Tell whether an array of a pytree stands for one that a transformation of JAX will fill in."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def _held_arrays(program: Any) -> Iterator[Any]:
+    """Arrays inside the compiled functions that a program calls."""
+    for equation in program.eqns:
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda value: hasattr(value, "consts")):
+            if hasattr(value, "consts"):
+                yield from value.consts
+                yield from _held_arrays(value.jaxpr)
+            elif hasattr(value, "eqns"):
+                yield from _held_arrays(value)

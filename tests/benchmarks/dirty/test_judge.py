@@ -1,0 +1,111 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from benchmarks.command import BenchmarkError
+from benchmarks.dirty.figures import judge_scene
+from benchmarks.dirty.truth import Case, Truth, find_cases, load_truth
+from benchmarks.dirty.verdict import FAILED, MISLED, REFUSED, SILENT, VAGUE, WARNED, judge_row, list_faults
+
+LENGTH, HALF, WALL = 20.0, 2.5, 2.5  # a straight arch 5 m wide and 5 m high
+
+
+def outline(half: float = HALF, floor: float = 0.0) -> np.ndarray:
+    """A closed section about the middle of its height, m; `floor` lifts its floor."""
+    turn = np.linspace(0.0, np.pi, 37)
+    crown = np.stack([half * np.cos(turn), half * np.sin(turn)], axis=1)
+    sides = np.linspace(0.0, -WALL + floor, 9)[1:]
+    left = np.stack([np.full(8, -half), sides], axis=1)
+    bed = np.stack([np.linspace(-half, half, 21)[1:], np.full(20, -WALL + floor)], axis=1)
+    right = np.stack([np.full(7, half), sides[::-1][1:]], axis=1)
+    return np.concatenate([crown, left, bed, right])
+
+
+def scene_folder(folder: Path, section: np.ndarray, length: float = LENGTH) -> Path:
+    station = np.linspace(0.0, length, 81)
+    around = np.stack(np.broadcast_arrays(station[:, None], section[:, 0], section[:, 1]), axis=-1)
+    n, m = around.shape[:2]
+    i, j = np.meshgrid(np.arange(n - 1), np.arange(m), indexing="ij")
+    a, b, c, d = i * m + j, i * m + (j + 1) % m, (i + 1) * m + j, (i + 1) * m + (j + 1) % m
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)])
+    mesh = trimesh.Trimesh(around.reshape(-1, 3), faces, process=False)
+    (folder / "meshes").mkdir(parents=True)
+    for name in ("lining", "lining_smooth"):
+        mesh.export(folder / "meshes" / f"{name}.ply")
+    position = np.stack([station, 0 * station, 0 * station], axis=1)
+    np.savez(folder / "bore.npz", station=station, position=position, filled=np.zeros(81, bool))
+    (folder / "manifest.json").write_text(json.dumps({"frame": {"origin": [1000.0, 0.0, 0.0]}}))
+    (folder / "scene.xml").write_text('<m><geom name="sleeper_0" pos="3 0 0"/></m>')
+    return folder
+
+
+@pytest.fixture
+def truth() -> Truth:
+    station = np.arange(0.0, LENGTH + 0.01, 0.25)
+    axis = np.stack([1000.0 + station, 0 * station, 0 * station], axis=1)
+    section = outline()[:37]
+    at, k = np.meshgrid(np.arange(1.0, 19.0), np.arange(len(section)), indexing="ij")
+    wall = np.stack([1000.0 + at.ravel(), *section[k.ravel()].T], axis=1)
+    full = np.full(len(axis), 2.5)
+    return Truth(axis, wall, (1.0, 19.0), full, 2 * full, 2 * full, "none", ends=(0.0, LENGTH), plain=True)
+
+
+def test_a_scene_that_is_the_truth_has_no_errors(tmp_path: Path, truth: Truth) -> None:
+    row = judge_scene(scene_folder(tmp_path / "scene", outline()), replace(truth, track="single"))
+    assert row["wall_mean"] < 1e-6
+    assert row["wall_near"] == 1.0
+    for name in ("width", "height", "floor", "aside"):
+        assert abs(row[f"{name}_worst"]) < 1e-6, name
+    assert not list_faults(row, replace(truth, track="single"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        ({"half": HALF + 0.05}, "width +10 cm"),
+        ({"floor": 0.2}, "floor +20 cm"),
+        ({"length": LENGTH + 1.0}, "1.00 m too long"),
+        ({"length": LENGTH - 3.0}, "of the span built"),
+        ({}, "1 sleepers where no track is"),
+    ],
+)
+def test_each_fault_of_a_scene_is_named(tmp_path: Path, truth: Truth, spoil: dict, named: str) -> None:
+    length = spoil.pop("length", LENGTH)
+    row = judge_scene(scene_folder(tmp_path / "scene", outline(**spoil), length), truth)
+    assert any(named in fault for fault in list_faults(row, truth)), list_faults(row, truth)
+
+
+def test_a_wrong_scene_needs_a_warning_that_names_place_and_cause(truth: Truth) -> None:
+    truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
+    row = {"status": 0, "message": "", "faults": ["floor +70 cm"]}
+    said = "a vehicle hides the floor from 12.5 to 13.9 m"
+    assert judge_row({**row, "warnings": []}, truth) == SILENT
+    assert judge_row({**row, "warnings": ["something is odd"]}, truth) == VAGUE
+    assert judge_row({**row, "warnings": ["a vehicle hides the floor from 0.5 to 1.0 m"]}, truth) == VAGUE
+    assert judge_row({**row, "warnings": [said]}, truth) == WARNED
+
+
+def test_a_refusal_must_name_the_cause_and_the_name_of_the_file_does_not_count(truth: Truth) -> None:
+    truth = replace(truth, expect="refused", cause=("room",))
+    row = {"status": 2, "faults": [], "warnings": []}
+    assert judge_row({**row, "message": "error: out/room.laz: only 1.9 m long"}, truth) == MISLED
+    assert judge_row({**row, "message": "error: out/room.laz: a room, not a tunnel"}, truth) == REFUSED
+    assert judge_row({**row, "status": 1, "message": "ValueError: room"}, truth) == FAILED
+
+
+def test_cases_are_found_with_their_arguments_and_missing_clouds_are_said(tmp_path: Path, truth: Truth) -> None:
+    values = {"axis": truth.axis, "wall": truth.wall, "span": truth.span, "width": 5.0}
+    np.savez(tmp_path / "arch-1_truth.npz", **values, arguments=["--control", "{folder}/prism.tum"], kind="late")
+    with pytest.raises(BenchmarkError, match="no cloud arch-1"):
+        find_cases(tmp_path)
+    (tmp_path / "arch-1.ply").touch()
+    (case,) = find_cases(tmp_path)
+    assert case == Case("arch-1", tmp_path / "arch-1.ply", tmp_path / "arch-1_truth.npz", case.arguments, "late")
+    assert case.words[-1] == str(tmp_path / "prism.tum")
+    assert np.all(load_truth(case).width == 5.0)
+    with pytest.raises(BenchmarkError, match="begins with road"):
+        find_cases(tmp_path, ("road",))

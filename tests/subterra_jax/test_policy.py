@@ -1,0 +1,241 @@
+"""A policy is a function: `action, memory = policy(obs, memory)`, whatever it is made of and wherever it is named."""
+
+import dataclasses
+import shutil
+from importlib import resources
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import policies
+from subterra_jax.baselines import registry
+from subterra_jax.baselines.registry import AgentError
+from subterra_jax.episode import Driver
+from subterra_jax.evaluation import Episodes, evaluate
+from subterra_jax.policies import PolicyError, load_policy
+from subterra_jax.recorder import RecorderConfig, record
+from subterra_jax.viewer import library
+from subterra_jax.viewer.config import ViewerConfig
+from tests.subterra_jax.probes import PROBES
+
+pytestmark = pytest.mark.door
+
+TASK, DRIVEN = "Subterra/StopAtShort-v0", "Subterra/TraverseShort-v0"
+SHORT = "TraverseShort-v0"
+FEW = ("random", "StopAtShort-v0")
+LONG = tuple(
+    pytest.param(name, marks=pytest.mark.slow) for name in ("oracle", "ring-count", "ring-filter", "particle-filter")
+)
+MINE = """
+from flax import struct
+import jax.numpy as jnp
+
+@struct.dataclass
+class Slow:
+    speed: float = 0.7
+    name: str = struct.field(pytree_node=False, default="slow")
+    uses_lidar: bool = struct.field(pytree_node=False, default=False)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def begin(self, key, obs, params):
+        return ()
+
+    def act(self, key, memory, obs, params, known):
+        return jnp.stack([self.speed, 0.0, jnp.nan, 0.0, 1.0]), memory
+"""
+
+
+@pytest.fixture(scope="module")
+def world():
+    return st.make(TASK)
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """A class in a file, a policy in a file, and a run folder with two checkpoints, the newer one of the policy."""
+    (tmp_path / "mine.py").write_text(MINE)
+    data = resources.files("subterra_jax") / "data" / "policies"
+    for ending in (".safetensors", ".json"):
+        with resources.as_file(data / f"{SHORT}{ending}") as packaged:
+            shutil.copy(packaged, tmp_path / f"own{ending}")
+            newer = tmp_path / "run" / "checkpoint" / "00000120"
+            newer.mkdir(parents=True, exist_ok=True)
+            shutil.copy(packaged, newer / f"policy{ending}")
+    (tmp_path / "run" / "checkpoint" / "00000090").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+    return tmp_path
+
+
+def keep_all(now, taken, params):
+    return {"action": taken.action, "obs": taken.observation, "state": taken.before}
+
+
+@pytest.mark.parametrize("name", [*FEW, *LONG])
+def test_the_function_drives_the_very_episode_that_the_evaluation_drives(name, world):
+    env, params = world
+    policy, driver = load_policy(name, env, params), Driver(env, keep=keep_all)
+    begun = driver.begin(params, policy.agent, 5)
+    _, kept = driver.go(params, policy.agent, begun, 0, 12)
+    memory = policy.initial_memory(begun.agent_key)
+    for k in range(12):
+        state = jax.tree.map(lambda leaf, k=k: leaf[k], kept["state"]) if name == "oracle" else None
+        action, memory = policy(kept["obs"][k], memory, state)
+        np.testing.assert_allclose(action, kept["action"][k][:2], rtol=1e-5, atol=1e-6, err_msg=f"step {k}")
+
+
+def test_a_batch_is_many_robots_and_each_has_a_key_of_its_own(world):
+    env, params = world
+    policy = load_policy("random", env, params)
+    obs = jnp.ones((3, 20))
+    memory = policy.initial_memory(jax.random.key(1), 3)
+    actions, after = policy(obs, memory)
+    for k, key in enumerate(jax.random.split(jax.random.key(1), 3)):
+        alone, _ = policy(obs[k], policy.initial_memory(key))
+        np.testing.assert_allclose(actions[k], alone, rtol=1e-6)
+    assert len(np.unique(actions[:, 0])) == 3
+    mapped, _ = jax.jit(jax.vmap(policy))(obs, memory)
+    np.testing.assert_array_equal(mapped, actions)
+    anew = policy.restart(after, jnp.array([False, True, False]))
+    assert list(np.asarray(anew.steps)) == [1, 0, 1]
+    again, _ = policy(obs, anew)
+    assert not np.isclose(again[1, 0], actions[1, 0])  # another episode draws other numbers
+
+
+def test_a_rollout_gives_a_policy_its_memory_and_begins_it_anew_with_each_episode():
+    env, params = st.make(DRIVEN, horizon=7)
+    policy, batch = load_policy(SHORT, env, params), st.AutoReset(env)
+    obs, state = batch.reset(jax.random.key(0), params, 4)
+    obs, state, steps = st.rollout(batch, policy, jax.random.key(1), obs, state, params, 10)
+    assert np.asarray(steps["truncated"])[6].all()
+    fresh = policy.initial_memory(n_envs=4)
+    np.testing.assert_allclose(steps["action"][7], policy(steps["obs"][7], fresh)[0], rtol=1e-5, atol=1e-6)
+    # In the middle of an episode the memory counts: earlier observations are in it.
+    assert not np.allclose(steps["action"][6], policy(steps["obs"][6], fresh)[0], atol=1e-3)
+    assert list(np.asarray(steps["memory"].steps)) == [3] * 4
+    *_, more = st.rollout(batch, policy, jax.random.key(2), obs, state, params, 2, memory=steps["memory"])
+    assert list(np.asarray(more["memory"].steps)) == [5] * 4
+
+
+def test_a_policy_knows_its_own_task_and_a_gait_is_a_policy_too():
+    policy = st.load_policy("TraverseShort-v0")
+    assert policy.env.id == "Subterra/TraverseShort-v0"
+    obs, _ = policy.env.reset(jax.random.key(0), policy.params)
+    action, _ = policy(obs, policy.initial_memory())
+    assert policy.env.action_space(policy.params).contains(action)
+    gait = st.load_policy("B2Walk-v0")
+    action, memory = gait(jnp.zeros((5, 56)), gait.initial_memory(n_envs=5))
+    assert action.shape == (5, 12)
+    assert gait.restart(memory, jnp.ones(5, bool)) == ()
+
+
+@pytest.mark.parametrize("source", ["policy:own.safetensors", "own.safetensors", "run", "policy:run", "run/checkpoint"])
+def test_a_file_and_a_run_folder_are_policies_like_a_released_one(source, places):
+    mine, released = load_policy(source), load_policy(SHORT)
+    assert jax.tree.all(jax.tree.map(np.array_equal, mine.agent.tensors, released.agent.tensors))
+
+
+DRIVERS = ("mine.py:Slow", "policy:own.safetensors", "policy:run")
+
+
+def test_recorder_and_viewer_take_a_file_a_run_folder_and_a_class_of_other_people(places):
+    for name in DRIVERS:
+        assert name in library.Library(ViewerConfig(agent=name, recordings=places)).agents
+    trace = record(RecorderConfig(out=places / "out", task="TraverseShort", agent="mine.py:Slow", steps=3))
+    np.testing.assert_allclose(trace.command[:, 0], 0.7)
+
+
+@pytest.mark.slow
+def test_leaderboard_recorder_and_viewer_drive_with_each_of_them(places):
+    from benchmarks.leaderboard.__main__ import main as leaderboard
+
+    words = ("--tasks", "TraverseShort", "--episodes", "1", "--batch", "1", "--out", "board", "--agents", *DRIVERS)
+    assert leaderboard(list(words)) == 0
+    table = (places / "board" / "leaderboard.md").read_text()
+    assert all(f"| {name} |" in table for name in DRIVERS)
+    plan = st.load_tunnel().slice(0.0, 60.0)
+    for k, name in enumerate(DRIVERS):
+        trace = record(RecorderConfig(out=places / str(k), task="TraverseShort", agent=name, steps=3))
+        library.Library(ViewerConfig(agent=name, recordings=places))
+        parts = library.drive_episode(plan, "0", "t", "smooth", DRIVEN, name, 0)
+        next(parts)
+        for commands in (trace.command, next(parts).command[1:]):
+            assert (np.abs(commands[:, 0] - 0.7) < 1e-6).all() == (name == DRIVERS[0])
+
+
+@pytest.mark.parametrize(
+    ("source", "task", "error", "message"),
+    [
+        ("nobody", TASK, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
+        ("policy:nobody", TASK, PolicyError, r"nobody: no such policy; released are"),
+        ("empty", TASK, PolicyError, r"empty: holds no policy.safetensors; release it again"),
+        ("ring-count", None, PolicyError, r"ring-count: drives any task, so name one"),
+        ("StopAt-v0", "Subterra/TraverseShort-v0", PolicyError, r"StopAt-v0: a policy that drives to a goal"),
+        ("TraverseShort-v0", TASK, PolicyError, r"TraverseShort-v0: made for observations of 18 numbers"),
+        ("StopAt-v0", "Subterra/ReturnShort-v0", PolicyError, r"has learnt Subterra/StopAt-v0 \(to stop\)"),
+        ("B2Walk-v0", TASK, PolicyError, r"made for observations of 56 numbers, the B2 gives 20"),
+        ("pathlib:Path", TASK, AgentError, r"agent 'pathlib:Path' has no uses_lidar"),
+    ],
+)
+def test_what_cannot_drive_here_is_refused_in_one_sentence(source, task, error, message, tmp_path, monkeypatch):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(error, match=message) as refused:
+        load_policy(source, *(st.make(task) if task else ()))
+    assert "\n" not in str(refused.value)
+
+
+def test_a_call_that_lacks_something_is_refused_in_one_sentence(world):
+    env, params = world
+    policy = load_policy("fused", env, params)
+    with pytest.raises(PolicyError, match=r"fused: Subterra/StopAtShort-v0 has 20 numbers, got .* \(18,"):
+        policy(jnp.zeros(18), policy.initial_memory())
+    oracle = load_policy("oracle", env, params)
+    with pytest.raises(PolicyError, match=r"oracle: is told the truth, so call it as policy\(obs, memory, state\)"):
+        oracle(jnp.zeros(20), oracle.initial_memory())
+    several = st.make(TASK, tunnel=["subterra-351", "control"], lining="smooth")
+    policy = load_policy("fused", *several)
+    with pytest.raises(PolicyError, match=r"drives in 2 tunnels, so call it as policy\(obs, memory, state\)"):
+        policy(jnp.zeros(20), policy.initial_memory())
+    with pytest.raises(PolicyError, match="belong together"):
+        load_policy("fused", env)
+
+
+@pytest.mark.parametrize("name", PROBES)
+def test_the_function_gives_an_agent_what_it_declares_and_no_more(name):
+    agent, speed = PROBES[name]
+    env, params = st.make("Subterra/TraverseShort-v0")
+    policy = load_policy(dataclasses.replace(agent), env, params)
+    obs, state = env.reset(jax.random.key(0), params)
+    action, _ = policy(obs, policy.initial_memory(), state)
+    assert float(action[0]) == pytest.approx(speed)
+
+
+@pytest.mark.parametrize(
+    ("name", "task", "message"),
+    [
+        ("TraverseShort-v0", TASK, "ppo-mlp|TraverseShort-v0: made for observations of 18 numbers"),
+        ("StopAt-v0", "Subterra/Return-v0", r"StopAt-v0: has learnt Subterra/StopAt-v0 \(to stop\)"),
+        ("Relocalise-v0", "Subterra/StopAt-v0", "Relocalise-v0: a policy that finds out where it is"),
+    ],
+)
+def test_an_evaluation_refuses_the_policy_of_another_task_in_one_sentence(name, task, message):
+    agent, _ = policies.load(name)
+    one = np.zeros(1, np.int32)
+    with pytest.raises(PolicyError, match=message) as refused:
+        evaluate(*st.make(task), agent, Episodes(np.zeros(1, np.uint32), one, one, one))
+    assert "\n" not in str(refused.value)
+
+
+def test_an_evaluation_takes_a_policy_as_it_takes_its_agent():
+    env, params = st.make(DRIVEN, horizon=5)
+    one = np.zeros(2, np.int32)
+    episodes = Episodes(np.arange(2, dtype=np.uint32), one, one, one)
+    policy = load_policy("random", env, params)
+    by_function, by_agent = (evaluate(env, params, one, episodes) for one in (policy, policy.agent))
+    assert by_function.travelled.min() > 0.0
+    np.testing.assert_array_equal(by_function.travelled, by_agent.travelled)

@@ -1,0 +1,65 @@
+"""Planar tunnels raised upright: level beams agree with the planar LiDAR, others with the floor and the crown."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import lidar, lidar3d, procedural
+from subterra_jax.lidar import reference
+from subterra_jax.lidar3d import beams
+from subterra_jax.tunnel import Tunnel
+
+N = 64
+
+
+@pytest.fixture(scope="module")
+def family() -> tuple[list[st.TunnelPlan], lidar3d.Relief]:
+    plans = [procedural.plan(seed).slice(20.0, 90.0) for seed in range(4)]
+    return plans, lidar3d.stack_reliefs([lidar3d.Relief.from_plan(plan) for plan in plans])
+
+
+def scans(relief: lidar3d.Relief, which: np.ndarray, poses: reference.Poses, height: float, beam: np.ndarray):
+    half = 0.5 * poses.heading
+    turn = np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1).astype(np.float32)
+    place = np.column_stack([poses.position, np.full(len(half), height)]).astype(np.float32)
+
+    def one(k, p, q, s):
+        return lidar3d.scan(relief.pick(k), p, q, s, beam, 30.0)
+
+    return np.asarray(jax.jit(jax.vmap(one))(which, place, turn, poses.station))
+
+
+def test_level_beams_in_a_family_of_raised_tunnels_give_the_planar_ranges(family) -> None:
+    plans, relief = family
+    params = lidar.LidarParams()
+    for k, plan in enumerate(plans):
+        poses = reference.random_poses(plan, N, np.random.default_rng(k))
+        planar = jax.vmap(lidar.scan, (None, 0, 0, 0, None))(
+            Tunnel.from_plan(plan), *map(jnp.asarray, (poses.position, poses.heading, poses.station)), params
+        )
+        ranges = scans(relief, np.full(N, k), poses, plan.lidar_height, beams.planar(16))
+        error = np.abs(ranges - np.asarray(planar))
+        assert np.median(error) < 2e-5
+        assert (error < 1e-3).mean() > 0.995
+
+
+def test_beams_up_and_down_meet_crown_and_floor(family) -> None:
+    plans, relief = family
+    poses = reference.random_poses(plans[1], N, np.random.default_rng(9))
+    beam = np.float32([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    ranges = scans(relief, np.ones(N, int), poses, 0.7, beam)
+    np.testing.assert_allclose(ranges, np.tile([5.3, 0.7], (N, 1)), atol=1e-4)
+
+
+def test_a_packaged_tunnel_is_raised_along_its_grade_and_a_crown_below_the_lidar_is_refused() -> None:
+    plan = st.load_tunnel().slice(100.0, 40.0)
+    relief = lidar3d.Relief.from_plan(plan)
+    assert relief.n_bytes < 2e6
+    mid = len(plan.station) // 2
+    place = jnp.asarray([*plan.centre[mid], plan.elevation[mid] + 1.0], jnp.float32)
+    down = lidar3d.cast(relief, place, np.float32([[0.0, 0.0, -1.0]]), jnp.float32(plan.station[mid]), 30.0)
+    np.testing.assert_allclose(down, [1.0], atol=1e-3)
+    with pytest.raises(st.SubterraError, match=r"crown must be above the LiDAR at 0.7 m, got crown=0.5 m"):
+        lidar3d.Relief.from_plan(plan, crown=0.5)
