@@ -26,6 +26,7 @@ from scene.writing.furniture import count_pieces
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene
 from scene.writing.planar import cut_walls, save_tunnel
+from scene.writing.shell import Variant, shell_fields
 from scene.writing.track import Track, TrackConfig, describe_track, lay_track, track_provenance
 
 SCENES = ("scene.xml", "scene_furnished.xml")
@@ -56,7 +57,14 @@ def write_geometry(
     smooth.export(folder / "meshes" / "lining_smooth.ply")
     bore.save(folder / "bore.npz")
     segments = {"furnished": planar_segments(furnished.pieces, bore, track.elevation, height)}
-    save_tunnel(folder / "tunnel.npz", name, provenance, bore, track.elevation, height, walls, segments)
+    bare, dressed = (folder / scene for scene in SCENES)
+    variants = {
+        "smooth": Variant(bore, False, bare),
+        "pockets": Variant(bore, True, bare),
+        "furnished": Variant(furnished.bore if furnished.niches else bore, True, dressed),
+    }
+    shell = shell_fields(bore, track.elevation, track.config, variants)
+    save_tunnel(folder / "tunnel.npz", name, provenance, bore, track.elevation, height, walls, segments, shell)
     placed = {f"furniture_{kind}": number for kind, number in count_pieces(furnished.pieces).items()}
     count |= {**placed, "furniture_niche": len(furnished.niches), "lining_faces": len(lining.faces)}
     return count, {"furniture": "by standard, in the variant furnished alone"}

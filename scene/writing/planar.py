@@ -11,7 +11,7 @@ from scene.bore import Axis, Bore, make_axis
 from scene.errors import FitError
 from scene.writing.mesh import has_rings
 
-SCHEMA = "subterra.tunnel/1"
+SCHEMA, PLANAR_SCHEMA = "subterra.tunnel/2", "subterra.tunnel/1"
 _SAME_JOINT = 0.4  # m: less than a ring is wide
 _COLLINEAR = 0.001  # m; half of it would add half as many vertices to a smooth wall
 
@@ -100,14 +100,16 @@ def save_tunnel(
     lidar_height: float,
     variants: dict[str, Walls],
     furniture: dict[str, Float[np.ndarray, "f 4"]] | None = None,
+    shell: dict[str, np.ndarray] | None = None,
 ) -> None:
     """Writes `tunnel.npz`; docs/formats.md says what each field means. `variants` holds `smooth` first.
 
-    `furniture` holds, by variant, segments beside the walls; none where a variant is not named.
+    `furniture` holds, by variant, segments beside the walls; none where a variant is not named. Without the fields of
+    `scene.writing.shell` the file is one of the first schema, which holds the plane alone.
     """
     plan = flatten_axis(bore.axis)
     fields: dict[str, np.ndarray] = {
-        "schema": np.array(SCHEMA),
+        "schema": np.array(SCHEMA if shell else PLANAR_SCHEMA),
         "name": np.array(name),
         "provenance": np.array(provenance),
         "station": bore.station,
@@ -123,7 +125,7 @@ def save_tunnel(
         fields[f"left_{variant}"], fields[f"left_station_{variant}"] = walls.left, walls.left_station
         fields[f"right_{variant}"], fields[f"right_station_{variant}"] = walls.right, walls.right_station
         fields[f"furniture_{variant}"] = (furniture or {}).get(variant, np.empty((0, 4)))
-    np.savez_compressed(path, **fields)  # type: ignore[arg-type]
+    np.savez_compressed(path, **fields, **(shell or {}))  # type: ignore[arg-type]
 
 
 def _area(polygon: Float[np.ndarray, "k 2"]) -> float:

@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.lidar3d.cells import N_FACES, Cells, sort_triangles
+from subterra_jax.lidar3d.rolled import raise_shell
 from subterra_jax.lidar3d.surface import SMALL, Axis, Triangles, read_axis, read_scene
 from subterra_jax.lidar3d.upright import CROWN, raise_walls
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -72,19 +73,22 @@ class Relief:
 
     @classmethod
     def from_plan(cls, plan: TunnelPlan, lining: str | None = None, *, crown: float = CROWN) -> "Relief":
-        """Put a planar tunnel on the device, its walls upright between floor and crown; needs no scene folder.
+        """Put a tunnel on the device; needs no scene folder.
 
-        A plan, from a `tunnel.npz` or generated, knows its walls at the LiDAR's height alone: this is no bore as
-        surveyed, but one in which level beams meet what the planar LiDAR meets.
+        A plan with a shell gives the bore as surveyed, with recesses, track and furniture. One without knows its walls
+        at the LiDAR's height alone: they stand upright between floor and crown, and level beams meet what the planar
+        LiDAR meets.
 
         Args:
             plan: The tunnel.
             lining: Variant of its walls; `None` is `pockets`, or the first if there is none of that name.
-            crown: Height of the crown above the ground, m.
+            crown: Height of the crown above the ground, m; of a plan without a shell.
 
         Raises:
             TunnelError: The plan does not have the lining, or the crown is not above its LiDAR.
         """
+        if plan.shell is not None:
+            return cls.from_triangles(*raise_shell(plan.shell, lining or plan.default_lining))
         return cls.from_triangles(*raise_walls(plan, lining, crown))
 
     @classmethod

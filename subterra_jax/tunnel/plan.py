@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
+from subterra_jax.tunnel.shell import Shell
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,7 @@ class TunnelPlan:
         lidar_height: Height of the LiDAR plane above `elevation`, m.
         linings: Variant name to its walls.
         ring_pitch: Distance between ring joints, at which the pockets repeat, m; 0 without rings, or if unknown.
+        shell: The bore in three dimensions; `None` where it is not known.
     """
 
     name: str
@@ -70,6 +72,7 @@ class TunnelPlan:
     lidar_height: float
     linings: dict[str, Lining]
     ring_pitch: float = 0.0
+    shell: Shell | None = None
 
     @property
     def length(self) -> float:
@@ -123,6 +126,7 @@ class TunnelPlan:
                 )
                 for name, lining in self.linings.items()
             },
+            shell=None if self.shell is None else self.shell.cut(start, end),
         )
 
     def _furniture(self, lining: Lining, start: float, end: float) -> np.ndarray:

@@ -16,9 +16,10 @@ from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.versions import other_schema
 from subterra_jax.procedural import expand, generate
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
+from subterra_jax.tunnel.shell import N_BRICK, Shell, ShellLining
 from subterra_jax.tunnel.tunnel import Tunnel, stack
 
-SCHEMA = "subterra.tunnel/1"
+SCHEMA, PLANAR_SCHEMA = "subterra.tunnel/2", "subterra.tunnel/1"  # with the bore in three dimensions, and without
 AGAIN = "build the scene again with `python -m scene.build`"
 
 
@@ -87,7 +88,7 @@ def read_tunnel(path: Path) -> TunnelPlan:
         TunnelError: The file cannot be read, or a field is missing or wrong.
     """
     fields = _Fields(path)
-    if (schema := fields.text("schema")) != SCHEMA:
+    if (schema := fields.text("schema")) not in (SCHEMA, PLANAR_SCHEMA):
         raise TunnelError(f"{path}: {other_schema(schema, SCHEMA, AGAIN)}")
     station = fields.numbers("station", None)
     n = len(station)
@@ -131,6 +132,8 @@ def read_tunnel(path: Path) -> TunnelPlan:
         },
         ring_pitch=ring_pitch,
     )
+    if schema == SCHEMA:
+        plan = dataclasses.replace(plan, shell=_read_shell(fields, plan))
     for name, lining in plan.linings.items():
         for side, wall, sign in (("left", lining.left, 1.0), ("right", lining.right, -1.0)):
             if np.median(sign * _lateral(plan, wall)) <= 0.0:
@@ -138,6 +141,42 @@ def read_tunnel(path: Path) -> TunnelPlan:
                     f"{side}_{name}", f"lies to the other side of the centreline: {side} means its {side}"
                 )
     return plan
+
+
+def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
+    """Read the bore in three dimensions."""
+    n = len(plan.station)
+    angle, rise = fields.numbers("shell_angle", None), fields.numbers("shell_rise", n)
+    m = len(angle)
+    step = np.diff(angle, append=angle[:1] + 2 * np.pi) if m else np.zeros(1)
+    if m < 8 or np.any(np.abs(step - 2 * np.pi / m) > 1e-6):
+        raise fields.fail("shell_angle", "must hold at least 8 even directions over one turn")
+    if np.any(np.abs(rise) >= 1.0):
+        raise fields.fail("shell_rise", "must be above -1 and below 1")
+    unit = float(fields.numbers("shell_unit"))
+    radius = unit * fields.numbers("shell_radius", n, m).cumsum(axis=1).cumsum(axis=0)
+    section = fields.numbers("shell_section", m)
+    for name, values in (("shell_radius", radius), ("shell_section", section)):
+        if not np.all(values > 0.0):
+            raise fields.fail(name, "must give positive distances from the axis")
+    level = np.sqrt(1.0 - rise**2)[:, None]
+    return Shell(
+        station=plan.station,
+        position=np.column_stack([plan.centre, plan.elevation + fields.numbers("shell_height", n)]),
+        tangent=np.column_stack([level * plan.tangent, rise]),
+        angle=angle,
+        radius=radius,
+        section=section,
+        track=fields.numbers("shell_track", None, N_BRICK),
+        linings={
+            name: ShellLining(
+                fields.numbers(f"shell_pocket_{name}", None, 5),
+                fields.numbers(f"shell_brick_{name}", None, N_BRICK),
+                float(fields.numbers(f"shell_seam_{name}")),
+            )
+            for name in plan.linings
+        },
+    )
 
 
 def _lateral(plan: TunnelPlan, wall: Wall) -> np.ndarray:

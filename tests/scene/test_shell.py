@@ -1,0 +1,122 @@
+"""The tunnel file holds the bore in three dimensions: the triangles made from it are those of the scene."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from scene.output import write_geometry
+from scene.writing.furniture import FurnitureConfig
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import TrackConfig, lay_track
+from subterra_jax.host.errors import TunnelError
+from subterra_jax.lidar3d import rolled
+from subterra_jax.lidar3d.surface import read_axis, read_scene
+from subterra_jax.tunnel.shell import brick_corners, make_bricks
+from subterra_jax.tunnel.sources import load_tunnel, read_tunnel
+
+LININGS = ("smooth", "pockets", "furnished")
+
+
+@pytest.fixture(scope="module")
+def built(bore, tmp_path_factory):
+    """A scene folder with niches, and its plan."""
+    folder = tmp_path_factory.mktemp("built")
+    config = SceneConfig(furniture=FurnitureConfig(passage_spacing=12.0, plate_spacing=8.0))
+    write_geometry(folder, "arc", "simulated", bore, lay_track(bore, TrackConfig()), config)
+    return folder, load_tunnel(folder / "tunnel.npz")
+
+
+def spoiled(folder, target, **changed):
+    """A copy of the tunnel file with other fields; those that are `None` are gone."""
+    with np.load(folder / "tunnel.npz") as data:
+        fields = {name: data[name] for name in data.files} | changed
+    np.savez(target, **{name: value for name, value in fields.items() if value is not None})
+    return target
+
+
+@pytest.mark.parametrize("lining", LININGS)
+def test_every_corner_of_the_shell_is_one_of_the_scene_and_the_other_way_round(built, lining):
+    folder, plan = built
+    _, mine = rolled.raise_shell(plan.shell, lining)
+    theirs = read_scene(folder, lining)
+    assert len(mine.faces) == len(theirs.faces)
+    middles = [part.vertices[part.faces].mean(axis=1) for part in (mine, theirs)]
+    # Middles of a box's triangles lie elsewhere where its sides are halved along the other diagonal.
+    for a, b, most in ((mine.vertices, theirs.vertices, 1e-3), (*middles, 1.0)):
+        for near, far in ((a, b), (b, a)):
+            gap = cKDTree(far).query(near)[0]
+            assert np.median(gap) < 1e-4
+            assert gap.max() < most
+
+
+def test_the_axis_is_that_of_the_bore(built):
+    folder, plan = built
+    axis, _ = rolled.raise_shell(plan.shell, "pockets")
+    wanted = read_axis(folder / "bore.npz")
+    np.testing.assert_allclose(axis.position, wanted.position, atol=1e-9)
+    np.testing.assert_allclose(axis.tangent, wanted.tangent, atol=1e-9)
+
+
+def test_the_radius_is_kept_to_a_tenth_of_a_millimetre(built, bore):
+    _, plan = built
+    assert np.abs(plan.shell.radius - bore.radius).max() <= 0.51e-4
+    np.testing.assert_allclose(plan.shell.section, bore.radius.mean(axis=0))
+
+
+def test_recesses_that_touch_are_joined_as_in_the_scene(bore, tmp_path):
+    rows = bore.pocket.copy()
+    rows["station"][4:8] = rows["station"][4:8].mean() + np.array([0.0, 0.0, 0.13, 0.13])
+    crowded = replace(bore, pocket=rows[:12])
+    write_geometry(tmp_path, "arc", "simulated", crowded, lay_track(crowded, TrackConfig()), SceneConfig())
+    _, mine = rolled.raise_shell(load_tunnel(tmp_path / "tunnel.npz").shell, "pockets")
+    gap = cKDTree(read_scene(tmp_path, "pockets").vertices).query(mine.vertices)[0]
+    assert np.quantile(gap, 0.999) < 1e-3
+
+
+def test_a_piece_has_its_part_of_the_axis_and_no_triangle_moves(built):
+    whole_axis, whole = rolled.raise_shell(built[1].shell, "pockets")
+    axis, surface = rolled.raise_shell(built[1].slice(6.0, 12.0).slice(1.0, 10.0).shell, "pockets")
+    assert axis.station[0] == 0.0
+    assert axis.station[-1] == pytest.approx(10.0)
+    wanted = np.stack([np.interp(7.0 + axis.station, whole_axis.station, x) for x in whole_axis.position.T], axis=-1)
+    np.testing.assert_allclose(axis.position, wanted, atol=1e-9)
+    np.testing.assert_array_equal(surface.vertices, whole.vertices)
+
+
+def test_a_file_of_the_first_schema_still_gives_the_plane(built, tmp_path):
+    folder, plan = built
+    old = spoiled(folder, tmp_path / "old.npz", schema=np.array("subterra.tunnel/1"))
+    flat = read_tunnel(old)
+    assert flat.shell is None
+    np.testing.assert_array_equal(flat.linings["pockets"].left.vertex, plan.linings["pockets"].left.vertex)
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"shell_radius": None}, "field 'shell_radius' is missing"),
+        ({"shell_angle": np.zeros(360)}, "field 'shell_angle' must hold at least 8 even directions"),
+        ({"shell_unit": np.array(-1e-4)}, "field 'shell_radius' must give positive distances"),
+        ({"shell_rise": np.full(98, 1.5)}, "field 'shell_rise' must be above -1"),
+        ({"shell_track": np.full((2, 13), np.nan)}, "field 'shell_track' has a value that is not finite"),
+        ({"shell_pocket_pockets": np.zeros((2, 4))}, r"field 'shell_pocket_pockets' must have shape \(any, 5\)"),
+    ],
+)
+def test_a_spoiled_field_is_named(built, tmp_path, changed, says):
+    assert len(built[1].station) == 98
+    with pytest.raises(TunnelError, match=says):
+        read_tunnel(spoiled(built[0], tmp_path / "spoiled.npz", **changed))
+
+
+def test_an_unknown_lining_is_named(built):
+    with pytest.raises(TunnelError, match="the shell has no lining 'rough'; it has smooth, pockets, furnished"):
+        rolled.raise_shell(built[1].shell, "rough")
+
+
+def test_a_brick_has_its_corners_where_they_are_asked_for():
+    brick = make_bricks(np.array([[1.0, 2.0, 3.0]]), np.array([np.pi / 2]), np.array([[0.5, 0.2, 0.1]]), 0.2)
+    corner = brick_corners(brick)[0]
+    np.testing.assert_allclose(corner[0b111], [0.8, 2.4, 3.1], atol=1e-12)
+    np.testing.assert_allclose(corner[0b000], [1.2, 1.4, 2.9], atol=1e-12)
