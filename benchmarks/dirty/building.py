@@ -10,12 +10,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.queues import Queue
 from pathlib import Path
 from typing import Any
 
 from benchmarks.dirty.truth import Case
 
 _WARNING = re.compile(r"^\s*(?:\[[^\]]*\]\s*)?warning:?\s*(.+)$", re.IGNORECASE)
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 TIMED_OUT = -1  # status of a build that was ended because it took too long
 
 
@@ -54,6 +56,19 @@ def build_case(case: Case, scene: Path, log: Path, flags: tuple[str, ...] = (), 
     warnings = tuple(dict.fromkeys([*manifest_warnings(scene), *printed])) if code == 0 else tuple(printed)
     message = "" if code == 0 else f"ended after {limit:g} s" if code == TIMED_OUT else (lines or [""])[-1]
     return Built(code, message, warnings, time.monotonic() - started, usage.ru_maxrss / 2**20)
+
+
+def take_processor(places: "Queue[int]") -> None:
+    """Ties this process, and the builds that it will start, to one processor and to one thread of each library.
+
+    Args:
+        places: Numbers from which each process takes its own; beyond the processors they begin again.
+    """
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    place = places.get()
+    if hasattr(os, "sched_setaffinity"):
+        mine = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {mine[place % len(mine)]})
 
 
 def manifest_warnings(scene: Path) -> list[str]:

@@ -169,12 +169,14 @@ class MutationsConfig:
         folder: Folder with clouds and their truth, as `benchmarks.dirty` judges them.
         out: Folder for the mutations; those that are there are kept.
         count: Number of mutations; kinds come in turn, and each kind takes the clouds in turn.
+        first: Number of the first; several processes can so make a part each.
         seed: Draws all that is drawn.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
     out: Path
     count: int = 200
+    first: int = 0
     seed: int = 0
 
 
@@ -185,11 +187,11 @@ def make_mutations(config: MutationsConfig) -> None:
         BenchmarkError: The folder holds no clouds with truth.
         OutputError: The folder for the mutations cannot be written.
     """
-    require_least(config, count=1, seed=0)
+    require_least(config, count=1, first=0, seed=0)
     require_folder(config.out)
     cases, kinds = find_cases(config.folder), list(MUTATIONS)
     wholes: dict[str, Mutant] = {}
-    for number in range(config.count):
+    for number in range(config.first, config.first + config.count):
         kind, case = kinds[number % len(kinds)], cases[number // len(kinds) % len(cases)]
         name = f"{number:03d}-{kind}-{case.name}"
         path = config.out / f"{name}_truth.npz"
