@@ -1,4 +1,4 @@
-"""Vector types of sixteen numbers for numba, with which a kernel states its SIMD instructions.
+"""Vector types of sixteen or eight numbers for numba, with which a kernel states its SIMD instructions.
 
 LLVM splits the vectors into the registers of the processor. Operators and comparisons work between vectors and
 between a vector and a number of its kind; comparisons of floats are false where one is NaN.
@@ -19,17 +19,24 @@ _FLOAT, _INT, _BOOL = ir.FloatType(), ir.IntType(32), ir.IntType(1)
 
 
 class Lanes(types.Type):
-    """Type of a vector of 16 elements, held in registers, never in a Python array."""
+    """Type of a vector of 16 or 8 elements, held in registers, never in a Python array."""
 
-    def __init__(self, name: str, element: ir.Type, scalar: types.Type) -> None:
-        super().__init__(name=f"lanes of {name}")
-        self.vector = ir.VectorType(element, N_LANES)
+    def __init__(self, name: str, element: ir.Type, scalar: types.Type, count: int = N_LANES) -> None:
+        super().__init__(name=f"{count} lanes of {name}")
+        self.vector = ir.VectorType(element, count)
         self.scalar = scalar
+        self.count = count
 
 
 FLOATS = Lanes("float32", _FLOAT, types.float32)
 INTS = Lanes("int32", _INT, types.int32)
 MASK = Lanes("bool", _BOOL, types.boolean)
+# Half as many, for short lists: one register of AVX2.
+N_HALF = 8
+HALF_FLOATS = Lanes("float32", _FLOAT, types.float32, N_HALF)
+HALF_INTS = Lanes("int32", _INT, types.int32, N_HALF)
+HALF_MASK = Lanes("bool", _BOOL, types.boolean, N_HALF)
+_ALL_FLOATS, _ALL_INTS, _ALL_MASKS = (FLOATS, HALF_FLOATS), (INTS, HALF_INTS), (MASK, HALF_MASK)
 
 
 @register_model(Lanes)
@@ -38,32 +45,38 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(dmm, lanes, lanes.vector)
 
 
-def _widen(builder: ir.IRBuilder, kind: types.Type, value: ir.Value) -> ir.Value:
+def _of(kind: Lanes, alike: tuple[Lanes, ...]) -> Lanes:
+    """Return the type among some that has as many lanes as another."""
+    return next(one for one in alike if one.count == kind.count)
+
+
+def _widen(builder: ir.IRBuilder, kind: types.Type, value: ir.Value, count: int) -> ir.Value:
     """Return a vector unchanged, or a number repeated in every lane."""
     if isinstance(kind, Lanes):
         return value
-    vector = ir.VectorType(value.type, N_LANES)
+    vector = ir.VectorType(value.type, count)
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, _INT(0))
-    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_INT, N_LANES), [0] * N_LANES))
+    return builder.shuffle_vector(first, first, ir.Constant(ir.VectorType(_INT, count), [0] * count))
 
 
 def _define(
-    op: Callable[..., Any], kinds: tuple[Lanes, ...], result: Lanes | None, emit: Callable[..., ir.Value]
+    op: Callable[..., Any], kinds: tuple[Lanes, ...], result: tuple[Lanes, ...], emit: Callable[..., ir.Value]
 ) -> None:
-    """Teach numba a binary operator; `emit` gets the builder, the kind and two vectors."""
+    """Teach numba a binary operator; `emit` gets the builder, the kind and two vectors, and makes one of `result`."""
 
     class Template(AbstractTemplate):
         def generic(self, args: Any, kws: Any) -> Any:
             kind = next((arg for arg in args if isinstance(arg, Lanes)), None)
             if kind not in kinds or any(isinstance(arg, Lanes) and arg is not kind for arg in args):
                 return None
-            return signature(result or kind, *(arg if arg is kind else kind.scalar for arg in args))
+            return signature(_of(kind, result or (kind,)), *(arg if arg is kind else kind.scalar for arg in args))
 
     infer_global(op)(Template)
     for kind in kinds:
 
         def lower(context: Any, builder: Any, sig: Any, args: Any, kind: Lanes = kind) -> ir.Value:
-            return emit(builder, kind, *(_widen(builder, *pair) for pair in zip(sig.args, args, strict=True)))
+            wide = (_widen(builder, *pair, kind.count) for pair in zip(sig.args, args, strict=True))
+            return emit(builder, kind, *wide)
 
         for pair in ((kind, kind), (kind, kind.scalar), (kind.scalar, kind)):
             lower_builtin(op, *pair)(lower)
@@ -71,20 +84,21 @@ def _define(
 
 def _comparison(sign: str) -> Callable[..., ir.Value]:
     def emit(builder: ir.IRBuilder, kind: Lanes, a: ir.Value, b: ir.Value) -> ir.Value:
-        return builder.fcmp_ordered(sign, a, b) if kind is FLOATS else builder.icmp_signed(sign, a, b)
+        return builder.fcmp_ordered(sign, a, b) if kind in _ALL_FLOATS else builder.icmp_signed(sign, a, b)
 
     return emit
 
 
-_define(operator.add, (FLOATS,), None, lambda builder, _, a, b: builder.fadd(a, b))
-_define(operator.sub, (FLOATS,), None, lambda builder, _, a, b: builder.fsub(a, b))
-_define(operator.mul, (FLOATS,), None, lambda builder, _, a, b: builder.fmul(a, b))
-_define(operator.truediv, (FLOATS,), None, lambda builder, _, a, b: builder.fdiv(a, b))
-_define(operator.and_, (INTS, MASK), None, lambda builder, _, a, b: builder.and_(a, b))
-_define(operator.or_, (INTS, MASK), None, lambda builder, _, a, b: builder.or_(a, b))
+_define(operator.add, _ALL_FLOATS, (), lambda builder, _, a, b: builder.fadd(a, b))
+_define(operator.sub, _ALL_FLOATS, (), lambda builder, _, a, b: builder.fsub(a, b))
+_define(operator.mul, _ALL_FLOATS, (), lambda builder, _, a, b: builder.fmul(a, b))
+_define(operator.truediv, _ALL_FLOATS, (), lambda builder, _, a, b: builder.fdiv(a, b))
+_define(operator.and_, _ALL_INTS + _ALL_MASKS, (), lambda builder, _, a, b: builder.and_(a, b))
+_define(operator.or_, _ALL_INTS + _ALL_MASKS, (), lambda builder, _, a, b: builder.or_(a, b))
+_define(operator.lshift, _ALL_INTS, (), lambda builder, _, a, b: builder.shl(a, b))
 for _op, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">=")):
-    _define(_op, (FLOATS, INTS), MASK, _comparison(_sign))
-_define(operator.eq, (FLOATS, INTS), MASK, _comparison("=="))
+    _define(_op, _ALL_FLOATS + _ALL_INTS, _ALL_MASKS, _comparison(_sign))
+_define(operator.eq, _ALL_FLOATS + _ALL_INTS, _ALL_MASKS, _comparison("=="))
 
 
 def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: list[ir.Value]) -> ir.Value:
@@ -99,10 +113,11 @@ def _call(builder: ir.IRBuilder, name: str, result: ir.Type, args: list[ir.Value
 def where(typing: Any, mask: Any, then: Any, otherwise: Any) -> Any:
     """Select, lane by lane, `then` where the mask is set, else `otherwise`; one of the two may be a number."""
     kind = then if isinstance(then, Lanes) else otherwise
-    sig = signature(kind, MASK, *(arg if arg is kind else kind.scalar for arg in (then, otherwise)))
+    sig = signature(kind, _of(kind, _ALL_MASKS), *(arg if arg is kind else kind.scalar for arg in (then, otherwise)))
 
     def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return builder.select(args[0], *(_widen(builder, *pair) for pair in zip(sig.args[1:], args[1:], strict=True)))
+        wide = (_widen(builder, *pair, kind.count) for pair in zip(sig.args[1:], args[1:], strict=True))
+        return builder.select(args[0], *wide)
 
     return sig, emit
 
@@ -110,9 +125,79 @@ def where(typing: Any, mask: Any, then: Any, otherwise: Any) -> Any:
 @intrinsic
 def magnitude(typing: Any, values: Any) -> Any:
     """Return absolute values."""
-    return signature(FLOATS, FLOATS), lambda context, builder, sig, args: _call(
-        builder, f"llvm.fabs.v{N_LANES}f32", FLOATS.vector, args
+    return signature(values, values), lambda context, builder, sig, args: _call(
+        builder, f"llvm.fabs.v{values.count}f32", values.vector, args
     )
+
+
+@intrinsic
+def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return a · b + c, rounded once where the processor can; at least one is a vector, the others may be numbers."""
+    kind = next(arg for arg in (a, b, c) if isinstance(arg, Lanes))
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        wide = [_widen(builder, *pair, kind.count) for pair in zip(sig.args, args, strict=True)]
+        return _call(builder, f"llvm.fmuladd.v{kind.count}f32", kind.vector, wide)
+
+    return signature(kind, *(arg if arg is kind else kind.scalar for arg in (a, b, c))), emit
+
+
+@intrinsic
+def negative(typing: Any, values: Any) -> Any:
+    """Return floats with the other sign."""
+    return signature(values, values), lambda context, builder, sig, args: builder.fneg(args[0])
+
+
+@intrinsic
+def repeat(typing: Any, value: Any) -> Any:
+    """Return a vector of eight that has a float or an integer in every lane."""
+    kind = HALF_FLOATS if value == types.float32 else HALF_INTS
+    return signature(kind, kind.scalar), lambda context, builder, sig, args: _widen(builder, value, args[0], kind.count)
+
+
+def _extreme(which: str) -> Any:
+    @intrinsic
+    def extreme(typing: Any, values: Any) -> Any:
+        def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+            name = f"llvm.vector.reduce.f{which}.v{values.count}f32"
+            function = builder.module.globals.get(name)
+            if function is None:
+                function = ir.Function(builder.module, ir.FunctionType(_FLOAT, [values.vector]), name)
+            return builder.call(function, args, fastmath=("nnan",))
+
+        return signature(types.float32, values), emit
+
+    return extreme
+
+
+# Least and greatest of the numbers in a vector, none of which is NaN.
+lowest, highest = _extreme("min"), _extreme("max")
+
+
+@intrinsic
+def first_set(typing: Any, mask: Any) -> Any:
+    """Return the number of the first lane that is set; one of them must be."""
+
+    def emit(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        word = builder.zext(builder.bitcast(args[0], ir.IntType(mask.count)), _INT)
+        return builder.cttz(word, _BOOL(1))
+
+    return signature(types.int32, mask), emit
+
+
+@intrinsic
+def pick(typing: Any, values: Any, lane: Any) -> Any:
+    """Return the number in a lane."""
+    return signature(values.scalar, values, types.intp), lambda context, builder, sig, args: builder.extract_element(
+        *args
+    )
+
+
+@intrinsic
+def as_floats(typing: Any, values: Any) -> Any:
+    """Return integers as floats."""
+    kind = _of(values, _ALL_FLOATS)
+    return signature(kind, values), lambda context, builder, sig, args: builder.sitofp(args[0], kind.vector)
 
 
 @intrinsic

@@ -1,23 +1,40 @@
-"""The march of `lidar3d.march` for one ray after another on a CPU."""
+"""The march of `lidar3d.march` for one ray after another on a CPU: each meets eight triangles or boxes at a time."""
 
 from typing import no_type_check
 
 import numpy as np
 from numba import njit
 
-from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, NEAR_UNIT, STEP_BITS, X_BITS, YZ_BITS
-from subterra_jax.lidar3d.march import PAST, SEAM
+from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, NEAR_UNIT, X_BITS
+from subterra_jax.lidar3d.march import FINE, PAST, SEAM
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
+from subterra_jax.native.gathers import load_corners, load_rows
+from subterra_jax.native.lanes import (
+    N_HALF,
+    N_LANES,
+    as_floats,
+    first_set,
+    fma,
+    load,
+    lowest,
+    magnitude,
+    negative,
+    pick,
+    repeat,
+    where,
+)
 
 _F, _I = np.float32, np.int32
 _ZERO, _ONE, _FAR, _TINY = _F(0.0), _F(1.0), _F(np.inf), _F(1e-12)
 _PAST, _SEAM, _OVER, _MARGIN, _UNIT = _F(-PAST), _F(-SEAM), _F(1.0 + SEAM), _F(MARGIN), _F(NEAR_UNIT)
-_FACES = FACES.astype(np.float32)
+# Left and up of the faces, and as many as a vector has lanes.
+_FACES = np.concatenate([*FACES.astype(np.float32).T])
+if N_FACES != N_LANES:
+    raise ImportError(f"the march of a CPU takes {N_LANES} faces of a prism at a time, and a relief has {N_FACES}")
 _QUARTER = N_WEDGES // 4
 _SHARE = _F(1.0 / _QUARTER)
 _HALF = X_BITS // 2
-_LOW_X, _SHIFT, _LOW_STEP = (1 << _HALF) - 1, 32 - YZ_BITS, (1 << STEP_BITS) - 1
-_MIDDLE = 1 << X_BITS - 1
+_LOW_X, _MIDDLE, _FINE = _I((1 << _HALF) - 1), _F(1 << X_BITS - 1), _F(FINE)
 
 compiled = njit(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
@@ -61,38 +78,43 @@ def leaving(frame, at, ox, oy, oz, dx, dy, dz, outwards):
 
 @compiled
 @no_type_check
-def point(vertex, number):
-    """Return a vertex in units of its relief."""
-    one, two = vertex[2 * number], vertex[2 * number + 1]
-    x = ((one & _LOW_X) << _HALF) + (two & _LOW_X) - _MIDDLE
-    return _F(x), _F(one >> _SHIFT), _F(two >> _SHIFT)
+def point(one, two):
+    """Return eight vertices in units of their relief: along the axis, and `FINE` parts of them across it."""
+    x = ((one & _LOW_X) << _I(_HALF)) | (two & _LOW_X)
+    return as_floats(x), as_floats(one), as_floats(two)
+
+
+@compiled
+@no_type_check
+def minor(a, b, c, d):
+    """Return a · b − c · d."""
+    return fma(a, b, negative(c * d))
 
 
 @compiled
 @no_type_check
 def meet(vertex, entry, first, count, first_vertex, ox, oy, oz, dx, dy, dz, hit, which):
     """Compare a ray with the triangles of a list; return the nearest distance, m, and its entry."""
-    for i in range(first, first + count):
-        code = np.uint32(entry[i])
-        number = first_vertex + np.int64(code >> (2 * STEP_BITS))
-        x, y, z = point(vertex, number)
-        ax, ay, az = point(vertex, number + np.int64((code >> STEP_BITS) & _LOW_STEP))
-        bx, by, bz = point(vertex, number + np.int64(code & _LOW_STEP))
+    best, batch, last = repeat(_FAR), repeat(_I(-1)), first + count - 1
+    for i in range(first, first + count, N_HALF):
+        one, one_x, two, two_x, three, three_x = load_corners(vertex, entry, i, last, first_vertex)
+        x, y, z = point(one, one_x)
+        ax, ay, az = point(two, two_x)
+        bx, by, bz = point(three, three_x)
         ax, ay, az, bx, by, bz = ax - x, ay - y, az - z, bx - x, by - y, bz - z
         gx, gy, gz = ox - x, oy - y, oz - z
-        px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
-        det = ax * px + ay * py + az * pz
-        u, size = gx * px + gy * py + gz * pz, abs(det)
-        if det < _ZERO:
-            u = -u
-        if not (u >= _SEAM * size and u <= _OVER * size and size > _ZERO):
-            continue
-        qx, qy, qz = gy * az - gz * ay, gz * ax - gx * az, gx * ay - gy * ax
-        inverse = _ONE / det
-        u, v = (gx * px + gy * py + gz * pz) * inverse, (dx * qx + dy * qy + dz * qz) * inverse
-        t = (bx * qx + by * qy + bz * qz) * inverse
-        if v >= _SEAM and u + v <= _OVER and t >= _PAST and t < hit:
-            hit, which = t, i
+        px, py, pz = minor(bz, dy, by, dz), minor(bx, dz, bz, dx), minor(by, dx, bx, dy)
+        qx, qy, qz = minor(gy, az, gz, ay), minor(gz, ax, gx, az), minor(gx, ay, gy, ax)
+        inverse = _ONE / fma(ax, px, fma(ay, py, az * pz))
+        u = fma(gx, px, fma(gy, py, gz * pz)) * inverse
+        v = fma(qx, dx, fma(qy, dy, qz * dz)) * inverse
+        t = fma(bx, qx, fma(by, qy, bz * qz)) * inverse
+        meets = (u >= _SEAM) & (v >= _SEAM) & (u + v <= _OVER) & (t >= _PAST) & (t < best)
+        best, batch = where(meets, t, best), where(meets, _I(i), batch)
+    nearest = lowest(best)
+    if nearest < hit:
+        lane = np.intp(first_set(best == nearest))
+        return nearest, min(np.int64(pick(batch, lane)) + lane, last)
     return hit, which
 
 
@@ -100,19 +122,50 @@ def meet(vertex, entry, first, count, first_vertex, ox, oy, oz, dx, dy, dz, hit,
 @no_type_check
 def meet_boxes(box, first, count, ox, oy, oz, dx, dy, dz):
     """Compare a ray with the boxes of a list; return the nearest distance, m, and the box's number."""
-    hit, which = _FAR, -1
-    for number in range(first, first + count):
-        enter, leave = -_FAR, _FAR
+    best, batch, last = repeat(_FAR), repeat(_I(-1)), first + count - 1
+    for i in range(first, first + count, N_HALF):
+        enter, leave = repeat(-_FAR), repeat(_FAR)
         for side in range(3):
-            at = 12 * number + 4 * side
-            speed = box[at] * dx + box[at + 1] * dy + box[at + 2] * dz
-            slope = _ONE / (_TINY if abs(speed) < _TINY else speed)
-            middle = (box[at + 3] - (box[at] * ox + box[at + 1] * oy + box[at + 2] * oz)) * slope
-            enter, leave = max(enter, middle - abs(slope)), min(leave, middle + abs(slope))
-        t = enter if enter >= _PAST else leave
-        if enter <= leave and t >= _PAST and t < hit:
-            hit, which = t, number
-    return hit, which
+            a, b, c, middle = load_rows(box, i, last, side)
+            speed = fma(a, dx, fma(b, dy, c * dz))
+            slope = _ONE / where(magnitude(speed) < _TINY, _TINY, speed)
+            middle = (middle - fma(a, ox, fma(b, oy, c * oz))) * slope
+            half = magnitude(slope)
+            enter, leave = greater(enter, middle - half), less(leave, middle + half)
+        t = where(enter >= _PAST, enter, leave)
+        meets = (enter <= leave) & (t >= _PAST) & (t < best)
+        best, batch = where(meets, t, best), where(meets, _I(i), batch)
+    nearest = lowest(best)
+    if nearest < _FAR:
+        lane = np.intp(first_set(best == nearest))
+        return nearest, min(np.int64(pick(batch, lane)) + lane, last)
+    return _FAR, -1
+
+
+@compiled
+@no_type_check
+def greater(a, b):
+    """Return the greater of two numbers, lane by lane."""
+    return where(a > b, a, b)
+
+
+@compiled
+@no_type_check
+def less(a, b):
+    """Return the lesser of two numbers, lane by lane."""
+    return where(a < b, a, b)
+
+
+@compiled
+@no_type_check
+def leap(frame, f, y, z, dy, dz):
+    """Return how far a ray stays in the block's prism, in which there is nothing, m; 0 if it is not in it."""
+    left, up = load(_FACES, 0), load(_FACES, N_LANES)
+    gap = load(frame, f) - fma(left, y, up * z)
+    if lowest(gap) < _ZERO:
+        return _ZERO
+    speed = fma(left, dy, up * dz)
+    return lowest(where(speed > _TINY, gap / speed, _F(1e9)))
 
 
 @compiled
@@ -161,30 +214,29 @@ def march_rows(
             back = leaving(frame, f + 12, ox, oy, oz, dx, dy, dz, -_ONE)
             front = leaving(frame, f + 16, ox, oy, oz, dx, dy, dz, _ONE)
             leave, following = (front, link[N_LINK * here + 1]) if front <= back else (back, link[N_LINK * here])
-            enter, out = -_FAR, _FAR
-            for i in range(N_FACES):
-                speed = _FACES[i, 0] * dy + _FACES[i, 1] * dz
-                if abs(speed) < _TINY:
-                    speed = _TINY
-                crossing = (frame[f + 25 + i] - (_FACES[i, 0] * oy + _FACES[i, 1] * oz)) / speed
-                if speed > _ZERO:
-                    out = min(out, crossing)
-                else:
-                    enter = max(enter, crossing)
-            start = min(out, leave) if enter <= reached and out > reached else reached
+            qx, qy, qz = ox + reached * dx, oy + reached * dy, oz + reached * dz
+            start = min(reached + leap(frame, f + 25, qy, qz, dy, dz), max(leave, reached))
             px, py, pz = ox + start * dx, oy + start * dy, oz + start * dz
-            qz, farther = oz + reached * dz, max(min(leave, farthest) - reached, _ZERO)
+            farther = max(min(leave, farthest) - reached, _ZERO)
             if qz + farther * min(dz, _ZERO) <= frame[f + 24] and link[N_LINK * here + 5] > 0:
                 nearest, number = meet_boxes(
                     box, np.int64(link[N_LINK * here + 4]), np.int64(link[N_LINK * here + 5]),
-                    ox + reached * dx, oy + reached * dy, qz, dx, dy, dz,
+                    qx, qy, qz, dx, dy, dz,
                 )  # fmt: skip
                 if reached + nearest < hit:
                     hit, which, at_home = reached + nearest, -2 - number, here
             stop = min(min(leave, farthest), hit) - start
             low, per_cell, along, across = frame[f + 20], frame[f + 21], frame[f + 22], frame[f + 23]
             pitch = _ONE / per_cell
-            ux, uy, uz, vx, vy, vz = px * along, py * across, pz * across, dx * along, dy * across, dz * across
+            across *= _FINE
+            ux, uy, uz, vx, vy, vz = (
+                px * along + _MIDDLE,
+                py * across,
+                pz * across,
+                dx * along,
+                dy * across,
+                dz * across,
+            )
             first_vertex, first_cell = np.int64(link[N_LINK * here + 2]), np.int64(link[N_LINK * here + 3])
             forward, onward = dx > _ZERO, py * dz - pz * dy > _ZERO
             slope = _ONE / (_F(1e-9) if abs(dx) < _F(1e-9) else dx)
