@@ -125,7 +125,7 @@ def step_and_pack(env: TunnelEnv, key: Any, state: Any, action: Any, params: Env
 
 def report_shapes(env: TunnelEnv, params: EnvParams) -> tuple[Any, Report]:
     """Return shapes and dtypes of a state and of a report, without computing either."""
-    key = jax.random.key(0)
+    key = jax.eval_shape(jax.random.key, 0)
     _, state = jax.eval_shape(env.reset, key, params)
     action = jax.ShapeDtypeStruct((env.action_size,), np.float32)
     obs, _, reward, terminated, truncated, info = jax.eval_shape(env.step, key, state, action, params)

@@ -49,13 +49,17 @@ def compile_as_one_kernel(function: Callable[..., Any], *examples: Any) -> Calla
     ignores it, and the program runs as it would have without.
     """
     inner = jax.jit(function)
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+    with jax.default_device(_first_cpu()):
         try:
             from jax.experimental.xla_metadata import set_xla_metadata
 
             return jax.jit(lambda *args: set_xla_metadata(inner(*args), **_MARK)).lower(*examples).compile()
         except (ImportError, TypeError, jax.errors.JaxRuntimeError):
             return inner.lower(*examples).compile()
+
+
+def _first_cpu() -> jax.Device:
+    return jax.local_devices(backend="cpu")[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +109,9 @@ def _programs_of(env: TunnelEnv, params: EnvParams) -> _Programs:
 def _compile_programs(setting: _Setting) -> _Programs:
     """Compile reset and step as functions of two flat arrays: the stream with the state, and the action."""
     env, params = setting.env, setting.params
-    state, example = packing.report_shapes(env, params)
+    # On the device they are compiled for, or JAX would trace reset and step anew for it.
+    with jax.default_device(_first_cpu()):
+        state, example = packing.report_shapes(env, params)
     stream = jax.ShapeDtypeStruct((2,), np.uint32)
     packed = jax.eval_shape(pack, (stream, state))
     unpack = unpacker((stream, state))

@@ -150,16 +150,53 @@ def _as(memory: Any, like: Any) -> Any:
 def _act(driver: DrivingPolicy, obs: Array, memory: DrivingMemory, state: Any) -> tuple[Array, DrivingMemory]:
     def one(obs: Array, memory: DrivingMemory, state: Any) -> tuple[Array, DrivingMemory]:
         env, agent = driver.env, driver.agent
-        here = driver.params if state is None else in_tunnel(env, driver.params, state.tunnel)
-        view = look(env, agent, here, obs)
-        first = memory.steps == 0
-        begun = _as(_begin(driver, memory.key, view, here), memory.agent)
-        begun = jax.tree.map(lambda new, old: jnp.where(first, new, old), begun, memory.agent)
+        here, view = _situation(driver, obs, state)
         key = jax.random.fold_in(memory.key, memory.steps + 1)
-        action, after = ask(env, agent, key, begun, view, state, here)
+        action, after = ask(env, agent, key, memory.agent, view, state, here)
         return action[: env.action_size], DrivingMemory(memory.key, memory.steps + 1, _as(after, memory.agent))
 
+    memory = dataclasses.replace(memory, agent=_begin_where_new(driver, obs, memory, state))
     return (one if obs.ndim == 1 else jax.vmap(one))(obs, memory, state)
+
+
+def _situation(driver: DrivingPolicy, obs: Array, state: Any) -> tuple[EnvParams, Any]:
+    """Returns the task in the tunnel that a robot is in, and its observation as the agent takes it."""
+    here = driver.params if state is None else in_tunnel(driver.env, driver.params, state.tunnel)
+    return here, look(driver.env, driver.agent, here, obs)
+
+
+def _begin_where_new(driver: DrivingPolicy, obs: Array, memory: DrivingMemory, state: Any) -> Any:
+    """Returns the agents' memories, begun where an episode begins.
+
+    Few others are computed: to begin may cost as much as a step, and in most steps few episodes begin, or none.
+    """
+
+    def begin(obs: Array, memory: DrivingMemory, state: Any) -> Any:
+        here, view = _situation(driver, obs, state)
+        return _as(_begin(driver, memory.key, view, here), memory.agent)
+
+    def keep(obs: Array, memory: DrivingMemory, state: Any) -> Any:
+        return memory.agent
+
+    new, robots = memory.steps == 0, (obs, memory, state)
+    if obs.ndim == 1:
+        return jax.lax.cond(new, begin, keep, *robots)
+    n = obs.shape[0]
+    n_few = max(1, n // 32)
+
+    def few(*robots: Any) -> Any:
+        (index,) = jnp.nonzero(new, size=n_few, fill_value=n)
+        begun = jax.vmap(begin)(*jax.tree.map(lambda leaf: leaf.at[index].get(mode="clip"), robots))
+        return jax.tree.map(lambda old, some: old.at[index].set(some, mode="drop"), memory.agent, begun)
+
+    def everybody(*robots: Any) -> Any:
+        begun = jax.vmap(begin)(*robots)
+        return jax.tree.map(
+            lambda some, old: jnp.where(new.reshape(-1, *[1] * (old.ndim - 1)), some, old), begun, memory.agent
+        )
+
+    n_new = jnp.sum(new)
+    return jax.lax.switch((n_new > 0).astype(jnp.int32) + (n_new > n_few), [keep, few, everybody], *robots)
 
 
 def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | None = None) -> Policy:

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import median_filter
-from scipy.spatial import KDTree
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.tunnel.blocks import distance_to_segment
@@ -299,7 +297,9 @@ def _smooth(values: Float[np.ndarray, " n"], spacing: float) -> Float[np.ndarray
     """Return the median over `_UNEVEN` metres; values that are not finite are filled from their neighbours."""
     known = np.flatnonzero(np.isfinite(values))
     filled = np.interp(np.arange(len(values)), known, values[known])
-    return median_filter(filled, 2 * round(0.5 * _UNEVEN / spacing) + 1, mode="nearest")
+    beside = round(0.5 * _UNEVEN / spacing)
+    padded = np.pad(filled, beside, mode="edge")
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * beside + 1), axis=-1)
 
 
 def _midline(left: Float[np.ndarray, "k 2"], right: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "n 2"]:
@@ -349,6 +349,8 @@ def _reaches(
 
 def _wall(plan: TunnelPlan, name: str, vertex: Float[np.ndarray, "k 2"]) -> Wall:
     """Return a wall with the stations of its vertices."""
+    from scipy.spatial import KDTree  # half a second to import, and only tunnels by hand need it
+
     node = KDTree(plan.centre).query(vertex)[1]
     station = plan.station[node] + np.sum((vertex - plan.centre[node]) * plan.tangent[node], axis=1)
     behind = np.maximum.accumulate(station) - station
@@ -367,6 +369,8 @@ def _check_drivable(plan: TunnelPlan) -> TunnelPlan:
     Raises:
         TunnelError: It comes back to itself, a wall stands across it, or it is narrower than the robot.
     """
+    from scipy.spatial import KDTree  # as above
+
     widest = float(plan.half_width.max())
     tree, every = KDTree(plan.centre), max(1, round(1.0 / plan.station[1]))
     for i in range(0, len(plan.station), every):

@@ -1,5 +1,6 @@
 """Tracks as a cloud shows them: none in a road, two where there are two, with the gauge and sleepers that they have."""
 
+import functools
 import json
 from dataclasses import replace
 
@@ -42,6 +43,7 @@ WORLDS = {
 }
 
 
+@functools.cache
 def scanned(name: str, sensor: str = "os1") -> tuple[Cloud, Bore]:
     world = WORLDS[name]
     if sensor == "terrestrial":
@@ -51,6 +53,11 @@ def scanned(name: str, sensor: str = "os1") -> tuple[Cloud, Bore]:
         cloud = thinned(world.scan(rays, railway.carried(L, 1.4, 0.5), 0.012))
     axis = fit_centreline(cloud.points, CentrelineConfig())
     return cloud, bore_from_sections(axis, fit_sections(cloud, axis))
+
+
+@functools.cache
+def seen_in(name: str, sensor: str = "os1") -> SeenTrack:
+    return find_track(*scanned(name, sensor))
 
 
 def f1(bore: Bore, cloud: Cloud, stations: np.ndarray) -> float:
@@ -69,7 +76,7 @@ def f1(bore: Bore, cloud: Cloud, stations: np.ndarray) -> float:
 )  # fmt: skip
 def test_proud_sleepers_and_the_gauge_are_found(name, sensor, gauge):
     cloud, bore = scanned(name, sensor)
-    (line,) = find_track(cloud, bore).lines
+    (line,) = seen_in(name, sensor).lines
     assert line.rails.measured
     assert line.rails.gauge == pytest.approx(gauge, abs=0.005)
     assert line.sleepers.protrusion == pytest.approx(0.24 if name == "ballast" else 0.22, abs=0.015)
@@ -81,7 +88,7 @@ def test_proud_sleepers_and_the_gauge_are_found(name, sensor, gauge):
 
 def test_two_tracks_are_two_and_a_gauge_that_no_face_shows_is_not_seen():
     cloud, bore = scanned("double")
-    seen = find_track(cloud, bore)
+    seen = seen_in("double")
     assert [float(np.median(line.rails.offset)) for line in seen.lines] == pytest.approx([-2.1, 2.1], abs=0.03)
     assert all(f1(bore, cloud, line.sleepers.station) >= 0.9 for line in seen.lines)
     laid = lay_track(bore, TrackConfig(), seen)
@@ -93,8 +100,8 @@ def test_two_tracks_are_two_and_a_gauge_that_no_face_shows_is_not_seen():
 
 @pytest.mark.parametrize("name", ["road", "corridor"])
 def test_no_railway_is_found_where_there_is_none(name):
-    cloud, bore = scanned(name, "terrestrial")
-    seen = find_track(cloud, bore)
+    _, bore = scanned(name, "terrestrial")
+    seen = seen_in(name, "terrestrial")
     assert not seen.lines
     laid = lay_track(bore, TrackConfig(), seen)
     assert not laid.lines
@@ -103,15 +110,15 @@ def test_no_railway_is_found_where_there_is_none(name):
 
 
 def test_cant_is_measured():
-    cloud, bore = scanned("canted")
-    (line,) = find_track(cloud, bore).lines
+    _, bore = scanned("canted")
+    (line,) = seen_in("canted").lines
     turned = 1 if bore.tangent[0, 0] > 0 else -1  # left is the other side for who goes back
     assert np.median(line.rails.cant) == pytest.approx(turned * 0.08, abs=0.01)
 
 
 def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor():
-    cloud, bore = scanned("bare rails")
-    seen = find_track(cloud, bore)
+    _, bore = scanned("bare rails")
+    seen = seen_in("bare rails")
     laid = lay_track(bore, TrackConfig(), seen)
     assert len(laid.lines) == 1
     assert not len(laid.sleeper_station)
@@ -122,8 +129,8 @@ def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor
 
 
 def test_the_user_may_want_none_or_the_standard_and_rings_get_the_standard():
-    cloud, bore = scanned("proud")
-    seen = find_track(cloud, bore)
+    _, bore = scanned("proud")
+    seen = seen_in("proud")
     none = lay_track(bore, TrackConfig(lay="none"), seen)
     assert (none.lines, none.why) == ((), "none: as asked for")
     for config, shown in ((TrackConfig(lay="standard"), seen), (TrackConfig(), SeenTrack())):
@@ -143,8 +150,8 @@ def test_a_face_read_a_centimetre_off_is_no_gauge(monkeypatch):
 
 @pytest.mark.parametrize("name", ["road", pytest.param("double", marks=pytest.mark.slow)])
 def test_what_is_written_agrees_and_a_scene_without_track_loads(name, tmp_path):
-    cloud, bore = scanned(name, "terrestrial")
-    seen = find_track(cloud, bore)
+    _, bore = scanned(name, "terrestrial")
+    seen = seen_in(name, "terrestrial")
     laid = lay_track(bore, TrackConfig(), seen)
     count, _ = write_geometry(tmp_path, name, "simulated", bore, laid, SceneConfig())
     text = (tmp_path / "scene.xml").read_text()

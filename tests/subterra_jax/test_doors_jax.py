@@ -457,7 +457,7 @@ def test_a_rule_that_cannot_be_hashed_runs_all_the_same(short):
     assert after.position.shape == (2,)
 
 
-def test_gymnasium_compiles_an_environment_once(short):
+def test_gymnasium_traces_and_compiles_an_environment_once(short, monkeypatch):
     gymnasium = pytest.importorskip("gymnasium")
     first = gymnasium.make("Subterra/TraverseShort-v0")
     obs, _ = first.reset(seed=0)
@@ -467,7 +467,10 @@ def test_gymnasium_compiles_an_environment_once(short):
         np.testing.assert_array_equal(obs, again)
 
     assert count(COMPILES, second) == 0
-    other = gymnasium.make("Subterra/TraverseShort-v0", horizon=3)
+    casts, cast = [], lidar.scan
+    monkeypatch.setattr(lidar, "scan", lambda *args: casts.append(1) or cast(*args))
+    other = gymnasium.make("Subterra/TraverseShort-v0", horizon=3, lidar=LidarParams(n_beams=5))
+    assert len(casts) == 2  # by reset and by step
     other.reset(seed=0)
     assert [other.step(np.float32([0.0, 0.0]))[3] for _ in range(3)] == [False, False, True]
 

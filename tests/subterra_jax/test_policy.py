@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 import subterra_jax as st
 from subterra_jax import policies
@@ -104,6 +105,47 @@ def test_a_batch_is_many_robots_and_each_has_a_key_of_its_own(world):
     assert list(np.asarray(anew.steps)) == [1, 0, 1]
     again, _ = policy(obs, anew)
     assert not np.isclose(again[1, 0], actions[1, 0])  # another episode draws other numbers
+
+
+BEGUN: list[int] = []
+
+
+@struct.dataclass
+class Drawn:
+    """Drives at a speed drawn when its episode begins, a little faster each step, and notes how many it draws for."""
+
+    name: str = struct.field(pytree_node=False, default="drawn")
+    uses_lidar: bool = struct.field(pytree_node=False, default=False)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def begin(self, key, obs, params):
+        speed = jax.random.uniform(key)
+        return jax.pure_callback(lambda x: BEGUN.append(x.size) or x, speed, speed, vmap_method="expand_dims")
+
+    def act(self, key, memory, obs, params, known):
+        return jnp.stack([memory, 0.0, jnp.nan, 0.0, 1.0]), memory + 0.01
+
+
+def test_a_batch_begins_the_memories_of_new_episodes_and_computes_few_others(world):
+    env, params = world
+    policy, n = load_policy(Drawn(), env, params), 64
+    obs, memory = jnp.ones((n, 20)), policy.initial_memory(jax.random.key(1), n)
+    _, memory = policy(obs, memory)
+    each = jax.jit(jax.vmap(policy))
+    for new, computed in (([], 0), ([5], 2), ([0, 63], 2), ([3, 4, 63], n)):
+        done = jnp.zeros(n, bool).at[jnp.array(new, int)].set(True)
+        before = policy.restart(memory, done)
+        BEGUN.clear()
+        action, memory = policy(obs, before)
+        jax.block_until_ready(memory)
+        assert sum(BEGUN) == computed
+        alone, apart = each(obs, before)
+        np.testing.assert_array_equal(action, alone)
+        np.testing.assert_array_equal(memory.agent, apart.agent)
+        kept = np.isin(np.arange(n), new, invert=True)
+        np.testing.assert_allclose(memory.agent[kept] - before.agent[kept], 0.01, atol=1e-6)
+        assert not np.isclose(memory.agent[~kept] - before.agent[~kept], 0.01, atol=1e-4).any()
 
 
 def test_a_rollout_gives_a_policy_its_memory_and_begins_it_anew_with_each_episode():

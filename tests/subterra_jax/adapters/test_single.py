@@ -50,6 +50,7 @@ def test_both_checkers_have_nothing_to_say(task, made):
 def test_gymnasium_finds_a_task_by_module_and_id_alone_and_nothing_heavy_comes_with_it():
     # Not rich, which flax brings along.
     heavy = ("mujoco", "brax", "gymnax", "stable_baselines3", "torch", "tyro", "scene", "train", "benchmarks")
+    heavy += ("scipy.ndimage", "scipy.spatial")  # half a second of the first impression
     code = (
         "import sys, gymnasium; assert 'subterra_jax' not in sys.modules;"
         f"env = gymnasium.make('subterra_jax:{TASK}', render_mode='rgb_array'); env.reset(); env.render();"
