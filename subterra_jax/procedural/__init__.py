@@ -1,4 +1,4 @@
-"""Tunnels drawn from a family: the ranges, one tunnel of a seed, the splits, and tunnels by name.
+"""Tunnels by name: the older family of ranges, which keeps to the bit; `open_world` has linings of every kind.
 
 Tunnel i of a split has seed `SPLITS[split] + i` with i below a million, so that the splits share no seed. `train` is
 for learning, `val` for choices, `test` for published figures.
@@ -12,13 +12,26 @@ import re
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.procedural import geometry
+from subterra_jax.procedural import geometry, open_world
 from subterra_jax.procedural.geometry import Alignment, ProceduralConfig, wall
 from subterra_jax.tunnel.arrays import cut_pockets
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 from subterra_jax.tunnel.tunnel import Tunnel, stack
 
-__all__ = ["SPLITS", "Draw", "ProceduralConfig", "control", "draw", "expand", "family", "generate", "plan", "seed_of"]
+__all__ = [
+    "SPLITS",
+    "Draw",
+    "ProceduralConfig",
+    "control",
+    "default_lining",
+    "draw",
+    "expand",
+    "family",
+    "generate",
+    "open_world",
+    "plan",
+    "seed_of",
+]
 
 LININGS = ("smooth", "pockets", "furnished")
 _SIDES = {"left": 1.0, "right": -1.0}
@@ -186,7 +199,7 @@ def control() -> TunnelPlan:
 SPLIT_SIZE = 1_000_000
 SPLITS = {"train": 0, "val": SPLIT_SIZE, "test": 2 * SPLIT_SIZE}
 _NAME = re.compile(r"procedural:(\w+):(\d+)")
-_SEVERAL = re.compile(r"(procedural:\w+):(\d+)-(\d+)")
+_SEVERAL = re.compile(r"(procedural:\w+|open:[a-z:-]+):(\d+)-(\d+)")
 
 
 def seed_of(split: str, index: int) -> int:
@@ -232,7 +245,7 @@ def family(
 
 
 def expand(name: str) -> list[str]:
-    """Expand a name: `procedural:train:0-255` becomes the names of 256 tunnels, any other name stays one."""
+    """Expand a name: `open:train:0-255` becomes the names of 256 tunnels, any other name stays one."""
     match = _SEVERAL.fullmatch(name)
     if match is None:
         return [name]
@@ -242,20 +255,46 @@ def expand(name: str) -> list[str]:
     return [f"{match[1]}:{index}" for index in range(first, last + 1)]
 
 
-def generate(name: str) -> TunnelPlan:
-    """Generate a tunnel by its name: `control`, or `procedural:SPLIT:INDEX`.
+def default_lining(name: str) -> str:
+    """Return the variant of the walls that a generated tunnel has by default."""
+    return "smooth" if name == "control" else open_world.VARIANTS[0] if name.startswith("open:") else "pockets"
+
+
+def generate(name: str, linings: tuple[str, ...] | None = None, solid: bool = False) -> TunnelPlan:
+    """Generate a tunnel by its name: `control`, `procedural:SPLIT:INDEX`, or one of the open world.
+
+    Args:
+        name: The name.
+        linings: Variants to make, where the family has them; `None` for all.
+        solid: Make the bore in three dimensions too, where the family has one.
 
     Raises:
         TunnelError: The tunnel does not exist.
     """
     if name == "control":
+        _known(name, linings, ("smooth",))
         return control()
+    if name.startswith("open:"):
+        return open_world.plan(name, variants=_known(name, linings, open_world.VARIANTS), solid=solid)
     match = _NAME.fullmatch(name)
     if match is None:
         raise TunnelError(
-            f"no tunnel {name!r}; a generated one is called control or procedural:SPLIT:INDEX, as in procedural:test:7"
+            f"no tunnel {name!r}; a generated one is called control, open:SPLIT:INDEX, open:KIND:SPLIT:INDEX or "
+            f"procedural:SPLIT:INDEX, as in procedural:test:7"
         )
     try:
-        return plan(seed_of(match[1], int(match[2])), name=name)
+        return plan(seed_of(match[1], int(match[2])), name=name, linings=_known(name, linings, LININGS))
     except ValueError as error:
         raise TunnelError(f"no tunnel {name!r}: {error}") from error
+
+
+def _known(name: str, wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the wanted variants of a family.
+
+    Raises:
+        TunnelError: The family lacks one.
+    """
+    for lining in wanted or ():
+        if lining not in there:
+            raise TunnelError(f"tunnel {name!r} has no lining {lining!r}; it has {', '.join(there)}")
+    return wanted or there

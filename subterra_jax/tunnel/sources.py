@@ -14,7 +14,7 @@ import numpy as np
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.versions import other_schema
-from subterra_jax.procedural import expand, generate
+from subterra_jax.procedural import default_lining, expand, generate
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 from subterra_jax.tunnel.shell import N_BRICK, Shell, ShellLining
 from subterra_jax.tunnel.tunnel import Tunnel, stack
@@ -39,7 +39,7 @@ class _Fields:
             with np.load(path, allow_pickle=False) as data:
                 self.data = {name: data[name] for name in data.files}
         except FileNotFoundError as error:
-            by_name = f"; by name there are {', '.join(PACKAGED)}, control and procedural:SPLIT:INDEX"
+            by_name = f"; by name there are {', '.join(PACKAGED)}, control, open:SPLIT:INDEX and procedural:SPLIT:INDEX"
             a_name = path.parent == Path() and not path.suffix
             raise TunnelError(f"{path}: no such tunnel file{by_name if a_name else ''}") from error
         except Exception as error:  # zipfile, zlib and NumPy each raise their own for a damaged archive
@@ -193,7 +193,7 @@ def tunnel_of(scene: Path) -> Path:
 
 
 PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
-GENERATED = re.compile(r"control|procedural:.*")  # names of generated tunnels
+GENERATED = re.compile(r"control|procedural:.*|open:.*")  # names of generated tunnels
 
 Source = Tunnel | TunnelPlan | str | Path | None
 
@@ -204,12 +204,15 @@ def tunnel_file(path: str | Path | None) -> Traversable:
     return resources.files("subterra_jax") / "data" / f"{name}.npz" if name in PACKAGED else Path(name)
 
 
-def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
+def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> TunnelPlan:
     """Read and check a `tunnel.npz`, or generate a tunnel by its name.
 
     Args:
         path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); `control`, the bore without
-            landmarks; or `procedural:SPLIT:INDEX`, one of the family. `None` is the first packaged one.
+            landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`, one of the open world; or
+            `procedural:SPLIT:INDEX`, one of the older family. `None` is the first packaged one.
+        solid: Give a tunnel of the open world its shell too, the bore in three dimensions; a file that has one always
+            comes with it.
 
     Returns:
         The tunnel with every lining variant; `Tunnel.from_plan` puts it on the device.
@@ -219,7 +222,7 @@ def load_tunnel(path: str | Path | None = None) -> TunnelPlan:
             tunnel does not exist.
     """
     if GENERATED.fullmatch(str(path)):
-        return generate(str(path))
+        return generate(str(path), solid=solid)
     with resources.as_file(tunnel_file(path)) as file:
         return read_tunnel(file)
 
@@ -248,7 +251,7 @@ def resolve(
 
     Args:
         tunnel: A `Tunnel`, which is returned unchanged; a plan; a file or name, as for `load_tunnel`; `None` for the
-            packaged tunnel; or a list of these, which becomes one stack, as does a name like `procedural:train:0-255`.
+            packaged tunnel; or a list of these, which becomes one stack, as does a name like `open:train:0-255`.
         lining: Variant of the walls; `None` is `pockets`, or the first where a tunnel has none.
         piece: Start and length of the piece to cut out, m; `None` keeps the whole tunnel. A piece beyond the tunnel's
             end is shortened.
@@ -266,7 +269,12 @@ def resolve(
         tunnel = names
     if tunnel is not None and not isinstance(tunnel, TunnelPlan | str | Path):
         return stack([resolve(each, lining, piece, reach) for each in tunnel])
-    plan = tunnel if isinstance(tunnel, TunnelPlan) else load_tunnel(tunnel)
+    if isinstance(tunnel, TunnelPlan):
+        plan = tunnel
+    elif GENERATED.fullmatch(str(tunnel)):
+        plan = generate(str(tunnel), (lining or default_lining(str(tunnel)),))  # no more than is needed is made
+    else:
+        plan = load_tunnel(tunnel)
     if piece is not None:
         name = lining or plan.default_lining
         plan = dataclasses.replace(plan, linings={name: plan.lining(name)})  # no more than is needed is cut

@@ -1,0 +1,145 @@
+"""Things at the walls of a drawn bore: niches, boxes, walkways. They know nothing of a sensor."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from subterra_jax.procedural.kinds import BENCHES, FIXTURES, FixtureRanges
+
+if TYPE_CHECKING:
+    from subterra_jax.procedural.bore import Section
+
+_END = 2.0  # ends of a tunnel without fixtures, m
+_APART = 0.3  # least distance of two fixtures at one wall, m
+
+
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """Boxes at a wall and niches in it.
+
+    Attributes:
+        start: Station where each begins, m, `(k,)`.
+        end: Station where it ends, m.
+        side: 1 at the left wall, -1 at the right.
+        out: How far it stands out of the wall; negative for how deep a niche is, m.
+        face: Lateral of its inner face without its sign, m; of a niche, of its mouth.
+        low: Lower end above the floor, m.
+        high: Upper end above the floor, m.
+    """
+
+    start: Float[np.ndarray, " k"]
+    end: Float[np.ndarray, " k"]
+    side: Float[np.ndarray, " k"]
+    out: Float[np.ndarray, " k"]
+    face: Float[np.ndarray, " k"]
+    low: Float[np.ndarray, " k"]
+    high: Float[np.ndarray, " k"]
+
+    def where(self, chosen: Bool[np.ndarray, " k"]) -> Boxes:
+        """Return some of them."""
+        return Boxes(**{field.name: getattr(self, field.name)[chosen] for field in dataclasses.fields(self)})
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """A walkway or covered trough along a whole wall: `side` 1 left or -1 right; `width` and height of its `top`, m."""
+
+    side: float
+    width: float
+    top: float
+
+
+def draw_benches(rng: np.random.Generator, items: tuple[str, ...]) -> tuple[Bench, ...]:
+    """Draw the benches among some items; the first is on a drawn side, the second opposite."""
+    side = float(rng.choice([-1.0, 1.0]))
+    drawn = {name: (float(rng.uniform(*width)), float(rng.uniform(*top))) for name, (width, top) in BENCHES.items()}
+    chosen = [drawn[name] for name in BENCHES if name in items]
+    return tuple(Bench(side * sign, *size) for sign, size in zip((1.0, -1.0), chosen, strict=False))
+
+
+def draw_boxes(
+    rng: np.random.Generator,
+    items: tuple[str, ...],
+    section: Section,
+    shift: float,
+    length: float,
+    before: Boxes | None = None,
+) -> Boxes:
+    """Draw boxes and niches of some items.
+
+    Args:
+        rng: Source of randomness.
+        items: Names in `FIXTURES`; what comes first keeps its place, and what would overlap it is left out.
+        section: Design section.
+        shift: Lateral of its middle line, m.
+        length: Length of the tunnel, m.
+        before: Boxes that are there already.
+    """
+    none = np.zeros(0)
+    made = Boxes(*(none,) * 7)
+    for name, ranges in FIXTURES.items():
+        some = _draw_item(rng, ranges, section, shift, length)  # drawn in any case, so that none moves another
+        if name in items:
+            for other in (made, *(() if before is None else (before,))):
+                args = (some.side, some.start - _APART, some.end + _APART, some.low, some.high)
+                free = ~overlaps(other, *args)
+                some = some.where(free)
+            made = Boxes(
+                *(np.concatenate([a, b]) for a, b in zip(vars(made).values(), vars(some).values(), strict=True))
+            )
+    order = np.argsort(made.start, kind="stable")
+    return Boxes(*(values[order] for values in vars(made).values()))
+
+
+def _draw_item(rng: np.random.Generator, ranges: FixtureRanges, section: Section, shift: float, length: float) -> Boxes:
+    """Draw all fixtures of one sort."""
+    spacing = rng.uniform(*ranges.spacing)
+    size = [float(rng.uniform(*r)) for r in (ranges.length, ranges.depth, ranges.low, ranges.high)]
+    first, sign = rng.uniform(0.0, spacing), float(rng.choice([-1.0, 1.0]))
+    middle, side = [], []
+    for k in range(ranges.sides):
+        at = np.arange(first + k * spacing / ranges.sides, length, spacing)
+        middle.append(at + ranges.jitter * spacing * rng.normal(size=len(at)))
+        side.append(np.full(len(at), sign * (-1.0) ** k))
+    place, where = np.concatenate(middle), np.concatenate(side)
+    along, out, low, high = size
+    inside = (place > _END + along) & (place < length - _END - along)
+    place, where = place[inside], where[inside]
+    # The nearest of the wall within its height, so that nothing hangs in the air.
+    heights = np.linspace(max(low, 0.0), high, 9)
+    nearest = section.wall(heights).min() - max(out, 0.0)
+    full = np.full(len(place), 1.0)
+    face = nearest + where * shift
+    return Boxes(place - 0.5 * along, place + 0.5 * along, where, out * full, face, low * full, high * full)
+
+
+def overlaps(
+    boxes: Boxes,
+    side: Float[np.ndarray, " p"],
+    start: Float[np.ndarray, " p"],
+    end: Float[np.ndarray, " p"],
+    low: Float[np.ndarray, " p"],
+    high: Float[np.ndarray, " p"],
+) -> Bool[np.ndarray, " p"]:
+    """Return which rectangles on the walls overlap one of the boxes.
+
+    Args:
+        boxes: The boxes.
+        side: Wall of each rectangle, 1 left, -1 right.
+        start: Station where it begins, m.
+        end: Station where it ends, m.
+        low: Lower edge, m.
+        high: Upper edge, m.
+    """
+    hit = np.zeros(len(side), bool)
+    order = np.argsort(start)
+    longest = float(np.max(end - start, initial=0.0))
+    for i in range(len(boxes.start)):
+        rows = order[slice(*np.searchsorted(start[order], [boxes.start[i] - longest, boxes.end[i]]))]
+        meets = (side[rows] == boxes.side[i]) & (end[rows] > boxes.start[i])
+        hit[rows] |= meets & (low[rows] < boxes.high[i]) & (high[rows] > boxes.low[i])
+    return hit
