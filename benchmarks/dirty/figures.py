@@ -84,7 +84,8 @@ def size_figures(smooth: trimesh.Trimesh, truth: Truth) -> dict[str, float]:
     """Return median and worst errors of width, height, floor and middle along the judged span, m.
 
     The worst is the largest of a running median over 1.5 m. A station at which a ray from the axis leaves the mesh has
-    no error, but lowers `seen`.
+    no error, but lowers `seen`. The width is that of the widest chord, or the median of those in the truth's `band`,
+    where its own is: the widest chord between rough walls is wider than they stand apart.
     """
     frames = true_frames(truth)
     caster = Caster(smooth)
@@ -95,24 +96,44 @@ def size_figures(smooth: trimesh.Trimesh, truth: Truth) -> dict[str, float]:
     drops = [_reach(caster, frames.position + y * frames.lateral, -up) for y in FLOOR_LINES]
     rise = _reach(caster, frames.position, up)
     drop = np.max(drops, axis=0)
-    left, right = np.full((2, len(_LEVELS), len(frames.station)), np.nan)
+    left, right, level_above = np.full((3, len(_LEVELS), len(frames.station)), np.nan)
     span = np.where(np.isfinite(height), height, 2.0 * above)
     for k, level in enumerate(_LEVELS):
-        start = frames.position + (level * span + 0.5 * span - above)[:, None] * up
+        level_above[k] = level * span + 0.5 * span - above
+        start = frames.position + level_above[k][:, None] * up
         left[k], right[k] = _reach(caster, start, frames.lateral), _reach(caster, start, -frames.lateral)
-    chord = np.where(np.isfinite(left + right), left + right, -np.inf)
-    widest = np.argmax(chord, axis=0)
-    at = np.arange(len(frames.station))
+    left, right = _across(left, right, level_above, truth.band)
     errors = {
-        "width": chord[widest, at] - width,
+        "width": left + right - width,
         "height": drop + rise - height,
         "floor": above - drop,  # positive where the built floor lies too high
-        "aside": 0.5 * (left - right)[widest, at],
+        "aside": 0.5 * (left - right),
     }
     figures = {"seen": float(np.mean(np.isfinite(drop + rise)))}
     for name, error in errors.items():
         figures |= _summed(name, error, frames.station)
     return figures
+
+
+def _across(
+    left: np.ndarray, right: np.ndarray, height: np.ndarray, band: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances to the left and right wall by which a section is judged, m.
+
+    Args:
+        left: Distances to the left wall on each level, m `(levels, k)`; NaN where there is none.
+        right: Those to the right.
+        height: Heights of the levels about the axis, m.
+        band: See `Truth`.
+    """
+    if np.isfinite(band).all():
+        inside = (height >= band[0]) & (height <= band[1]) & np.isfinite(left + right)
+        masked = (np.ma.masked_array(side, ~inside) for side in (left, right))
+        middle_left, middle_right = (np.ma.median(side, axis=0).filled(np.nan) for side in masked)
+        return middle_left, middle_right
+    chord = np.where(np.isfinite(left + right), left + right, -np.inf)
+    widest, at = np.argmax(chord, axis=0), np.arange(chord.shape[1])
+    return left[widest, at], right[widest, at]
 
 
 def _reach(caster: Caster, start: np.ndarray, heading: np.ndarray) -> np.ndarray:

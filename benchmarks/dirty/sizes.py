@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 _WINDOW = 3.0  # m of the bore from which one size is read
 _LEAST = 4  # points for a size
-_BAND = (-1.5, 0.1)  # m about the axis: heights at which the walls stand upright
+BAND = (-1.5, 0.1)  # m about the axis: heights at which the walls stand upright
 _CROWN = 0.25  # m beside the axis
 _FLOOR_HALF, _FLOOR_SLACK = (
     0.5,
@@ -52,7 +52,7 @@ def measure_sizes(
     cloud = np.stack([laz.x, laz.y, laz.z], axis=1)
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(axis, axis=0), axis=1))])
     at, y, z = local_places(wall, axis, station)
-    upright = (z > _BAND[0]) & (z < _BAND[1])
+    upright = (z > BAND[0]) & (z < BAND[1])
     sides = [_quantiles(station, at[chosen], y[chosen]) for chosen in (upright & (y > 0), upright & (y < 0))]
     crown = (np.abs(y) < _CROWN) & (z > 0.0)
     top = _quantiles(station, at[crown], z[crown]) if told.crown else np.full(len(station), np.nan)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.command import BenchmarkError
-from benchmarks.dirty.sizes import DESCRIBED, measure_sizes
+from benchmarks.dirty.sizes import BAND, DESCRIBED, measure_sizes
 
 GAUGE = 1.435  # m, of the tracks in the dirty clouds
 _ENDING = "_truth.npz"
@@ -35,6 +35,7 @@ class Truth:
     sleepers: Float[np.ndarray, "k 3"] = field(default_factory=lambda: np.empty((0, 3)))  # Middles of their tops, m
     ends: tuple[float, float] = (float("nan"), float("nan"))  # Stations at which the lining ends, m
     bulge: tuple[str, ...] = ()  # Sizes judged by their median alone
+    band: tuple[float, float] = (float("nan"), float("nan"))  # Heights about the axis that `width` is the median of, m
     plain: bool = False  # True where the lining has neither rings nor pockets, and none may be called measured
     expect: str = "built"  # `built`, or `refused` where there is no tunnel
     trouble: tuple[float, float] = (float("nan"), float("nan"))  # Stations of the trouble, m
@@ -113,11 +114,11 @@ def load_truth(case: Case) -> Truth:
     }
     given |= {name: str(values[name]) for name in ("track", "expect") if name in values}
     given |= {name: float(values[name]) for name in ("proud", "gauge") if name in values}
-    given |= {name: tuple(float(v) for v in values[name]) for name in ("ends", "trouble") if name in values}
+    given |= {name: tuple(float(v) for v in values[name]) for name in ("ends", "trouble", "band") if name in values}
     given |= {name: tuple(str(v) for v in values[name]) for name in ("bulge", "cause") if name in values}
     if told is not None:
         gauge = GAUGE if told.track != "none" else float("nan")
-        given = {"track": told.track, "proud": told.proud, "gauge": gauge, "bulge": told.bulge} | given
+        given = {"track": told.track, "proud": told.proud, "gauge": gauge, "bulge": told.bulge, "band": BAND} | given
     start, end = (float(v) for v in values["span"])
     given |= {name: values[name] for name in ("sleepers",) if name in values}
     given |= {name: bool(values.get(name, False)) for name in ("plain", "must_say")}

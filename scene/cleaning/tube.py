@@ -31,6 +31,7 @@ _MOSTLY = 0.5  # the same for the usual section
 _LEAST_ROWS = 3
 _DIFFERENT = 0.3  # m
 _LAYBY = 7.0  # m: shorter is a niche
+_LONGER = (1 - 2 * _PERSISTENT) * (2 * _PRESENT + ROW)  # m by which what persists is longer than what is there
 _WIDEST = 2.0  # times the usual radius
 _AROUND = 0.5  # share of the directions that change at once where the section changes
 _HIDDEN = 0.3  # share of the directions with returns behind: what is in front stands inside
@@ -120,7 +121,7 @@ def _decide(
     wall = usual.copy()
     # Wider for a lay-by's length: the bore is wider here.
     wider = (present > usual + _DIFFERENT) & (present < _WIDEST * usual)
-    rows = round(_LAYBY / ROW)
+    rows = round((_LAYBY + _LONGER) / ROW)
     line = np.ones((rows, 1), bool)
     padded = np.pad(wider, ((rows, rows), (0, 0)), mode="edge")
     lasting = binary_opening(binary_closing(padded, np.ones((5, 1), bool)), line)[rows:-rows]

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from scene.bore import Bore
 from scene.cloud import Cloud
+from scene.fitting.evidence import steadier_than_chance
 from scene.fitting.rails import SeenRails, find_rails
 
 _BIN = 0.01  # m along
@@ -127,6 +128,8 @@ def _find_sleepers(
     centre = (first[wide] + last[wide]) / 2 * _BIN
     spacing = _usual_spacing(centre)
     if not _SPACINGS[0] < spacing < _SPACINGS[1] or wide.sum() < _MIN_SEEN * length / spacing:
+        return None
+    if not steadier_than_chance(np.diff(centre)):
         return None
     owner = _nearest_sleeper(centre, station[near])
     on_top = (np.abs(station[near] - centre[owner]) < 0.06) & (height[near] > step)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from scene.bore import POCKET
-from scene.fitting import pockets
+from scene.fitting import pockets, trackseen
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
-from scene.fitting.evidence import more_than_chance
+from scene.fitting.evidence import more_than_chance, steadier_than_chance
 from scene.fitting.section import fit_sections
 from tests.scene.clouds import curved_d_bore
 from tests.scene.scanned import arch, pillar, scan, with_outliers
@@ -58,3 +58,30 @@ def test_random_stations_are_chance_whatever_pitch_suits_them_best(count):
         wave = np.arange(0.0, 60.0, 1.5)
         joints = pockets.find_ring_joints(found["station"], 60.0)
         assert not more_than_chance(found, joints if len(joints) else wave, PITCHES, 2.75)
+
+
+def strewn_bed(rng: np.random.Generator, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Station and height of points between two rails, with lumps of 22 cm that begin at some stations, m."""
+    station = rng.uniform(0.0, 30.0, 60_000)
+    raised = (station[:, None] >= starts) & (station[:, None] < starts + 0.22)
+    return station, 0.08 * raised.any(axis=1) + rng.normal(0.0, 0.006, len(station))
+
+
+def rubble(rng: np.random.Generator) -> np.ndarray:
+    return np.cumsum(0.3 + rng.exponential(0.22, 80))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rubble_between_rails_is_no_row_of_sleepers(seed, monkeypatch):
+    rng = np.random.default_rng(seed)
+    station, height = strewn_bed(rng, rubble(rng))
+    assert trackseen._find_sleepers(station, height, 30.0, 0.25) is None
+    monkeypatch.setattr(trackseen, "steadier_than_chance", lambda gaps: True)
+    assert trackseen._find_sleepers(station, height, 30.0, 0.25) is not None, "this bed does not try the evidence"
+
+
+@pytest.mark.parametrize("pitches", [(0.6,), (0.5, 0.5, 0.75), (0.57, 0.63), (0.6, 0.6, 1.2)])
+def test_a_row_of_sleepers_is_no_chance_with_any_true_pitch_and_some_unseen(pitches):
+    rng = np.random.default_rng(2)
+    starts = np.cumsum(np.resize(pitches, 40)) + rng.normal(0.0, 0.015, 40)
+    assert steadier_than_chance(np.diff(starts[starts < 28.0]))

@@ -5,6 +5,7 @@ import pytest
 
 from scene.cleaning.clean import CleaningConfig, clean_cloud
 from scene.cleaning.removed import BEYOND, BRANCH, CAUSES, ELSEWHERE, INSIDE, SCATTERED, Cleaned
+from scene.cleaning.tube import measure_tube
 from scene.errors import FitError
 from scene.fitting.centreline import CentrelineConfig
 from scene.fitting.unroll import fill_holes, fill_nearest
@@ -171,3 +172,15 @@ def test_a_wall_unseen_beside_a_train_goes_on_as_before_and_behind():
     assert np.abs(filled - seen)[30:80, 10:50].max() < 0.03
     assert np.isnan(filled[5, 5])  # small holes are filled from all around
     assert np.nanmax(np.abs(fill_nearest(field) - seen)) > 0.2  # which would bulge here
+
+
+@pytest.mark.parametrize(("length", "bore"), [(5.0, False), (9.0, True)])
+def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, bore):
+    rng = np.random.default_rng(6)
+    station, angle = rng.uniform(0.0, 90.0, 200_000), rng.uniform(-np.pi, np.pi, 200_000)
+    beside = (np.abs(station - 45.0) < length / 2) & (np.abs(angle) < 0.5)
+    radius = np.where(beside, 4.0, 2.75) + rng.normal(0.0, 0.01, len(station))
+    tube = measure_tube(station, angle, radius, 90.0, 8.0)
+    row = round((45.0 - tube.grid.start) / tube.grid.step)
+    wall = float(np.median(tube.wall[row - 2 : row + 3][:, np.abs(tube.grid.angle) < 0.3]))
+    assert wall == pytest.approx(4.0 if bore else 2.75, abs=0.15)

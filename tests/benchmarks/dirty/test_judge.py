@@ -79,6 +79,19 @@ def test_each_fault_of_a_scene_is_named(tmp_path: Path, truth: Truth, spoil: dic
     assert any(named in fault for fault in list_faults(row, truth)), list_faults(row, truth)
 
 
+def test_rough_walls_are_as_wide_as_they_stand_apart_and_no_wider(tmp_path: Path, truth: Truth) -> None:
+    section = outline()
+    rough = section.copy()
+    rough[:, 0] *= 1.0 + 0.02 * np.cos(section[:, 1] * 2.0 * np.pi / 0.8)  # 5 cm in and out
+    folder = scene_folder(tmp_path / "scene", rough)
+    assert judge_scene(folder, truth)["width"] > 0.05  # its widest chord
+    banded = replace(truth, band=(-1.7, -0.1))  # two waves
+    assert abs(judge_scene(folder, banded)["width"]) < 0.02
+    wide = judge_scene(scene_folder(tmp_path / "wide", outline(HALF + 0.05)), banded)
+    assert abs(wide["width"] - 0.1) < 1e-6
+    assert abs(wide["aside"]) < 1e-6
+
+
 def test_a_wrong_scene_needs_a_warning_that_names_place_and_cause(truth: Truth) -> None:
     truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
     row = {"status": 0, "message": "", "faults": ["floor +70 cm"]}
