@@ -47,7 +47,7 @@ def test_the_variance_of_a_wandering_error_is_its_double_integral():
 def test_the_first_look_finds_both_walls_and_the_angle_between_them(params, angle):
     look = jax.jit(steering.track_walls)
     ranges = jnp.asarray(between_walls(2.5, 3.1, angle))
-    found = steering.find_walls(ranges, params)
+    found = jax.jit(steering.find_walls)(ranges, params)
     for _ in range(20):
         found = look(found, ranges, params)
     np.testing.assert_allclose([found.left, found.right, found.angle], [2.5, 3.1, angle], atol=2e-3)
@@ -111,14 +111,15 @@ def test_a_box_in_the_way_slows_it_down_and_has_it_choose_another_lane(params):
     ranges[0] = 2.0
     avoid = Avoidance()
     clear = observation(ranges=jnp.asarray(between_walls(2.8, 2.8, 0.0)))
-    memory = avoid.begin(clear, params)
-    free = avoid.look(memory, clear, jnp.zeros(2), params)
+    memory, look = avoid.begin(clear, params), jax.jit(avoid.look)
+    free = look(memory, clear, jnp.zeros(2), params)
     assert abs(free.lane) < 0.05
-    blocked = avoid.look(memory, observation(ranges=jnp.asarray(ranges)), jnp.zeros(2), params)
+    blocked = look(memory, observation(ranges=jnp.asarray(ranges)), jnp.zeros(2), params)
     assert abs(blocked.lane) >= params.vehicle.radius + avoid.margin
-    assert avoid.steer(free, jnp.float32(2.0), params)[0] == pytest.approx(avoid.speed)
+    steer = jax.jit(avoid.steer)
+    assert steer(free, jnp.float32(2.0), params)[0] == pytest.approx(avoid.speed)
     near = dataclasses.replace(blocked, along=blocked.along - 1.3, lane=jnp.zeros(()))
-    assert 0.05 < avoid.steer(near, jnp.float32(2.0), params)[0] < 0.3
+    assert 0.05 < steer(near, jnp.float32(2.0), params)[0] < 0.3
 
 
 def test_where_a_corner_is_near_it_turns_steeper_to_its_lane_than_where_the_way_is_free(params):
