@@ -44,8 +44,8 @@ def compiled(*static: str) -> Callable[[_Method], _Method]:
 
 @contextlib.contextmanager
 def in_32_bits() -> Iterator[None]:
-    """Compute as JAX does by default, whatever the mode; agents do. Also a decorator."""
-    with jax.enable_x64(False):
+    """Compute as JAX does by default, whatever the mode: 32 bits, lenient promotion; agents do. Also a decorator."""
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 

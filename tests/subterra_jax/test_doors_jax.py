@@ -17,10 +17,13 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import lidar, native
+from subterra_jax import lidar, lidar3d, native
 from subterra_jax.baselines import registry
 from subterra_jax.lidar import LidarParams
+from subterra_jax.lidar3d import beams
+from subterra_jax.lidar3d.surface import Axis, Triangles
 from subterra_jax.parts.unicycle import clearance
+from tests.subterra_jax import surfaces
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 pytestmark = pytest.mark.door
@@ -78,6 +81,24 @@ def test_every_kind_of_task_runs_in_it_and_keeps_32_bits(task, settings):
     for path, leaf in jax.tree_util.tree_flatten_with_path((shapes, one, params))[0]:
         assert leaf.dtype in (jnp.float32, jnp.int32, jnp.uint32, jnp.bool_), (path, leaf.dtype)
         assert not leaf.weak_type, path
+
+
+@pytest.mark.parametrize("settings", [wide, strict])
+@pytest.mark.parametrize("kernels", [pytest.param(True, marks=needs_kernels), False])
+def test_the_lidar_in_three_dimensions_and_its_derivatives_run_in_it(settings, kernels, monkeypatch):
+    axis = surfaces.axis_of(12.0)
+    surface = surfaces.tube(axis, 2.0, 12, 7)
+    relief = lidar3d.Relief.from_triangles(Axis(**axis), Triangles(*surface))
+    if not kernels:
+        monkeypatch.setattr(native, "supported", lambda: False)
+
+    def scan(position, orientation, station):
+        return lidar3d.scan(relief, position, orientation, station, beams.planar(5), 30.0)
+
+    where = jnp.array([6.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.float32(6.0)
+    with settings():
+        for function in (scan, jax.jacfwd(scan), jax.jacrev(scan), jax.vmap(scan, (None, None, None), axis_size=2)):
+            assert jax.eval_shape(function, *where).dtype == jnp.float32
 
 
 def test_the_same_episodes_come_out():
