@@ -22,7 +22,7 @@ from scene.reconstruct import Reconstruction, reconstruct
 from scene.resume import Partial, partial_folder
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.host.files import replace_folder, require_folder
+from subterra_jax.host.files import replace_file, replace_folder, require_folder
 from subterra_jax.host.loading import load_module
 
 _POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
@@ -102,8 +102,11 @@ def build(
             judgement = _write(folder, source, config.name or out.name, result, config)
             _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
         partial.discard()
-    except (RecordingError, FitError):
+        _page_of_refusal(out).unlink(missing_ok=True)  # of an earlier try
+    except (RecordingError, FitError) as error:
         partial.discard()  # the input is at fault, and would be again
+        if isinstance(error, DoubtError) and error.page:
+            raise _leave_page(error, out) from error
         raise
     finally:
         partial.close()
@@ -127,7 +130,19 @@ def _write(folder: Path, source: Path, name: str, result: Reconstruction, config
     try:
         return write_scene_folder(folder, name, result, config)
     except DoubtError as error:
-        raise DoubtError(f"{source}: {error}") from error
+        raise DoubtError(f"{source}: {error}", error.page) from error
+
+
+def _page_of_refusal(out: Path) -> Path:
+    """Return the place of the report on a build that was refused: beside its folder, which stays as it was."""
+    return out.with_name(f"{out.name}-refused.html")
+
+
+def _leave_page(error: DoubtError, out: Path) -> DoubtError:
+    """Writes the report of a refused build; returns the error with the place of the report in its sentence."""
+    with replace_file(_page_of_refusal(out)) as fresh:
+        fresh.write_text(error.page, encoding="utf-8")
+    return DoubtError(f"{error} ({_page_of_refusal(out)} shows why)")
 
 
 def _print_time(started: float, text: str) -> None:

@@ -15,8 +15,8 @@ import trimesh
 from scene.bore import Bore
 from scene.cloud import thin_cloud
 from scene.errors import FitError
-from scene.judging.judge import STATION, Judgement, JudgingConfig, judge_bore, require_trust
-from scene.judging.page import write_page
+from scene.judging.judge import STATION, DoubtError, Judgement, JudgingConfig, judge_bore, require_trust
+from scene.judging.page import render_page
 from scene.judging.returns import TrackZone
 from scene.judging.sanity import doubt_bore
 from scene.poses.trajectory import save_tum
@@ -157,7 +157,12 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
     bore = result.bore
     track = lay_track(bore, config.track, result.seen)
     judgement = judge_reconstruction(result, track, config.judging)
-    require_trust(judgement, config.judging.force)
+    removed = [{**vars(part), "warning": part.warning} for part in result.removed]
+    try:
+        require_trust(judgement, config.judging.force)
+    except DoubtError as error:
+        shown = {"detected": result.facts, "removed": removed}
+        raise DoubtError(str(error), render_page(name, bore, judgement, shown)) from error
     count, furnished = write_geometry(folder, name, config.provenance, bore, track, config.scene)
     content = {
         "name": name,
@@ -189,9 +194,9 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
         },
     }
     content["judgement"] = judgement.facts
-    content["removed"] = [{**vars(part), "warning": part.warning} for part in result.removed]
+    content["removed"] = removed
     write_stations(folder / "stations.csv", judgement)
-    write_page(folder / "build.html", name, result.bore, judgement, content)
+    (folder / "build.html").write_text(render_page(name, bore, judgement, content), encoding="utf-8")
     write_manifest(folder / "manifest.json", content, config)
     if result.cloud is not None:
         trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")

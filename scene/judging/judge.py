@@ -30,7 +30,16 @@ STATION = np.dtype([
 
 
 class DoubtError(FitError):
-    """A bore was built, but it explains too little of what the scanner saw, or cannot be a tunnel."""
+    """A bore was built, but it explains too little of what the scanner saw, or cannot be a tunnel.
+
+    Attributes:
+        page: HTML of the report that shows why; empty where there is none.
+    """
+
+    def __init__(self, message: str, page: str = "") -> None:
+        """Keeps the sentence for the user and the report."""
+        super().__init__(message)
+        self.page = page
 
 
 @dataclass(frozen=True)
@@ -235,7 +244,11 @@ def _tabulate(bore: Bore, returns: Returns, coverage: Coverage, cause: np.ndarra
 
 
 def require_trust(judgement: Judgement, force: bool) -> None:
-    """Raises `DoubtError` where a warning refuses the bore and `force` is not set."""
+    """Raises `DoubtError` where a warning refuses the bore and `force` is not set.
+
+    Poses that blur the walls are named first: what is wrong with the bore follows from them.
+    """
     grave = [warning for warning in judgement.warnings if warning.refuses]
     if grave and not force:
-        raise DoubtError(f"{grave[0].text}; --force builds it all the same")
+        poses = [f"{warning.text}; so " for warning in judgement.warnings if warning.code == "poses"]
+        raise DoubtError(f"{''.join(poses)}{grave[0].text}; --force builds it all the same")

@@ -1,6 +1,5 @@
 """`build.html`: one page that shows what was seen, cut, filled and doubted; it needs neither network nor script."""
 
-from pathlib import Path
 from typing import Any
 
 from scene.bore import Bore
@@ -26,11 +25,10 @@ _KEY = (
 _LEAST_SHOWN = 0.002  # a station whose unexplained share is less makes no picture
 
 
-def write_page(path: Path, name: str, bore: Bore, judgement: Judgement, content: dict[str, Any]) -> None:
-    """Writes the report of a build; the same build gives the same bytes.
+def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, Any]) -> str:
+    """Return the report of a build as HTML; the same build gives the same text.
 
     Args:
-        path: The file.
         name: Name of the tunnel.
         bore: The bore as built.
         judgement: What it explains.
@@ -48,12 +46,11 @@ def write_page(path: Path, name: str, bore: Bore, judgement: Judgement, content:
         parts += ["<h2>Station by station</h2>", draw_strips(judgement, bore.length),
                   "<p>The same as numbers is in <code>stations.csv</code>.</p>"]  # fmt: skip
     parts += [*_sections(bore, judgement), *_tables(judgement, content)]
-    page = (
+    return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{text(name)}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>\n"
     )
-    path.write_text(page, encoding="utf-8")
 
 
 def _warnings(judgement: Judgement) -> list[str]:

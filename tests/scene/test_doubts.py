@@ -13,7 +13,7 @@ from scene.bore import STATION_STEP, Bore, axis_through
 from scene.build import build
 from scene.cleaning.crop import ExtentConfig
 from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
-from scene.judging.page import write_page
+from scene.judging.page import render_page
 from scene.judging.sanity import doubt_bore
 from scene.output import BuildConfig
 from scene.reconstruct import ReconstructConfig
@@ -111,13 +111,10 @@ def test_what_nobody_measured_is_said(bore):
     assert not doubt_bore(bore, METRES, {"pockets": "by standard"}, surveyed=False)
 
 
-def test_the_page_shows_warnings_and_worst_stations_and_needs_nothing_else(bore, tmp_path):
+def test_the_page_shows_warnings_and_worst_stations_and_needs_nothing_else(bore):
     cloud = cloud_of(about(bore, *on_wall(bore)), block(bore, (9, 15), (-1, 1), (-3.1, -1.0)))
     judgement = judge_bore(bore, cloud, JudgingConfig())
-    pages = []
-    for name in ("a", "b"):
-        write_page(tmp_path / name, "<bore> & co", bore, judgement, {"provenance": {"bore": "measured"}})
-        pages.append((tmp_path / name).read_text())
+    pages = [render_page("<bore> & co", bore, judgement, {"provenance": {"bore": "measured"}}) for _ in range(2)]
     assert pages[0] == pages[1]
     page = pages[0]
     assert "&lt;bore&gt; &amp; co" in page
@@ -156,14 +153,20 @@ def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys)
     assert table["inside"][8:13].mean() > table["inside"][:6].mean() + 0.05
 
 
-def test_a_build_that_explains_too_little_leaves_nothing_and_force_builds_it(with_vehicle, tmp_path):
+def test_a_build_that_explains_too_little_leaves_its_report_alone_and_force_builds_it(with_vehicle, tmp_path):
     config = BuildConfig(judging=JudgingConfig(refuse_above=0.01))
     with pytest.raises(DoubtError, match=r"vehicle\.ply: \d+% of the returns .* --force builds it all the same"):
         build(with_vehicle, tmp_path / "bore", config=config)
-    assert not list(tmp_path.iterdir())
+    (report,) = tmp_path.iterdir()
+    assert report.name == "bore-refused.html"
+    page = report.read_text()
+    assert 'class="warn grave"' in page
+    assert "% of the returns lie further than 10 cm" in page
+    assert "<figure>" in page
     forced = replace(config, judging=replace(config.judging, force=True))
     build(with_vehicle, tmp_path / "bore", config=forced)
     assert (tmp_path / "bore" / "build.html").exists()
+    assert not report.exists()
 
 
 def test_a_build_says_where_its_stations_begin_and_which_way_they_grow(with_vehicle, tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 from scene.bore import Bore
 from scene.cleaning.removed import CAUSES
 from scene.cloud import Cloud
-from scene.judging.judge import DoubtError, JudgingConfig, judge_bore, require_trust
+from scene.judging.judge import DoubtError, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
 FLOOR = -3.2
@@ -154,6 +154,14 @@ def test_a_bore_that_explains_too_little_is_refused_unless_forced(bore, wall):
         require_trust(judgement, force=False)
     require_trust(judgement, force=True)
     require_trust(judge_bore(bore, cloud_of(wall, raised), JudgingConfig(refuse_above=0.6)), force=False)
+
+
+def test_poses_that_blur_the_walls_are_named_before_what_came_of_them(bore, wall):
+    raised = about(bore, *on_wall(bore, 60_000, outward=-0.5, seed=3))
+    judgement = judge_bore(bore, cloud_of(wall, raised), JudgingConfig())
+    blurred = replace(judgement, warnings=(*judgement.warnings, Warned("poses", "the poses blur the walls")))
+    with pytest.raises(DoubtError, match=r"^the poses blur the walls; so 50% of the returns"):
+        require_trust(blurred, force=False)
 
 
 def test_what_was_cut_away_as_another_tunnel_refuses_nothing(bore, wall):
