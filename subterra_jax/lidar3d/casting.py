@@ -18,12 +18,11 @@ from subterra_jax import native
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d import fused
-from subterra_jax.lidar3d.march import FINE, Hits, Tools, corners, march
+from subterra_jax.lidar3d.march import FINE, Hits, Tools, corners
+from subterra_jax.lidar3d.relay import march_in_relay
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.rows import axes, spread
 
-# Rays that XLA marches in step: each round costs the same for all, and the last round is that of the slowest ray.
-_IN_STEP = 256
 # Memory of a ray, bytes: origin, direction, block, limit, distance, entry, block again, each once more as a row.
 _BYTES = 2 * 4 * 11
 
@@ -255,7 +254,8 @@ def _tools(relief: Relief) -> Tools:
 
     def one(name: str, index: Array, mask: Array | None) -> Array:
         index = index if mask is None else jnp.where(mask, index, 0)
-        value = arrays[name].at[index].get(mode="promise_in_bounds")
+        # Once, and not again in every program that uses the value.
+        value = lax.optimization_barrier(arrays[name].at[index].get(mode="promise_in_bounds"))
         return value if mask is None else jnp.where(mask, value, 0)
 
     def load(name: str, index: Array, mask: Array | None = None) -> Any:
@@ -300,17 +300,5 @@ def _find_more(axis_size: int, batched: Any, relief: Relief, *rows: Array) -> tu
 
 
 def _find_in_step(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Hits:
-    """Find the first triangles by XLA, some thousand rays at a time."""
-
-    def some(rows: tuple[Array, ...]) -> Hits:
-        o, d, block, limit = rows
-        return march(_tools(relief), relief.n_x, tuple(o.T), tuple(d.T), block, limit)
-
-    n = len(blocks)
-    rows = (origins, directions, blocks, limits)
-    if n <= _IN_STEP:
-        return some(rows)
-    # The last part is filled up with the first rays.
-    which = jnp.arange(-(-n // _IN_STEP) * _IN_STEP).reshape(-1, _IN_STEP) % n
-    hits = lax.map(lambda chosen: some(tuple(row[chosen] for row in rows)), which)
-    return Hits(*(part.reshape(-1)[:n] for part in hits))
+    """Find the first triangles by XLA."""
+    return march_in_relay(_tools(relief), relief.n_x, origins, directions, blocks, limits)

@@ -114,6 +114,47 @@ def _any(mask: Bool[Array, "n"]) -> Bool[Array, ""]:
 
 def _cross_block(tools: Tools, n_x: int, origin: Point, direction: Point, limit: Array, rays: Rays) -> Rays:
     """Take each ray that goes on through its block."""
+    way = enter_block(tools, origin, direction, limit, rays)
+    found, entry = _cross_cells(tools, n_x, way, rays.going & (way.end >= 0.0))
+    return leave_block(rays, way, limit, Hits(way.begin + found, entry, rays.block))
+
+
+class Way(NamedTuple):
+    """Ways of rays through one block each, in its frame; distances are from the rays' origins if not said otherwise.
+
+    Attributes:
+        at: Points where the rays leave the empty prism, m.
+        d: Unit vectors.
+        begin: Distance to these points, m.
+        end: Distance from there to where the ray leaves the block, or needs go no further, m.
+        leave: Distance at which the ray leaves the block, m.
+        following: Block behind or ahead that it enters then; -1 at a mouth.
+        hits: First triangles or boxes met so far, those in earlier blocks and the boxes of this one.
+        low: Where the first cell begins along the axis, m.
+        per_cell: Cells a metre.
+        along: Units of a vertex along the axis, 1/m.
+        across: Units of a vertex across the axis, 1/m.
+        first_vertex: First vertex of the block.
+        first_cell: First cell of the block.
+    """
+
+    at: tuple[Array, ...]
+    d: tuple[Array, ...]
+    begin: Float[Array, "n"]
+    end: Float[Array, "n"]
+    leave: Float[Array, "n"]
+    following: Int[Array, "n"]
+    hits: Hits
+    low: Float[Array, "n"]
+    per_cell: Float[Array, "n"]
+    along: Float[Array, "n"]
+    across: Float[Array, "n"]
+    first_vertex: Int[Array, "n"]
+    first_cell: Int[Array, "n"]
+
+
+def enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, rays: Rays) -> Way:
+    """Put each ray into the frame of its block, meet the boxes there, and leap through the empty prism."""
     row = rays.block * N_FRAME
     frame = lambda i: tools.load("frame", row + i)  # noqa: E731
     link = lambda i: tools.load("link", rays.block * N_LINK + i)  # noqa: E731
@@ -134,10 +175,16 @@ def _cross_block(tools: Tools, n_x: int, origin: Point, direction: Point, limit:
     begin = jnp.minimum(rays.reached + leap, jnp.maximum(leave, rays.reached))
     at = [tools.fma(begin - rays.reached, d[i], at[i]) for i in range(3)]
     end = jnp.minimum(jnp.minimum(leave, limit), hits.distance) - begin
-    found, entry = _cross_cells(tools, n_x, frame, link, at, d, end, rays.going & (end >= 0.0))
-    hits = _nearer(hits, Hits(begin + found, entry, rays.block))
-    going = rays.going & (leave < jnp.minimum(limit, hits.distance)) & (following >= 0)
-    return Rays(jnp.where(going, following, rays.block), jnp.where(going, leave, rays.reached), hits, going)
+    numbers = [frame(i) for i in range(20, 24)]
+    return Way(tuple(at), tuple(d), begin, end, leave, following, hits, *numbers, link(2), link(3))
+
+
+def leave_block(rays: Rays, way: Way, limit: Array, found: Hits) -> Rays:
+    """Return rays in their next blocks, with what they met in the last."""
+    hits = _nearer(way.hits, found)
+    going = rays.going & (way.leave < jnp.minimum(limit, hits.distance)) & (way.following >= 0)
+    following, reached = jnp.where(going, way.following, rays.block), jnp.where(going, way.leave, rays.reached)
+    return Rays(following, reached, hits, going)
 
 
 def _nearer(one: Hits, other: Hits) -> Hits:
@@ -196,52 +243,106 @@ class Step(NamedTuple):
     going: Bool[Array, "n"]
 
 
-def _cross_cells(
-    tools: Tools, n_x: int, frame: Any, link: Any, at: list[Array], d: list[Array], end: Array, going: Array
-) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
-    """Return the distance at which rays meet a triangle in their block, m, or `inf`, and its entry."""
-    along, across = frame(22), frame(23) * FINE
+class Ray(NamedTuple):
+    """Rays among the cells of their blocks.
+
+    Attributes:
+        units: Points where they begin, in units of the relief along the axis, and a `FINE` part of them across it.
+        speeds: Changes of these over a metre.
+        x: Places along the axis where they begin, in cells from the first.
+        slope: Metres that they go for each cell along the axis.
+        forward: 1 for rays along the axis, 0 for those against it.
+        onward: True for rays that turn to the next wedge, not to the one before.
+    """
+
+    units: Point
+    speeds: Point
+    x: Float[Array, "n"]
+    slope: Float[Array, "n"]
+    forward: Int[Array, "n"]
+    onward: Bool[Array, "n"]
+
+
+def ray_in_cells(tools: Tools, way: Way) -> Ray:
+    """Return what rays in their blocks need at every cell."""
+    at, d, along, across = way.at, way.d, way.along, way.across * FINE
     # Vertices count from 0 along the axis.
     units = (tools.fma(at[0], along, 0.5 * (1 << X_BITS)), at[1] * across, at[2] * across)
     speeds = (d[0] * along, d[1] * across, d[2] * across)
-    first_vertex, first_cell = link(2), link(3)
     forward = jnp.where(d[0] > 0.0, 1, 0)
     onward = tools.minor(at[1], d[2], at[2], d[1]) > 0.0
-    # In cells from the first.
-    x = (at[0] - frame(20)) * frame(21)
-    slope = tools.reciprocal(jnp.where(jnp.abs(d[0]) < 1e-9, 1e-9, d[0]) * frame(21))
+    slope = tools.reciprocal(jnp.where(jnp.abs(d[0]) < 1e-9, 1e-9, d[0]) * way.per_cell)
+    return Ray(units, speeds, (at[0] - way.low) * way.per_cell, slope, forward, onward)
+
+
+def first_step(tools: Tools, n_x: int, way: Way, ray: Ray, going: Bool[Array, "n"]) -> Step:
+    """Return rays in the cells where they begin."""
+    first_x = jnp.clip(ray.x, 0.0, n_x - 1.0).astype(jnp.int32)
+    wedge = wedge_at(tools, way.at[1], way.at[2])
+    nothing = jnp.full_like(way.end, jnp.inf)
+    return Step(first_x, wedge, jnp.zeros_like(way.end), nothing, jnp.full_like(first_x, -1), going)
+
+
+class Stay(NamedTuple):
+    """Stays of rays in one cell each.
+
+    Attributes:
+        first: First entry of the cell's list.
+        count: Number of entries that the ray must be compared with.
+        leave: Distance at which it leaves, m.
+        ends: True where it leaves through an end of the cell, not through a side of its wedge.
+    """
+
+    first: Int[Array, "n"]
+    count: Int[Array, "n"]
+    leave: Float[Array, "n"]
+    ends: Bool[Array, "n"]
+
+
+def enter_cell(tools: Tools, n_x: int, way: Way, ray: Ray, step: Step) -> Stay:
+    """Look up the lists of the cells where rays are, empty for a ray that does not come near its triangles."""
+    at, d = way.at, way.d
+    edge = step.x + ray.forward
+    # The outermost cells reach to infinity.
+    leave_x = jnp.where((edge <= 0) | (edge >= n_x), jnp.inf, (edge.astype(jnp.float32) - ray.x) * ray.slope)
+    turn = step.wedge.astype(jnp.float32) * (4.0 / N_WEDGES)
+    (y0, z0), (y1, z1) = wedge_edge(turn), wedge_edge(turn + 4.0 / N_WEDGES)
+    y, z = jnp.where(ray.onward, y1, y0), jnp.where(ray.onward, z1, z0)
+    speed, side = tools.minor(y, d[2], z, d[1]), tools.minor(z, at[1], y, at[2])
+    turns = jnp.where(ray.onward, speed, -speed) > _TINY
+    leave_wedge = jnp.where(turns, side * tools.reciprocal(jnp.where(turns, speed, 1.0)), jnp.inf)
+    leave = jnp.maximum(jnp.minimum(leave_x, leave_wedge), step.reached)
+    y, z = y0 + y1, z0 + z1
+    deeper = tools.dot((y, z), d[1:])
+    deepest = jnp.where(deeper > 0.0, jnp.minimum(leave, way.end), step.reached)
+    depth = tools.fma(deeper, deepest, tools.dot((y, z), at[1:]))
+    first, word = tools.load("cell", way.first_cell + step.x * N_WEDGES + step.wedge)
+    near = (word & 0xFFFF).astype(jnp.float32)
+    reaches = step.going & ((depth + MARGIN) * (1.0 / NEAR_UNIT) >= near)
+    return Stay(first, jnp.where(reaches, lax.shift_right_logical(word, 16), 0), leave, leave_x <= leave_wedge)
+
+
+def leave_cell(way: Way, ray: Ray, step: Step, stay: Stay) -> Step:
+    """Return rays in their next cells; `step` has the nearest triangles so far."""
+    going = step.going & (stay.leave < way.end) & (step.hit > stay.leave)
+    x = step.x + jnp.where(stay.ends & going, 2 * ray.forward - 1, 0)
+    wedge = step.wedge + jnp.where(stay.ends | ~going, 0, jnp.where(ray.onward, 1, -1))
+    wedge = jnp.where(wedge == N_WEDGES, 0, jnp.where(wedge < 0, N_WEDGES - 1, wedge))
+    return Step(x, wedge, jnp.where(going, stay.leave, step.reached), step.hit, step.entry, going)
+
+
+def _cross_cells(
+    tools: Tools, n_x: int, way: Way, going: Bool[Array, "n"]
+) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
+    """Return the distance at which rays meet a triangle in their block, m, or `inf`, and its entry."""
+    ray = ray_in_cells(tools, way)
 
     def one_cell(step: Step) -> Step:
-        edge = step.x + forward
-        # The outermost cells reach to infinity.
-        leave_x = jnp.where((edge <= 0) | (edge >= n_x), jnp.inf, (edge.astype(jnp.float32) - x) * slope)
-        turn = step.wedge.astype(jnp.float32) * (4.0 / N_WEDGES)
-        (y0, z0), (y1, z1) = wedge_edge(turn), wedge_edge(turn + 4.0 / N_WEDGES)
-        y, z = jnp.where(onward, y1, y0), jnp.where(onward, z1, z0)
-        speed, side = tools.minor(y, d[2], z, d[1]), tools.minor(z, at[1], y, at[2])
-        turns = jnp.where(onward, speed, -speed) > _TINY
-        leave_wedge = jnp.where(turns, side * tools.reciprocal(jnp.where(turns, speed, 1.0)), jnp.inf)
-        leave = jnp.maximum(jnp.minimum(leave_x, leave_wedge), step.reached)
-        y, z = y0 + y1, z0 + z1
-        deeper = tools.dot((y, z), d[1:])
-        deepest = jnp.where(deeper > 0.0, jnp.minimum(leave, end), step.reached)
-        depth = tools.fma(deeper, deepest, tools.dot((y, z), at[1:]))
-        first, word = tools.load("cell", first_cell + step.x * N_WEDGES + step.wedge)
-        near = (word & 0xFFFF).astype(jnp.float32)
-        reaches = step.going & ((depth + MARGIN) * (1.0 / NEAR_UNIT) >= near)
-        count = jnp.where(reaches, lax.shift_right_logical(word, 16), 0)
-        hit, entry = _meet(tools, first, count, first_vertex, units, speeds, step.hit, step.entry)
-        going = step.going & (leave < end) & (hit > leave)
-        ends = leave_x <= leave_wedge
-        x_next = step.x + jnp.where(ends & going, 2 * forward - 1, 0)
-        wedge = step.wedge + jnp.where(ends | ~going, 0, jnp.where(onward, 1, -1))
-        wedge = jnp.where(wedge == N_WEDGES, 0, jnp.where(wedge < 0, N_WEDGES - 1, wedge))
-        return Step(x_next, wedge, jnp.where(going, leave, step.reached), hit, entry, going)
+        stay = enter_cell(tools, n_x, way, ray, step)
+        hit, entry = _meet(tools, way, ray, stay, step)
+        return leave_cell(way, ray, step._replace(hit=hit, entry=entry), stay)
 
-    first_x = jnp.clip(x, 0.0, n_x - 1.0).astype(jnp.int32)
-    none = jnp.full_like(first_x, -1)
-    wedge = wedge_at(tools, at[1], at[2])
-    start = Step(first_x, wedge, jnp.zeros_like(end), jnp.full_like(end, jnp.inf), none, going)
+    start = first_step(tools, n_x, way, ray, going)
     step = lax.while_loop(lambda step: _any(step.going), one_cell, start)
     return step.hit, step.entry
 
@@ -265,29 +366,38 @@ def _point(tools: Tools, number: Int[Array, "n"]) -> Point:
     return x.astype(jnp.float32), one.astype(jnp.float32), two.astype(jnp.float32)
 
 
-def _meet(
-    tools: Tools, first: Array, count: Array, first_vertex: Array, at: Point, d: Point, hit: Array, entry: Array
+def _meet(tools: Tools, way: Way, ray: Ray, stay: Stay, step: Step) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
+    """Compare rays with the triangles of a list each; return the nearest distance, m, and its entry."""
+
+    def one_triangle(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        return meet_one(tools, way.first_vertex, ray, stay.first + i, i < stay.count, *best)
+
+    return lax.fori_loop(0, jnp.max(stay.count), one_triangle, (step.hit, step.entry))
+
+
+def meet_one(
+    tools: Tools,
+    first_vertex: Int[Array, "n"],
+    ray: Ray,
+    number: Int[Array, "n"],
+    listed: Bool[Array, "n"],
+    hit: Float[Array, "n"],
+    entry: Int[Array, "n"],
 ) -> tuple[Float[Array, "n"], Int[Array, "n"]]:
-    """Compare rays with the triangles of a list each; return the nearest distance, m, and its entry.
+    """Compare rays with a triangle each, if it is listed; return the nearest distance, m, and its entry.
 
     Source: Möller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
     """
-
-    def one_triangle(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-        hit, entry = best
-        listed = i < count
-        p, second, third = corners(tools, first + i, first_vertex, listed)
-        a, b = ([q[j] - p[j] for j in range(3)] for q in (second, third))
-        gap = [at[j] - p[j] for j in range(3)]
-        across_b, across_a = tools.cross(d, b), tools.cross(gap, a)
-        det = tools.dot(a, across_b)
-        there = jnp.abs(det) > 0.0
-        inverse = tools.reciprocal(jnp.where(there, det, 1.0))
-        u, v, t = (tools.dot(*pair) * inverse for pair in ((gap, across_b), (d, across_a), (b, across_a)))
-        meets = listed & there & (jnp.minimum(u, v) >= -SEAM) & (u + v <= 1.0 + SEAM) & (t >= -PAST) & (t < hit)
-        return jnp.where(meets, t, hit), jnp.where(meets, first + i, entry)
-
-    return lax.fori_loop(0, jnp.max(count), one_triangle, (hit, entry))
+    p, second, third = corners(tools, number, first_vertex, listed)
+    a, b = ([q[j] - p[j] for j in range(3)] for q in (second, third))
+    gap = [ray.units[j] - p[j] for j in range(3)]
+    across_b, across_a = tools.cross(ray.speeds, b), tools.cross(gap, a)
+    det = tools.dot(a, across_b)
+    there = jnp.abs(det) > 0.0
+    inverse = tools.reciprocal(jnp.where(there, det, 1.0))
+    u, v, t = (tools.dot(*pair) * inverse for pair in ((gap, across_b), (ray.speeds, across_a), (b, across_a)))
+    meets = listed & there & (jnp.minimum(u, v) >= -SEAM) & (u + v <= 1.0 + SEAM) & (t >= -PAST) & (t < hit)
+    return jnp.where(meets, t, hit), jnp.where(meets, number, entry)
 
 
 def _meet_boxes(

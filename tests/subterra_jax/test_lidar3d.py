@@ -7,7 +7,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
-from subterra_jax.lidar3d import beams, casting, fused
+from subterra_jax.lidar3d import beams, casting, fused, march, relay
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import Axis, Triangles
 from tests.subterra_jax import surfaces
@@ -196,11 +196,17 @@ def test_machine_code_and_xla_give_the_same_ranges(bend, reliefs, name):
     assert (triangle[np.asarray(xla.entry)] == triangle[np.asarray(code.entry)]).mean() > 0.98
 
 
-def test_a_batch_marched_in_parts_gives_what_it_gives_in_one(bend, reliefs, monkeypatch):
+def test_rays_that_take_each_others_places_meet_what_they_meet_in_step(bend, reliefs, monkeypatch):
     rays = bend_rays(bend[0], 56, 6)
-    whole = found_by(casting._find_in_step, reliefs["bend"], *rays)
-    monkeypatch.setattr(casting, "_IN_STEP", 25)
-    np.testing.assert_array_equal(whole.distance, found_by(casting._find_in_step, reliefs["bend"], *rays).distance)
+
+    def in_step(relief, origin, way, block, limit):
+        return march.march(casting._tools(relief), relief.n_x, tuple(origin.T), tuple(way.T), block, limit)
+
+    whole = found_by(in_step, reliefs["bend"], *rays)
+    monkeypatch.setattr(relay, "N_PLACES", 9)
+    relayed = found_by(casting._find_in_step, reliefs["bend"], *rays)
+    np.testing.assert_array_equal(whole.entry, relayed.entry)
+    np.testing.assert_allclose(whole.distance, relayed.distance, rtol=1e-6)
 
 
 def test_bores_picked_from_a_stack_give_what_each_gives_alone(bend, reliefs):
