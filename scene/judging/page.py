@@ -7,7 +7,7 @@ from scene.judging.drawing import draw_plan, draw_profile, draw_section, draw_st
 from scene.judging.judge import Judgement
 from scene.judging.words import name_span
 
-_STYLE = """
+STYLE = """
 body{font:15px/1.45 system-ui,sans-serif;color:#1f2933;max-width:1060px;margin:24px auto;padding:0 16px}
 h1{font-size:24px;margin:0 0 4px}h2{font-size:17px;margin:26px 0 6px;border-bottom:1px solid #d9dee4}
 svg{width:100%;height:auto;background:#fbfcfd;border:1px solid #e4e7eb}svg text{font:11px system-ui,sans-serif}
@@ -48,7 +48,7 @@ def render_page(name: str, bore: Bore, judgement: Judgement, content: dict[str, 
     parts += [*_sections(bore, judgement), *_tables(judgement, content)]
     return (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{text(name)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>'
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
         f"<body>{''.join(parts)}</body></html>\n"
     )
 
@@ -100,13 +100,14 @@ def _tables(judgement: Judgement, content: dict[str, Any]) -> list[str]:
     read = [(key.replace("_", " "), value) for key, value in sorted(content.get("detected", {}).items())
             if isinstance(value, str | int | float) and not isinstance(value, bool)]  # fmt: skip
     return [
-        _table("Cut away before fitting", removed), _table("Unexplained, place by place", places[:20]),
-        _table("Wall that nobody saw", unseen[:20]), _table("Measured or placed", provenance),
-        _table("How the input was read", read),
+        make_table("Cut away before fitting", removed), make_table("Unexplained, place by place", places[:20]),
+        make_table("Wall that nobody saw", unseen[:20]), make_table("Measured or placed", provenance),
+        make_table("How the input was read", read),
     ]  # fmt: skip
 
 
-def _table(title: str, rows: list[Any]) -> str:
+def make_table(title: str, rows: list[Any]) -> str:
+    """Return a table below its heading; nothing where it has no rows."""
     if not rows:
         return ""
     cells = "".join(f"<tr>{''.join(f'<td>{text(_short(cell))}</td>' for cell in row)}</tr>" for row in rows)

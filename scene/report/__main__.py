@@ -1,0 +1,218 @@
+"""`python -m scene.report DIR`: takeaways for surveyors from a built scene.
+
+Example: python -m scene.report build/tunnel --design axis.xml --out build/tunnel-report
+"""
+
+import csv
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import ezdxf
+import numpy as np
+import tyro
+
+from scene.bore import Bore, load_bore
+from scene.errors import FitError, RecordingError, require_input
+from scene.report import drawings, sections
+from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, read_design_table
+from scene.report.clearance import clearance, g1, read_gauge, read_rails
+from scene.report.landxml import read_landxml, write_landxml
+from scene.report.page import write_report
+from scene.report.sheet import write_csv, write_workbook
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.files import replace_folder, require_folder
+
+_MEETS = 5.0  # m; a design axis further from the bore than this is another tunnel's
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """Takeaways for surveyors from a built scene.
+
+    Attributes:
+        scene: Scene folder, as `scene.build` writes it.
+        out: Folder to write; beside the scene, with `-report`, if not given.
+        design: Design axis: LandXML, or CSV with CHAINAGE, EASTING, NORTHING, ELEVATION; gives the chainages.
+        section: Design section: CSV of rows `left, up` about the axis, m; else `--radius`, else the bore's own median.
+        radius: Design radius of a round bore, m.
+        gauge: Loading gauge: `g1`, or CSV of a closed polygon of rows `left, height over rail`, m.
+        start: Chainage of station 0, m; that of the manifest if neither this nor a design is given.
+        tolerance: Misfit by which the alignment may use fewer elements, m.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    out: Path | None = None
+    design: Path | None = None
+    section: Path | None = None
+    radius: float | None = None
+    gauge: Literal["g1"] | Path = "g1"
+    start: float | None = None
+    tolerance: float = 0.002
+
+
+def report(config: ReportConfig) -> Path:
+    """Write the folder whole, or not at all; returns it.
+
+    Raises:
+        SubterraError: The scene, design, section or gauge is at fault, or the output cannot be written.
+    """
+    out = require_folder(config.out or config.scene.with_name(f"{config.scene.name}-report"))
+    manifest = _read_manifest(config.scene)
+    bore = load_bore(require_input(config.scene / "bore.npz"))
+    origin = np.asarray(manifest["frame"]["origin"], float)
+    design = None if config.design is None else _read_design(config.design, origin)
+    located = None if design is None else _locate(bore, design, config.design)
+    start = _first_chainage(config, manifest, located)
+    section = _read_section(bore, config)
+    gauge = g1() if config.gauge == "g1" else read_gauge(Path(config.gauge))
+    fit = align_bore(bore, str(manifest["name"]), origin, start, config.tolerance)
+    with replace_folder(out) as folder:
+        facts = _facts(bore, manifest, section.name, start, fit)
+        tables = {"metres": sections.tabulate(bore, section, origin, start)}
+        if len(bore.ring_station):
+            tables["rings"] = sections.tabulate(bore, section, origin, start, rings=True)
+        over, under = sections.volumes(tables["metres"])
+        facts |= {"overbreak": f"{over:.2f} m³", "underbreak": f"{under:.2f} m³"}
+        ezdxf.options.write_fixed_meta_data_for_testing = True  # no times of day
+        drawings.write_sections(folder / "sections.dxf", bore, section, start)
+        drawings.write_plan_profile(folder / "plan_profile.dxf", bore, origin, start)
+        drawings.write_unrolled(folder, bore, section)
+        drawings.draw_alignment(folder / "alignment.png", fit)
+        write_landxml(folder / "alignment.xml", fit.alignment)
+        if design is not None and located is not None:
+            facts |= _write_offsets(folder, bore, design, located)
+        facts |= _write_clearance(folder, config.scene, bore, gauge, start)
+        write_csv(folder / "sections.csv", tables["metres"])
+        write_workbook(folder / "rings.xlsx", tables, facts)
+        write_report(folder, str(manifest["name"]), facts, tables["metres"], _element_rows(fit))
+    return out
+
+
+def _read_manifest(scene: Path) -> dict[str, Any]:
+    path = scene / "manifest.json"
+    if not path.is_file():
+        raise RecordingError(f"{scene}: not a scene folder, for it has no manifest.json; build it with scene.build")
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise RecordingError(f"{path}: not JSON ({error})") from error
+
+
+def _read_design(path: Path, origin: np.ndarray) -> Design:
+    if path.suffix.lower() == ".csv":
+        return read_design_table(path, origin)
+    return design_of(read_landxml(path), origin)
+
+
+def _locate(bore: Bore, design: Design, path: Path | None) -> np.ndarray:
+    """Return chainage, offset to the right and height above the design of the bore's axis."""
+    located = design.locate(bore.position)
+    away = np.hypot(located[:, 1], located[:, 2] if design.has_heights else 0.0)
+    if np.median(away) > _MEETS:
+        raise FitError(
+            f"{path}: the design axis does not meet the tunnel: it is {np.median(away):.0f} m away in the median; are "
+            "unit, frame and the order of east and north the same?"
+        )
+    return located
+
+
+def _first_chainage(config: ReportConfig, manifest: dict[str, Any], located: np.ndarray | None) -> float:
+    if config.start is not None:
+        return config.start
+    if located is not None:
+        return float(located[0, 0])
+    return float(manifest.get("detected", {}).get("chainage_start") or 0.0)
+
+
+def _read_section(bore: Bore, config: ReportConfig) -> sections.DesignSection:
+    if config.section is not None and config.radius is not None:
+        raise FitError("--section and --radius exclude each other")
+    if config.radius is not None:
+        return sections.circle_section(bore, config.radius)
+    if config.section is not None:
+        gauge = read_gauge(config.section)  # the same form: a closed polygon
+        return sections.polygon_section(bore, gauge.points, config.section.name)
+    return sections.own_section(bore)
+
+
+def _facts(bore: Bore, manifest: dict[str, Any], section: str, start: float, fit: AlignmentFit) -> dict[str, str]:
+    kinds = [element.kind for element in fit.plan.elements]
+    return {
+        "length": f"{bore.length:.2f} m, chainage {start:.2f} to {start + bore.length:.2f} m",
+        "recording": str(manifest.get("input_provenance", "unknown")),
+        "stations that were interpolated": f"{bore.filled.mean():.0%}",
+        "design section": section,
+        "width": f"{bore.width.mean():.3f} m in the mean, {bore.width.min():.3f} to {bore.width.max():.3f} m",
+        "height": f"{bore.height.mean():.3f} m in the mean, {bore.height.min():.3f} to {bore.height.max():.3f} m",
+        "alignment": f"{kinds.count('line')} lines, {kinds.count('arc')} arcs, {kinds.count('clothoid')} clothoids; "
+        f"the axis is {1e3 * fit.plan.rms:.1f} mm off in plan and {1e3 * fit.profile.rms:.1f} mm in height, RMS",
+    }  # fmt: skip
+
+
+def _write_offsets(folder: Path, bore: Bore, design: Design, located: np.ndarray) -> dict[str, str]:
+    rows = ((f"{s:.3f}", *(f"{value:.4f}" for value in place)) for s, place in zip(bore.station, located, strict=True))
+    _write_rows(folder / "offsets.csv", ("station [m]", "chainage [m]", "right [m]", "above [m]"), rows)
+    above = located[:, 2] if design.has_heights else None
+    drawings.draw_offsets(folder / "offsets.png", located[:, 0], located[:, 1], above, design.name)
+    grows = "with" if located[-1, 0] > located[0, 0] else "against"
+    spread = f"{1e3 * np.median(located[:, 1]):+.0f} mm to the right in the median"
+    return {"design axis": f"{design.name}; its chainage grows {grows} the stations; the axis lies {spread}"}
+
+
+def _write_clearance(folder: Path, scene: Path, bore: Bore, gauge: Any, start: float) -> dict[str, str]:
+    rails = read_rails(scene / "scene.xml", bore)
+    if rails is None:
+        return {"clearance": "no track was laid in this scene"}
+    free = clearance(bore, rails, gauge, bore.axis.curvature)
+    every = max(1, round(1.0 / (bore.station[1] - bore.station[0])))
+    chainage = start + bore.station
+    rows = (
+        tuple(f"{value:.4f}" for value in (c, *place))
+        for c, place in zip(chainage[::every], free[::every], strict=True)
+    )
+    _write_rows(folder / "clearance.csv", ("chainage [m]", "free [m]", "left of the axis [m]", "above it [m]"), rows)
+    drawings.draw_clearance(folder / "clearance.png", chainage, free[:, 0], gauge.name)
+    worst = int(np.argmin(free[:, 0]))
+    return {"clearance": f"{free[worst, 0]:.3f} m at least, at chainage {chainage[worst]:.2f} m ({gauge.name})"}
+
+
+def _write_rows(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(rows)
+
+
+def _element_rows(fit: AlignmentFit) -> list[tuple[str, ...]]:
+    rows = []
+    for number, part in enumerate((fit.plan, fit.profile)):
+        for one in part.elements:
+            ends = [_describe_bend(value) if number == 0 else f"{value:+.3%}" for value in (one.first, one.last)]
+            rows.append((one.kind, f"{fit.alignment.start + one.start:.2f} m", f"{one.length:.2f} m", *ends))
+    return rows
+
+
+def _describe_bend(curvature: float) -> str:
+    if abs(curvature) < 1e-6:
+        return "straight"
+    return f"{'left' if curvature > 0.0 else 'right'}, {abs(1.0 / curvature):.1f} m"
+
+
+def main(words: list[str] | None = None) -> int:
+    """Runs the command and returns its exit status."""
+    config = parse(
+        lambda given: tyro.cli(ReportConfig, prog="python -m scene.report", args=given, description=__doc__), words
+    )
+
+    def act() -> None:
+        print(report(config) / "report.html")
+
+    return run_command(act, "interrupted; the output is as it was")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

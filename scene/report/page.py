@@ -1,0 +1,67 @@
+"""`report.html`: sizes, the worst places first, alignment, clearance, and what lies beside it."""
+
+import base64
+from pathlib import Path
+
+import numpy as np
+
+from scene.judging.drawing import text
+from scene.judging.page import STYLE, make_table
+
+_WORST = 12
+
+
+def write_report(
+    folder: Path, name: str, facts: dict[str, str], table: np.ndarray, elements: list[tuple[str, ...]]
+) -> None:
+    """Write the page; pictures of the folder are put into it.
+
+    Args:
+        folder: The folder, with its pictures.
+        name: Name of the tunnel.
+        facts: Rows of the first table.
+        table: Rows of `sections.ROW`.
+        elements: Rows of the table of the alignment.
+    """
+    parts = [f"<h1>{text(name)}</h1>", make_table("In short", list(facts.items()))]
+    worst = np.argsort(-np.maximum(table["deviation_most"], -table["deviation_least"]))[:_WORST]
+    rows = [
+        (f"{table['chainage'][k]:.2f} m", f"{100 * table['deviation_most'][k]:+.1f} cm",
+         f"{100 * table['deviation_least'][k]:+.1f} cm", f"{table['over'][k]:.3f} m²", f"{table['under'][k]:.3f} m²",
+         "interpolated" if table["filled"][k] else f"{table['coverage'][k]:.0%} seen")
+        for k in worst
+    ]  # fmt: skip
+    head = ("chainage", "most outwards", "most inwards", "overbreak", "underbreak", "evidence")
+    parts.append(make_table("Worst places", [head, *rows]))
+    titles = {
+        "unrolled.png": "Deviation from the design, rolled out", "offsets.png": "Against the design axis",
+        "alignment.png": "Alignment fitted to the axis", "clearance.png": "Clearance",
+    }  # fmt: skip
+    for file, title in titles.items():
+        if (folder / file).exists():
+            picture = base64.b64encode((folder / file).read_bytes()).decode()
+            parts.append(
+                f'<h2>{title}</h2><img style="width:100%" alt="{title}" src="data:image/png;base64,{picture}">'
+            )
+        if file == "alignment.png":
+            parts.append(make_table("Elements", [("element", "begins", "length", "from", "to"), *elements]))
+    files = [(file.name, _FILES.get(file.name, "")) for file in sorted(folder.iterdir())]
+    parts.append(make_table("Beside this page", files))
+    page = (
+        f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{text(name)}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
+        f"<body>{''.join(parts)}</body></html>\n"
+    )
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+_FILES = {
+    "sections.csv": "a row for each metre",
+    "rings.xlsx": "the same, and a row for each ring, as a spreadsheet",
+    "alignment.xml": "LandXML 1.2: lines, arcs and clothoids, grades and parabolas",
+    "sections.dxf": "sections as measured and as designed, every 10 m, looking ahead",
+    "plan_profile.dxf": "plan and profile with chainage",
+    "unrolled.tif": "deviation from the design in m, rows along the bore, columns around it from the floor",
+    "clearance.csv": "least free distance around the gauge at each metre",
+    "offsets.csv": "the axis against the design axis",
+}
