@@ -3,7 +3,6 @@
 import hashlib
 import json
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,21 +11,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from scene.build import build
+from scene.build import build, main
 from tests.scene.bags import write_bag, write_bag_without_lidar, write_tum
 from tests.scene.clouds import curved_d_bore
 
-ROOT = Path(__file__).parents[2]
 
+@pytest.fixture
+def command(monkeypatch, capsys):
+    """`python -m scene.build ARGUMENTS` in this process: exit status and standard error."""
 
-def command(*arguments: object) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "scene.build", *map(str, arguments)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    def run(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["scene.build", *map(str, arguments)])
+        with np.errstate():
+            status = main()
+        return status, capsys.readouterr().err
+
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -110,12 +110,12 @@ def test_the_same_input_gives_the_same_bytes(cloud_file, scene, tmp_path):
             assert path.read_bytes() == (tmp_path / "bore" / path.relative_to(scene)).read_bytes(), path.name
 
 
-def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path):
+def test_a_failed_build_leaves_the_previous_scene_whole(scene, tmp_path, command):
     before = {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
     bad = tmp_path / "bad.ply"
     bad.write_bytes(b"ply\n")
-    done = command(bad, "--out", scene)
-    assert done.returncode == 2
+    status, _ = command(bad, "--out", scene)
+    assert status == 2
     assert before == {path: path.stat().st_mtime_ns for path in scene.rglob("*")}
 
 
@@ -166,22 +166,22 @@ def inputs(tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path):
+def test_bad_input_is_one_sentence_status_2_and_no_output(case, inputs, tmp_path, command):
     arguments, sentence = inputs[case]
     out = tmp_path / "scene"
-    done = command(*arguments, "--out", out)
-    assert done.returncode == 2, done.stderr
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, done.stderr
+    status, told = command(*arguments, "--out", out)
+    assert status == 2, told
+    lines = [line for line in told.splitlines() if line.strip()]
+    assert len(lines) == 1, told
     assert re.search(rf"^error: .*{sentence}", lines[0]), lines[0]
     assert not list(tmp_path.iterdir())
 
 
-def test_an_output_that_is_a_file_is_refused_before_any_work(cloud_file, tmp_path):
+def test_an_output_that_is_a_file_is_refused_before_any_work(cloud_file, tmp_path, command):
     blocked = tmp_path / "file"
     blocked.write_text("mine")
     for out in (blocked, blocked / "below"):
-        done = command(cloud_file, "--out", out)
-        assert done.returncode == 2
-        assert f"{blocked}: is a file" in done.stderr
+        status, told = command(cloud_file, "--out", out)
+        assert status == 2
+        assert f"{blocked}: is a file" in told
     assert blocked.read_text() == "mine"

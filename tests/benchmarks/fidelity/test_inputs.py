@@ -1,11 +1,11 @@
 """What a user can get wrong with the commands: one sentence, status 2, nothing half-written."""
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.inputs import Inputs, complete_inputs, with_sigma
@@ -36,20 +36,10 @@ def test_the_noise_of_a_sensor_comes_from_its_data_sheet() -> None:
     assert with_sigma(HoldConfig(sigma=0.011), Path("survey_os1.bag")).sigma == 0.011
 
 
-def test_a_mistake_at_the_command_line_ends_in_one_sentence_and_status_2(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "benchmarks.fidelity",
-        "run",
-        "--scene",
-        str(tmp_path),
-        "--out",
-        str(tmp_path / "o"),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3])
-    assert done.returncode == 2
-    assert done.stderr.strip() == f"error: {tmp_path}: is no scene folder, scene.xml is missing"
+def test_a_mistake_at_the_command_line_ends_in_one_sentence_and_status_2(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["fidelity", "run", "--scene", str(tmp_path), "--out", str(tmp_path / "o")])
+    assert main() == 2
+    assert capsys.readouterr().err.strip() == f"error: {tmp_path}: is no scene folder, scene.xml is missing"
     assert not (tmp_path / "o").exists()
 
 
