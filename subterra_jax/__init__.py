@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from subterra_jax.batch import AutoReset, rollout
     from subterra_jax.compiled import cache_programs
     from subterra_jax.env import Env
+    from subterra_jax.evaluation.localisability import localisability
     from subterra_jax.policies import load_policy
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
@@ -44,6 +45,7 @@ __all__ = [
     "constants_digest",
     "load_policy",
     "load_tunnel",
+    "localisability",
     "make",
     "parts",
     "procedural",
@@ -72,6 +74,7 @@ _HOMES = {
     "TunnelPlan": "tunnel.plan",
     "load_policy": "policies",
     "load_tunnel": "tunnel.sources",
+    "localisability": "evaluation.localisability",
     "make": "tasks",
     "randomize": "randomization",
     "rollout": "batch",

@@ -59,9 +59,43 @@ def _wandered(distance: Float[np.ndarray, " n"], wander: WanderParams | None) ->
 
 
 def _fused(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
-    """Variance of the true distance given commands and readings, m²: a Kalman filter's, which needs no data.
+    """Variance of the true distance given commands and readings, m²: a Kalman filter's, which needs no data."""
+    n = math.ceil(distance.max() / _STRETCH)
+    variance = _station_variance(np.zeros(n), params, 0.0)
+    return np.interp(distance, _STRETCH * np.arange(n + 1), variance)
 
-    Its state is the station, the constant and the wandering slip, the constant and the wandering scale error.
+
+def filter_variance(
+    station: Float[np.ndarray, " n"], information: Float[np.ndarray, " n"], params: EnvParams
+) -> Float[np.ndarray, " n"]:
+    """Compute the variance of the station that a perfect filter keeps on the way through a tunnel at full speed, m².
+
+    It has commands, odometry and the information of each scan; to the first order in the errors.
+
+    Args:
+        station: Stations, m, growing.
+        information: Information of one scan about the station there, 1/m².
+        params: A task with slip; its start and its errors of commands and odometry.
+
+    Returns:
+        Variances; behind the start, that of the start.
+
+    Source: Tichavský et al. 1998, the recursion of the posterior Cramér–Rao bound, here of a linear system.
+    """
+    begin, start = float(params.start.station), float(params.start.station_sigma) ** 2
+    n = max(1, math.ceil((station[-1] - begin) / _STRETCH))
+    at = begin + _STRETCH * (np.arange(n) + 1.0)
+    scans = _STRETCH / float(np.max(params.vehicle.speed_max * params.vehicle.period))
+    variance = _station_variance(scans * np.interp(at, station, information), params, start)
+    return np.interp(station, begin + _STRETCH * np.arange(n + 1), variance)
+
+
+def _station_variance(
+    information: Float[np.ndarray, " n"], params: EnvParams, start: float
+) -> Float[np.ndarray, " n+1"]:
+    """Variance of the station after each stretch, m², given what is learnt about it at the end of each, 1/m².
+
+    The state is the station, the constant and the wandering slip, the constant and the wandering scale error.
     """
     slip, odometry = params.slip, params.odometry
     wanders = (None, None, slip.wander, None, odometry.wander)
@@ -69,14 +103,21 @@ def _fused(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.nda
     stationary = np.array([0.0 if w is None else float(w.sigma) ** 2 for w in wanders])
     keep = np.array([1.0 if w is None else math.exp(-_STRETCH / float(w.length)) for w in wanders])
     noise = max(_noise_of_a_metre(params) / _STRETCH, 1e-15)
-    moved, read = np.eye(5), np.array([0.0, 1.0, 1.0, 1.0, 1.0])
+    moved, read, here = np.eye(5), np.array([0.0, 1.0, 1.0, 1.0, 1.0]), np.eye(5)[0]
     moved[0, 1:3] = _STRETCH
-    covariance, found = np.diag(sigma**2 + stationary), [0.0]
-    for _ in range(math.ceil(distance.max() / _STRETCH)):
-        spread = covariance @ read
-        covariance = covariance - np.outer(spread, spread) / (read @ spread + noise)
+    covariance, found = np.diag(sigma**2 + stationary + start * here), [start]
+    for told in information:
+        covariance = _learn(covariance, read, noise)
         # The error of the whole stretch becomes known as the reading of that stretch is.
         covariance = moved @ covariance @ moved.T
         covariance = covariance * np.outer(keep, keep) + np.diag((1.0 - keep**2) * stationary)
+        if told > 0.0:
+            covariance = _learn(covariance, here, 1.0 / told)
         found.append(covariance[0, 0])
-    return np.interp(distance, _STRETCH * np.arange(len(found)), found)
+    return np.array(found)
+
+
+def _learn(covariance: Float[np.ndarray, "5 5"], row: Float[np.ndarray, "5"], noise: float) -> Float[np.ndarray, "5 5"]:
+    """Covariance after a measurement `row · state` with a variance of noise."""
+    spread = covariance @ row
+    return covariance - np.outer(spread, spread) / (row @ spread + noise)

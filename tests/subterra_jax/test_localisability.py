@@ -1,0 +1,170 @@
+"""Information of scans about the pose: against analytic answers, and against float64 casts of random poses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.evaluation import bounds
+from subterra_jax.evaluation.localisability import Solid, localisability, marginal_bound, scan_information
+from subterra_jax.lidar import reference
+from subterra_jax.lidar3d import Relief, beams
+from subterra_jax.tunnel import from_centreline
+
+SIGMA, BLUR, TURN, STEP = 0.05, 0.05, 0.02, 0.025
+TASK = "Subterra/StopAt-v0"
+
+
+def corridor(pockets: bool, bend: float = 0.0) -> st.TunnelPlan:
+    """80 m, straight or bent, with a pocket every 1.5 m on the left, or none."""
+    station = np.arange(0.0, 80.05, 0.1)
+    heading = bend * station
+    xy = np.concatenate([[[0.0, 0.0]], np.cumsum(0.1 * np.stack([np.cos(heading), np.sin(heading)], -1)[:-1], axis=0)])
+    rows = [(s, 1.0, 0.3, 0.12) for s in np.arange(6.0, 74.0, 1.5)] if pockets else ()
+    return from_centreline(xy, 2.5, pockets=rows)
+
+
+@pytest.fixture(scope="module")
+def params():
+    return {pockets: st.make(TASK, tunnel=corridor(pockets))[1] for pockets in (False, True)}
+
+
+@pytest.fixture(scope="module")
+def found(params):
+    return {pockets: localisability(params[pockets]) for pockets in params}
+
+
+def inner(found) -> np.ndarray:
+    return (found.station > 32.0) & (found.station < 48.0)
+
+
+def test_a_slope_counts_its_square_over_the_noise():
+    station = STEP * np.arange(81)
+    ranges = np.stack([3.0 + 0.4 * station, 5.0 - 0.1 * station], axis=-1)
+    shifted = [ranges + move * np.array([1.0, -1.0]) * BLUR for move in (1.0, -1.0)]
+    turned = [ranges + move * np.array([2.0, 0.5]) * TURN for move in (1.0, -1.0)]
+    information = scan_information([ranges, *shifted, *turned], STEP, BLUR, TURN, SIGMA)[40]
+    slope = np.array([[0.4, 1.0, 2.0], [-0.1, -1.0, 0.5]])
+    np.testing.assert_allclose(information, slope.T @ slope / SIGMA**2, rtol=1e-6)
+
+
+def test_a_jump_counts_as_the_straight_line_through_poses_about_it():
+    station = STEP * np.arange(-60, 61)
+    jump = np.where(station > 0.0, 0.3, 0.0)[:, None] + 4.0
+    information = scan_information([jump] * 5, STEP, BLUR, TURN, SIGMA)[:, 0, 0]
+    noise = BLUR * np.random.default_rng(0).standard_normal(400_000)
+    for at in (0.0, 0.05):
+        seen = np.where(at + noise > 0.5 * STEP, 0.3, 0.0)  # the jump lies between two of the stations
+        slope = np.mean(seen * noise) / BLUR**2
+        left_over = seen.var() - slope**2 * BLUR**2
+        row = np.argmin(np.abs(station - at))
+        # The jump of a grid is a ramp of half a blur.
+        assert information[row] == pytest.approx(slope**2 / (SIGMA**2 + left_over), rel=0.06)
+    assert information[0] == 0.0
+
+
+def test_a_wall_without_landmarks_tells_no_station_and_pockets_do(found):
+    for bend in (0.0, 1.0 / 300.0):
+        smooth = localisability(st.make(TASK, tunnel=corridor(False, bend))[1]) if bend else found[False]
+        assert np.all(np.isinf(smooth.station_bound[inner(smooth)]))
+        assert np.min(smooth.station_bound[:16]) < 0.5, "a mouth is seen"
+        assert np.all(smooth.offset_bound < 0.05)
+        assert np.all(smooth.heading_bound < 0.05)
+    pockets = found[True]
+    assert np.all(pockets.station_bound[inner(pockets)] < 0.3)
+    assert pockets.drift[inner(pockets)].max() < 0.1 < 0.3 < found[False].drift[inner(pockets)].max()
+
+
+def test_the_control_tunnel_of_the_benchmark_tells_nothing_away_from_its_mouths():
+    found = localisability(st.make(TASK, tunnel="control")[1], step=1.0)
+    inside = (found.station > 35.0) & (found.station < 316.0)
+    assert np.all(np.isinf(found.station_bound[inside]))
+    assert np.isfinite(found.station_bound[:16]).any()
+    assert np.isfinite(found.station_bound[-16:]).any()
+    deep = (found.station > 290.0) & (found.station < 310.0)
+    assert np.all(found.drift[deep] > 0.5 * found.blind_drift[deep])
+
+
+def test_information_agrees_with_float64_casts_of_random_poses(params, found):
+    """Straight lines fitted to reference scans of normally distributed poses, beam by beam."""
+    plan, rng, n = corridor(True), np.random.default_rng(3), 3000
+    segments = plan.lining("pockets").segments
+    for cell in (70, 71, 72, 83):
+        low, high = (found[True].station[cell] + side * 0.25 for side in (-1.0, 1.0))
+        own = []
+        for at in np.linspace(low, high, 12):
+            noise = BLUR * rng.standard_normal(n)
+            noise -= noise.mean()
+            seen = reference.scan(segments, np.stack([at + noise, np.zeros(n)], -1), np.zeros(n))
+            slope = noise @ seen / (noise @ noise)
+            left_over = np.var(seen - np.outer(noise, slope), axis=0)
+            own.append(np.sum(np.where(np.abs(slope) < 0.02, 0.0, slope) ** 2 / (SIGMA**2 + left_over)))
+        assert found[True].information[cell, 0, 0] == pytest.approx(np.mean(own), rel=0.12)
+
+
+def test_slopes_over_offset_and_heading_are_those_of_finite_differences(found):
+    plan = corridor(False)
+    segments, at = plan.lining("smooth").segments, found[False].station[80]
+    slope = []
+    for offset, turn in ((1e-4, 0.0), (0.0, 1e-4)):
+        scans = [
+            reference.scan(segments, np.array([[at, side * offset]]), np.array([side * turn]))[0]
+            for side in (1.0, -1.0)
+        ]
+        slope.append((scans[0] - scans[1]) / 2e-4)
+    information = np.einsum("ib,jb->ij", slope, slope) / SIGMA**2
+    np.testing.assert_allclose(found[False].information[80, 1:, 1:], information, rtol=0.02, atol=1.0)
+
+
+def test_information_falls_with_the_square_of_the_noise(params, found):
+    noisy = params[True].replace(lidar=params[True].lidar.replace(range_sigma=0.1))
+    twice = localisability(noisy)
+    cells = inner(twice)
+    # What lies beside a straight line is noise as well, so that less than a factor of four is lost.
+    ratio = found[True].information[cells, 0, 0] / twice.information[cells, 0, 0]
+    assert np.all((ratio > 1.5) & (ratio <= 4.0 + 1e-6))
+    np.testing.assert_allclose(found[False].information[80, 1, 1] * 0.25, localisability(
+        params[False].replace(lidar=params[False].lidar.replace(range_sigma=0.1))
+    ).information[80, 1, 1], rtol=1e-3)  # fmt: skip
+
+
+def test_a_filter_without_scans_keeps_the_drift_of_the_closed_form_and_scans_pull_it_in(params):
+    station = np.arange(2.0, 79.0)
+    blind = bounds.filter_variance(station, np.zeros(len(station)), params[True])
+    np.testing.assert_allclose(blind, bounds._fused(station, params[True]), rtol=1e-6)
+    # One scan of 10 cm a step, and nearly nothing else to go by: sigma² / n.
+    steps = [bounds.filter_variance(station, np.full(len(station), told), params[True]) for told in (1.0, 100.0)]
+    assert np.all(steps[1][5:] < steps[0][5:])
+    assert np.all(steps[0][5:] < blind[5:])
+    hidden = params[True].replace(start=params[True].start.replace(station_sigma=3.0))
+    first = bounds.filter_variance(np.array([0.0, 0.5, 60.0]), np.full(3, 1.0), hidden)
+    # 2.5 scans of 1 m in the first half metre against a prior of 3 m.
+    assert first[0] == pytest.approx(9.0)
+    assert first[1] == pytest.approx(1.0 / (1.0 / 9.0 + 2.5), rel=0.01)
+
+
+def test_the_bound_of_one_unknown_leaves_the_others_free():
+    information = np.array([[[4.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 1.0]]])
+    for i in range(3):
+        assert marginal_bound(information, i)[0] == pytest.approx(np.linalg.inv(information[0])[i, i] ** 0.5)
+
+
+@pytest.mark.slow
+def test_level_beams_in_three_dimensions_tell_what_planar_ones_tell(found, params):
+    plan = corridor(True).slice(20.0, 30.0)
+    planar = localisability(st.make("Subterra/StopAtShort-v0", tunnel=dataclasses.replace(plan), goal=_near())[1])
+    env_params = st.make("Subterra/StopAtShort-v0", tunnel=plan, goal=_near())[1]
+    solid = localisability(env_params, solid=Solid(Relief.from_plan(plan), plan, beams.planar(16)))
+    np.testing.assert_allclose(solid.information[10:50, 0, 0], planar.information[10:50, 0, 0], rtol=0.05)
+
+
+def _near() -> st.rules.GoalParams:
+    return st.rules.GoalParams(low=5.0, high=20.0)
+
+
+def test_what_cannot_be_asked_is_refused(params):
+    with pytest.raises(ValueError, match="no tunnel 1 in a stack of 1"):
+        localisability(params[True], index=1)
+    with pytest.raises(ValueError, match=r"blur=0 m and step=0\.5 m"):
+        localisability(params[True], blur=0.0)
