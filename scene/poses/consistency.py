@@ -2,11 +2,12 @@
 
 The thickness of walls in sweeps put together is compared with that in single sweeps. Where it is larger, likely
 mistakes are undone one by one: another order of the quaternion, clocks apart, a mount turned. The one that makes the
-walls thin is named.
+walls thin is named. Besides the median the thickest fifth counts: a mount that is off in pitch slides upright walls
+along themselves, and blurs only what of floor and crown a sensor sees.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -26,6 +27,7 @@ _POINTS = 2500  # of each sweep
 _QUERIES, _NEIGHBOURS = 300, 16
 _LONGEST = 25.0  # m; returns further away are far apart
 _BLURRED, _LEAST = 1.3, 0.012  # times the thickness in a sweep, and m, from which walls count as blurred
+_THICKEST, _WORSE, _LEAST_WORSE = 0.8, 1.35, 0.015  # quantile; the same limits for the thickest fifth
 _EXPLAINS = 0.7  # a mistake that is named brings the thickness below this share
 _MIN_GAIN = 0.004  # m
 _SHIFTS = (0.05, 0.1, 0.2, 0.3, 0.5, 1.0)  # s
@@ -39,13 +41,24 @@ class PoseCheck:
 
     thickness: float  # Of walls in several sweeps together, m, standard deviation
     expected: float  # Of walls in single sweeps, m
+    upper: float  # That which a fifth of the places of several sweeps exceeds, m
+    upper_expected: float  # The same of single sweeps, m
     cause: str = ""  # The mistake that explains the difference, in words; empty where none was found
     wxyz: bool = False  # True where the quaternions are in the order w, x, y, z
 
     @property
     def blurred(self) -> bool:
         """True where the poses make the walls thicker than the scanner does."""
+        return self._mostly or self.upper > max(_WORSE * self.upper_expected, _LEAST_WORSE)
+
+    @property
+    def _mostly(self) -> bool:
         return self.thickness > max(_BLURRED * self.expected, _LEAST)
+
+    @property
+    def compared(self) -> tuple[float, float]:
+        """Thickness that tells, in several sweeps and in single ones, m: the median, or else the thickest fifth."""
+        return (self.thickness, self.expected) if self._mostly else (self.upper, self.upper_expected)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -58,10 +71,9 @@ class PoseCheck:
         if not self.blurred:
             return None
         likely = self.cause or "the poses, their clock or the mount of the LiDAR may be wrong"
-        return (
-            f"the poses blur the walls: {1000 * self.thickness:.0f} mm thick where a single sweep has "
-            f"{1000 * self.expected:.0f} mm; {likely}"
-        )
+        here, expected = (f"{1000 * value:.0f} mm" for value in self.compared)
+        part = "" if self._mostly else " in the thickest fifth"
+        return f"the poses blur the walls: {here} thick{part} where a single sweep has {expected}; {likely}"
 
 
 def check_poses(recording: Recording, trajectory: Trajectory) -> PoseCheck | None:
@@ -73,11 +85,11 @@ def check_poses(recording: Recording, trajectory: Trajectory) -> PoseCheck | Non
     if not places:
         return None
 
-    def thickness(poses: Trajectory, turn: Rotation | None = None, single: bool = False) -> float:
+    def thickness(poses: Trajectory, turn: Rotation | None = None, single: bool = False) -> tuple[float, float]:
         return _measure(places, poses, turn, single)
 
-    expected, given = thickness(trajectory, single=True), thickness(trajectory)
-    check = PoseCheck(given, expected)
+    (expected, upper_expected), (given, upper) = thickness(trajectory, single=True), thickness(trajectory)
+    check = PoseCheck(given, expected, upper, upper_expected)
     return _find_cause(check, trajectory, thickness) if check.blurred else check
 
 
@@ -102,8 +114,8 @@ def _sample_scans(recording: Recording, trajectory: Trajectory) -> Iterator[list
         yield group
 
 
-def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None, single: bool) -> float:
-    """Median thickness of the walls, m: in each sweep by itself, or in all sweeps of a place."""
+def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None, single: bool) -> tuple[float, float]:
+    """Median thickness of the walls and that of the thickest fifth, m: in each sweep alone, or in all of a place."""
     result = []
     for group in places:
         clouds = [
@@ -114,7 +126,8 @@ def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None,
             result.append(np.concatenate([_thickness(cloud, _QUERIES // len(clouds)) for cloud in clouds]))
         else:
             result.append(_thickness(np.concatenate(clouds), _QUERIES))
-    return float(np.median(np.concatenate(result)))
+    middle, upper = np.quantile(np.concatenate(result), [0.5, _THICKEST])
+    return float(middle), float(upper)
 
 
 def _thickness(points: np.ndarray, queries: int) -> Float[np.ndarray, " q"]:
@@ -126,21 +139,21 @@ def _thickness(points: np.ndarray, queries: int) -> Float[np.ndarray, " q"]:
     return np.sqrt(np.maximum(spread[:, 0], 0.0))
 
 
-def _find_cause(check: PoseCheck, poses: Trajectory, thickness: Callable[..., float]) -> PoseCheck:
+def _find_cause(check: PoseCheck, poses: Trajectory, thickness: Callable[..., tuple[float, float]]) -> PoseCheck:
     """Undo likely mistakes one by one, and name the one that makes the walls thin."""
-    limit = min(_EXPLAINS * check.thickness, check.thickness - _MIN_GAIN)
-    other = reorder(poses)
-    found = [(thickness(other), "the quaternions are in the order w, x, y, z", True)]
+    given = check.compared[0]
+    which = 0 if given == check.thickness else 1
+    limit = min(_EXPLAINS * given, given - _MIN_GAIN)
+    found = [(thickness(reorder(poses))[which], "the quaternions are in the order w, x, y, z", True)]
     for shift in (sign * size for size in _SHIFTS for sign in (1, -1)):
         side = "later" if shift > 0 else "earlier"
         words = f"with the poses {abs(shift):g} s {side} they are thin: two clocks differ"
         moved = Trajectory(poses.times + shift, poses.positions, poses.rotations, poses.source)
-        found.append((thickness(moved), words, False))
+        found.append((thickness(moved)[which], words, False))
     for axis, name in enumerate(_AXES):
         for angle in (sign * size for size in _TURNS for sign in (1, -1)):
             words = f"with the LiDAR turned by {angle:+g}° in {name} they are thin: the extrinsic is off"
-            found.append((thickness(poses, Rotation.from_euler("xyz"[axis], angle, degrees=True)), words, False))
+            turn = Rotation.from_euler("xyz"[axis], angle, degrees=True)
+            found.append((thickness(poses, turn)[which], words, False))
     best, words, wxyz = min(found, key=lambda row: row[0])
-    if best > limit:
-        return check
-    return PoseCheck(check.thickness, check.expected, words, wxyz)
+    return check if best > limit else replace(check, cause=words, wxyz=wxyz)

@@ -1,10 +1,13 @@
 """Poses that do not belong to their scans are noticed by the walls, and the mistake is named."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.judging.sanity import doubt_bore
+from scene.poses import consistency
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
@@ -27,18 +30,22 @@ def walls(start: np.ndarray, ray: np.ndarray) -> np.ndarray:
     return np.minimum(*sides)
 
 
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory):
+def record(folder: Path, lowest: float) -> Path:
+    """A bag of sweeps whose rays lean by at most some angle's sine from the LiDAR's own plane."""
     rng = np.random.default_rng(0)
     scans = []
     for k in range(COUNT):
         position, attitude = pose(k / RATE + 0.1 * np.arange(RAYS) / RAYS)  # the writer spreads them over 0.1 s
-        ray = rng.standard_normal((RAYS, 3))
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        up, turn = rng.uniform(-lowest, lowest, RAYS), rng.uniform(-np.pi, np.pi, RAYS)
+        ray = np.column_stack([*(np.sqrt(1.0 - up**2) * side(turn) for side in (np.cos, np.sin)), up])
         distance = walls(position, attitude.apply(ray)) + rng.normal(0, 0.01, RAYS)
         scans.append((100.0 + k / RATE, (distance[:, None] * ray).astype(np.float32)))
-    path = write_bag(tmp_path_factory.mktemp("bag") / "walk.bag", scans)
-    with Recording(path) as opened:
+    return write_bag(folder / "walk.bag", scans)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    with Recording(record(tmp_path_factory.mktemp("bag"), 1.0)) as opened:
         yield opened
 
 
@@ -70,6 +77,15 @@ def test_a_wrong_clock_and_a_wrong_mount_are_named(recording, name, bore):
     assert said in check.words
     warnings = doubt_bore(bore, check.facts, {}, surveyed=True)
     assert [warning.code for warning in warnings] == ["poses"]
+
+
+def test_a_pitched_mount_is_named_though_a_flat_fan_sees_little_but_upright_walls(tmp_path, monkeypatch):
+    with Recording(record(tmp_path, 0.4)) as flat:
+        assert check_poses(flat, trajectory()).words is None
+        wrong = trajectory(turn=(0.0, 3.0, 0.0))
+        assert "-3° in pitch they are thin: the extrinsic is off" in check_poses(flat, wrong).words
+        monkeypatch.setattr(consistency, "_WORSE", np.inf)
+        assert check_poses(flat, wrong).words is None, "the median would do"
 
 
 def test_quaternions_in_the_other_order_are_found(recording):
