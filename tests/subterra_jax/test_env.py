@@ -142,30 +142,35 @@ def test_vmap_equals_a_loop(task):
         leaves_equal(alone, jax.tree.map(lambda leaf, i=i: leaf[i], batched), atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    "leaf", ["horizon", "goal_coverage", "lidar.range_sigma", "vehicle.speed_max", "start.lateral"]
-)
-def test_params_may_be_batched(leaf):
+LEAVES = ("horizon", "goal_coverage", "lidar.range_sigma", "vehicle.speed_max", "start.lateral")
+
+
+@pytest.mark.parametrize("leaves", [LEAVES, *(pytest.param((leaf,), marks=pytest.mark.slow) for leaf in LEAVES)])
+def test_params_may_be_batched(leaves):
     env, params = st.make("Subterra/TraverseShort-v0")
-    axes = jax.tree.map(lambda _: None, params)
-    part, _, name = leaf.rpartition(".")
-    owner = getattr(params, part) if part else params
-    values = jnp.stack([getattr(owner, name), 2 * getattr(owner, name)])
 
-    def put(tree, value):
-        inner = (getattr(tree, part) if part else tree).replace(**{name: value})
-        return tree.replace(**{part: inner}) if part else inner
+    def read(leaf):
+        part, _, name = leaf.rpartition(".")
+        return getattr(getattr(params, part) if part else params, name)
 
-    @jax.jit
+    def put(tree, values):
+        for leaf, value in zip(leaves, values, strict=True):
+            part, _, name = leaf.rpartition(".")
+            inner = (getattr(tree, part) if part else tree).replace(**{name: value})
+            tree = tree.replace(**{part: inner}) if part else inner
+        return tree
+
     def two_steps(params):
-        _, state = jax.jit(env.reset)(jax.random.key(0), params)
+        _, state = env.reset(jax.random.key(0), params)
         _, state, *_ = env.step(jax.random.key(1), state, FORWARD, params)
         return env.step(jax.random.key(2), state, FORWARD, params)
 
-    batched = jax.jit(jax.vmap(two_steps, (put(axes, 0),)))(put(params, values))
-    for i, value in enumerate(values):
-        alone = two_steps(put(params, value))
-        leaves_equal(alone, jax.tree.map(lambda x, i=i: x[i], batched), atol=2e-4)
+    values, axes = [jnp.stack([read(leaf), 2 * read(leaf)]) for leaf in leaves], jax.tree.map(lambda _: None, params)
+    batched = jax.jit(jax.vmap(two_steps, (put(axes, [0] * len(leaves)),)))(put(params, values))
+    alone = jax.jit(two_steps)
+    for i in range(2):
+        one = alone(put(params, [value[i] for value in values]))
+        leaves_equal(one, jax.tree.map(lambda x, i=i: x[i], batched), atol=2e-4)
 
 
 def test_an_episode_is_truncated_at_the_horizon_and_that_is_not_termination():

@@ -16,9 +16,12 @@ ZERO = faults.FaultParams(
 )
 
 
+_start = jax.jit(jax.vmap(faults.start_faults, (0, 0, None, None)))  # eager code would compile every operation
+
+
 def begun(params, n=N):
     draw, seed = jax.random.uniform(jax.random.key(0), (n,)), jax.random.bits(jax.random.key(1), (n,))
-    return jax.vmap(faults.start_faults, (0, 0, None, None))(draw, seed, jnp.zeros(6), params)
+    return _start(draw, seed, jnp.zeros(6), params)
 
 
 def run(params, steps, n=N):
@@ -44,7 +47,7 @@ def test_at_severity_0_nothing_is_spoilt():
     state = run(params, 30)[-1]
     draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
     ranges = jnp.full((N, BEAMS), 3.0)
-    spoilt = jax.vmap(faults.spoil, (0, 0, 0, None, None))(ranges, state, draw, jnp.float32(30.0), params)
+    spoilt = jax.jit(jax.vmap(faults.spoil, (0, 0, 0, None, None)))(ranges, state, draw, jnp.float32(30.0), params)
     np.testing.assert_array_equal(spoilt, ranges)
     assert not jax.vmap(faults.frozen)(state).any()
     np.testing.assert_array_equal(jax.vmap(faults.observed, (0, None))(state, params)[:, 0], 30.0)
@@ -54,7 +57,7 @@ def test_at_severity_0_nothing_is_spoilt():
 def test_dust_reflects_the_stated_share_of_beams_somewhere_before_the_wall():
     params = dataclasses.replace(ZERO, dust_rate=0.15)
     draw = jax.random.uniform(jax.random.key(5), (N, faults.n_step_noise(BEAMS)))
-    spoilt = jax.vmap(faults.spoil, (0, 0, 0, None, None))(
+    spoilt = jax.jit(jax.vmap(faults.spoil, (0, 0, 0, None, None)))(
         jnp.full((N, BEAMS), 3.0), begun(params), draw, jnp.float32(30.0), params
     )
     short = np.asarray(spoilt)[np.asarray(spoilt) < 3.0]
@@ -67,7 +70,7 @@ def test_dropped_beams_are_one_sector_that_reports_the_largest_range():
     state = run(params, 5)[-1]
     draw = jnp.zeros(faults.n_step_noise(BEAMS))
     spoilt = np.asarray(
-        jax.vmap(faults.spoil, (0, 0, None, None, None))(
+        jax.jit(jax.vmap(faults.spoil, (0, 0, None, None, None)))(
             jnp.full((N, BEAMS), 3.0), state, draw, jnp.float32(30.0), params
         )
     )
