@@ -47,14 +47,14 @@ $(STAMP): pyproject.toml
 	@touch $@
 
 SHARED ?= ../shared
-tunnels: $(STAMP)  ## make the packaged tunnels again, byte for byte; SHARED names the folder that holds data/metro_asbuilt
+tunnels: $(STAMP)  ## make the packaged bores in three dimensions again; the planar walls stay as they are; SHARED names the folder that holds data/metro_asbuilt
 	$(BIN)/python -m scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out build/survey-351
 	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
 		--provenance simulated --name subterra-351 --out build/subterra-351
 	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --reconstruct.lining.clock-angle 0.61 \
 		--out build/metro-asbuilt
 	for name in subterra-351 metro-asbuilt; do \
-		cp build/$$name/tunnel.npz subterra_jax/data/$$name.npz && cp build/$$name/manifest.json subterra_jax/data/$$name.json; \
+		cp build/$$name/tunnel.npz subterra_jax/data/$$name-solid.npz; \
 	done
 
 clean:           ## remove what was built

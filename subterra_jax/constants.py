@@ -63,3 +63,9 @@ DUST_RATE = 0.15  # per beam
 FREEZE_RATE, FREEZE_STEPS = 0.01, 30.0  # per step, steps
 DELAY = 4.0  # steps
 WET_PATCH, WET_SHARE, WET_LOSS = 10.0, 0.3, 0.3  # m, of the patches, of the speed
+
+# LiDARs in three dimensions: range noise, what each metre and each unit of the tangent of incidence add to it, returns
+# lost, share of mixed pixels where these are asked for.
+SPATIAL_SIGMA, SPATIAL_SIGMA_PER_METRE, SPATIAL_SIGMA_SLANT = 0.019, 1e-4, 0.002  # m, m/m, m
+SPATIAL_LOST, SPATIAL_MIXED = 0.004, 0.1  # 1, 1
+SPATIAL_HEIGHT = 0.7  # m above the ground

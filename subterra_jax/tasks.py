@@ -22,6 +22,7 @@ from subterra_jax.host.loading import load_module
 from subterra_jax.host.versions import no_task
 from subterra_jax.parts import Faults, Obstacles, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
 from subterra_jax.parts.wander import WanderParams
 from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
 from subterra_jax.rules.rule import ERRANDS
@@ -163,6 +164,8 @@ def make(
     lining: str | None = None,
     estimates: bool = False,
     parts: Sequence[Part] = (),
+    sensor: Any = SENSORS[0],
+    sweep: bool = False,
     **overrides: Any,
 ) -> tuple[Any, Any]:
     """Make an environment and its params.
@@ -179,6 +182,9 @@ def make(
         estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
             estimation track. It does not move the robot; `info` tells its error.
         parts: Further parts, as sensors of one's own; their entries stand at the end of the observation.
+        sensor: The LiDAR: `planar16`, the paper's; `spin16x64`, `vlp16`, `os1-64`, `avia` or unit vectors `(n, 3)`, in
+            three dimensions, whose `scan` takes the place of `ranges`; or what `parts.make_sensor` returns.
+        sweep: Cast each beam of a LiDAR in three dimensions from the pose at its own time.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
             `obstacles` and `faults` bring their part to a task that lacks it.
 
@@ -192,22 +198,38 @@ def make(
     """
     id = find(id)
     if id == WALK or id in MISSIONS:
+        _require_planar(id, sensor, sweep)
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
         make_walking = walking.make if id == WALK else walking.make_mission
         return make_walking(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
     task = TASKS[id]
-    named = {part.name for part in (*task.parts, *parts)}
+    spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
+    if spatial:
+        made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
+        overrides = {"lidar": dataclasses.replace(made, sweep=sweep or made.sweep), **overrides}
+    else:
+        _require_planar(id, sensor, sweep)
+    own = [SpatialLidar() if spatial and isinstance(part, PlanarLidar) else part for part in task.parts]
+    named = {part.name for part in (*own, *parts)}
     brought = (part for part in OPTIONAL if part.name in overrides and part.name not in named)
-    env = TunnelEnv(id=id, rule=task.rule, parts=(*task.parts, *brought, *parts), estimates=estimates)
+    env = TunnelEnv(id=id, rule=task.rule, parts=(*own, *brought, *parts), estimates=estimates)
     horizon = overrides.pop("horizon", task.horizon)
     entries = collect_entries(env, {**task.params, **overrides})
     _check_robot(entries)
-    reach = float(np.max(entries["lidar"].range_max))
-    params = make_params(env, resolve(tunnel, lining, task.piece, reach), horizon, entries)
+    reach = c.RANGE_MAX if spatial else float(np.max(entries["lidar"].range_max))
+    params = make_params(env, resolve(tunnel, lining, task.piece, reach, spatial), horizon, entries)
     env.check(params)
     check_length(env, params)
     return env, params
+
+
+def _require_planar(id: str, sensor: Any, sweep: bool) -> None:
+    """Refuse another LiDAR than the planar one, or its sweep."""
+    if not (isinstance(sensor, str) and sensor == SENSORS[0]):
+        raise ValueError(f"{id} has the sensor {SENSORS[0]!r} alone, got {sensor!r}")
+    if sweep:
+        raise ValueError(f"{SENSORS[0]!r} measures a scan at one moment: sweep=True needs a LiDAR in three dimensions")
 
 
 def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, Any]:

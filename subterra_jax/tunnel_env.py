@@ -273,6 +273,10 @@ class TunnelEnv:
         low, high = (np.concatenate([np.ravel(np.asarray(bound[side])) for bound in bounds]) for side in (0, 1))
         return Box(low.astype(np.float32), high.astype(np.float32))
 
+    def images(self, params: EnvParams) -> dict[str, tuple[int, int]]:
+        """Return rows and columns of the named entries that are images; in an observation they lie row by row."""
+        return {name: shape for part in self.parts for name, shape in part.images(params).items()}
+
     def action_space(self, params: EnvParams) -> Box:
         """Return the bounds of an action; `step` clips to them."""
         speed, yaw_rate = (np.max(np.asarray(v)) for v in (params.vehicle.speed_max, params.vehicle.yaw_rate_max))
@@ -331,6 +335,8 @@ class TunnelEnv:
             raise ValueError(f"{self.id}: the rule {rule} needs the part {min(missing)!r}; there are {sorted(names)}")
         _check_start(self, params)
         self._space(params)
+        for part in self.parts:
+            part.check(frozenset(names), params)
 
     def _observers(self) -> list[Part | Rule]:
         """Parts and rule in the order of their entries in the observation."""

@@ -18,7 +18,7 @@ from subterra_jax.policies.loading import Agent
 from train.config import ConfigError
 from train.log import print_table
 from train.policies import open_agent
-from train.world import World, open_world
+from train.world import PLANAR, World, open_world
 
 _BATCH = 500
 
@@ -94,7 +94,7 @@ def command(arguments: Command) -> None:
     lining = arguments.lining
     if lining is None and arguments.tunnel is None:
         lining = facts["world"]["lining"]
-    world = open_world(arguments.task or facts["task"], arguments.tunnel, lining)
+    world = open_world(arguments.task or facts["task"], arguments.tunnel, lining, facts["world"].get("sensor", PLANAR))
     source = arguments.policy or agent.name
     released.check_fits(agent, world.env, world.params, source)
     found = {**world.facts, **evaluate(world, agent, arguments.episodes)}

@@ -51,6 +51,7 @@ class Command:
         tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, `procedural:train:7`,
             `procedural:train:0-255`, of which each episode draws one.
         lining: Variant of the walls; `pockets` if left out, or the first where a tunnel has none.
+        sensor: LiDAR: `planar16`, the task's own; `spin16x64`, `vlp16` or `os1-64`, seen as an image; or `avia`.
         memory: `none`: a perceptron over a few observations. `gru`: a network that remembers; it learns by reward, or
             with `--teacher oracle` (any baseline, policy file or run folder) from a teacher. `map`: a belief over every
             place of a known tunnel, for Relocalise; what a scan says of a place is learnt.
@@ -72,6 +73,7 @@ class Command:
     task: str = _DEFAULT_TASK
     tunnel: Path | None = None
     lining: str | None = None
+    sensor: Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"] = "planar16"
     memory: Literal["none", "gru", "map"] = "none"
     preset: str | None = None
     seeds: tuple[int, ...] = ()
@@ -186,7 +188,9 @@ def command(arguments: Command) -> int:
 def _world(arguments: Command) -> World:
     """Opens the task for the robot that is to do it."""
     if arguments.embodiment == "scout":
-        return open_world(arguments.task, arguments.tunnel, arguments.lining)
+        return open_world(arguments.task, arguments.tunnel, arguments.lining, arguments.sensor)
+    if arguments.sensor != "planar16":
+        raise ConfigError(f"sensor = {arguments.sensor}: the B2 carries planar16")
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
     return embodied.open_world(arguments.task, arguments.tunnel, arguments.lining, arguments.legs)

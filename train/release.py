@@ -18,7 +18,7 @@ from train.config import Legs
 from train.evaluate import evaluate
 from train.log import print_table
 from train.policies import load_policy, make_agent, write_policy
-from train.world import World, library_versions, open_world
+from train.world import PLANAR, World, library_versions, open_world
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +63,7 @@ def command(arguments: Command) -> None:
 def _world(stored: dict[str, Any], arguments: Command) -> World:
     """Opens the world to score in: of the robot that was trained, or of the stand-in of one on legs."""
     if stored["world"].get("embodiment") is None:
-        return open_world(stored["task"], arguments.tunnel, arguments.lining)
+        return open_world(stored["task"], arguments.tunnel, arguments.lining, stored["world"].get("sensor", PLANAR))
     from train.b2 import embodied  # MuJoCo is loaded only where legs are meant
 
     return embodied.open_world(stored["task"], arguments.tunnel, arguments.lining, Legs(robots=0))

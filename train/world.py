@@ -18,6 +18,7 @@ from subterra_jax.tasks import TaskError, find
 from subterra_jax.tunnel.sources import tunnel_digest
 from train.config import ConfigError
 
+PLANAR = "planar16"
 REWARD = "reward"  # fact of a world with other weights than the task's
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
 
@@ -104,7 +105,7 @@ def require_task(task: str) -> str:
     return task
 
 
-def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) -> World:
+def open_world(task: str, tunnel: Path | str | None, lining: str | None = None, sensor: str = PLANAR) -> World:
     """Opens a task on a tunnel.
 
     Args:
@@ -112,17 +113,18 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) 
         tunnel: File or name; None is the packaged tunnel. `procedural:train:0-255` means several tunnels, of which each
             episode draws one.
         lining: Variant of the walls; None is the tunnel's usual one.
+        sensor: LiDAR, as `st.make` takes it by name.
 
     Raises:
-        ConfigError: There is no such task, or the tunnel has no room for it.
+        ConfigError: There is no such task or sensor, or the tunnel has no room for it.
         TunnelError: The tunnel file is missing or wrong, or has no such lining.
     """
     task = require_task(task)
     names = [tunnel] if tunnel is None else expand(str(tunnel))
-    plans = [st.load_tunnel(name) for name in names]
+    plans = [st.load_tunnel(name, solid=sensor != PLANAR) for name in names]
     lining = lining or plans[0].default_lining
     try:
-        env, params = st.make(task, tunnel=plans if len(plans) > 1 else plans[0], lining=lining)
+        env, params = st.make(task, tunnel=plans if len(plans) > 1 else plans[0], lining=lining, sensor=sensor)
     except st.SubterraError:
         raise
     except ValueError as error:
@@ -136,6 +138,8 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None = None) 
         "constants": st.constants_digest(env, params),
         "tunnel_sha256": digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest(),
     }
+    if sensor != PLANAR:
+        facts["sensor"] = sensor
     return World(task, env, params, facts)
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from subterra_jax.lidar3d.beams import level_ring, n_level
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -21,7 +22,8 @@ class Observed:
 
     Attributes:
         flat: The observation itself.
-        ranges: LiDAR ranges, m, the first straight ahead, the others counter-clockwise.
+        ranges: LiDAR ranges, m, the first straight ahead, the others counter-clockwise; of a LiDAR in three dimensions
+            `beams.level_ring`.
         distance: Dead-reckoned distance, m.
         heading: Dead-reckoned heading, rad, in [-π, π]; 0 at the start.
         goal: Station of the goal, m.
@@ -92,6 +94,15 @@ class Agent(Protocol):
         """
 
 
+LIDAR_ENTRIES = frozenset({"ranges", "scan", "intensity"})
+
+
+def n_ranges(params: EnvParams) -> int:
+    """Return the number of `Observed.ranges`."""
+    sensor = params.lidar
+    return n_level(sensor.shape) if hasattr(sensor, "shape") else sensor.n_beams
+
+
 def observed(env: TunnelEnv, params: EnvParams, flat: Float[Array, "n_obs"], sees: bool = True) -> Observed:
     """Take an observation apart.
 
@@ -103,11 +114,13 @@ def observed(env: TunnelEnv, params: EnvParams, flat: Float[Array, "n_obs"], see
     """
     fields = env.fields(params)
     if not sees:
-        flat = flat.at[fields["ranges"]].set(jnp.nan)
+        for name in LIDAR_ENTRIES & set(fields):
+            flat = flat.at[fields[name]].set(jnp.nan)
     entries = {name: flat[where] for name, where in fields.items()}
+    ranges = entries["ranges"] if "ranges" in entries else level_ring(entries["scan"], params.lidar.shape)
     distance, heading = entries["odometry"]
     further = {name: entries[name][0] for name in ("goal", "ring_pitch", "flag") if name in entries}
-    return Observed(flat, entries["ranges"], distance, heading, **further, entries=entries)
+    return Observed(flat, ranges, distance, heading, **further, entries=entries)
 
 
 def shown(params: EnvParams, sees_map: bool) -> EnvParams:
@@ -115,5 +128,6 @@ def shown(params: EnvParams, sees_map: bool) -> EnvParams:
     if sees_map:
         return params
     tunnel = params.tunnel
+    tunnel = dataclasses.replace(tunnel, space=None)
     hidden: dict[str, Any] = {name: jnp.full_like(getattr(tunnel, name), jnp.nan) for name in ("grid", "box", "wall")}
     return params.replace(tunnel=dataclasses.replace(tunnel, **hidden))

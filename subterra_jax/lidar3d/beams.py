@@ -3,6 +3,8 @@
 They are the input of `lidar3d.scan`, which takes a sweep from one pose; motion during a sweep is left to the caller.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 
@@ -69,6 +71,27 @@ def rosette(
     first, second = (2.0 * np.pi * rate * time for rate in _PRISMS)
     azimuth = half_fov[0] * 0.5 * (np.cos(first) + np.cos(second))
     return _unit(azimuth, half_fov[1] * 0.5 * (np.sin(first) + np.sin(second)))
+
+
+N_LEVEL = 16  # beams of `level_ring`
+
+
+def level_ring(scan: Any, shape: tuple[int, int]) -> Any:
+    """Return what of a scan a planar LiDAR would see: 16 beams of the ring just above its middle, ahead first.
+
+    Args:
+        scan: Ranges row by row, `(..., rows * columns)`.
+        shape: Rows and columns. A scan of one row is returned whole.
+    """
+    rows, columns = shape
+    if rows == 1:
+        return scan
+    return scan[..., (rows // 2) * columns + np.arange(n_level(shape)) * columns // N_LEVEL]
+
+
+def n_level(shape: tuple[int, int]) -> int:
+    """Return the number of beams of `level_ring`."""
+    return shape[1] if shape[0] == 1 else N_LEVEL
 
 
 def _unit(azimuth: np.ndarray, elevation: np.ndarray) -> Float[np.ndarray, "n 3"]:

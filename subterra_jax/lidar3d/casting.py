@@ -5,14 +5,14 @@ Under any number of `vmap`s all rays are one call. The cost depends on neither t
 triangles, and no ray's result on another's.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import native
 from subterra_jax.compiled import in_32_bits
@@ -90,6 +90,60 @@ def cast(
     blocks = jnp.broadcast_to(block_at(relief, origin, station), (n,))
     limits = jnp.broadcast_to(jnp.asarray(range_max, jnp.float32), (n,))
     return _ranges(relief.shared, origins, jnp.asarray(directions, jnp.float32), blocks, limits)
+
+
+class Met(NamedTuple):
+    """Surfaces that rays meet.
+
+    Attributes:
+        ranges: Distance along each ray, m; exactly the largest range where nothing is met.
+        normal: Unit normal of the surface, tunnel frame, to either side; arbitrary where nothing is met.
+        thing: A box is met, as track or furniture, and not the lining.
+    """
+
+    ranges: Float[Array, "n"]
+    normal: Float[Array, "n 3"]
+    thing: Bool[Array, "n"]
+
+
+@in_32_bits()
+def meet(
+    relief: Relief,
+    origins: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"],
+    station: Float[Array, ""],
+    limits: Float[Array, "n"],
+) -> Met:
+    """Return the surfaces that rays meet, each from an origin of its own. Ranges have derivatives as those of `cast`.
+
+    Args:
+        relief: Surface of the bore, or of one picked from a stack.
+        origins: Origins, tunnel frame, m, all within 2 m of the station.
+        directions: Unit vectors, tunnel frame; not checked.
+        station: Station of the origins, m.
+        limits: Largest ranges, m.
+    """
+    blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, jnp.asarray(station, jnp.float32))
+    return Met(*_meet(relief.shared, origins, directions, blocks, limits))
+
+
+@jax.custom_jvp
+@in_32_bits()
+def _meet(
+    relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array
+) -> tuple[Array, Array, Array]:
+    hits = _find(relief, origins, directions, blocks, limits)
+    normal = _normals(relief, hits, origins, directions)
+    return _clip(hits, origins, directions, limits), normal, hits.entry < -1
+
+
+@_meet.defjvp
+@in_32_bits()
+def _meet_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """Return what rays meet and how the ranges change; the same surface is met."""
+    ranges, change = _ranges_and_changes(primals, tangents)
+    _, normal, thing = _meet(*primals)
+    return (ranges, normal, thing), (change, jnp.zeros_like(normal), np.zeros(thing.shape, jax.dtypes.float0))
 
 
 def _require_pattern(directions: Float[Array, "n 3"]) -> None:

@@ -17,6 +17,7 @@ from subterra_jax.tunnel.shell import Shell, ShellLining, brick_corners
 _BAND = 0.6  # share of the spacing around within which no grid point is near a rim or a corner of the section
 _CORNER = np.radians(30.0)  # a section that turns more than this over four of its angles has a corner there
 _PAD = 1.0  # of the sheet, repeated beyond the seam, m
+_AROUND_CUT = 4.0  # of wall beyond a cut that is triangulated, m; further away no triangle depends on it
 _LID = 0.05  # of a recess's box inside the bore, so that a union leaves no film, m
 
 
@@ -59,8 +60,12 @@ def _raise_wall(shell: Shell, lining: ShellLining) -> Triangles:
     plane = _unroll(shell, lining.seam)
     boxes, apart = _rectangles(shell, plane, lining.pocket)
     fold = np.sort(plane.to_around(_section_corners(shell)))
-    sheet = _triangulate(plane, shell.station[-1], fold, boxes[apart], shell.spacing)
-    wall = _roll_up(shell, plane, sheet, lining.pocket[apart])
+    near = np.array([shell.window[0] - _AROUND_CUT, shell.window[1] + _AROUND_CUT])
+    if not apart.all():
+        near = np.array([-np.inf, np.inf])  # the union needs the whole, closed at both mouths
+    chosen = apart & (boxes[:, 2] > near[0]) & (boxes[:, 3] < near[1])
+    sheet = _triangulate(plane, shell.station[-1], fold, boxes[chosen], shell.spacing, near)
+    wall = _roll_up(shell, plane, sheet, lining.pocket[chosen])
     return wall if apart.all() else _sink(wall, sheet, shell, lining.pocket[~apart])
 
 
@@ -184,10 +189,12 @@ def _triangulate(
     fold: Float[np.ndarray, " c"],
     boxes: Float[np.ndarray, "r 4"],
     spacing: tuple[float, float],
+    near: Float[np.ndarray, "2"],
 ) -> _Sheet:
-    """Triangulate one turn over the whole length, with edges along the axis at the arc lengths `fold`, m."""
+    """Triangulate one turn between two stations, with edges along the axis at the arc lengths `fold`, m."""
     band = _BAND * spacing[1]
     u, s = _grid(plane.girth, length, fold, spacing)
+    u, s = (values[(s >= near[0]) & (s <= near[1])] for values in (u, s))
     recess, clear = np.full(len(u), -1), np.ones(len(u), bool)
     for k, (u0, u1, s0, s1) in enumerate(boxes):
         rows = slice(*np.searchsorted(s, [s0 - band, s1 + band]))

@@ -6,6 +6,7 @@ from subterra_jax.parts.odometer import Odometer
 from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, Sight, Step
 from subterra_jax.parts.planar_lidar import PlanarLidar
 from subterra_jax.parts.slip import Slip
+from subterra_jax.parts.spatial_lidar import SpatialLidar, SpatialParams, make_sensor
 from subterra_jax.parts.unicycle import Unicycle
 
 __all__ = [
@@ -20,6 +21,9 @@ __all__ = [
     "PlanarLidar",
     "Sight",
     "Slip",
+    "SpatialLidar",
+    "SpatialParams",
     "Step",
     "Unicycle",
+    "make_sensor",
 ]

@@ -235,6 +235,23 @@ class Part(abc.ABC):
         del params
         return {}
 
+    def images(self, params: EnvParams) -> dict[str, tuple[int, int]]:
+        """Return rows and columns of the entries that are images, row by row in the observation."""
+        del params
+        return {}
+
+    def check(self, others: frozenset[str], params: EnvParams) -> None:
+        """Refuse params that the part cannot honour, or parts that it does not go with.
+
+        Args:
+            others: Names of all parts.
+            params: The task.
+
+        Raises:
+            ValueError: It cannot.
+        """
+        del others, params
+
     def privileged(self, own: Any) -> dict[str, Array]:
         """Return what a teacher or a critic may know of the part, and an agent may not."""
         del own

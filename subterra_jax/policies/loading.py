@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from subterra_jax.baselines import registry
-from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.agent import Observed, n_ranges
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.policies import belief, senses
 from subterra_jax.policies.belief import Belief, Habits
@@ -68,7 +68,8 @@ def from_tensors(
             raise ValueError(f"made for senses of version {version}, this release has {senses.VERSION}; train it anew")
         shown = senses.Senses(str(layout.get("tracker", "loop")), bool(layout.get("boxes", False)))
         width = float(layout["bin_width"])
-        return Recurrent(arrays, low, high, bin_width=width, shown=shown, name=name, conditions=conditions)
+        image = tuple(layout["image"]) if layout.get("image") else None
+        return Recurrent(arrays, low, high, bin_width=width, shown=shown, image=image, name=name, conditions=conditions)
     if kind == belief.KIND:
         return Belief(arrays, low, high, habits=Habits(**layout["habits"]), name=name, conditions=conditions)
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
@@ -100,9 +101,11 @@ def check_task(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
     if isinstance(agent, Recurrent):
         if errand not in ("stop", "return"):
             raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
-        wanted, made_for = params.lidar.n_beams, agent.n_beams
+        wanted, made_for = n_ranges(params), agent.n_beams
         if wanted != made_for:
             raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
+        if (image := env.images(params).get("scan")) != agent.image:
+            raise PolicyError(f"{source}: made for images of shape {agent.image}, {env.id} has {image}")
     elif isinstance(agent, Belief):
         if errand != "report":
             raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
@@ -193,5 +196,6 @@ def _try(agent: Agent) -> None:
         jax.eval_shape(belief.try_scan, agent.tensors)
         return
     zero, ranges = jnp.zeros(()), jnp.zeros(agent.n_beams)
-    seen = Observed(flat=ranges, ranges=ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero)
+    entries = {} if agent.image is None else {"scan": jnp.zeros(agent.image[0] * agent.image[1])}
+    seen = Observed(ranges, ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero, entries=entries)
     jax.eval_shape(agent.answer, agent.blank(), seen, zero)

@@ -119,6 +119,7 @@ class Recurrent:
         high: Largest action, m/s and rad/s.
         bin_width: Width of a bin of the estimation head, m.
         shown: Choice of the network's inputs.
+        image: Rows and columns of the scan of a LiDAR in three dimensions that it sees; None without one.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
         uses_lidar: Always true: it reads the ranges.
@@ -131,6 +132,7 @@ class Recurrent:
     high: Float[Array, "2"]
     bin_width: float = struct.field(pytree_node=False)
     shown: senses.Senses = struct.field(pytree_node=False, default=senses.PLAIN)
+    image: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
     name: str = struct.field(pytree_node=False, default="ppo-gru")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
     uses_lidar: bool = struct.field(pytree_node=False, default=True)
@@ -139,12 +141,13 @@ class Recurrent:
 
     @property
     def n_features(self) -> int:
-        """Number of the network's inputs."""
-        return self.tensors["memory.Dense_0.kernel"].shape[0]
+        """Number of the network's inputs beside an image."""
+        glance = 0 if self.image is None else self.tensors["memory.glance.kernel"].shape[1]
+        return self.tensors["memory.Dense_0.kernel"].shape[0] - glance
 
     @property
     def n_beams(self) -> int:
-        """Number of beams of the scans that it was trained on."""
+        """Number of beams of the planar scans that it was trained on."""
         return self.shown.n_beams(self.n_features)
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> RecurrentMemory:
@@ -174,7 +177,7 @@ class Recurrent:
             "flag": jnp.atleast_1d(obs.flag),
         }
         sight = senses.look(parts, start, memory.reckoning)
-        hidden = self._update_hidden(memory.hidden, sight.features)
+        hidden = self._update_hidden(memory.hidden, self._with_image(sight.features, obs))
         error, log_sigma = self._estimate(hidden)
         aim = senses.aim(sight.ahead - error, log_sigma)
         parameters = perceptron(self.tensors, "policy", jnp.concatenate([hidden, aim]), jax.nn.swish)
@@ -184,6 +187,15 @@ class Recurrent:
         direction = 1.0 - 2.0 * sight.reckoning.back
         station = start + sight.station + error + direction * senses.PERIOD * jnp.maximum(action[0], 0.0)
         return jnp.stack([action[0], action[1], station, log_sigma, direction]), after
+
+    def _with_image(self, features: Float[Array, "n"], obs: Observed) -> Float[Array, "m"]:
+        """Returns the features with what the network sees of the scan."""
+        if self.image is None:
+            return features
+        tiles = jax.nn.swish(
+            dense(self.tensors, "memory.patch", senses.patches(obs.entries["scan"] / 30.0, self.image))
+        )
+        return jnp.concatenate([features, jax.nn.swish(dense(self.tensors, "memory.glance", tiles.reshape(-1)))])
 
     def _update_hidden(self, before: Float[Array, "hidden"], features: Float[Array, "n"]) -> Float[Array, "hidden"]:
         """Returns the hidden state one step later."""

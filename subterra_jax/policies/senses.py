@@ -262,6 +262,25 @@ def _features(
     return jnp.concatenate([across, ranges / 30.0, now.action, jnp.stack(single, axis=-1), *near], axis=-1)
 
 
+PATCH = 4  # rows and columns of a patch of an image
+
+
+def patches(image: Float[Array, "*env n"], shape: tuple[int, int]) -> Float[Array, "*env k 32"]:
+    """Return the patches of an image of ranges, each pixel as its distance across the tunnel and as its range.
+
+    Args:
+        image: Ranges over 30 m, row by row.
+        shape: Rows and columns, multiples of 4; columns go round the whole turn.
+    """
+    rows, columns = shape
+    side = np.abs(np.sin(np.arange(columns) * (2.0 * np.pi / columns))).astype(np.float32)
+    grid = image.reshape(*image.shape[:-1], rows, columns)
+    across = jnp.clip((30.0 * grid * side - HALF_WIDTH) / 0.3, -3.0, 3.0)
+    both = jnp.stack([across, grid], axis=-1)
+    tiles = both.reshape(*image.shape[:-1], rows // PATCH, PATCH, columns // PATCH, PATCH, 2)
+    return jnp.swapaxes(tiles, -4, -3).reshape(*image.shape[:-1], -1, 2 * PATCH * PATCH)
+
+
 def aim(ahead: Float[Array, "*env"], log_sigma: Float[Array, "*env"]) -> Float[Array, "*env 5"]:
     """Returns the distance to go at several scales, from the last decimetres on.
 

@@ -62,6 +62,7 @@ class TunnelPlan:
             unknown. Pockets repeat with it.
         shell: The bore in three dimensions; `None` where it is not known.
         ring_joint: Stations of the ring joints as built, which nobody is told, m, `(r,)`; empty where not known.
+        source: File that it was read from; empty if from none.
     """
 
     name: str
@@ -76,6 +77,7 @@ class TunnelPlan:
     ring_pitch: float = 0.0
     shell: Shell | None = None
     ring_joint: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    source: str = ""
 
     @property
     def length(self) -> float:

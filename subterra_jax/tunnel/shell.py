@@ -74,7 +74,7 @@ class Shell:
         return np.cross(self.tangent, self.left)
 
     def cut(self, start: float, end: float) -> Shell:
-        """Return the piece between two stations of this piece, m. Its arrays stay whole, so that no triangle moves."""
+        """Return the piece between two stations of this piece, m. Its arrays stay whole, so that no point moves."""
         first, last = self.window
         return dataclasses.replace(self, window=(first + start, min(first + end, last)))
 

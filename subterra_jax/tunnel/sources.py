@@ -131,6 +131,7 @@ def read_tunnel(path: Path) -> TunnelPlan:
             for name in names
         },
         ring_pitch=ring_pitch,
+        source=str(path),
     )
     if schema == SCHEMA:
         plan = dataclasses.replace(plan, shell=_read_shell(fields, plan))
@@ -193,6 +194,9 @@ def tunnel_of(scene: Path) -> Path:
 
 
 PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
+# The walls of the packaged tunnels stay, byte for byte, since every score depends on them; the bore in three dimensions
+# lies beside them, from the same survey built again.
+SOLID = "-solid.npz"
 GENERATED = re.compile(r"control|procedural:.*|open:.*")  # names of generated tunnels
 
 Source = Tunnel | TunnelPlan | str | Path | None
@@ -224,7 +228,12 @@ def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> Tunne
     if GENERATED.fullmatch(str(path)):
         return generate(str(path), solid=solid)
     with resources.as_file(tunnel_file(path)) as file:
-        return read_tunnel(file)
+        plan = read_tunnel(file)
+    beside = resources.files("subterra_jax") / "data" / f"{plan.name}{SOLID}"
+    if plan.shell is not None or str(path or PACKAGED[0]) not in PACKAGED or not beside.is_file():
+        return plan
+    with resources.as_file(beside) as file:
+        return dataclasses.replace(plan, shell=read_tunnel(file).shell)
 
 
 def tunnel_digest(path: str | Path | None = None) -> str:
@@ -246,6 +255,7 @@ def resolve(
     lining: str | None,
     piece: tuple[float, float] | None,
     reach: float,
+    spatial: bool = False,
 ) -> Tunnel:
     """Return the device tunnel for anything that a user may name one by.
 
@@ -255,24 +265,29 @@ def resolve(
         lining: Variant of the walls; `None` is `pockets`, or the first where a tunnel has none.
         piece: Start and length of the piece to cut out, m; `None` keeps the whole tunnel. A piece beyond the tunnel's
             end is shortened.
-        reach: Largest LiDAR range, m.
+        reach: Largest range of a planar LiDAR, m.
+        spatial: Add the tunnel's `Space`, which a LiDAR in three dimensions needs.
 
     Raises:
-        TunnelError: A file cannot be read or is wrong, or the tunnel or lining does not exist.
-        ValueError: A `Tunnel` was made for shorter ranges, or the list is empty.
+        TunnelError: A file cannot be read, is wrong or holds no heights, or the tunnel or lining does not exist.
+        ValueError: A `Tunnel` was made for shorter ranges or for planar LiDARs alone, or the list is empty.
     """
     if isinstance(tunnel, Tunnel):
         if tunnel.reach < reach:
             raise ValueError(f"the tunnel was made for ranges up to {tunnel.reach} m, got range_max={reach}")
+        if spatial and tunnel.space is None:
+            raise ValueError("the tunnel was made for planar LiDARs alone: give its name, its file or its plan")
         return tunnel
     if isinstance(tunnel, str | Path) and len(names := expand(str(tunnel))) > 1:
         tunnel = names
     if tunnel is not None and not isinstance(tunnel, TunnelPlan | str | Path):
-        return stack([resolve(each, lining, piece, reach) for each in tunnel])
+        return stack([resolve(each, lining, piece, reach, spatial) for each in tunnel])
     if isinstance(tunnel, TunnelPlan):
         plan = tunnel
     elif GENERATED.fullmatch(str(tunnel)):
-        plan = generate(str(tunnel), (lining or default_lining(str(tunnel)),))  # no more than is needed is made
+        plan = generate(
+            str(tunnel), (lining or default_lining(str(tunnel)),), spatial
+        )  # no more than is needed is made
     else:
         plan = load_tunnel(tunnel)
     if piece is not None:
@@ -280,4 +295,9 @@ def resolve(
         plan = dataclasses.replace(plan, linings={name: plan.lining(name)})  # no more than is needed is cut
         start, length = piece
         plan = plan.slice(start, min(length, plan.length - start))
-    return Tunnel.from_plan(plan, lining, reach=reach)
+    planar = Tunnel.from_plan(plan, lining, reach=reach)
+    if not spatial:
+        return planar
+    from subterra_jax.lidar3d.space import Space  # it reads plans itself
+
+    return dataclasses.replace(planar, space=Space.from_plan(plan, lining))

@@ -44,6 +44,7 @@ class Tunnel:
             window, counted up to the next power of two, holds blocks of one tunnel, padding, or nothing.
         n_contact: Blocks in a contact window.
         n_candidates: Blocks in which a beam looks for its hit, nearest first.
+        space: Surface and ground, a `lidar3d.space.Space`, for LiDARs in three dimensions; `None` without one.
     """
 
     length: Float[Array, "*k"]
@@ -60,6 +61,7 @@ class Tunnel:
     n_scan: int = struct.field(pytree_node=False)
     n_contact: int = struct.field(pytree_node=False)
     n_candidates: int = struct.field(pytree_node=False)
+    space: Any = None
 
     @property
     def count(self) -> int:
@@ -76,9 +78,10 @@ class Tunnel:
         """
         if self.count == 1:
             return self
-        return self._with_numbers(
+        one = self._with_numbers(
             self.length[index], self.spacing[index], self.ring_pitch[index], self.first_node[index], self.n_nodes[index]
         )
+        return one if self.space is None else dataclasses.replace(one, space=self.space.pick(index))
 
     @property
     def walls(self) -> "Tunnel":
@@ -86,7 +89,8 @@ class Tunnel:
 
         In a batch that picks different tunnels it is one for all.
         """
-        return self._with_numbers(*(np.float32(0.0),) * 3, *(np.int32(0),) * 2)
+        bare = dataclasses.replace(self, space=None)
+        return bare._with_numbers(*(np.float32(0.0),) * 3, *(np.int32(0),) * 2)
 
     def _with_numbers(self, length: Any, spacing: Any, ring_pitch: Any, first_node: Any, n_nodes: Any) -> "Tunnel":
         return dataclasses.replace(
@@ -261,6 +265,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         n_scan=n_scan,
         n_contact=n_contact,
         n_candidates=max(t.n_candidates for t in tunnels),
+        space=None if tunnels[0].space is None else tunnels[0].space.join([t.space for t in tunnels]),
     )
 
 

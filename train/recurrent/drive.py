@@ -8,6 +8,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 import subterra_jax as st
+from subterra_jax.baselines.agent import n_ranges
+from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.policies import senses
 from train.config import ConfigError
 from train.recurrent.config import RecurrentConfig
@@ -68,7 +70,11 @@ class Rollout:
 def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> senses.Sight:
     """Returns the inputs of the network for a batch of observations."""
     part = {name: observation[..., where] for name, where in env.fields(params).items()}
-    return senses.look(part, params.start.station, reckoning)
+    if "scan" not in part:
+        return senses.look(part, params.start.station, reckoning)
+    part["ranges"] = level_ring(part["scan"], params.lidar.shape)
+    view = senses.look(part, params.start.station, reckoning)
+    return view.replace(features=jnp.concatenate([view.features, part["scan"] / 30.0], axis=-1))  # type: ignore[attr-defined]
 
 
 def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Array, "env"]) -> Float[Array, "env n"]:
@@ -106,7 +112,7 @@ def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, layout: Recurre
     return Drive(
         env_state=state,
         observation=observation,
-        reckoning=senses.start((n_envs,), params.lidar.n_beams, layout.shown),
+        reckoning=senses.start((n_envs,), n_ranges(params), layout.shown),
         hidden=jnp.zeros((n_envs, layout.hidden)),
         first=jnp.ones(n_envs, bool),
         episode_return=jnp.zeros(n_envs),
@@ -238,6 +244,7 @@ def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayo
         min_std=config.min_std,
         tracker=shown.tracker,
         boxes=shown.boxes,
+        image=env.images(params).get("scan"),
     )
 
 
@@ -249,5 +256,5 @@ def senses_of(params: Any, config: RecurrentConfig) -> senses.Senses:
 
 def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Array, Array]:
     _, state = batch.reset(jax.random.key(0), params, 1)
-    view = look(env, params, observation, senses.start((1,), params.lidar.n_beams, shown))
+    view = look(env, params, observation, senses.start((1,), n_ranges(params), shown))
     return view.features, truth(env, params, state, view, jnp.zeros(1))

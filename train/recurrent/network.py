@@ -14,6 +14,7 @@ from subterra_jax.policies.senses import PLAIN, Senses
 from train.learning import MLP, NormalTanhDistribution
 
 Weights = Any
+PATCH_WIDTH, GLANCE_WIDTH = 32, 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,7 @@ class RecurrentLayout:
         senses: Version of its inputs.
         tracker: Ring counter whose count it sees.
         boxes: It sees the boxes that are remembered.
+        image: Rows and columns of the image that the last features are; None without one.
     """
 
     n_features: int
@@ -47,6 +49,7 @@ class RecurrentLayout:
     senses: int = senses.VERSION
     tracker: str = PLAIN.tracker
     boxes: bool = PLAIN.boxes
+    image: tuple[int, int] | None = None
 
     @property
     def shown(self) -> Senses:
@@ -55,9 +58,13 @@ class RecurrentLayout:
 
 
 class Memory(nn.Module):
-    """A dense layer and a GRU over time; the hidden state is cleared where an episode begins."""
+    """A dense layer and a GRU over time; the hidden state is cleared where an episode begins.
+
+    An image among the features is first seen patch by patch, then as a whole.
+    """
 
     hidden: int
+    image: tuple[int, int] | None = None
 
     @nn.compact
     def __call__(
@@ -67,6 +74,12 @@ class Memory(nn.Module):
         first: Bool[Array, "time env"],
     ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
         """Returns the last hidden state, and that of every step."""
+        if self.image is not None:
+            n_pixels = self.image[0] * self.image[1]
+            tiles = senses.patches(features[..., -n_pixels:], self.image)
+            tiles = nn.swish(nn.Dense(PATCH_WIDTH, name="patch")(tiles))
+            glance = nn.swish(nn.Dense(GLANCE_WIDTH, name="glance")(tiles.reshape(*tiles.shape[:-2], -1)))
+            features = jnp.concatenate([features[..., :-n_pixels], glance], axis=-1)
         encoded = nn.swish(nn.Dense(self.hidden)(features))
         # All that does not wait for the state before is done for the whole sequence at once.
         gates = nn.Dense(3 * self.hidden)(encoded)
@@ -113,7 +126,7 @@ class RecurrentNetworks:
         self.distribution = NormalTanhDistribution(n_action, min_std=layout.min_std)
         self._memory: Any
         self._estimate: Any
-        self._memory, self._estimate = Memory(layout.hidden), nn.Dense(layout.bins)
+        self._memory, self._estimate = Memory(layout.hidden, layout.image), nn.Dense(layout.bins)
         self._policy = MLP(
             layer_sizes=(layout.hidden, self.distribution.param_size),
             activation=jax.nn.swish,
