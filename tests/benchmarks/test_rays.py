@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.rays import speed
+from benchmarks.rays import peers, speed
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
 from benchmarks.rays.casting import Agreement
 from scene.output import write_geometry
@@ -119,4 +119,18 @@ def test_the_speed_of_a_batch_is_printed_and_a_folder_that_is_no_scene_refused(
     assert speed.command(["--scene", str(scene), "--robots", "4", "--columns", "4", "--repeats", "1"]) == 0
     assert re.search(r"4 robots x 64 beams: \S+ M rays/s .*surface \S+ MB", capsys.readouterr().out)
     assert speed.command(["--scene", str(tmp_path)]) == 2
+    assert "is no built scene" in capsys.readouterr().err
+
+
+def test_peers_cast_the_same_rays_as_the_3d_lidar(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = list(peers.measure(peers.PeersConfig(scene=scene, robots=2, repeats=1)))
+    names = [row.name for row in rows]
+    assert [name.split()[0] for name in names[:3]] == ["lidar3d.scan", "embree", "MuJoCo"]
+    for row in rows:
+        assert row.error.shape == (2048,)
+        assert np.median(row.error) < 1e-4, row.name
+        assert np.mean(row.error < 1e-3) > 0.998, row.name
+        assert row.rates.min() > 0.0
+    assert rows[0].n_bytes < 1e6  # 24 m of 7.9 MB for 351 m
+    assert peers.command(["--scene", str(scene / "nowhere")]) == 2
     assert "is no built scene" in capsys.readouterr().err

@@ -1,5 +1,8 @@
 """3-D LiDAR: tubes and boxes with known answers, and float64 brute force over every triangle of a rough bend."""
 
+import re
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -266,6 +269,16 @@ def test_a_pose_is_found_by_descending_on_one_scan(reliefs):
     for _ in range(60):
         guess = guess - 0.005 * slope(guess)
     np.testing.assert_allclose(guess[1:], place[1:], atol=1e-3)
+
+
+def test_the_page_finds_a_pose_by_descending_on_one_scan():
+    page = Path(__file__).parents[2] / "docs" / "api" / "lidar3d.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    space: dict = {}
+    exec(code, space)
+    pose, true_pose = np.asarray(space["pose"]), np.asarray(space["true_pose"])
+    np.testing.assert_allclose(pose[:3], true_pose[:3], atol=1e-4)
+    np.testing.assert_allclose(pose[3:], true_pose[3:], atol=np.deg2rad(1e-3))
 
 
 @pytest.mark.parametrize(
