@@ -104,7 +104,7 @@ def describe(found: Localisability) -> str:
     inside = inside if inside.any() else np.ones(len(inside), bool)
     bound, drift = found.station_bound[inside], found.drift[inside]
     blind = np.mean(~np.isfinite(bound))
-    least, usual = (float(np.quantile(bound, q)) for q in (0.1, 0.5))
+    least, usual = (float(np.quantile(bound, q, method="lower")) for q in (0.1, 0.5))
     where = found.station[inside][int(np.argmax(drift))]
     return (
         f"one scan tells the station to {usual:.2f} m in the median ({least:.2f} m in the best tenth), nothing in "

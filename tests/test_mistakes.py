@@ -37,6 +37,7 @@ MISTAKES = {
     "benchmarks.atlas none": "none: no such tunnel file; by name there are",
     "benchmarks.atlas control --linings pockets": "tunnel 'control' has no lining 'pockets'; it has smooth",
     "benchmarks.atlas control --sensors radar": "there is no sensor 'radar'; there are planar, spin16x64",
+    "benchmarks.linings --kinds brick": "there is no kind 'brick'; there are straight, universal",
     "benchmarks.kinds --split dev": "there is no split 'dev'; there are train, val, test-seen, test-unseen",
     "benchmarks.kinds --agents nobody": "no agent 'nobody'",
     "benchmarks.rays.speed nosuch": "Unrecognized options: nosuch",

@@ -108,8 +108,8 @@ def localisability(
     length = float(tunnel.length)
     fine = np.linspace(0.0, length, round(length / (0.5 * blur)) + 1)
     turn = _TURN * blur / BLUR
-    take = _planar(tunnel, params) if solid is None else _spatial(tunnel, params, solid)
-    ranges = [_cast(take, tunnel, fine, offset * blur, heading * turn) for offset, heading in _POSES]
+    cast = _caster(_planar(tunnel, params) if solid is None else _spatial(params, solid), tunnel)
+    ranges = [cast(fine, offset * blur, heading * turn) for offset, heading in _POSES]
     information = scan_information(ranges, fine[1], blur, turn, float(np.max(params.lidar.range_sigma)))
     n = max(1, round(length / step))
     cell = np.minimum((fine / length * n).astype(int), n - 1)
@@ -142,7 +142,7 @@ def scan_information(
 
     def blurred(values: np.ndarray, kernel: np.ndarray) -> np.ndarray:
         padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
-        return np.apply_along_axis(np.convolve, 0, padded, kernel[::-1], mode="valid")
+        return sum(k * padded[i : i + len(values)] for i, k in enumerate(kernel))
 
     middle = ranges[0]
     mean = blurred(middle, weight)
@@ -175,9 +175,8 @@ def _planar(tunnel: Tunnel, params: EnvParams) -> Cast:
     return lambda position, heading, station: lidar.scan(tunnel, position, heading, station, params.lidar)
 
 
-def _spatial(tunnel: Tunnel, params: EnvParams, solid: Solid) -> Cast:
+def _spatial(params: EnvParams, solid: Solid) -> Cast:
     """Cast of a level sensor that follows the grade of the ground."""
-    del tunnel
     plan, range_max = solid.plan, float(np.max(params.lidar.range_max))
     height = plan.lidar_height if solid.height is None else solid.height
     grid, ground = jnp.asarray(plan.station, jnp.float32), jnp.asarray(plan.elevation + height, jnp.float32)
@@ -194,11 +193,11 @@ def _spatial(tunnel: Tunnel, params: EnvParams, solid: Solid) -> Cast:
     return cast
 
 
-def _cast(take: Cast, tunnel: Tunnel, station: np.ndarray, offset: float, turn: float) -> Float[np.ndarray, "n beams"]:
-    """Ranges at stations along the axis, beside it and turned, in float64."""
+def _caster(take: Cast, tunnel: Tunnel) -> Callable[[np.ndarray, float, float], Float[np.ndarray, "n beams"]]:
+    """Cast at stations along the axis, beside it and turned, in float64; one program for all."""
 
     @jax.jit
-    def many(stations: Array) -> Array:
+    def many(stations: Array, offset: Array, turn: Array) -> Array:
         def one(s: Array) -> Array:
             x, y, tangent_x, tangent_y, _ = at_station(tunnel, s)
             position = jnp.stack([x - offset * tangent_y, y + offset * tangent_x])
@@ -206,5 +205,9 @@ def _cast(take: Cast, tunnel: Tunnel, station: np.ndarray, offset: float, turn: 
 
         return jax.vmap(one)(stations)
 
-    padded = np.pad(station, (0, -len(station) % _BATCH), mode="edge").astype(np.float32).reshape(-1, _BATCH)
-    return np.concatenate([np.asarray(many(rows)) for rows in padded]).astype(np.float64)[: len(station)]
+    def cast(station: np.ndarray, offset: float, turn: float) -> np.ndarray:
+        padded = np.pad(station, (0, -len(station) % _BATCH), mode="edge").astype(np.float32).reshape(-1, _BATCH)
+        rows = [np.asarray(many(some, np.float32(offset), np.float32(turn))) for some in padded]
+        return np.concatenate(rows).astype(np.float64)[: len(station)]
+
+    return cast

@@ -88,9 +88,9 @@ def test_the_control_tunnel_of_the_benchmark_tells_nothing_away_from_its_mouths(
 
 def test_information_agrees_with_float64_casts_of_random_poses(params, found):
     """Straight lines fitted to reference scans of normally distributed poses, beam by beam."""
-    plan, rng, n = corridor(True), np.random.default_rng(3), 3000
+    plan, rng, n = corridor(True), np.random.default_rng(3), 1500
     segments = plan.lining("pockets").segments
-    for cell in (70, 71, 72, 83):
+    for cell in (70, 71):
         low, high = (found[True].station[cell] + side * 0.25 for side in (-1.0, 1.0))
         own = []
         for at in np.linspace(low, high, 12):
