@@ -12,6 +12,7 @@ from subterra_jax import lidar
 from subterra_jax.lidar import reference
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS
+from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
 ASIDE = np.array([0.0, 2.5])
@@ -155,4 +156,33 @@ RING = 20.0 * np.column_stack([np.cos(np.linspace(0.0, 7.0, 200)), np.sin(np.lin
 def test_a_mistake_is_refused_in_one_sentence(make, message):
     with pytest.raises(st.TunnelError, match=message) as caught:
         make()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.door
+def test_an_unknown_tunnel_is_told_those_there_are():
+    with pytest.raises(
+        st.TunnelError, match="subterra-352: no such tunnel file; by name there are subterra-351, metro"
+    ):
+        st.make("Subterra/Traverse-v0", tunnel="subterra-352")
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda a: {"tangent": -a["tangent"]}, "field 'tangent' is flipped at index 0"),
+        (lambda a: {"tangent": np.where(np.arange(len(a["tangent"]))[:, None] == 9, -1, 1) * a["tangent"]}, "index 9"),
+        (
+            lambda a: {"left_smooth": a["right_smooth"], "right_smooth": a["left_smooth"]},
+            "'left_smooth' lies to the other",
+        ),
+        (lambda a: {"right_pockets": a["left_pockets"]}, "field 'right_pockets' lies to the other side"),
+    ],
+)
+def test_a_file_written_by_hand_is_checked_like_arrays(plan_of, spoil, message):
+    arrays = tunnel_arrays(straight(40.0))
+    plan_of(arrays)
+    with pytest.raises(st.TunnelError, match=message) as caught:
+        plan_of({**arrays, **spoil(arrays)})
     assert "\n" not in str(caught.value)

@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -252,3 +253,20 @@ def test_the_short_task_is_the_first_60_metres():
     assert float(st.make("Subterra/TraverseShort-v0")[1].tunnel.length) == pytest.approx(60.0)
     assert float(st.make("Subterra/TraverseShort-v0", odometry=OdometryParams())[1].horizon) == 600
     assert float(st.make("Subterra/Traverse-v0")[1].horizon) == 3000
+
+
+@pytest.mark.door
+@pytest.mark.parametrize(("estimates", "size"), [(False, 2), (True, 4)])
+def test_an_action_of_another_shape_is_refused_in_one_sentence(estimates, size, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checker would come first
+    env, params = st.make("Subterra/StopAtShort-v0", estimates=estimates)
+    batch = st.AutoReset(env)
+    _, one = jax.eval_shape(env.reset, jax.random.key(0), params)
+    _, many = jax.eval_shape(lambda: batch.reset(jax.random.key(0), params, 5))
+    right = {(size,), (5, size)}
+    for shape in {(), (1,), (2,), (3,), (4,), (7,), (5, 1), (5, 7), (5, 2), (5, 4), (4, size), (5, size, 1)} - right:
+        for step, state in ((env.step, one), (batch.step, many)):
+            with pytest.raises(ValueError, match=rf"{size}.*got an array of shape") as caught:
+                jax.eval_shape(step, jax.random.key(0), state, jax.ShapeDtypeStruct(shape, jnp.float32), params)
+            assert "\n" not in str(caught.value)
+    jax.eval_shape(env.step, jax.random.key(0), one, [0.0] * size, params)  # a list will do
