@@ -167,7 +167,8 @@ def find_floors(
         rows = rows[:: max(1, len(rows) // 4000)]
         upper = fit_floor_line(lateral[rows], upward[rows])
         lower = find_lower_line(lateral[rows], upward[rows], upper)
-        lines.append([line for line in (lower, upper) if line is not None])
+        found = [line for line in (lower, upper) if line is not None]
+        lines.append(found or _lines_beside_pit(lateral[rows], upward[rows]))
     sway = np.zeros(count) if axis is None else _sway(np.interp(middle, axis.station, axis.position[:, 2]), middle)
     chosen = _even_run([[line[0] + sway[k] for line in section] for k, section in enumerate(lines)])
     if len(chosen) < 0.5 * count:
@@ -183,6 +184,19 @@ def find_floors(
         gaussian_filter1d(median_filter(v, 3, mode="nearest"), sigma, mode="nearest") for v in (height, slope)
     )
     return Floors(at, height, slope)
+
+
+_MIDDLE, _PIT, _PIT_SHARE = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; share of the returns that low
+
+
+def _lines_beside_pit(lateral: np.ndarray, upward: np.ndarray) -> list[tuple[float, float]]:
+    """Return the floor about the axis of a section that is much deeper beside it, as under a platform; else nothing."""
+    near = np.abs(lateral) < _MIDDLE
+    line = fit_floor_line(lateral[near], upward[near])
+    if line is None:
+        return []
+    deep = upward < line[0] + line[1] * lateral - _PIT
+    return [line] if deep.mean() > _PIT_SHARE else []
 
 
 _GAP = 4  # sections without a floor beyond which it runs on by itself, not beside the axis

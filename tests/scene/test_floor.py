@@ -119,3 +119,29 @@ def test_without_the_search_below_the_floor_would_be_a_plateau_over_the_track(mo
     monkeypatch.setattr(floor, "find_lower_line", lambda *_: None)
     _, error = built(SCANS["vlp16"](World(arch(5.1, 5.5, 3.0), L, PROUD)), 0.04)
     assert np.median(error) > 0.1
+
+
+def bedded(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Station, lateral and upward place of a bore whose floor sways, and drops by 2 m beside a bed from 20 to 40 m."""
+    station = rng.uniform(0.0, 60.0, count)
+    lateral = rng.uniform(-2.7, 4.5, count)
+    pit = (station > 20.0) & (station < 40.0) & (lateral > 1.0)
+    inside = (lateral < 2.7) | pit
+    upward = np.where(pit, -4.9, -2.8) + 0.04 * np.sin(2 * np.pi * station / 25.0) + rng.normal(0, 0.004, count)
+    turn = rng.uniform(0.0, np.pi, count)
+    walls = np.stack([station, 2.7 * np.cos(turn), 2.7 * np.sin(turn)])
+    return tuple(np.concatenate([np.stack([station, lateral, upward])[:, inside], walls], axis=1))
+
+
+def test_the_floor_goes_on_beside_a_pit_and_is_not_guessed_across_it(monkeypatch):
+    points = bedded(np.random.default_rng(7), 200_000)
+
+    def worst() -> float:
+        floors = floor.find_floors(*points, 0.0, 60.0)
+        inner = (floors.station > 2.0) & (floors.station < 58.0)
+        true = -2.8 + 0.04 * np.sin(2 * np.pi * floors.station / 25.0)
+        return float(np.abs(floors.height - true)[inner].max())
+
+    assert worst() < 0.01
+    monkeypatch.setattr(floor, "_lines_beside_pit", lambda *_: [])
+    assert worst() > 0.03
