@@ -35,7 +35,7 @@ class Mount:
         height: Height above the floor, m.
         lateral: Distance to the left of the robot's middle, m.
         roll: Turn about the axis ahead, rad; the left side rises.
-        pitch: Turn about the axis to the left, rad; above 0 it looks up. Of no account in the plane.
+        pitch: Turn about the axis to the left, rad; above 0 it looks down. Of no account in the plane.
     """
 
     height: float

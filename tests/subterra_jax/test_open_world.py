@@ -1,5 +1,7 @@
 """Tunnels of every kind of lining: what is drawn, what is told, which split has what, and the cut by the plane."""
 
+import hashlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.lidar import reference
-from subterra_jax.procedural import expand, open_world
+from subterra_jax.procedural import expand, kinds, open_world
 from subterra_jax.procedural.bore import draw_bore
 from subterra_jax.procedural.kinds import KINDS
 from subterra_jax.procedural.open_world import HELD_OUT, SPLITS, draw, kinds_of, levels_of, plan
@@ -39,6 +41,16 @@ def test_what_is_unseen_is_in_no_other_split():
     assert draw("open:cast:test-unseen:3", 30.0).furniture == "none"
     firsts = sorted(SPLITS.values())
     assert min(np.diff(firsts)) >= open_world.SPLIT_SIZE
+
+
+def test_the_ranges_are_pinned():
+    """Whoever changes a range, a split or a source of randomness makes another open world, and says so here."""
+    own = [value for name, value in sorted(vars(kinds).items()) if name.isupper() and not name.startswith("_")]
+    own += [
+        getattr(open_world, name) for name in ("HELD_OUT", "SPLITS", "LINE", "GRADE_SD", "GRADE_MOST", "GRADE_WAVE")
+    ]
+    digest = hashlib.sha256(repr(own).encode()).hexdigest()
+    assert digest == "46de7d3c973fac72a91bdcb260bf1c05f94783a6b8599bf167f364550adad30e"
 
 
 def test_a_split_has_its_kinds_in_turn_and_a_range_of_names_is_their_list():
