@@ -73,12 +73,13 @@ def end_stations(tube: Tube, around: Around) -> tuple[float, float]:
     on = (out < _BEHIND) & decide[column]
 
     def outermost(end: float, way: int) -> float:
-        """Station up to which 40 % of the directions show the lining."""
+        """Station up to which 40 % of the directions show the lining; `end` itself where fewer do near it."""
         ahead = way * (around.station - end)
         rows = on & (np.abs(ahead) < 2 * tube.grid.step)
         last_seen = np.full(tube.grid.columns, -np.inf)
         np.maximum.at(last_seen, column[rows], ahead[rows])
-        return end + way * float(np.quantile(last_seen[decide], 1 - _END_ENCLOSED, method="nearest"))
+        reach = float(np.quantile(last_seen[decide], 1 - _END_ENCLOSED, method="nearest"))
+        return end + way * reach if np.isfinite(reach) else end
 
     first, last = first + full[0] * tube.grid.step, first + (full[-1] + 1) * tube.grid.step
     first, last = outermost(first, -1), outermost(last, 1)

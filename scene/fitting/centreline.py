@@ -181,6 +181,8 @@ def section_middles(
     enough = np.flatnonzero(np.diff(bounds) >= max(full, 1))
     if usual is not None:
         stand_in = usual(extended)
+        if not len(enough):
+            raise FitError("no tunnel in the cloud: none of its returns lies on the wall of the way that was followed")
         enough = np.arange(enough[0], enough[-1] + 1)
     for k in enough:
         rows = order[bounds[k] : bounds[k + 1]]

@@ -5,10 +5,12 @@ import pytest
 
 from scene.cleaning.clean import CleaningConfig, clean_cloud
 from scene.cleaning.removed import BEYOND, BRANCH, CAUSES, ELSEWHERE, INSIDE, SCATTERED, Cleaned
+from scene.cleaning.sort import Around, end_stations
+from scene.cleaning.tube import Tube as WallTube
 from scene.cleaning.tube import measure_tube
 from scene.errors import FitError
 from scene.fitting.centreline import CentrelineConfig
-from scene.fitting.unroll import fill_holes, fill_nearest
+from scene.fitting.unroll import Grid, fill_holes, fill_nearest
 from tests.scene.shapes import PLACE, Box, Tube, cavity, placed
 from tests.scene.test_reconstruction import thin
 
@@ -184,3 +186,16 @@ def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, bore)
     row = round((45.0 - tube.grid.start) / tube.grid.step)
     wall = float(np.median(tube.wall[row - 2 : row + 3][:, np.abs(tube.grid.angle) < 0.3]))
     assert wall == pytest.approx(4.0 if bore else 2.75, abs=0.15)
+
+
+def test_a_mouth_at_which_no_direction_shows_the_wall_ends_where_its_last_row_does():
+    grid = Grid.over(0.0, 40.0, 0.5, 120)
+    wall, every = np.full((grid.rows, 120), 2.75), np.ones((grid.rows, 120), bool)
+    tube = WallTube(grid, wall, wall, every, every, every)
+    rng = np.random.default_rng(8)
+    station, turn = rng.uniform(0.0, 40.0, 50_000), rng.uniform(-np.pi, np.pi, 50_000)
+    radius = np.where(station > 30.0, 4.0, 2.75)  # a flare: closed all around, but nowhere near the wall
+    around = Around(station, radius * np.cos(turn), radius * np.sin(turn))
+    first, last = end_stations(tube, around)
+    assert first == pytest.approx(-1.0, abs=0.3)  # where nothing lies beyond, the rim stays whole
+    assert last == pytest.approx(41.0, abs=0.3)
