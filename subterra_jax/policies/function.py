@@ -196,7 +196,8 @@ def _begin_where_new(driver: DrivingPolicy, obs: Array, memory: DrivingMemory, s
         )
 
     n_new = jnp.sum(new)
-    return jax.lax.switch((n_new > 0).astype(jnp.int32) + (n_new > n_few), [keep, few, everybody], *robots)
+    branch = jnp.where(n_new == 0, 0, jnp.where(n_new <= n_few, 1, 2))
+    return jax.lax.switch(branch, [keep, few, everybody], *robots)
 
 
 def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | None = None) -> Policy:
