@@ -69,3 +69,8 @@ WET_PATCH, WET_SHARE, WET_LOSS = 10.0, 0.3, 0.3  # m, of the patches, of the spe
 SPATIAL_SIGMA, SPATIAL_SIGMA_PER_METRE, SPATIAL_SIGMA_SLANT = 0.019, 1e-4, 0.002  # m, m/m, m
 SPATIAL_LOST, SPATIAL_MIXED = 0.004, 0.1  # 1, 1
 SPATIAL_HEIGHT = 0.7  # m above the ground
+
+# IMU, where one is asked for: noise densities, random walks of the biases, and first biases.
+IMU_ACCEL_DENSITY, IMU_GYRO_DENSITY = 5.574e-3, 5.144e-3  # m/s²/√Hz, rad/s/√Hz
+IMU_ACCEL_WALK, IMU_GYRO_WALK = 1.208e-4, 1.088e-4  # m/s²/√s, rad/s/√s
+IMU_ACCEL_BIAS, IMU_GYRO_BIAS = 0.02, 0.003  # m/s², rad/s

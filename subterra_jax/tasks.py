@@ -20,7 +20,7 @@ from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_module
 from subterra_jax.host.versions import no_task
-from subterra_jax.parts import Faults, Obstacles, Odometer, Part, PlanarLidar, Slip
+from subterra_jax.parts import Faults, Imu, Obstacles, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
 from subterra_jax.parts.wander import WanderParams
@@ -34,7 +34,7 @@ from subterra_jax.tunnel_env import TunnelEnv
 
 PLAIN: tuple[Part, ...] = (Odometer(), PlanarLidar())
 SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())
-OPTIONAL: tuple[Part, ...] = (Slip(), Obstacles(), Faults())
+OPTIONAL: tuple[Part, ...] = (Slip(), Obstacles(), Faults(), Imu())
 
 
 class TaskError(SubterraError, ValueError):
@@ -186,7 +186,7 @@ def make(
             three dimensions, whose `scan` takes the place of `ranges`; or what `parts.make_sensor` returns.
         sweep: Cast each beam of a LiDAR in three dimensions from the pose at its own time.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
-            `obstacles` and `faults` bring their part to a task that lacks it.
+            `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
     Returns:
         The static environment (a `TunnelEnv`), and params whose every leaf is an array (`EnvParams`).

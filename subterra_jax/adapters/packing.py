@@ -172,7 +172,28 @@ def action_space(env: TunnelEnv, params: EnvParams) -> spaces.Box:
     return spaces.Box(box.low, box.high, dtype=np.float32)
 
 
-def named_fields(env: TunnelEnv, params: EnvParams, flat: bool) -> dict[str, slice] | None:
+class Fields(dict[str, slice]):
+    """Parts of an observation by name, and the shapes of those that are images.
+
+    Args:
+        fields: Place of each part.
+        images: Rows and columns of those that lie row by row.
+    """
+
+    def __init__(self, fields: Mapping[str, slice], images: Mapping[str, tuple[int, int]]):
+        super().__init__(fields)
+        self.images = dict(images)
+
+    def shaped(self, name: str, values: np.ndarray) -> np.ndarray:
+        """Return the values `(..., n)` of a part in its shape."""
+        return values.reshape(*values.shape[:-1], *self.images[name]) if name in self.images else values
+
+    def __reduce__(self) -> tuple[Any, tuple[dict[str, slice], dict[str, tuple[int, int]]]]:
+        """Make it anew in a copy or another process."""
+        return Fields, (dict(self), self.images)
+
+
+def named_fields(env: TunnelEnv, params: EnvParams, flat: bool) -> Fields | None:
     """Return the parts of an observation by name; `None` for a plain vector.
 
     Args:
@@ -181,18 +202,19 @@ def named_fields(env: TunnelEnv, params: EnvParams, flat: bool) -> dict[str, sli
         flat: Return a plain vector for every task; a task with `PAPER_FIELDS` alone does so anyway.
     """
     fields = env.fields(params)
-    return None if flat or tuple(fields) == PAPER_FIELDS else fields
+    return None if flat or tuple(fields) == PAPER_FIELDS else Fields(fields, env.images(params))
 
 
-def observation_space(env: TunnelEnv, params: EnvParams, fields: Mapping[str, slice] | None) -> spaces.Space[Any]:
-    """Return a `Box`, or a `Dict` with one `Box` for each named field."""
+def observation_space(env: TunnelEnv, params: EnvParams, fields: Fields | None) -> spaces.Space[Any]:
+    """Return a `Box`, or a `Dict` with one `Box` for each named field; that of an image has rows and columns."""
     box = env.observation_space(params)
     if fields is None:
         return spaces.Box(box.low, box.high, dtype=np.float32)
     # Gymnasium would sort the keys of a plain dict; this order is that of the vector.
-    return spaces.Dict([(name, spaces.Box(box.low[at], box.high[at], dtype=np.float32)) for name, at in fields.items()])
+    bounds = {name: [fields.shaped(name, side[at]) for side in (box.low, box.high)] for name, at in fields.items()}
+    return spaces.Dict([(name, spaces.Box(low, high, dtype=np.float32)) for name, (low, high) in bounds.items()])
 
 
-def as_observation(vector: np.ndarray, fields: Mapping[str, slice] | None) -> Observation:
+def as_observation(vector: np.ndarray, fields: Fields | None) -> Observation:
     """Bring vectors `(..., n_obs)` into the form of the space; the parts of a dict are views."""
-    return vector if fields is None else {name: vector[..., at] for name, at in fields.items()}
+    return vector if fields is None else {name: fields.shaped(name, vector[..., at]) for name, at in fields.items()}

@@ -17,7 +17,7 @@ from subterra_jax.adapters import packing
 from subterra_jax.adapters.batch import Batch
 from subterra_jax.adapters.choosing import read_choice
 from subterra_jax.adapters.moments import Moment, refuse_fork
-from subterra_jax.adapters.packing import Observation, Report, as_observation, start_streams
+from subterra_jax.adapters.packing import Fields, Observation, Report, as_observation, start_streams
 from subterra_jax.adapters.views import make_view
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
@@ -41,7 +41,7 @@ def mask_info(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any
     return masked
 
 
-def final_info(step: Report, done: np.ndarray, fields: Mapping[str, slice] | None) -> dict[str, Any]:
+def final_info(step: Report, done: np.ndarray, fields: Fields | None) -> dict[str, Any]:
     """Return `final_obs` and `final_info` of the episodes that ended in a step; empty if none did.
 
     Args:

@@ -11,6 +11,7 @@ import numpy as np
 
 from subterra_jax.drawing import top_down, wall_points
 from subterra_jax.host.errors import MissingLibraryError, SubterraError
+from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts.boxes import Boxes
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
@@ -80,7 +81,7 @@ class TopView:
             np.asarray(state.position, np.float64),
             float(state.heading),
             float(params.vehicle.radius),
-            obs[fields["ranges"]],
+            obs[fields["ranges"]] if "ranges" in fields else level_ring(obs[fields["scan"]], params.lidar.shape),
             goal=None if goal is None else _line_across(tunnel, goal),
             boxes=jax.device_get(_boxes_near(env, state, params)),
         )

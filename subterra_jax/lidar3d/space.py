@@ -12,7 +12,10 @@ from jaxtyping import Array, Float
 from subterra_jax import constants
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
+from subterra_jax.tunnel import at_station
 from subterra_jax.tunnel.plan import TunnelPlan
+
+Rows = tuple[Array, Array, Array]
 
 
 @struct.dataclass
@@ -79,7 +82,32 @@ class Mount:
     yaw: Float[Array, ""] | float = 0.0
 
 
-Rows = tuple[Array, Array, Array]
+def ground_at(tunnel: Any, station: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return height (m) and rise along the axis (m/m) of the ground at a station; 0 in a tunnel without `Space`."""
+    if tunnel.space is None:
+        return jnp.zeros_like(station), jnp.zeros_like(station)
+    place = station / tunnel.spacing
+    node = jnp.clip(jnp.floor(place), 0, (tunnel.n_nodes - 2).astype(place.dtype))
+    row, share = tunnel.first_node + node.astype(jnp.int32), place - node
+    low, high = tunnel.space.ground[row], tunnel.space.ground[row + 1]
+    return low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
+
+
+def level_axes(rise: Array, tangent_x: Array, tangent_y: Array, heading: Array) -> tuple[Rows, Rows, Rows]:
+    """Return the axes ahead, left and up of a robot on ground that rises along the axis and is level across it.
+
+    Args:
+        rise: Rise of the ground along the axis, m/m.
+        tangent_x: Tangent of the axis in plan; its length does not matter.
+        tangent_y: Its second part.
+        heading: Heading of the robot in plan, rad.
+    """
+    level = 1.0 / jnp.sqrt(tangent_x**2 + tangent_y**2)
+    slope_x, slope_y = rise * tangent_x * level, rise * tangent_y * level
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    up = _unit((-slope_x, -slope_y, jnp.ones_like(rise)))
+    ahead = _unit((cos, sin, slope_x * cos + slope_y * sin))
+    return ahead, _cross(up, ahead), up
 
 
 def stand(
@@ -97,18 +125,9 @@ def stand(
     Returns:
         Position, tunnel frame, m; and the sensor's axes ahead, left and up as rows.
     """
-    place = station / tunnel.spacing
-    node = jnp.clip(jnp.floor(place), 0, (tunnel.n_nodes - 2).astype(place.dtype))
-    row, share = tunnel.first_node + node.astype(jnp.int32), place - node
-    low, high = tunnel.space.ground[row], tunnel.space.ground[row + 1]
-    z, rise = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])
-    tangent = tunnel.grid[row, 2:4]
-    level = 1.0 / jnp.hypot(tangent[0], tangent[1])
-    slope_x, slope_y = rise * tangent[0] * level, rise * tangent[1] * level
-    cos, sin = jnp.cos(heading), jnp.sin(heading)
-    up = _unit((-slope_x, -slope_y, jnp.ones_like(rise)))
-    ahead = _unit((cos, sin, slope_x * cos + slope_y * sin))
-    left = _cross(up, ahead)
+    z, rise = ground_at(tunnel, station)
+    _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
+    ahead, left, up = level_axes(rise, tangent_x, tangent_y, heading)
     at = [
         p + mount.lateral * a + mount.height * b
         for p, a, b in zip((position[0], position[1], z), left, up, strict=True)

@@ -2,6 +2,7 @@
 
 from subterra_jax.parts.boxes import Obstacles
 from subterra_jax.parts.faults import Faults
+from subterra_jax.parts.imu import Imu, ImuParams
 from subterra_jax.parts.odometer import Odometer
 from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, Sight, Step
 from subterra_jax.parts.planar_lidar import PlanarLidar
@@ -12,6 +13,8 @@ from subterra_jax.parts.unicycle import Unicycle
 __all__ = [
     "Drive",
     "Faults",
+    "Imu",
+    "ImuParams",
     "Motion",
     "Moved",
     "Noise",

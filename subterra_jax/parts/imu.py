@@ -1,0 +1,182 @@
+"""An inertial measurement unit: specific force and turn rate at 100 to 400 Hz between two steps."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from subterra_jax import constants as c
+from subterra_jax.lidar3d.space import ground_at, level_axes
+from subterra_jax.parts.part import Batch, Bounds, Keys, Noise, Part, Sight, Step
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel import at_station
+
+GRAVITY = 9.81  # m/s²
+
+
+@struct.dataclass
+class ImuParams:
+    """Errors and rate of an IMU at the robot's middle. Source of the densities: the Avia's BMI088 in GEODE.
+
+    Attributes:
+        accel_density: Noise density of specific force, m/s²/√Hz.
+        gyro_density: Noise density of the turn rate, rad/s/√Hz.
+        accel_walk: Random walk of its bias, m/s²/√s.
+        gyro_walk: Random walk of its bias, rad/s/√s.
+        accel_bias: Standard deviation over episodes of the first bias in each axis, m/s².
+        gyro_bias: Likewise of the turn rate, rad/s.
+        rate: Samples a second; a whole number of them makes a step.
+    """
+
+    accel_density: Float[Array, ""] | float = c.IMU_ACCEL_DENSITY
+    gyro_density: Float[Array, ""] | float = c.IMU_GYRO_DENSITY
+    accel_walk: Float[Array, ""] | float = c.IMU_ACCEL_WALK
+    gyro_walk: Float[Array, ""] | float = c.IMU_GYRO_WALK
+    accel_bias: Float[Array, ""] | float = c.IMU_ACCEL_BIAS
+    gyro_bias: Float[Array, ""] | float = c.IMU_GYRO_BIAS
+    rate: int = struct.field(pytree_node=False, default=200)
+
+
+@struct.dataclass
+class ImuState:
+    """Samples of the last step, and what the next ones go on from.
+
+    Attributes:
+        samples: Specific force along the robot's axes ahead, left and up (m/s²) and turn rate about them (rad/s),
+            oldest first.
+        velocity: Mean velocity in the last sample's interval, tunnel frame, m/s.
+        axes: Axes ahead, left and up at its end, as rows, tunnel frame.
+        bias: Present bias, as a sample.
+    """
+
+    samples: Float[Array, "n 6"]
+    velocity: Float[Array, "3"]
+    axes: Float[Array, "3 3"]
+    bias: Float[Array, "6"]
+
+
+def measure(
+    velocity: Float[Array, "n_after 3"], axes: Float[Array, "n_after 3 3"], interval: Float[Array, ""] | float
+) -> Float[Array, "n 6"]:
+    """Return what an ideal IMU gives over intervals, each the mean of its own.
+
+    Velocity first, then position by the new velocity, `R` by the turn: so integrated, the samples give back velocities
+    and axes exactly.
+
+    Args:
+        velocity: Mean velocities before the first interval and in each, tunnel frame, m/s.
+        axes: Axes ahead, left and up as rows, at the beginning of the first interval and at the end of each.
+        interval: Length of an interval, s.
+
+    Returns:
+        Specific force (m/s²) along the axes at the beginning of each interval, and turn rate about them (rad/s).
+    """
+    change = (velocity[1:] - velocity[:-1]) / interval
+    change = change.at[:, 2].add(GRAVITY)
+    force = jnp.sum(axes[:-1] * change[:, None, :], axis=-1)
+    # Half the antisymmetric part of the turn between two axes is its sine times its axis.
+    turn = jnp.sum(axes[:-1, :, None, :] * axes[1:, None, :, :], axis=-1)
+    sine = 0.5 * jnp.stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]], axis=-1
+    )
+    size = jnp.sqrt(jnp.maximum(jnp.sum(sine * sine, axis=-1, keepdims=True), 1e-24))
+    return jnp.concatenate([force, sine * jnp.arcsin(jnp.minimum(size, 1.0)) / size / interval], axis=-1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Imu(Part):
+    """Specific force and turn rate, with noise and wandering biases; gravity with the grade of the ground."""
+
+    name: ClassVar[str] = "imu"
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `imu`."""
+        return {"imu": ImuParams()}
+
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> Float[Array, "*batch 6"]:
+        """Draw standard normal numbers for the biases."""
+        del params
+        return jax.random.normal(key, (*batch, 6), jnp.float32)
+
+    def normals(self, params: EnvParams) -> int:
+        """Six for each sample, and six for the walk of the biases."""
+        return 6 * (_count(params) + 1)
+
+    def begin(self, draw: Float[Array, "6"], state: State, params: EnvParams) -> ImuState:
+        """Stand still."""
+        axes = _axes(params.tunnel.pick(state.tunnel), state.station, state.heading)
+        rest = measure(jnp.zeros((2, 3)), jnp.stack([axes, axes]), 1.0)
+        bias = _sizes(params.imu.accel_bias, params.imu.gyro_bias) * draw
+        return ImuState(jnp.repeat(rest, _count(params), axis=0) + bias, jnp.zeros(3), axes, bias)
+
+    def advance(self, own: ImuState, step: Step, noise: Noise, params: EnvParams) -> ImuState:
+        """Measure the arc of a step."""
+        n, period, sensor = _count(params), jnp.asarray(params.vehicle.period), params.imu
+        interval = period / n
+        speed, rate = step.drive.motion[0], step.drive.motion[1]
+        middle = (jnp.arange(n, dtype=jnp.float32) + 0.5) * interval
+        end = (jnp.arange(n, dtype=jnp.float32) + 1.0) * interval
+        heading = step.before.heading + rate * middle
+        half = 0.5 * rate * interval
+        level = speed * jnp.where(jnp.abs(half) < 1e-3, 1.0 - half * half / 6.0, jnp.sin(half) / _not_zero(half))
+        x, y = level * jnp.cos(heading), level * jnp.sin(heading)
+        along = (step.place.station - step.before.station) / period
+        here = step.before.station + along * middle
+        _, rise = jax.vmap(ground_at, (None, 0))(step.tunnel, here)
+        velocity = jnp.concatenate([own.velocity[None], jnp.stack([x, y, rise * along], axis=-1)])
+        place, turned = step.before.station + along * end, step.before.heading + rate * end
+        axes = jax.vmap(_axes, (None, 0, 0))(step.tunnel, place, turned)
+        axes = jnp.concatenate([own.axes[None], axes])
+        true = measure(velocity, axes, interval)
+        drawn = noise.normal.reshape(n + 1, 6)
+        bias = own.bias + _sizes(sensor.accel_walk, sensor.gyro_walk) * jnp.sqrt(period) * drawn[-1]
+        white = _sizes(sensor.accel_density, sensor.gyro_density) * jnp.sqrt(1.0 / interval) * drawn[:-1]
+        return ImuState(true + bias + white, velocity[-1], axes[-1], bias)
+
+    def observe(self, own: ImuState, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
+        """Return `imu`: the samples of the last step, one after another."""
+        del own, noise, params
+        return {"imu": sight.parts[self.name].samples.reshape(-1)}
+
+    def space(self, params: EnvParams) -> dict[str, Bounds]:
+        """Return no bounds."""
+        n = 6 * _count(params)
+        return {"imu": (np.full(n, -np.inf), np.full(n, np.inf))}
+
+    def check(self, others: frozenset[str], params: EnvParams) -> None:
+        """Refuse a rate of which no whole number of samples makes a step.
+
+        Raises:
+            ValueError: There is no such number.
+        """
+        del others
+        n = params.imu.rate * float(np.max(np.asarray(params.vehicle.period)))
+        if not (n > 0.5 and abs(n - round(n)) < 1e-4):
+            raise ValueError(
+                f"rate of the imu must give a whole number of samples a step of {float(params.vehicle.period):g} s, "
+                f"got {params.imu.rate}"
+            )
+
+
+def _count(params: EnvParams) -> int:
+    return round(params.imu.rate * c.PERIOD)
+
+
+def _sizes(accel: Any, gyro: Any) -> Float[Array, "6"]:
+    """Return one size for the three axes of each sensor."""
+    return jnp.concatenate([jnp.full(3, accel), jnp.full(3, gyro)])
+
+
+def _not_zero(value: Array) -> Array:
+    return jnp.where(jnp.abs(value) < 1e-3, 1.0, value)
+
+
+def _axes(tunnel: Any, station: Array, heading: Array) -> Float[Array, "3 3"]:
+    """Return the robot's axes on the ground."""
+    _, rise = ground_at(tunnel, station)
+    _, _, tangent_x, tangent_y, _ = at_station(tunnel, station)
+    return jnp.stack([jnp.stack(axis) for axis in level_axes(rise, tangent_x, tangent_y, heading)])

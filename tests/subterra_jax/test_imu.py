@@ -1,0 +1,129 @@
+"""The IMU reads gravity at rest, gives the motion back when it is integrated, and is as noisy as it says."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.parts import ImuParams
+from subterra_jax.parts.imu import GRAVITY
+
+TASK, GRADE = "Subterra/TraverseShort-v0", 0.04
+IDEAL = ImuParams(*[0.0] * 6)
+
+
+def made(imu, grade=GRADE):
+    """A task in a bend of 40 m radius that climbs; its LiDAR in three dimensions brings the ground along."""
+    station = np.linspace(0.0, 60.0, 121)
+    xy = 40.0 * np.stack([np.sin(station / 40.0), 1.0 - np.cos(station / 40.0)], axis=-1)
+    plan = st.tunnel.from_centreline(xy, 2.8, elevation=grade * station)
+    return st.make(TASK, tunnel=plan, sensor=np.array([[1.0, 0.0, 0.0]]), imu=imu)
+
+
+def drive(env, params, actions, key=0):
+    """Samples `(steps, n, 6)` and states of a drive."""
+    _, state = env.reset(jax.random.key(key), params)
+
+    def one(state, now):
+        action, key = now
+        state, *_ = env.advance(state, action, env.draw_step(key, (), params), params)
+        return state, state
+
+    keys = jax.random.split(jax.random.key(key + 1), len(actions))
+    _, states = jax.jit(lambda s: jax.lax.scan(one, s, (jnp.asarray(actions, jnp.float32), keys)))(state)
+    return state, states
+
+
+def rotation(vector):
+    """The rotation matrix of a rotation vector, in float64."""
+    angle = np.linalg.norm(vector)
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+@pytest.mark.parametrize(
+    "rate", [pytest.param(100, marks=pytest.mark.slow), 200, pytest.param(400, marks=pytest.mark.slow)]
+)
+def test_ten_seconds_integrated_give_the_motion_to_a_millimetre_and_a_hundredth_of_a_degree(rate):
+    env, params = made(dataclasses.replace(IDEAL, rate=rate))
+    rng = np.random.default_rng(rate)
+    actions = np.stack([rng.uniform(0.5, 1.6, 100), 0.03 + rng.uniform(-0.1, 0.1, 100)], axis=-1)
+    first, states = drive(env, params, actions)
+    samples = np.asarray(states.imu.samples, np.float64).reshape(-1, 6)
+    assert len(samples) == 10 * rate
+    turned = np.asarray(first.imu.axes, np.float64).T
+    place = np.array([*np.asarray(first.position, np.float64), GRADE * float(first.station)])
+    velocity = np.zeros(3)
+    for sample in samples:
+        velocity = velocity + (turned @ sample[:3] - [0.0, 0.0, GRAVITY]) / rate
+        place = place + velocity / rate
+        turned = turned @ rotation(sample[3:] / rate)
+    end = [*np.asarray(states.position[-1], np.float64), GRADE * float(states.station[-1])]
+    assert np.linalg.norm(place - end) < 1e-3
+    assert float(states.station[-1] - first.station) > 8.0
+    ahead = np.asarray(states.imu.axes[-1, 0])
+    heading = float(states.heading[-1])
+    assert np.arctan2(ahead[1], ahead[0]) == pytest.approx(heading, abs=1e-4)
+    away = np.arccos(np.clip((np.trace(turned @ np.asarray(states.imu.axes[-1])) - 1.0) / 2.0, -1.0, 1.0))
+    assert np.rad2deg(away) < 0.01
+
+
+def test_at_rest_it_reads_gravity_with_the_grade():
+    env, params = made(IDEAL)
+    first, states = drive(env, params, np.zeros((5, 2)))
+    for samples in (first.imu.samples, *states.imu.samples):
+        force, turn = np.asarray(samples)[:, :3], np.asarray(samples)[:, 3:]
+        np.testing.assert_allclose(np.linalg.norm(force, axis=1), GRAVITY, rtol=1e-5)
+        np.testing.assert_allclose(turn, 0.0, atol=1e-5)
+        # Uphill the seat pushes from behind.
+        up = np.hypot(1.0, GRADE)
+        tilt = GRADE * np.cos(float(first.heading) - float(first.station) / 40.0) / up
+        np.testing.assert_allclose(force[:, 0], GRAVITY * tilt, atol=5e-3)
+        np.testing.assert_allclose(force[:, 2], GRAVITY / up, rtol=1e-4)
+
+
+def allan(values, rate, tau):
+    """Allan deviation at one averaging time, overlapping."""
+    n = round(tau * rate)
+    total = np.concatenate([[0.0], np.cumsum(values)]) / rate
+    second = total[2 * n :] - 2.0 * total[n:-n] + total[: -2 * n]
+    return np.sqrt(np.mean(second**2) / 2.0) / tau
+
+
+def check_densities(n_steps, white_at, walk_at):
+    params = ImuParams(rate=100)
+    env, made_params = made(params, grade=0.0)
+    _, states = drive(env, made_params, np.zeros((n_steps, 2)))
+    samples = np.asarray(states.imu.samples, np.float64).reshape(-1, 6)
+    for axis in range(6):
+        density, walk = (
+            (params.accel_density, params.accel_walk) if axis < 3 else (params.gyro_density, params.gyro_walk)
+        )
+        for tau in white_at:
+            wanted = np.hypot(density / np.sqrt(tau), walk * np.sqrt(tau / 3.0))
+            assert allan(samples[:, axis], 100, tau) == pytest.approx(wanted, rel=0.15)
+    bias = np.asarray(states.imu.bias, np.float64)
+    for axis, walk in ((slice(0, 3), params.accel_walk), (slice(3, 6), params.gyro_walk)):
+        steps = np.diff(bias[:, axis], axis=0)
+        assert np.std(steps) == pytest.approx(walk * np.sqrt(0.1), rel=0.05)
+    assert walk_at is None or len(samples) >= 100 * walk_at
+
+
+def test_the_noise_of_a_minute_has_the_densities():
+    check_densities(900, (0.05, 0.5), None)
+
+
+@pytest.mark.slow
+def test_the_allan_deviation_of_an_hour_has_the_densities():
+    check_densities(36_000, (0.05, 1.0, 10.0, 30.0), 3600)
+
+
+def test_a_rate_that_does_not_go_into_a_step_is_refused():
+    with pytest.raises(ValueError, match=r"whole number of samples a step of 0\.1 s, got 33"):
+        made(ImuParams(rate=33))
