@@ -343,7 +343,7 @@ def _find(
 
 @_find.def_vmap
 @in_32_bits()
-def _find_more(axis_size: int, batched: Any, relief: Relief, *rows: Array) -> tuple[Hits, Hits]:
+def _find_more(axis_size: int, batched: Any, relief: Relief, *rows: Any) -> tuple[Hits, Hits]:
     """Merge a batch axis into the rays; find those of each relief by themselves if the reliefs differ."""
     yes = Hits(True, True, True)  # type: ignore[arg-type]
     if any(jax.tree.leaves(batched[0])):
