@@ -113,13 +113,13 @@ def localisability(
     information = scan_information(ranges, fine[1], blur, turn, float(np.max(params.lidar.range_sigma)))
     n = max(1, round(length / step))
     cell = np.minimum((fine / length * n).astype(int), n - 1)
-    mean = np.stack([np.bincount(cell, column, n) for column in information.reshape(len(fine), 9).T], axis=-1)
-    mean = (mean / np.bincount(cell, minlength=n)[:, None]).reshape(n, 3, 3)
+    total = np.stack([np.bincount(cell, column, n) for column in information.reshape(len(fine), 9).T], axis=-1)
+    mean = (total / np.bincount(cell, minlength=n)[:, None]).reshape(n, 3, 3)
     station = (np.arange(n) + 0.5) * length / n
-    bounds = [marginal_bound(mean, i) for i in range(3)]
-    seen = filter_variance(station, bounds[0] ** -2.0, params)
+    along, aside, turned = (marginal_bound(mean, i) for i in range(3))
+    seen = filter_variance(station, along**-2.0, params)
     blind = filter_variance(station, np.zeros(n), params)
-    return Localisability(station, mean, *bounds, np.sqrt(seen), np.sqrt(blind))
+    return Localisability(station, mean, along, aside, turned, np.sqrt(seen), np.sqrt(blind))
 
 
 def scan_information(
