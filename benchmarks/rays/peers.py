@@ -148,20 +148,23 @@ def build_warp(folder: Path, lining: str, scans: Scans, surface: Triangles) -> t
     )
     used = resident_memory() - before
 
-    @wp.kernel
-    def cast_ray(
-        mesh: wp.uint64, origin: wp.array(dtype=wp.vec3), way: wp.array(dtype=wp.vec3), out: wp.array(dtype=wp.float32)
-    ):
+    vectors, numbers = wp.array(dtype=wp.vec3), wp.array(dtype=wp.float32)
+
+    def cast_ray(mesh, origin, way, out):
         ray = wp.tid()
         query = wp.mesh_query_ray(mesh, origin[ray], way[ray], 30.0)
         out[ray] = wp.where(query.result, query.t, 30.0)
+
+    # Warp's types of arrays are calls, which no type checker takes for types.
+    cast_ray.__annotations__ = {"mesh": wp.uint64, "origin": vectors, "way": vectors, "out": numbers}
+    kernel = wp.kernel(cast_ray)
 
     origin = np.repeat(scans.position, len(scans.beam), axis=0)
     rows = [wp.array(values.astype(np.float32), dtype=wp.vec3, device="cpu") for values in (origin, scans.directions())]
     out = wp.empty(len(origin), dtype=wp.float32, device="cpu")
 
     def cast() -> np.ndarray:
-        wp.launch(cast_ray, dim=len(origin), inputs=[mesh.id, *rows, out], device="cpu")
+        wp.launch(kernel, dim=len(origin), inputs=[mesh.id, *rows, out], device="cpu")
         return np.asarray(out.numpy())
 
     return f"Warp {wp.__version__} mesh_query_ray", cast, used

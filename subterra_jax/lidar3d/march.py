@@ -175,8 +175,21 @@ def enter_block(tools: Tools, origin: Point, direction: Point, limit: Array, ray
     begin = jnp.minimum(rays.reached + leap, jnp.maximum(leave, rays.reached))
     at = [tools.fma(begin - rays.reached, d[i], at[i]) for i in range(3)]
     end = jnp.minimum(jnp.minimum(leave, limit), hits.distance) - begin
-    numbers = [frame(i) for i in range(20, 24)]
-    return Way(tuple(at), tuple(d), begin, end, leave, following, hits, *numbers, link(2), link(3))
+    return Way(
+        tuple(at),
+        tuple(d),
+        begin,
+        end,
+        leave,
+        following,
+        hits,
+        frame(20),
+        frame(21),
+        frame(22),
+        frame(23),
+        link(2),
+        link(3),
+    )
 
 
 def leave_block(rays: Rays, way: Way, limit: Array, found: Hits) -> Rays:
@@ -288,13 +301,13 @@ class Stay(NamedTuple):
 
     Attributes:
         first: First entry of the cell's list.
-        count: Number of entries that the ray must be compared with.
+        listed: Number of entries that the ray must be compared with.
         leave: Distance at which it leaves, m.
         ends: True where it leaves through an end of the cell, not through a side of its wedge.
     """
 
     first: Int[Array, "n"]
-    count: Int[Array, "n"]
+    listed: Int[Array, "n"]
     leave: Float[Array, "n"]
     ends: Bool[Array, "n"]
 
@@ -370,9 +383,9 @@ def _meet(tools: Tools, way: Way, ray: Ray, stay: Stay, step: Step) -> tuple[Flo
     """Compare rays with the triangles of a list each; return the nearest distance, m, and its entry."""
 
     def one_triangle(i: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-        return meet_one(tools, way.first_vertex, ray, stay.first + i, i < stay.count, *best)
+        return meet_one(tools, way.first_vertex, ray, stay.first + i, i < stay.listed, *best)
 
-    return lax.fori_loop(0, jnp.max(stay.count), one_triangle, (step.hit, step.entry))
+    return lax.fori_loop(0, jnp.max(stay.listed), one_triangle, (step.hit, step.entry))
 
 
 def meet_one(

@@ -140,7 +140,7 @@ def _cross_some(
     def one_round(state: tuple[Step, Stay, Array]) -> tuple[Step, Stay, Array]:
         step, stay, compared = state
         step = lax.optimization_barrier(_meet_some(tools, way, ray, step, stay, compared))
-        over = compared + _AT_ONCE >= stay.count
+        over = compared + _AT_ONCE >= stay.listed
         step = lax.optimization_barrier(_choose(over, leave_cell(way, ray, step, stay), step))
         stay = _choose(over, enter_cell(tools, n_x, way, ray, step), stay)
         return step, stay, jnp.where(over, 0, compared + _AT_ONCE)
@@ -152,7 +152,7 @@ def _meet_some(tools: Tools, way: Way, ray: Ray, step: Step, stay: Stay, compare
     """Compare rays with the next few triangles of their lists."""
     several = lambda part: jnp.repeat(part, _AT_ONCE)  # noqa: E731
     place = compared[:, None] + jnp.arange(_AT_ONCE)
-    listed = (place < stay.count[:, None]) & step.going[:, None]
+    listed = (place < stay.listed[:, None]) & step.going[:, None]
     number = (stay.first[:, None] + place).ravel()
     rays = jax.tree.map(several, ray)
     nothing = jnp.full(number.shape, jnp.inf), jnp.full(number.shape, -1)

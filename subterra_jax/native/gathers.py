@@ -42,7 +42,7 @@ def _pairs(builder: ir.IRBuilder, pairs: ir.Value, numbers: list[ir.Value]) -> t
             word = builder.load(builder.gep(pairs, [numbers[_ORDER[i + j]]]), align=4)
             quarter = builder.insert_element(quarter, word, _INT(j))
         quarters.append(builder.bitcast(quarter, ir.VectorType(_INT, 4)))
-    low, high = (_shuffle(builder, *quarters[i : i + 2], list(range(8))) for i in (0, 2))
+    low, high = (_shuffle(builder, quarters[i], quarters[i + 1], list(range(8))) for i in (0, 2))
     first = [0, 2, 8, 10, 4, 6, 12, 14]
     return _shuffle(builder, low, high, first), _shuffle(builder, low, high, [k + 1 for k in first])
 
