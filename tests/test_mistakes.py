@@ -66,6 +66,8 @@ MISTAKES = {
     "scene.report": "missing: SCENE",
     "scene.report empty --out o": "empty: not a scene folder",
     "scene.report empty --out text.txt": "text.txt: is a file",
+    "scene.compare empty empty --out o": "empty: not a scene folder",
+    "scene.compare empty empty --out text.txt": "text.txt: is a file",
     "scene.export empty --to glb": "empty: not a scene folder",
     "scene.export empty --to moon": "'moon'",
     "train.walk --out o --robots 0": "robots must be at least 1",

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import ezdxf
 import numpy as np
+import trimesh
 import tyro
 
 from scene.bore import Bore, load_bore
@@ -22,7 +23,7 @@ from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, 
 from scene.report.clearance import clearance, g1, read_gauge, read_rails
 from scene.report.landxml import read_landxml, write_landxml
 from scene.report.page import write_report
-from scene.report.sheet import write_csv, write_workbook
+from scene.report.tables import write_csv, write_points, write_workbook
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_folder, require_folder
 
@@ -86,6 +87,10 @@ def report(config: ReportConfig) -> Path:
         if design is not None and located is not None:
             facts |= _write_offsets(folder, bore, design, located)
         facts |= _write_clearance(folder, config.scene, bore, gauge, start)
+        cloud = config.scene / "cloud.ply"
+        if cloud.is_file():  # a ring survey has none
+            points = np.asarray(trimesh.load(cloud).vertices, float)
+            write_points(folder / "points.laz", bore, points, origin, start)
         write_csv(folder / "sections.csv", tables["metres"])
         write_workbook(folder / "rings.xlsx", tables, facts)
         write_report(folder, str(manifest["name"]), facts, tables["metres"], _element_rows(fit))

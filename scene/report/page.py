@@ -58,6 +58,7 @@ def write_report(
 _FILES = {
     "sections.csv": "a row for each metre",
     "rings.xlsx": "the same, and a row for each ring, as a spreadsheet",
+    "points.laz": "the cloud, thinned to one point a 6 cm voxel, with station, offset, height and deviation",
     "alignment.xml": "LandXML 1.2: lines, arcs and clothoids, grades and parabolas",
     "sections.dxf": "sections as measured and as designed, every 10 m, looking ahead",
     "plan_profile.dxf": "plan and profile with chainage",

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -108,7 +109,7 @@ def save_tunnel(
     `scene.writing.shell` the file is one of the first schema, which holds the plane alone.
     """
     plan = flatten_axis(bore.axis)
-    fields: dict[str, np.ndarray] = {
+    fields: dict[str, Any] = {
         "schema": np.array(SCHEMA if shell else PLANAR_SCHEMA),
         "name": np.array(name),
         "provenance": np.array(provenance),
@@ -125,7 +126,7 @@ def save_tunnel(
         fields[f"left_{variant}"], fields[f"left_station_{variant}"] = walls.left, walls.left_station
         fields[f"right_{variant}"], fields[f"right_station_{variant}"] = walls.right, walls.right_station
         fields[f"furniture_{variant}"] = (furniture or {}).get(variant, np.empty((0, 4)))
-    np.savez_compressed(path, **fields, **(shell or {}))  # type: ignore[arg-type]
+    np.savez_compressed(path, **fields, **(shell or {}))
 
 
 def _area(polygon: Float[np.ndarray, "k 2"]) -> float:

@@ -44,7 +44,7 @@ _POSES = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # offse
 
 @dataclasses.dataclass(frozen=True)
 class Localisability:
-    """What scans tell of a pose, by station; `inf` where they tell nothing.
+    """Bounds on what scans tell of a pose, by station; `inf` where they tell nothing.
 
     Attributes:
         station: Middles of the cells of station, m, `(n,)`.

@@ -5,10 +5,12 @@ import dataclasses
 import json
 
 import ezdxf
+import laspy
 import numpy as np
 import openpyxl
 import pytest
 import tifffile
+import trimesh
 
 from scene.bore import Bore
 from scene.errors import FitError, RecordingError
@@ -34,7 +36,16 @@ def scene(bore: Bore, tmp_path_factory):
     manifest = {"name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN.tolist()},
                 "detected": {"chainage_start": 100.0}}  # fmt: skip
     (folder / "manifest.json").write_text(json.dumps(manifest))
+    trimesh.PointCloud(cloud_of(bore)).export(folder / "cloud.ply")
     return folder
+
+
+def cloud_of(bore: Bore) -> np.ndarray:
+    """Three points at station 12: on the crown, 1 m left of the axis and 0.5 m up, and 5 cm behind the right wall."""
+    frame = bore.axis.at(np.array([12.0]))
+    places = ((0.0, 2.8), (1.0, 0.5), (-2.85, -0.5))
+    points = np.concatenate([frame.position + left * frame.lateral + up * frame.up for left, up in places])
+    return np.concatenate([points, points + 100.0 * frame.tangent])
 
 
 def railway(length: float = 240.0):
@@ -216,7 +227,7 @@ def test_g1_is_a_polygon_of_its_known_size():
     assert points[:, 1].max() == pytest.approx(4.31)
 
 
-def test_the_folder_holds_what_surveyors_open(scene, tmp_path):
+def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
     design = tmp_path / "design.csv"
     with np.load(scene / "bore.npz") as data:
         position, lateral = data["position"], data["lateral"]
@@ -237,12 +248,29 @@ def test_the_folder_holds_what_surveyors_open(scene, tmp_path):
     with (out / "offsets.csv").open() as file:
         offsets = np.array(list(csv.reader(file))[1:], float)
     assert offsets[10:-10, 2] == pytest.approx(-0.1, abs=0.003)  # the bore lies to the left of the design
+    points = laspy.read(out / "points.laz")
+    assert len(points) == 3  # those 100 m on are beyond the end
+    assert points["station"] == pytest.approx(712.0, abs=0.02)
+    assert points["offset"] == pytest.approx([0.0, -1.0, 2.85], abs=0.002)
+    assert points["height"] == pytest.approx([2.8, 0.5, -0.5], abs=0.002)
+    assert points["deviation"] == pytest.approx(
+        [0.0, np.hypot(1.0, 0.5) - 2.8, 0.05 * np.hypot(2.85, 0.5) / 2.85], abs=0.003
+    )
+    assert np.column_stack([points.x, points.y, points.z]) == pytest.approx(cloud_of(bore)[:3] + ORIGIN, abs=1e-3)
     page = (out / "report.html").read_text()
     assert "Clearance" in page
     assert page.count("data:image/png") == 4
     again = tmp_path / "again"
     assert main([str(scene), "--design", str(design), "--out", str(again)]) == 0
-    same = ("sections.csv", "alignment.xml", "sections.dxf", "unrolled.tif", "clearance.csv", "offsets.csv")
+    same = (
+        "points.laz",
+        "sections.csv",
+        "alignment.xml",
+        "sections.dxf",
+        "unrolled.tif",
+        "clearance.csv",
+        "offsets.csv",
+    )
     assert all((out / name).read_bytes() == (again / name).read_bytes() for name in same)
 
 

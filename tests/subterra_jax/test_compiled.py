@@ -144,7 +144,7 @@ def test_replacing_leaves_a_tree_of_axes_as_it_is():
 
 
 def count(event: str, function: Any) -> int:
-    """How often JAX reports an event while a function runs."""
+    """Return the number of times that JAX reports an event while a function runs."""
     counts = []
     listen = lambda name, *_, **__: counts.append(name == event)  # noqa: E731
     jax.monitoring.register_event_duration_secs_listener(listen)

@@ -87,7 +87,7 @@ def value(env, action, states, noises, params, weights):
 
 
 def ends(env, action, states, noises, params):
-    """Whether an episode ends within these steps."""
+    """Return whether an episode ends within these steps."""
 
     def one(state, noise):
         state, _, terminated, *_ = env.advance(state, action, noise, params)

@@ -62,7 +62,7 @@ def test_the_lidar_in_three_dimensions_and_its_derivatives_run_in_it(settings, k
 
 
 def drive_by(driver: str, env: st.TunnelEnv, params: st.EnvParams, n_envs: int, n_steps: int) -> Any:
-    """What a batch and an agent meet from its start; not the agent's memory, whose types are its own."""
+    """Return all that a batch and an agent meet from its start; not the agent's memory, whose types are its own."""
     policy, batch = st.load_policy(driver, env, params), st.AutoReset(env)
     obs, state = batch.reset(jax.random.key(0), params, n_envs)
     steps = st.rollout(batch, policy, jax.random.key(1), obs, state, params, n_steps)[2]

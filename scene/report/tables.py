@@ -1,14 +1,18 @@
-"""The table of sections as a spreadsheet and as CSV."""
+"""The table of sections as a spreadsheet and as CSV, and the cloud with places on the bore as LAZ."""
 
 import csv
 import datetime
 from pathlib import Path
 
+import laspy
 import numpy as np
+from jaxtyping import Float
 from openpyxl import Workbook
 from openpyxl.formatting.rule import ColorScaleRule
 from openpyxl.styles import Font
 from openpyxl.utils import get_column_letter
+
+from scene.bore import Bore
 
 HEADS = {
     "station": ("station", "m"), "chainage": ("chainage", "m"), "easting": ("easting of the axis", "m"),
@@ -64,3 +68,51 @@ def _cell(value: np.generic) -> float | str:
     if isinstance(value, np.bool_):
         return "yes" if value else "no"
     return round(float(value), 6) if np.isfinite(value) else ""
+
+
+def write_points(
+    path: Path, bore: Bore, points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"], start: float
+) -> None:
+    """Write points as LAZ in the input's frame, each with its place on the bore as extra dimensions.
+
+    These are `station` (chainage), `offset` (to the right of the axis), `height` (above the axis) and `deviation`
+    (outside the smooth section, so that pockets and track are deviations too), m. Points beyond the ends are left out.
+
+    Args:
+        path: The file.
+        bore: The bore.
+        points: Points in the tunnel frame, m.
+        origin: Offset of the tunnel frame, m.
+        start: Chainage of station 0, m.
+    """
+    station, left, up = bore.axis.local(points)
+    inside = (station >= 0.0) & (station <= bore.length)
+    station, left, up, points = station[inside], left[inside], up[inside], points[inside]
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = np.floor(origin), np.full(3, 1e-4)
+    header.creation_date = datetime.date(2000, 1, 1)  # no times of day
+    values = {
+        "station": start + station,
+        "offset": -left,
+        "height": up,
+        "deviation": _deviation(bore, station, left, up),
+    }
+    for name in values:
+        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=np.float32 if name != "station" else np.float64))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = (points + origin).T
+    for name, column in values.items():
+        cloud[name] = column
+    cloud.write(path)
+
+
+def _deviation(bore: Bore, station: np.ndarray, left: np.ndarray, up: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Return how far points lie outside the smooth section, bilinear in station and angle, m."""
+    n, m = bore.radius.shape
+    row = np.clip(station / bore.station[1], 0.0, n - 1.0)
+    column = np.mod((np.arctan2(up, left) - bore.angle[0]) / (2.0 * np.pi) * m, m)
+    r, c = np.minimum(row.astype(int), n - 2), np.minimum(column.astype(int), m - 1)
+    along, across, d = row - r, column - c, (c + 1) % m
+    near = bore.radius[r, c] * (1.0 - across) + bore.radius[r, d] * across
+    far = bore.radius[r + 1, c] * (1.0 - across) + bore.radius[r + 1, d] * across
+    return np.hypot(left, up) - (near * (1.0 - along) + far * along)

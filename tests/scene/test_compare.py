@@ -1,0 +1,93 @@
+"""Two surveys of one tunnel: what moved is found with its place and size, and nothing where nothing moved."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from scene.bore import Bore
+from scene.compare import CompareConfig, compare_clouds, main, name_clock
+
+CONFIG = CompareConfig(Path("a"), Path("b"), Path("c"))
+
+
+def survey(bore: Bore, seed: int, bulge: float = 0.0, spacing: float = 0.06) -> np.ndarray:
+    """Points of the wall with 2 mm of noise; from 10 to 12 m a metre of the left wall is moved inwards."""
+    rng = np.random.default_rng(seed)
+    station = rng.uniform(0.0, bore.length, round(bore.length * 18.0 / spacing**2))
+    angle = rng.uniform(-np.pi, np.pi, len(station))
+    frame = bore.axis.at(station)
+    order = np.argsort(bore.angle)
+    radius = np.interp(angle, bore.angle[order], bore.radius[0][order], period=2.0 * np.pi)
+    radius += rng.normal(0.0, 0.002, len(station))
+    moved = (station > 10.0) & (station < 12.0) & (np.abs(angle) < 0.5 / 2.8)
+    radius -= bulge * moved
+    outwards = np.cos(angle)[:, None] * frame.lateral + np.sin(angle)[:, None] * frame.up
+    return frame.position + radius[:, None] * outwards
+
+
+def test_a_bulge_of_3_cm_is_found_with_its_place_and_nothing_else(bore: Bore):
+    result = compare_clouds(bore, survey(bore, 1), survey(bore, 2, bulge=0.03), CONFIG)
+    assert len(result.changes) == 1
+    (change,) = result.changes
+    assert change.start == pytest.approx(10.0, abs=0.3)
+    assert change.end == pytest.approx(12.0, abs=0.3)
+    assert change.angle == pytest.approx(0.0, abs=0.05)
+    assert name_clock(change.angle) in ("9:00", "8:45", "9:15")
+    assert change.most == pytest.approx(-0.03, abs=0.002)
+    assert change.median == pytest.approx(-0.03, abs=0.005)
+    assert 1.5 < change.area < 3.5
+    assert change.detection < 0.01
+
+
+def test_nothing_is_found_where_nothing_moved(bore: Bore):
+    result = compare_clouds(bore, survey(bore, 3), survey(bore, 4), CONFIG)
+    assert result.changes == ()
+    assert np.isfinite(result.moved).mean() > 0.95
+    # The level of detection holds what its name says: 5 % of the places lie beyond it where nothing moved, fewer with
+    # a registration error that is not there.
+    assert np.mean(np.abs(result.moved) > result.detection) < 0.05
+
+
+def test_a_bulge_across_the_seam_of_the_angle_is_one_change(bore: Bore):
+    points = survey(bore, 6)
+    station, left, up = bore.axis.local(points)
+    right = (np.abs(station - 15.0) < 1.0) & (left < -2.5) & (np.abs(up) < 0.5)  # about the angle pi
+    moved = points + right[:, None] * 0.03 * bore.axis.at(station).lateral
+    result = compare_clouds(bore, survey(bore, 7), moved, CONFIG)
+    assert len(result.changes) == 1
+    assert abs(result.changes[0].angle) == pytest.approx(np.pi, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("angle", "clock"), [(np.pi / 2, "12:00"), (0.0, "9:00"), (np.pi, "3:00"), (-np.pi / 2, "6:00")]
+)
+def test_the_clock_has_12_at_the_crown_and_9_on_the_left(angle, clock):
+    assert name_clock(angle) == clock
+
+
+def write_scene(folder: Path, bore: Bore, points: np.ndarray, origin: tuple[float, float, float]) -> Path:
+    folder.mkdir(parents=True)
+    bore.save(folder / "bore.npz")
+    trimesh.PointCloud(points).export(folder / "cloud.ply")
+    (folder / "manifest.json").write_text(json.dumps({"name": "t", "frame": {"origin": list(origin)}}))
+    return folder
+
+
+def test_folders_with_other_origins_are_compared_and_written(bore: Bore, tmp_path, capsys):
+    one = write_scene(tmp_path / "one", bore, survey(bore, 1, spacing=0.08), (100.0, 200.0, 0.0))
+    shift = np.array([3.0, -2.0, 0.0])
+    moved = dataclasses.replace(bore, position=bore.position - shift)
+    other = write_scene(tmp_path / "other", moved, survey(bore, 2, 0.03, 0.08) - shift, (103.0, 198.0, 0.0))
+    out = tmp_path / "out"
+    assert main([str(one), str(other), "--out", str(out)]) == 0
+    assert " at 9:00: -" in capsys.readouterr().out
+    assert len((out / "changes.csv").read_text().splitlines()) == 2
+    assert sorted(path.name for path in out.iterdir()) == ["change.npz", "change.png", "changes.csv"]
+    far = write_scene(tmp_path / "far", bore, survey(bore, 3, spacing=0.2), (900.0, 200.0, 0.0))
+    assert main([str(one), str(far), "--out", str(tmp_path / "no")]) == 2
+    assert "of one tunnel, and in one frame?" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()
