@@ -108,6 +108,8 @@ MISTAKES = {
     "benchmarks.rays --scene none": "none: is no built scene",
     "benchmarks.rays --scene empty --seed -1": "seed must be at least 0",
     "benchmarks.rays --scene empty --out text.txt/x.json": "text.txt: is a file",
+    "benchmarks.rays.peers --scene none": "none: is no built scene",
+    "benchmarks.rays.peers --scene empty --robots 0": "robots must be at least 1",
     "benchmarks.reproduce --jobs moon --out o": "no job 'moon'",
     "benchmarks.slam": "Expected one of {record, run, score}",
     "benchmarks.slam record": "missing: --out",

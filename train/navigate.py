@@ -48,20 +48,19 @@ class Command:
     Attributes:
         out: Run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json.
         task: Task id.
-        tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, `procedural:train:7`,
-            `procedural:train:0-255`, of which each episode draws one.
-        lining: Variant of the walls; `pockets` if left out, or the first where a tunnel has none.
-        sensor: LiDAR: `planar16`, the task's own; `spin16x64`, `vlp16` or `os1-64`, seen as an image; or `avia`.
+        tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, or several of which
+            each episode draws one: `procedural:train:0-255`, `open:train:0-255`.
+        lining: Variant of the walls; `pockets`, or the tunnel's first, if left out.
+        sensor: LiDAR; `planar16` is the task's own, `avia` no image.
         memory: `none`: a perceptron over a few observations. `gru`: a network that remembers; it learns by reward, or
-            with `--teacher oracle` (any baseline, policy file or run folder) from a teacher. `map`: a belief over every
-            place of a known tunnel, for Relocalise; what a scan says of a place is learnt.
+            with `--teacher oracle` (any baseline, policy file or run folder) from a teacher. `map`: a belief over the
+            places of a known tunnel, for Relocalise.
         preset: `cpu` or `gpu`; what jax runs on if left out.
         seeds: Train these seeds at once, each into `out/seed-<k>`.
         resume: Go on from the newest checkpoint, or from the beginning.
         overwrite: Throw away the run that `out` holds.
         evaluation_episodes: Episodes of the evaluation after training, of 500.
-        embodiment: `scout`, the round robot of the tasks; or `b2`: learnt on a planar robot that obeys as late as the
-            walking one does, then tried on four legs.
+        embodiment: `scout`, the tasks' robot; or `b2`: one that obeys as late, then tried on four legs.
         settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
         legs: The trial of `--embodiment b2`.
         logs: Further places to log to.

@@ -13,7 +13,6 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import cKDTree
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
@@ -254,6 +253,8 @@ def _parts_of_blocks(axis: Axis, parts: Float[np.ndarray, "k n 3"], blocks: Bloc
     """Return which of some convex parts, given by their corners, reach between the planes of each block."""
     if not len(parts):
         return [np.zeros(0, np.int64) for _ in blocks.centre]
+    from scipy.spatial import cKDTree  # half a second to import, and planar tasks do not need it
+
     near = axis.station[cKDTree(axis.position).query(parts.mean(axis=1))[1]]
     reach = np.linalg.norm(np.ptp(parts, axis=1), axis=1) + 2.0 * (axis.station[1] - axis.station[0])
     low, high = near - reach, near + reach

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d.surface import BOX_FACES, Axis, Triangles, join_surfaces
@@ -238,6 +237,8 @@ def _delaunay(u: np.ndarray, s: np.ndarray, girth: float) -> Int[np.ndarray, "f 
     source = np.concatenate([np.arange(len(u)), low, high])
     shift = np.concatenate([np.zeros(len(u)), np.full(len(low), girth), np.full(len(high), -girth)])
     points = np.column_stack([u[source] + shift, s[source]])
+    from scipy.spatial import Delaunay  # half a second to import, and planar tasks do not need it
+
     faces = Delaunay(points).simplices
     corner = points[faces]
     (ax, ay), (bx, by) = (corner[:, 1] - corner[:, 0]).T, (corner[:, 2] - corner[:, 0]).T

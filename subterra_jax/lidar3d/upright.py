@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import KDTree
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d.surface import Axis, Triangles, join_surfaces
@@ -48,6 +47,8 @@ def _raised(
     start: Float[np.ndarray, "n 2"], end: Float[np.ndarray, "n 2"], plan: TunnelPlan, crown: float
 ) -> Triangles:
     """Return segments of wall raised from a little below the floor to a little above the crown."""
+    from scipy.spatial import KDTree  # half a second to import, and planar tasks do not need it
+
     nearest = KDTree(plan.centre)
     corners = []
     for point in (start, end):

@@ -59,6 +59,7 @@ def test_a_zip_of_ply_scans_is_read_by_a_file_outside_the_package(tmp_path):
     assert "static" in facts["point_times"]
 
 
+@pytest.mark.slow
 def test_a_scene_is_built_from_it_by_one_option(tmp_path):
     bore = curved_d_bore(length=30.0, per_metre=4000, offset=(0.0, 0.0, 0.0))
     walk = write_zip(tmp_path / "walk.zip", np.array_split(bore.points.astype(np.float32), 10))

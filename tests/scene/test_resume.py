@@ -263,6 +263,7 @@ def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(cl
     assert [entry.name for entry in tmp_path.iterdir()] == ["scene"], said
 
 
+@pytest.mark.slow
 def test_a_build_that_is_killed_in_its_odometry_goes_on_and_leaves_nothing_behind(bag, tmp_path):
     out = tmp_path / "scene"
     build = start(bag, "--out", out, "--keep-every", "0")

@@ -30,6 +30,7 @@ def short() -> tuple[Any, Any, Any]:
 # Transformations
 
 
+@pytest.mark.slow
 def test_the_methods_run_in_shards_as_alone():
     code = """
 import jax, jax.numpy as jnp, numpy as np, subterra_jax as st
@@ -92,6 +93,7 @@ def test_a_step_can_be_checkpointed_and_its_state_given_away(short):
     assert copy.position.is_deleted()
 
 
+@pytest.mark.slow
 def test_a_step_runs_with_nans_watched_and_uncompiled(short):
     env, params, state = short
     plain = env.step(jax.random.key(1), state, jnp.ones(2), params)

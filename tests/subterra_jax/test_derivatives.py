@@ -59,6 +59,7 @@ def test_the_clearance_changes_towards_the_nearest_wall(corridor):
     np.testing.assert_allclose(slope(points), expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_standing_robot_and_one_inside_a_box_have_no_nan_in_their_derivatives():
     env, params = st.make("Subterra/ObstructedShort-v0", estimates=True)
     _, state = env.reset(jax.random.key(0), params)

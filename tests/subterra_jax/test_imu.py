@@ -47,9 +47,8 @@ def rotation(vector):
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-@pytest.mark.parametrize(
-    "rate", [pytest.param(100, marks=pytest.mark.slow), 200, pytest.param(400, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [100, 200, 400])
 def test_ten_seconds_integrated_give_the_motion_to_a_millimetre_and_a_hundredth_of_a_degree(rate):
     env, params = made(dataclasses.replace(IDEAL, rate=rate))
     rng = np.random.default_rng(rate)

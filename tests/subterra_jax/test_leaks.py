@@ -34,6 +34,7 @@ def control():
     return success, stop_bounds(params)
 
 
+@pytest.mark.slow
 def test_the_command_integrator_stops_as_often_as_theory_says_and_no_more(control):
     success, bounds = control
     assert abs(success("command-integrator") - bounds["command"]) < three_errors(bounds["command"])

@@ -69,6 +69,7 @@ def drive_by(driver: str, env: st.TunnelEnv, params: st.EnvParams, n_envs: int, 
     return obs, {name: leaf for name, leaf in steps.items() if name != "memory"}
 
 
+@pytest.mark.slow
 def test_the_same_episodes_come_out_and_an_agent_drives_alike():
     task = "Subterra/FaultedShort-v0"
     env, params = st.make(task, horizon=12)

@@ -49,6 +49,7 @@ def observe(env, state, params, key=1):
     return {name: np.asarray(flat[at]) for name, at in env.fields(params).items()}
 
 
+@pytest.mark.slow
 def test_level_beams_see_what_the_planar_lidar_sees_on_a_grade(graded):
     fan = exact(beams.planar(16))
     env, params = st.make(TASK, tunnel=graded, sensor=fan)
@@ -89,6 +90,7 @@ def test_a_mount_turns_as_its_words_say(graded):
     np.testing.assert_allclose(np.asarray(axes) @ np.asarray(axes).T, np.eye(3), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_batch_in_several_tunnels_sees_what_each_robot_sees_alone(graded):
     plans = [graded, straight()]
     env, params = st.make(TASK, tunnel=plans, sensor=exact("spin16x64"))
@@ -152,6 +154,7 @@ def test_a_sweep_of_the_vlp16_falls_on_the_walls_only_when_deskewed_with_the_tru
     assert np.quantile(walls_missed(points(np.full(len(times), 0.1))), 0.9) > 0.02
 
 
+@pytest.mark.slow
 def test_a_robot_that_stands_sees_the_same_with_and_without_a_sweep():
     scans = []
     for sweep in (False, True):
@@ -216,6 +219,7 @@ def test_pixels_are_mixed_at_edges_alone():
     np.testing.assert_allclose(np.linalg.norm(rim - rays, axis=1), 0.01, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_sensor_with_every_error_stays_within_its_bounds_and_misses_some():
     made = make_sensor("vlp16", intensity=True)
     sensor = dataclasses.replace(made, echo=dataclasses.replace(made.echo, mixing=True))

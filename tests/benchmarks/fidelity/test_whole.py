@@ -106,6 +106,7 @@ def test_a_run_scores_all_18_categories_of_a_right_tube(scored, recording) -> No
     assert drawn == {name for name, _ in FIGURES} - {"F14-controls", "F15-sweep"}  # these need their commands
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_metric_from_a_file_is_listed_apart_and_the_verdict_stays_the_suite_s(
     scored, tmp_path, monkeypatch, capsys

@@ -40,6 +40,7 @@ def of(tree, k):
     return jax.tree.map(lambda leaf: np.asarray(leaf)[k], tree)
 
 
+@pytest.mark.slow
 def test_half_a_second_in_both_engines_ends_in_the_same_joint_angles(walking, moment, in_c):
     """From one state, told the same targets: within 1e-4 rad after 25 control periods, 125 steps of physics."""
     params, state, seen = moment
