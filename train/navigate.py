@@ -50,7 +50,7 @@ class Command:
         task: Task id.
         tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, or several of which
             each episode draws one: `procedural:train:0-255`, `open:train:0-255`.
-        lining: Variant of the walls; `pockets`, or the tunnel's first, if left out.
+        lining: Variant of the walls; `pockets`, or its first, if left out.
         sensor: LiDAR; `planar16` is the task's own, `avia` no image.
         memory: `none`: a perceptron over a few observations. `gru`: a network that remembers; it learns by reward, or
             with `--teacher oracle` (any baseline, policy file or run folder) from a teacher. `map`: a belief over the
@@ -60,7 +60,7 @@ class Command:
         resume: Go on from the newest checkpoint, or from the beginning.
         overwrite: Throw away the run that `out` holds.
         evaluation_episodes: Episodes of the evaluation after training, of 500.
-        embodiment: `scout`, the tasks' robot; or `b2`: one that obeys as late, then tried on four legs.
+        embodiment: `scout`, the tasks' robot; or `b2`, tried on four legs afterwards.
         settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
         legs: The trial of `--embodiment b2`.
         logs: Further places to log to.
