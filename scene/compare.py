@@ -14,7 +14,7 @@ import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import trimesh
@@ -223,7 +223,8 @@ def _read_scene(folder: Path) -> tuple[Bore, np.ndarray, np.ndarray]:
         raise RecordingError(f"{folder}: not a scene folder, for it has no manifest.json; build it with scene.build")
     if not (folder / "cloud.ply").is_file():
         raise RecordingError(f"{folder}: has no cloud.ply, as scenes of ring surveys; two clouds are needed")
-    points = np.asarray(trimesh.load(require_input(folder / "cloud.ply")).vertices, float)
+    cloud: Any = trimesh.load(require_input(folder / "cloud.ply"))
+    points = np.asarray(cloud.vertices, float)
     origin = np.asarray(json.loads(manifest.read_text())["frame"]["origin"], float)
     return load_bore(folder / "bore.npz"), points, origin
 

@@ -87,9 +87,9 @@ def report(config: ReportConfig) -> Path:
         if design is not None and located is not None:
             facts |= _write_offsets(folder, bore, design, located)
         facts |= _write_clearance(folder, config.scene, bore, gauge, start)
-        cloud = config.scene / "cloud.ply"
-        if cloud.is_file():  # a ring survey has none
-            points = np.asarray(trimesh.load(cloud).vertices, float)
+        if (config.scene / "cloud.ply").is_file():  # a ring survey has none
+            cloud: Any = trimesh.load(config.scene / "cloud.ply")
+            points = np.asarray(cloud.vertices, float)
             write_points(folder / "points.laz", bore, points, origin, start)
         write_csv(folder / "sections.csv", tables["metres"])
         write_workbook(folder / "rings.xlsx", tables, facts)

@@ -101,7 +101,7 @@ def save_tunnel(
     lidar_height: float,
     variants: dict[str, Walls],
     furniture: dict[str, Float[np.ndarray, "f 4"]] | None = None,
-    shell: dict[str, np.ndarray] | None = None,
+    shell: dict[str, Any] | None = None,
 ) -> None:
     """Writes `tunnel.npz`; docs/formats.md says what each field means. `variants` holds `smooth` first.
 
