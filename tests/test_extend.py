@@ -120,6 +120,7 @@ def test_a_task_from_outside_works_with_gymnasium_and_stable_baselines(desk):
     assert vector.step(np.zeros((2, 2), np.float32))[1].shape == (2,)
 
 
+@pytest.mark.slow
 def test_leaderboard_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
     from benchmarks.leaderboard.__main__ import main as leaderboard
     from subterra_jax.recorder.__main__ import main as recorder

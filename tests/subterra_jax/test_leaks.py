@@ -40,6 +40,7 @@ def test_the_command_integrator_stops_as_often_as_theory_says_and_no_more(contro
     assert abs(success("command-integrator") - bounds["command"]) < three_errors(bounds["command"])
 
 
+@pytest.mark.slow
 def test_the_odometer_stops_as_often_as_theory_says_and_no_more(control):
     success, bounds = control
     assert abs(success("dead-reckoning") - bounds["odometry"]) < three_errors(bounds["odometry"])

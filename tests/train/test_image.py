@@ -21,6 +21,7 @@ from train.recurrent.network import without_critic
 TASK = "Subterra/StopAtShort-v0"
 
 
+@pytest.mark.slow
 def test_a_student_with_an_image_learns_and_its_release_gives_the_same_action():
     xy = np.stack([np.linspace(0.0, 70.0, 71), np.zeros(71)], axis=-1)
     plan = st.tunnel.from_centreline(xy, 2.8, ring_pitch=1.5)

@@ -99,6 +99,7 @@ def test_every_task_has_a_preset_that_makes_sense(task, preset):
     check_recurrent(make_recurrent_config(task, preset))
 
 
+@pytest.mark.slow
 def test_a_run_that_was_killed_goes_on_to_the_same_bytes(tmp_path, capsys):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     line = ("--task", TASK, "--memory", "gru", *SMALL, "--steps=768", "--evaluation-episodes=2", "--checkpoint-every=1")

@@ -74,6 +74,7 @@ def several(tunnel, tmp_path_factory):
     return run
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_run_for_each_seed_and_goes_on_where_they_last_stood_together(several, capsys):
     status, whole = several("--steps=16384")
     assert status == 0
