@@ -1,4 +1,4 @@
-"""Where one gets lost in a tunnel: bound of one scan and drift of a perfect filter along it, by lining and sensor.
+"""Atlas of a tunnel: bound of one scan and drift of a perfect filter along it, by lining and sensor.
 
 `python -m benchmarks.atlas build/tunnel --linings pockets smooth --out out/atlas`
 """

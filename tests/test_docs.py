@@ -103,7 +103,7 @@ def test_the_pages_have_python_and_commands_in_them():
 
 
 def _stopping(real: Callable[..., Any]) -> Callable[..., Any]:
-    """What reads a command line, and then has nothing follow."""
+    """Return a function that reads a command line, and then has nothing follow."""
 
     def read(*args: Any, **kwargs: Any) -> Any:
         real(*args, **kwargs)

@@ -24,7 +24,7 @@ def run(source):
 
 @pytest.fixture(scope="module")
 def page():
-    """What the page makes but for its last two blocks, with a few small environments."""
+    """Names that the page makes but for its last two blocks, with a few small environments."""
     source = "\n".join(BLOCKS[:-2])
     return run(source.replace("= 16, 128, 128", "= 1, 8, 24"))
 

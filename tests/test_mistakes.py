@@ -1,4 +1,4 @@
-"""What a user can get wrong at a command line: one sentence, exit status 2, nothing half-written."""
+"""Mistakes of a user at a command line: one sentence, exit status 2, nothing half-written."""
 
 import os
 import runpy

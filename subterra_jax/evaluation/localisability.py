@@ -1,4 +1,4 @@
-"""How well walls tell where a robot is: information of a scan, its bound, and the drift that a perfect filter keeps.
+"""Information of a scan about where a robot is, its bound, and the drift that a perfect filter keeps.
 
 A scan holds ranges with independent normal noise, so its Fisher information about a pose is the sum over the beams of
 g gᵀ / σ², with g the slope of a range over station, offset and heading.

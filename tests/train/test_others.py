@@ -98,7 +98,7 @@ def test_a_function_on_the_host_drives_as_the_same_function_in_jax(fresh):
 
 
 def learns(name, steps, **options):
-    """Whether a trainer reaches the goal within a number of steps."""
+    """Return whether a trainer reaches the goal within a number of steps."""
     watch = Watch(TASK, **options)
     others.importlib.import_module(f"train.others.{name}").train(watch, steps, seed=0)
     assert all(a.steps < b.steps for a, b in zip(watch.scores, watch.scores[1:], strict=False))

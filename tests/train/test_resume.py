@@ -34,7 +34,7 @@ def digest(run):
 
 
 def cut(whole, out, *kept):
-    """What a kill before the first checkpoint leaves: some files, the logs longer than any checkpoint knows."""
+    """Leave what a kill before the first checkpoint does: some files, the logs longer than any checkpoint knows."""
     out.mkdir()
     for name in kept:
         shutil.copy(whole / name, out / name)

@@ -1,4 +1,4 @@
-"""What a user can get wrong with the commands: one sentence, status 2, nothing half-written."""
+"""Mistakes of a user with the commands: one sentence, status 2, nothing half-written."""
 
 import sys
 from pathlib import Path

@@ -32,7 +32,7 @@ def test_sb3s_checker_has_nothing_to_say_and_the_spaces_hold(env):
 
 
 def test_the_observation_has_neither_the_goal_nor_the_truth(env):
-    """The same but for the goal: the same observation. Another true start: the same achieved goal."""
+    """Another goal alone leaves the observation as it is, and another true start the achieved goal."""
     near, _ = env.reset(seed=1, options={"goal": 12.0})
     far, _ = env.reset(seed=1, options={"goal": 50.0})
     np.testing.assert_array_equal(near["observation"], far["observation"])
