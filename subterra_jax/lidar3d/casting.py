@@ -18,7 +18,7 @@ from subterra_jax import native
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d import fused
-from subterra_jax.lidar3d.march import FINE, Hits, Tools, corners
+from subterra_jax.lidar3d.march import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relay import march_in_relay
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.rows import axes, spread
@@ -132,9 +132,8 @@ def meet(
 def _meet(
     relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array
 ) -> tuple[Array, Array, Array]:
-    hits = _find(relief, origins, directions, blocks, limits)
-    normal = _normals(relief, hits, origins, directions)
-    return _clip(hits, origins, directions, limits), normal, hits.entry < -1
+    hits, normal = _find_facing(relief, origins, directions, blocks, limits)
+    return _clip(hits, origins, directions, limits), jnp.stack(normal, axis=-1), hits.entry < -1
 
 
 @_meet.defjvp
@@ -271,35 +270,14 @@ def _ranges_and_changes(primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Return ranges and their changes: a ray's end stays in the plane of the triangle that it meets."""
     relief, origins, directions, blocks, limits = primals
     _, moved, turned, _, widened = tangents
-    hits = _find(relief, origins, directions, blocks, limits)
-    ranges = _clip(hits, origins, directions, limits)
-    normal = _normals(relief, hits, origins, directions)
+    hits, rows = _find_facing(relief, origins, directions, blocks, limits)
+    ranges, normal = _clip(hits, origins, directions, limits), jnp.stack(rows, axis=-1)
     facing = jnp.sum(normal * directions, axis=-1)
     meets = (hits.entry != -1) & (hits.distance < limits) & (jnp.abs(facing) > 0.0)
     shift = jnp.sum(normal * (moved + ranges[:, None] * turned), axis=-1)
     return ranges, jnp.where(
         meets, -shift / jnp.where(meets, facing, 1.0), jnp.where(hits.distance >= limits, widened, 0.0)
     )
-
-
-def _normals(relief: Relief, hits: Hits, origins: Array, directions: Array) -> Float[Array, "n 3"]:
-    """Return unit normals of what is met, tunnel frame; arbitrary where there is nothing."""
-    row = relief.frame[hits.block]
-    axes = row[:, 3:12].reshape(-1, 3, 3)
-    first, second, third = corners(_tools(relief), hits.entry, relief.link[hits.block, 2], hits.entry >= 0)
-    scale = [row[:, 22], FINE * row[:, 23], FINE * row[:, 23]]
-    a, b = ([(p - q) / s for p, q, s in zip(corner, first, scale, strict=True)] for corner in (second, third))
-    flat = jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]], axis=-1)
-    # A box is met on the face that is furthest out where it is met.
-    sides = relief.box[jnp.maximum(-2 - hits.entry, 0)].reshape(-1, 3, 4)
-    end = origins + hits.distance[:, None] * directions - row[:, :3]
-    end = jnp.stack([jnp.sum(axes[:, i] * end, axis=-1) for i in range(3)], axis=-1)
-    place = jnp.abs(jnp.sum(sides[..., :3] * end[:, None], axis=-1) - sides[..., 3])
-    face = jnp.take_along_axis(sides[..., :3], jnp.argmax(place, axis=-1)[:, None, None], axis=1)[:, 0]
-    local = jnp.where((hits.entry >= 0)[:, None], flat, face)
-    size = jnp.sqrt(jnp.sum(local**2, axis=-1, keepdims=True))
-    turned = sum(axes[:, i] * local[:, i, None] for i in range(3))
-    return turned / jnp.where(size > 0.0, size, 1.0)
 
 
 def _tools(relief: Relief) -> Tools:
@@ -320,6 +298,28 @@ def _tools(relief: Relief) -> Tools:
     return Tools(load, lambda a, b, c: a * b + c, lambda a: 1.0 / a)
 
 
+def _by_platform(find: Any, on_gpu: Any, on_cpu: Any, relief: Relief, rows: Any) -> Any:
+    """Call what is fastest on the device: the fused kernel, machine code, or XLA's `find`."""
+    _require_memory(len(rows[2]))
+    kernels: dict[str, Any] = {}
+    if fused.supported():
+        kernels["cuda"] = on_gpu
+    if native.supported():
+        kernels["cpu"] = on_cpu
+    return lax.platform_dependent(relief, *rows, **kernels, default=find)
+
+
+def _merged(find: Any, find_in_step: Any, axis_size: int, batched: Any, relief: Relief, rows: Any) -> tuple[Any, Any]:
+    """Merge a batch axis into the rays; find those of each relief by themselves if the reliefs differ."""
+    if any(jax.tree.leaves(batched[0])):
+        found = jax.vmap(find_in_step, in_axes=axes(batched))(relief, *rows)
+    else:
+        rows = spread(tuple(map(jnp.asarray, rows)), batched[1:], axis_size)
+        flat = find(relief, *(row.reshape(-1, *row.shape[2:]) for row in rows))
+        found = jax.tree.map(lambda part: part.reshape(axis_size, -1), flat)
+    return found, jax.tree.map(lambda part: True, found)
+
+
 @custom_vmap
 @in_32_bits()
 def _find(
@@ -330,29 +330,59 @@ def _find(
     limits: Float[Array, "n"],
 ) -> Hits:
     """Find the first triangle that each ray meets, by the fastest means at hand."""
-    _require_memory(len(blocks))
-    kernels: dict[str, Any] = {}
-    if fused.supported():
-        kernels["cuda"] = fused.find
-    if native.supported():
-        from subterra_jax.native import marchcall  # numba is optional
-
-        kernels["cpu"] = marchcall.find
-    return lax.platform_dependent(relief, origins, directions, blocks, limits, **kernels, default=_find_in_step)
+    return _by_platform(_find_in_step, fused.find, _find_natively, relief, (origins, directions, blocks, limits))
 
 
 @_find.def_vmap
 @in_32_bits()
 def _find_more(axis_size: int, batched: Any, relief: Relief, *rows: Any) -> tuple[Hits, Hits]:
-    """Merge a batch axis into the rays; find those of each relief by themselves if the reliefs differ."""
-    yes = Hits(True, True, True)  # type: ignore[arg-type]
-    if any(jax.tree.leaves(batched[0])):
-        return jax.vmap(_find_in_step, in_axes=axes(batched))(relief, *rows), yes
-    flat = [row.reshape(-1, *row.shape[2:]) for row in spread(tuple(map(jnp.asarray, rows)), batched[1:], axis_size)]
-    hits = _find(relief, *flat)
-    return Hits(*(part.reshape(axis_size, -1) for part in hits)), yes
+    """Merge a batch axis into the rays."""
+    return _merged(_find, _find_in_step, axis_size, batched, relief, rows)
+
+
+@custom_vmap
+@in_32_bits()
+def _find_facing(
+    relief: Relief,
+    origins: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"],
+    blocks: Int[Array, "n"],
+    limits: Float[Array, "n"],
+) -> tuple[Hits, Point]:
+    """Find the first triangle that each ray meets, and its normal, by the fastest means at hand."""
+    rows = (origins, directions, blocks, limits)
+    return _by_platform(_facing_in_step, fused.find_facing, _facing_natively, relief, rows)
+
+
+@_find_facing.def_vmap
+@in_32_bits()
+def _find_more_facing(axis_size: int, batched: Any, relief: Relief, *rows: Any) -> tuple[Any, Any]:
+    """Merge a batch axis into the rays."""
+    return _merged(_find_facing, _facing_in_step, axis_size, batched, relief, rows)
 
 
 def _find_in_step(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Hits:
     """Find the first triangles by XLA."""
     return march_in_relay(_tools(relief), relief.n_x, origins, directions, blocks, limits)
+
+
+def _find_natively(relief: Relief, *rows: Array) -> Hits:
+    """Find the first triangles by machine code."""
+    from subterra_jax.native import marchcall  # numba is optional
+
+    return marchcall.find(relief, *rows)
+
+
+def _facing_in_step(relief: Relief, *rows: Array) -> tuple[Hits, Point]:
+    """Find the first triangles and their normals by XLA."""
+    return _with_normals(relief, _find_in_step(relief, *rows), rows)
+
+
+def _facing_natively(relief: Relief, *rows: Array) -> tuple[Hits, Point]:
+    """Find the first triangles by machine code, and their normals by XLA."""
+    return _with_normals(relief, _find_natively(relief, *rows), rows)
+
+
+def _with_normals(relief: Relief, hits: Hits, rows: Any) -> tuple[Hits, Point]:
+    origins, directions = rows[:2]
+    return hits, normals(_tools(relief), tuple(origins.T), tuple(directions.T), hits)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.lidar3d.march import Hits, Tools, march
+from subterra_jax.lidar3d.march import Hits, Point, Tools, march, normals
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 
 # Rays of one program: one warp, one ray a lane.
@@ -30,6 +30,23 @@ def find(
     limit: Float[Array, n],
 ) -> Hits:
     """Find the first triangle that each ray meets, as `march.march`."""
+    return Hits(*_launch(relief, origin, direction, block, limit, facing=False))
+
+
+def find_facing(
+    relief: Relief,
+    origin: Float[Array, "n 3"],
+    direction: Float[Array, "n 3"],
+    block: Int[Array, n],
+    limit: Float[Array, n],
+) -> tuple[Hits, Point]:
+    """Find the first triangle that each ray meets, and its normal, as `march.march` and `march.normals`."""
+    rows = _launch(relief, origin, direction, block, limit, facing=True)
+    return Hits(*rows[:3]), rows[3:]
+
+
+def _launch(relief: Relief, origin: Array, direction: Array, block: Array, limit: Array, *, facing: bool) -> Any:
+    """March rays, 32 by a program; return the rows of `Hits`, and of normals if asked."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -37,25 +54,25 @@ def find(
     rows = [jnp.pad(row, (0, -count % _ROWS), mode="edge") for row in (*origin.T, *direction.T, block, limit)]
     row = pl.BlockSpec((_ROWS,), lambda i: (i,))
     whole = pl.BlockSpec(memory_space=pl.ANY)
-    shape = lambda dtype: jax.ShapeDtypeStruct(rows[0].shape, dtype)  # noqa: E731
-    hits = pl.pallas_call(
-        partial(_kernel, n_x=relief.n_x, on_gpu=on_gpu),
+    kinds = (jnp.float32, jnp.int32, jnp.int32, *(jnp.float32,) * 3 * facing)
+    out = pl.pallas_call(
+        partial(_kernel, n_x=relief.n_x, on_gpu=on_gpu, facing=facing),
         grid=(rows[0].shape[0] // _ROWS,),
         in_specs=[row] * 8 + [whole] * len(ARRAYS),
-        out_specs=[row] * 3,
-        out_shape=[shape(jnp.float32), shape(jnp.int32), shape(jnp.int32)],
+        out_specs=[row] * len(kinds),
+        out_shape=[jax.ShapeDtypeStruct(rows[0].shape, kind) for kind in kinds],
         compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=not on_gpu,
     )(*rows, *(getattr(relief, name).reshape(-1) for name in ARRAYS))
-    return Hits(*(part[:count] for part in hits))
+    return tuple(part[:count] for part in out)
 
 
-def _kernel(*refs: Any, n_x: int, on_gpu: bool) -> None:
+def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool) -> None:
     """March 32 rays."""
     from jax.experimental.pallas import triton
 
     *rows, block_ref, limit_ref = refs[:8]
-    arrays = dict(zip(ARRAYS, refs[8:-3], strict=True))
+    arrays = dict(zip(ARRAYS, refs[8 : 8 + len(ARRAYS)], strict=True))
 
     def load(name: str, index: Array, mask: Array | None = None) -> Any:
         if name not in PAIRS:
@@ -67,8 +84,10 @@ def _kernel(*refs: Any, n_x: int, on_gpu: bool) -> None:
 
     tools = Tools(load, *((_fma, _reciprocal) if on_gpu else (lambda a, b, c: a * b + c, lambda a: 1.0 / a)))
     ox, oy, oz, dx, dy, dz = (ref[...] for ref in rows)
-    hits = march(tools, n_x, (ox, oy, oz), (dx, dy, dz), block_ref[...], limit_ref[...])
-    for ref, part in zip(refs[-3:], hits, strict=True):
+    origin, direction = (ox, oy, oz), (dx, dy, dz)
+    hits = march(tools, n_x, origin, direction, block_ref[...], limit_ref[...])
+    parts = (*hits, *(normals(tools, origin, direction, hits) if facing else ()))
+    for ref, part in zip(refs[8 + len(ARRAYS) :], parts, strict=True):
         ref[...] = part
 
 

@@ -360,6 +360,39 @@ def _cross_cells(
     return step.hit, step.entry
 
 
+def normals(tools: Tools, origin: Point, direction: Point, hits: Hits) -> Point:
+    """Return unit normals of what rays meet, tunnel frame, to either side; arbitrary where there is nothing."""
+    row = hits.block * N_FRAME
+    frame = lambda i: tools.load("frame", row + i)  # noqa: E731
+    axes = [[frame(3 + 3 * i + j) for j in range(3)] for i in range(3)]
+    first, second, third = corners(tools, hits.entry, tools.load("link", hits.block * N_LINK + 2), hits.entry >= 0)
+    along, across = frame(22), FINE * frame(23)
+    a, b = (
+        [(p - q) * tools.reciprocal(unit) for p, q, unit in zip(corner, first, (along, across, across), strict=True)]
+        for corner in (second, third)
+    )
+    end = [tools.fma(hits.distance, direction[i], origin[i] - frame(i)) for i in range(3)]
+    face = _face(tools, hits.entry, [tools.dot(axis, end) for axis in axes])
+    met = hits.entry < -1
+    local = [jnp.where(met, one, other) for one, other in zip(face, tools.cross(a, b), strict=True)]
+    turned = [tools.dot([axis[i] for axis in axes], local) for i in range(3)]
+    squared = tools.dot(turned, turned)
+    scale = lax.rsqrt(jnp.where(squared > 0.0, squared, 1.0))
+    return turned[0] * scale, turned[1] * scale, turned[2] * scale
+
+
+def _face(tools: Tools, entry: Int[Array, "n"], end: list[Array]) -> list[Array]:
+    """Return normals of the faces on which rays end, in the frames of their blocks: those furthest out there."""
+    number = jnp.maximum(-2 - entry, 0)
+    place, face = jnp.full_like(end[0], -1.0), [jnp.zeros_like(end[0])] * 3
+    for side in range(3):
+        row = [tools.load("box", 12 * number + 4 * side + j) for j in range(4)]
+        out = jnp.abs(tools.dot(row[:3], end) - row[3])
+        face = [jnp.where(out > place, new, old) for new, old in zip(row[:3], face, strict=True)]
+        place = jnp.maximum(out, place)
+    return face
+
+
 def corners(
     tools: Tools, entry: Int[Array, "n"], first_vertex: Int[Array, "n"], listed: Bool[Array, "n"]
 ) -> tuple[Point, Point, Point]:

@@ -10,7 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
-from subterra_jax.lidar3d import beams, casting, fused, march, relay
+from subterra_jax.lidar3d import beams, casting, cells, fused, march, relay
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import Axis, Triangles
 from tests.subterra_jax import surfaces
@@ -181,9 +181,31 @@ def found_by(find, relief, origin, way, station):
 @pytest.mark.parametrize("name", ["bend", "things"])
 def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
     rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 72, 4)
-    xla, kernel = (found_by(find, reliefs[name], *rays) for find in (casting._find_in_step, fused.find))
+    finds = (casting._facing_in_step, fused.find_facing)
+    (xla, xla_normal), (kernel, normal) = (found_by(find, reliefs[name], *rays) for find in finds)
     np.testing.assert_array_equal(xla.entry, kernel.entry)
     np.testing.assert_allclose(xla.distance, kernel.distance, rtol=1e-6)
+    np.testing.assert_allclose(xla_normal, normal, atol=1e-6)
+    for one, other in zip(found_by(fused.find, reliefs[name], *rays), kernel, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+@pytest.mark.parametrize("find", [casting._facing_in_step, fused.find_facing])
+def test_normals_are_those_of_the_faces_of_a_box_and_of_the_tube_behind_it(find):
+    axis, middle = surfaces.axis_of(LENGTH), np.float32([20.0, 0.5, -1.0])
+    box = middle + cells.BOX_CORNERS * [0.25, 0.2, 0.3], cells.BOX_FACES
+    relief = relief_of(axis, surfaces.together(surfaces.tube(axis, RADIUS, 360, 31), box))
+    side = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+    origin = middle + 0.7 * np.concatenate([side, side]) + np.float32([0.013, 0.017, 0.019])
+    way = np.concatenate([-side, side])
+    hits, normal = found_by(find, relief, origin, way, np.full(12, 20.0, np.float32))
+    normal, met = np.transpose(normal), origin + np.minimum(hits.distance, 30.0)[:, None] * way
+    assert (np.asarray(hits.entry)[:6] < -1).all()
+    np.testing.assert_allclose(np.abs(normal[:6]), np.abs(side), atol=1e-6)
+    wall = 6 + np.array([1, 2, 4, 5])
+    radial = met[wall] * [0.0, 1.0, 1.0] / np.linalg.norm(met[wall, 1:], axis=1)[:, None]
+    np.testing.assert_allclose(np.abs(np.sum(normal[wall] * radial, axis=1)), 1.0, atol=1e-4)
+    assert not normal[[6, 9]].any()  # along the tunnel and out of a mouth
 
 
 @pytest.mark.skipif(not native.supported(), reason="needs numba")
@@ -292,7 +314,7 @@ def test_the_page_finds_a_pose_by_descending_on_one_scan():
 def test_a_pattern_that_is_none_is_refused(reliefs, pattern, sentence):
     place = jnp.array([30.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=sentence):
-        lidar3d.scan(reliefs["tube"], place, jnp.array([1.0, 0.0, 0.0, 0.0]), place[0], pattern, 30.0)
+        lidar3d.scan(reliefs["tube"], place, jnp.array([1.0, 0.0, 0.0, 0.0]), place[0], jnp.asarray(pattern), 30.0)
 
 
 def test_a_sensor_in_the_wall_is_refused(reliefs):
@@ -305,6 +327,6 @@ def test_a_sensor_in_the_wall_is_refused(reliefs):
 def test_a_batch_that_cannot_fit_is_refused_with_what_would(reliefs, monkeypatch):
     monkeypatch.setattr(casting, "device_memory", lambda: 1_000_000)
     place = jnp.zeros((100, 3)).at[:, 0].set(30.0)
-    beam = beams.planar(512)
+    beam = jnp.asarray(beams.planar(512))
     with pytest.raises(st.SubterraError, match=r"51,200 rays .* at most [0-9,]+ at once"):
         jax.vmap(lidar3d.cast, (None, 0, None, 0, None))(reliefs["tube"], place, beam, place[:, 0], 30.0)
