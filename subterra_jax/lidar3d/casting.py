@@ -109,21 +109,23 @@ class Met(NamedTuple):
 @in_32_bits()
 def meet(
     relief: Relief,
-    origins: Float[Array, "n 3"],
+    origins: Float[Array, "n 3"] | Float[Array, "3"],
     directions: Float[Array, "n 3"],
     station: Float[Array, ""],
     limits: Float[Array, "n"],
 ) -> Met:
-    """Return the surfaces that rays meet, each from an origin of its own. Ranges have derivatives as those of `cast`.
+    """Return the surfaces that rays meet. Ranges have derivatives as those of `cast`.
 
     Args:
         relief: Surface of the bore, or of one picked from a stack.
-        origins: Origins, tunnel frame, m, all within 2 m of the station.
+        origins: Origins, one for each ray or one for all, tunnel frame, m, within 2 m of the station.
         directions: Unit vectors, tunnel frame; not checked.
         station: Station of the origins, m.
         limits: Largest ranges, m.
     """
-    blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, jnp.asarray(station, jnp.float32))
+    find_blocks = block_at if origins.ndim == 1 else jax.vmap(block_at, (None, 0, None))
+    blocks = jnp.broadcast_to(find_blocks(relief, origins, jnp.asarray(station, jnp.float32)), limits.shape)
+    origins = jnp.broadcast_to(origins, directions.shape)
     return Met(*_meet(relief.shared, origins, directions, blocks, limits))
 
 

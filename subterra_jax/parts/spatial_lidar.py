@@ -254,9 +254,9 @@ class SpatialLidar(Part):
         n, both = sensor.n_beams, rays
         if sensor.echo.mixing:
             both = jnp.concatenate([rays, echo.rim_of(rays, uniform[:, 2], sensor.echo)])
-            origins = jnp.concatenate([origins, origins])
+            origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
         limits = jnp.broadcast_to(jnp.where(sight.wanted, sensor.range_max, 0.0), len(both))
-        met = meet(sight.tunnel.space.relief, origins, both, sight.station, limits.astype(jnp.float32))
+        met = meet(sight.tunnel.space.relief, origins if sensor.sweep else origins[0], both, sight.station, limits.astype(jnp.float32))
         standing = sight.hits(both[:, :2])
         nearer = standing < met.ranges
         met = met._replace(ranges=jnp.minimum(met.ranges, standing), thing=met.thing | nearer)
