@@ -256,7 +256,8 @@ class SpatialLidar(Part):
             both = jnp.concatenate([rays, echo.rim_of(rays, uniform[:, 2], sensor.echo)])
             origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
         limits = jnp.broadcast_to(jnp.where(sight.wanted, sensor.range_max, 0.0), len(both))
-        met = meet(sight.tunnel.space.relief, origins if sensor.sweep else origins[0], both, sight.station, limits.astype(jnp.float32))
+        start = origins if sensor.sweep else origins[0]
+        met = meet(sight.tunnel.space.relief, start, both, sight.station, limits.astype(jnp.float32))
         standing = sight.hits(both[:, :2])
         nearer = standing < met.ranges
         met = met._replace(ranges=jnp.minimum(met.ranges, standing), thing=met.thing | nearer)
