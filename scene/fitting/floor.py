@@ -160,10 +160,11 @@ def find_floors(
     count = max(int((end - start) / _FLOOR_STEP), 1)
     middle = start + (np.arange(count) + 0.5) * (end - start) / count
     order = np.argsort(station, kind="stable")
-    bounds = np.searchsorted(station[order], start + np.arange(count + 1) * (end - start) / count)
+    half = _half_window(station, start, end, count)
+    first, last = (np.searchsorted(station[order], middle + side * half) for side in (-1, 1))
     lines: list[list[tuple[float, float]]] = []
     for k in range(count):
-        rows = order[bounds[k] : bounds[k + 1]]
+        rows = order[first[k] : last[k]]
         rows = rows[:: max(1, len(rows) // 4000)]
         upper = fit_floor_line(lateral[rows], upward[rows])
         lower = find_lower_line(lateral[rows], upward[rows], upper)
@@ -184,6 +185,16 @@ def find_floors(
         gaussian_filter1d(median_filter(v, 3, mode="nearest"), sigma, mode="nearest") for v in (height, slope)
     )
     return Floors(at, height, slope)
+
+
+_ENOUGH, _LONGEST_WINDOW = 1000, 4.0  # points that show a floor beside sleepers; m
+
+
+def _half_window(station: np.ndarray, start: float, end: float, count: int) -> float:
+    """Half the length of bore that one floor line is fitted to, m: more than a section's where a cloud is thin."""
+    inside = int(((station >= start) & (station <= end)).sum())
+    needed = _ENOUGH / max(inside, 1) * (end - start)
+    return max(min(needed, _LONGEST_WINDOW), (end - start) / count) / 2
 
 
 _MIDDLE, _PIT, _PIT_SHARE = 1.2, 0.5, 0.05  # m beside the axis; m below its floor; share of the returns that low

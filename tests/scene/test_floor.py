@@ -65,6 +65,14 @@ def test_floor_and_height_are_right_under_track_and_beside_walkways(world, senso
     assert np.median(bore.width) == pytest.approx(np.ptp(world.outline[:, 0]), abs=0.03)
 
 
+def test_a_thin_cloud_shows_the_floor_between_sleepers_in_longer_windows(monkeypatch):
+    points = SCANS["terrestrial"](World(arch(5.1, 5.5, 3.0), L, PROUD))
+    thin = points[np.random.default_rng(3).permutation(len(points))[:5_000]]  # 10 a square metre
+    assert np.abs(built(thin, 0.07)[1][8:-8]).max() < 0.03
+    monkeypatch.setattr(floor, "_LONGEST_WINDOW", 0.0)
+    assert np.abs(built(thin, 0.07)[1][8:-8]).max() > 0.05
+
+
 def test_ghosts_of_a_walker_do_not_lift_the_floor():
     points, rng = SCANS["vlp16"](World(arch(5.5, 6.0, 3.2), L)), np.random.default_rng(1)
     count = int(0.12 * len(points))
