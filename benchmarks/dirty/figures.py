@@ -92,6 +92,7 @@ def size_figures(smooth: trimesh.Trimesh, truth: Truth) -> dict[str, float]:
     above = np.interp(frames.row, np.arange(len(truth.axis)), truth.axis_above_floor)
     height = np.interp(frames.row, np.arange(len(truth.axis)), truth.height)
     width = np.interp(frames.row, np.arange(len(truth.axis)), truth.width)
+    middle = np.interp(frames.row, np.arange(len(truth.axis)), np.broadcast_to(truth.middle, len(truth.axis)))
     up = np.array([0.0, 0.0, 1.0])
     drops = [_reach(caster, frames.position + y * frames.lateral, -up) for y in FLOOR_LINES]
     rise = _reach(caster, frames.position, up)
@@ -107,7 +108,7 @@ def size_figures(smooth: trimesh.Trimesh, truth: Truth) -> dict[str, float]:
         "width": left + right - width,
         "height": drop + rise - height,
         "floor": above - drop,  # positive where the built floor lies too high
-        "aside": 0.5 * (left - right),
+        "aside": 0.5 * (left - right) - middle,
     }
     figures = {"seen": float(np.mean(np.isfinite(drop + rise)))}
     for name, error in errors.items():

@@ -47,7 +47,10 @@ DESCRIBED = {
 def measure_sizes(
     source: Path, axis: Float[np.ndarray, "n 3"], wall: Float[np.ndarray, "w 3"], told: Described
 ) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return `axis_above_floor`, `width` and `height` at each point of the axis, m; NaN where too little was seen."""
+    """Return `axis_above_floor`, `width`, `height` and `middle` at each point of the axis, m.
+
+    NaN where too little was seen. `middle` is how far the middle between both walls lies to the left of the axis.
+    """
     laz = laspy.read(source)
     cloud = np.stack([laz.x, laz.y, laz.z], axis=1)
     station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(axis, axis=0), axis=1))])
@@ -61,7 +64,8 @@ def measure_sizes(
     lower = np.interp(at, station, _quantiles(station, at[low], z[low], 0.25))
     low &= np.abs(z - lower) < _FLOOR_THICK
     above = -_quantiles(station, at[low], z[low])
-    return {"axis_above_floor": above, "width": sides[0] - sides[1], "height": above + top}
+    middle = 0.5 * (sides[0] + sides[1])
+    return {"axis_above_floor": above, "width": sides[0] - sides[1], "height": above + top, "middle": middle}
 
 
 def local_places(

@@ -41,6 +41,7 @@ class Truth:
     trouble: tuple[float, float] = (float("nan"), float("nan"))  # Stations of the trouble, m
     must_say: bool = False  # True where even a right scene must come with a warning that names the cause
     cause: tuple[str, ...] = ()  # Words of which a warning or refusal names at least one
+    middle: Float[np.ndarray, " n"] | float = 0.0  # Of both walls, to the left of the axis, m: rough walls move it
 
     @property
     def station(self) -> Float[np.ndarray, " n"]:
@@ -112,6 +113,7 @@ def load_truth(case: Case) -> Truth:
     given: dict[str, Any] = {
         name: np.broadcast_to(np.asarray(values.get(name, np.nan), float), count) for name in names
     }
+    given["middle"] = np.broadcast_to(np.asarray(values.get("middle", 0.0), float), count)
     given |= {name: str(values[name]) for name in ("track", "expect") if name in values}
     given |= {name: float(values[name]) for name in ("proud", "gauge") if name in values}
     given |= {name: tuple(float(v) for v in values[name]) for name in ("ends", "trouble", "band") if name in values}

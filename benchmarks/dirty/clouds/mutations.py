@@ -95,7 +95,8 @@ def stray(rng: np.random.Generator, whole: Mutant) -> Mutant:
 
 def mirror(rng: np.random.Generator, whole: Mutant) -> Mutant:
     """Return a piece with left and right exchanged."""
-    return _moved(take_window(rng, whole), lambda points: points * (-1.0, 1.0, 1.0))
+    moved = _moved(take_window(rng, whole), lambda points: points * (-1.0, 1.0, 1.0))
+    return replace(moved, truth=replace(moved.truth, middle=-np.asarray(moved.truth.middle)))
 
 
 def in_mm(rng: np.random.Generator, whole: Mutant) -> Mutant:

@@ -77,6 +77,8 @@ def test_a_mirror_exchanges_the_sides_and_a_turn_leans_by_up_to_15_degrees() -> 
     mirrored = MUTATIONS["mirrored"](rng, whole)
     assert (mirrored.points[:, 0] < 0.0).all()
     assert mirrored.truth.axis[0, 0] == -whole.truth.axis[0, 0]
+    aside = replace(whole, truth=replace(whole.truth, middle=0.03))
+    assert MUTATIONS["mirrored"](rng, aside).truth.middle == -0.03
     leans, yaws = [], []
     for _ in range(40):
         turned = MUTATIONS["rotated"](rng, whole)

@@ -92,6 +92,13 @@ def test_rough_walls_are_as_wide_as_they_stand_apart_and_no_wider(tmp_path: Path
     assert abs(wide["aside"]) < 1e-6
 
 
+def test_an_axis_is_judged_by_where_the_true_walls_stand(tmp_path: Path, truth: Truth) -> None:
+    moved = outline() + np.array([0.05, 0.0])  # both walls 5 cm further to the left
+    folder = scene_folder(tmp_path / "scene", moved)
+    assert abs(judge_scene(folder, truth)["aside"] - 0.05) < 1e-6
+    assert abs(judge_scene(folder, replace(truth, middle=np.full(len(truth.axis), 0.05)))["aside"]) < 1e-6
+
+
 def test_a_wrong_scene_needs_a_warning_that_names_place_and_cause(truth: Truth) -> None:
     truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
     row = {"status": 0, "message": "", "faults": ["floor +70 cm"]}
