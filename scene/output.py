@@ -19,6 +19,7 @@ from scene.judging.judge import STATION, DoubtError, Judgement, JudgingConfig, j
 from scene.judging.page import render_page
 from scene.judging.returns import TrackZone
 from scene.judging.sanity import doubt_bore
+from scene.judging.trackdoubt import doubt_track
 from scene.poses.trajectory import save_tum
 from scene.reconstruct import ReconstructConfig, Reconstruction
 from scene.writing.furnished import furnish_bore, planar_segments
@@ -129,6 +130,7 @@ class BuildConfig:
 def judge_reconstruction(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgement:
     """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
     odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
+    odd += doubt_track(track, result.seen)
     if result.everything is None:
         judgement = Judgement(config.tolerance, ())
     else:

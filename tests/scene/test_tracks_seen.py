@@ -14,6 +14,7 @@ from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from scene.fitting.trackseen import SeenTrack, find_track
+from scene.judging.trackdoubt import doubt_track
 from scene.output import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, describe_track, lay_track, track_provenance
@@ -186,3 +187,18 @@ def test_sleepers_of_uneven_pitch_are_not_filled_up():
     (line,) = find_track(cloud, bore).lines
     inside = (uneven + 0.3 < L).sum()
     assert abs(len(line.sleepers.station) - inside) <= 2
+
+
+def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
+    cloud, bore = scanned("proud", "terrestrial")
+    seen = seen_in("proud", "terrestrial")
+    assert doubt_track(lay_track(bore, TrackConfig(), seen), seen) == []
+    unseen = SeenTrack((replace(seen.lines[0], sleepers=None, bed=0.2),), sought=True)
+    (warned,) = doubt_track(lay_track(bore, TrackConfig(), unseen), unseen)
+    assert "44 sleepers lie where a spacing of 0.60 m asks for them, and none of them was seen" in warned.text
+    few = np.arange(len(seen.lines[0].sleepers.measured)) < 9
+    some = SeenTrack((replace(seen.lines[0], sleepers=replace(seen.lines[0].sleepers, measured=few)),), sought=True)
+    (warned,) = doubt_track(lay_track(bore, TrackConfig(), some), some)
+    assert "only 9 of them were seen" in warned.text
+    asked = lay_track(bore, TrackConfig(lay="standard"), unseen)
+    assert doubt_track(asked, unseen) == doubt_track(lay_track(bore, TrackConfig(), None), SeenTrack()) == []
