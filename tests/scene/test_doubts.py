@@ -88,6 +88,15 @@ def test_a_section_on_its_side_is_noticed(bore):
     assert "flat on the left" in codes(turned)["lying"]
 
 
+def test_a_round_bore_along_z_is_a_shaft_and_one_with_a_floor_a_guess(bore):
+    guessed = {**METRES, "axes": "x-zy (detected: longest along z, so y is taken as up)"}
+    assert "taken as up" in codes(bore, guessed)["axes"]
+    tube = replace(bore, radius=np.full_like(bore.radius, 3.0))
+    told = codes(tube, guessed)["shaft"]
+    assert re.search(r"a vertical shaft, \d+ m along z .*--axes x-zy.*REFUSES", told)
+    assert "shaft" not in codes(tube, {**METRES, "axes": "x-zy (by flag)"})
+
+
 def test_a_duct_that_was_taken_for_the_crown_dents_the_section(bore):
     dented = bore.radius.copy()
     near = np.abs(bore.angle - np.pi / 2) < 0.2
