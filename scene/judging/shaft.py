@@ -31,6 +31,6 @@ def doubt_shaft(bore: Bore, axes: str) -> list[Warned]:
         )]  # fmt: skip
     return [Warned(
         "axes",
-        f"the cloud is {size}, so y was taken as up; if it is a vertical shaft, it is no tunnel, and if z is up, --axes "
-        "xyz says so",
+        f"the cloud is {size}, so y was taken as up; if it is a vertical shaft, it is no tunnel, and if z is up, "
+        "--axes xyz says so",
     )]  # fmt: skip

@@ -22,8 +22,8 @@ def doubt_track(track: Track, seen: SeenTrack) -> list[Warned]:
     told = "none of them was seen" if not measured else f"only {measured} of them were seen"
     return [Warned(
         "sleepers",
-        f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {told}: the returns between "
-        "the rails are too few, or lie too even, to tell them; --track none leaves the track out",
+        f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {told}: the returns "
+        "between the rails are too few, or lie too even, to tell them; --track none leaves the track out",
     )]  # fmt: skip
 
 

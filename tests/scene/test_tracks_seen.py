@@ -190,7 +190,7 @@ def test_sleepers_of_uneven_pitch_are_not_filled_up():
 
 
 def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
-    cloud, bore = scanned("proud", "terrestrial")
+    _cloud, bore = scanned("proud", "terrestrial")
     seen = seen_in("proud", "terrestrial")
     assert doubt_track(lay_track(bore, TrackConfig(), seen), seen) == []
     unseen = SeenTrack((replace(seen.lines[0], sleepers=None, bed=0.2),), sought=True)
