@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 VERSION = "0.1.0"  # as in pyproject.toml, which a checkout on the path does not tell
 
+BUILD_AGAIN = "build the scene again with `python -m scene.build`"
 _UPDATE = "pip install --upgrade subterra-jax"
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.host.versions import other_schema
-from subterra_jax.tunnel.sources import AGAIN
+from subterra_jax.host.versions import BUILD_AGAIN, other_schema
 
 if TYPE_CHECKING:
     import mujoco
@@ -84,7 +83,7 @@ def read_axis(path: Path) -> Axis:
     try:
         with np.load(path, allow_pickle=False) as data:
             if (found := str(data["schema"])) != _BORE_SCHEMA:
-                raise TunnelError(f"{path}: {other_schema(found, _BORE_SCHEMA, AGAIN)}")
+                raise TunnelError(f"{path}: {other_schema(found, _BORE_SCHEMA, BUILD_AGAIN)}")
             return Axis(*(np.asarray(data[name], np.float64) for name in ("station", "position", "tangent")))
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise TunnelError(f"{path}: not a bore file ({error})") from error

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.host.versions import other_schema
+from subterra_jax.host.versions import BUILD_AGAIN, other_schema
 from subterra_jax.procedural import default_lining, expand, generate
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 from subterra_jax.tunnel.shell import N_BRICK, Shell, ShellLining
 from subterra_jax.tunnel.tunnel import Tunnel, stack
 
 SCHEMA, PLANAR_SCHEMA = "subterra.tunnel/2", "subterra.tunnel/1"  # with the bore in three dimensions, and without
-AGAIN = "build the scene again with `python -m scene.build`"
 
 
 def describe_damage(path: Path, error: Exception) -> str:
@@ -89,7 +88,7 @@ def read_tunnel(path: Path) -> TunnelPlan:
     """
     fields = _Fields(path)
     if (schema := fields.text("schema")) not in (SCHEMA, PLANAR_SCHEMA):
-        raise TunnelError(f"{path}: {other_schema(schema, SCHEMA, AGAIN)}")
+        raise TunnelError(f"{path}: {other_schema(schema, SCHEMA, BUILD_AGAIN)}")
     station = fields.numbers("station", None)
     n = len(station)
     if n < 2:
