@@ -16,6 +16,7 @@ from rich.table import Table
 
 from benchmarks.command import run_main
 from benchmarks.results import environment_facts, png_bytes, write_file
+from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import SCHEMA, ProgramScore, ScoreConfig, score_all
@@ -26,6 +27,9 @@ _PROG = "python -m benchmarks.slam"
 _RECORD = f"""Record listed episodes, with the truth kept apart.
 
 Example: {_PROG} record --scene build/tunnel --linings smooth pockets --out out/slam/set"""
+_ARENA = f"""Record the arena: drives for LiDAR-inertial programs, from smooth walls to rough ones.
+
+Example: {_PROG} arena --out out/arena"""
 _RUN = f"""Run a LiDAR odometry library on recordings.
 
 Example: {_PROG} run --library kiss-icp --recordings out/slam/set --out out/slam/kiss-icp"""
@@ -35,6 +39,7 @@ Example: {_PROG} score --estimate out/slam/kiss-icp --truth out/slam/set/truth -
 
 Command = (
     Annotated[SetConfig, tyro.conf.subcommand("record", description=_RECORD)]
+    | Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
     | Annotated[RunConfig, tyro.conf.subcommand("run", description=_RUN)]
     | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
 )
@@ -46,14 +51,14 @@ _PANELS = (("along the axis", 0), ("across it", 1))
 _STYLES = ("-", "--", ":", "-.")
 
 
-def main(config: SetConfig | RunConfig | ScoreConfig) -> None:
+def main(config: SetConfig | ArenaConfig | RunConfig | ScoreConfig) -> None:
     """Records, runs or scores.
 
     Raises:
         SubterraError: An input is missing or wrong, or an output cannot be written.
     """
-    if isinstance(config, SetConfig):
-        for name, existed in make_set(config):
+    if isinstance(config, SetConfig | ArenaConfig):
+        for name, existed in make_set(config) if isinstance(config, SetConfig) else make_arena(config):
             _progress.print(f"{name}: {'there already' if existed else 'recorded'}")
     elif isinstance(config, RunConfig):
         for name, result in run_all(config):

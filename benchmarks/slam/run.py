@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.results import environment_facts, write_file
+from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
 from benchmarks.slam.recordings import CLOUDS, PLANAR, Sweep, count_messages, read_clouds, read_planar, recordings_in
+from benchmarks.slam.tum import save_tum
 from subterra_jax.host.files import replace_file
 
 Step = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "4 4"]]
@@ -81,7 +82,7 @@ def find_library(name: str) -> tuple[Library, str]:
         BenchmarkError: There is no such library, or it is not installed.
     """
     if name not in LIBRARIES:
-        raise BenchmarkError(f"no library {name!r}; there are {', '.join(LIBRARIES)}")
+        raise BenchmarkError(f"no library {name!r}; there are {', '.join([*LIBRARIES, *PROGRAMS, WHEELS])}")
     library = LIBRARIES[name]
     try:
         return library, version(library.package)
@@ -116,6 +117,7 @@ def estimate_poses(
 
 SCHEMA = "subterra.slam-run/1"
 WHEELS = "wheel-odometry"
+RUN_FILE, CALIBRATION = "run.json", "calibration.yaml"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,14 +125,18 @@ class RunConfig:
     """Settings of a run.
 
     Attributes:
-        library: `kiss-icp`, `genz-icp`, `kiss-icp-planar`, or `wheel-odometry`, which copies the robot's own odometry.
+        library: `kiss-icp`, `genz-icp`, `kiss-icp-planar`; one of `evalio-` and `kiss`, `genz`, `mad`, `ct`, `loam`,
+            `liosam`, `dlio`, `form`, or `rko-lio`, on recordings of the arena; or `wheel-odometry`, which copies the
+            robot's own odometry.
         recordings: Set of recordings, or its `recordings/`.
         out: Folder for the poses, `NAME.tum`; files there already are kept.
+        limit: Time after which a program of the arena counts as failed on a recording, s.
     """
 
     library: str
     recordings: Path
     out: Path
+    limit: float = 3600.0
 
 
 def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
@@ -139,6 +145,9 @@ def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
     Raises:
         BenchmarkError: The library is unknown or not installed, or no recording has its topic.
     """
+    if config.library in PROGRAMS:
+        yield from _run_inertial(config)
+        return
     library, number = (None, "") if config.library == WHEELS else find_library(config.library)
     bags, ran = recordings_in(config.recordings), []
     for name, bag in bags:
@@ -158,7 +167,48 @@ def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
     if not ran:
         raise BenchmarkError(f"{config.recordings}: no recording has what {config.library} reads")
     facts = {"schema": SCHEMA, "library": config.library, "version": number, "recordings": ran, **environment_facts()}
-    write_file(config.out / "run.json", (json.dumps(facts, indent=1, default=str) + "\n").encode())
+    write_file(config.out / RUN_FILE, (json.dumps(facts, indent=1, default=str) + "\n").encode())
+
+
+def _run_inertial(config: RunConfig) -> Iterator[tuple[str, str]]:
+    """Runs a program that needs the times of points; those that fail are listed in `run.json` with the reason."""
+    number, results = find_program(config.library), _results_so_far(config.out / RUN_FILE)
+    bags = [(name, bag.parent) for name, bag in recordings_in(config.recordings)]
+    ready = [(name, folder) for name, folder in bags if (folder / CALIBRATION).is_file()]
+    if not ready:
+        raise BenchmarkError(
+            f"{config.recordings}: holds no {CALIBRATION}, which {config.library} needs "
+            "(`python -m benchmarks.slam arena` makes such recordings)"
+        )
+    for name, folder in ready:
+        target = config.out / f"{name}.tum"
+        if target.is_file():
+            yield name, "there already"
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        results[name] = run_program(config.library, folder, target, config.limit)
+        _write_facts(config, number, [name for name, _ in ready], results)
+        yield name, describe_run(results[name])
+    _write_facts(config, number, [name for name, _ in ready], results)
+
+
+def describe_run(result: dict[str, Any]) -> str:
+    """Returns a line about a program's run on one recording."""
+    if "failed" in result:
+        return f"failed: {result['failed']}"
+    return f"{result['poses']} poses in {result['seconds']:.0f} s, {100.0 * result['share']:.0f} % of real time"
+
+
+def _results_so_far(path: Path) -> dict[str, dict[str, Any]]:
+    try:
+        return json.loads(path.read_text())["results"]
+    except (OSError, ValueError, KeyError):
+        return {}
+
+
+def _write_facts(config: RunConfig, number: str, names: list[str], results: dict[str, dict[str, Any]]) -> None:
+    facts = {"schema": SCHEMA, "library": config.library, "version": number, "recordings": names, "results": results}
+    write_file(config.out / RUN_FILE, (json.dumps(facts | environment_facts(), indent=1, default=str) + "\n").encode())
 
 
 def _run_one(library: Library, bag: Path, target: Path) -> str:
@@ -168,10 +218,3 @@ def _run_one(library: Library, bag: Path, target: Path) -> str:
     seconds = time.monotonic() - started
     save_tum(target, times, poses)
     return f"{len(times)} sweeps in {seconds:.0f} s"
-
-
-def save_tum(path: Path, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"]) -> None:
-    """Writes poses as rows `t x y z qx qy qz qw`."""
-    rows = np.column_stack([times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)])
-    with replace_file(path) as fresh:
-        np.savetxt(fresh, rows, fmt="%.9f")

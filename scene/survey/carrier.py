@@ -5,6 +5,7 @@ first mouth, outside, so that the section is seen whole from station 0 on; it en
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -48,6 +49,20 @@ class Poses:
     quaternion: Float[np.ndarray, "n 4"]  # x, y, z, w; takes LiDAR vectors to the survey frame
 
 
+class Motion(Protocol):
+    """The motion of a rack along a bore: a carried `Walk`, or a drive of `benchmarks.slam.arena`."""
+
+    @property
+    def duration(self) -> float:
+        """Length of the recording, s."""
+
+    def station(self, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+        """Return the station of the carrier, m."""
+
+    def poses(self, time: Float[np.ndarray, "n"]) -> Poses:
+        """Return the exact poses at `time`, s."""
+
+
 @dataclass(frozen=True)
 class Walk:
     """The carried LiDAR's motion."""
@@ -80,7 +95,7 @@ class Walk:
 class Carried:
     """An instrument on the walk."""
 
-    walk: Walk  # Motion of the rack, which is that of the Avia's frame
+    walk: Motion  # Motion of the rack, which is that of the Avia's frame
     mount: Mount  # Mount of the instrument against the Avia
 
     def poses(self, time: Float[np.ndarray, "n"]) -> Poses:

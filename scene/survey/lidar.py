@@ -123,17 +123,47 @@ _OS1_ELEVATION = np.deg2rad(np.linspace(22.5, -22.5, OS1_RINGS))  # ring 0 looks
 _OS1_AZIMUTH = np.deg2rad(np.tile([4.22, 1.41, -1.41, -4.22], OS1_RINGS // 4))
 
 
-def os1_directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
-    """Return unit vectors in the LiDAR frame at times, s, in whole columns; `phase` is not used."""
-    ring = np.arange(len(time)) % OS1_RINGS
+def os1_directions(
+    time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"], kept: Int[np.ndarray, "r"] | None = None
+) -> Float[np.ndarray, "n 3"]:
+    """Return unit vectors in the LiDAR frame at times, s, in whole columns of the beams `kept`, by default all.
+
+    `phase` is not used.
+    """
+    rings = np.arange(OS1_RINGS) if kept is None else kept
+    ring = rings[np.arange(len(time)) % len(rings)]
     azimuth = np.pi - 2.0 * np.pi * time / SCAN_PERIOD + _OS1_AZIMUTH[ring]
     level = np.cos(_OS1_ELEVATION)[ring]
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(_OS1_ELEVATION)[ring]], axis=-1)
 
 
-def os1() -> Lidar:
-    """Return the OS1-64, stamped at the start of a sweep; all beams of a column fire at once."""
-    column = (np.arange(OS1_COLUMNS) * round(SCAN_PERIOD * 1e9)) // OS1_COLUMNS
-    line = np.tile(np.arange(OS1_RINGS), OS1_COLUMNS)
+def os1(columns: int = OS1_COLUMNS, rings: int = OS1_RINGS) -> Lidar:
+    """Return the OS1, stamped at the start of a sweep; all beams of a column fire at once.
+
+    Args:
+        columns: Columns of a turn: 512, 1024 or 2048, the device's modes.
+        rings: Beams in use: 64, or every second, fourth ... one of them, as the OS1-32 and the OS1-16 have.
+
+    Raises:
+        ValueError: `rings` does not divide 64.
+    """
+    if rings < 1 or OS1_RINGS % rings:
+        raise ValueError(f"rings must divide {OS1_RINGS}, got {rings}")
+    column = (np.arange(columns) * round(SCAN_PERIOD * 1e9)) // columns
+    kept = np.arange(0, OS1_RINGS, OS1_RINGS // rings)
+
+    def directions(time: Float[np.ndarray, "n"], phase: Float[np.ndarray, "2"]) -> Float[np.ndarray, "n 3"]:
+        return os1_directions(time, phase, kept)
+
     # The manual's 45 m hold for a target of 10 %.
-    return Lidar("os1", column.repeat(OS1_RINGS), 0, line, os1_directions, 0.5, 120.0, 0.1 / 45.0**2, 1.6e-3)
+    return Lidar(
+        "os1",
+        column.repeat(rings),
+        0,
+        np.tile(np.arange(rings), columns),
+        directions,
+        0.5,
+        120.0,
+        0.1 / 45.0**2,
+        1.6e-3,
+    )

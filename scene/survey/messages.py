@@ -5,7 +5,7 @@ import struct
 import numpy as np
 from jaxtyping import Float
 
-from scene.survey.lidar import OS1_COLUMNS, OS1_RINGS, Lidar, Sweep
+from scene.survey.lidar import Lidar, Sweep
 
 EPOCH = 1_700_000_000  # s: stamp of the first point, the same for every survey
 
@@ -190,7 +190,8 @@ def ouster_message(sweep: Sweep, lidar: Lidar) -> bytes:
 
     A beam without return keeps its time and ring and lies at (0, 0, 0).
     """
-    row_by_row = np.arange(len(sweep.points)).reshape(OS1_COLUMNS, OS1_RINGS).T.ravel()
+    rings = int(lidar.line.max()) + 1
+    row_by_row = np.arange(len(sweep.points)).reshape(-1, rings).T.ravel()
     local, reflectivity = sweep.points[row_by_row], sweep.reflectivity[row_by_row] / 1.5
     distance = np.linalg.norm(local.astype(np.float64), axis=1)
     # Filled in place: a copy of these records would leave what it likes in their padding.
@@ -200,4 +201,4 @@ def ouster_message(sweep: Sweep, lidar: Lidar) -> bytes:
     points["range"] = np.rint(1e3 * distance)
     points["reflectivity"] = np.rint(reflectivity)
     points["intensity"] = np.rint(_SIGNAL * reflectivity / np.where(distance > 0.0, distance, 1.0) ** 2)
-    return _message(sweep.number, sweep.begin + lidar.stamp, b"os_sensor", OS1_RINGS, points, dense=False)
+    return _message(sweep.number, sweep.begin + lidar.stamp, b"os_sensor", rings, points, dense=False)

@@ -1,8 +1,9 @@
 """The sweeps of a LiDAR along the walk, and the turns of a profile scanner."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
+from jaxtyping import Float
 
 from scene.survey.bore import Bore
 from scene.survey.carrier import CARRY_HEIGHT, Carried, rotate
@@ -21,12 +22,23 @@ def n_sweeps(carried: Carried, every: int) -> int:
     return len(range(0, round(carried.walk.duration / SCAN_PERIOD), every))
 
 
+# What floats between the LiDAR and the walls: from rays in the LiDAR's frame and what they hit to what they then hit.
+Veil = Callable[[np.random.Generator, Float[np.ndarray, "n 3"], Hits], Hits]
+
+
 def sweeps(
-    rng: np.random.Generator, lidar: Lidar, carried: Carried, caster: Caster, errors: SensorErrors, every: int = 1
+    rng: np.random.Generator,
+    lidar: Lidar,
+    carried: Carried,
+    caster: Caster,
+    errors: SensorErrors,
+    every: int = 1,
+    veil: Veil | None = None,
 ) -> Iterator[Sweep]:
     """Yields every `every`-th sweep in order of time; every point is cast from the pose at its own time.
 
-    Without `distortion` in `errors`, all points of a sweep are measured at its stamp, and say so.
+    Without `distortion` in `errors`, all points of a sweep are measured at its stamp, and say so. A `veil` stands
+    before every surface, as dust does.
     """
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     offset = lidar.offset if errors.distortion else np.full_like(lidar.offset, lidar.stamp)
@@ -41,6 +53,8 @@ def sweeps(
         heading = rotate(poses.quaternion, ray)
         caster.load(float(carried.walk.station(begin[:1])[0]), poses.position[0])
         hits = caster.cast_loaded(poses.position, heading)
+        if veil is not None:
+            hits = veil(rng, ray, hits)
 
         valid = draw_returns(rng, lidar, errors, hits)
         distance = hits.distance

@@ -1,0 +1,217 @@
+"""One recording: a drive through a bore, cast by the survey's simulator and written as bags, the truth apart."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from benchmarks.results import write_file
+from benchmarks.slam.arena import bags, dust, wheels
+from benchmarks.slam.arena.bags import FormatName, Message
+from benchmarks.slam.arena.drives import REST, Drive, MotionName, draw_drive
+from benchmarks.slam.arena.walls import WallName, draw_walls
+from scene.survey import carrier, messages
+from scene.survey.carrier import Carried, Poses
+from scene.survey.cast import Caster
+from scene.survey.config import SensorErrors
+from scene.survey.lidar import Lidar, Sweep, avia, os1, vlp16
+from scene.survey.rack import Mount
+from scene.survey.sweeps import sweeps
+from scene.survey.write import write_tum
+
+SensorName = Literal["avia", "vlp16", "os1-16", "os1-32", "os1-64"]
+IMU_TOPIC, IMU_FRAME, IMU_RATE = "/imu/data", "imu_link", 200.0
+# p_imu = p_lidar + shift: the IMU hangs 10 cm under the LiDAR and 5 cm behind it, axes parallel.
+IMU = Mount(np.eye(3), np.array([0.05, -0.02, 0.10]))
+_BEHIND, _AHEAD = 45.0, 45.0  # m of bore beyond the drive, further than echoes come back from
+_TRUTH_RATE, _AXIS_STEP = 200.0, 0.25  # Hz; m
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A LiDAR as its driver publishes it.
+
+    Attributes:
+        lidar: Model.
+        topic: Topic of its sweeps.
+        frame: Frame of its points.
+        kind: Type of its messages.
+        encode: A sweep as one of them.
+        beams: Lines.
+        ahead: Bore that it may see before the end of the drive, m.
+    """
+
+    lidar: Lidar
+    topic: str
+    frame: str
+    kind: str
+    encode: Callable[[Sweep, Lidar], bytes]
+    beams: int
+    ahead: float = _AHEAD
+
+
+def make_sensor(name: SensorName) -> Sensor:
+    """Returns a sensor by name.
+
+    The VLP-16's sweeps are stamped at their first packet (`timestamp_first_packet: true` of its driver), as programs
+    that use the times of points expect; the OS1 runs with 512 columns.
+    """
+    if name == "avia":
+        return Sensor(avia(), "/livox/lidar", "livox_frame", messages.CUSTOM_TYPE, messages.custom_message, 6, 85.0)
+    if name == "vlp16":
+        lidar = replace(vlp16(), stamp=0)
+        return Sensor(lidar, "/velodyne_points", "velodyne", messages.CLOUD_TYPE, messages.velodyne_message, 16)
+    rings = int(name.removeprefix("os1-"))
+    lidar = os1(512, rings)
+    return Sensor(lidar, "/ouster/points", "os_sensor", messages.CLOUD_TYPE, messages.ouster_message, rings)
+
+
+@dataclass(frozen=True)
+class Course:
+    """One recording of the arena: what is driven through, how, and with which sensor.
+
+    Attributes:
+        name: Name of the recording.
+        walls: Position on the dial.
+        sensor: LiDAR.
+        motion: Way of carrying it.
+        dust: Density of the dust that moves with it; 0 is none, 1 full.
+        distance: Length of the way, m.
+    """
+
+    name: str
+    walls: WallName
+    sensor: SensorName = "vlp16"
+    motion: MotionName = "trolley"
+    dust: float = 0.0
+    distance: float = 60.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A course, drawn: its drive and its sensor, and seeds for their noise."""
+
+    course: Course
+    sensor: Sensor
+    drive: Drive
+    seeds: dict[str, np.random.SeedSequence]
+
+
+def draw_scene(course: Course, seed: np.random.SeedSequence) -> Scene:
+    """Draws bore, drive and noise of a course."""
+    names = ("walls", "drive", "dust", "lidar", "imu", "wheels")
+    seeds = dict(zip(names, seed.spawn(len(names)), strict=True))
+    sensor = make_sensor(course.sensor)
+    bore = draw_walls(seeds["walls"], course.walls, _BEHIND + course.distance + sensor.ahead)
+    drive = draw_drive(np.random.default_rng(seeds["drive"]), bore, course.motion, _BEHIND, course.distance)
+    return Scene(course, sensor, drive, seeds)
+
+
+def cast_sweeps(scene: Scene) -> Iterator[Sweep]:
+    """Yields the sweeps of a scene; every point is cast from the pose at its own time."""
+    veil = None
+    if scene.course.dust > 0.0:
+        veil = dust.draw_dust(np.random.default_rng(scene.seeds["dust"]), scene.course.dust)
+    lidar = scene.sensor.lidar
+    caster = Caster(scene.drive.bore.mesh(), lidar.range_max)
+    rng = np.random.default_rng(scene.seeds["lidar"])
+    return sweeps(rng, lidar, Carried(scene.drive, _HERE), caster, SensorErrors(), veil=veil)
+
+
+_HERE = Mount(np.eye(3), np.zeros(3))
+
+
+def stream(scene: Scene) -> Iterator[Message]:
+    """Yields all messages of a recording in order of time; a sweep comes when it is complete."""
+    yield bags.static_message(_transforms(scene))
+    waiting = sorted([*_inertial(scene), *_odometry(scene)[0]], key=lambda m: m[:2])
+    sent, sensor = 0, scene.sensor
+    for sweep in cast_sweeps(scene):
+        end = sweep.begin + 100_000_000
+        while sent < len(waiting) and waiting[sent].time < end:
+            yield waiting[sent]
+            sent += 1
+        yield Message(end, sensor.topic, sensor.kind, sensor.encode(sweep, sensor.lidar))
+    yield from waiting[sent:]
+
+
+def _transforms(scene: Scene) -> list[Any]:
+    level, height = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, scene.drive.carrier.height])
+    return [
+        bags.transform(scene.sensor.frame, height, level),
+        bags.transform(IMU_FRAME, height + IMU.origin, level),
+    ]
+
+
+def _inertial(scene: Scene) -> list[Message]:
+    rng = np.random.default_rng(scene.seeds["imu"])
+    sample = carrier.measure_inertial(rng, Carried(scene.drive, _HERE), IMU_RATE, IMU, SensorErrors())
+    at = np.rint(sample.time * 1e9).astype(np.int64)
+    raw = messages.imu_messages(IMU_FRAME, at, None, sample.gyro, sample.accel)
+    return [Message(int(t), IMU_TOPIC, messages.IMU_TYPE, one) for t, one in zip(at, raw, strict=True)]
+
+
+def _odometry(scene: Scene) -> tuple[list[Message], Float[np.ndarray, "n"], Poses]:
+    time = np.arange(round(scene.drive.duration * wheels.RATE)) / wheels.RATE
+    rng = np.random.default_rng(scene.seeds["wheels"])
+    position, quaternion = wheels.measure_wheels(rng, scene.drive.station(time), scene.drive.poses(time))
+    rows = zip(np.rint(time * 1e9).astype(np.int64), position, quaternion, strict=True)
+    return (
+        [bags.odometry_message(int(t), p, q, scene.sensor.frame) for t, p, q in rows],
+        time,
+        Poses(position, quaternion),
+    )
+
+
+def write_recording(scene: Scene, folder: Path, formats: tuple[FormatName, ...]) -> Iterator[Message]:
+    """Writes the bags, odometry and calibration of a recording; yields its messages as they are written."""
+    folder.mkdir(parents=True)
+    yield from bags.write_bags(folder, formats, stream(scene))
+    (folder / bags.MCAP).mkdir(exist_ok=True)
+    _, time, poses = _odometry(scene)
+    write_tum(folder / bags.MCAP / "odometry.tum", time, poses.position, poses.quaternion)
+    write_file(folder / "calibration.yaml", yaml.safe_dump(calibration(scene), sort_keys=False).encode())
+
+
+def calibration(scene: Scene) -> dict[str, Any]:
+    """Returns topics, extrinsics and noise of a recording, for a program's own configuration."""
+    lidar, root = scene.sensor.lidar, float(np.sqrt(IMU_RATE))
+    return {
+        "lidar": {
+            "topic": scene.sensor.topic, "frame": scene.sensor.frame, "model": scene.course.sensor, "rate": 10.0,
+            "rows": scene.sensor.beams, "columns": len(lidar.offset) // scene.sensor.beams,
+            "range_min": lidar.range_min, "range_max": lidar.range_max, "stamp": "first point", "motion_in_sweep": True,
+        },
+        "imu": {
+            "topic": IMU_TOPIC, "frame": IMU_FRAME, "rate": IMU_RATE, "rest_at_start": REST,
+            "rotation_from_lidar": IMU.rotation.tolist(), "shift_from_lidar": IMU.shift.tolist(),
+            "accel_noise_density": carrier.ACCEL_SIGMA / root, "accel_random_walk": carrier.ACCEL_WALK,
+            "gyro_noise_density": carrier.GYRO_SIGMA / root, "gyro_random_walk": carrier.GYRO_WALK,
+            "accel_bias_sigma": carrier.ACCEL_BIAS, "gyro_bias_sigma": carrier.GYRO_BIAS, "gravity": carrier.GRAVITY,
+        },
+        "wheels": {"topic": "/odom", "rate": wheels.RATE},
+    }  # fmt: skip
+
+
+def write_truth(scene: Scene, folder: Path) -> None:
+    """Writes what a program must not see: the LiDAR's poses, the axis, and how the course was drawn."""
+    folder.mkdir(parents=True, exist_ok=True)
+    drive = scene.drive
+    time = np.arange(round(drive.duration * _TRUTH_RATE) + 1) / _TRUTH_RATE
+    poses = drive.poses(time)
+    write_tum(folder / "lidar.tum", time, poses.position, poses.quaternion)
+    station = np.arange(0.0, drive.bore.alignment.length + 1e-9, _AXIS_STEP)
+    above = np.full_like(station, drive.carrier.height) - 0.5 * drive.bore.section.height(station)
+    points = drive.bore.alignment.frames(station).point(np.zeros_like(station), above)
+    rows = [
+        "station,x,y,z",
+        *(f"{s:.6f},{x:.6f},{y:.6f},{z:.6f}" for s, (x, y, z) in zip(station, points, strict=True)),
+    ]
+    write_file(folder / "axis.csv", ("\n".join(rows) + "\n").encode())
+    facts = {"provenance": "simulated", **asdict(scene.course), "duration": drive.duration}
+    write_file(folder / "course.json", (json.dumps(facts, indent=1) + "\n").encode())

@@ -1,0 +1,143 @@
+"""Ready sets of recordings by one command: every course of the dial, its truth apart, resumable."""
+
+import hashlib
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.command import BenchmarkError
+from benchmarks.results import write_file
+from benchmarks.slam.arena.bags import FormatName
+from benchmarks.slam.arena.drives import CARRIERS
+from benchmarks.slam.arena.record import Course, draw_scene, write_recording, write_truth
+from benchmarks.slam.arena.walls import WALLS
+from benchmarks.slam.recordings import INDEX, RECORDINGS, TRUTH
+
+SCHEMA = "subterra.arena/1"
+_DIAL = tuple(Course(f"walls-{name}", name) for name in WALLS)
+_SENSORS = tuple(
+    Course(f"beams-{beams:02d}", "furnished", sensor)
+    for beams, sensor in ((6, "avia"), (32, "os1-32"), (64, "os1-64"))
+)  # fmt: skip
+_DUST = (Course("dust-half", "furnished", dust=0.1), Course("dust-lock", "furnished", dust=1.0))
+_MOTIONS = tuple(Course(f"motion-{name}", "furnished", motion=name) for name in CARRIERS if name != "trolley")
+COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS)
+
+
+@dataclass(frozen=True)
+class ArenaConfig:
+    """Settings of a set.
+
+    Attributes:
+        out: Folder of the set: `recordings/` to hand out, `truth/` to keep.
+        courses: Names of the recordings, as `walls-smooth`; by default all.
+        formats: `mcap` for ROS 2, `bag` for ROS 1.
+        distance: Length of each drive, m.
+        seed: Draws walls, drives and noise.
+        secret: Number from which they are drawn instead, so that nobody else can make the truth. It is kept with the
+            truth only.
+        jobs: Recordings made at a time.
+    """
+
+    out: Path
+    courses: tuple[str, ...] = tuple(one.name for one in COURSES)
+    formats: tuple[FormatName, ...] = ("mcap",)
+    distance: float = 45.0
+    seed: int = 0
+    secret: int | None = None
+    jobs: int = 1
+
+
+def plan_arena(config: ArenaConfig) -> list[Course]:
+    """Returns the courses of a set.
+
+    Raises:
+        BenchmarkError: There is no such course or format, or a number is out of range.
+    """
+    known = {one.name: one for one in COURSES}
+    for name in config.courses:
+        if name not in known:
+            raise BenchmarkError(f"no course {name!r}; there are {', '.join(known)}")
+    if not config.courses or not config.formats:
+        raise BenchmarkError("nothing to record: courses and formats must name at least one")
+    if not 5.0 <= config.distance <= 500.0:
+        raise BenchmarkError(f"distance must lie between 5 and 500 m, got {config.distance:g}")
+    for name, least in (("seed", 0), ("jobs", 1), ("secret", 0)):
+        value = getattr(config, name)
+        if value is not None and value < least:
+            raise BenchmarkError(f"{name} must be at least {least}, got {value}")
+    return [replace(known[name], distance=config.distance) for name in dict.fromkeys(config.courses)]
+
+
+def course_seed(config: ArenaConfig, course: Course) -> np.random.SeedSequence:
+    """Returns the seed of a course; with a secret it cannot be computed without it."""
+    origin = f"seed {config.seed}" if config.secret is None else f"secret {config.secret}"
+    digest = hashlib.sha256(f"{SCHEMA} {origin} {course.name}".encode()).digest()
+    # The dial turns one thing at a time: walls, drives and noise of one seed differ by nothing else.
+    shared = hashlib.sha256(f"{SCHEMA} {origin}".encode()).digest()
+    return np.random.SeedSequence(int.from_bytes((shared if config.secret is None else digest)[:8], "little"))
+
+
+def make_arena(config: ArenaConfig) -> Iterator[tuple[str, bool]]:
+    """Records what is missing; yields each name and whether it was there already.
+
+    Raises:
+        BenchmarkError: The folder was recorded with other settings.
+        SubterraError: The folder cannot be written.
+    """
+    plan = plan_arena(config)
+    settings = {"schema": SCHEMA, "distance": config.distance, "formats": config.formats, "seed": config.seed}
+    kept = json.dumps(settings | {"secret": config.secret}, indent=1)
+    path = config.out / TRUTH / INDEX
+    if path.is_file() and path.read_text() != kept:
+        raise BenchmarkError(f"{config.out}: was recorded with other settings; choose another folder")
+    write_file(path, kept.encode())
+    missing = [one for one in plan if not (config.out / RECORDINGS / one.name).is_dir()]
+    yield from ((one.name, True) for one in plan if one not in missing)
+    for name in _record_all(config, missing):
+        yield name, False
+    public = dict(settings)
+    if config.secret is not None:
+        public.pop("seed")
+    courses = [{**asdict(one), "provenance": "simulated"} for one in plan]
+    write_file(config.out / INDEX, (json.dumps(public | {"recordings": courses}, indent=1) + "\n").encode())
+
+
+def _record_all(config: ArenaConfig, courses: list[Course]) -> Iterator[str]:
+    if config.jobs == 1:
+        for one in courses:
+            yield _record(config, one)
+        return
+    with ProcessPoolExecutor(config.jobs, mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_record, config, one) for one in courses]):
+            yield future.result()
+
+
+def _record(config: ArenaConfig, course: Course) -> str:
+    """Makes one recording under a temporary name and renames it when it is whole."""
+    part = config.out / f".{course.name}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    scene = draw_scene(course, course_seed(config, course))
+    total, shown = scene.drive.duration, -1
+    for message in write_recording(scene, part, config.formats):
+        share = int(10.0 * 1e-9 * message.time / total)
+        if share > shown and sys.stderr.isatty():
+            shown = share
+            print(f"{course.name}: {10 * share} %", end="\r", file=sys.stderr)
+    write_truth(scene, config.out / TRUTH / course.name)
+    (config.out / RECORDINGS).mkdir(exist_ok=True)
+    part.rename(config.out / RECORDINGS / course.name)
+    return course.name
+
+
+def describe_courses() -> list[dict[str, Any]]:
+    """Returns all courses for a table."""
+    return [asdict(one) for one in COURSES]

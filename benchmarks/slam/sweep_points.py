@@ -1,0 +1,46 @@
+"""Points of a sweep from the message of any driver, with the time of each."""
+
+from typing import Any
+
+import numpy as np
+
+# One layout for all: m, reflectivity or intensity as reported, ns after the header's stamp, line.
+POINT = np.dtype([
+    ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("t", "<u4"), ("ring", "<u2"),
+])  # fmt: skip
+_KINDS = {2: "u1", 4: "<u2", 6: "<u4", 7: "<f4", 8: "<f8"}
+_TIMES = {"time": 1e9, "t": 1.0}  # field of Velodyne's and Ouster's drivers, and its unit in ns
+
+
+def sweep_points(message: Any) -> np.ndarray:
+    """Returns the points of a Velodyne's or Ouster's `PointCloud2` or a Livox's `CustomMsg`, `(n,)` of `POINT`.
+
+    Beams without a return stay, at (0, 0, 0), where the driver keeps them.
+
+    Raises:
+        ValueError: The cloud has no time of its points.
+    """
+    if hasattr(message, "point_num"):
+        return _from_livox(message)
+    fields = {field.name: field for field in message.fields}
+    names = list(fields)
+    layout = np.dtype({
+        "names": names, "formats": [_KINDS[fields[name].datatype] for name in names],
+        "offsets": [fields[name].offset for name in names], "itemsize": message.point_step,
+    })  # fmt: skip
+    raw = np.frombuffer(message.data, layout)
+    time = next((name for name in _TIMES if name in fields), None)
+    if time is None:
+        raise ValueError(f"its points have no time; they have {', '.join(names)}")
+    points = np.zeros(len(raw), POINT)
+    for name in ("x", "y", "z", "intensity", "ring"):
+        points[name] = raw[name]
+    points["t"] = np.rint(_TIMES[time] * raw[time].astype(np.float64))
+    return points
+
+
+def _from_livox(message: Any) -> np.ndarray:
+    points = np.zeros(len(message.points), POINT)
+    rows = [(p.x, p.y, p.z, p.reflectivity, p.offset_time, p.line) for p in message.points]
+    points[:] = np.array(rows, POINT) if rows else points
+    return points
