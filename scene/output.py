@@ -3,8 +3,9 @@
 import dataclasses
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +85,19 @@ def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
         "schema": MANIFEST_SCHEMA,
         "files": hash_files(path.parent),
         "config": _json_value(dataclasses.asdict(config)),
-        "versions": {name: version(name) for name in _LIBRARIES},
+        "versions": _library_versions(),
         **_json_value(content),
     }
     path.write_text(json.dumps(whole, indent=2, sort_keys=True) + "\n")
+
+
+def _library_versions() -> dict[str, str]:
+    """Return the versions of the libraries that are installed; formats without their library cannot have been read."""
+    found = {}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def hash_files(folder: Path) -> dict[str, str]:

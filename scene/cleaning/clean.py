@@ -6,13 +6,13 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from scene.bore import Axis
 from scene.cleaning.follow import Course, follow_bore
 from scene.cleaning.refusal import name_cloud
-from scene.cleaning.removed import KEPT, Cleaned, list_removed, part_of_cloud
+from scene.cleaning.removed import INSIDE, KEPT, SCATTERED, Cleaned, list_removed, part_of_cloud
 from scene.cleaning.seeds import Seed, find_seeds
 from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
 from scene.cleaning.tube import Tube, measure_tube
@@ -30,13 +30,16 @@ _TRIED = 8  # seeds followed
 _ENCLOSED = 0.65  # share of the directions
 _ELONGATION = 1.4  # least length over width
 _ABOVE, _CROWN, _STREET = 0.8, 0.15, 7.0  # sine of directions above; share of them matched; m
+_FLAG = tyro.conf.arg(prefix_name=False)
 
 
 @dataclass(frozen=True)
 class CleaningConfig:
     """Settings of the search for what is not the bore."""
 
-    strict: Annotated[bool, tyro.conf.arg(prefix_name=False)] = False  # Refuse a cloud with a branch.
+    strict: Annotated[bool, _FLAG] = False  # Refuse a cloud with a branch.
+    filter_outliers: Annotated[bool, _FLAG] = True  # Leave out scattered returns without neighbours.
+    filter_moving: Annotated[bool, _FLAG] = True  # Leave out what moved or stands inside: people, trails, vehicles.
 
 
 def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConfig) -> Cleaned:
@@ -62,7 +65,7 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     points = cloud.points.astype(np.float64)
     around = look_around(points, axis)
     behind, cause = sort_points(around, tube, supported, ends)
-    cause = name_bodies(points, cause, behind, supported)
+    cause = _filter(name_bodies(points, cause, behind, supported), config)
     if (cause != KEPT).mean() < _LITTLE:
         try:
             whole = _as_it_is(cloud, centreline)
@@ -79,6 +82,12 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     if config.strict and warning:
         raise FitError(warning)
     return Cleaned(kept, axis, removed, cause)
+
+
+def _filter(cause: Int[np.ndarray, " n"], config: CleaningConfig) -> Int[np.ndarray, " n"]:
+    """Return the causes with those that the user wants kept as the bore's."""
+    wanted = [kind for kind, out in ((SCATTERED, config.filter_outliers), (INSIDE, config.filter_moving)) if not out]
+    return np.where(np.isin(cause, wanted), KEPT, cause) if wanted else cause
 
 
 def _sorted_coarse(

@@ -25,9 +25,12 @@ _TOP = 0.010  # above and below the top of the head, m
 _FACE_BAND = 0.015  # m between the edge of the top and the face below it
 _FACE_BLUR = 0.004  # m
 _FACE_RETURNS = 12
+_FACE_SHARP = 0.006  # m: spread of returns about the face; twice 15 mm of band, evenly filled, have 0.0087
 _PIECE = 8.0  # m of track of which one gauge is measured
 _LEAST_PIECES = 2
 _SURE = 0.003  # standard error of a gauge that counts as measured, m
+_PIECES_AGREE = 0.004  # spread of the pieces, m: where poses blur the faces all pieces err alike, and more do not help
+_FEW_PIECES = 6  # whose spread is their standard deviation: three agree with their median by chance
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,8 @@ class SeenRails:
     @property
     def measured(self) -> bool:
         """True where the gauge is known within a few millimetres."""
-        return bool(self.pieces >= _LEAST_PIECES and self.spread / np.sqrt(self.pieces) < _SURE)
+        agree = self.spread < _PIECES_AGREE and self.spread / np.sqrt(self.pieces) < _SURE
+        return bool(self.pieces >= _LEAST_PIECES and agree)
 
     def offset_at(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return the place of the track's middle to the left of the axis, m."""
@@ -191,6 +195,7 @@ def _measure(
     smooth = (
         median_filter(np.interp(at, at[known], cant[known]), 5, mode="nearest") if known.any() else np.zeros(len(at))
     )
+    gauge *= np.hypot(1.0, np.median(smooth) / apart)  # along the plane of both heads, not across the level
     return SeenRails(
         at, offset, smooth, apart, float(np.median(gauge)) if len(gauge) else np.nan,
         _robust_spread(gauge), len(gauge),
@@ -199,8 +204,10 @@ def _measure(
 
 
 def _robust_spread(values: np.ndarray) -> float:
-    """Standard deviation by the median distance from the median; NaN for fewer than two values."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values)))) if len(values) > 1 else np.nan
+    """Standard deviation, of many values by the median distance from the median; NaN for fewer than two values."""
+    if len(values) < _FEW_PIECES:
+        return float(np.std(values, ddof=1)) if len(values) > 1 else np.nan
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 def _block_tops(height: np.ndarray, block: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
@@ -229,7 +236,9 @@ def _block_medians(value: np.ndarray, block: np.ndarray, rows: np.ndarray, count
 
 
 def _inner_edge(across: np.ndarray, above: np.ndarray) -> float:
-    """Distance from the track's middle where a head ends on its inner side, m; NaN where too few returns show it.
+    """Distance from the track's middle where a head ends on its inner side, m.
+
+    NaN where too few returns show it, or poses blur it.
 
     It is where most returns from the side of the head lie. The edge of the top, where that side is out of sight, would
     be up to a centimetre off: poses that are a little off move it outwards, while a blurred face stays where it is.
@@ -240,7 +249,7 @@ def _inner_edge(across: np.ndarray, above: np.ndarray) -> float:
     edge = float(np.mean(top) - np.sqrt(3.0) * np.std(top))  # of what is spread evenly over a head
     side = across[(above < -_FACE[0]) & (above > -_FACE[1])]
     side = side[np.abs(side - edge) < _FACE_BAND]
-    if len(side) < _FACE_RETURNS:
+    if len(side) < _FACE_RETURNS or np.std(side) > _FACE_SHARP:
         return np.nan
     step = 0.001
     count, edges = np.histogram(side, np.arange(side.min() - 0.01, side.max() + 0.01, step))

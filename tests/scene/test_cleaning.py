@@ -199,3 +199,15 @@ def test_a_mouth_at_which_no_direction_shows_the_wall_ends_where_its_last_row_do
     first, last = end_stations(tube, around)
     assert first == pytest.approx(-1.0, abs=0.3)  # where nothing lies beyond, the rim stays whole
     assert last == pytest.approx(41.0, abs=0.3)
+
+
+def test_the_user_may_keep_outliers_and_what_stands_inside():
+    rng = np.random.default_rng(5)
+    points = arch()
+    strays = rng.uniform(points.min(axis=0) - 2.0, points.max(axis=0) + 2.0, (len(points) // 100, 3))
+    dirty = turned(np.concatenate([points, strays, box(rng, (12, -0.6, 0.0), (15, 0.6, 1.7), 4000)]))
+    assert {CAUSES[SCATTERED], CAUSES[INSIDE]} <= set(causes(cleaned(dirty)))
+    for name, kept in (("filter_outliers", SCATTERED), ("filter_moving", INSIDE)):
+        told = clean_cloud(thin(dirty), CleaningConfig(**{name: False}), CentrelineConfig())
+        assert CAUSES[kept] not in causes(told)
+        assert {CAUSES[SCATTERED], CAUSES[INSIDE]} - {CAUSES[kept]} <= set(causes(told))

@@ -14,6 +14,7 @@ from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from scene.fitting.trackseen import SeenTrack, find_track
+from scene.fitting.trackseen import _above_floor as above_floor
 from scene.judging.trackdoubt import doubt_track
 from scene.output import write_geometry
 from scene.writing.mjcf import SceneConfig
@@ -117,6 +118,17 @@ def test_cant_is_measured():
     assert np.median(line.rails.cant) == pytest.approx(turned * 0.08, abs=0.01)
 
 
+def test_the_gauge_of_a_canted_track_is_that_of_its_own_plane():
+    station, lateral, upward, height = above_floor(*scanned("proud"))
+    gauges = []
+    for lean in np.radians([0.0, 12.0]):  # a survey frame that is not level: the very same track, 12° on its side
+        across = lateral * np.cos(lean) - upward * np.sin(lean)
+        upright = lateral * np.sin(lean) + upward * np.cos(lean)
+        (line,) = rails_seen.find_rails(station, across, height / np.cos(lean), upright)
+        gauges.append(line.gauge)
+    assert gauges[1] == pytest.approx(gauges[0], abs=0.002)
+
+
 def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor():
     _, bore = scanned("bare rails")
     seen = seen_in("bare rails")
@@ -202,3 +214,19 @@ def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
     assert "only 9 of them were seen" in warned.text
     asked = lay_track(bore, TrackConfig(lay="standard"), unseen)
     assert doubt_track(asked, unseen) == doubt_track(lay_track(bore, TrackConfig(), None), SeenTrack()) == []
+
+
+def test_a_gauge_between_faces_that_poses_blur_is_not_measured(monkeypatch):
+    station, lateral, upward, height = above_floor(*scanned("proud"))
+    blurred = lateral + np.random.default_rng(1).normal(0.0, 0.012, len(lateral))
+    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    assert not line.measured
+    monkeypatch.setattr(rails_seen, "_FACE_SHARP", 1.0)
+    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    assert line.measured  # all pieces agree
+    assert line.gauge < 1.435 - 0.005
+
+
+def test_three_pieces_of_which_two_agree_by_chance_make_no_gauge():
+    gauges = np.array([1.4105, 1.4233, 1.4234])
+    assert rails_seen._robust_spread(gauges) > rails_seen._PIECES_AGREE
