@@ -1,0 +1,60 @@
+"""Inputs of a memory, one for each metre commanded, and what it answers."""
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from subterra_jax.policies.locate.matching import SHARES
+
+DELAY = 12  # blocks after which all beams have passed a block
+N_RECENT = 5  # parts of a block in the raw scans that a memory may get
+N_RAW = N_RECENT * 14 * 2
+
+
+@struct.dataclass
+class Block:
+    """One metre of commanded distance.
+
+    Attributes:
+        evidence: Log likelihood of each of `matching.SHARES`, by the block `DELAY` metres ago; 0 where there is none.
+        read: Distance that the odometer counted in this metre, less 1, m.
+        steps: Steps taken in this metre.
+        raw: What the beams saw in this metre: distance beyond the wall and ahead, both of order 1.
+    """
+
+    evidence: Float[Array, "n_shares"]
+    read: Float[Array, ""]
+    steps: Float[Array, ""]
+    raw: Float[Array, "n_raw"]
+
+
+@struct.dataclass
+class Estimate:
+    """Answer of a memory.
+
+    Attributes:
+        correction: True less commanded distance since the start, m.
+        share: The same for the metres to come, m per m.
+        log_scale: Log of the mean absolute error of `correction` that is expected, m.
+    """
+
+    correction: Float[Array, ""]
+    share: Float[Array, ""]
+    log_scale: Float[Array, ""]
+
+
+def matched_inputs(block: Block) -> Float[Array, "n"]:
+    """Returns evidence and odometry as inputs of a network."""
+    centred = block.evidence - jnp.mean(block.evidence, axis=-1, keepdims=True)
+    belief = jnp.exp(block.evidence - jnp.max(block.evidence, axis=-1, keepdims=True))
+    belief = belief / jnp.sum(belief, axis=-1, keepdims=True)
+    shares = jnp.asarray(SHARES)
+    mean = jnp.sum(belief * shares, axis=-1, keepdims=True)
+    sigma = jnp.sqrt(jnp.sum(belief * (shares - mean) ** 2, axis=-1, keepdims=True) + 1e-10)
+    read, steps = block.read[..., None], block.steps[..., None]
+    return jnp.concatenate([0.3 * centred, 30.0 * mean, 30.0 * sigma, 20.0 * read, 0.1 * steps], axis=-1)
+
+
+def raw_inputs(block: Block) -> Float[Array, "n"]:
+    """Returns scans and odometry as inputs of a network, without the front end."""
+    return jnp.concatenate([block.raw, 20.0 * block.read[..., None], 0.1 * block.steps[..., None]], axis=-1)

@@ -1,0 +1,105 @@
+"""From metres to estimates: a Kalman filter, or a network whose answers are summed; with or without the front end."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from subterra_jax.policies.locate import kalman, matching
+from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block, Estimate, matched_inputs, raw_inputs
+from subterra_jax.policies.locate.recurrent import CELLS, HIDDEN, apply, dense
+
+Weights = dict[str, Any]
+NETWORKS = ("kalman", *CELLS)
+FRONTS = ("match", "scans")
+_N_MATCHED = matching.N_SHARES + 4
+_UNIT = 0.02  # of the speed: answers of order 1
+
+
+@struct.dataclass
+class Sums:
+    """Memory of a network.
+
+    Attributes:
+        cell: Memory of its cell.
+        correction: Sum of its answers for the metres that all beams have passed, m.
+        age: Metres so far.
+    """
+
+    cell: Any
+    correction: Float[Array, ""]
+    age: Float[Array, ""]
+
+
+def init(network: str, front: str, key: PRNGKeyArray) -> Weights:
+    """Returns untrained weights of a localiser.
+
+    Raises:
+        ValueError: There is no such network or front end, or a filter shall do without the front end.
+    """
+    if network not in NETWORKS or front not in FRONTS:
+        known = f"networks are {', '.join(NETWORKS)}; fronts are {', '.join(FRONTS)}"
+        raise ValueError(f"no network {network!r} with front {front!r}; {known}")
+    if network == "kalman" and front != "match":
+        raise ValueError("a Kalman filter needs the evidence of the front end: front = match")
+    keys = jax.random.split(key, 5)
+    weights: Weights = {"match": matching.init(keys[0])} if front == "match" else {}
+    if network == "kalman":
+        return {**weights, "kalman": kalman.init(keys[1])}
+    n_in = _N_MATCHED if front == "match" else N_RAW + 2
+    return {
+        **weights,
+        "in": dense(keys[1], n_in, HIDDEN),
+        "in_2": dense(keys[2], HIDDEN, HIDDEN),
+        "cell": CELLS[network].init(keys[3]),
+        "out": dense(keys[4], HIDDEN, 3, 0.1),
+    }
+
+
+def start(network: str, weights: Weights) -> Any:
+    """Returns the memory at the start."""
+    if network == "kalman":
+        return kalman.start(weights["kalman"])
+    return Sums(CELLS[network].start(), jnp.zeros(()), jnp.zeros(()))
+
+
+def step(network: str, weights: Weights, memory: Any, block: Block) -> tuple[Any, Estimate]:
+    """Takes in one metre, and answers."""
+    if network == "kalman":
+        return kalman.step(weights["kalman"], memory, block)
+    cell, hidden = CELLS[network].step(weights["cell"], memory.cell, _embed(weights, block))
+    passed, coming, log_rate = _answers(weights, hidden)
+    age = memory.age + 1.0
+    correction = memory.correction + jnp.where(age > DELAY, passed, 0.0)
+    ahead = jnp.minimum(age, DELAY) * coming
+    estimate = Estimate(correction + ahead, coming, _log_scale(log_rate, age))
+    return Sums(cell, correction, age), estimate
+
+
+def sequence(network: str, weights: Weights, blocks: Block) -> Estimate:
+    """Returns the answers to all metres of a drive; fields of `blocks` have the metres as first axis."""
+    if network == "kalman":
+        return kalman.sequence(weights["kalman"], blocks)
+    hidden = CELLS[network].sequence(weights["cell"], _embed(weights, blocks))
+    passed, coming, log_rate = _answers(weights, hidden)
+    age = jnp.arange(1.0, hidden.shape[0] + 1.0)
+    correction = jnp.cumsum(jnp.where(age > DELAY, passed, 0.0))
+    return Estimate(correction + jnp.minimum(age, DELAY) * coming, coming, _log_scale(log_rate, age))
+
+
+def _embed(weights: Weights, block: Block) -> Array:
+    rows = matched_inputs(block) if "match" in weights else raw_inputs(block)
+    return apply(weights["in_2"], jax.nn.gelu(apply(weights["in"], rows)))
+
+
+def _answers(weights: Weights, hidden: Array) -> tuple[Array, Array, Array]:
+    """Returns error of the command in the metre passed and in those to come, and the log of the error's growth."""
+    out = apply(weights["out"], hidden)
+    return _UNIT * out[..., 0], _UNIT * out[..., 1], out[..., 2]
+
+
+def _log_scale(log_rate: Array, age: Array) -> Array:
+    """Returns the log of the error expected after `age` metres."""
+    return jnp.log(0.03) + 0.5 * jnp.log(age) + log_rate

@@ -1,0 +1,117 @@
+"""Profiles of the walls, one for each beam, over the commanded distance at which a point would be beside the robot."""
+
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from subterra_jax.baselines.steering import Corridor
+from subterra_jax.lidar import bearings
+
+BIN = 0.1  # m of a profile's bin
+BLOCK = 10  # bins of a block, over which evidence is summed
+REACH = 9.5  # m ahead or behind; points further away are left out
+WINDOW = 256  # bins that a robot keeps
+N_SIDES, N_BEARINGS = 2, 7  # of 16 beams, those that are neither ahead nor behind
+_ECHO = 1e-3  # m below `range_max`: no echo
+_OUT = 1.5  # m; points further from the tracked wall than this are not of the wall
+_SPREAD = 2.0  # bins to either side over which a point counts, with falling weight
+
+Grid = Float[Array, "2 7 bins"]
+
+
+@struct.dataclass
+class Points:
+    """Points that a scan found on the walls, by side (left, right) and bearing (from ahead to behind).
+
+    Attributes:
+        along: Distance ahead, m.
+        out: Distance beyond the tracked wall, m.
+        seen: True where there is a point.
+    """
+
+    along: Float[Array, "2 7"]
+    out: Float[Array, "2 7"]
+    seen: Bool[Array, "2 7"]
+
+
+@struct.dataclass
+class Profiles:
+    """Weighted sums of points by bin.
+
+    Attributes:
+        weight: Sum of weights.
+        out: Weighted sum of distances beyond the wall, m.
+        along: Weighted sum of distances ahead at which they were seen, m.
+    """
+
+    weight: Grid
+    out: Grid
+    along: Grid
+
+
+def find_points(ranges: Float[Array, "n_beams"], walls: Corridor, range_max: Float[Array, ""] | float) -> Points:
+    """Returns the points of a scan on either wall; of more than 16 beams, those at the bearings of 16."""
+    n, every = ranges.shape[0], ranges.shape[0] // 16
+    left = every * np.arange(1, N_BEARINGS + 1)
+    chosen = np.stack([left, n - left])
+    angle = jnp.asarray(bearings(n)[chosen], jnp.float32) + walls.angle
+    reach = ranges[chosen]
+    along, across = reach * jnp.cos(angle), reach * jnp.abs(jnp.sin(angle))
+    out = across - jnp.stack([walls.left, walls.right])[:, None]
+    seen = (reach < range_max - _ECHO) & (jnp.abs(along) < REACH) & (jnp.abs(out) < _OUT)
+    return Points(along, out, seen)
+
+
+def blank(n_bins: int) -> Profiles:
+    """Returns profiles without a point."""
+    return Profiles(*(jnp.zeros((N_SIDES, N_BEARINGS, n_bins)) for _ in range(3)))
+
+
+def add_points(profiles: Profiles, points: Points, bins: Float[Array, "*t 2 7"], wrapped: bool = False) -> Profiles:
+    """Adds points, of one scan or of many.
+
+    Args:
+        profiles: Profiles so far.
+        points: Points; their fields may have leading axes.
+        bins: Place of each point, in bins.
+        wrapped: Bins beyond the end begin anew; otherwise points there are left out.
+    """
+    n_bins = profiles.weight.shape[-1]
+    first = jnp.floor(bins).astype(jnp.int32)
+    index = first[..., None] + np.arange(-1, 3)
+    weight = jnp.maximum(1.0 - jnp.abs(index - bins[..., None]) / _SPREAD, 0.0) * points.seen[..., None]
+    inside = (index >= 0) & (index < n_bins) if not wrapped else jnp.ones_like(index, bool)
+    weight, index = jnp.where(inside, weight, 0.0), jnp.mod(index, n_bins)
+    side, beam = np.arange(N_SIDES)[:, None, None], np.arange(N_BEARINGS)[None, :, None]
+
+    def add(sums: Grid, values: Array) -> Grid:
+        return sums.at[side, beam, index].add(weight * values)
+
+    one = jnp.ones(())
+    return Profiles(
+        add(profiles.weight, one),
+        add(profiles.out, points.out[..., None]),
+        add(profiles.along, points.along[..., None]),
+    )
+
+
+def forget(profiles: Profiles, before: Int[Array, ""], now: Int[Array, ""]) -> Profiles:
+    """Empties the bins of a wrapped window that the robot's newest bin has come to since `before`."""
+    n_bins = profiles.weight.shape[-1]
+    index = jnp.arange(n_bins)
+    newest = lambda at: at - jnp.mod(at - index, n_bins)  # noqa: E731
+    kept = newest(now) == newest(before)
+    return Profiles(*(jnp.where(kept, sums, 0.0) for sums in (profiles.weight, profiles.out, profiles.along)))
+
+
+def cut(profiles: Profiles, first: Int[Array, ""], n: int) -> Profiles:
+    """Returns `n` bins of wrapped profiles, from bin `first` on."""
+    index = jnp.mod(first + jnp.arange(n), profiles.weight.shape[-1])
+    return Profiles(*(sums[..., index] for sums in (profiles.weight, profiles.out, profiles.along)))
+
+
+def mean_along(profiles: Profiles) -> Float[Array, "2 7"]:
+    """Returns the mean distance ahead at which the points were seen, m; 0 where there are none."""
+    total = jnp.sum(profiles.weight, axis=-1)
+    return jnp.sum(profiles.along, axis=-1) / jnp.maximum(total, 1e-3)

@@ -1,0 +1,1 @@
+"""Training of learnt localisers: `python -m train.locate`."""

@@ -1,0 +1,133 @@
+"""Learns a localiser by driving: the true station is the target, in training only."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from subterra_jax.policies.locate import memory, streams
+from train.locate.drives import Drive, record_drives
+
+
+@dataclasses.dataclass(frozen=True)
+class LocateConfig:
+    """Settings of a learnt localiser.
+
+    Attributes:
+        network: `kalman`, `gru`, `s5` or `transformer`.
+        front: `match` compares what beams ahead and behind saw; `scans` gives the network the scans themselves.
+        seed: Seed of weights and drives.
+        n_envs: Drives recorded in one iteration.
+        n_steps: Steps of each.
+        minibatch: Drives in one step of the optimiser.
+        epochs: Times that each drive is learnt from.
+        learning_rate: Of Adam, at most; it rises over the first steps and falls with the time that is left.
+        max_grad_norm: Norm to which gradients are clipped.
+        minutes: Time of the training.
+    """
+
+    network: str = "kalman"
+    front: str = "match"
+    seed: int = 0
+    n_envs: int = 512
+    n_steps: int = 900
+    minibatch: int = 64
+    epochs: int = 1
+    learning_rate: float = 2e-3
+    max_grad_norm: float = 1.0
+    minutes: float = 20.0
+
+
+@struct.dataclass
+class TrainState:
+    """State of a training.
+
+    Attributes:
+        weights: Of the localiser.
+        moments: State of the optimiser.
+        key: Source of all later randomness.
+        steps: Steps of the optimiser.
+    """
+
+    weights: Any
+    moments: Any
+    key: PRNGKeyArray
+    steps: Array
+
+
+_WARM = 50.0  # steps of the optimiser
+_SHORT = 30  # metres; errors over so short a way count too
+_MOST = 5.0  # standard scales of an error beyond which a single drive has no further say
+
+
+class LocateLearner:
+    """Training as pure functions.
+
+    Args:
+        env: An environment that starts facing growing stations.
+        params: Its parameters.
+        config: Settings.
+    """
+
+    def __init__(self, env: Any, params: Any, config: LocateConfig) -> None:
+        self.env, self.config = env, config
+        period = float(params.vehicle.period) * float(params.vehicle.speed_max)
+        self.n_metres = int(config.n_steps * period)
+        self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(b2=0.99))
+
+    def init(self) -> TrainState:
+        """Returns the state before training."""
+        key_weights, key = jax.random.split(jax.random.key(self.config.seed))
+        weights = memory.init(self.config.network, self.config.front, key_weights)
+        return TrainState(weights, self.optimizer.init(weights), key, jnp.zeros((), jnp.int32))
+
+    def iterate(self, state: TrainState, params: Any, left: Array) -> tuple[TrainState, dict[str, Array]]:
+        """Records drives and learns from them; `left` is the share of the time that is left."""
+        config = self.config
+        key, key_drive, key_order = jax.random.split(state.key, 3)
+        drive = record_drives(self.env, params, key_drive, config.n_envs, config.n_steps)
+        n_batches = config.n_envs // config.minibatch
+
+        def one(carry: TrainState, index: Array) -> tuple[TrainState, dict[str, Array]]:
+            part = jax.tree.map(lambda leaf: leaf[index], drive)
+            (loss, terms), gradients = jax.value_and_grad(self._loss, has_aux=True)(carry.weights, part)
+            finite = jnp.isfinite(optax.global_norm(gradients))
+            gradients = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradients)
+            updates, moments = self.optimizer.update(gradients, carry.moments)
+            warm = jnp.minimum(1.0, (carry.steps + 1.0) / _WARM)
+            rate = config.learning_rate * warm * (0.02 + 0.98 * 0.5 * (1.0 - jnp.cos(jnp.pi * left)))
+            weights = jax.tree.map(lambda w, u: w - rate * u, carry.weights, updates)
+            return carry.replace(weights=weights, moments=moments, steps=carry.steps + 1), {"loss": loss, **terms}
+
+        orders = jax.vmap(lambda k: jax.random.permutation(k, config.n_envs))(
+            jax.random.split(key_order, config.epochs)
+        )
+        state, terms = jax.lax.scan(one, state, orders.reshape(config.epochs * n_batches, config.minibatch))
+        return state.replace(key=key), jax.tree.map(jnp.nanmean, terms)
+
+    def _loss(self, weights: Any, drive: Drive) -> tuple[Array, dict[str, Array]]:
+        """Returns the negative log likelihood of the true stations, and what is logged."""
+        answers, truth, valid = jax.vmap(lambda d: estimate(self.config.network, weights, d, self.n_metres))(drive)
+        error = answers.correction - truth
+        scaled = jnp.abs(error) * jnp.exp(-answers.log_scale)
+        robust = jnp.where(scaled < _MOST, scaled, _MOST * (1.0 + jnp.log(jnp.maximum(scaled, _MOST) / _MOST)))
+        short = jnp.abs(error[:, _SHORT:] - error[:, :-_SHORT])
+        total = _mean(robust + answers.log_scale, valid) + _mean(jnp.minimum(short, 1.0), valid[:, _SHORT:])
+        near = _mean(jnp.abs(error) < 1.0, valid & (jnp.arange(self.n_metres) > 100))
+        return total, {"error": _mean(jnp.abs(error), valid), "within": near}
+
+
+def estimate(network: str, weights: Any, drive: Drive, n: int) -> tuple[Any, Array, Array]:
+    """Returns answers, truth (m) and whether each metre was completed, of one drive."""
+    blocks = streams.metres(drive.record, weights.get("match"), n)
+    ends = jnp.arange(1.0, n + 1.0)
+    truth = jnp.interp(ends, drive.record.driven, drive.moved) - ends
+    return memory.sequence(network, weights, blocks), truth, streams.reached(drive.record, n)
+
+
+def _mean(values: Array, valid: Bool[Array, "env metre"]) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(valid, values, 0.0)) / jnp.maximum(jnp.sum(valid), 1.0)

@@ -1,0 +1,61 @@
+"""Many tunnels at once, made by several processes."""
+
+import concurrent.futures
+import functools
+import multiprocessing
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import subterra_jax as st
+from subterra_jax.host.files import replace_file
+from subterra_jax.host.versions import VERSION
+from subterra_jax.procedural import expand
+from subterra_jax.tunnel import Tunnel
+
+
+def make(task: str, names: str, lining: str | None = None, cache: Path | None = None) -> tuple[Any, Any, list[str]]:
+    """Returns a task in several tunnels, and their names.
+
+    Args:
+        task: Task id.
+        names: One name, or several as `open:train:0-63`, or names with commas between.
+        lining: Variant of the walls; None is the usual one.
+        cache: Folder of this command's own in which tunnels are kept from run to run; None keeps none.
+
+    Raises:
+        TunnelError: There is no such tunnel or lining.
+    """
+    wanted = [name for part in names.split(",") for name in expand(part)]
+    one = functools.partial(_tunnel, lining=lining, cache=cache)
+    workers = min(len(wanted), os.cpu_count() or 1)
+    if workers > 1:
+        context = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
+            tunnels = list(pool.map(one, wanted, chunksize=1))
+    else:
+        tunnels = [one(name) for name in wanted]
+    env, params = st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0])
+    return env, params, wanted
+
+
+def _tunnel(name: str, lining: str | None, cache: Path | None) -> Tunnel:
+    """Returns a tunnel whose arrays are of the host, so that they go from one process to another."""
+    kept = None if cache is None else cache / f"{VERSION}-{name}-{lining}.pickle".replace("/", "_")
+    if kept is not None and kept.is_file():
+        return pickle.loads(kept.read_bytes())
+    plan = st.load_tunnel(name)
+    made = jax.device_get(Tunnel.from_plan(plan, lining or plan.default_lining))
+    if kept is not None:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with replace_file(kept) as fresh:
+            fresh.write_bytes(pickle.dumps(made))
+    return made
+
+
+def _on_cpu() -> None:
+    """Keeps a process that makes tunnels away from the accelerator."""
+    jax.config.update("jax_platforms", "cpu")
