@@ -172,7 +172,7 @@ class Navigator:
         del key
         steering = self.steering.look(memory.steering, obs, memory.command, params)
         now, raised, done = watch(memory.mission, obs, params)
-        driven = Driven(memory.command[0], self.steering.cosine(steering), memory.mission.direction, raised)
+        driven = Driven(memory.command[0], self.steering.cosine(steering), memory.mission.direction, raised, steering)
         mirrored = self.steering.turn_round(steering)
         steering = jax.tree.map(lambda new, old: jnp.where(done, new, old), mirrored, steering)
         estimate, localiser = self.localiser.update(memory.localiser, obs, driven, params, known)

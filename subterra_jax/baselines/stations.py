@@ -84,12 +84,14 @@ class Driven:
         cosine: Cosine of the angle between heading and axis, by the steering.
         direction: 1 on the way out, -1 on the way back.
         flagged: True where the flag has just been raised: the goal is `flag_reach` away.
+        walls: Memory of the steering: the walls that it tracks.
     """
 
     speed: Float[Array, ""]
     cosine: Float[Array, ""]
     direction: Float[Array, ""]
     flagged: Bool[Array, ""]
+    walls: Any = None
 
 
 class Localiser(Protocol):

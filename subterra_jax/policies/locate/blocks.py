@@ -8,7 +8,8 @@ from subterra_jax.policies.locate.matching import SHARES
 
 DELAY = 12  # blocks after which all beams have passed a block
 N_RECENT = 5  # parts of a block in the raw scans that a memory may get
-N_RAW = N_RECENT * 14 * 2
+N_ROW = 28  # numbers of one scan
+N_RAW = N_RECENT * N_ROW
 
 
 @struct.dataclass

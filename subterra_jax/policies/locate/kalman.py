@@ -151,6 +151,6 @@ def _as_normal(evidence: Array, prior_mean: Array, prior_variance: Array) -> tup
     belief = jax.nn.softmax(prior + evidence)
     own = jax.nn.softmax(prior)  # of the prior on the same grid, whose ends cut it off
     (mean, variance), (mean_own, variance_own) = _moments(belief), _moments(own)
-    precision = jnp.maximum(1.0 / variance - 1.0 / variance_own, 1.0)
+    precision = jnp.maximum(1.0 / variance - 1.0 / variance_own, 0.01)
     value = mean + (mean - mean_own) / (variance_own * precision)
     return jnp.clip(value, -0.3, 0.3), 1.0 / precision

@@ -11,7 +11,7 @@ from subterra_jax.lidar import bearings
 BIN = 0.1  # m of a profile's bin
 BLOCK = 10  # bins of a block, over which evidence is summed
 REACH = 9.5  # m ahead or behind; points further away are left out
-WINDOW = 256  # bins that a robot keeps
+WINDOW = 288  # bins that a robot keeps
 N_SIDES, N_BEARINGS = 2, 7  # of 16 beams, those that are neither ahead nor behind
 _ECHO = 1e-3  # m below `range_max`: no echo
 _OUT = 1.5  # m; points further from the tracked wall than this are not of the wall

@@ -1,0 +1,146 @@
+"""A learnt localiser as the robot goes: the same metres as in training, one at a time."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from subterra_jax.baselines.agent import Known, Observed
+from subterra_jax.baselines.stations import Driven, Station, believed_start
+from subterra_jax.policies.locate import matching, memory, profiles
+from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, N_ROW, Block, Estimate
+from subterra_jax.policies.locate.profiles import BIN, BLOCK, REACH, WINDOW, Profiles
+from subterra_jax.policies.locate.streams import raw_rows
+
+_TO_SIGMA = 1.2533  # standard deviation of a normal distribution over its mean absolute error
+_NEWEST = int(REACH / BIN) + 3  # bins ahead of the robot that a point may count in
+_STEP = 1.0  # m; no step is longer
+
+
+@struct.dataclass
+class LocatorMemory:
+    """Memory of a learnt localiser.
+
+    Attributes:
+        begin: Believed station of the start, m.
+        driven: Commanded distance along the axis, m.
+        reading: Last reading of the odometer, m.
+        steps: Steps so far.
+        metres: Metres completed.
+        read_before: Reading at the end of the last metre, m, interpolated.
+        steps_before: Steps at that time, interpolated.
+        window: Profiles about the robot.
+        raw: Sums of the scans in the parts of this metre.
+        counts: Scans in each part.
+        cell: Memory behind the front end.
+        estimate: Its last answer.
+    """
+
+    begin: Float[Array, ""]
+    driven: Float[Array, ""]
+    reading: Float[Array, ""]
+    steps: Float[Array, ""]
+    metres: Int[Array, ""]
+    read_before: Float[Array, ""]
+    steps_before: Float[Array, ""]
+    window: Profiles
+    raw: Float[Array, "parts row"]
+    counts: Float[Array, "parts"]
+    cell: Any
+    estimate: Estimate
+
+
+@struct.dataclass
+class Locator:
+    """Estimates the station by commands, corrected by what it has learnt of the walls.
+
+    Attributes:
+        weights: As `memory.init` makes them, trained.
+        network: Name of the memory.
+        blind: Leave the evidence and the scans out: the ablation that shows what the walls tell.
+    """
+
+    weights: Any
+    network: str = struct.field(pytree_node=False)
+    blind: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def begin(self, obs: Observed, params: Any) -> LocatorMemory:
+        """Begins at the believed start."""
+        zero = jnp.zeros(())
+        return LocatorMemory(
+            begin=believed_start(params)[0],
+            driven=zero,
+            reading=obs.distance,
+            steps=zero - 1.0,
+            metres=jnp.zeros((), jnp.int32),
+            read_before=obs.distance,
+            steps_before=zero,
+            window=profiles.blank(WINDOW),
+            raw=jnp.zeros((N_RECENT, N_ROW)),
+            counts=jnp.zeros(N_RECENT),
+            cell=memory.start(self.network, self.weights),
+            estimate=Estimate(zero, zero, jnp.log(jnp.full((), 0.05))),
+        )
+
+    def update(
+        self, before: LocatorMemory, obs: Observed, driven: Driven, params: Any, known: Known
+    ) -> tuple[Station, LocatorMemory]:
+        """Takes in a step: adds the scan to the profiles, and asks the memory at the end of each metre."""
+        del known
+        at = before.driven + jnp.minimum(driven.speed * params.vehicle.period * driven.cosine, _STEP)
+        now = dataclasses.replace(before, driven=at, reading=obs.distance, steps=before.steps + 1.0)
+        ended = jnp.floor(at).astype(jnp.int32) > before.metres
+        block, now = self._see(before, now, obs, driven, params, ended)
+        cell, estimate = memory.step(self.network, self.weights, before.cell, block)
+        kept = (before.cell, before.estimate, before.metres, before.read_before, before.steps_before)
+        new = (
+            cell,
+            estimate,
+            before.metres + 1,
+            before.read_before + block.read + 1.0,
+            before.steps_before + block.steps,
+        )
+        new = jax.tree.map(lambda one, old: jnp.where(ended, one, old), new, kept)
+        now = dataclasses.replace(
+            now, cell=new[0], estimate=new[1], metres=new[2], read_before=new[3], steps_before=new[4]
+        )
+        since = at - now.metres
+        station = now.begin + at + now.estimate.correction + now.estimate.share * since
+        log_sigma = now.estimate.log_scale + jnp.log(_TO_SIGMA)
+        return Station(station, jnp.maximum(log_sigma, jnp.log(0.01)), driven.direction), now
+
+    def _see(
+        self, before: LocatorMemory, now: LocatorMemory, obs: Observed, driven: Driven, params: Any, ended: Array
+    ) -> tuple[Block, LocatorMemory]:
+        """Returns the metre that may have ended, and the memory with the scan."""
+        points = profiles.find_points(obs.ranges, driven.walls, params.lidar.range_max)
+        window = profiles.forget(before.window, _newest(before.driven), _newest(now.driven))
+        window = profiles.add_points(window, points, (now.driven + points.along) / BIN, wrapped=True)
+        metre = before.metres
+        share = (metre + 1.0 - before.driven) / jnp.maximum(now.driven - before.driven, 1e-6)
+        read = before.reading + share * (now.reading - before.reading)
+        steps = before.steps + share
+        if self.blind or "match" not in self.weights:
+            evidence = jnp.zeros(matching.N_SHARES)
+        else:
+            first = BLOCK * (metre - DELAY) - matching.LAGS - matching.MARGIN
+            found = matching.evidence(self.weights["match"], profiles.cut(window, first, matching.N_CUT))
+            evidence = jnp.where(metre >= DELAY, found, 0.0)
+        raw = before.raw / jnp.maximum(before.counts, 1.0)[:, None]
+        block = Block(evidence, read - before.read_before - 1.0, steps - before.steps_before, raw.reshape(-1))
+        if self.blind:
+            block = dataclasses.replace(block, raw=jnp.zeros_like(block.raw))
+        part = jnp.clip(jnp.floor((now.driven % 1.0) * N_RECENT).astype(jnp.int32), 0, N_RECENT - 1)
+        sums, counts = (jnp.where(ended, 0.0, old) for old in (before.raw, before.counts))
+        return block, dataclasses.replace(
+            now, window=window, raw=sums.at[part].add(raw_rows(points)), counts=counts.at[part].add(1.0)
+        )
+
+
+def _newest(driven: Float[Array, ""]) -> Int[Array, ""]:
+    """Returns the newest bin that a robot may put a point in."""
+    return jnp.floor(driven / BIN).astype(jnp.int32) + _NEWEST
