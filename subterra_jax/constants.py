@@ -64,6 +64,17 @@ FREEZE_RATE, FREEZE_STEPS = 0.01, 30.0  # per step, steps
 DELAY = 4.0  # steps
 WET_PATCH, WET_SHARE, WET_LOSS = 10.0, 0.3, 0.3  # m, of the patches, of the speed
 
+# Tasks of version 1. Starts and goals lie further from a mouth than the LiDAR reaches, hidden start and drift included;
+# goals are distances from the start. In T5 the margin is more than the reach and the travel together.
+INSIDE_MARGIN, INSIDE_LOW, INSIDE_HIGH, INSIDE_SIGMA = 40.0, 60.0, 320.0, 3.0  # m
+INSIDE_SHORT_LOW, INSIDE_SHORT_HIGH = 10.0, 60.0  # m
+RELOCALISE_MARGIN, RELOCALISE_TRAVEL = 95.0, 60.0  # m
+# Each size of a fault is drawn for an episode between 1 - spread and 1 + spread times its middle. Odometers do not
+# begin at 0 there, or the first reading would tell the delay.
+FAULT_SPREAD = 2.0 / 3.0
+DRAWN_DROPOUT_SHARE, DRAWN_DELAY = 0.5, 2.4  # of the beams, steps; the others are those above
+ORIGIN_DISTANCE_SIGMA, ORIGIN_HEADING_SIGMA = 0.05, 0.005  # m, rad
+
 # LiDARs in three dimensions: range noise, what each metre and each unit of the tangent of incidence add to it, returns
 # lost, share of mixed pixels where these are asked for.
 SPATIAL_SIGMA, SPATIAL_SIGMA_PER_METRE, SPATIAL_SIGMA_SLANT = 0.019, 1e-4, 0.002  # m, m/m, m

@@ -20,11 +20,23 @@ from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_module
 from subterra_jax.host.versions import no_task
-from subterra_jax.parts import Faults, Imu, Obstacles, Odometer, Part, PlanarLidar, Slip
+from subterra_jax.parts import DrawnFaults, Faults, Imu, Obstacles, ObstaclesAhead, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
 from subterra_jax.parts.wander import WanderParams
-from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
+from subterra_jax.procedural import open_world
+from subterra_jax.rules import (
+    GoalParams,
+    Relocalise,
+    RelocaliseInside,
+    Rule,
+    StartParams,
+    StopAt,
+    StopInside,
+    Traverse,
+    TurnBack,
+    TurnBackInside,
+)
 from subterra_jax.rules.rule import ERRANDS
 from subterra_jax.state import EnvParams, as_array
 from subterra_jax.tunnel import CONTACT_REACH
@@ -97,6 +109,31 @@ TASKS: dict[str, Task] = {
         Relocalise(), c.HORIZON_RELOCALISE_SHORT, _SHORT, SLIPPING, _drifting(goal=_NEAR_REPORT)
     ),
 }
+VERSIONS = ("v0", "v1")
+
+
+def _version_1() -> dict[str, Task]:
+    """Tasks told honestly: start and goal inside, fault sizes drawn, and each with a hidden start as well."""
+    goal = GoalParams(low=c.INSIDE_LOW, high=c.INSIDE_HIGH, margin=c.INSIDE_MARGIN)
+    near = goal.replace(low=c.INSIDE_SHORT_LOW, high=c.INSIDE_SHORT_HIGH, tolerance=c.SHORT_TOLERANCE)  # type: ignore[attr-defined]
+    report = GoalParams(margin=c.RELOCALISE_MARGIN, travel_max=c.RELOCALISE_TRAVEL)
+    rows = {
+        "StopAt": Task(StopInside(), c.HORIZON_STOP, None, SLIPPING, _drifting(goal=goal)),
+        "Return": Task(TurnBackInside(), c.HORIZON_RETURN, None, SLIPPING, _drifting(goal=goal)),
+        "Obstructed": Task(StopInside(), c.HORIZON_STOP, None, (*SLIPPING, ObstaclesAhead()), _drifting(goal=goal)),
+        "Faulted": Task(StopInside(), c.HORIZON_STOP, None, (*SLIPPING, DrawnFaults()), _drifting(goal=goal)),
+    }
+    hidden = StartParams(station_sigma=c.INSIDE_SIGMA)
+    offset = {
+        f"{name}Offset": dataclasses.replace(row, params={**row.params, "start": hidden}) for name, row in rows.items()
+    }
+    rows |= offset
+    rows["StopAtShort"] = Task(StopInside(), c.HORIZON_STOP_SHORT, None, SLIPPING, _drifting(goal=near))
+    rows["Relocalise"] = Task(RelocaliseInside(), c.HORIZON_RELOCALISE, None, SLIPPING, _drifting(goal=report))
+    return {f"Subterra/{name}-v1": row for name, row in rows.items()}
+
+
+TASKS |= _version_1()
 BUILT_IN = tuple(TASKS)
 
 
@@ -262,21 +299,27 @@ def make_params(env: TunnelEnv, tunnel: Any, horizon: Any, entries: Mapping[str,
     return jax.tree.map(as_leaf, params, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
 
 
-def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None) -> str:
+def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None, version: str = "v0") -> str:
     """SHA-256 of the numbers that define the benchmark, or one task of it, whatever the tunnel.
 
     Args:
-        env: An environment; None for all tasks of the benchmark with their default params.
+        env: An environment; None for all tasks of a version of the benchmark with their default params.
         params: Its params.
+        version: One of `VERSIONS`. That of `v1` is of the open world's kinds and splits too.
     """
     if env is None or params is None:
-        return _benchmark_digest()
+        return _benchmark_digest(version)
     return _digest(_figures(env, params))
 
 
 @functools.cache
-def _benchmark_digest() -> str:
-    return _digest({id: _figures(*_without_tunnel(id, TASKS[id])) for id in BUILT_IN})
+def _benchmark_digest(version: str) -> str:
+    figures: dict[str, Any] = {
+        id: _figures(*_without_tunnel(id, TASKS[id])) for id in BUILT_IN if id.endswith(f"-{version}")
+    }
+    if version != VERSIONS[0]:
+        figures["world"] = open_world.figures()
+    return _digest(figures)
 
 
 def _without_tunnel(id: str, task: Task) -> tuple[TunnelEnv, EnvParams]:

@@ -27,6 +27,21 @@ PLANAR_TASKS = tuple(
         "RelocaliseShort",
     )
 )
+PLANAR_TASKS += tuple(
+    f"Subterra/{name}-v1"
+    for name in (
+        "StopAt",
+        "Return",
+        "Obstructed",
+        "Faulted",
+        "StopAtOffset",
+        "ReturnOffset",
+        "ObstructedOffset",
+        "FaultedOffset",
+        "StopAtShort",
+        "Relocalise",
+    )
+)
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
 # MuJoCo is loaded only where one of these is made.

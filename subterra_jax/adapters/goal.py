@@ -43,7 +43,8 @@ class GoalConditioned(gymnasium.Wrapper[GoalObservation, np.ndarray, Any, np.nda
             name = getattr(env.spec, "id", type(inner).__name__)
             raise GoalError(f"{name} does not ask for a stop at a goal, so that no goal can be exchanged")
         fields = task.fields(params)
-        self._tolerance, self._believed_start = float(params.goal.tolerance), float(params.start.station)
+        self._tolerance, self._told_start = float(params.goal.tolerance), float(params.start.station)
+        self._start = fields["start"].start if "start" in fields else None
         self._goal, self._distance = fields["goal"].start, fields["odometry"].start
         self._rest = [at for name, where in fields.items() if name != "goal" for at in range(where.start, where.stop)]
         box = task.observation_space(params)
@@ -96,5 +97,6 @@ class GoalConditioned(gymnasium.Wrapper[GoalObservation, np.ndarray, Any, np.nda
 
     def _split(self, obs: Any) -> GoalObservation:
         flat = np.concatenate(list(obs.values())) if isinstance(obs, dict) else obs
-        achieved = np.array([self._believed_start + flat[self._distance]], np.float32)
+        told = self._told_start if self._start is None else flat[self._start]
+        achieved = np.array([told + flat[self._distance]], np.float32)
         return {"observation": flat[self._rest], "achieved_goal": achieved, "desired_goal": flat[[self._goal]]}

@@ -29,6 +29,7 @@ class Observed:
         goal: Station of the goal, m.
         ring_pitch: Distance between rings of the lining, m; 0 where there are none.
         flag: 1 once the goal has been reached, else 0.
+        start: Station of the start as it is told, m; None where it is `params.start.station`.
         entries: Every entry of the observation by name, those of parts from outside included.
     """
 
@@ -39,6 +40,7 @@ class Observed:
     goal: Float[Array, ""] | float = 0.0
     ring_pitch: Float[Array, ""] | float = 0.0
     flag: Float[Array, ""] | float = 0.0
+    start: Float[Array, ""] | None = None
     entries: dict[str, Array] = struct.field(default_factory=dict)
 
 
@@ -119,7 +121,7 @@ def observed(env: TunnelEnv, params: EnvParams, flat: Float[Array, "n_obs"], see
     entries = {name: flat[where] for name, where in fields.items()}
     ranges = entries["ranges"] if "ranges" in entries else level_ring(entries["scan"], params.lidar.shape)
     distance, heading = entries["odometry"]
-    further = {name: entries[name][0] for name in ("goal", "ring_pitch", "flag") if name in entries}
+    further = {name: entries[name][0] for name in ("goal", "ring_pitch", "flag", "start") if name in entries}
     return Observed(flat, ranges, distance, heading, **further, entries=entries)
 
 

@@ -146,11 +146,16 @@ def weigh(
 ) -> Cloud:
     """Multiplies the weights by the likelihood of a scan, and adjusts offsets and headings to it."""
     gain, pose = fit(walls, cloud.pose, ranges, range_max, model)
+    return log_weights(dataclasses.replace(cloud, pose=pose), gain, params)
+
+
+def log_weights(cloud: Cloud, gain: Float[Array, "n"], params: CloudParams) -> Cloud:
+    """Multiplies the weights by a likelihood, flattened where it would leave too few particles; `gain` is its log."""
     options = _normalise(cloud.log_weight + jnp.asarray(_POWERS)[:, None] * gain)
     enough = _effective_size(options) >= params.least_share * gain.shape[0]
     # The largest power that leaves enough particles, or else the least.
     chosen = jnp.where(jnp.any(enough), jnp.argmax(enough), len(_POWERS) - 1)
-    return dataclasses.replace(cloud, pose=pose, log_weight=options[chosen])
+    return dataclasses.replace(cloud, log_weight=options[chosen])
 
 
 def _normalise(log_weight: Float[Array, "*m n"]) -> Float[Array, "*m n"]:

@@ -43,7 +43,7 @@ class FusedCount:
 
     def begin(self, obs: Observed, params: EnvParams) -> Belief:
         """Begins with the nominal errors of the task."""
-        start, start_sigma = believed_start(params)
+        start, start_sigma = believed_start(obs, params)
         sigmas = jnp.zeros(5).at[_S].set(start_sigma)
         slip = slip_sizes(params)
         sigmas = sigmas.at[_GAIN].set(slip.gain_sigma).at[_SLIP].set(slip.wander.sigma)

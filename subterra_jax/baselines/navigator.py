@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
-from subterra_jax.baselines.stations import Driven, Localiser, Station
+from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
 from subterra_jax.baselines.steering import Steering
 from subterra_jax.state import EnvParams
 
@@ -66,7 +66,7 @@ def target_speed(mission: Mission, estimate: Station, obs: Observed, params: Env
         return jnp.zeros(())  # stand and report
     target = obs.goal
     if params.errand == "return":
-        home = jnp.asarray(params.start.station, jnp.float32)
+        home = told_start(obs, params)
         # Out until the flag is raised, wherever the goal is believed to be.
         target = jnp.where(mission.direction > 0.0, _FAR, home)
     to_go = mission.direction * (target - estimate.station)

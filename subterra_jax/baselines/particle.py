@@ -17,7 +17,7 @@ from subterra_jax.baselines.cloud import Cloud, CloudParams, cloud_params, move,
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit_roughly
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven, Station, told_start
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.state import EnvParams
@@ -80,7 +80,7 @@ class ParticleLocaliser:
         station_key, cloud_key = jax.random.split(jax.random.key(self.seed))
         walls = self.walls.pick(params.tunnel)
         spread = jnp.clip(jax.random.normal(station_key, (self.n_particles,)), -3.0, 3.0)
-        station = jnp.maximum(params.start.station + params.start.station_sigma * spread, 0.0)
+        station = jnp.maximum(told_start(obs, params) + params.start.station_sigma * spread, 0.0)
         pose = TunnelPose(station, jnp.zeros_like(station), jnp.zeros_like(station))
         pose = fit_roughly(walls, pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
         return FilterMemory(new_cloud(cloud_key, pose, self.motion), begin_reckoning(obs), jnp.zeros((), jnp.int32))

@@ -1,12 +1,13 @@
 """Dead reckoning: command and odometer fused by their nominal errors, with the delay of what is observed.
 
-An odometer that reads exactly what it read before has stopped counting: then the command counts alone. One that has
-not moved since the robot set off shows how old the observations are.
+An odometer that reads exactly what it read before, or where its noise goes on less than half of what was commanded, has
+stopped counting: then the command counts alone. One that has not moved since the robot set off shows how old the
+observations are.
 """
 
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.stations import slip_sizes
@@ -16,6 +17,7 @@ from subterra_jax.state import EnvParams
 
 # Weight of the odometer for ring counting; its errors and the command's are independent: 2 % + 1 % and 2 % + 2 %.
 ODOMETER_SHARE = 0.6
+_LEAST_COMMAND, _STILL_SHARE = 0.03, 0.5  # m, 1; half of a step is five standard deviations at full speed
 
 
 @struct.dataclass
@@ -63,6 +65,8 @@ def reckon(
     """
     moved, turned = obs.distance - before.distance, wrap(obs.heading - before.heading)
     still = (moved == 0.0) & (turned == 0.0)
+    if obs.start is not None:
+        still = seems_still(moved, speed * period)
     waiting = jnp.where(still, before.waiting, 0.0)
     late = (waiting > 0.0) & (speed > 0.0)
     delay = jnp.minimum(before.delay + late.astype(jnp.int32), MAX_DELAY)
@@ -71,6 +75,16 @@ def reckon(
     distance = jnp.where(waiting > 0.0, 0.0, share * moved + (1.0 - share) * speeds[delay] * period)
     turn = jnp.where(waiting > 0.0, 0.0, jnp.where(still, jnp.nan, turned))
     return distance, turn, Reckoning(obs.distance, obs.heading, speeds, delay, waiting)
+
+
+def seems_still(read: Float[Array, "*env"], commanded: Float[Array, "*env"]) -> Bool[Array, "*env"]:
+    """Tell whether an odometer seems to have stopped counting, where its noise goes on (tasks of version 1).
+
+    Args:
+        read: Distance added in a step, m.
+        commanded: Distance commanded in that step, m; below 3 cm noise of 1 cm would decide.
+    """
+    return (commanded > _LEAST_COMMAND) & (jnp.abs(read) < _STILL_SHARE * commanded)
 
 
 def unobserved_distance(now: Reckoning, period: Float[Array, ""]) -> Float[Array, ""]:

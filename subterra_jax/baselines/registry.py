@@ -10,6 +10,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
+from subterra_jax.baselines.ceiling import NAME as BAYES
+from subterra_jax.baselines.ceiling import ceiling
 from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import particle_agent
@@ -106,3 +108,4 @@ register("ring-filter", ring_filter)
 _navigator(CEILING, Truth(), CentreLine())
 register("scan-matching", scan_matching)
 register("particle-filter", particle_agent)
+register(BAYES, ceiling)

@@ -16,7 +16,7 @@ from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven, Station, told_start
 from subterra_jax.baselines.steering import CentreLine, find_walls
 from subterra_jax.lidar import bearings
 from subterra_jax.state import EnvParams
@@ -283,9 +283,7 @@ class ScanMatcher:
         """Begins at the believed start, on an axis that is taken to be straight."""
         zero, corridor = jnp.zeros(()), find_walls(obs.ranges, params)
         half_width = 0.5 * (corridor.left + corridor.right)
-        pose = AxisPose(
-            jnp.asarray(params.start.station, jnp.float32), corridor.offset, corridor.angle, zero, half_width
-        )
+        pose = AxisPose(told_start(obs, params), corridor.offset, corridor.angle, zero, half_width)
         lasting = self.motion.scale_sigma**2 + self.motion.wander.sigma**2
         return MatchMemory(
             profile=empty_profile(),

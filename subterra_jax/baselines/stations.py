@@ -52,12 +52,17 @@ def odometry_sigma(distance: Float[Array, ""], steps: Float[Array, ""], params: 
     return jnp.sqrt(variance + wander_variance(distance, odometry.wander))
 
 
-def believed_start(params: EnvParams) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def told_start(obs: Observed, params: EnvParams) -> Float[Array, ""]:
+    """Return the station of the start as it is told, m."""
+    return jnp.asarray(params.start.station if obs.start is None else obs.start, jnp.float32)
+
+
+def believed_start(obs: Observed, params: EnvParams) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the believed station of the start and its standard deviation, m; anywhere, where that is the task."""
     if params.errand == "report":
         room = params.tunnel.length - 2.0 * params.goal.margin
         return 0.5 * params.tunnel.length, room / jnp.sqrt(12.0)
-    return jnp.asarray(params.start.station, jnp.float32), jnp.asarray(params.start.station_sigma, jnp.float32)
+    return told_start(obs, params), jnp.asarray(params.start.station_sigma, jnp.float32)
 
 
 @struct.dataclass
@@ -141,7 +146,7 @@ def _add_step(memory: Count, step: Float[Array, ""], driven: Driven, reading: Fl
 def _start(obs: Observed, params: EnvParams) -> Count:
     """Begins at the believed start."""
     zero = jnp.zeros(())
-    return Count(*believed_start(params), zero, zero, obs.distance)
+    return Count(*believed_start(obs, params), zero, zero, obs.distance)
 
 
 def _station(memory: Count, sigma: Float[Array, ""], driven: Driven) -> Station:

@@ -1,6 +1,7 @@
 """The parts of an environment, one file each; `part.py` is their contract."""
 
-from subterra_jax.parts.boxes import Obstacles
+from subterra_jax.parts.boxes import Obstacles, ObstaclesAhead
+from subterra_jax.parts.drawn_faults import DrawnFaultParams, DrawnFaults
 from subterra_jax.parts.faults import Faults
 from subterra_jax.parts.imu import Imu, ImuParams
 from subterra_jax.parts.odometer import Odometer
@@ -11,6 +12,8 @@ from subterra_jax.parts.spatial_lidar import SpatialLidar, SpatialParams, make_s
 from subterra_jax.parts.unicycle import Unicycle
 
 __all__ = [
+    "DrawnFaultParams",
+    "DrawnFaults",
     "Drive",
     "Faults",
     "Imu",
@@ -19,6 +22,7 @@ __all__ = [
     "Moved",
     "Noise",
     "Obstacles",
+    "ObstaclesAhead",
     "Odometer",
     "Part",
     "PlanarLidar",

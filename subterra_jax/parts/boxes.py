@@ -189,3 +189,46 @@ class Obstacles(Part):
     def boxes(self, own: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
         """Return the boxes within a LiDAR's reach."""
         return [boxes_near(own, station, REACH, N_SLOTS, tunnel, params.obstacles)]
+
+
+@struct.dataclass
+class ClearStartState:
+    """Boxes of an episode that begins inside.
+
+    Attributes:
+        seed: Seed of the boxes.
+        start: Station of the start, m.
+    """
+
+    seed: UInt32[Array, ""]
+    start: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class ObstaclesAhead(Obstacles):
+    """Boxes ahead of a start that may lie anywhere: `obstacles.first` is a distance from the start."""
+
+    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> Any:
+        """Return the seed, and where the boxes begin."""
+        return ClearStartState(draw[0], state.station)
+
+    def clearance(self, own: Any, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Array:
+        """Measure the distance to the nearest box, m."""
+        return super().clearance(own.seed, position, station, tunnel, self._ahead(own, params))
+
+    def hits(
+        self, own: Any, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
+    ) -> Float[Array, "n_beams"]:
+        """Measure where beams meet boxes, m."""
+        return super().hits(own.seed, sight, directions, self._ahead(own, params))
+
+    def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
+        """Return the boxes within a LiDAR's reach."""
+        return super().boxes(own.seed, station, tunnel, self._ahead(own, params))
+
+    def _ahead(self, own: ClearStartState, params: EnvParams) -> EnvParams:
+        """Params of the boxes of an episode."""
+        sizes = params.obstacles
+        return dataclasses.replace(
+            params, parts=params.parts.copy({"obstacles": sizes.replace(first=sizes.first + own.start)})
+        )

@@ -11,6 +11,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.stations import told_start
 from subterra_jax.policies import senses
 from subterra_jax.policies.files import Conditions
 from subterra_jax.state import EnvParams
@@ -165,7 +166,7 @@ class Recurrent:
     ) -> tuple[Action, RecurrentMemory]:
         """Returns the action of one control period, and the memory after it."""
         del key, known
-        return self.answer(memory, obs, jnp.asarray(params.start.station, jnp.float32))
+        return self.answer(memory, obs, told_start(obs, params))
 
     def answer(self, memory: RecurrentMemory, obs: Observed, start: Float[Array, ""]) -> tuple[Action, RecurrentMemory]:
         """Returns action and memory, from the observation and the believed start (m)."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from typing import Any
 
 import numpy as np
 
@@ -50,6 +51,19 @@ def levels_of(kind: str, split: str) -> tuple[str, ...]:
     if kind not in HELD_OUT:
         return LEVELS
     return tuple(level for level in LEVELS if (level == HELD_OUT[kind]) == (split == UNSEEN))
+
+
+def figures() -> dict[str, Any]:
+    """Return every number that defines the open world, as plain values: kinds, splits, alignments, grades."""
+    return {
+        "kinds": {name: dataclasses.asdict(kind) for name, kind in KINDS.items()},
+        "length": LENGTH,
+        "splits": SPLITS,
+        "held_out": HELD_OUT,
+        "line": dataclasses.asdict(LINE),
+        "grade": (GRADE_SD, GRADE_MOST, GRADE_WAVE),
+        "share": _HALF,
+    }
 
 
 @dataclasses.dataclass(frozen=True)

@@ -166,7 +166,7 @@ def _start_recording(
         radius=float(params.vehicle.radius),
         range_max=float(params.lidar.range_max),
         length=float(params.tunnel.length),
-        start=float(params.start.station),
+        start=float(obs[fields["start"]][0]) if "start" in fields else float(params.start.station),
         goal=float(obs[fields["goal"]][0]) if "goal" in fields else np.nan,
         success=0.0,
         contact=0.0,

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax import tasks
+from subterra_jax.procedural import open_world
 
 Value = float | int | list[float] | None
 
@@ -157,6 +159,25 @@ WALKING: dict[str, Value] = {
     "fall_height": 0.25,
     "fall_tilt": 1.0,
 }
+INSIDE: dict[str, Value] = {
+    **WITH_GOAL,
+    **LONG,
+    "goal.margin": 40.0,
+    "goal.low": 60.0,
+    "goal.high": 320.0,
+    "goal.flag_reach": 2.0,
+    "start.station_sigma": 0.0,
+    "told.pitch_error": 0.0,
+}
+HIDDEN: dict[str, Value] = {"start.station_sigma": 3.0}
+DRAWN_FAULTS: dict[str, Value] = {
+    **FAULTS,
+    "faults.dropout_share": 0.5,
+    "faults.delay": 2.4,
+    "faults.spread": 2.0 / 3.0,
+    "faults.origin_distance": 0.05,
+    "faults.origin_heading": 0.005,
+}
 TABLE: dict[str, dict[str, Value]] = {
     "Subterra/Traverse-v0": {**TRAVERSE, "horizon": 3000},
     "Subterra/TraverseShort-v0": {**TRAVERSE, "horizon": 600},
@@ -179,12 +200,39 @@ TABLE: dict[str, dict[str, Value]] = {
     "Subterra/FaultedShort-v0": {**WITH_GOAL, **SHORT_GOALS, **AT_MOUTH, **FAULTS, "horizon": 1000},
     "Subterra/Relocalise-v0": {**WITH_GOAL, **LONG, **CLEAR, "goal.travel_max": 120.0, "horizon": 2000},
     "Subterra/RelocaliseShort-v0": {**WITH_GOAL, **SHORT, **CLEAR, "goal.travel_max": 40.0, "horizon": 1000},
+    "Subterra/StopAt-v1": {**INSIDE, **CLEAR, "horizon": 4000},
+    "Subterra/Return-v1": {**INSIDE, **CLEAR, "horizon": 8000},
+    "Subterra/Obstructed-v1": {**INSIDE, **BOXES, "horizon": 4000},
+    "Subterra/Faulted-v1": {**INSIDE, **DRAWN_FAULTS, "horizon": 4000},
+    "Subterra/StopAtOffset-v1": {**INSIDE, **CLEAR, **HIDDEN, "horizon": 4000},
+    "Subterra/ReturnOffset-v1": {**INSIDE, **CLEAR, **HIDDEN, "horizon": 8000},
+    "Subterra/ObstructedOffset-v1": {**INSIDE, **BOXES, **HIDDEN, "horizon": 4000},
+    "Subterra/FaultedOffset-v1": {**INSIDE, **DRAWN_FAULTS, **HIDDEN, "horizon": 4000},
+    "Subterra/StopAtShort-v1": {
+        **INSIDE,
+        **CLEAR,
+        "goal.low": 10.0,
+        "goal.high": 60.0,
+        "goal.tolerance": 0.25,
+        "horizon": 1000,
+    },
+    "Subterra/Relocalise-v1": {
+        **WITH_GOAL,
+        **LONG,
+        **CLEAR,
+        "goal.margin": 95.0,
+        "goal.travel_max": 60.0,
+        "horizon": 2000,
+    },
     "Subterra/B2Traverse-v0": WALKING_MISSION,
     "Subterra/B2Walk-v0": WALKING,
 }
 # m: the whole packaged tunnel, or its first metres.
-LENGTHS = {"Subterra/TraverseShort-v0": 60.0} | {name: 65.0 for name in TABLE if "Short" in name and "Trav" not in name}
-SHA256 = "4b15c44cfe5a7868cd04351a9c76ef4636ff32a818d761decc365b4d8056280d"
+LENGTHS = {"Subterra/TraverseShort-v0": 60.0} | {
+    name: 65.0 for name in TABLE if "Short-v0" in name and "Trav" not in name
+}
+SHA256 = "c60f594132b7d16b611d10e51dc1adaafe8f00aac06ae8af253f8f70766bb891"
+VERSION_1_SHA256 = "10843af873f83497ba645cf3d882f05ea2b9973a6571829b014f71f05ee68ace"
 BENCHMARK_SHA256 = "83b420fe7ff1f64a0aee373733478697f68eade60d249f8c3393ff29f9b263bb"
 
 
@@ -234,6 +282,17 @@ def test_a_task_has_the_constants_of_the_table(id):
 
 def test_the_digest_of_the_benchmark_is_the_one_that_results_are_comparable_under():
     assert st.constants_digest() == BENCHMARK_SHA256
+    assert st.constants_digest(version="v1") == VERSION_1_SHA256
+
+
+def test_half_of_a_number_of_the_open_world_is_another_digest(monkeypatch):
+    for name, value in (("LENGTH", (150.0, 3000.0)), ("HELD_OUT", {}), ("GRADE_SD", 0.005), ("_HALF", 0.25)):
+        with monkeypatch.context() as patched:
+            patched.setattr(open_world, name, value)
+            tasks._benchmark_digest.cache_clear()
+            assert st.constants_digest(version="v1") != VERSION_1_SHA256, name
+            assert st.constants_digest() == BENCHMARK_SHA256, "version 0 has no open world in it"
+    tasks._benchmark_digest.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -245,6 +304,9 @@ def test_the_digest_of_the_benchmark_is_the_one_that_results_are_comparable_unde
         "Subterra/Obstructed-v0",
         "Subterra/Faulted-v0",
         "Subterra/Relocalise-v0",
+        "Subterra/FaultedOffset-v1",
+        "Subterra/Obstructed-v1",
+        "Subterra/Relocalise-v1",
     ],
 )
 def test_half_of_any_constant_is_another_digest(id):

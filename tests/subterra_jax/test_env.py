@@ -44,7 +44,7 @@ def leaves_equal(a, b, **tolerance):
 
 
 @pytest.mark.parametrize("estimates", [False, True])
-@pytest.mark.parametrize("id", sorted(st.TASKS))
+@pytest.mark.parametrize("id", sorted(id for id in st.TASKS if id.endswith("-v0")))
 def test_every_task_gives_what_the_contract_says(id, estimates):
     env, params = st.make(id, estimates=estimates)
     n_obs = env.observation_size(params)
@@ -62,7 +62,7 @@ def test_every_task_gives_what_the_contract_says(id, estimates):
     assert described[0] == described[1]
 
 
-@pytest.mark.parametrize("id", sorted(st.TASKS))
+@pytest.mark.parametrize("id", sorted(id for id in st.TASKS if id.endswith("-v0")))
 def test_the_parts_of_an_observation_are_named_and_bounded(id):
     env, params = st.make(id)
     parts = list(env.fields(params).values())

@@ -25,7 +25,7 @@ from tests.subterra_jax import tunnels
 def test_the_list_is_the_one_whose_hash_is_known_and_holds_500_seeds_of_every_task():
     data = (resources.files("subterra_jax") / "data" / "evaluation.json").read_bytes()
     assert hashlib.sha256(data).hexdigest() == lists.SHA256
-    assert data == lists.draw_list(tuple(st.TASKS))
+    assert data == lists.draw_list(tuple(id for id in st.TASKS if id.endswith("-v0")))
     seeds = np.stack([lists.listed_seeds(task) for task in st.TASKS])
     assert seeds.shape == (len(st.TASKS), 500)
     assert len(np.unique(seeds)) == seeds.size

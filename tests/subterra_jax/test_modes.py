@@ -80,7 +80,7 @@ def test_the_same_episodes_come_out_and_an_agent_drives_alike():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", list(st.tasks.BUILT_IN))
+@pytest.mark.parametrize("task", [id for id in st.tasks.BUILT_IN if id.endswith("-v0")])
 @pytest.mark.parametrize("fused", [True, False])
 def test_the_same_episodes_of_every_task_come_out(task, fused):
     options: dict[str, Any] = {"horizon": 40, "lidar": LidarParams(fused=fused)}

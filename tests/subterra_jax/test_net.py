@@ -23,7 +23,7 @@ from tests.subterra_jax.probes import PROBES
 
 SPEED, PERIOD = 2.0, 0.1
 MANY, FEW = 3000, 400  # robots; two sizes only, or each would be compiled anew
-WITH_GOAL = tuple(name for name in st.TASKS if "Traverse" not in name)
+WITH_GOAL = tuple(name for name in st.TASKS if "Traverse" not in name and name.endswith("-v0"))
 
 
 @functools.cache

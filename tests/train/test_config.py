@@ -29,7 +29,7 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(name):
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu"])
-@pytest.mark.parametrize("task", st.TASKS)
+@pytest.mark.parametrize("task", [id for id in st.TASKS if id.endswith("-v0")])
 def test_every_task_has_presets_that_make_sense(task, preset):
     config = check(make_config(task, preset))
     assert preset == "cpu" or config.steps_per_iteration >= 1_000_000

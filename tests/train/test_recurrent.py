@@ -94,7 +94,7 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(name, value):
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu"])
-@pytest.mark.parametrize("task", st.TASKS)
+@pytest.mark.parametrize("task", [id for id in st.TASKS if id.endswith("-v0")])
 def test_every_task_has_a_preset_that_makes_sense(task, preset):
     check_recurrent(make_recurrent_config(task, preset))
 

@@ -25,7 +25,14 @@ from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.navigator import Navigator
-from subterra_jax.baselines.reckoning import Delay, StepDistances, advance_delay, begin_delay, delayed_distance
+from subterra_jax.baselines.reckoning import (
+    Delay,
+    StepDistances,
+    advance_delay,
+    begin_delay,
+    delayed_distance,
+    seems_still,
+)
 from subterra_jax.baselines.rings import bank
 from subterra_jax.baselines.rings.loop import RingMemory, begin_memory
 from subterra_jax.baselines.rings.walls import Bumps, Walls, begin_walls, track_walls
@@ -252,7 +259,10 @@ class RingFilter:
         """Advances by dead reckoning and a scan."""
         fused, reckoning = FusedCount().update(memory.reckoning, obs, driven, params, known)
         commanded = driven.speed * params.vehicle.period
-        moved = StepDistances(commanded, obs.distance - memory.reckoning.reading) * driven.cosine
+        read = obs.distance - memory.reckoning.reading
+        if obs.start is not None:
+            read = jnp.where(seems_still(read, commanded), 0.0, read)
+        moved = StepDistances(commanded, read) * driven.cosine
         pitch = jnp.asarray(obs.ring_pitch)
         loss = fault_sizes(params).wet_loss if self.wet else 0.0
         track = advance(memory.track, obs.ranges, moved, driven.direction, pitch, loss)

@@ -197,7 +197,7 @@ class RingMemory:
 
 def begin_memory(track: Any, obs: Observed, params: EnvParams) -> RingMemory:
     """Return the memory at the believed start."""
-    start = jnp.stack([jnp.asarray(value, jnp.float32) for value in stations.believed_start(params)])
+    start = jnp.stack([jnp.asarray(value, jnp.float32) for value in stations.believed_start(obs, params)])
     return RingMemory(start, track, FusedCount().begin(obs, params))
 
 

@@ -1,0 +1,135 @@
+"""The ceiling: a Bayes filter that has the exact map, the sizes of all noise, and those of the episode's faults.
+
+A particle filter whose every particle casts the whole scan in the true walls. It is no agent that anybody could send
+in: nobody is told how late the data or how slippery the rail of an episode is. Nothing else of the truth is read.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from subterra_jax import lidar
+from subterra_jax.baselines.agent import Known, Observed
+from subterra_jax.baselines.avoidance import steering_of
+from subterra_jax.baselines.cloud import log_weights, move, resample, summarise
+from subterra_jax.baselines.navigator import Navigator
+from subterra_jax.baselines.particle import FilterMemory, ParticleLocaliser, Relocaliser
+from subterra_jax.baselines.reckoning import Reckoning, reckon, unobserved_distance
+from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit
+from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.parts.faults import MAX_DELAY, N_SEVERITIES
+from subterra_jax.state import EnvParams
+from subterra_jax.tunnel import at_station
+
+NAME = "ceiling"
+_LEAST_SIGMA = 0.01  # m
+_ECHO = 1e-3  # m below `range_max`: no echo
+
+
+@struct.dataclass
+class ExactParams:
+    """Likelihood of a scan that was cast at a particle.
+
+    Attributes:
+        pose_sigma: Standard deviation that a particle's offset and heading add to a range, m.
+        power: Exponent of the likelihood: scans share the errors of the particles.
+        lost: Share of the echoes that are lost or false, where there are faults; elsewhere a tenth of it.
+    """
+
+    pose_sigma: float = 0.02
+    power: float = 0.5
+    lost: float = 0.2
+
+
+@struct.dataclass
+class ExactLocaliser(ParticleLocaliser):
+    """Estimates the station by particles that cast their scans in the exact map, and knows the faults' sizes.
+
+    Attributes:
+        exact: Settings of the likelihood.
+    """
+
+    exact: ExactParams = struct.field(default_factory=ExactParams)
+    privileged: bool = struct.field(pytree_node=False, default=True)
+
+    def update(
+        self, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
+    ) -> tuple[Station, FilterMemory]:
+        """Advances by dead reckoning and a scan, and resamples where few particles are left."""
+        move_key, draw_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), 1 + memory.step))
+        walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
+        before = with_known_delay(memory.reckoning, params, known)
+        distance, turn, reckoning = reckon(before, obs, driven.speed, self.odometer_share, period)
+        motion = self.motion
+        if known is not None and "fault_wet_loss" in known:
+            motion = dataclasses.replace(motion, slip_loss=params.faults.wet_loss * known["fault_wet_loss"])
+        cloud = move(move_key, memory.cloud, walls, distance, turn, motion)
+        _, pose = fit(walls, cloud.pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
+        cloud = dataclasses.replace(cloud, pose=pose)
+        cloud = log_weights(cloud, exact_likelihood(pose, obs.ranges, params, self.exact), motion)
+        summary = summarise(cloud, motion)
+        station = summary.station + unobserved_distance(reckoning, period) * jnp.cos(summary.heading)
+        direction = jnp.where(jnp.cos(summary.heading) > 0.0, 1.0, -1.0)
+        estimate = Station(station, jnp.log(jnp.maximum(summary.sigma, _LEAST_SIGMA)), direction)
+        return estimate, FilterMemory(resample(draw_key, cloud, motion), reckoning, memory.step + 1)
+
+
+def with_known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reckoning:
+    """Return the dead reckoning with the delay that the episode has, where faults are drawn."""
+    if known is None or "fault_delay" not in known:
+        return before
+    share = known["severity"] / (N_SEVERITIES - 1)
+    delay = jnp.clip(jnp.round(params.faults.delay * known["fault_delay"] * share), 0, MAX_DELAY).astype(jnp.int32)
+    return dataclasses.replace(before, delay=delay, waiting=jnp.zeros_like(before.waiting))
+
+
+def exact_likelihood(
+    pose: TunnelPose, ranges: Float[Array, "n_beams"], params: EnvParams, exact: ExactParams
+) -> Float[Array, "n"]:
+    """Compute the log likelihood of a scan at many poses, each by casting its beams in the walls.
+
+    Args:
+        pose: Poses, each field `(n,)`.
+        ranges: The scan, m.
+        params: The task in the tunnel that the robot is in.
+        exact: Settings of the likelihood.
+    """
+    tunnel, sensor = params.tunnel, params.lidar
+
+    def cast(station: Array, lateral: Array, heading: Array) -> Array:
+        x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
+        position = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x])
+        return lidar.scan(tunnel, position, heading + jnp.arctan2(tangent_y, tangent_x), station, sensor)
+
+    expected = jax.vmap(cast)(pose.station, pose.lateral, pose.heading)
+    lost = exact.lost if "faults" in params.parts else 0.1 * exact.lost
+    lost = exact.lost if "obstacles" in params.parts else lost
+    variance = jnp.asarray(sensor.range_sigma) ** 2 + exact.pose_sigma**2
+    square = (ranges - expected) ** 2 / variance
+    normal = jnp.exp(-0.5 * square) / jnp.sqrt(2.0 * jnp.pi * variance)
+    seen = jnp.log((1.0 - lost) * normal + lost / jnp.asarray(sensor.range_max))
+    silent, empty = ranges >= sensor.range_max - _ECHO, expected >= sensor.range_max - _ECHO
+    nothing = jnp.where(empty, jnp.log1p(-0.5 * lost), jnp.log(0.5 * lost))
+    return exact.power * jnp.sum(jnp.where(silent[None], nothing, seen), axis=-1)
+
+
+def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator | Relocaliser:
+    """Makes the ceiling of a task.
+
+    Args:
+        params: The task.
+        n_particles: Number of particles; None is 512, twice that where the start is hidden or rails may be wet, and
+            4,096 where it may be anywhere.
+    """
+    hidden = float(params.start.station_sigma.max()) > 0.0
+    usual = 4096 if params.errand == "report" else 1024 if hidden or "faults" in params.parts else 512
+    made = ParticleLocaliser.of(params, n_particles or usual)
+    fields = {field.name: getattr(made, field.name) for field in dataclasses.fields(made) if field.name != "privileged"}
+    localiser = ExactLocaliser(**{**fields, "scan": ScanModel(range_sigma=float(params.lidar.range_sigma))})
+    if params.errand == "report":
+        return Relocaliser(localiser, CentreLine(), name=NAME, privileged=True)
+    return Navigator(localiser, steering_of(params, CentreLine()), name=NAME, uses_map=True)

@@ -1,0 +1,137 @@
+"""Tasks of version 1: where they begin, what they tell, and that nothing gives a fault or the start away."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.baselines.agent import observed
+from subterra_jax.rules import Choice
+
+N = 2000
+SEES = 30.0  # m, reach of the LiDAR
+
+
+def begin(id, n=N, **overrides):
+    """Environment, params and the first states of many episodes in a smooth bore."""
+    env, params = st.make(id, tunnel="control", **overrides)
+
+    @jax.jit
+    def states(params):
+        return jax.vmap(env.begin, (0, None))(env.draw_reset(jax.random.key(3), (n,), params), params)
+
+    return env, params, states(params)
+
+
+@pytest.mark.parametrize("name", ["StopAt", "ReturnOffset"])
+def test_no_mouth_is_in_sight_of_a_start_or_a_goal(name):
+    _, params, state = begin(f"Subterra/{name}-v1")
+    length = float(params.tunnel.length)
+    for station in (state.station, state.goal.station):
+        assert float(station.min()) > SEES
+        assert length - float(station.max()) > SEES
+    assert float(state.goal.told.min()) == pytest.approx(40.0, abs=1.0)
+    assert length - float(state.goal.station.max()) == pytest.approx(40.0, abs=1.0)
+    distance = state.goal.station - state.goal.told
+    room = min(320.0, length - 80.0)
+    assert float(distance.min()) == pytest.approx(60.0, abs=1.0)
+    assert float(distance.max()) == pytest.approx(room, abs=1.0)
+    assert float(distance.mean()) == pytest.approx(0.5 * (60.0 + room), rel=0.03)
+
+
+def test_no_mouth_comes_into_sight_within_the_travel_of_a_relocalisation():
+    _, params, state = begin("Subterra/Relocalise-v1")
+    margin = SEES + float(params.goal.travel_max)
+    assert float(state.station.min()) > margin
+    assert float(state.station.max()) < float(params.tunnel.length) - margin
+
+
+def test_a_hidden_start_is_off_by_three_metres_and_a_known_one_by_nothing():
+    _, _, known = begin("Subterra/StopAt-v1")
+    _, _, hidden = begin("Subterra/StopAtOffset-v1")
+    np.testing.assert_allclose(known.station, known.goal.told, rtol=1e-6)
+    off = np.asarray(hidden.station - hidden.goal.told)
+    assert off.std() == pytest.approx(2.97, rel=0.06)  # cut off at three standard deviations
+    assert abs(off.mean()) < 0.25
+    assert np.abs(off).max() <= 9.001
+
+
+def test_the_believed_start_is_observed_and_the_true_one_is_not():
+    env, params = st.make("Subterra/ReturnOffset-v1", tunnel="control")
+    flat, state = env.reset(jax.random.key(0), params)
+    obs = observed(env, params, flat)
+    assert float(obs.start) == float(state.goal.told)
+    assert float(obs.flag) == 0.0
+    far = np.abs(np.asarray(flat) - float(state.station)).min()
+    assert far > 0.1, "a number of the observation is the true station"
+
+
+def test_the_way_back_ends_at_the_station_that_was_told():
+    env, params = st.make("Subterra/ReturnOffset-v1", tunnel="control")
+    _, state = env.reset(jax.random.key(0), params)
+    raised = {**state.parts, "goal": state.goal.replace(flag=jnp.ones(()), still=jnp.full((), 99, jnp.int32))}
+    stands = lambda where: env.step(  # noqa: E731
+        jax.random.key(1), state.replace(station=where, parts=raised), jnp.zeros(2), params
+    )[-1]["goal_error"]
+    assert float(stands(state.station)) == pytest.approx(float(state.station - state.goal.told), abs=0.02)
+
+
+def test_a_chosen_start_is_told_and_keeps_the_distance_of_the_goal():
+    env, params = st.make("Subterra/StopAtOffset-v1", tunnel="control")
+    draws = env.draw_reset(jax.random.key(0), (), params)
+    drawn, placed = env.begin(draws, params), env.begin({**draws, "choice": Choice(station=50.0)}, params)
+    assert float(placed.station) == float(placed.goal.told) == 50.0
+    kept = float(placed.goal.station) - 50.0
+    assert kept == pytest.approx(float(drawn.goal.station - drawn.goal.told), abs=1e-3)
+
+
+def test_an_ablation_may_tell_a_wrong_ring_length():
+    told = st.rules.ToldParams(pitch_error=0.01)
+    env, params = st.make("Subterra/StopAt-v1", told=told)
+    flat, _ = env.reset(jax.random.key(0), params)
+    pitch = float(flat[env.fields(params)["ring_pitch"]][0])
+    assert pitch == pytest.approx(1.01 * float(params.tunnel.ring_pitch))
+
+
+def test_no_box_stands_at_the_start_and_many_stand_ahead():
+    env, params, state = begin("Subterra/Obstructed-v1", 300)
+    boxes = jax.vmap(lambda one: env.boxes(one, params)[0])(state)
+    apart = np.linalg.norm(np.asarray(boxes.centre) - np.asarray(state.position)[:, None], axis=-1)
+    reach = np.linalg.norm(np.asarray(boxes.half), axis=-1)
+    assert (apart - reach).min() > 6.0
+    assert np.mean((apart < 40.0).any(axis=1)) > 0.9
+
+
+def test_sizes_of_faults_are_drawn_over_their_ranges_and_not_observed():
+    env, params, state = begin("Subterra/Faulted-v1")
+    scale = np.asarray(state.faults.scale)
+    assert scale.min() == pytest.approx(1.0 / 3.0, abs=0.01)
+    assert scale.max() == pytest.approx(5.0 / 3.0, abs=0.01)
+    np.testing.assert_allclose(np.corrcoef(scale.T), np.eye(scale.shape[1]), atol=0.1)
+    assert set(env.fields(params)) == {"ranges", "odometry", "goal", "ring_pitch", "start"}
+
+
+def test_frozen_and_late_readings_carry_noise_and_begin_anywhere():
+    env, params = st.make("Subterra/Faulted-v1", tunnel="control")
+    worst = params.replace(faults=params.faults.replace(severity_low=4, severity_high=4, freeze_rate=0.2))
+    where = env.fields(params)["odometry"]
+
+    @jax.jit
+    def readings(key, command):
+        first, state = env.reset(key, worst)
+
+        def step(state, key):
+            flat, state, *_ = env.step(key, state, jnp.stack([command, 0.0]), worst)
+            return state, (flat[where], state.faults.freeze_left)
+
+        _, (seen, frozen) = jax.lax.scan(step, state, jax.random.split(key, 60))
+        return jnp.concatenate([first[where][None], seen]), frozen
+
+    command = jnp.repeat(jnp.array([0.0, 2.0]), 48)
+    seen, frozen = jax.vmap(readings)(jax.random.split(jax.random.key(1), 96), command)
+    change = np.diff(np.asarray(seen), axis=1)
+    assert (np.asarray(frozen) > 0.0).mean() > 0.3
+    assert not (change == 0.0).any(), "an exact zero"
+    assert not (np.asarray(seen)[:, 0] == 0.0).any(), "a first reading of 0 tells that nothing is late"
+    assert change[:48, :, 0].std() == pytest.approx(0.01, rel=0.05), "frozen or not, the noise of one step"
