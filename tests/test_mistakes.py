@@ -111,7 +111,7 @@ MISTAKES = {
     "benchmarks.rays.peers --scene none": "none: is no built scene",
     "benchmarks.rays.peers --scene empty --robots 0": "robots must be at least 1",
     "benchmarks.reproduce --jobs moon --out o": "no job 'moon'",
-    "benchmarks.slam": "Expected one of {record, arena, run, score}",
+    "benchmarks.slam": "Expected one of {record, arena, run, board, score}",
     "benchmarks.slam arena": "missing: --out",
     "benchmarks.slam arena --out o --courses moon": "no course 'moon'; there are walls-smooth",
     "benchmarks.slam arena --out o --distance nan": "distance must lie between 5 and 500 m, got nan",

@@ -17,6 +17,9 @@ from rich.table import Table
 from benchmarks.command import run_main
 from benchmarks.results import environment_facts, png_bytes, write_file
 from benchmarks.slam.arena.sets import ArenaConfig, make_arena
+from benchmarks.slam.board import BoardConfig, make_board
+from benchmarks.slam.board_page import as_markdown as board_markdown
+from benchmarks.slam.board_page import as_png as board_png
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import SCHEMA, ProgramScore, ScoreConfig, score_all
@@ -33,6 +36,9 @@ Example: {_PROG} arena --out out/arena"""
 _RUN = f"""Run a LiDAR odometry library on recordings.
 
 Example: {_PROG} run --library kiss-icp --recordings out/slam/set --out out/slam/kiss-icp"""
+_BOARD = f"""Run and score every program on sets of the arena.
+
+Example: {_PROG} board --sets out/arena --out out/board --jobs 2"""
 _SCORE = f"""Score TUM files against the truth.
 
 Example: {_PROG} score --estimate out/slam/kiss-icp --truth out/slam/set/truth --out out/slam/scores"""
@@ -41,6 +47,7 @@ Command = (
     Annotated[SetConfig, tyro.conf.subcommand("record", description=_RECORD)]
     | Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
     | Annotated[RunConfig, tyro.conf.subcommand("run", description=_RUN)]
+    | Annotated[BoardConfig, tyro.conf.subcommand("board", description=_BOARD)]
     | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
 )
 _HEAD = (
@@ -51,7 +58,7 @@ _PANELS = (("along the axis", 0), ("across it", 1))
 _STYLES = ("-", "--", ":", "-.")
 
 
-def main(config: SetConfig | ArenaConfig | RunConfig | ScoreConfig) -> None:
+def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | ScoreConfig) -> None:
     """Records, runs or scores.
 
     Raises:
@@ -63,6 +70,10 @@ def main(config: SetConfig | ArenaConfig | RunConfig | ScoreConfig) -> None:
     elif isinstance(config, RunConfig):
         for name, result in run_all(config):
             _progress.print(f"{name}: {result}")
+    elif isinstance(config, BoardConfig):
+        for name, result in make_board(config):
+            _progress.print(f"{name}: {result}")
+        _write_board(config.out)
     else:
         scores = score_all(config)
         if config.out is not None:
@@ -85,6 +96,14 @@ def _write(folder: Path, scores: list[ProgramScore]) -> None:
     write_file(folder / "scores.json", as_json(scores, environment_facts()).encode())
     write_file(folder / "scores.md", as_markdown(scores).encode())
     write_file(folder / "scores.png", as_png(scores))
+
+
+def _write_board(folder: Path) -> None:
+    """Writes a board's table and figure beside its `board.json`, and prints the table."""
+    board = json.loads((folder / "board.json").read_text())
+    write_file(folder / "board.md", board_markdown(board).encode())
+    write_file(folder / "board.png", board_png(board))
+    print(board_markdown(board))
 
 
 def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:

@@ -104,6 +104,7 @@ class Score:
         rpe: Spread of the pieces' errors, m.
         ape: Spread of the position errors, m.
         ape_turn: Spread of the attitude errors, °.
+        reach: Distance driven when the error of the station first exceeds 1 m, m; `None` where it never does.
     """
 
     name: str
@@ -124,6 +125,7 @@ class Score:
     rpe: Spread | None
     ape: Spread
     ape_turn: Spread
+    reach: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the score for JSON."""
@@ -179,9 +181,18 @@ def score_track(track: Track, axis: Axis, alignment: str, piece: float, name: st
         axis=axis.source, along_final=float(parts[-1, 0]), along_rms=rms(parts[:, 0]), across_rms=rms(parts[:, 1]),
         up_rms=rms(parts[:, 2]), drift=100.0 * abs(float(parts[-1, 0])) / distance if distance > 0.0 else None,
         piece=piece, ape=Spread.of(np.linalg.norm(error, axis=1)), ape_turn=Spread.of(np.degrees(turn)),
-        **_pieces(track, axis, piece),
+        reach=reach_of(travelled, parts[:, 0]), **_pieces(track, axis, piece),
     )  # fmt: skip
     return score, Curve(travelled, parts)
+
+
+REACH_ERROR = 1.0  # m
+
+
+def reach_of(travelled: Float[np.ndarray, " n"], along: Float[np.ndarray, " n"]) -> float | None:
+    """Returns the distance driven when the error of the station first exceeds 1 m, m; `None` where it never does."""
+    beyond = np.flatnonzero(np.abs(along) > REACH_ERROR)
+    return float(travelled[beyond[0]]) if len(beyond) else None
 
 
 def _pieces(track: Track, axis: Axis, piece: float) -> dict[str, Any]:

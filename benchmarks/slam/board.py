@@ -1,0 +1,158 @@
+"""The arena's board: every program on every recording of some sets, scored, as a table and as the dial's figure."""
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.command import BenchmarkError, require_least
+from benchmarks.results import environment_facts, write_file
+from benchmarks.slam.arena.bound import find_floor
+from benchmarks.slam.arena.record import Course, draw_scene
+from benchmarks.slam.arena.sets import ArenaConfig, course_seed
+from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
+from benchmarks.slam.recordings import INDEX, TRUTH, recordings_in
+from benchmarks.slam.run import WHEELS
+from benchmarks.slam.score import TRUTH_FILE, score_files
+from subterra_jax.host.files import replace_file
+
+SCHEMA = "subterra.arena-board/1"
+LEAST_COVERED = 0.9  # share of a recording below which a program counts as failed on it
+
+
+@dataclass(frozen=True)
+class BoardConfig:
+    """Settings of a board.
+
+    Attributes:
+        sets: Sets of the arena with their truth, one for each seed.
+        out: Folder for poses, `board.json`, `board.md` and `board.png`.
+        programs: Programs to run; by default all, the odometer included.
+        jobs: Programs run at a time.
+        limit: Time after which a program counts as failed on a recording, s.
+    """
+
+    sets: tuple[Path, ...]
+    out: Path
+    programs: tuple[str, ...] = (WHEELS, *PROGRAMS)
+    jobs: int = 1
+    limit: float = 1800.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One program on one recording of one set."""
+
+    program: str
+    folder: Path
+    place: Path  # Folder of its poses and facts
+
+    @property
+    def truth(self) -> Path:
+        """File of the true poses."""
+        return self.folder.parent.parent / TRUTH / self.folder.name / TRUTH_FILE
+
+
+def plan_board(config: BoardConfig) -> list[Case]:
+    """Returns the cases of a board.
+
+    Raises:
+        BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, or two have one
+            name.
+    """
+    require_least(config, jobs=1)
+    if not config.sets or not config.programs:
+        raise BenchmarkError("sets and programs must name at least one")
+    if len({folder.name for folder in config.sets}) < len(config.sets):
+        raise BenchmarkError("sets must differ in the last part of their names")
+    for name in config.programs:
+        if name not in (*PROGRAMS, WHEELS):
+            raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *PROGRAMS])}")
+        if name != WHEELS:
+            find_program(name)
+    cases = []
+    for folder in config.sets:
+        for name, bag in recordings_in(folder):
+            place = config.out / "poses" / folder.name
+            cases += [Case(program, bag.parent, place / program) for program in config.programs]
+            if not cases[-1].truth.is_file():
+                raise BenchmarkError(f"{folder}: holds no truth of {name}")
+    return cases
+
+
+def make_board(config: BoardConfig) -> Iterator[tuple[str, str]]:
+    """Runs and scores what is missing; yields each case and its result; writes `board.json` at the end.
+
+    Raises:
+        BenchmarkError: See `plan_board`.
+    """
+    cases = plan_board(config)
+    # The slowest programs begin first, so that the last case does not wait for one of them.
+    order = sorted(cases, key=lambda one: one.program not in ("evalio-form", "evalio-genz", "evalio-ct"))
+    with ThreadPoolExecutor(config.jobs) as pool:
+        futures = {pool.submit(_run, one, config.limit): one for one in order}
+        for future in as_completed(futures):
+            one = futures[future]
+            yield f"{one.place.parent.name} {one.folder.name} {one.program}", _said(future.result())
+    rows = [row | read_case(one) for one in cases if (row := _labels(one))]
+    floors = [_floor(folder, name) for folder in config.sets for name, _ in recordings_in(folder)]
+    content = {"schema": SCHEMA, **environment_facts(), "versions": _versions(config), "rows": rows, "floors": floors}
+    write_file(config.out / "board.json", (json.dumps(content, indent=1, default=str) + "\n").encode())
+
+
+def _run(case: Case, limit: float) -> dict[str, Any]:
+    """Runs a case unless its facts are there; returns them."""
+    facts, target = case.place / f"{case.folder.name}.json", case.place / f"{case.folder.name}.tum"
+    if facts.is_file():
+        return json.loads(facts.read_text())
+    case.place.mkdir(parents=True, exist_ok=True)
+    if case.program == WHEELS:
+        with replace_file(target) as fresh:
+            fresh.write_bytes((case.folder / "recording" / "odometry.tum").read_bytes())
+        result: dict[str, Any] = {}
+    else:
+        result = run_program(case.program, case.folder, target, limit)
+    write_file(facts, (json.dumps(result) + "\n").encode())
+    return result
+
+
+def _said(result: dict[str, Any]) -> str:
+    return f"failed: {result['failed']}" if "failed" in result else f"{result.get('seconds', 0.0):.0f} s"
+
+
+def _labels(case: Case) -> dict[str, Any]:
+    return {"set": case.place.parent.name, "recording": case.folder.name, "program": case.program}
+
+
+def read_case(case: Case) -> dict[str, Any]:
+    """Returns the facts and the score of a case that was run."""
+    facts = _run(case, 0.0)
+    target = case.place / f"{case.folder.name}.tum"
+    if "failed" in facts:
+        return facts
+    try:
+        score, _ = score_files(target, case.truth)
+    except BenchmarkError as error:
+        return facts | {"failed": str(error)}
+    if score.covered < LEAST_COVERED:
+        facts = facts | {"failed": f"gives poses over {100.0 * score.covered:.0f} % of the recording only"}
+    kept = ("distance", "covered", "drift", "along_final", "across_rms", "up_rms", "reach")
+    return facts | {name: getattr(score, name) for name in kept} | {"along_rms": score.along_rms}
+
+
+def _floor(folder: Path, name: str) -> dict[str, Any]:
+    """Returns the floor of a recording, which is drawn again from the settings beside its truth."""
+    settings = json.loads((folder / TRUTH / INDEX).read_text())
+    facts = json.loads((folder / TRUTH / name / "course.json").read_text())
+    course = Course(**{key: facts[key] for key in ("name", "walls", "sensor", "motion", "dust", "distance")})
+    config = replace(ArenaConfig(folder), seed=settings["seed"], secret=settings["secret"])
+    floor = find_floor(draw_scene(course, np.random.SeedSequence(course_seed(config, course).entropy)))
+    return {"set": folder.name, "recording": name, **floor._asdict(), "walls": course.walls, "sensor": course.sensor}
+
+
+def _versions(config: BoardConfig) -> dict[str, str]:
+    return {name: find_program(name) for name in config.programs if name != WHEELS}

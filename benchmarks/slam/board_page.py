@@ -1,0 +1,132 @@
+"""The arena's board as a Markdown table and as the figure of the dial."""
+
+from collections.abc import Callable
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from benchmarks.results import png_bytes
+
+Row = dict[str, Any]
+_DIAL = ("walls-smooth", "walls-joints", "walls-pockets", "walls-furnished", "walls-sprayed")
+_BEAMS = ("beams-06", "walls-furnished", "beams-32", "beams-64")
+_DUST = ("walls-furnished", "dust-half", "dust-lock")
+_REST = ("motion-walk", "motion-b2")
+_NAMES = {
+    "walls-smooth": "smooth", "walls-joints": "joints", "walls-pockets": "pockets", "walls-furnished": "furnished",
+    "walls-sprayed": "sprayed", "beams-06": "6 beams", "beams-32": "32 beams", "beams-64": "64 beams",
+    "dust-half": "thin dust", "dust-lock": "own cloud", "motion-walk": "walked", "motion-b2": "B2",
+}  # fmt: skip
+_LEAST = 3e-5  # m per 100 m, lower end of the figure
+
+
+def median_drift(rows: list[Row], program: str, recording: str) -> tuple[float, float, float] | None:
+    """Returns median, least and largest axial drift per 100 m over the sets, m; `None` where a run failed."""
+    some = [row for row in rows if row["program"] == program and row["recording"] == recording]
+    if not some or any("failed" in row for row in some):
+        return None
+    values = [float(row["drift"]) for row in some]
+    return float(np.median(values)), min(values), max(values)
+
+
+def as_markdown(board: dict[str, Any]) -> str:
+    """Returns the table, drift per 100 m for each program and recording, and the failures with their reasons."""
+    rows, names = board["rows"], [name for name in _NAMES if any(row["recording"] == name for row in board["rows"])]
+    programs = list(dict.fromkeys(row["program"] for row in rows))
+    head = ["program", *(_NAMES[name] for name in names), "across, m", "reach, m", "of real time"]
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    for program in sorted(programs, key=lambda one: _rank(rows, one)):
+        cells = [_cell(median_drift(rows, program, name)) for name in names]
+        lines.append(f"| {' | '.join([program, *cells, *_sums(rows, program)])} |")
+    floors = [_of(board["floors"], name, "drift") for name in names]
+    lines.append(f"| *floor* | {' | '.join(f'{value:.4f}' for value in floors)} | | | |")
+    note = (
+        "Axial drift, m per 100 m: median of the sets (least to largest). *Across*: RMS, median of all recordings. "
+        "*Reach*: distance driven before 1 m of axial error, median of the recordings where it is exceeded."
+    )
+    failed = [f"- {row['program']} on {row['recording']} of {row['set']}: {row['failed']}" for row in rows
+              if "failed" in row]  # fmt: skip
+    return "\n".join([*lines, "", note, "", *(["Failed:", "", *failed, ""] if failed else [])])
+
+
+def _rank(rows: list[Row], program: str) -> float:
+    """Returns the median drift over all recordings; failures come last."""
+    values = [row["drift"] if "failed" not in row else 1e9 for row in rows if row["program"] == program]
+    return float(np.median(values))
+
+
+def _cell(values: tuple[float, float, float] | None) -> str:
+    if values is None:
+        return "failed"
+    middle, low, high = (f"{value:.2f}" if value < 10.0 else f"{value:.0f}" for value in values)
+    return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def _sums(rows: list[Row], program: str) -> list[str]:
+    some = [row for row in rows if row["program"] == program and "failed" not in row]
+    reach = [row["reach"] for row in some if row["reach"] is not None]
+    share = [row["share"] for row in some if "share" in row]
+    parts = ([row["across_rms"] for row in some], reach, share)
+    texts: tuple[Callable[[float], str], ...] = (
+        lambda v: f"{v:.3f}", lambda v: f"{v:.0f} ({len(reach)}/{len(some)})", lambda v: f"{100.0 * v:.0f} %",
+    )  # fmt: skip
+    return [text(float(np.median(values))) if values else "" for text, values in zip(texts, parts, strict=True)]
+
+
+def _of(floors: list[Row], recording: str, name: str) -> float:
+    return float(np.median([row[name] for row in floors if row["recording"] == recording]))
+
+
+def draw_board(board: dict[str, Any]) -> Figure:
+    """Draws axial drift per 100 m against walls, beams, dust and carriers, beside the floor."""
+    rows = board["rows"]
+    held = {row["recording"] for row in rows}
+    groups = [("walls", _DIAL), ("beams, furnished", _BEAMS), ("dust, furnished", _DUST), ("carried by", _REST)]
+    panels = [(title, [name for name in names if name in held]) for title, names in groups]
+    panels = [(title, names) for title, names in panels if names]
+    widths = [max(1.2, len(names)) for _, names in panels]
+    figure, axes = plt.subplots(
+        1, len(panels), figsize=(11.0, 5.2), sharey=True, width_ratios=widths, layout="constrained", squeeze=False
+    )
+    for panel, (title, names) in zip(axes[0], panels, strict=True):
+        _draw_panel(panel, board, title, names)
+    axes[0, 0].set_ylabel("axial drift, m per 100 m")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+    return figure
+
+
+def _draw_panel(axes: Axes, board: dict[str, Any], title: str, names: list[str]) -> None:
+    rows, colours = board["rows"], plt.get_cmap("tab10")
+    at = np.arange(len(names))
+    programs = list(dict.fromkeys(row["program"] for row in rows))
+    for k, program in enumerate(programs):
+        found = [median_drift(rows, program, name) or (np.nan,) * 3 for name in names]
+        middle, low, high = np.maximum(np.array(found, float), _LEAST).T
+        place, wheels = at + 0.05 * (k - 0.5 * len(programs)), program == "wheel-odometry"
+        axes.errorbar(
+            place, middle, [middle - low, high - middle], marker="s" if wheels else "o", ms=4, lw=1.2, capsize=2,
+            color="0.3" if wheels else colours(k % 10), ls=":" if wheels else "-", label=program,
+        )  # fmt: skip
+    floor = [_of(board["floors"], name, "drift") for name in names]
+    axes.plot(at, np.maximum(floor, _LEAST), "k--", lw=1.4, label="floor")
+    axes.set_yscale("log")
+    axes.set_ylim(_LEAST, 300.0)
+    axes.set_xticks(at, [_tick(name, title) for name in names], rotation=35, ha="right")
+    axes.set_title(title, fontsize=10)
+    axes.grid(alpha=0.3, which="major")
+    axes.axhline(100.0, color="0.7", lw=0.8)
+
+
+def _tick(recording: str, title: str) -> str:
+    """Returns the label of a recording; the furnished drive ends three scales."""
+    if recording != "walls-furnished" or title == "walls":
+        return _NAMES[recording]
+    return "16 beams" if title.startswith("beams") else "none"
+
+
+def as_png(board: dict[str, Any]) -> bytes:
+    """Returns the figure as a PNG file."""
+    return png_bytes(draw_board(board), dpi=130)

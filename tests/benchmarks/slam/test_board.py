@@ -1,0 +1,92 @@
+"""The arena's board: bounds along the dial, tables and figure, distances reached, mistakes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.command import BenchmarkError
+from benchmarks.slam import board, board_page
+from benchmarks.slam.arena import bound
+from benchmarks.slam.arena.record import Course, draw_scene
+from benchmarks.slam.score import reach_of
+from tests.benchmarks.slam.tracks import line, write_axis, write_tum
+
+
+def test_slopes_are_those_of_the_ranges_and_jumps_count_as_noise():
+    shift = bound._PLACES
+    slope, left = bound.fit_slopes(np.column_stack([3.0 - 0.4 * shift, np.where(shift > 0.0, 5.0, 4.0), 0.0 * shift]))
+    np.testing.assert_allclose(slope[[0, 2]], [-0.4, 0.0], atol=1e-12)
+    np.testing.assert_allclose(left[[0, 2]], 0.0, atol=1e-12)
+    assert left[1] > 0.05
+
+
+def test_the_dial_tells_more_the_rougher_the_walls(monkeypatch):
+    monkeypatch.setattr(bound, "_SWEEPS", 2)
+    found = {}
+    for walls in ("smooth", "joints", "furnished"):
+        found[walls] = bound.find_floor(
+            draw_scene(Course("one", walls, distance=10.0), np.random.SeedSequence(seed.entropy))
+        )
+    assert found["smooth"].sweep > 3.0 * found["joints"].sweep
+    assert found["joints"].sweep > 3.0 * found["furnished"].sweep
+    one = found["joints"]
+    sweeps = 10.0 * one.view / 1.5
+    assert one.drift == pytest.approx(one.sweep * np.sqrt(2.0 / sweeps) * np.sqrt(100.0 / one.view))
+
+
+def test_a_program_reaches_as_far_as_its_error_stays_within_a_metre():
+    travelled = np.arange(6.0)
+    assert reach_of(travelled, np.array([0.0, 0.5, -0.9, -1.1, 0.0, 0.0])) == 3.0
+    assert reach_of(travelled, np.zeros(6)) is None
+
+
+@pytest.fixture
+def sets(tmp_path: Path) -> list[Path]:
+    """Two sets of two recordings without bags, and poses of a program that is 1 % and 3 % long and once missing."""
+    for k, name in enumerate(("one", "two")):
+        for recording in ("walls-smooth", "walls-sprayed"):
+            truth = tmp_path / name / "truth" / recording
+            time, position, turn = line()
+            write_tum(truth / "lidar.tum", time, position, turn)
+            write_axis(truth / "axis.csv", position)
+            place = tmp_path / "poses" / name / "mine"
+            write_tum(place / f"{recording}.tum", time, position * (1.01 + 0.02 * k), turn)
+            failed = k == 1 and recording == "walls-smooth"
+            facts = {"failed": "crashed"} if failed else {"poses": len(time), "seconds": 5.0, "share": 0.25}
+            (place / f"{recording}.json").write_text(json.dumps(facts))
+    return [tmp_path / "one", tmp_path / "two"]
+
+
+def test_a_board_has_medians_over_the_sets_and_names_failures(sets, tmp_path):
+    names = ("walls-smooth", "walls-sprayed")
+    cases = [board.Case("mine", folder / "recordings" / name, tmp_path / "poses" / folder.name / "mine")
+             for folder in sets for name in names]  # fmt: skip
+    rows = [board._labels(one) | board.read_case(one) for one in cases]
+    floors = [{"recording": name, "drift": 0.01} for name in names]
+    content = {"rows": rows, "floors": floors}
+    assert board_page.median_drift(rows, "mine", "walls-smooth") is None
+    assert board_page.median_drift(rows, "mine", "walls-sprayed") == pytest.approx((2.0, 1.0, 3.0), abs=1e-6)
+    text = board_page.as_markdown(content)
+    assert "| mine | failed | 2.00 (1.00 to 3.00) | 0.000 | 33 (1/3) | 25 % |" in text
+    assert "- mine on walls-smooth of two: crashed" in text
+    assert board_page.as_png(content).startswith(b"\x89PNG")
+
+
+def test_half_a_trajectory_is_a_failure(sets, tmp_path):
+    case = board.Case("mine", sets[0] / "recordings" / "walls-sprayed", tmp_path / "poses" / "one" / "mine")
+    path = case.place / "walls-sprayed.tum"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:200]))
+    assert board.read_case(case)["failed"].startswith("gives poses over 50 %")
+
+
+@pytest.mark.parametrize(("words", "sentence"), [
+    ({"sets": ()}, "must name at least one"), ({"jobs": 0}, "jobs must be at least 1"),
+    ({"programs": ("moon",)}, "no program 'moon'; there are wheel-odometry"),
+    ({"sets": (Path("a/x"), Path("b/x"))}, "differ in the last part"),
+])  # fmt: skip
+def test_wrong_settings_of_a_board_are_refused(tmp_path, words, sentence):
+    settings = {"sets": (tmp_path,), "out": tmp_path / "o"} | words
+    with pytest.raises(BenchmarkError, match=sentence):
+        board.plan_board(board.BoardConfig(**settings))
