@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from scene.bore import Bore
+from scene.bore import Axis, Bore
 from scene.cleaning.clean import CleaningConfig, clean_cloud
 from scene.cleaning.crop import ExtentConfig, crop_cloud, describe_chainage, keep_stations, turn_round
 from scene.cleaning.removed import Removed
 from scene.cloud import Cloud
 from scene.errors import FitError, RecordingError, require_input
-from scene.fitting.assemble import bore_from_sections, describe_bore
-from scene.fitting.centreline import CentrelineConfig
+from scene.fitting.assemble import bore_from_sections, describe_bore, find_fold
+from scene.fitting.centreline import CentrelineConfig, smooth_axis
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
 from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
-from scene.fitting.section import fit_sections
+from scene.fitting.section import Sections, fit_sections
 from scene.fitting.trackseen import SeenTrack, find_track
 from scene.poses.calibration import UNCALIBRATED, Calibration
 from scene.poses.consistency import check_poses, reorder
@@ -211,9 +211,8 @@ def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stag
     cleaned, everything, first = keep_stations(cleaned, everything, config.extent)
     cloud, axis, removed = cleaned.cloud, cleaned.axis, cleaned.removed
     stage.advance()
-    sections = fit_sections(cloud, axis)
+    axis, sections, smooth = _fit_unfolded(cloud, axis, config.centreline.cutoff)
     stage.advance()
-    smooth = bore_from_sections(axis, sections)
     removed = tuple(part.shifted(-sections.grid.start) for part in removed)
     bore, provenance = add_lining(smooth, sections, cloud, config.lining)
     stage.advance()
@@ -234,6 +233,25 @@ def _fit_cloud(registered: Registered, config: ReconstructConfig, progress: Stag
         bore, cloud.origin, registered.record, facts, provenance, odometry, cloud,
         everything, removed, cleaned.cause, seen,
     )  # fmt: skip
+
+
+_STRAIGHTER = 3  # times that an axis is smoothed over twice the length
+
+
+def _fit_unfolded(cloud: Cloud, axis: Axis, cutoff: float) -> tuple[Axis, Sections, Bore]:
+    """Fits sections to an axis, which is smoothed further where they fold: at a jump of the wall it may bend sharply.
+
+    `cutoff` is the wavelength that the axis is smooth over, m.
+    """
+    sections = fit_sections(cloud, axis)
+    bore = bore_from_sections(axis, sections)
+    for power in range(1, _STRAIGHTER + 1):
+        if find_fold(bore) is None:
+            break
+        axis = smooth_axis(axis.position, cutoff * 2**power)
+        sections = fit_sections(cloud, axis)
+        bore = bore_from_sections(axis, sections)
+    return axis, sections, bore
 
 
 def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:

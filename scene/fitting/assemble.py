@@ -169,6 +169,13 @@ def bore_from_sections(axis: Axis, sections: Sections) -> Bore:
     return replace(bore, stretch=find_stretches(bore, sections.flat_floor, float(np.quantile(sections.sigma, _SURE))))
 
 
+def find_fold(bore: Bore) -> float | None:
+    """Return the first station at which a section cuts the next one, m; `None` where none does."""
+    step = np.einsum("nmi,ni->nm", np.diff(bore.surface(), axis=0), bore.tangent[:-1] + bore.tangent[1:])
+    folded = np.flatnonzero((step <= 0).any(axis=1))
+    return float(bore.station[folded[0]]) if len(folded) else None
+
+
 _STRAIGHT = 1e-5  # 1/m
 
 

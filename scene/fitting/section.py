@@ -17,6 +17,7 @@ from scene.cloud import Cloud
 from scene.errors import FitError
 from scene.fitting import unroll
 from scene.fitting.floor import Floors, clip_to_floor, extend_to_floor, find_floors, is_floor
+from scene.fitting.gaps import fill_sides
 from scene.fitting.kriging import krige_profiles
 from scene.fitting.profile import N_ANGLES
 from scene.fitting.unroll import Grid
@@ -179,7 +180,7 @@ def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None
     wall = unroll.cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
-    wall = unroll.fill_holes(wall, _LARGE_HOLE)
+    wall = fill_sides(unroll.fill_holes(wall, _LARGE_HOLE), coarse.angle)
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
     along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
     wall = unroll.median_smooth(unroll.fill_nearest(wall), window)

@@ -7,6 +7,7 @@ from manifold3d import Manifold, Mesh64, OpType
 
 from scene.bore import Bore
 from scene.errors import FitError
+from scene.fitting.assemble import find_fold
 from scene.writing import unrolled
 from scene.writing.unrolled import Sheet, Unrolled
 
@@ -67,13 +68,9 @@ def split_lining(lining: trimesh.Trimesh, bore: Bore, length: float) -> list[tri
 
 
 def _require_unfolded(bore: Bore) -> None:
-    step = np.einsum("nmi,ni->nm", np.diff(bore.surface(), axis=0), bore.tangent[:-1] + bore.tangent[1:])
-    folded = np.flatnonzero((step <= 0).any(axis=1))
-    if len(folded):
-        raise FitError(
-            f"the sections fold into each other at {bore.station[folded[0]]:.1f} m; "
-            "is the curve too tight for the width?"
-        )
+    fold = find_fold(bore)
+    if fold is not None:
+        raise FitError(f"the sections fold into each other at {fold:.1f} m; is the curve too tight for the width?")
 
 
 def _pocket_rectangles(bore: Bore, plane: Unrolled) -> tuple[Float[np.ndarray, "p 4"], Bool[np.ndarray, " p"]]:

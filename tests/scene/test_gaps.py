@@ -1,0 +1,55 @@
+"""Walls that nobody saw stand straight, and an axis that makes sections fold is smoothed until none do."""
+
+import numpy as np
+import pytest
+
+from scene.bore import axis_through
+from scene.cleaning.clean import CleaningConfig, clean_cloud
+from scene.fitting import section
+from scene.fitting.assemble import bore_from_sections, find_fold
+from scene.fitting.centreline import CentrelineConfig
+from scene.fitting.gaps import fill_sides
+from scene.fitting.section import fit_sections
+from scene.reconstruct import _fit_unfolded
+from tests.scene import railway
+from tests.scene.railway import World, arch, thinned
+from tests.scene.shapes import PLACE
+
+L = 18.0
+ARCH = World(arch(5.5, 6.0, 3.2), L)
+
+
+def test_a_gap_in_a_wall_is_closed_by_a_line_and_those_of_crown_and_floor_stay():
+    angle = -np.pi + 2 * np.pi * (np.arange(120) + 0.5) / 120
+    square = 2.0 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
+    for middle, known in ((0.0, True), (np.pi, True), (np.pi / 2, False), (-np.pi / 2, False)):
+        unseen = np.abs(np.angle(np.exp(1j * (angle - middle)))) < np.deg2rad(30)
+        filled = fill_sides(np.where(unseen, np.nan, square)[None], angle)[0]
+        assert np.isfinite(filled[unseen]).all() == known
+        np.testing.assert_allclose(filled[np.isfinite(filled)], square[np.isfinite(filled)], atol=1e-9)
+
+
+def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypatch):
+    points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
+    unseen = (points[:, 1] > 2.70) & (points[:, 2] - 0.01 * points[:, 0] < 3.2)
+    cleaned = clean_cloud(thinned(points[~unseen] + PLACE, 0.07), CleaningConfig(), CentrelineConfig())
+
+    def width() -> np.ndarray:
+        return bore_from_sections(cleaned.axis, fit_sections(cleaned.cloud, cleaned.axis)).width[8:-8]
+
+    assert np.abs(width() - 5.5).max() < 0.10
+    monkeypatch.setattr(section, "fill_sides", lambda wall, angle: wall)
+    assert np.median(width()) > 6.0
+
+
+def test_an_axis_that_bends_so_sharply_that_sections_fold_is_smoothed():
+    cloud = thinned(ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004), 0.07)
+    along = np.arange(0.0, L + 0.1, 0.5)
+    jump = 0.9 / (1.0 + np.exp((L / 2 - along) / 0.12))  # as at the end of a platform
+    path = np.column_stack([along, jump - 0.4, 2.9 + 0.01 * along]) + PLACE - cloud.origin
+    axis = axis_through(path, 0.25)
+    assert find_fold(bore_from_sections(axis, fit_sections(cloud, axis))) is not None
+    smoothed, _, bore = _fit_unfolded(cloud, axis, 12.0)
+    assert find_fold(bore) is None
+    assert np.abs(smoothed.curvature).max() < 0.3
+    assert np.median(bore.width) == pytest.approx(5.5, abs=0.05)
