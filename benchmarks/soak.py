@@ -16,6 +16,7 @@ from rich.console import Console
 
 import subterra_jax as st
 from benchmarks.command import require_least, run_main
+from subterra_jax.procedural import expand
 
 _EXTREMES = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, -0.0, 1e-38)
 _CHUNK = 100
@@ -30,8 +31,9 @@ class SoakConfig:
         steps: Environment steps of all tasks together.
         tasks: Task ids; all tasks if not given.
         n_envs: Environments in a batch.
-        tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given.
-        lining: Variant of the walls.
+        tunnel: Tunnel file, or a name as for `st.make`, of a family of tunnels too (`open:test-unseen:0-5`), of which
+            each episode draws one; the packaged default if not given.
+        lining: Variant of the walls; `None` is the tunnel's first.
         checkify: Run a short piece of each task under `jax.experimental.checkify` as well.
         seed: Seed for environments and actions.
     """
@@ -40,7 +42,7 @@ class SoakConfig:
     tasks: tuple[str, ...] = ()
     n_envs: int = 1024
     tunnel: str | None = None
-    lining: str = "pockets"
+    lining: str | None = "pockets"
     checkify: bool = True
     seed: int = 0
 
@@ -132,8 +134,9 @@ def run(config: SoakConfig, console: Console) -> bool:
     """
     require_least(config, steps=1, n_envs=1, seed=0)
     tasks = config.tasks or tuple(st.TASKS)
-    plan = st.load_tunnel(config.tunnel)
-    made = [st.make(task, plan, config.lining, estimates=True) for task in tasks]
+    several = config.tunnel is not None and len(names := expand(config.tunnel)) > 1
+    plans: Any = [st.load_tunnel(name) for name in names] if several else st.load_tunnel(config.tunnel)
+    made = [st.make(task, plans, config.lining, estimates=True) for task in tasks]
     clean = True
     for task, (env, params) in zip(tasks, made, strict=True):
         complaints = soak(env, params, config.n_envs, -(-config.steps // len(tasks)), config.seed)

@@ -139,4 +139,4 @@ def test_an_id_of_another_version_names_the_one_there_is():
     with pytest.raises(ValueError, match="has Subterra/B2Traverse-v0"):
         st.make("Subterra/B2Traverse-v1")
     with pytest.raises(gymnasium.error.VersionNotFound, match="StopAt"):
-        gymnasium.make("subterra_jax:Subterra/StopAt-v1")
+        gymnasium.make("subterra_jax:Subterra/StopAt-v7")

@@ -1,0 +1,133 @@
+"""Agents on the tasks of version 1, by kind of lining and split, between floor and ceiling.
+
+`python -m benchmarks.openboard --tasks StopAt Return --out out/openboard`
+
+Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. `--report-only` writes
+tables and picture of the cells that are there.
+"""
+
+import dataclasses
+import hashlib
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+import subterra_jax as st
+from benchmarks.command import run_main
+from benchmarks.openboard import columns as board
+from benchmarks.openboard import report
+from benchmarks.results import environment_facts, write_file
+from subterra_jax.baselines import registry
+from subterra_jax.evaluation import evaluate
+from subterra_jax.evaluation.floor import floor
+from subterra_jax.host.files import require_folder
+
+_progress = Console(stderr=True, highlight=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class OpenboardConfig:
+    """Settings of the leaderboard of version 1.
+
+    Attributes:
+        out: Folder for the cells, `openboard.md` and `openboard.png`.
+        tasks: Tasks without `Subterra/` and `-v1`.
+        agents: Names of agents.
+        splits: Splits of the open world; a choice may be made on `val` alone.
+        episodes: Episodes of each kind and split.
+        tunnels: Tunnels of each kind and split, over which the episodes are spread.
+        report_only: Drive nothing.
+    """
+
+    out: Path
+    tasks: tuple[str, ...] = board.TASKS
+    agents: tuple[str, ...] = board.AGENTS
+    splits: tuple[str, ...] = ("val", "test-seen", "test-unseen")
+    episodes: int = 50
+    tunnels: int = 5
+    report_only: bool = False
+
+
+def run(config: OpenboardConfig) -> None:
+    """Drives the agents whose cells are missing, and writes tables and picture.
+
+    Raises:
+        SubterraError: A task, split or agent is unknown, or the folder cannot be written.
+    """
+    board.check(config.tasks, config.agents, config.splits, config.tunnels, config.episodes)
+    require_folder(config.out)
+    missing = [
+        (task, agent)
+        for task in config.tasks
+        for agent in config.agents
+        if not _is_there(cell_file(config, task, agent), config)
+    ]
+    if missing and not config.report_only:
+        _drive(config, missing)
+    cells = report.read_cells(config.out / "cells", conditions(config))
+    write_file(config.out / "openboard.md", report.as_markdown(cells).encode())
+    write_file(config.out / "openboard.png", report.as_png(cells))
+    print(config.out / "openboard.md")
+
+
+def conditions(config: OpenboardConfig) -> str:
+    """Return a digest of what a cell depends on: constants, world, tunnels and episodes."""
+    content = [st.constants_digest(version="v1"), config.splits, config.episodes, config.tunnels, board.FIRST]
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def cell_file(config: OpenboardConfig, task: str, agent: str) -> Path:
+    """Return the file of a task and an agent."""
+    return config.out / "cells" / f"{task}.{agent}.json"
+
+
+def _is_there(file: Path, config: OpenboardConfig) -> bool:
+    return file.exists() and json.loads(file.read_text()).get("conditions") == conditions(config)
+
+
+def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
+    """Drives agents, the tunnels made once for all."""
+    columns = board.columns_of(config.splits)
+    names = board.tunnel_names(columns, config.tunnels)
+    started = time.monotonic()
+    tunnel = st.make(f"Subterra/{missing[0][0]}-v1", tunnel=names)[1].tunnel
+    _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
+    floors: dict[str, list[float]] = {}
+    for task, agent in missing:
+        started = time.monotonic()
+        env, params = st.make(f"Subterra/{task}-v1", tunnel=tunnel, estimates=True)
+        if task not in floors:
+            floors[task] = [floor(params, index) for index in range(len(names))]
+        episodes = board.draw_episodes(task, columns, config.tunnels, config.episodes)
+        records = evaluate(env, params, registry.make_agent(agent, params), episodes, len(episodes))
+        seconds = time.monotonic() - started
+        content: dict[str, Any] = {
+            "schema": board.SCHEMA,
+            "conditions": conditions(config),
+            "task": task,
+            "agent": agent,
+            "columns": [dataclasses.asdict(column) for column in columns],
+            "tunnels": config.tunnels,
+            "success": records.success.astype(int).tolist(),
+            "contact": records.contact.astype(int).tolist(),
+            "goal_error": [None if np.isnan(e) else round(float(e), 3) for e in records.goal_error],
+            "floor": [round(value, 4) for value in floors[task]],
+            "seconds": round(seconds, 1),
+            "facts": {**environment_facts(), "constants_sha256": st.constants_digest(version="v1")},
+        }
+        write_file(cell_file(config, task, agent), (json.dumps(content) + "\n").encode())
+        _progress.print(f"{task}, {agent}: {100 * records.success.mean():.1f} % ({seconds:.0f} s)")
+
+
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 2 for a user's mistake."""
+    return run_main("openboard", OpenboardConfig, run, description=__doc__, words=words)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

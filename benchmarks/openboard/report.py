@@ -1,0 +1,174 @@
+"""Tables and picture of the leaderboard of version 1, and which of its figures would be leaks."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.command import BenchmarkError
+from benchmarks.openboard.columns import AGENTS, SCHEMA, TASKS
+from benchmarks.results import png_bytes
+from subterra_jax.evaluation.floor import is_above
+from subterra_jax.evaluation.records import grouped, interval
+
+BLIND = ("dead-reckoning", "fused")  # steer by the walls, and never localise by them
+CEILING = "ceiling"
+TUNED_ON = {
+    "dead-reckoning": "nothing",
+    "fused": "nothing; told the sizes of the errors",
+    "ring-count": "`subterra-351`, older family",
+    "ring-filter": "`subterra-351`, older family",
+    "scan-matching": "`subterra-351`, older family",
+    "particle-filter": "`subterra-351`, older family; has the map",
+    CEILING: "nothing; has the map, the sizes of errors and of the episode's faults",
+}
+_COLOURS = {"ring-count": "#e09f3e", "ring-filter": "#c1121f", "scan-matching": "#8367c7", "particle-filter": "#1b4965"}
+
+
+def read_cells(folder: Path, conditions: str) -> list[dict[str, Any]]:
+    """Read the cells of a folder that were driven under some conditions, in the order of tasks and agents.
+
+    Raises:
+        BenchmarkError: There is none.
+    """
+    cells = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
+    cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] == conditions]
+    if not cells:
+        raise BenchmarkError(f"{folder}: holds no cell of these tunnels, episodes and constants")
+    place = lambda names, name: names.index(name) if name in names else len(names)  # noqa: E731
+    return sorted(cells, key=lambda cell: (place(TASKS, cell["task"]), place(AGENTS, cell["agent"]), cell["agent"]))
+
+
+def summarise(cell: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return for each column success, its 95 % interval over tunnels and episodes, contact, median error (m), floor."""
+    tunnels, columns = cell["tunnels"], cell["columns"]
+    success = np.array(cell["success"], float).reshape(len(columns), -1)
+    contact = np.array(cell["contact"], float).reshape(len(columns), -1)
+    error = np.array([np.nan if e is None else e for e in cell["goal_error"]], float).reshape(len(columns), -1)
+    bound = np.array(cell["floor"], float).reshape(len(columns), tunnels).mean(axis=1)
+    rows = []
+    for i, column in enumerate(columns):
+        group = np.arange(success.shape[1]) % tunnels
+        low, high = interval(grouped(success[i], group), lambda s: s.mean(axis=(-2, -1)))
+        stopped = np.abs(error[i][~np.isnan(error[i]) & (contact[i] == 0.0)])
+        rows.append(
+            {
+                **column,
+                "success": float(success[i].mean()),
+                "low": low,
+                "high": high,
+                "contact": float(contact[i].mean()),
+                "median_error": float(np.median(stopped)) if len(stopped) else None,
+                "floor": float(bound[i]),
+                "n": success.shape[1],
+            }
+        )
+    return rows
+
+
+def find_leaks(cells: list[dict[str, Any]]) -> list[str]:
+    """Name the figures beyond a bound: a blind agent above the floor, or any agent above the ceiling.
+
+    A figure is beyond where the difference is more than four standard errors of the two: a table has some hundred.
+    """
+    ceiling = {cell["task"]: summarise(cell) for cell in cells if cell["agent"] == CEILING}
+    found = []
+    for cell in cells:
+        for i, row in enumerate(summarise(cell)):
+            where = f"{cell['agent']}, {cell['task']}, {row['kind']} of {row['split']}"
+            if cell["agent"] in BLIND and is_above(row["success"], row["floor"], row["n"], 0):
+                found.append(f"{where}: {100 * row['success']:.0f} % is above the floor, {100 * row['floor']:.0f} %")
+            top = ceiling[cell["task"]][i] if cell["task"] in ceiling else None
+            if top is not None and is_above(row["success"], top["success"], row["n"], top["n"]):
+                found.append(
+                    f"{where}: {100 * row['success']:.0f} % is above the ceiling, {100 * top['success']:.0f} %"
+                )
+    return found
+
+
+def as_markdown(cells: list[dict[str, Any]]) -> str:
+    """Return one table for each split and task: success in %, its interval, median error at the stop in m."""
+    leaks = find_leaks(cells)
+    facts = cells[0]["facts"]
+    lines = [
+        f"Version 1, constants `{facts['constants_sha256'][:12]}`, {cells[0]['tunnels']} tunnels and "
+        f"{len(cells[0]['success']) // len(cells[0]['columns'])} episodes of each kind and split; {facts['device']}.",
+        "Success in %, its 95 % interval, median error at the stop in m.",
+        "",
+        "Beyond a bound: " + ("; ".join(leaks) if leaks else "nobody") + ".",
+    ]
+    for split in dict.fromkeys(column["split"] for column in cells[0]["columns"]):
+        for task in dict.fromkeys(cell["task"] for cell in cells):
+            rows = {cell["agent"]: summarise(cell) for cell in cells if cell["task"] == task}
+            some = {agent: [row for row in found if row["split"] == split] for agent, found in rows.items()}
+            first = next(iter(some.values()))
+            lines += ["", f"### {task}, {split}", "", "| agent | tuned on | " + " | ".join(r["kind"] for r in first)]
+            lines[-1] += " |"
+            lines.append("|---|---|" + "---|" * len(first))
+            bounds = " | ".join(f"{100 * row['floor']:.0f}" for row in first)
+            lines.append(f"| floor, in theory | | {bounds} |")
+            for agent, found in some.items():
+                lines.append(
+                    f"| {agent} | {TUNED_ON.get(agent, 'not known')} | " + " | ".join(map(_cell, found)) + " |"
+                )
+    return "\n".join(lines) + "\n"
+
+
+def _cell(row: dict[str, Any]) -> str:
+    error = "-" if row["median_error"] is None else f"{row['median_error']:.2f}"
+    contact = f", contact {100 * row['contact']:.0f}" if row["contact"] else ""
+    return f"{100 * row['success']:.0f} ({100 * row['low']:.0f}-{100 * row['high']:.0f}), {error}{contact}"
+
+
+def draw(cells: list[dict[str, Any]]) -> Figure:
+    """Draw one panel a task: for each kind and split a bar from floor to ceiling, and a dot for each agent."""
+    tasks = list(dict.fromkeys(cell["task"] for cell in cells))
+    columns = cells[0]["columns"]
+    n_columns = min(3, len(tasks))
+    shape = (-(-len(tasks) // n_columns), n_columns)
+    figure, grid = plt.subplots(
+        *shape, figsize=(1.0 + 4.6 * shape[1], 0.8 + 2.9 * shape[0]), squeeze=False, layout="constrained", sharey=True
+    )
+    for axes, task in zip(grid.flat, tasks, strict=False):
+        _panel(axes, task, {cell["agent"]: summarise(cell) for cell in cells if cell["task"] == task}, columns)
+    for axes in list(grid.flat)[len(tasks) :]:
+        axes.axis("off")
+    for axes in grid[:, 0]:
+        axes.set_ylabel("success, %")
+    handles, names = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=6, fontsize=8)
+    figure.suptitle(
+        "Grey bar: from the floor (no look at the walls) to the ceiling (map and every size known)", fontsize=10
+    )
+    return figure
+
+
+def _panel(axes: Any, task: str, rows: dict[str, list[dict[str, Any]]], columns: list[dict[str, str]]) -> None:
+    place = np.arange(len(columns))
+    bottom = 100.0 * np.array([row["floor"] for row in next(iter(rows.values()))])
+    top = 100.0 * np.array([row["success"] for row in rows[CEILING]]) if CEILING in rows else np.full(len(place), 100.0)
+    axes.bar(place, np.maximum(top - bottom, 0.0), 0.8, bottom, color="#dddddd", label="floor to ceiling")
+    for agent, found in rows.items():
+        if agent in (CEILING, *BLIND):
+            continue
+        axes.plot(
+            place, [100.0 * r["success"] for r in found], "o", ms=4.5, color=_COLOURS.get(agent, "black"), label=agent
+        )
+    axes.set_title(task, fontsize=10)
+    axes.set_ylim(0.0, 103.0)
+    axes.set_xticks(place, [column["kind"] for column in columns], rotation=90, fontsize=7)
+    for i in range(1, len(columns)):
+        if columns[i]["split"] != columns[i - 1]["split"]:
+            axes.axvline(i - 0.5, color="black", lw=0.8)
+    for split in dict.fromkeys(column["split"] for column in columns):
+        here = [i for i, column in enumerate(columns) if column["split"] == split]
+        axes.text(np.mean(here), 101.0, split, ha="center", va="top", fontsize=7)
+    axes.grid(axis="y", alpha=0.3)
+
+
+def as_png(cells: list[dict[str, Any]]) -> bytes:
+    """Return the picture as a PNG file."""
+    return png_bytes(draw(cells), dpi=120)

@@ -1,0 +1,75 @@
+"""The leaderboard of version 1: its columns, its resumption, and that a figure beyond a bound is named."""
+
+import json
+
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from benchmarks.openboard import __main__ as command
+from benchmarks.openboard import columns, report
+
+SPLITS = ("val", "test-unseen")
+
+
+def cell(agent, success, task="StopAt", n=40, floor=0.3):
+    """A cell of one column."""
+    hits = [1] * round(n * success)
+    return {
+        "schema": columns.SCHEMA,
+        "conditions": "x",
+        "task": task,
+        "agent": agent,
+        "columns": [{"kind": "cast", "split": "val"}],
+        "tunnels": 2,
+        "success": hits + [0] * (n - len(hits)),
+        "contact": [0] * n,
+        "goal_error": [0.5] * (n - 1) + [None],
+        "floor": [floor, floor],
+        "facts": {"constants_sha256": "0" * 64, "device": "none"},
+    }
+
+
+def test_a_column_has_its_own_tunnels_and_a_split_its_own_seeds():
+    some = columns.columns_of(SPLITS)
+    assert len(some) == 10
+    names = columns.tunnel_names(some, 2)
+    assert names[:2] == ["open:straight:val:100", "open:straight:val:101"]
+    assert names[-1].startswith("open:rock:test-unseen:")
+    found = columns.draw_episodes("Faulted", some, 2, 20)
+    for place, column in enumerate(some):
+        rows = slice(20 * place, 20 * place + 20)
+        assert {names[i].rsplit(":", 1)[0] for i in found.tunnel[rows]} == {f"open:{column.kind}:{column.split}"}
+        assert np.bincount(found.severity[rows]).tolist() == [4] * 5
+    assert not set(found.seed[:20]) & set(found.seed[-20:])
+    np.testing.assert_array_equal(found.seed[:20], found.seed[20:40])
+    assert found.seed.max() < 2**30, "a listed episode lies above"
+
+
+def test_figures_beyond_a_bound_are_named_and_others_are_not():
+    fair = [cell("fused", 0.4), cell("ring-filter", 0.9), cell("ceiling", 0.95)]
+    assert report.find_leaks(fair) == []
+    assert "fused, StopAt, cast of val: 100 % is above the floor" in report.find_leaks([cell("fused", 1.0)])[0]
+    above = report.find_leaks([cell("ring-filter", 1.0), cell("ceiling", 0.5)])
+    assert above == ["ring-filter, StopAt, cast of val: 100 % is above the ceiling, 50 %"]
+
+
+def test_a_table_and_a_picture_hold_every_agent(tmp_path):
+    cells = [cell("fused", 0.4), cell("ring-filter", 0.9), cell("ceiling", 0.95)]
+    text = report.as_markdown(cells)
+    assert "| floor, in theory | | 30 |" in text
+    assert "| ring-filter | `subterra-351`, older family | 90 (" in text
+    assert report.as_png(cells)[:4] == b"\x89PNG"
+
+
+def test_a_cell_that_is_there_is_not_driven_again(tmp_path, monkeypatch, capsys):
+    config = command.OpenboardConfig(tmp_path, ("StopAt",), ("fused",), ("val",), 40, 2)
+    there = {**cell("fused", 0.4), "conditions": command.conditions(config)}
+    command.cell_file(config, "StopAt", "fused").parent.mkdir()
+    command.cell_file(config, "StopAt", "fused").write_text(json.dumps(there))
+    monkeypatch.setattr(command, "evaluate", None)
+    command.run(config)
+    assert (tmp_path / "openboard.png").exists()
+    changed = command.OpenboardConfig(tmp_path, ("StopAt",), ("fused",), ("val",), 41, 2)
+    with pytest.raises(st.SubterraError, match="holds no cell"):
+        command.run(command.OpenboardConfig(**{**vars(changed), "report_only": True}))
