@@ -22,6 +22,8 @@ from subterra_jax.evaluation import Episodes, Records, evaluate
 from subterra_jax.evaluation.bounds import stop_bounds
 from subterra_jax.evaluation.records import grouped, interval
 from subterra_jax.host.files import require_folder
+from subterra_jax.policies import open_agent
+from subterra_jax.policies.opening import policy_source
 from subterra_jax.procedural.open_world import SPLITS, kinds_of
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import find
@@ -49,7 +51,7 @@ class KindsConfig:
     Attributes:
         task: Task id.
         split: Split of the open world; a choice may be made on `val` alone.
-        agents: Names of agents.
+        agents: Names of agents, or files of policies.
         episodes: Episodes of each kind.
         tunnels: Tunnels of each kind, over which the episodes are spread.
         lining: `built`, `bare` or `smooth`.
@@ -85,7 +87,7 @@ def run(config: KindsConfig) -> None:
     found = {}
     for agent in config.agents:
         started = time.monotonic()
-        found[agent] = evaluate(env, params, registry.make_agent(agent, params), episodes, len(episodes))
+        found[agent] = evaluate(env, params, open_agent(agent, env, params), episodes, len(episodes))
         _progress.print(f"{agent}: {100 * found[agent].success.mean():.1f} % ({time.monotonic() - started:.0f} s)")
     rows = {agent: [summary(records, config, kind) for kind in range(len(kinds))] for agent, records in found.items()}
     text = as_markdown(config, kinds, rows, params)
@@ -114,8 +116,9 @@ def check(config: KindsConfig) -> None:
     if config.split not in SPLITS:
         raise BenchmarkError(f"there is no split {config.split!r}; there are {', '.join(SPLITS)}")
     for agent in config.agents:
-        if agent not in registry.names():
-            raise BenchmarkError(f"no agent {agent!r}; there are {', '.join(registry.names())}")
+        if agent not in registry.names() and policy_source(agent) is None:
+            known = ", ".join(registry.names())
+            raise BenchmarkError(f"no agent {agent!r}; there are {known}, or a policy's file or folder")
     if config.out is not None:
         require_folder(config.out)
 

@@ -15,13 +15,15 @@ from subterra_jax.compiled import in_32_bits
 from subterra_jax.policies import belief, senses
 from subterra_jax.policies.belief import Belief, Habits
 from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
+from subterra_jax.policies.locate import agent as locate
+from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.networks import FeedForward, Recurrent
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, constants_digest
 from subterra_jax.tunnel_env import TunnelEnv
 
-Agent = FeedForward | Recurrent | Belief
-KINDS = ("mlp", "gru", belief.KIND)
+Agent = FeedForward | Recurrent | Belief | Locating
+KINDS = ("mlp", "gru", belief.KIND, locate.KIND)
 PREFIX = "policy:"  # of the names of released policies among the agents
 
 
@@ -50,7 +52,7 @@ def from_tensors(
 
     Args:
         kind: One of `KINDS`.
-        layout: `action_low`, `action_high`, and `frames`, `bin_width` or `habits`.
+        layout: `action_low`, `action_high`, and `frames`, `bin_width`, `habits` or `network`.
         tensors: By name, as the agent's class says.
         name: Name on the leaderboard.
         conditions: Conditions of its training, which `check_fits` compares; None: any.
@@ -72,6 +74,8 @@ def from_tensors(
         return Recurrent(arrays, low, high, bin_width=width, shown=shown, image=image, name=name, conditions=conditions)
     if kind == belief.KIND:
         return Belief(arrays, low, high, habits=Habits(**layout["habits"]), name=name, conditions=conditions)
+    if kind == locate.KIND:
+        return Locating(arrays, low, high, network=str(layout["network"]), name=name, conditions=conditions)
     raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
 
 
@@ -109,6 +113,11 @@ def check_task(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
     elif isinstance(agent, Belief):
         if errand != "report":
             raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
+    elif isinstance(agent, Locating):
+        if errand not in locate.ERRANDS:
+            raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
+        if (n := n_ranges(params)) % 16:
+            raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
     elif agent.n_observation != size:
         raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")
     conditions = agent.conditions
@@ -194,6 +203,9 @@ def _try(agent: Agent) -> None:
         return
     if isinstance(agent, Belief):
         jax.eval_shape(belief.try_scan, agent.tensors)
+        return
+    if isinstance(agent, Locating):
+        locate.check_tensors(agent)
         return
     zero, ranges = jnp.zeros(()), jnp.zeros(agent.n_beams)
     entries = {} if agent.image is None else {"scan": jnp.zeros(agent.image[0] * agent.image[1])}

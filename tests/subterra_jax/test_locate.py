@@ -1,13 +1,21 @@
 """Learnt localisers: the front end against known walls, and the robot's metres against those of training."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.stations import Driven
+from subterra_jax.baselines.steering import Corridor
+from subterra_jax.policies import from_tensors
 from subterra_jax.policies.locate import kalman, matching, memory, streams
+from subterra_jax.policies.locate.agent import check_tensors, flat
 from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block
-from subterra_jax.policies.locate.profiles import Points
+from subterra_jax.policies.locate.locator import Locator
+from subterra_jax.policies.locate.profiles import Points, find_points
 
 _HALF, _N = 2.7, 40  # m; metres
 
@@ -57,7 +65,9 @@ def _random_blocks(n, key=1):
     )
 
 
-@pytest.mark.parametrize("network", memory.NETWORKS)
+@pytest.mark.parametrize(
+    "network", ["gru", *(pytest.param(name, marks=pytest.mark.slow) for name in ("kalman", "s5", "transformer"))]
+)
 def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once(network):
     weights = memory.init(network, "match", jax.random.key(2))
     blocks = _random_blocks(35)
@@ -86,3 +96,69 @@ def test_a_network_or_front_that_does_not_exist_is_named():
         memory.init("lstm", "match", jax.random.key(0))
     with pytest.raises(ValueError, match="needs the evidence"):
         memory.init("kalman", "scans", jax.random.key(0))
+
+
+def _ranges(driven, share=0.01):
+    """Scans of 16 beams by a robot that keeps to the middle; the ends of the tunnel are out of sight."""
+    angle = 2.0 * np.pi * np.arange(16) / 16
+    side = np.where(np.abs(np.sin(angle)) < 0.1, np.nan, np.abs(np.sin(angle)))
+    along = _HALF * np.cos(angle) / side
+    station = (1.0 + share) * driven[:, None] + along + np.where(np.sin(angle) > 0.0, 0.0, 7.3)
+    noise = 0.02 * np.random.default_rng(5).standard_normal(station.shape)
+    return np.where(np.isnan(side), 30.0, (_HALF + _relief(station) + noise) / np.where(np.isnan(side), 1.0, side))
+
+
+@pytest.mark.parametrize(
+    ("network", "front"), [("kalman", "match"), pytest.param("s5", "scans", marks=pytest.mark.slow)]
+)
+def test_a_robot_makes_the_metres_of_its_training(network, front):
+    rng = np.random.default_rng(7)
+    speed = np.where(np.arange(240) % 9 < 7, 2.0, 0.7)  # not all metres have five steps
+    speed[0] = 0.0
+    driven = np.cumsum((0.1 * speed).astype(np.float32))  # in 32 bits, as the robot sums
+    ranges = jnp.asarray(_ranges(driven), jnp.float32)
+    read = jnp.asarray(np.cumsum(0.1 * speed * 1.02 + 0.01 * rng.standard_normal(240)) + 5.0, jnp.float32)
+    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
+    points = jax.vmap(lambda r: find_points(r, walls, 30.0))(ranges)
+    weights = memory.init(network, front, jax.random.key(4))
+    n = int(driven[-1])
+    record = streams.Record(jnp.asarray(driven, jnp.float32), read, points)
+    whole = memory.sequence(network, weights, streams.metres(record, weights.get("match"), n))
+    params = SimpleNamespace(
+        errand="stop",
+        start=SimpleNamespace(station=3.0, station_sigma=0.0),
+        vehicle=SimpleNamespace(period=0.1),
+        lidar=SimpleNamespace(range_max=30.0),
+    )
+    locator, one, no = Locator(weights, network), jnp.ones(()), jnp.zeros((), bool)
+
+    def step(now, row):
+        r, distance, v = row
+        obs = Observed(r, r, distance=distance, heading=jnp.zeros(()))
+        station, now = locator.update(now, obs, Driven(v, one, one, no, walls), params, None)
+        return now, (now.metres, now.estimate.correction, station.station)
+
+    first = Observed(ranges[0], ranges[0], distance=read[0], heading=jnp.zeros(()))
+    _, (metres, correction, station) = jax.lax.scan(
+        step, locator.begin(first, params), (ranges, read, jnp.asarray(speed, jnp.float32))
+    )
+    ends = np.flatnonzero(np.diff(np.asarray(metres)) > 0) + 1
+    assert len(ends) == n
+    np.testing.assert_allclose(np.asarray(correction)[ends], np.asarray(whole.correction), atol=2e-3)
+    assert abs(float(station[-1]) - 3.0 - driven[-1]) < 2.0
+    assert np.ptp(np.asarray(whole.correction)) > 0.02  # there is something to compare
+
+
+@pytest.mark.parametrize("network", memory.NETWORKS)
+def test_tensors_of_a_localiser_come_back_as_an_agent_or_are_refused(network):
+    tensors = flat(memory.init(network, "match", jax.random.key(0)))
+    layout = {"network": network, "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
+    agent = from_tensors("locate", layout, tensors, "one")
+    check_tensors(agent)
+    name = next(iter(tensors))
+    with pytest.raises(KeyError, match=name):
+        check_tensors(from_tensors("locate", layout, {k: v for k, v in tensors.items() if k != name}, "one"))
+    with pytest.raises(ValueError, match=r"is \(2, 3\)"):
+        check_tensors(from_tensors("locate", layout, {**tensors, name: jnp.zeros((2, 3))}, "one"))
+    with pytest.raises(ValueError, match="extra is of no"):
+        check_tensors(from_tensors("locate", layout, {**tensors, "extra": jnp.zeros(3)}, "one"))

@@ -1,6 +1,7 @@
 """Trains a learnt localiser: `python -m train.locate --network kalman --out DIR`."""
 
 import dataclasses
+import hashlib
 import json
 import sys
 import time
@@ -10,12 +11,18 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import safetensors.numpy
 import tyro
 
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
+from subterra_jax.policies import TRAINED_UNDER, training_conditions
+from subterra_jax.policies.files import SCHEMA
+from subterra_jax.policies.locate.agent import KIND, flat
 from train.locate import scores, tunnels
 from train.locate.learner import LocateConfig, LocateLearner
+from train.policies import facts_file
+from train.world import library_versions
 
 _EVERY = 20.0  # s between two lines of the log
 
@@ -25,7 +32,7 @@ class Command:
     """Trains a localiser, then scores it on drives in `val`.
 
     Attributes:
-        out: Folder for `policy.npz`, `log.jsonl` and `scores.json`.
+        out: Folder for `policy.safetensors` and its facts, `log.jsonl` and `scores.json`.
         task: Task that is driven, one that starts at a mouth.
         tunnels: Tunnels to learn in.
         val: Tunnels to score in.
@@ -52,7 +59,7 @@ def command(arguments: Command) -> None:
     learner = LocateLearner(env, params, arguments.config)
     state = learner.init()
     state = train(learner, state, params, arguments)
-    save(arguments.out / "policy.npz", state.weights)
+    save(arguments.out / "policy.safetensors", state, env, params, arguments)
     env, params, names = tunnels.make(arguments.task, arguments.val, cache=arguments.cache)
     found = scores.score(arguments.config.network, state.weights, env, params, jax.random.key(2**20), arguments.drives)
     table = scores.by_kind(found, names)
@@ -84,12 +91,32 @@ def train(learner: LocateLearner, state: Any, params: Any, arguments: Command) -
     return state
 
 
-def save(path: Path, weights: Any) -> None:
-    """Writes the weights."""
-    leaves = jax.tree_util.tree_flatten_with_path(jax.device_get(weights))[0]
-    named = {jax.tree_util.keystr(where, simple=True, separator="."): np.asarray(leaf) for where, leaf in leaves}
-    with replace_file(path) as fresh, fresh.open("wb") as file:
-        np.savez(file, **named)
+def save(path: Path, state: Any, env: Any, params: Any, arguments: Command) -> None:
+    """Writes weights and facts, as `st.load_policy` reads them."""
+    named = {name: np.asarray(leaf, np.float32) for name, leaf in flat(jax.device_get(state.weights)).items()}
+    content = safetensors.numpy.save(dict(sorted(named.items())))
+    bounds = env.action_space(params)
+    layout = {
+        "network": arguments.config.network,
+        "action_low": [float(x) for x in bounds.low[:2]],
+        "action_high": [float(x) for x in bounds.high[:2]],
+    }
+    facts = {
+        "schema": SCHEMA,
+        "name": f"locate-{arguments.config.network}",
+        "kind": KIND,
+        "task": env.id,
+        "layout": layout,
+        "tensors_sha256": hashlib.sha256(content).hexdigest(),
+        TRAINED_UNDER: training_conditions(env, params).to_json(),
+        "config": dataclasses.asdict(arguments.config),
+        "tunnels": arguments.tunnels,
+        "updates": int(state.steps),
+        "versions": library_versions(),
+    }
+    for place, data in ((path, content), (facts_file(path), f"{json.dumps(facts, indent=1)}\n".encode())):
+        with replace_file(place) as fresh:
+            fresh.write_bytes(data)
 
 
 if __name__ == "__main__":

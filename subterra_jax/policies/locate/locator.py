@@ -134,7 +134,8 @@ class Locator:
         block = Block(evidence, read - before.read_before - 1.0, steps - before.steps_before, raw.reshape(-1))
         if self.blind:
             block = dataclasses.replace(block, raw=jnp.zeros_like(block.raw))
-        part = jnp.clip(jnp.floor((now.driven % 1.0) * N_RECENT).astype(jnp.int32), 0, N_RECENT - 1)
+        part = jnp.floor(now.driven * N_RECENT).astype(jnp.int32) - N_RECENT * jnp.floor(now.driven).astype(jnp.int32)
+        part = jnp.clip(part, 0, N_RECENT - 1)
         sums, counts = (jnp.where(ended, 0.0, old) for old in (before.raw, before.counts))
         return block, dataclasses.replace(
             now, window=window, raw=sums.at[part].add(raw_rows(points)), counts=counts.at[part].add(1.0)

@@ -1,0 +1,102 @@
+"""A learnt localiser in the written controller: it keeps to the middle and stops where it believes the goal to be."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+from flax import struct
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.navigator import Memory, Navigator
+from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.policies.files import Conditions
+from subterra_jax.policies.locate import memory
+from subterra_jax.policies.locate.locator import Locator
+from subterra_jax.policies.networks import Tensors
+from subterra_jax.state import EnvParams
+
+KIND = "locate"
+ERRANDS = ("stop",)  # it counts on driving forward
+
+
+@struct.dataclass
+class Locating:
+    """Drives to a goal by a learnt localiser.
+
+    Attributes:
+        tensors: Weights by name, parts of the name between dots.
+        low: Smallest action, m/s and rad/s.
+        high: Largest action, m/s and rad/s.
+        network: Memory behind the front end, of `memory.NETWORKS`.
+        blind: Cut what the walls tell: the ablation of the learnt estimate.
+        name: Name on the leaderboard.
+        conditions: Conditions of its training; None: any.
+        uses_lidar: Always true.
+        uses_map: Always false: it has no map.
+        privileged: Always false: it gets no truth.
+    """
+
+    tensors: Tensors
+    low: Float[Array, "2"]
+    high: Float[Array, "2"]
+    network: str = struct.field(pytree_node=False, default="kalman")
+    blind: bool = struct.field(pytree_node=False, default=False)
+    name: str = struct.field(pytree_node=False, default=KIND)
+    conditions: Conditions | None = struct.field(pytree_node=False, default=None)
+    uses_lidar: bool = struct.field(pytree_node=False, default=True)
+    uses_map: bool = struct.field(pytree_node=False, default=False)
+    privileged: bool = struct.field(pytree_node=False, default=False)
+
+    def without_walls(self) -> "Locating":
+        """Returns the agent with its learnt estimate cut out: the same weights, and nothing that the walls tell."""
+        return dataclasses.replace(self, blind=True, name=f"{self.name}, cut")
+
+    def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
+        """Begins at the believed start."""
+        return self._navigator().begin(key, obs, params)
+
+    def act(
+        self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
+    ) -> tuple[Action, Memory]:
+        """Returns command and estimate of one control period, and the memory after it."""
+        return self._navigator().act(key, memory, obs, params, known)
+
+    def _navigator(self) -> Navigator:
+        return Navigator(Locator(nested(self.tensors), self.network, self.blind), CentreLine(), name=self.name)
+
+
+def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns weights by name as a tree: `match.taps` becomes `{"match": {"taps": …}}`."""
+    tree: dict[str, Any] = {}
+    for name, tensor in tensors.items():
+        *path, last = name.split(".")
+        branch = tree
+        for part in path:
+            branch = branch.setdefault(part, {})
+        branch[last] = tensor
+    return tree
+
+
+def check_tensors(agent: Locating) -> None:
+    """Refuses tensors that are missing or misshapen.
+
+    Raises:
+        KeyError: One is missing.
+        ValueError: There is no such network, or a tensor has another shape or name.
+    """
+    front = "match" if any(name.startswith("match.") for name in agent.tensors) else "scans"
+    shapes = jax.eval_shape(lambda key: memory.init(agent.network, front, key), jax.random.key(0))
+    wanted = flat(shapes)
+    for name, leaf in wanted.items():
+        if agent.tensors[name].shape != leaf.shape:
+            raise ValueError(f"{name} is {agent.tensors[name].shape}, not {leaf.shape}")
+    if further := sorted(set(agent.tensors) - set(wanted)):
+        raise ValueError(f"{further[0]} is of no {agent.network}")
+
+
+def flat(weights: Any) -> dict[str, Any]:
+    """Returns a tree of weights by name; the inverse of `nested`."""
+    leaves = jax.tree_util.tree_flatten_with_path(weights)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
