@@ -21,43 +21,62 @@ LAGS = 13  # bins by which a profile is shifted to either side
 _MEAN, _TAPS = 8, 9  # bins to either side of a running mean; bins of the filter
 MARGIN = _MEAN + _TAPS // 2  # bins about a block that its evidence depends on, beside the shifts
 N_CUT = BLOCK + 2 * (LAGS + MARGIN)  # bins that the evidence of a block needs
-_CHANNELS = 6
+_CHANNELS, _EDGES = 8, 4  # features; the first of them are of one sign, as the edges of niches and boxes are
 PAIRS = np.array(list(itertools.combinations(range(N_BEARINGS), 2)))  # (ahead, behind)
 _UNIT = 0.03  # m: relief that is large against noise
+_DEAD = 0.3  # of an edge, in the filter's unit: noise makes lesser ones
+_OFF = -6.0  # of a weight before learning: as good as none
 
 Weights = dict[str, Any]
 _einsum = partial(jnp.einsum, precision="highest")  # differences of squares: no TF32
 
 
 def init(key: PRNGKeyArray) -> Weights:
-    """Returns weights that compare the profiles themselves, high-passed and smoothed; learning improves on them."""
-    taps = 0.15 * jax.random.normal(key, (N_BEARINGS, _TAPS, 2, _CHANNELS)) / np.sqrt(_TAPS)
+    """Returns weights from which learning goes on: edges that beams ahead or behind see sharply, and smoothed relief.
+
+    A niche hides its near edge from beams ahead and its far edge from those behind; a box does so the other way round.
+    So the former meet walls that come nearer sharply, and the latter walls that recede.
+    """
+    taps = 0.1 * jax.random.normal(key, (N_BEARINGS, _TAPS, 3, _CHANNELS + 1)) / np.sqrt(_TAPS)
+    recede = jnp.array([0.0, -0.25, -0.25, -0.25, 0.0, 0.25, 0.25, 0.25, 0.0])
     smooth = jnp.array([0.0, 0.0, 0.0, 0.25, 0.5, 0.25, 0.0, 0.0, 0.0])
-    slope = jnp.array([0.0, 0.0, -0.25, -0.25, 0.0, 0.25, 0.25, 0.0, 0.0])
-    taps = taps.at[:, :, 0, 0].add(smooth).at[:, :, 0, 1].add(slope)
+    for channel, filters in enumerate((-recede, recede)):
+        taps = taps.at[:, :, 0, channel].add(filters)
+    taps = taps.at[..., _CHANNELS].set(0.0).at[:, :, 2, _CHANNELS].set(-4.0 / _TAPS)
+    taps = taps.at[:, :, 0, _EDGES].add(smooth).at[:, :, 0, _EDGES + 1].add(recede)
+    middle = N_BEARINGS // 2
+    pair = jnp.full((len(PAIRS), _CHANNELS), _OFF + 3.0)
+    pair = pair.at[:, 0].set(np.where(PAIRS[:, 1] <= middle, -0.5, _OFF))
+    pair = pair.at[:, 1].set(np.where(PAIRS[:, 0] >= middle, -0.5, _OFF))
+    pair = pair.at[:, _EDGES].set(-2.0)
     return {
         "taps": taps,
-        "bias": jnp.zeros((N_BEARINGS, _CHANNELS)),
-        "gain": jnp.zeros((_CHANNELS,)).at[2:].set(-1.5),
-        "pair": jnp.full(len(PAIRS), -2.5),
+        "bias": jnp.zeros((N_BEARINGS, _CHANNELS + 1)).at[:, _CHANNELS].set(5.0),
+        "pair": pair,
         "count": jnp.zeros(()),
     }
 
 
-def encode(weights: Weights, profiles: Profiles) -> tuple[Float[Array, "2 7 bins c"], Grid]:
-    """Returns features of the profiles and the weight of each bin, 0 to 1; `MARGIN` bins at either end are lost."""
+def encode(weights: Weights, profiles: Profiles) -> tuple[Float[Array, "2 7 bins c"], Float[Array, "2 7 bins c"]]:
+    """Returns features of the profiles and their weights, 0 to 1; `MARGIN` bins at either end are lost."""
     there = jnp.minimum(profiles.weight, 1.0)
     out = profiles.out / jnp.maximum(profiles.weight, 1e-3)
     n = profiles.weight.shape[-1] - 2 * _MEAN
     sums = [_running(values, n) for values in (there * out, there)]
     relief = out[..., _MEAN : _MEAN + n] - sums[0] / jnp.maximum(sums[1], 1e-3)
     there = there[..., _MEAN : _MEAN + n]
-    inputs = jnp.stack([there * jnp.arcsinh(relief / _UNIT), 1.0 - there], axis=-1)
+    relief = there * jnp.arcsinh(relief / _UNIT)
+    inputs = jnp.stack([relief, 1.0 - there, jnp.abs(relief)], axis=-1)
     m = n - _TAPS + 1
     rows = jnp.stack([inputs[..., k : k + m, :] for k in range(_TAPS)], axis=-2)
     found = _einsum("sbukc,bkcd->sbud", rows, weights["taps"]) + weights["bias"][:, None]
     half = _TAPS // 2
-    return jnp.exp(weights["gain"]) * jnp.tanh(found), there[..., half : half + m]
+    edges = jnp.maximum(found[..., :_EDGES] - _DEAD, 0.0)
+    features = jnp.tanh(jnp.concatenate([edges, found[..., _EDGES:_CHANNELS]], axis=-1))
+    there = there[..., half : half + m, None]
+    gated = there * jax.nn.sigmoid(found[..., _CHANNELS:])  # relief counts where nothing deep hides the wall
+    edge = np.arange(_CHANNELS) < _EDGES
+    return features, jnp.where(edge, there, gated)
 
 
 def _running(values: Grid, n: int) -> Grid:
@@ -80,34 +99,38 @@ def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_shares"]:
 
 
 def compare(
-    weights: Weights, features: Float[Array, "2 7 bins c"], there: Grid, along: Float[Array, "2 7"]
+    weights: Weights,
+    features: Float[Array, "2 7 bins c"],
+    there: Float[Array, "2 7 bins c"],
+    along: Float[Array, "2 7"],
 ) -> Float[Array, "n_shares"]:
     """Compares the pairs of beams on either side.
 
     Args:
         weights: Of `init`, trained.
         features: Features of `BLOCK + 2 LAGS` bins about the block.
-        there: Weights of the bins.
+        there: Weights of the features.
         along: Mean distance ahead at which each beam saw the block, m.
     """
     shifts = range(2 * LAGS + 1)
     seen_ahead = jnp.stack([features[:, :, k : k + BLOCK] for k in shifts], axis=2)
     there_ahead = jnp.stack([there[:, :, k : k + BLOCK] for k in shifts], axis=2)
     behind, there_behind = features[:, :, LAGS : LAGS + BLOCK], there[:, :, LAGS : LAGS + BLOCK]
-    square = lambda f: jnp.sum(f * f, axis=-1)  # noqa: E731
-    ahead_square = _einsum("saku,sbu->sabk", there_ahead * square(seen_ahead), there_behind)
-    behind_square = _einsum("saku,sbu->sabk", there_ahead, there_behind * square(behind))
-    product = _einsum("sakuc,sbuc->sabk", there_ahead[..., None] * seen_ahead, there_behind[..., None] * behind)
-    count = _einsum("saku,sbu->sabk", there_ahead, there_behind)
+    overlap = partial(_einsum, "sakuc,sbuc->sabkc")
+    ahead_square, behind_square = (
+        overlap(there_ahead * seen_ahead**2, there_behind),
+        overlap(there_ahead, there_behind * behind**2),
+    )
+    product, count = overlap(there_ahead * seen_ahead, there_behind * behind), overlap(there_ahead, there_behind)
     a, b = PAIRS[:, 0], PAIRS[:, 1]
     cost = ((ahead_square + behind_square - 2.0 * product) / (count + 1.0))[:, a, b]
+    cost = jnp.sum(jax.nn.softplus(weights["pair"])[:, None] * cost, axis=-1)
     shares = jnp.asarray(SHARES)
     apart = (along[:, a] - along[:, b]) / BIN
     target = LAGS + jnp.clip(apart[..., None] * shares / (1.0 + shares), 2.0 - LAGS, LAGS - 2.0)
     curve = _einsum("spek,spk->spe", _cubic(jnp.arange(2 * LAGS + 1) - target[..., None]), cost)
-    present = jnp.max(count[:, a, b], axis=-1) / BLOCK
-    weight = jax.nn.softplus(weights["pair"]) * BLOCK * present**2
-    return -jnp.exp(weights["count"]) * _einsum("sp,spe->e", weight, curve)
+    present = jnp.max(count[..., 0][:, a, b], axis=-1) / BLOCK
+    return -jnp.exp(weights["count"]) * _einsum("sp,spe->e", BLOCK * present**2, curve)
 
 
 def _cubic(x: Array) -> Array:
