@@ -65,6 +65,14 @@ def test_floor_and_height_are_right_under_track_and_beside_walkways(world, senso
     assert np.median(bore.width) == pytest.approx(np.ptp(world.outline[:, 0]), abs=0.03)
 
 
+def test_sleepers_that_stand_out_little_do_not_lift_the_ballast(monkeypatch):
+    low = [box for aside in (-2.0, 2.0) for box in railway.sleepers(SPACED, 0.06, aside)]
+    points = SCANS["os1"](World(arch(8.7, 6.6, 3.0), L, low))
+    assert abs(np.median(built(points, 0.04)[1][8:-8])) < 0.008
+    monkeypatch.setattr(floor, "_PEAK_HALF", 0.0)  # which leaves the line where it was
+    assert np.median(built(points, 0.04)[1][8:-8]) > 0.008
+
+
 def test_a_thin_cloud_shows_the_floor_between_sleepers_in_longer_windows(monkeypatch):
     points = SCANS["terrestrial"](World(arch(5.1, 5.5, 3.0), L, PROUD))
     thin = points[np.random.default_rng(3).permutation(len(points))[:5_000]]  # 10 a square metre
