@@ -2,12 +2,14 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 
 import subterra_jax as st
 from benchmarks.openboard import __main__ as command
-from benchmarks.openboard import columns, report
+from benchmarks.openboard import ablations, bound, columns, report, search
+from subterra_jax.baselines import registry
 
 SPLITS = ("val", "test-unseen")
 
@@ -73,3 +75,35 @@ def test_a_cell_that_is_there_is_not_driven_again(tmp_path, monkeypatch, capsys)
     changed = command.OpenboardConfig(tmp_path, ("StopAt",), ("fused",), ("val",), 41, 2)
     with pytest.raises(st.SubterraError, match="holds no cell"):
         command.run(command.OpenboardConfig(**{**vars(changed), "report_only": True}))
+
+
+@pytest.mark.parametrize("agent", search.SPACES)
+def test_a_search_begins_with_the_default_and_keeps_it_unless_another_is_clearly_better(agent):
+    _, params = st.make("Subterra/StopAt-v1", tunnel="control")
+    first, *others = search.candidates(agent)
+    field = search.SPACES[agent][0]
+    default = getattr(registry.make_agent(agent, params).localiser, field)
+    for name, value in first.items():
+        assert getattr(default, name) == pytest.approx(value), name
+    made = getattr(search.with_settings(agent, others[-1])(params).localiser, field)
+    assert {name: getattr(made, name) for name in first} == others[-1]
+    rows = [{"settings": s, "success": x} for s, x in ((first, 0.5), (others[0], 0.52), (others[1], 0.51))]
+    assert search.choose(rows, 400) == first
+    rows[1]["success"] = 0.6
+    assert search.choose(rows, 400) == others[0]
+
+
+def test_an_ablation_of_wet_rail_has_its_loss_in_every_episode():
+    part = ablations.WetRail(factor=4.0 / 3.0)
+    env, params = st.make("Subterra/Faulted-v1", tunnel="control")
+    drawn = env.draw_reset(jax.random.key(0), (), params)
+    state = env.begin(drawn, params)
+    loss = part.sizes(part.begin(drawn["faults"], state, params), params).wet_loss
+    assert float(loss) == pytest.approx(0.4)
+
+
+def test_bound_and_error_are_compared_where_the_bound_is_tight():
+    row = {"tunnel": "x", "station": [1.0, 2.0, 3.0], "bound": [0.1, 0.1, 1.0], "error": [0.12, 0.12, 9.0]}
+    assert bound.ratio(row) == pytest.approx(1.2)
+    assert "ratio 1.20" in bound.describe(row)
+    assert bound.ratio({**row, "bound": [1.0, 1.0, 1.0]}) is None
