@@ -23,13 +23,16 @@ from subterra_jax.evaluation.bounds import stop_bounds
 from subterra_jax.evaluation.records import grouped, interval
 from subterra_jax.host.files import require_folder
 from subterra_jax.policies import open_agent
+from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.opening import policy_source
 from subterra_jax.procedural.open_world import SPLITS, kinds_of
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import find
+from train.locate.tunnels import load
 
 SCHEMA = "subterra.kinds/1"
 N_GROUPS = 10
+CUT = "cut:"  # before the file of a learnt localiser: the ablation
 AGENTS = ("dead-reckoning", "fused", "ring-count", "ring-filter", "particle-filter", "oracle")
 _OLD = "`subterra-351` and the older family"
 TUNED_ON = {
@@ -51,11 +54,12 @@ class KindsConfig:
     Attributes:
         task: Task id.
         split: Split of the open world; a choice may be made on `val` alone.
-        agents: Names of agents, or files of policies.
+        agents: Names of agents, or files of policies; `cut:FILE` is a learnt localiser without what walls tell it.
         episodes: Episodes of each kind.
         tunnels: Tunnels of each kind, over which the episodes are spread.
         lining: `built`, `bare` or `smooth`.
         first: Index of the first tunnel.
+        cache: Folder in which made tunnels are kept from run to run.
         out: Folder for `kinds.json` and `kinds.md`; `None` prints the table only.
     """
 
@@ -66,6 +70,7 @@ class KindsConfig:
     tunnels: int = 10
     lining: str = "built"
     first: int = 0
+    cache: Path | None = None
     out: Path | None = None
 
 
@@ -81,13 +86,14 @@ def run(config: KindsConfig) -> None:
         f"open:{kind}:{config.split}:{config.first + i}" for kind in kinds for i in range(config.tunnels)
     ]  # of one kind after another
     started = time.monotonic()
-    env, params = st.make(find(config.task, short=True), tunnel=names, lining=config.lining, estimates=True)
+    task, tunnels = find(config.task, short=True), load(names, config.lining, config.cache)
+    env, params = st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0], estimates=True)
     _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
     episodes = draw_episodes(config, len(kinds))
     found = {}
     for agent in config.agents:
         started = time.monotonic()
-        found[agent] = evaluate(env, params, open_agent(agent, env, params), episodes, len(episodes))
+        found[agent] = evaluate(env, params, _agent(agent, env, params), episodes, len(episodes))
         _progress.print(f"{agent}: {100 * found[agent].success.mean():.1f} % ({time.monotonic() - started:.0f} s)")
     rows = {agent: [summary(records, config, kind) for kind in range(len(kinds))] for agent, records in found.items()}
     text = as_markdown(config, kinds, rows, params)
@@ -106,6 +112,21 @@ def run(config: KindsConfig) -> None:
     print(config.out / "kinds.md")
 
 
+def _agent(name: str, env: Any, params: EnvParams) -> Any:
+    """Makes an agent by its name.
+
+    Raises:
+        BenchmarkError: What shall be cut is not a learnt localiser.
+        SubterraError: There is no such agent or policy, or it does not fit the task.
+    """
+    agent = open_agent(name.removeprefix(CUT), env, params)
+    if not name.startswith(CUT):
+        return agent
+    if not isinstance(agent, Locating):
+        raise BenchmarkError(f"{name}: only a learnt localiser can be cut, and this is {type(agent).__name__}")
+    return agent.without_walls()
+
+
 def check(config: KindsConfig) -> None:
     """Refuses settings that cannot be run, before anything is made.
 
@@ -116,7 +137,7 @@ def check(config: KindsConfig) -> None:
     if config.split not in SPLITS:
         raise BenchmarkError(f"there is no split {config.split!r}; there are {', '.join(SPLITS)}")
     for agent in config.agents:
-        if agent not in registry.names() and policy_source(agent) is None:
+        if agent not in registry.names() and policy_source(agent.removeprefix(CUT)) is None:
             known = ", ".join(registry.names())
             raise BenchmarkError(f"no agent {agent!r}; there are {known}, or a policy's file or folder")
     if config.out is not None:

@@ -30,16 +30,20 @@ def make(task: str, names: str, lining: str | None = None, cache: Path | None = 
         TunnelError: There is no such tunnel or lining.
     """
     wanted = [name for part in names.split(",") for name in expand(part)]
-    one = functools.partial(_tunnel, lining=lining, cache=cache)
-    workers = min(len(wanted), os.cpu_count() or 1)
-    if workers > 1:
-        context = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
-            tunnels = list(pool.map(one, wanted, chunksize=1))
-    else:
-        tunnels = [one(name) for name in wanted]
+    tunnels = load(wanted, lining, cache)
     env, params = st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0])
     return env, params, wanted
+
+
+def load(names: list[str], lining: str | None = None, cache: Path | None = None) -> list[Tunnel]:
+    """Returns the tunnels of these names; `lining`, `cache` and errors as for `make`."""
+    one = functools.partial(_tunnel, lining=lining, cache=cache)
+    workers = min(len(names), os.cpu_count() or 1)
+    if workers == 1:
+        return [one(name) for name in names]
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
+        return list(pool.map(one, names, chunksize=1))
 
 
 def _tunnel(name: str, lining: str | None, cache: Path | None) -> Tunnel:

@@ -72,7 +72,7 @@ class Locator:
         """Begins at the believed start."""
         zero = jnp.zeros(())
         return LocatorMemory(
-            begin=believed_start(params)[0],
+            begin=believed_start(obs, params)[0],
             driven=zero,
             reading=obs.distance,
             steps=zero - 1.0,
