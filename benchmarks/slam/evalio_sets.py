@@ -30,9 +30,9 @@ from evalio.datasets.loaders import (
     LidarStamp,
     RosbagIter,
 )
-from evalio.types import SE3, SO3, ImuParams, LidarParams, Stamp, Trajectory
+from evalio.types import SE3, SO3, ImuMeasurement, ImuParams, LidarParams, Stamp, Trajectory
 
-from benchmarks.slam.sweep_points import sweep_points
+from benchmarks.slam.sweep_points import livox_points
 
 SET = "SUBTERRA_SET"
 _LIVOX_FIELDS = [("x", 7, 0), ("y", 7, 4), ("z", 7, 8), ("intensity", 7, 12), ("t", 6, 16), ("ring", 4, 20)]
@@ -128,13 +128,11 @@ _FIRED_RINGS = np.array([0, 8, 1, 9, 2, 10, 3, 11, 4, 12, 5, 13, 6, 14, 7, 15]) 
 class _LivoxIter(RosbagIter):
     """Reads Livox's own message too, which evalio's iterator does not know."""
 
-    def _lidar_conversion(self, message: Any) -> Any:
-        if not hasattr(message, "point_num"):
-            return super()._lidar_conversion(message)
-        points = sweep_points(message)
+    def _convert_livox(self, raw: bytes) -> Any:
+        stamp, points = livox_points(raw)
         cloud = PointCloudMetadata(
-            stamp=Stamp(sec=message.header.stamp.sec, nsec=message.header.stamp.nanosec), height=1, width=len(points),
-            row_step=points.nbytes, point_step=points.itemsize, is_bigendian=0, is_dense=0,
+            stamp=Stamp.from_nsec(stamp), height=1, width=len(points), row_step=points.nbytes,
+            point_step=points.itemsize, is_bigendian=0, is_dense=0,
         )  # fmt: skip
         fields = [Field(name=name, datatype=DataType(code), offset=offset) for name, code, offset in _LIVOX_FIELDS]
         scan = pc2_to_evalio(cloud, fields, points.tobytes())
@@ -145,9 +143,16 @@ class _LivoxIter(RosbagIter):
     def __iter__(self) -> Any:
         """Yields IMU samples and sweeps in order of recording."""
         for connection, _, raw in self.reader.messages(connections=self.connections_lidar + self.connections_imu):
+            if connection.msgtype.endswith("CustomMsg"):
+                yield self._convert_livox(raw)
+                continue
             message = self.reader.deserialize(raw, connection.msgtype)
             imu = connection.msgtype == "sensor_msgs/msg/Imu"
             yield self._imu_conversion(message) if imu else self._lidar_conversion(message)
+
+    def lidar_iter(self) -> Any:
+        """Yields the sweeps."""
+        return (one for one in self if not isinstance(one, ImuMeasurement))
 
 
 def open_set(folder: Path, names: Sequence[str]) -> Any:

@@ -122,12 +122,15 @@ def read_samples(recording: Path) -> Iterator[tuple[int, Any]]:
     """Yields stamps, ns, with pairs of acceleration and turn rate, or arrays of points, in order of recording."""
     from rosbags.highlevel import AnyReader
 
-    from benchmarks.slam.sweep_points import sweep_points
+    from benchmarks.slam.sweep_points import livox_points, sweep_points
 
     facts = yaml.safe_load((recording / "calibration.yaml").read_text())
     with AnyReader([recording / "recording"]) as reader:
         topics = (facts["lidar"]["topic"], facts["imu"]["topic"])
         for connection, _, raw in reader.messages([one for one in reader.connections if one.topic in topics]):
+            if connection.msgtype.endswith("CustomMsg"):
+                yield livox_points(raw)
+                continue
             message: Any = reader.deserialize(raw, connection.msgtype)
             stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
             if connection.topic == topics[0]:

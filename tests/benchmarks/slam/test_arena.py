@@ -1,5 +1,6 @@
 """Recordings of the arena: layouts of the drivers, both kinds of bag, the IMU at rest, wheels, dust, and mistakes."""
 
+import json
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -16,7 +17,7 @@ from benchmarks.slam.arena import bags, record, sets, wheels
 from benchmarks.slam.arena.drives import CARRIERS, REST
 from benchmarks.slam.arena.dust import draw_dust
 from benchmarks.slam.arena.walls import draw_walls
-from benchmarks.slam.sweep_points import sweep_points
+from benchmarks.slam.sweep_points import livox_points, sweep_points
 from scene.survey.carrier import ACCEL_BIAS, GRAVITY, Poses
 from scene.survey.cast import Hits
 
@@ -58,6 +59,49 @@ def test_both_bags_hold_the_same_messages_and_other_readers_agree(made):
     for one, two, three in zip(*clouds, foreign, strict=True):
         np.testing.assert_array_equal(one, two)
         np.testing.assert_array_equal(one, three)
+
+
+def test_livox_points_are_read_from_the_bytes_as_from_the_objects(made):
+    name, folder = made
+    if name != "avia":
+        return
+    with AnyReader([folder / bags.MCAP]) as reader:
+        for connection, _, raw in reader.messages():
+            if connection.topic == TOPICS[name]:
+                message = reader.deserialize(raw, connection.msgtype)
+                stamp, points = livox_points(raw)
+                assert stamp == message.timebase
+                np.testing.assert_array_equal(points, sweep_points(message))
+
+
+def test_evalio_loads_a_recording_with_its_own_classes(made, monkeypatch):
+    name, folder = made
+    (folder / "set" / "recordings" / "one").mkdir(parents=True, exist_ok=True)
+    place = folder / "set" / "recordings" / "one"
+    if not (place / "recording").exists():
+        (place / "recording").symlink_to(folder / bags.MCAP)
+    scene = record.draw_scene(record.Course("one", "smooth", name, distance=1.0), SEED)
+    (place / "calibration.yaml").write_text(json.dumps(record.calibration(scene)))
+    from evalio.types import ImuMeasurement
+
+    from benchmarks.slam import evalio_sets
+
+    monkeypatch.setenv(evalio_sets.SET, str(folder))
+    (one,) = evalio_sets.open_set(folder / "set", ["one"])
+    samples = list(one.data_iter())
+    sweeps = [s for s in samples if not isinstance(s, ImuMeasurement)]
+    assert len(samples) - len(sweeps) >= 40
+    raw = [sweep_points(m) for topic, _, m in content(folder / bags.MCAP) if topic == TOPICS[name]]
+    facts = one.lidar_params()
+    for sweep, points in zip(sweeps, raw, strict=True):
+        xyz = np.array([(p.x, p.y, p.z, p.row, p.t.to_sec()) for p in sweep.points])
+        assert len(xyz) == facts.num_rows * facts.num_columns
+        seen = np.abs(xyz[:, :3]).sum(axis=1) > 0.0
+        valid = np.abs(points["x"]) + np.abs(points["y"]) + np.abs(points["z"]) > 0.0
+        told = np.column_stack([points["x"], points["y"], points["z"], points["ring"], 1e-9 * points["t"]])[valid]
+        assert seen.sum() == valid.sum()
+        np.testing.assert_allclose(np.sort(xyz[seen], axis=0), np.sort(told, axis=0), atol=2e-6)
+    np.testing.assert_allclose(one.imu_T_lidar().trans, record.IMU.shift)
 
 
 def test_layouts_are_those_of_the_drivers(made):
