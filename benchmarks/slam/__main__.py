@@ -23,6 +23,7 @@ from benchmarks.slam.board_page import as_png as board_png
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import SCHEMA, ProgramScore, ScoreConfig, score_all
+from benchmarks.slam.submission import SubmissionConfig, check_submission
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -39,6 +40,9 @@ Example: {_PROG} run --library kiss-icp --recordings out/slam/set --out out/slam
 _BOARD = f"""Run and score every program on sets of the arena.
 
 Example: {_PROG} board --sets out/arena --out out/board --jobs 2"""
+_CHECK = f"""Check that a submission can be scored, without the truth.
+
+Example: {_PROG} check --submission mine --recordings out/arena"""
 _SCORE = f"""Score TUM files against the truth.
 
 Example: {_PROG} score --estimate out/slam/kiss-icp --truth out/slam/set/truth --out out/slam/scores"""
@@ -48,6 +52,7 @@ Command = (
     | Annotated[ArenaConfig, tyro.conf.subcommand("arena", description=_ARENA)]
     | Annotated[RunConfig, tyro.conf.subcommand("run", description=_RUN)]
     | Annotated[BoardConfig, tyro.conf.subcommand("board", description=_BOARD)]
+    | Annotated[SubmissionConfig, tyro.conf.subcommand("check", description=_CHECK)]
     | Annotated[ScoreConfig, tyro.conf.subcommand("score", description=_SCORE)]
 )
 _HEAD = (
@@ -58,8 +63,8 @@ _PANELS = (("along the axis", 0), ("across it", 1))
 _STYLES = ("-", "--", ":", "-.")
 
 
-def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | ScoreConfig) -> None:
-    """Records, runs or scores.
+def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | SubmissionConfig | ScoreConfig) -> None:
+    """Records, runs, checks or scores.
 
     Raises:
         SubterraError: An input is missing or wrong, or an output cannot be written.
@@ -74,6 +79,8 @@ def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | ScoreConfig
         for name, result in make_board(config):
             _progress.print(f"{name}: {result}")
         _write_board(config.out)
+    elif isinstance(config, SubmissionConfig):
+        print("\n".join(check_submission(config)))
     else:
         scores = score_all(config)
         if config.out is not None:
