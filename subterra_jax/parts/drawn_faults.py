@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from subterra_jax import constants
 from subterra_jax.parts.faults import MAX_DELAY, FaultParams, Faults, FaultState
@@ -77,22 +77,22 @@ class DrawnFaults(Faults):
         fields["seen"] = begun.seen.at[1:, 4:].add(-past)
         return DrawnFaultState(**fields, scale=1.0 + faults.spread * (2.0 * draw[2] - 1.0), origin=origin)
 
-    def sizes(self, own: DrawnFaultState, params: EnvParams) -> FaultParams:
+    def sizes(self, own: Any, params: EnvParams) -> FaultParams:
         """Return the sizes of the faults of an episode at severity 4."""
         middle = params.faults
         return middle.replace(**{name: getattr(middle, name) * own.scale[i] for i, name in enumerate(SIZES)})
 
-    def drive(self, own: DrawnFaultState, drive: Drive, state: State, params: EnvParams) -> Drive:
+    def drive(self, own: Any, drive: Drive, state: State, params: EnvParams) -> Drive:
         """Take speed from the robot on wet rail; the wheels of a frozen odometer seem to stand."""
         drive = super().drive(own, drive, state, params)
         return Drive(jnp.where(super().holds_odometer(own), 0.0, drive.wheels), drive.motion)
 
-    def holds_odometer(self, own: DrawnFaultState) -> bool:
+    def holds_odometer(self, own: Any) -> Bool[Array, ""]:
         """Hold nothing: the odometer counts wheels that seem to stand, with its noise."""
         del own
-        return False
+        return jnp.zeros((), bool)
 
-    def look_from(self, own: DrawnFaultState, sight: Sight, params: EnvParams) -> Sight:
+    def look_from(self, own: Any, sight: Sight, params: EnvParams) -> Sight:
         """Show an earlier moment, by an odometer that did not begin at 0."""
         sight = super().look_from(own, sight, params)
         reading = sight.parts["odometry"]
@@ -101,6 +101,6 @@ class DrawnFaults(Faults):
         )
         return dataclasses.replace(sight, parts={**sight.parts, "odometry": shifted})
 
-    def privileged(self, own: DrawnFaultState) -> dict[str, Array]:
+    def privileged(self, own: Any) -> dict[str, Array]:
         """Return the severity, and the factors on the middles of the sizes that a bound may know."""
         return {**super().privileged(own), **{f"fault_{name}": own.scale[i] for i, name in enumerate(SIZES)}}

@@ -88,7 +88,7 @@ def record_drives(
         return (state, seen, walls, command, driven, over), kept
 
     start = state.station
-    carry = (state, seen, walls, command, driven, over)
+    carry: Any = (state, seen, walls, command, driven, over)
     (state, *_), (record, station) = jax.lax.scan(step, carry, jnp.arange(n_steps))
     record = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), record)
     return Drive(record, jnp.swapaxes(station, 0, 1) - start[:, None], state.tunnel)

@@ -101,13 +101,13 @@ class LocateLearner:
             warm = jnp.minimum(1.0, (carry.steps + 1.0) / _WARM)
             rate = config.learning_rate * warm * (0.02 + 0.98 * 0.5 * (1.0 - jnp.cos(jnp.pi * left)))
             weights = jax.tree.map(lambda w, u: w - rate * u, carry.weights, updates)
-            return carry.replace(weights=weights, moments=moments, steps=carry.steps + 1), {"loss": loss, **terms}
+            return TrainState(weights, moments, carry.key, carry.steps + 1), {"loss": loss, **terms}
 
         orders = jax.vmap(lambda k: jax.random.permutation(k, config.n_envs))(
             jax.random.split(key_order, config.epochs)
         )
         state, terms = jax.lax.scan(one, state, orders.reshape(config.epochs * n_batches, config.minibatch))
-        return state.replace(key=key), jax.tree.map(jnp.nanmean, terms)
+        return dataclasses.replace(state, key=key), jax.tree.map(jnp.nanmean, terms)
 
     def _loss(self, weights: Any, drive: Drive) -> tuple[Array, dict[str, Array]]:
         """Returns the negative log likelihood of the true stations, and what is logged."""

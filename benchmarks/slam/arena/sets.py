@@ -17,16 +17,17 @@ from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
 from benchmarks.slam.arena.bags import FormatName
 from benchmarks.slam.arena.drives import CARRIERS
-from benchmarks.slam.arena.record import Course, draw_scene, write_recording, write_truth
+from benchmarks.slam.arena.record import Course, SensorName, draw_scene, write_recording, write_truth
 from benchmarks.slam.arena.walls import WALLS
 from benchmarks.slam.recordings import INDEX, RECORDINGS, TRUTH
 
 SCHEMA = "subterra.arena/1"
 _DIAL = tuple(Course(f"walls-{name}", name) for name in WALLS)
+_BY_BEAMS: tuple[tuple[int, SensorName], ...] = ((6, "avia"), (32, "os1-32"), (64, "os1-64"))
 _SENSORS = tuple(
     Course(f"beams-{beams:02d}", "furnished", sensor)
-    for beams, sensor in ((6, "avia"), (32, "os1-32"), (64, "os1-64"))
-)  # fmt: skip
+    for beams, sensor in _BY_BEAMS
+)
 _DUST = (Course("dust-half", "furnished", dust=0.1), Course("dust-lock", "furnished", dust=1.0))
 _MOTIONS = tuple(Course(f"motion-{name}", "furnished", motion=name) for name in CARRIERS if name != "trolley")
 COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS)

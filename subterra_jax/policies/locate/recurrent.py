@@ -160,4 +160,4 @@ class Attention:
         return x + apply(layer["down"], jax.nn.gelu(apply(layer["up"], _norm(x))))
 
 
-CELLS = {"gru": Gru(), "s5": StateSpace(), "transformer": Attention()}
+CELLS: dict[str, Gru | StateSpace | Attention] = {"gru": Gru(), "s5": StateSpace(), "transformer": Attention()}
