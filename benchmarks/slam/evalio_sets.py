@@ -158,7 +158,8 @@ class _LivoxIter(RosbagIter):
 def open_set(folder: Path, names: Sequence[str]) -> Any:
     """Returns the dataset of a set: an enumeration of its recordings."""
     os.environ[SET] = str(folder)
-    return SubterraSet("Subterra", {name.replace("-", "_"): name for name in names})
+    enumerate_members: Any = SubterraSet  # the functional form of an enumeration, which evalio's stubs hide
+    return enumerate_members("Subterra", {name.replace("-", "_"): name for name in names})
 
 
 if (set_folder() / "recordings").is_dir():

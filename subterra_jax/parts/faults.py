@@ -186,7 +186,7 @@ class Faults(Part):
         """Return `faults`."""
         return {"faults": FaultParams()}
 
-    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, Array]:
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, ...]:
         """Draw random bits `(*batch, 2)`, of which the second word counts, and a uniform number `(*batch,)`."""
         del params
         return jax.random.bits(key[0], (*batch, 2), jnp.uint32), jax.random.uniform(key[1], batch, jnp.float32)
@@ -195,7 +195,7 @@ class Faults(Part):
         """Count the numbers of a step."""
         return n_step_noise(params.lidar.n_beams)
 
-    def begin(self, draw: tuple[Array, Array], state: State, params: EnvParams) -> FaultState:
+    def begin(self, draw: tuple[Array, ...], state: State, params: EnvParams) -> FaultState:
         """Begin an episode without faults."""
         seen = sight(state.position, state.heading, state.station, state.odometry)
         return start_faults(draw[1], draw[0][1], seen, params.faults)

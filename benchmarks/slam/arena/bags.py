@@ -20,12 +20,13 @@ BAG, MCAP = "recording.bag", "recording"
 ODOMETRY, STATIC = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _LIVOX_2 = "livox_ros_driver2/msg/CustomMsg"  # the same fields under the name of the ROS 2 driver
 
-_PADDED = np.dtype({
+_LAYOUT: Any = {
     "names": messages.POINT.names,
     "formats": [kind for kind, *_ in (messages.POINT.fields or {}).values()],
     "offsets": [offset for _, offset, *_ in (messages.POINT.fields or {}).values()],
     "itemsize": messages.POINT.itemsize + 1,
-})  # fmt: skip
+}
+_PADDED = np.dtype(_LAYOUT)
 
 
 class Message(NamedTuple):

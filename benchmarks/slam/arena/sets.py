@@ -24,10 +24,7 @@ from benchmarks.slam.recordings import INDEX, RECORDINGS, TRUTH
 SCHEMA = "subterra.arena/1"
 _DIAL = tuple(Course(f"walls-{name}", name) for name in WALLS)
 _BY_BEAMS: tuple[tuple[int, SensorName], ...] = ((6, "avia"), (32, "os1-32"), (64, "os1-64"))
-_SENSORS = tuple(
-    Course(f"beams-{beams:02d}", "furnished", sensor)
-    for beams, sensor in _BY_BEAMS
-)
+_SENSORS = tuple(Course(f"beams-{beams:02d}", "furnished", sensor) for beams, sensor in _BY_BEAMS)
 _DUST = (Course("dust-half", "furnished", dust=0.1), Course("dust-lock", "furnished", dust=1.0))
 _MOTIONS = tuple(Course(f"motion-{name}", "furnished", motion=name) for name in CARRIERS if name != "trolley")
 COURSES: tuple[Course, ...] = (*_DIAL, *_SENSORS, *_DUST, *_MOTIONS)
