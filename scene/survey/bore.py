@@ -22,6 +22,7 @@ from scene.survey.section import (
     rectangle,
     vault,
 )  # fmt: skip
+from scene.survey.sizes import DESIGN, draw_sizes
 from scene.survey.surroundings import Cutting, Thing, box_thing, cutting_mesh, draw_cutting, round_thing, thing_mesh
 
 _IRREGULAR_SIGMA = 0.13  # m, standard deviation of the walls
@@ -191,20 +192,27 @@ def _draw_section(rng: np.random.Generator, kind: _Class, length: float, correla
 
 
 def draw_bore(
-    seed: np.random.SeedSequence, length: float, truth: TruthName = "paper", correlation: float = 2.0
+    seed: np.random.SeedSequence,
+    length: float,
+    truth: TruthName = "paper",
+    correlation: float = 2.0,
+    tolerances: bool = False,
 ) -> Bore:
     """Draws a bore of a length between the mouths, m, and a class.
 
-    `correlation` is the length in which the walls of `irregular` decorrelate, m; the others do not use it.
+    `correlation` is the length in which the walls of `irregular` decorrelate, m; the others do not use it. With
+    `tolerances` the sizes of track, rings and pockets are drawn too; the other draws stay as they are without.
     """
-    first, second, third, fourth = (np.random.default_rng(s) for s in seed.spawn(4))
+    first, second, third, fourth, fifth = (np.random.default_rng(s) for s in seed.spawn(5))
+    sizes = draw_sizes(fifth) if tolerances else DESIGN
     kind = _CLASSES[truth]
     alignment = lay_out(first, length, kind.elements(first, length))
     section = _draw_section(second, kind, length, correlation)
-    furniture = draw_furniture(third, length, rings=kind.rings and not kind.rough)
+    furniture = draw_furniture(third, length, kind.rings and not kind.rough, sizes)
     things = kind.things(fourth, length)
     begin = fourth.uniform(0.65, 0.75) * length
-    furniture = replace(furniture, tracks=kind.tracks, rise=kind.rise, dark=(begin, begin + kind.dark))
+    tracks = tuple(middle + sizes.track_aside for middle in kind.tracks)
+    furniture = replace(furniture, tracks=tracks, rise=kind.rise, dark=(begin, begin + kind.dark))
     if not kind.tracks:
         furniture = replace(furniture, sleepers=np.empty(0))
     cutting = draw_cutting(fourth, 0.5 * float(section.width(np.array([length]))[0])) if kind.cutting else None

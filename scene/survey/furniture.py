@@ -1,32 +1,26 @@
-"""Sizes and places of what is built into the bore: rings, bolt pockets, nails, sleepers, rails."""
+"""Places of what is built into the bore: rings, bolt pockets, nails, sleepers, rails; and the sizes that never vary."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-RING_WIDTH = 1.5  # m [track.md A5: Guangzhou line 21]
-POCKET_LENGTH = 0.20  # m, along the axis
+from scene.survey.sizes import DESIGN, Sizes
+
 POCKET_WIDTH = 0.18  # m, along the girth
-POCKET_DEPTH = 0.13  # m, mean, along the normal of the section at the pocket's middle
-POCKET_OFFSET = 0.22  # m from the ring joint to the middle of a pocket
 NAIL_DIAMETER = 0.028  # m
 NAIL_DEPTH = 0.06  # m, axis of the nail behind the lining surface
 POCKET_DEPTH_SIGMA = 0.01  # m, from pocket to pocket
 FILLED_SHARE = 0.05  # pockets missing: mortared flush
 NAIL_MISSING_SHARE = 0.03
 
-SLEEPER_SPACING = 0.6  # m
 SLEEPER_JITTER = 0.01  # m, standard deviation of each sleeper's station
-SLEEPER_LENGTH = 2.50  # m, across the track
-SLEEPER_TOP = 0.20  # m, along the track
 SLEEPER_BOTTOM = 0.30  # m, along the track
 SLEEPER_HEIGHT = 0.20  # m
 SLEEPER_RISE = 0.06  # m, top of the sleeper above the floor (ballast surface); the rest is buried and not modelled
 
-PAD = (0.18, 0.15, 0.010)  # m: along, across, thick
+PAD = (0.18, 0.15)  # m: along, across
 CLIP = (0.11, 0.09, 0.06)  # m: along, across, high
 CLIP_INNER = 0.070  # m from the rail's axis to the near face of a clip, which so overlaps the foot by 5 mm
-GAUGE = 1.435  # m, between the inner faces of the rail heads 14 to 16 mm below rail top
 
 # Right half of a CHN60 rail without inclination, from the edge of the foot to the middle of the head: across, up, m.
 # Height 176, foot 150, head 73, web 16.5 mm; the head's side is vertical through the gauge plane.
@@ -35,7 +29,8 @@ RAIL_HALF = 1e-3 * np.array([
     (36.5, 164.0), (33.0, 171.0), (22.0, 175.0), (8.0, 175.9),
 ])  # fmt: skip
 RAIL_HEIGHT = 0.176  # m
-RAIL_AXIS = 0.5 * (GAUGE + 0.073)  # m from the track's axis to the rail's: half the gauge and half a head
+_HEAD_WIDTH = 0.073  # m
+_WORN = 0.150  # m above the foot: what lies higher of a worn head has come down
 
 
 N_ROWS = 8  # longitudinal rows of pockets: four on the left side from the floor up, four on the right
@@ -54,25 +49,42 @@ class Furniture:
     tracks: tuple[float, ...] = (0.0,)  # Middles of the tracks to the left of the axis, m; empty where there is none
     rise: float = SLEEPER_RISE  # Top of the sleepers above the floor, m
     dark: tuple[float, float] = (0.0, 0.0)  # Stations between which the lining gives no echo, m
+    sizes: Sizes = DESIGN  # Sizes as built
+
+    @property
+    def rail_height(self) -> float:
+        """Height of the rails from foot to top, m."""
+        return RAIL_HEIGHT - self.sizes.wear
+
+    @property
+    def rail_half(self) -> np.ndarray:
+        """Right half of the rails' profile: across, up, m, `(11, 2)`."""
+        return RAIL_HALF - np.where(RAIL_HALF[:, 1:] > _WORN, (0.0, self.sizes.wear), 0.0)
+
+    @property
+    def rail_axis(self) -> float:
+        """Distance from a track's middle to the middle of a rail, m: half the gauge and half a head."""
+        return 0.5 * (self.sizes.gauge + _HEAD_WIDTH)
 
     @property
     def rail_top(self) -> float:
         """Height of the rails' tops above the floor, m."""
-        return self.rise + PAD[2] + RAIL_HEIGHT
+        return self.rise + self.sizes.pad + self.rail_height
 
 
-def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True) -> Furniture:
-    """Draws the furniture of a bore of `length` m, without rings, pockets and nails if not `rings`.
+def draw_furniture(rng: np.random.Generator, length: float, rings: bool = True, sizes: Sizes = DESIGN) -> Furniture:
+    """Draws the furniture of a bore of `length` m and such sizes, without rings, pockets and nails if not `rings`.
 
     The first joint and the first sleeper stand at drawn stations: whoever assumes that they start at a mouth is wrong.
     """
-    joints = np.arange(rng.uniform(0.1, 1.4), length - 1e-3, RING_WIDTH)[: None if rings else 0]
+    joints = np.arange(rng.uniform(0.1, 1.4), length - 1e-3, sizes.ring_width)[: None if rings else 0]
     # Far enough from the mouths for the jitter, which ends at three standard deviations.
-    sleepers = np.arange(rng.uniform(0.19, 0.44), length - 0.19, SLEEPER_SPACING)
+    sleepers = np.arange(rng.uniform(0.19, 0.44), length - 0.19, sizes.sleeper_spacing)
     sleepers = sleepers + SLEEPER_JITTER * np.clip(rng.standard_normal(len(sleepers)), -3.0, 3.0)
-    reach = POCKET_OFFSET + 0.5 * POCKET_LENGTH + 0.05
+    reach = sizes.pocket_offset + 0.5 * sizes.pocket_length + 0.05
     pocketed = (joints > reach) & (joints < length - reach)
     filled = rng.random((len(joints), N_ROWS, 2)) < FILLED_SHARE
-    depth = POCKET_DEPTH + POCKET_DEPTH_SIGMA * np.clip(rng.standard_normal(filled.shape), -3.0, 3.0)
+    depth = sizes.pocket_depth + POCKET_DEPTH_SIGMA * np.clip(rng.standard_normal(filled.shape), -3.0, 3.0)
+    depth += np.asarray(sizes.row_depth)[None, :, None]
     nails = (rng.random((len(joints), N_ROWS)) >= NAIL_MISSING_SHARE) & ~filled.any(axis=2)
-    return Furniture(joints, pocketed, filled, depth, nails & pocketed[:, None], sleepers)
+    return Furniture(joints, pocketed, filled, depth, nails & pocketed[:, None], sleepers, sizes=sizes)

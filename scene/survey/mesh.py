@@ -87,7 +87,8 @@ def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> 
 
 def _one_track(alignment: Alignment, section: Section, furniture: Furniture, offset: float) -> Mesh:
     """Return a track whose middle runs `offset` m to the left of the axis."""
-    s, rise = furniture.sleepers, furniture.rise
+    s, rise, sizes = furniture.sleepers, furniture.rise, furniture.sizes
+    pad = (*fur.PAD, sizes.pad)
     frames = alignment.frames(s)
     floor = -0.5 * section.height(s)
 
@@ -97,29 +98,29 @@ def _one_track(alignment: Alignment, section: Section, furniture: Furniture, off
         )
 
     # Down to just under the floor only: from outside the mouth, one would see the buried part beneath it.
-    tall = rise + _BURIED + 0.5 * fur.SLEEPER_LENGTH * abs(section.crossfall)
-    low = fur.SLEEPER_TOP + (fur.SLEEPER_BOTTOM - fur.SLEEPER_TOP) * tall / fur.SLEEPER_HEIGHT
-    sleeper = 0.5 * _CORNERS * (1.0, fur.SLEEPER_LENGTH, tall)
-    sleeper[:, 0] *= np.where(sleeper[:, 2] > 0, fur.SLEEPER_TOP, low)
+    tall = rise + _BURIED + 0.5 * sizes.sleeper_length * abs(section.crossfall)
+    low = sizes.sleeper_top + (fur.SLEEPER_BOTTOM - sizes.sleeper_top) * tall / fur.SLEEPER_HEIGHT
+    sleeper = 0.5 * _CORNERS * (1.0, sizes.sleeper_length, tall)
+    sleeper[:, 0] *= np.where(sleeper[:, 2] > 0, sizes.sleeper_top, low)
     meshes = [boxes(sleeper, 0.0, rise - 0.5 * tall, Part.SLEEPER)]
-    for rail in (fur.RAIL_AXIS, -fur.RAIL_AXIS):
-        meshes.append(boxes(0.5 * _CORNERS * fur.PAD, rail, rise + 0.5 * fur.PAD[2], Part.FASTENING))
+    for rail in (furniture.rail_axis, -furniture.rail_axis):
+        meshes.append(boxes(0.5 * _CORNERS * pad, rail, rise + 0.5 * sizes.pad, Part.FASTENING))
         for side in (-1, 1):
             across = rail + side * (fur.CLIP_INNER + 0.5 * fur.CLIP[1])
             above = rise + 0.5 * fur.CLIP[2]
             meshes.append(boxes(0.5 * _CORNERS * fur.CLIP, across, above, Part.FASTENING))
-        meshes.append(_rail_mesh(alignment, section, offset + rail, rise))
+        meshes.append(_rail_mesh(alignment, section, furniture, offset + rail))
     return join_meshes(meshes)
 
 
-def _rail_mesh(alignment: Alignment, section: Section, across: float, rise: float) -> Mesh:
+def _rail_mesh(alignment: Alignment, section: Section, furniture: Furniture, across: float) -> Mesh:
     """One rail from mouth to mouth, `across` to the left of the axis, on sleepers that rise above the floor."""
     stations = np.linspace(0.0, alignment.length, int(np.ceil(alignment.length / _RAIL_STEP)) + 1)
-    half = fur.RAIL_HALF
+    half = furniture.rail_half
     # Half at negative `lateral` upwards, the middle of the head, the other half downwards: normals come out outwards.
-    outline = np.concatenate([half * (-1, 1), [(0.0, fur.RAIL_HEIGHT)], half[::-1]])
+    outline = np.concatenate([half * (-1, 1), [(0.0, furniture.rail_height)], half[::-1]])
     k, n = len(outline), len(stations)
-    base = rise + fur.PAD[2] - 0.5 * section.height(stations)[:, None]
+    base = furniture.rise + furniture.sizes.pad - 0.5 * section.height(stations)[:, None]
     y, z = np.broadcast_to(outline[:, 0] + across, (n, k)), outline[:, 1] + base
     vertices = alignment.frames(stations).point(y, z).reshape(-1, 3)
 
@@ -142,7 +143,7 @@ def nail_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> M
     station = furniture.joints[joint]
     node = section.shape.rows[row, 1]
     ends = []
-    for offset in (-fur.POCKET_OFFSET, fur.POCKET_OFFSET):
+    for offset in (-furniture.sizes.pocket_offset, furniture.sizes.pocket_offset):
         frames = alignment.frames(station + offset)
         at = np.arange(len(node))
         yz = section.rough(station + offset)[at, node] + fur.NAIL_DEPTH * section.shape.normal[node]
@@ -175,8 +176,8 @@ _FLOOR_CELL = 0.3  # m across the floor
 
 def station_rows(furniture: Furniture, length: float) -> Float[np.ndarray, "n"]:
     """Return the stations of the surface grid: mouths, joints, edges and middles of pockets, and cells between."""
-    half = 0.5 * fur.POCKET_LENGTH
-    offsets = np.array([0.0, _JOINT_HALF, *(fur.POCKET_OFFSET + half * np.array([-1, 0, 1]))])
+    half, offset = 0.5 * furniture.sizes.pocket_length, furniture.sizes.pocket_offset
+    offsets = np.array([0.0, _JOINT_HALF, *(offset + half * np.array([-1, 0, 1]))])
     near = (furniture.joints[furniture.pocketed, None] + np.concatenate([-offsets, offsets])).ravel()
     bare = (furniture.joints[~furniture.pocketed, None] + _JOINT_HALF * np.array([-1, 0, 1])).ravel()
     breaks = np.concatenate([[0.0, length], near, bare])
@@ -209,10 +210,10 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
     part[np.min(abs(middle[:, None] - furniture.joints), axis=1, initial=np.inf) < _JOINT_HALF] = Part.JOINT
     part[(middle > furniture.dark[0]) & (middle < furniture.dark[1])] = Part.DARK
     keep = np.ones(quads.shape[:2], bool)
-    pockets = []
+    pockets, sizes = [], furniture.sizes
     for j, r, side in np.argwhere(furniture.pocketed[:, None, None] & ~furniture.filled):
-        centre = furniture.joints[j] + (2 * side - 1) * fur.POCKET_OFFSET
-        i0, ic, i1 = np.searchsorted(rows, centre + 0.5 * fur.POCKET_LENGTH * np.array([-1, 0, 1]) - 1e-6)
+        centre = furniture.joints[j] + (2 * side - 1) * sizes.pocket_offset
+        i0, ic, i1 = np.searchsorted(rows, centre + 0.5 * sizes.pocket_length * np.array([-1, 0, 1]) - 1e-6)
         j0, jc, j1 = shape.rows[r]
         keep[i0:i1, j0:j1] = False
         out = shape.normal[jc, 0] * frames.lateral[ic] + shape.normal[jc, 1] * frames.up[ic]

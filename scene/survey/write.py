@@ -170,7 +170,7 @@ def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
         "cutting": bore.cutting.describe() if bore.cutting else None,
         "dark": _rounded(np.array(furniture.dark)) if furniture.dark[0] < furniture.dark[1] else None,
         "strays": bore.strays,
-        "rings": {"width": fur.RING_WIDTH, "station": _rounded(furniture.joints)},
+        "rings": {"width": furniture.sizes.ring_width, "station": _rounded(furniture.joints)},
         "pockets": _describe_pockets(bore),
         "nails": {"diameter": fur.NAIL_DIAMETER, "depth": fur.NAIL_DEPTH, "count": int(furniture.nails.sum())},
         "sleepers": _describe_sleepers(bore),
@@ -182,7 +182,7 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
     """Every pocket by growing ring, row and station; `open` is false where it is mortared flush."""
     section, furniture = bore.section, bore.furniture
     out = []
-    for side, offset in enumerate((-fur.POCKET_OFFSET, fur.POCKET_OFFSET)):
+    for side, offset in enumerate((-furniture.sizes.pocket_offset, furniture.sizes.pocket_offset)):
         station = furniture.joints + offset
         frames, smooth = bore.alignment.frames(station), section.smooth(station)
         half = 0.5 * section.height(station)
@@ -195,7 +195,7 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
                     "station": round(float(station[j]), 6), "angle": round(float(np.arctan2(z, y)), 6),
                     "above_floor": round(float(z + half[j]), 6), "position": _rounded(centre),
                     "outward": _rounded(normal[0] * frames.lateral[j] + normal[1] * frames.up[j], 9),
-                    "length": fur.POCKET_LENGTH, "depth": round(float(furniture.depth[j, r, side]), 6),
+                    "length": furniture.sizes.pocket_length, "depth": round(float(furniture.depth[j, r, side]), 6),
                     "width": round(float(np.linalg.norm(smooth[j, last] - smooth[j, first])), 6),
                     "open": not bool(furniture.filled[j, r, side]), "nail": bool(furniture.nails[j, r]),
                 })  # fmt: skip
@@ -203,28 +203,29 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
 
 
 def _describe_sleepers(bore: Bore) -> dict[str, Any]:
-    station, tracks = bore.furniture.sleepers, bore.furniture.tracks
+    station, tracks, sizes = bore.furniture.sleepers, bore.furniture.tracks, bore.furniture.sizes
     top = bore.furniture.rise - 0.5 * bore.section.height(station)
     frames = bore.alignment.frames(station)
     places = [frames.point(np.full_like(top, track), top) for track in tracks]
     return {
         "station": _rounded(np.tile(station, len(tracks))),
         "position": _rounded(np.concatenate(places) if places else np.empty((0, 3))),
-        "spacing": fur.SLEEPER_SPACING, "length": fur.SLEEPER_LENGTH, "top_width": fur.SLEEPER_TOP,
+        "spacing": sizes.sleeper_spacing, "length": sizes.sleeper_length, "top_width": sizes.sleeper_top,
         "bottom_width": fur.SLEEPER_BOTTOM, "height": fur.SLEEPER_HEIGHT, "top_above_floor": bore.furniture.rise,
     }  # fmt: skip
 
 
 def _describe_rails(bore: Bore, station: np.ndarray) -> dict[str, Any]:
-    frames, tracks = bore.alignment.frames(station), bore.furniture.tracks
+    furniture = bore.furniture
+    frames, tracks = bore.alignment.frames(station), furniture.tracks
     top = bore.furniture.rail_top - 0.5 * bore.section.height(station)
 
     def lines(side: float) -> list[Any]:
-        places = [frames.point(np.full_like(top, track + side * fur.RAIL_AXIS), top) for track in tracks]
+        places = [frames.point(np.full_like(top, track + side * furniture.rail_axis), top) for track in tracks]
         return _rounded(np.concatenate(places) if places else np.empty((0, 3)))
 
     return {
-        "profile": "CHN60", "gauge": fur.GAUGE, "height": fur.RAIL_HEIGHT, "pad": fur.PAD[2],
-        "axis_offset": fur.RAIL_AXIS, "top_above_floor": bore.furniture.rail_top, "inclination": 0.0,
-        "left": lines(1.0), "right": lines(-1.0),
+        "profile": "CHN60", "gauge": furniture.sizes.gauge, "height": round(furniture.rail_height, 6),
+        "pad": furniture.sizes.pad, "axis_offset": furniture.rail_axis, "top_above_floor": furniture.rail_top,
+        "inclination": 0.0, "left": lines(1.0), "right": lines(-1.0),
     }  # fmt: skip
