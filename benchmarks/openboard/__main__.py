@@ -26,6 +26,7 @@ from subterra_jax.baselines import registry
 from subterra_jax.evaluation import evaluate
 from subterra_jax.evaluation.floor import floor
 from subterra_jax.host.files import require_folder
+from train.locate.tunnels import load
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -41,6 +42,7 @@ class OpenboardConfig:
         splits: Splits of the open world; a choice may be made on `val` alone.
         episodes: Episodes of each kind and split.
         tunnels: Tunnels of each kind and split, over which the episodes are spread.
+        cache: Folder in which made tunnels are kept from run to run.
         report_only: Drive nothing.
     """
 
@@ -50,6 +52,7 @@ class OpenboardConfig:
     splits: tuple[str, ...] = ("val", "test-seen", "test-unseen")
     episodes: int = 50
     tunnels: int = 5
+    cache: Path | None = None
     report_only: bool = False
 
 
@@ -95,7 +98,7 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
     columns = board.columns_of(config.splits)
     names = board.tunnel_names(columns, config.tunnels)
     started = time.monotonic()
-    tunnel = st.make(f"Subterra/{missing[0][0]}-v1", tunnel=names)[1].tunnel
+    tunnel = st.make(f"Subterra/{missing[0][0]}-v1", tunnel=load(names, cache=config.cache))[1].tunnel
     _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
     floors: dict[str, list[float]] = {}
     for task, agent in missing:
