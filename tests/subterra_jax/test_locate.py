@@ -55,7 +55,7 @@ def test_smooth_walls_tell_nothing():
 
 def _random_blocks(n, key=1):
     rng = np.random.default_rng(key)
-    evidence = 2.0 * rng.standard_normal((n, matching.N_SHARES))
+    evidence = 2.0 * rng.standard_normal((n, len(matching.SHARES)))
     evidence[:DELAY] = 0.0
     return Block(
         jnp.asarray(evidence, jnp.float32),
@@ -82,7 +82,7 @@ def test_the_filter_trusts_sharp_evidence_over_its_own_odometry():
     weights = kalman.init(jax.random.key(0))
     sharp = -0.5 * ((jnp.asarray(matching.SHARES) - 0.02) / 0.002) ** 2
     n = 60
-    evidence = jnp.broadcast_to(sharp, (n, matching.N_SHARES)).at[:DELAY].set(0.0)
+    evidence = jnp.broadcast_to(sharp, (n, len(matching.SHARES))).at[:DELAY].set(0.0)
     blocks = Block(evidence, jnp.full(n, 0.05), jnp.full(n, 5.0), jnp.zeros((n, N_RAW)))
     with_walls = kalman.sequence(weights, blocks)
     blind = kalman.sequence(weights, blocks.replace(evidence=jnp.zeros_like(evidence)))

@@ -1,6 +1,7 @@
 """Learns a localiser by driving: the true station is the target, in training only."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -19,23 +20,24 @@ class LocateConfig:
 
     Attributes:
         network: `kalman`, `gru`, `s5` or `transformer`.
-        front: `match` compares what beams ahead and behind saw; `scans` gives the network the scans themselves.
-        seed: Seed of weights and drives.
+        front: `match` compares what beams ahead and behind saw, `wide` for errors as large as wet rail makes them too;
+            `scans` gives the network the scans themselves.
         n_envs: Drives recorded in one iteration.
         n_steps: Steps of each.
         minibatch: Drives in one step of the optimiser.
+        chunk: Drives whose gradients are computed at once; more take more memory and give the same result.
         epochs: Times that each drive is learnt from.
         learning_rate: Of Adam, at most; it rises over the first steps and falls with the time that is left.
         max_grad_norm: Norm to which gradients are clipped.
-        minutes: Time of the training.
+        minutes: Time of the training, with compiling.
     """
 
     network: str = "kalman"
     front: str = "match"
-    seed: int = 0
     n_envs: int = 512
     n_steps: int = 900
     minibatch: int = 64
+    chunk: int = 16
     epochs: int = 1
     learning_rate: float = 2e-3
     max_grad_norm: float = 1.0
@@ -61,6 +63,7 @@ class TrainState:
 
 _WARM = 50.0  # steps of the optimiser
 _SHORT = 30  # metres; errors over so short a way count too
+_FAR = 100  # metres from which on the share of right estimates is logged
 _MOST = 5.0  # standard scales of an error beyond which a single drive has no further say
 
 
@@ -76,12 +79,22 @@ class LocateLearner:
     def __init__(self, env: Any, params: Any, config: LocateConfig) -> None:
         self.env, self.config = env, config
         period = float(params.vehicle.period) * float(params.vehicle.speed_max)
+        self.chunk = math.gcd(config.minibatch, config.chunk)
         self.n_metres = int(config.n_steps * period)
         self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(b2=0.99))
 
-    def init(self) -> TrainState:
+    @staticmethod
+    def check(config: LocateConfig) -> None:
+        """Refuses a network or front end that there is not.
+
+        Raises:
+            ValueError: There is no such one.
+        """
+        jax.eval_shape(lambda key: memory.init(config.network, config.front, key), jax.random.key(0))
+
+    def init(self, seed: Array | int) -> TrainState:
         """Returns the state before training."""
-        key_weights, key = jax.random.split(jax.random.key(self.config.seed))
+        key_weights, key = jax.random.split(jax.random.key(seed))
         weights = memory.init(self.config.network, self.config.front, key_weights)
         return TrainState(weights, self.optimizer.init(weights), key, jnp.zeros((), jnp.int32))
 
@@ -94,7 +107,7 @@ class LocateLearner:
 
         def one(carry: TrainState, index: Array) -> tuple[TrainState, dict[str, Array]]:
             part = jax.tree.map(lambda leaf: leaf[index], drive)
-            (loss, terms), gradients = jax.value_and_grad(self._loss, has_aux=True)(carry.weights, part)
+            (loss, terms), gradients = self._gradients(carry.weights, part)
             finite = jnp.isfinite(optax.global_norm(gradients))
             gradients = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradients)
             updates, moments = self.optimizer.update(gradients, carry.moments)
@@ -109,16 +122,36 @@ class LocateLearner:
         state, terms = jax.lax.scan(one, state, orders.reshape(config.epochs * n_batches, config.minibatch))
         return dataclasses.replace(state, key=key), jax.tree.map(jnp.nanmean, terms)
 
-    def _loss(self, weights: Any, drive: Drive) -> tuple[Array, dict[str, Array]]:
-        """Returns the negative log likelihood of the true stations, and what is logged."""
+    def _gradients(self, weights: Any, part: Drive) -> tuple[tuple[Array, dict[str, Array]], Any]:
+        """Returns loss, what is logged, and gradients of a minibatch, summed over its chunks."""
+        valid = jax.vmap(lambda record: streams.reached(record, self.n_metres))(part.record)
+        counts = [jnp.maximum(jnp.sum(some), 1.0) for some in (valid, valid[:, _SHORT:], valid[:, _FAR:])]
+        chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, self.chunk, *leaf.shape[1:]), part)
+        gradient = jax.value_and_grad(self._loss, has_aux=True)
+
+        def add(total: Any, chunk: Drive) -> tuple[Any, None]:
+            return jax.tree.map(jnp.add, total, gradient(weights, chunk, counts)), None
+
+        zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(
+            gradient, weights, jax.tree.map(lambda leaf: leaf[0], chunks), counts))  # fmt: skip
+        return jax.lax.scan(add, zero, chunks)[0]
+
+    def _loss(self, weights: Any, drive: Drive, counts: list[Array]) -> tuple[Array, dict[str, Array]]:
+        """Returns a chunk's part of the negative log likelihood of the true stations, and of what is logged.
+
+        Args:
+            weights: Of the localiser.
+            drive: The chunk.
+            counts: Metres in the minibatch: all, those `_SHORT` m or more from the start, and those `_FAR` m or more.
+        """
         answers, truth, valid = jax.vmap(lambda d: estimate(self.config.network, weights, d, self.n_metres))(drive)
         error = answers.correction - truth
         scaled = jnp.abs(error) * jnp.exp(-answers.log_scale)
         robust = jnp.where(scaled < _MOST, scaled, _MOST * (1.0 + jnp.log(jnp.maximum(scaled, _MOST) / _MOST)))
-        short = jnp.abs(error[:, _SHORT:] - error[:, :-_SHORT])
-        total = _mean(robust + answers.log_scale, valid) + _mean(jnp.minimum(short, 1.0), valid[:, _SHORT:])
-        near = _mean(jnp.abs(error) < 1.0, valid & (jnp.arange(self.n_metres) > 100))
-        return total, {"error": _mean(jnp.abs(error), valid), "within": near}
+        short = jnp.minimum(jnp.abs(error[:, _SHORT:] - error[:, :-_SHORT]), 1.0)
+        total = _sum(robust + answers.log_scale, valid) / counts[0] + _sum(short, valid[:, _SHORT:]) / counts[1]
+        near = _sum(jnp.abs(error) < 1.0, valid & (jnp.arange(self.n_metres) >= _FAR)) / counts[2]
+        return total, {"error": _sum(jnp.abs(error), valid) / counts[0], "within": near}
 
 
 def estimate(network: str, weights: Any, drive: Drive, n: int) -> tuple[Any, Array, Array]:
@@ -129,5 +162,5 @@ def estimate(network: str, weights: Any, drive: Drive, n: int) -> tuple[Any, Arr
     return memory.sequence(network, weights, blocks), truth, streams.reached(drive.record, n)
 
 
-def _mean(values: Array, valid: Bool[Array, "env metre"]) -> Float[Array, ""]:
-    return jnp.sum(jnp.where(valid, values, 0.0)) / jnp.maximum(jnp.sum(valid), 1.0)
+def _sum(values: Array, valid: Bool[Array, "env metre"]) -> Float[Array, ""]:
+    return jnp.sum(jnp.where(valid, values, 0.0))

@@ -1,5 +1,6 @@
-"""Errors of a localiser by kind of lining, over drives from the mouth: what a stop at any goal would miss by."""
+"""Errors of a localiser by kind of lining, over drives as an agent makes them: what a stop at a goal would miss by."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -7,61 +8,66 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from train.locate.drives import record_drives
+from train.locate.drives import Drive, record_drives
 from train.locate.learner import estimate
 
 _FIRST, _STEPS = 60, 1750  # m, the nearest goal; steps, 320 m and what slip adds
-_BATCH = 64
+_BATCH = 16
+FARTHEST = 320  # m, the farthest goal
+
+Found = dict[str, np.ndarray]
 
 
-def score(
-    network: str, weights: Any, env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = 320
-) -> dict[str, np.ndarray]:
-    """Drives `n` robots from the mouth at full speed.
+def record(env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = FARTHEST) -> Drive:
+    """Drives `n` robots from where the task starts, at full speed, for `last` m."""
+    steps = int(np.ceil(_STEPS * last / FARTHEST))
+    drive = jax.jit(lambda key: record_drives(env, params, key, n, steps, from_mouth=True))
+    return drive(key)
+
+
+def make_judge(network: str, last: int = FARTHEST) -> Callable[[Any, Drive], dict[str, Array]]:
+    """Compiles a function of weights and recorded drives.
 
     Returns:
-        `within` (share of goals from 60 to `last` m at which the estimate is right to 1 m), `error` (median, m),
-        `claimed` (mean absolute error that it claims at the end, m) and `found` (mean absolute error there), with the
-        number of each robot's `tunnel`, all `(n,)`.
+        Of each drive `within` (share of goals from 60 to `last` m at which the estimate is right to 1 m), `error`
+        (median, m), `claimed` (mean absolute error that it claims at the end, m), `found` (error there, m), all `(n,)`.
+        A drive that comes less than 60 m far has no goal, and `within` of NaN.
     """
-    steps = int(np.ceil(_STEPS * last / 320))
-    network_name, goals = network, jnp.arange(last) >= _FIRST - 1
+    goals = jnp.arange(last) >= min(_FIRST, last // 2) - 1
 
     @jax.jit
-    def drive(key: PRNGKeyArray) -> Any:
-        return record_drives(env, params, key, min(n, _BATCH), steps, from_mouth=True)
-
-    @jax.jit
-    def one(weights: Any, drives: Any) -> dict[str, Array]:
-        def errors(drive: Any) -> dict[str, Array]:
-            answers, truth, valid = estimate(network_name, weights, drive, last)
+    def judge(weights: Any, drives: Drive) -> dict[str, Array]:
+        def errors(drive: Drive) -> dict[str, Array]:
+            answers, truth, valid = estimate(network, weights, drive, last)
             error, use = jnp.abs(answers.correction - truth), goals & valid
-            count = jnp.maximum(jnp.sum(use), 1)
+            end = jnp.maximum(jnp.sum(valid) - 1, 0)
             return {
-                "within": jnp.sum(use & (error <= 1.0)) / count,
+                "within": jnp.sum(use & (error <= 1.0)) / jnp.sum(use),
                 "error": jnp.nanmedian(jnp.where(use, error, jnp.nan)),
-                "claimed": jnp.exp(answers.log_scale[-1]),
-                "found": error[-1],
+                "claimed": jnp.exp(answers.log_scale[end]),
+                "found": error[end],
             }
 
-        return {**jax.lax.map(errors, drives, batch_size=16), "tunnel": drives.tunnel}
+        return jax.lax.map(errors, drives, batch_size=_BATCH)
 
-    rows = []
-    for index in range(-(-n // _BATCH)):
-        rows.append(jax.device_get(one(weights, drive(jax.random.fold_in(key, index)))))
-    return {name: np.concatenate([row[name] for row in rows])[:n] for name in rows[0]}
+    return judge
 
 
-def by_kind(found: dict[str, np.ndarray], names: list[str]) -> dict[str, dict[str, float]]:
-    """Returns the means by kind of lining (medians of `error`), and over all of them as `all`."""
-    kinds = np.array([kind_of(name) for name in names])[found["tunnel"].astype(int)]
+def by_kind(found: Found, tunnel: np.ndarray, names: list[str]) -> dict[str, dict[str, float]]:
+    """Returns the means by kind of lining (medians of `error`), and over all of them as `all`.
+
+    Args:
+        found: As from a judge.
+        tunnel: Number of each drive's tunnel.
+        names: Names of the tunnels.
+    """
+    kinds = np.array([kind_of(name) for name in names])[np.asarray(tunnel).astype(int)]
     table = {}
     for kind in (*dict.fromkeys(kinds.tolist()), "all"):
         rows = kinds == kind if kind != "all" else np.ones(len(kinds), bool)
         table[kind] = {
-            name: float((np.median if name == "error" else np.mean)(values[rows]))
+            name: float((np.nanmedian if name == "error" else np.nanmean)(np.asarray(values)[rows]))
             for name, values in found.items()
-            if name != "tunnel"
         }
     return table
 

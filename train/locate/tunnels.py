@@ -17,26 +17,31 @@ from subterra_jax.procedural import expand
 from subterra_jax.tunnel import Tunnel
 
 
-def make(task: str, names: str, lining: str | None = None, cache: Path | None = None) -> tuple[Any, Any, list[str]]:
-    """Returns a task in several tunnels, and their names.
+def names_of(names: str) -> list[str]:
+    """Returns the names in `names`: one, or several as `open:train:0-63`, or names with commas between.
+
+    Raises:
+        TunnelError: There is no such tunnel.
+    """
+    return [name for part in names.split(",") for name in expand(part)]
+
+
+def enter(task: str, tunnels: list[Tunnel]) -> tuple[Any, Any]:
+    """Returns a task in one or several tunnels."""
+    return st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0])
+
+
+def load(names: list[str], lining: str | None = None, cache: Path | None = None) -> list[Tunnel]:
+    """Returns the tunnels of these names.
 
     Args:
-        task: Task id.
-        names: One name, or several as `open:train:0-63`, or names with commas between.
+        names: Names of single tunnels.
         lining: Variant of the walls; None is the usual one.
         cache: Folder of this command's own in which tunnels are kept from run to run; None keeps none.
 
     Raises:
         TunnelError: There is no such tunnel or lining.
     """
-    wanted = [name for part in names.split(",") for name in expand(part)]
-    tunnels = load(wanted, lining, cache)
-    env, params = st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0])
-    return env, params, wanted
-
-
-def load(names: list[str], lining: str | None = None, cache: Path | None = None) -> list[Tunnel]:
-    """Returns the tunnels of these names; `lining`, `cache` and errors as for `make`."""
     one = functools.partial(_tunnel, lining=lining, cache=cache)
     workers = min(len(names), os.cpu_count() or 1)
     if workers == 1:

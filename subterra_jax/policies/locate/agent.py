@@ -86,7 +86,7 @@ def check_tensors(agent: Locating) -> None:
         KeyError: One is missing.
         ValueError: There is no such network, or a tensor has another shape or name.
     """
-    front = "match" if any(name.startswith("match.") for name in agent.tensors) else "scans"
+    front = memory.front_of(agent.tensors)
     shapes = jax.eval_shape(lambda key: memory.init(agent.network, front, key), jax.random.key(0))
     wanted = flat(shapes)
     for name, leaf in wanted.items():

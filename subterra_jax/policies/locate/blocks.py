@@ -4,8 +4,6 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.policies.locate.matching import SHARES
-
 DELAY = 12  # blocks after which all beams have passed a block
 N_RECENT = 5  # parts of a block in the raw scans that a memory may get
 N_ROW = 28  # numbers of one scan
@@ -17,7 +15,7 @@ class Block:
     """One metre of commanded distance.
 
     Attributes:
-        evidence: Log likelihood of each of `matching.SHARES`, by the block `DELAY` metres ago; 0 where there is none.
+        evidence: Log likelihood of each error compared, by the block `DELAY` metres ago; 0 where there is none.
         read: Distance that the odometer counted in this metre, less 1, m.
         steps: Steps taken in this metre.
         raw: What the beams saw in this metre: distance beyond the wall and ahead, both of order 1.
@@ -44,12 +42,11 @@ class Estimate:
     log_scale: Float[Array, ""]
 
 
-def matched_inputs(block: Block) -> Float[Array, "n"]:
-    """Returns evidence and odometry as inputs of a network."""
+def matched_inputs(block: Block, shares: Float[Array, "n_shares"]) -> Float[Array, "n"]:
+    """Returns evidence over the errors `shares`, and odometry, as inputs of a network."""
     centred = block.evidence - jnp.mean(block.evidence, axis=-1, keepdims=True)
     belief = jnp.exp(block.evidence - jnp.max(block.evidence, axis=-1, keepdims=True))
     belief = belief / jnp.sum(belief, axis=-1, keepdims=True)
-    shares = jnp.asarray(SHARES)
     mean = jnp.sum(belief * shares, axis=-1, keepdims=True)
     sigma = jnp.sqrt(jnp.sum(belief * (shares - mean) ** 2, axis=-1, keepdims=True) + 1e-10)
     read, steps = block.read[..., None], block.steps[..., None]

@@ -124,11 +124,12 @@ class Locator:
         share = (metre + 1.0 - before.driven) / jnp.maximum(now.driven - before.driven, 1e-6)
         read = before.reading + share * (now.reading - before.reading)
         steps = before.steps + share
-        if self.blind or "match" not in self.weights:
-            evidence = jnp.zeros(matching.N_SHARES)
+        match = self.weights.get("match")
+        if self.blind or match is None:
+            evidence = jnp.zeros_like(jnp.asarray(matching.SHARES) if match is None else match["shares"])
         else:
             first = BLOCK * (metre - DELAY) - matching.LAGS - matching.MARGIN
-            found = matching.evidence(self.weights["match"], profiles.cut(window, first, matching.N_CUT))
+            found = matching.evidence(match, profiles.cut(window, first, matching.N_CUT))
             evidence = jnp.where(metre >= DELAY, found, 0.0)
         raw = before.raw / jnp.maximum(before.counts, 1.0)[:, None]
         block = Block(evidence, read - before.read_before - 1.0, steps - before.steps_before, raw.reshape(-1))

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, N_BEARINGS, Grid, Profiles, mean_along
 
-N_SHARES = 41
-SHARES = np.linspace(-0.08, 0.08, N_SHARES).astype(np.float32)  # errors of the command that are compared
+# Errors of the command that are compared: those of slip; and of wet rail, which takes a tenth to half of the speed.
+SHARES = np.linspace(-0.08, 0.08, 41).astype(np.float32)
+WIDE_SHARES = np.concatenate([np.linspace(-0.53, -0.11, 22), SHARES]).astype(np.float32)
 LAGS = 13  # bins by which a profile is shifted to either side
 _MEAN, _TAPS = 8, 9  # bins to either side of a running mean; bins of the filter
 MARGIN = _MEAN + _TAPS // 2  # bins about a block that its evidence depends on, beside the shifts
@@ -31,8 +32,10 @@ Weights = dict[str, Any]
 _einsum = partial(jnp.einsum, precision="highest")  # differences of squares: no TF32
 
 
-def init(key: PRNGKeyArray) -> Weights:
+def init(key: PRNGKeyArray, compared: Any = SHARES) -> Weights:
     """Returns weights from which learning goes on: edges that beams ahead or behind see sharply, and smoothed relief.
+
+    Among them are the errors that are compared, which are not learnt.
 
     A niche hides its near edge from beams ahead and its far edge from those behind; a box does so the other way round.
     So the former meet walls that come nearer sharply, and the latter walls that recede.
@@ -54,7 +57,13 @@ def init(key: PRNGKeyArray) -> Weights:
         "bias": jnp.zeros((N_BEARINGS, _CHANNELS + 1)).at[:, _CHANNELS].set(5.0),
         "pair": pair,
         "count": jnp.zeros(()),
+        "shares": jnp.asarray(compared),
     }
+
+
+def shares(weights: Weights) -> Float[Array, "n_shares"]:
+    """Returns the errors of the command that are compared."""
+    return jax.lax.stop_gradient(weights["shares"])
 
 
 def encode(weights: Weights, profiles: Profiles) -> tuple[Float[Array, "2 7 bins c"], Float[Array, "2 7 bins c"]]:
@@ -86,7 +95,7 @@ def _running(values: Grid, n: int) -> Grid:
 
 
 def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_shares"]:
-    """Returns the log likelihood, up to a constant, of each of `SHARES` by one block.
+    """Returns the log likelihood, up to a constant, of each of `shares` by one block.
 
     Args:
         weights: Of `init`, trained.
@@ -125,9 +134,9 @@ def compare(
     a, b = PAIRS[:, 0], PAIRS[:, 1]
     cost = ((ahead_square + behind_square - 2.0 * product) / (count + 1.0))[:, a, b]
     cost = jnp.sum(jax.nn.softplus(weights["pair"])[:, None] * cost, axis=-1)
-    shares = jnp.asarray(SHARES)
     apart = (along[:, a] - along[:, b]) / BIN
-    target = LAGS + jnp.clip(apart[..., None] * shares / (1.0 + shares), 2.0 - LAGS, LAGS - 2.0)
+    error = shares(weights)
+    target = LAGS + jnp.clip(apart[..., None] * error / (1.0 + error), 2.0 - LAGS, LAGS - 2.0)
     curve = _einsum("spek,spk->spe", _cubic(jnp.arange(2 * LAGS + 1) - target[..., None]), cost)
     present = jnp.max(count[..., 0][:, a, b], axis=-1) / BLOCK
     return -jnp.exp(weights["count"]) * _einsum("sp,spe->e", BLOCK * present**2, curve)

@@ -13,8 +13,8 @@ from subterra_jax.policies.locate.recurrent import CELLS, HIDDEN, apply, dense
 
 Weights = dict[str, Any]
 NETWORKS = ("kalman", *CELLS)
-FRONTS = ("match", "scans")
-_N_MATCHED = matching.N_SHARES + 4
+FRONTS = ("match", "wide", "scans")
+_COMPARED = {"match": matching.SHARES, "wide": matching.WIDE_SHARES}
 _UNIT = 0.02  # of the speed: answers of order 1
 
 
@@ -43,12 +43,12 @@ def init(network: str, front: str, key: PRNGKeyArray) -> Weights:
         known = f"networks are {', '.join(NETWORKS)}; fronts are {', '.join(FRONTS)}"
         raise ValueError(f"no network {network!r} with front {front!r}; {known}")
     if network == "kalman" and front != "match":
-        raise ValueError("a Kalman filter needs the evidence of the front end: front = match")
+        raise ValueError("a Kalman filter needs the evidence of the front end for slip: front = match")
     keys = jax.random.split(key, 5)
-    weights: Weights = {"match": matching.init(keys[0])} if front == "match" else {}
+    weights: Weights = {"match": matching.init(keys[0], _COMPARED[front])} if front in _COMPARED else {}
     if network == "kalman":
         return {**weights, "kalman": kalman.init(keys[1])}
-    n_in = _N_MATCHED if front == "match" else N_RAW + 2
+    n_in = len(_COMPARED[front]) + 4 if front in _COMPARED else N_RAW + 2
     return {
         **weights,
         "in": dense(keys[1], n_in, HIDDEN),
@@ -56,6 +56,13 @@ def init(network: str, front: str, key: PRNGKeyArray) -> Weights:
         "cell": CELLS[network].init(keys[3]),
         "out": dense(keys[4], HIDDEN, 3, 0.1),
     }
+
+
+def front_of(tensors: Any) -> str:
+    """Returns the front end of weights by name."""
+    shares = tensors.get("match.shares")
+    wide = shares is not None and shares.shape == matching.WIDE_SHARES.shape
+    return "scans" if shares is None else "wide" if wide else "match"
 
 
 def start(network: str, weights: Weights) -> Any:
@@ -90,7 +97,7 @@ def sequence(network: str, weights: Weights, blocks: Block) -> Estimate:
 
 
 def _embed(weights: Weights, block: Block) -> Array:
-    rows = matched_inputs(block) if "match" in weights else raw_inputs(block)
+    rows = matched_inputs(block, matching.shares(weights["match"])) if "match" in weights else raw_inputs(block)
     return apply(weights["in_2"], jax.nn.gelu(apply(weights["in"], rows)))
 
 

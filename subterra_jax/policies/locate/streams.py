@@ -40,7 +40,7 @@ def metres(record: Record, weights: matching.Weights | None, n: int) -> Block:
     ends = jnp.arange(n + 1, dtype=jnp.float32)
     reads = jnp.interp(ends, record.driven, record.read)
     times = jnp.interp(ends, record.driven, jnp.arange(len(record.driven), dtype=jnp.float32))
-    evidence = jnp.zeros((n, matching.N_SHARES)) if weights is None else _evidence(record, weights, n)
+    evidence = jnp.zeros((n, len(matching.SHARES))) if weights is None else _evidence(record, weights, n)
     return Block(evidence, jnp.diff(reads) - 1.0, jnp.diff(times), _raw(record, n))
 
 
@@ -65,7 +65,7 @@ def _evidence(record: Record, weights: matching.Weights, n: int) -> Float[Array,
         return matching.compare(weights, some, weight, along)
 
     found = jax.vmap(one)(jnp.arange(n - DELAY))
-    return jnp.concatenate([jnp.zeros((DELAY, matching.N_SHARES)), found])
+    return jnp.concatenate([jnp.zeros((DELAY, found.shape[-1])), found])
 
 
 def _raw(record: Record, n: int) -> Float[Array, "n n_raw"]:
