@@ -3,19 +3,16 @@
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import environment_facts, write_file
 from benchmarks.slam.arena.bound import find_floor
-from benchmarks.slam.arena.record import Course, draw_scene
-from benchmarks.slam.arena.sets import ArenaConfig, course_seed
+from benchmarks.slam.arena.sets import redraw
 from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
-from benchmarks.slam.recordings import INDEX, TRUTH, recordings_in
+from benchmarks.slam.recordings import TRUTH, recordings_in
 from benchmarks.slam.run import WHEELS
 from benchmarks.slam.score import TRUTH_FILE, score_files
 from subterra_jax.host.files import replace_file
@@ -146,11 +143,8 @@ def read_case(case: Case) -> dict[str, Any]:
 
 def _floor(folder: Path, name: str) -> dict[str, Any]:
     """Returns the floor of a recording, which is drawn again from the settings beside its truth."""
-    settings = json.loads((folder / TRUTH / INDEX).read_text())
-    facts = json.loads((folder / TRUTH / name / "course.json").read_text())
-    course = Course(**{key: facts[key] for key in ("name", "walls", "sensor", "motion", "dust", "distance")})
-    config = replace(ArenaConfig(folder), seed=settings["seed"], secret=settings["secret"])
-    floor = find_floor(draw_scene(course, np.random.SeedSequence(course_seed(config, course).entropy)))
+    scene = redraw(folder, name)
+    floor, course = find_floor(scene), scene.course
     return {"set": folder.name, "recording": name, **floor._asdict(), "walls": course.walls, "sensor": course.sensor}
 
 

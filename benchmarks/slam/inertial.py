@@ -1,4 +1,4 @@
-"""LiDAR-inertial programs on one recording, each in a process of its own: `evalio`'s pipelines and `rko-lio`.
+"""Programs on a recording, each in a process of its own: `evalio`'s pipelines, `rko-lio`, trackers of `subterra_jax`.
 
 The process reads the bag, feeds sweeps and IMU samples in order, and writes the LiDAR's poses. A program that crashes
 takes its process with it and no more.
@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,10 @@ from benchmarks.command import BenchmarkError
 from benchmarks.slam.tum import save_tum
 
 EVALIO = ("kiss", "genz", "mad", "ct", "loam", "liosam", "dlio", "form")
-PROGRAMS = {**{f"evalio-{name}": "evalio" for name in EVALIO}, "rko-lio": "rko-lio"}  # name to its package
+TRACKERS = ("ring-filter", "particle-filter")  # of the station alone: `trackers`
+PROGRAMS = {  # name to its package
+    **{f"evalio-{name}": "evalio" for name in EVALIO}, "rko-lio": "rko-lio", **dict.fromkeys(TRACKERS, "jax"),
+}  # fmt: skip
 # What is not left at a program's defaults: sums of several threads differ from run to run; points are undistorted by
 # their times, which evalio leaves out; no sweep is skipped to keep up with real time.
 _CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "numberOfCores": 1, "deskew": True,
@@ -140,15 +143,22 @@ def read_samples(recording: Path) -> Iterator[tuple[int, Any]]:
                 yield stamp, (np.array([force.x, force.y, force.z]), np.array([turn.x, turn.y, turn.z]))
 
 
+def _run(name: str, recording: Path) -> Poses:
+    if name in TRACKERS:
+        from benchmarks.slam.trackers import run_tracker
+
+        return run_tracker(name, recording)
+    return _rko(recording) if name == "rko-lio" else _evalio(name.removeprefix("evalio-"), recording)
+
+
 def main(words: list[str]) -> int:
     """Runs `NAME RECORDING TARGET` and prints one line of JSON."""
     name, recording, target = words[0], Path(words[1]), Path(words[2])
-    program: Callable[[], Poses]
-    if name == "rko-lio":
-        program = lambda: _rko(recording)  # noqa: E731
-    else:
-        program = lambda: _evalio(name.removeprefix("evalio-"), recording)  # noqa: E731
-    times, poses, seconds = program()
+    try:
+        times, poses, seconds = _run(name, recording)
+    except (BenchmarkError, ValueError) as error:
+        print(f"{name} {error}", file=sys.stderr)
+        return 1
     if len(times) < _LEAST_POSES or not np.isfinite(poses).all():
         problem = "gives poses that are not finite" if len(times) >= _LEAST_POSES else f"gives {len(times)} poses"
         print(f"{name} {problem}", file=sys.stderr)

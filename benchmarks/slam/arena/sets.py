@@ -17,7 +17,7 @@ from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
 from benchmarks.slam.arena.bags import FormatName
 from benchmarks.slam.arena.drives import CARRIERS
-from benchmarks.slam.arena.record import Course, SensorName, draw_scene, write_recording, write_truth
+from benchmarks.slam.arena.record import Course, Scene, SensorName, draw_scene, write_recording, write_truth
 from benchmarks.slam.arena.walls import WALLS
 from benchmarks.slam.recordings import INDEX, RECORDINGS, TRUTH
 
@@ -134,6 +134,26 @@ def _record(config: ArenaConfig, course: Course) -> str:
     (config.out / RECORDINGS).mkdir(exist_ok=True)
     part.rename(config.out / RECORDINGS / course.name)
     return course.name
+
+
+def redraw(folder: Path, name: str) -> Scene:
+    """Draws the scene of a recording again from the settings beside its truth.
+
+    Args:
+        folder: The set.
+        name: The recording.
+
+    Raises:
+        BenchmarkError: The set has no truth of the recording.
+    """
+    try:
+        settings = json.loads((folder / TRUTH / INDEX).read_text())
+        facts = json.loads((folder / TRUTH / name / "course.json").read_text())
+    except (OSError, ValueError) as error:
+        raise BenchmarkError(f"{folder}: holds no truth of {name}, from which it could be drawn again") from error
+    course = Course(**{key: facts[key] for key in ("name", "walls", "sensor", "motion", "dust", "distance")})
+    config = replace(ArenaConfig(folder), seed=settings["seed"], secret=settings["secret"])
+    return draw_scene(course, course_seed(config, course))
 
 
 def describe_courses() -> list[dict[str, Any]]:
