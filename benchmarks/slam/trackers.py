@@ -25,7 +25,7 @@ from benchmarks.slam.arena.wheels import SCALE, SCALE_PIECE, SCALE_SIGMA
 from benchmarks.slam.inertial import Poses, read_samples
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.survey.cast import Caster
-from scene.survey.furniture import RING_WIDTH
+from scene.survey.sizes import DESIGN
 from subterra_jax.baselines import cloud as particles
 from subterra_jax.baselines.reckoning import StepDistances
 from subterra_jax.baselines.rings import grid
@@ -159,7 +159,7 @@ class RingTracker:
         """Advances by a sweep; returns the station less that of the start, m."""
         distance, one = jnp.float32(step.distance), jnp.ones(())
         moved, ranges = StepDistances(distance, distance), jnp.asarray(step.ranges, jnp.float32)
-        self._track = _count_rings(self._track, ranges, moved, one, jnp.float32(RING_WIDTH), jnp.zeros(()))
+        self._track = _count_rings(self._track, ranges, moved, one, jnp.float32(DESIGN.ring_width), jnp.zeros(()))
         return float(self._track.station)
 
 
