@@ -250,7 +250,7 @@ def save(path: Path, weights: Any, updates: int, seed: int, env: Any, params: An
         "task": env.id,
         "layout": layout,
         "tensors_sha256": hashlib.sha256(content).hexdigest(),
-        TRAINED_UNDER: training_conditions(env, params).to_json(),
+        TRAINED_UNDER: _conditions(env, params),
         "config": dataclasses.asdict(arguments.config),
         "seed": seed,
         "tunnels": arguments.tunnels,
@@ -260,6 +260,11 @@ def save(path: Path, weights: Any, updates: int, seed: int, env: Any, params: An
     for place, data in ((path, content), (facts_file(path), f"{json.dumps(facts, indent=1)}\n".encode())):
         with replace_file(place) as fresh:
             fresh.write_bytes(data)
+
+
+def _conditions(env: Any, params: Any) -> dict[str, Any]:
+    """Returns the conditions of the training; a localiser reads ranges and numbers by name, among whatever fields."""
+    return dataclasses.replace(training_conditions(env, params), fields=None).to_json()
 
 
 def _identity(arguments: Command) -> dict[str, Any]:

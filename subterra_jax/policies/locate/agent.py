@@ -1,4 +1,7 @@
-"""A learnt localiser in the written controller: it keeps to the middle and stops where it believes the goal to be."""
+"""A learnt localiser in the written controller: it keeps to the middle and stops where it believes the goal to be.
+
+Round boxes it steers by the written avoidance: what is learnt is where the robot is.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -9,16 +12,18 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.navigator import Memory, Navigator
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.files import Conditions
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.locator import Locator
+from subterra_jax.policies.locate.ways import TwoWays
 from subterra_jax.policies.networks import Tensors
 from subterra_jax.state import EnvParams
 
 KIND = "locate"
-ERRANDS = ("stop",)  # it counts on driving forward
+ERRANDS = ("stop", "return")
 
 
 @struct.dataclass
@@ -55,16 +60,18 @@ class Locating:
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
         """Begins at the believed start."""
-        return self._navigator().begin(key, obs, params)
+        return self._navigator(params).begin(key, obs, params)
 
     def act(
         self, key: PRNGKeyArray, memory: Memory, obs: Observed, params: EnvParams, known: Known
     ) -> tuple[Action, Memory]:
         """Returns command and estimate of one control period, and the memory after it."""
-        return self._navigator().act(key, memory, obs, params, known)
+        return self._navigator(params).act(key, memory, obs, params, known)
 
-    def _navigator(self) -> Navigator:
-        return Navigator(Locator(nested(self.tensors), self.network, self.blind), CentreLine(), name=self.name)
+    def _navigator(self, params: EnvParams) -> Navigator:
+        locator = Locator(nested(self.tensors), self.network, self.blind)
+        localiser = TwoWays(locator) if params.errand == "return" else locator
+        return Navigator(localiser, steering_of(params, CentreLine()), name=self.name)
 
 
 def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ DELAY = 12  # blocks after which all beams have passed a block
 N_RECENT = 5  # parts of a block in the raw scans that a memory may get
 N_ROW = 28  # numbers of one scan
 N_RAW = N_RECENT * N_ROW
+_SLOWEST = 25.0  # steps in a metre; more count as so many, since nobody drives so slowly in training
 
 
 @struct.dataclass
@@ -49,10 +50,11 @@ def matched_inputs(block: Block, shares: Float[Array, "n_shares"]) -> Float[Arra
     belief = belief / jnp.sum(belief, axis=-1, keepdims=True)
     mean = jnp.sum(belief * shares, axis=-1, keepdims=True)
     sigma = jnp.sqrt(jnp.sum(belief * (shares - mean) ** 2, axis=-1, keepdims=True) + 1e-10)
-    read, steps = block.read[..., None], block.steps[..., None]
+    read, steps = block.read[..., None], jnp.minimum(block.steps[..., None], _SLOWEST)
     return jnp.concatenate([0.3 * centred, 30.0 * mean, 30.0 * sigma, 20.0 * read, 0.1 * steps], axis=-1)
 
 
 def raw_inputs(block: Block) -> Float[Array, "n"]:
     """Returns scans and odometry as inputs of a network, without the front end."""
-    return jnp.concatenate([block.raw, 20.0 * block.read[..., None], 0.1 * block.steps[..., None]], axis=-1)
+    steps = jnp.minimum(block.steps[..., None], _SLOWEST)
+    return jnp.concatenate([block.raw, 20.0 * block.read[..., None], 0.1 * steps], axis=-1)

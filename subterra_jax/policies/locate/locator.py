@@ -91,7 +91,7 @@ class Locator:
     ) -> tuple[Station, LocatorMemory]:
         """Takes in a step: adds the scan to the profiles, and asks the memory at the end of each metre."""
         del known
-        at = before.driven + jnp.minimum(driven.speed * params.vehicle.period * driven.cosine, _STEP)
+        at = before.driven + jnp.clip(driven.speed * params.vehicle.period * driven.cosine, 0.0, _STEP)
         now = dataclasses.replace(before, driven=at, reading=obs.distance, steps=before.steps + 1.0)
         ended = jnp.floor(at).astype(jnp.int32) > before.metres
         block, now = self._see(before, now, obs, driven, params, ended)
@@ -117,7 +117,8 @@ class Locator:
         self, before: LocatorMemory, now: LocatorMemory, obs: Observed, driven: Driven, params: Any, ended: Array
     ) -> tuple[Block, LocatorMemory]:
         """Returns the metre that may have ended, and the memory with the scan."""
-        points = profiles.find_points(obs.ranges, driven.walls, params.lidar.range_max)
+        walls = getattr(driven.walls, "corridor", driven.walls)  # steering round boxes keeps them with its hits
+        points = profiles.find_points(obs.ranges, walls, params.lidar.range_max)
         window = profiles.forget(before.window, _newest(before.driven), _newest(now.driven))
         window = profiles.add_points(window, points, (now.driven + points.along) / BIN, wrapped=True)
         metre = before.metres
