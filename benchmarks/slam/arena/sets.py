@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
 from benchmarks.slam.arena.bags import FormatName
+from benchmarks.slam.arena.describe import describe_set
 from benchmarks.slam.arena.drives import CARRIERS
 from benchmarks.slam.arena.record import Course, Scene, SensorName, draw_scene, write_recording, write_truth
 from benchmarks.slam.arena.walls import WALLS
@@ -107,6 +108,7 @@ def make_arena(config: ArenaConfig) -> Iterator[tuple[str, bool]]:
         public.pop("seed")
     courses = [{**asdict(one), "provenance": "simulated"} for one in plan]
     write_file(config.out / INDEX, (json.dumps(public | {"recordings": courses}, indent=1) + "\n").encode())
+    describe_set(config.out, plan)
 
 
 def _record_all(config: ArenaConfig, courses: list[Course]) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """Recordings of the arena: layouts of the drivers, both kinds of bag, the IMU at rest, wheels, dust, and mistakes."""
 
+import hashlib
 import json
 from dataclasses import replace
 from itertools import islice
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam.__main__ import command
-from benchmarks.slam.arena import bags, record, sets, wheels
+from benchmarks.slam.arena import bags, describe, record, sets, wheels
 from benchmarks.slam.arena.drives import CARRIERS, REST
 from benchmarks.slam.arena.dust import draw_dust
 from benchmarks.slam.arena.walls import draw_walls
@@ -266,3 +267,33 @@ def test_a_set_is_resumed_and_inertial_programs_keep_to_furnished_walls_and_lose
     assert drift["walls-furnished"] < 1.0
     assert drift["walls-smooth"] > 50.0
     assert drift["dust-lock"] > 50.0
+
+
+def test_a_set_describes_its_files_and_courses(tmp_path):
+    plan = sets.plan_arena(sets.ArenaConfig(tmp_path, ("walls-joints", "beams-06")))
+    for one in plan:
+        scene = record.draw_scene(replace(one, distance=5.0), SEED)
+        folder = tmp_path / "recordings" / one.name
+        (folder / "recording").mkdir(parents=True)
+        (folder / "recording" / "recording.mcap").write_bytes(one.name.encode())
+        (folder / "calibration.yaml").write_text(json.dumps(record.calibration(scene)))
+    (tmp_path / "truth").mkdir()
+    (tmp_path / "truth" / "lidar.tum").write_text("secret")
+    describe.describe_set(tmp_path, plan)
+    content = json.loads((tmp_path / "croissant.json").read_text())
+    files = {one["contentUrl"]: one["sha256"] for one in content["distribution"]}
+    told = {str(path.relative_to(tmp_path)) for path in (tmp_path / "recordings").rglob("*") if path.is_file()}
+    assert set(files) == told
+    for name, digest in files.items():
+        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() == digest
+    (courses,) = content["recordSet"]
+    fields = {one["@id"] for one in courses["field"]}
+    assert courses["key"]["@id"] in fields
+    assert all(set(row) == fields for row in courses["data"])
+    assert [row["courses/name"] for row in courses["data"]] == ["walls-joints", "beams-06"]
+    sheet = (tmp_path / "datasheet.md").read_text()
+    assert "{" not in sheet
+    assert "| beams-06 | furnished | avia, 6 lines | trolley | 0 | 45 |" in sheet
+    assert "noise of 0.00039 m/s²/√Hz and 0.00036 rad/s/√Hz" in sheet
+    croissant = pytest.importorskip("mlcroissant", reason="the validator is no dependency")
+    assert [*croissant.Dataset(jsonld=content).records("courses")]
