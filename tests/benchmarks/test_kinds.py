@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import subterra_jax as st
 from benchmarks import atlas, kinds, linings
 from subterra_jax.evaluation import Records
+from subterra_jax.evaluation.floor import floor
+from subterra_jax.tunnel import Tunnel
 
 
 def test_every_kind_has_the_same_episodes_spread_over_its_own_tunnels():
@@ -22,6 +25,26 @@ def test_every_kind_has_the_same_episodes_spread_over_its_own_tunnels():
     assert episodes.seed.max() < 2**30, "a listed episode lies above"
     other = kinds.draw_episodes(kinds.KindsConfig(episodes=12, tunnels=3, split="test-seen"), 4)
     assert not set(other.seed) & set(episodes.seed)
+
+
+def test_further_tunnels_are_columns_of_their_own_and_severities_are_spread_over_all_tunnels():
+    config = kinds.KindsConfig(episodes=20, tunnels=2, further=("subterra-351", "control"))
+    episodes = kinds.draw_episodes(config, 4, 2, faults=True)
+    np.testing.assert_array_equal(kinds.column_of(episodes.tunnel, config), np.repeat(np.arange(6), 20))
+    for tunnel in np.unique(episodes.tunnel):
+        severities = episodes.severity[episodes.tunnel == tunnel]
+        assert set(np.bincount(severities, minlength=5)) == {len(severities) // 5}
+    alone = kinds.KindsConfig(episodes=3, tunnels=0, further=("subterra-351", "control"))
+    assert kinds.column_of(kinds.draw_episodes(alone, 0, 2).tunnel, alone).tolist() == [0, 0, 0, 1, 1, 1]
+
+
+def test_the_floor_is_that_of_each_columns_tunnels():
+    config = kinds.KindsConfig(tunnels=0, further=("subterra-351", "control"))
+    tunnels = [Tunnel.from_plan(plan, plan.default_lining) for plan in map(st.load_tunnel, config.further)]
+    _, params = st.make("Subterra/StopAtOffset-v1", tunnel=tunnels)
+    low = kinds.floors(params, config, 2)
+    assert low == pytest.approx([floor(params, 0), floor(params, 1)], abs=1e-3)
+    assert 0.1 < low[0] < 0.3
 
 
 def test_success_is_counted_by_kind():
