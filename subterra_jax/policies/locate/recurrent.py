@@ -125,38 +125,46 @@ class Attention:
         return layers
 
     def start(self) -> Array:
-        """Returns the memory at the start: no rows yet."""
-        return jnp.zeros((_LAYERS + 1, SPAN, HIDDEN + 1))
+        """Returns the memory at the start: no keys and values yet; the last number is 1 where there are some."""
+        return jnp.zeros((_LAYERS, SPAN, 2 * HIDDEN + 1))
 
     def step(self, weights: Weights, memory: Array, x: Array) -> tuple[Array, Array]:
         """Returns the memory after a row, and the hidden numbers."""
         kept = []
         for i in range(_LAYERS):
-            row = jnp.concatenate([x, jnp.ones(1)])
-            rows = jnp.concatenate([memory[i, 1:], row[None]])
+            layer = weights[f"layer_{i}"]
+            q, k, v = self._project(layer, x)
+            rows = jnp.concatenate([memory[i, 1:], jnp.concatenate([k, v, jnp.ones(1)])[None]])
             kept.append(rows)
-            x = self._layer(weights[f"layer_{i}"], rows[:, :-1], rows[:, -1] > 0.5)
-        kept.append(memory[_LAYERS])
+            k, v, there = jnp.split(rows, [HIDDEN, 2 * HIDDEN], axis=-1)
+            x = self._mix(layer, x, self._attend(layer, q, k, v, there[:, 0] > 0.5))
         return jnp.stack(kept), x
 
     def sequence(self, weights: Weights, rows: Float[Array, "t n"]) -> Float[Array, "t n"]:
         """Returns the hidden numbers after each row."""
-        t = rows.shape[0]
-        index = np.arange(t)[:, None] + np.arange(1 - SPAN, 1)
-        there = jnp.asarray(index >= 0)
+        index = np.arange(rows.shape[0])[:, None] + np.arange(1 - SPAN, 1)
+        there, index = jnp.asarray(index >= 0), np.maximum(index, 0)
         for i in range(_LAYERS):
-            windows = rows[np.maximum(index, 0)]
-            rows = jax.vmap(lambda w, m, layer=weights[f"layer_{i}"]: self._layer(layer, w, m))(windows, there)
+            layer = weights[f"layer_{i}"]
+            q, k, v = self._project(layer, rows)
+            heard = jax.vmap(lambda q, k, v, there, layer=layer: self._attend(layer, q, k, v, there))(
+                q, k[index], v[index], there
+            )
+            rows = self._mix(layer, rows, heard)
         return rows
 
-    def _layer(self, layer: Weights, rows: Float[Array, "span n"], there: Array) -> Array:
-        """Returns the last row after attention over all of them and a perceptron."""
-        normed = _norm(rows)
-        q, k, v = jnp.split(apply(layer["qkv"], normed), 3, axis=-1)
+    def _project(self, layer: Weights, x: Array) -> tuple[Array, ...]:
+        return tuple(jnp.split(apply(layer["qkv"], _norm(x)), 3, axis=-1))
+
+    def _attend(self, layer: Weights, q: Array, k: Array, v: Array, there: Array) -> Array:
+        """Returns the mean of the values of the last rows, by head, weighted by how their keys fit the query."""
         split = lambda x: x.reshape(*x.shape[:-1], _HEADS, -1)  # noqa: E731
-        score = jnp.einsum("hd,shd->hs", split(q[-1]), split(k)) / np.sqrt(HIDDEN / _HEADS) + layer["near"]
+        score = jnp.einsum("hd,shd->hs", split(q), split(k)) / np.sqrt(HIDDEN / _HEADS) + layer["near"]
         share = jax.nn.softmax(jnp.where(there, score, -1e9), axis=-1)
-        x = rows[-1] + apply(layer["out"], jnp.einsum("hs,shd->hd", share, split(v)).reshape(-1))
+        return jnp.einsum("hs,shd->hd", share, split(v)).reshape(-1)
+
+    def _mix(self, layer: Weights, x: Array, heard: Array) -> Array:
+        x = x + apply(layer["out"], heard)
         return x + apply(layer["down"], jax.nn.gelu(apply(layer["up"], _norm(x))))
 
 
