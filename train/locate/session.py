@@ -100,7 +100,6 @@ def run(arguments: Command) -> None:
     """
     check(arguments)
     begin = time.monotonic()
-    _write_config(arguments)
     everything = tunnels.load(
         tunnels.names_of(arguments.tunnels) + tunnels.names_of(arguments.val), None, arguments.cache
     )
@@ -108,6 +107,7 @@ def run(arguments: Command) -> None:
     env, params = tunnels.enter(arguments.task, everything[:n_train])
     val_env, val_params = tunnels.enter(arguments.task, everything[n_train:])
     print(f"{len(everything)} tunnels: {time.monotonic() - begin:.0f} s", flush=True)
+    _write_config(arguments)
     drives = scores.record(val_env, val_params, jax.random.key(_VAL_SEED), arguments.drives)
     session = Session(arguments, env, params, drives)
     session.train()

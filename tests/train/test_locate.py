@@ -1,0 +1,105 @@
+"""Training of localisers: what is refused, that it learns and goes on, and scores by kind."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.policies.locate import memory
+from subterra_jax.policies.locate.profiles import Points
+from subterra_jax.policies.locate.streams import Record
+from train.config import ConfigError
+from train.locate import scores, session
+from train.locate.drives import Drive
+from train.locate.learner import LocateConfig, LocateLearner
+
+_SMALL = LocateConfig("gru", n_envs=2, n_steps=200, minibatch=2, chunk=1)
+
+
+def _command(tmp_path, **changes):
+    return session.Command(out=tmp_path, config=dataclasses.replace(_SMALL, **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"minibatch": 3}, "n_envs = 2 must be a multiple of minibatch = 3"),
+        ({"network": "lstm"}, "no network 'lstm'"),
+        ({"network": "kalman", "front": "wide"}, "needs the evidence"),
+        ({"n_steps": 100}, "n_steps must be at least 200, got 100"),
+        ({"minutes": 0.0}, "minutes must be positive"),
+    ],
+)
+def test_settings_that_cannot_be_trained_with_are_refused_by_name(tmp_path, changes, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        session.run(_command(tmp_path / "run", **changes))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("seeds", [(), (1, 1), (-1,)])
+def test_seeds_must_differ(tmp_path, seeds):
+    with pytest.raises(ConfigError, match="seeds must differ and be at least 0"):
+        session.check(dataclasses.replace(_command(tmp_path), seeds=seeds))
+
+
+def test_scores_are_told_by_kind():
+    names = ["open:cast:val:0", "open:rock:val:0"]
+    found = {"within": np.array([1.0, 0.5, 0.0, np.nan]), "error": np.array([0.1, 0.3, 9.0, np.nan])}
+    table = scores.by_kind(found, np.array([0, 0, 1, 1]), names)
+    assert table["cast"] == {"within": 0.75, "error": pytest.approx(0.2)}
+    assert table["rock"] == {"within": 0.0, "error": 9.0}
+    assert table["all"]["within"] == 0.5
+
+
+def _made_up_drive(n_envs, share):
+    """Robots that drive (1 + share) times what is commanded, as their odometers say, past smooth walls."""
+    driven = jnp.broadcast_to(0.2 * jnp.arange(200.0), (n_envs, 200))
+    points = Points(jnp.zeros((n_envs, 200, 2, 7)), jnp.zeros((n_envs, 200, 2, 7)), jnp.ones((n_envs, 200, 2, 7), bool))
+    scale = 1.0 + jnp.asarray(share)[:, None]
+    return Drive(Record(driven, scale * driven, points), scale * driven, jnp.zeros(n_envs, jnp.int32))
+
+
+def test_a_judge_counts_the_goals_at_which_the_estimate_is_right():
+    drives = _made_up_drive(3, [0.0, 0.02, 0.5])
+    weights = memory.init("kalman", "match", jax.random.key(0))
+    found = scores.make_judge("kalman", 38)(weights, drives)
+    assert found["within"][0] == 1.0
+    assert found["within"][2] < 0.2
+    assert found["found"][0] < found["found"][1] < found["found"][2]
+
+
+@pytest.mark.slow
+def test_gradients_do_not_depend_on_the_chunks():
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
+    drives = _made_up_drive(4, [0.0, 0.01, -0.02, 0.03])
+    found = []
+    for chunk in (4, 1):
+        learner = LocateLearner(env, params, dataclasses.replace(_SMALL, n_envs=4, minibatch=4, chunk=chunk))
+        found.append(jax.jit(learner._gradients)(learner.init(0).weights, drives))
+    for one, other in zip(jax.tree.leaves(found[0]), jax.tree.leaves(found[1]), strict=True):
+        np.testing.assert_allclose(one, other, rtol=2e-3, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_run_writes_policies_that_load_and_goes_on_as_what_it_was(tmp_path, monkeypatch):
+    settings = {"tunnels": "control", "val": "control", "task": "Subterra/StopAtShort-v1", "drives": 2, "seeds": (3, 4)}
+    command = dataclasses.replace(_command(tmp_path, minutes=0.01), **settings)
+    session.run(command)
+    folder = tmp_path / "seed-3"
+    policy = st.load_policy(str(folder / "policy.safetensors"))
+    assert policy is not None
+    first = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert len(first) == 1
+    assert json.loads((folder / "scores.json").read_text())["seed"] == 3
+    with pytest.raises(ConfigError, match="was begun with another n_steps"):
+        session.run(dataclasses.replace(command, resume=True, config=dataclasses.replace(command.config, n_steps=220)))
+    longer = dataclasses.replace(command.config, minutes=(first[0]["seconds"] + 30.0) / 60.0)
+    session.run(dataclasses.replace(command, resume=True, config=longer))
+    second = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert second[0] == first[0]
+    assert [row["step"] for row in second] == [400 * (i + 1) for i in range(len(second))]
+    assert len(second) > 1
