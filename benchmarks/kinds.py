@@ -24,6 +24,7 @@ from subterra_jax.evaluation.floor import floor
 from subterra_jax.evaluation.records import grouped, interval
 from subterra_jax.host.files import require_folder
 from subterra_jax.policies import open_agent
+from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.opening import policy_source
 from subterra_jax.procedural.open_world import SPLITS, kinds_of
@@ -123,9 +124,16 @@ def _write(config: KindsConfig, columns: tuple[str, ...], rows: dict[str, list],
         "facts": {**environment_facts(), **constants_facts()},
         "floor": None if lows is None else dict(zip(columns, lows, strict=True)),
         "rows": {agent: dict(zip(columns, row, strict=True)) for agent, row in rows.items()},
+        "policies": {agent: digest for agent in rows if (digest := _digest(agent)) is not None},
     }
     write_file(config.out / "kinds.json", (json.dumps(content, indent=1) + "\n").encode())
     write_file(config.out / "kinds.md", as_markdown(config, columns, rows, lows).encode())
+
+
+def _digest(agent: str) -> str | None:
+    """Returns the digest of a policy's tensors; None of a baseline."""
+    source = policy_source(agent.removeprefix(CUT))
+    return None if source is None else read_facts(source)["tensors_sha256"]
 
 
 def floors(params: EnvParams, config: KindsConfig, n_columns: int) -> list[float] | None:

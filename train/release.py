@@ -16,6 +16,7 @@ from subterra_jax.policies import TRAINED_UNDER, Conditions
 from subterra_jax.policies.files import TENSORS
 from train.config import Legs
 from train.evaluate import evaluate
+from train.locate import release as localiser
 from train.log import print_table
 from train.policies import load_policy, make_agent, write_policy
 from train.world import PLANAR, World, library_versions, open_world
@@ -26,11 +27,12 @@ class Command:
     """Releases a trained policy with its scores on the task's fixed list of episodes.
 
     Attributes:
-        run: Run folder of `train.navigate`, or one checkpoint in it.
+        run: Run folder of `train.navigate`, or one checkpoint in it; or the folder of a seed of `train.locate`.
         out: The tensors' file, which ends in `.safetensors`; the facts go beside it.
         tunnel: Tunnel file or name of the evaluation; the packaged tunnel if left out.
         lining: Variant of the walls of the evaluation; the tunnel's usual one if left out.
         episodes: Episodes of the evaluation.
+        measured: Tables `kinds.json` of `benchmarks.kinds` whose rows go into the card of a localiser.
     """
 
     run: tyro.conf.Positional[Path]
@@ -38,11 +40,16 @@ class Command:
     tunnel: Path | None = None
     lining: str | None = None
     episodes: int = 500
+    measured: tuple[Path, ...] = ()
 
 
 def command(arguments: Command) -> None:
     """Evaluates the policy and writes its two files."""
     require_file(arguments.out, TENSORS)
+    if localiser.is_localiser(arguments.run):
+        found = localiser.release(arguments.run, arguments.out, arguments.episodes, arguments.measured)
+        print_table(str(arguments.out), {name: value for name, value in found.items() if value is not None})
+        return
     networks, policy, stored = load_policy(arguments.run)
     world = _world(stored, arguments)
     found = evaluate(world, make_agent(networks, policy), arguments.episodes)

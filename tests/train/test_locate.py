@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from subterra_jax import policies
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
 from train.config import ConfigError
-from train.locate import scores, session
+from train.locate import release, scores, session
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner
 
@@ -103,3 +104,55 @@ def test_a_run_writes_policies_that_load_and_goes_on_as_what_it_was(tmp_path, mo
     assert second[0] == first[0]
     assert [row["step"] for row in second] == [400 * (i + 1) for i in range(len(second))]
     assert len(second) > 1
+
+
+def _table(path, digest, agents):
+    cell = {
+        "success": 0.5,
+        "low": 0.4,
+        "high": 0.6,
+        "contact": 0.0,
+        "median_error": 0.3,
+        "by_tunnel": [],
+        "episodes": [],
+    }
+    content = {
+        "schema": "subterra.kinds/1",
+        "config": {"task": "Subterra/StopAt-v1", "split": "val", "episodes": 10},
+        "rows": {agent: {"cast": {**cell, "success": 0.1 * i}} for i, agent in enumerate(agents)},
+        "policies": {agent: digest for agent in agents if "fused" not in agent},
+    }
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_card_takes_the_rows_of_its_own_policy(tmp_path):
+    table = _table(tmp_path / "kinds.json", "abc", ("fused", "p.safetensors", "cut:p.safetensors"))
+    row = release._rows(table, "abc")
+    assert (row["task"], row["as it is"]["cast"]["success"], row["cut"]["cast"]["success"]) == (
+        "Subterra/StopAt-v1",
+        0.1,
+        0.2,
+    )
+    with pytest.raises(ConfigError, match="has no row of this policy"):
+        release._rows(table, "other")
+    (tmp_path / "junk.json").write_text('{"schema": "x"}')
+    with pytest.raises(ConfigError, match=r"is no table of benchmarks\.kinds"):
+        release._rows(tmp_path / "junk.json", "abc")
+
+
+@pytest.mark.slow
+def test_a_released_localiser_is_loaded_with_its_card(tmp_path):
+    task, out = "Subterra/StopAtShort-v1", tmp_path / "locate-mine.safetensors"
+    command = session.Command(out=tmp_path, task=task, tunnels="control", val="control", drives=2, config=_SMALL)
+    session.run(dataclasses.replace(command, config=dataclasses.replace(_SMALL, minutes=0.01)))
+    policy = tmp_path / "seed-0" / "policy.safetensors"
+    digest = json.loads(policy.with_suffix(".json").read_text())["tensors_sha256"]
+    table = _table(tmp_path / "kinds.json", digest, ("p", "cut:p"))
+    release.release(tmp_path / "seed-0", out, 2, (table,))
+    agent, card = policies.load(out)
+    assert agent.name == "locate-mine"
+    assert card["trained_under"]["n_beams"] == 16
+    assert card["measured"][0]["cut"]["cast"]["success"] == pytest.approx(0.1)
+    assert card["success_against_time"]
+    assert out.read_bytes() == policy.read_bytes()
