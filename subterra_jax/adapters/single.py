@@ -21,7 +21,7 @@ from subterra_jax.adapters import packing
 from subterra_jax.adapters.choosing import check_clear, read_choice, reset_chosen
 from subterra_jax.adapters.moments import Moment, refuse_fork
 from subterra_jax.adapters.packing import Observation, as_observation, pack, start_streams, take_key, unpacker
-from subterra_jax.adapters.views import make_view
+from subterra_jax.adapters.views import view_for
 from subterra_jax.compiled import hashable
 from subterra_jax.rules import Choice
 from subterra_jax.state import EnvParams, State
@@ -154,9 +154,9 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         lining: As for `subterra_jax.make`.
         flat: Return a plain vector for every task.
         render_mode: `None` or `rgb_array`.
-        view: Picture of `render`: `top`, the plan from above, drawn without GL; or `mujoco`, the scene from a camera
-            behind the robot.
-        scene: Folder of `scene.build`, or one of its MJCF files; `view="mujoco"` needs it, `top` does not.
+        view: Picture of `render`: `top`, the plan from above, drawn without GL; or `mujoco`, from a camera behind the
+            robot: the scene, or without one the bore of the tunnel.
+        scene: Folder of `scene.build`, or one of its MJCF files.
         **overrides: As for `subterra_jax.make`.
     """
 
@@ -177,7 +177,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         refuse_fork()
         self.render_mode = render_mode
-        self._view = make_view(view, scene)
+        self._view = view_for(view, scene, task, tunnel, lining)
         env, params = make(task, self._view.tunnel if tunnel is None else tunnel, lining, **overrides)
         self._env, self._params = env, params
         self._fields = packing.named_fields(env, params, flat)

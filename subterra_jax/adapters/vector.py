@@ -18,7 +18,7 @@ from subterra_jax.adapters.batch import Batch
 from subterra_jax.adapters.choosing import read_choice
 from subterra_jax.adapters.moments import Moment, refuse_fork
 from subterra_jax.adapters.packing import Fields, Observation, Report, as_observation, start_streams
-from subterra_jax.adapters.views import make_view
+from subterra_jax.adapters.views import view_for
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
 
@@ -102,7 +102,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": self.autoreset_mode}
-        self._view = make_view(view, scene)
+        self._view = view_for(view, scene, task, tunnel, lining)
         env, params = make(task, self._view.tunnel if tunnel is None else tunnel, lining, **overrides)
         self.batch = Batch(env, params, num_envs, self.autoreset_mode)
         self.fields = packing.named_fields(env, params, flat)

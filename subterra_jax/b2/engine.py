@@ -12,16 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
-from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import physics
 from subterra_jax.b2.model import robot_spec
-from subterra_jax.b2.params import Body, Build, Surroundings, WalkParams, WalkState
+from subterra_jax.b2.params import Body, Build, Surroundings
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import TrackError
 from subterra_jax.b2.walk import WalkEnv
@@ -43,7 +41,8 @@ class Workbench:
         model: The model.
         data: Its data.
         lock: Lock to hold from `put` to `take`.
-        watch: Called with the data at the end of each control period, as for a film; `None` by default.
+        watch: Called at the end of each control period, as for a film, with the data and the position of its origin in
+            the tunnel frame, m; `None` by default.
     """
 
     def __init__(self, model: mujoco.MjModel, prefix: str = ""):
@@ -55,7 +54,7 @@ class Workbench:
         self._middle = model.body_ipos[self.trunk].copy()
         self._gain, self._bias = model.actuator_gainprm.copy(), model.actuator_biasprm.copy()
         self.lock = threading.Lock()
-        self.watch: Callable[[mujoco.MjData], None] | None = None
+        self.watch: Callable[[mujoco.MjData, Any], None] | None = None
 
     def apply_build(self, build: Build) -> None:
         """Gives the robot the properties of a build."""
@@ -90,6 +89,8 @@ class Workbench:
                 for _ in range(n_steps):
                     data.xfrc_applied[self.trunk] = wall_wrench(data.qpos, data.qvel, around)
                     mujoco.mj_step(self.model, data)
+            if self.watch is not None:
+                self.watch(data, around.origin)
             return self.take()
 
     def put(self, body: Body, targets: np.ndarray, origin: np.ndarray | float = 0.0) -> None:
@@ -102,8 +103,6 @@ class Workbench:
     def take(self, origin: np.ndarray | float = 0.0) -> Body:
         """Return the state of the robot, its position from `origin`, m."""
         data = self.data
-        if self.watch is not None:
-            self.watch(data)
         qpos = data.qpos.copy()
         qpos[:3] -= origin
         return Body(*(part.astype(np.float32) for part in (qpos, data.qvel, data.qacc_warmstart)))
@@ -136,17 +135,6 @@ class MujocoPhysics(Physics):
     def run_one(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build) -> Body:
         """Advances one robot by one control period."""
         return self.bench.run(body, targets, around, build, self.substeps)
-
-
-@struct.dataclass
-class SceneSurroundings(Surroundings):
-    """`Surroundings` at a position in a scene.
-
-    Attributes:
-        origin: Position of the anchor, tunnel frame, m.
-    """
-
-    origin: Float[Array, "3"] | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -188,36 +176,26 @@ class ScenePhysics(MujocoPhysics):
 
     def run_one(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build) -> Body:
         """Advances one robot by one control period, in the scene's coordinates."""
-        assert isinstance(around, SceneSurroundings)
         bench, origin = self.bench, np.asarray(around.origin, np.float64)
         with bench.lock:
             bench.apply_build(build)
             bench.put(body, targets, origin)
             mujoco.mj_step(bench.model, bench.data, self.substeps)
+            if bench.watch is not None:
+                bench.watch(bench.data, np.zeros(3))
             return bench.take(origin)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class SceneWalk(WalkEnv):
-    """`WalkEnv` in a built scene: its physics needs the robot's position there."""
+def walk_in_scene(walk: WalkEnv, folder: Path, lining: str | None) -> WalkEnv:
+    """Return an environment moved into the scene of a folder: the one with furniture where the lining is `furnished`.
 
-    @classmethod
-    def of(cls, walk: WalkEnv, folder: Path, lining: str | None) -> "SceneWalk":
-        """Moves an environment into the scene of a folder: the one with furniture where the lining is `furnished`.
-
-        Raises:
-            TrackError: The scene cannot be read.
-        """
-        file = folder / ("scene_furnished.xml" if lining == "furnished" else "scene.xml")
-        if not file.is_file():
-            raise TrackError(f"{file} is missing")
-        own = {name: getattr(walk, name) for name in ("id", "driven", "privileged")}
-        return cls(physics=ScenePhysics(robot=walk.physics.robot, scene=file), **own)
-
-    def surroundings(self, state: WalkState, params: WalkParams) -> SceneSurroundings:
-        """Return ground and walls of the next control period, and their position."""
-        around: dict[str, Any] = vars(super().surroundings(state, params))
-        return SceneSurroundings(**around, origin=jnp.asarray(params.track.position[state.anchor]))
+    Raises:
+        TrackError: The scene cannot be read.
+    """
+    file = folder / ("scene_furnished.xml" if lining == "furnished" else "scene.xml")
+    if not file.is_file():
+        raise TrackError(f"{file} is missing")
+    return dataclasses.replace(walk, physics=ScenePhysics(robot=walk.physics.robot, scene=file))
 
 
 def far_from_walls(qpos: Any, around: Surroundings) -> bool:

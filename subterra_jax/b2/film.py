@@ -7,7 +7,7 @@ from typing import Any
 
 from subterra_jax.b2.gait import RELEASED
 from subterra_jax.b2.gym import B2Env  # first: it chooses how MuJoCo draws
-from subterra_jax.b2.view import Moment, PictureError
+from subterra_jax.b2.view import PictureError, place
 
 # isort: split
 import jax
@@ -60,17 +60,16 @@ def film(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.n
         PictureError: There is no OpenGL.
     """
     physics: Any = env.walk.physics
-    moments: list[Moment] = []
+    moments: list[np.ndarray] = []
     count = 0
-    physics.bench.watch = lambda data: moments.append(Moment.from_data(data))
+    physics.bench.watch = lambda data, origin: moments.append(place(data, origin))
     pictures = []
     try:
         obs, _ = env.reset(seed=seed)
         for _ in range(round(seconds / float(env.params.vehicle.period))):
             moments.clear()
             obs, _, terminated, truncated, _ = env.step(driver.act(obs))
-            around, first = env.around(), -count % _EVERY
-            pictures += [env.camera().snap(moment, around) for moment in moments[first::_EVERY]]
+            pictures += [env.camera().draw(moment) for moment in moments[-count % _EVERY :: _EVERY]]
             count += len(moments)
             if terminated or truncated:
                 break

@@ -16,10 +16,11 @@ if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.ge
 
 from subterra_jax.adapters import packing
 from subterra_jax.adapters.packing import start_streams, take_key
+from subterra_jax.adapters.views import TunnelChoice
 from subterra_jax.b2 import TRAVERSE, WALK, tasks
-from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
+from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
 from subterra_jax.b2.gait import RELEASED, WalkPolicy
-from subterra_jax.b2.params import Surroundings, WalkParams, WalkState
+from subterra_jax.b2.params import WalkParams, WalkState
 from subterra_jax.b2.view import Camera
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.tunnel.plan import TunnelPlan
@@ -42,10 +43,11 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
     params: Any
     walk: WalkEnv
 
-    def __init__(self, render_mode: str | None, width: int, height: int):
+    def __init__(self, tunnel: TunnelChoice, render_mode: str | None, width: int, height: int):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         self.render_mode, self._size = render_mode, (width, height)
+        self._tunnel = tunnel
         self._cpu = jax.local_devices(backend="cpu")[0]
         self._stream: np.ndarray | None = None
         self._camera: Camera | None = None
@@ -56,7 +58,6 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
         self.observation_space = packing.observation_space(self.env, self.params, None)
         self.action_space = packing.action_space(self.env, self.params)
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
-        self._around = jax.jit(self.walk.surroundings)
 
     def walking(self) -> tuple[WalkState, WalkParams]:
         """Return the state and the parameters of the walking robot."""
@@ -102,8 +103,10 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
             return None
         if self.state is None:
             raise error.ResetNeeded("reset() must come before render()")
-        around = self.around()
-        return self.camera().picture(jax.device_get(self.walking()[0]), around)
+        state, params = jax.device_get(self.walking()[0]), self.walking()[1]
+        qpos = np.array(state.body.qpos, np.float64)
+        qpos[:3] += np.asarray(params.track.position[state.anchor], np.float64)
+        return self.camera().draw(qpos)
 
     def camera(self) -> Camera:
         """Return the camera, made at the first call.
@@ -112,13 +115,8 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
             PictureError: There is no OpenGL.
         """
         if self._camera is None:
-            self._camera = Camera(self.walk, self.walking()[1], *self._size)
+            self._camera = Camera(self.walk, self.walking()[1], self._tunnel, *self._size)
         return self._camera
-
-    def around(self) -> Surroundings:
-        """Return the ground and walls around the robot."""
-        with jax.default_device(self._cpu):
-            return jax.device_get(self._around(*self.walking()))
 
     def close(self) -> None:
         """Releases the renderer, if there is one."""
@@ -168,7 +166,7 @@ class B2Env(SingleB2):
         height: int = 480,
         **overrides: Any,
     ):
-        super().__init__(render_mode, width, height)
+        super().__init__(TunnelChoice(tunnel, lining), render_mode, width, height)
         with jax.default_device(self._cpu):
             self.env, self.params = tasks.make_mission(
                 task, tunnel, lining, scene=scene, policy=policy, odometer=odometer, engine="mujoco", **overrides
@@ -209,11 +207,11 @@ class B2WalkEnv(SingleB2):
         height: int = 480,
         **overrides: Any,
     ):
-        super().__init__(render_mode, width, height)
+        super().__init__(TunnelChoice(tunnel, lining), render_mode, width, height)
         with jax.default_device(self._cpu):
             self.env, self.params = tasks.make(task, tunnel, lining, scene=scene, physics=MujocoPhysics(), **overrides)
         if scene is not None:
-            self.env = SceneWalk.of(self.env, Path(scene), lining)
+            self.env = walk_in_scene(self.env, Path(scene), lining)
         self.walk = self.env
         self._prepare()
 

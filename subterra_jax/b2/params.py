@@ -173,11 +173,13 @@ class Surroundings:
         ground: Positions and quaternions of the window's mocap bodies.
         quaternion: Rotation of the anchor: x along the track.
         half_width: Half the distance between the walls, m.
+        origin: Position of the anchor, tunnel frame, m; the window does not need it.
     """
 
     ground: tuple[Float[Array, "n_mocap 3"], Float[Array, "n_mocap 4"]]
     quaternion: Float[Array, "4"]
     half_width: Float[Array, ""]
+    origin: Float[Array, "3"] | None = None
 
 
 @struct.dataclass

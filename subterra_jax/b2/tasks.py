@@ -10,7 +10,7 @@ import numpy as np
 
 from subterra_jax.b2 import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.engine import MujocoPhysics, SceneWalk
+from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
 from subterra_jax.b2.gait import RELEASED, GaitParams, WalkPolicy, check_fits, load_policy
 from subterra_jax.b2.mission import PERIODS, LegOdometer, Legs, TrunkLidar
 from subterra_jax.b2.model import RobotError
@@ -171,7 +171,7 @@ def make_mission(
     if scene is not None:
         relief = relief or Relief.from_scene(scene, lining or "pockets")
         if engine == "mujoco":
-            walker = SceneWalk.of(walker, Path(scene), lining)
+            walker = walk_in_scene(walker, Path(scene), lining)
     trained = _gait(policy, walker.observation_size(walking))
     own = {"walk": walking, "policy": trained, "relief": relief}
     env = TunnelEnv(

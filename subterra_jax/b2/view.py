@@ -1,46 +1,45 @@
-"""Pictures of a walking B2, drawn by MuJoCo: in the scene in which it walks, or on its window of track."""
+"""Pictures of a walking B2, drawn by MuJoCo: in the scene in which it walks, or in the bore of its tunnel."""
 
-import os
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
-from subterra_jax.b2.engine import MujocoPhysics, SceneSurroundings, rotate_vector
-from subterra_jax.b2.params import Surroundings, WalkParams, WalkState
+from subterra_jax.adapters.views import TunnelChoice
+from subterra_jax.b2 import track
+from subterra_jax.b2.engine import PREFIX, MujocoPhysics, ScenePhysics, rotate_vector
+from subterra_jax.b2.model import robot_spec
+from subterra_jax.b2.params import WalkParams
 from subterra_jax.b2.walk import WalkEnv
-from subterra_jax.host.errors import SubterraError
+from subterra_jax.lidar3d.surface import Triangles
+from subterra_jax.pictures.renderer import PictureError as PictureError
+from subterra_jax.pictures.renderer import light_near, open_renderer
+from subterra_jax.pictures.stage import Piece, add_box, add_surface, stage_spec
+from subterra_jax.pictures.surfaces import FLOOR, Surface
+from subterra_jax.tunnel.plan import TunnelPlan
 
-_MOST_LAMPS = 7  # OpenGL has eight lights, one of them the headlight
-_BEHIND, _PITCH_DEG, _ASIDE_DEG, _AHEAD = 2.6, -16.0, 18.0, 0.6  # of the trunk: m, degrees, degrees, m
-_AMBIENT, _DIFFUSE = 0.45, 0.55  # of the headlight, where a model has no lamps
-_WALL_LENGTH, _WALL_HEIGHT = 8.0, 1.2  # half sizes of the two panels that stand for the walls of a tunnel, m
-_WALL_COLOUR = np.array([0.62, 0.61, 0.58, 1.0], np.float32)
+_BEHIND, _PITCH_DEG, _ASIDE_DEG = 2.9, -15.0, 24.0  # of the point looked at: m, degrees, degrees
+_AHEAD, _BELOW = 0.35, 0.1  # of the trunk, that point, m
+_RAIL, _SLEEPER = (0.40, 0.33, 0.28), (0.62, 0.61, 0.58)
+_BED_BEYOND = 0.5  # m behind the walls
+_N_POSE = 19  # numbers of the robot's pose: position, quaternion, joints
 
 
-class PictureError(SubterraError):
-    """MuJoCo cannot draw here."""
-
-
-class Moment(NamedTuple):
-    """Poses of the robot and of the window's mocap bodies, if any, in the model's coordinates."""
-
-    qpos: np.ndarray
-    position: np.ndarray
-    quaternion: np.ndarray
-
-    @classmethod
-    def from_data(cls, data: mujoco.MjData) -> "Moment":
-        """Copies the poses from data."""
-        return cls(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy())
+def place(data: mujoco.MjData, origin: Any) -> Float[np.ndarray, "19"]:
+    """Return the robot's pose in the tunnel frame from data whose origin lies at a position there, m."""
+    qpos = np.array(data.qpos[:_N_POSE])
+    qpos[:3] += np.asarray(origin, np.float64)
+    return qpos
 
 
 class Camera:
-    """Draws a robot from behind, a little to one side.
+    """Draws a robot from behind, a little to one side; in its scene, or in a piece of its tunnel's bore.
 
     Args:
         walk: The environment; its physics must be MuJoCo's own.
         params: Its params.
+        tunnel: The tunnel to draw where there is no scene.
         width: Width of a picture, pixels.
         height: Height of a picture, pixels.
 
@@ -48,84 +47,87 @@ class Camera:
         PictureError: There is no OpenGL.
     """
 
-    def __init__(self, walk: WalkEnv, params: WalkParams, width: int = 480, height: int = 480):
+    def __init__(self, walk: WalkEnv, params: WalkParams, tunnel: TunnelChoice, width: int = 480, height: int = 480):
         assert isinstance(walk.physics, MujocoPhysics)
-        self._physics, self._params = walk.physics, params
-        model = walk.physics.bench.model
-        frame = model.vis.global_
-        frame.offwidth, frame.offheight = max(frame.offwidth, width), max(frame.offheight, height)
-        if not model.nlight:
-            model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = _AMBIENT, _DIFFUSE
-        # Drawing must not change the solver's data.
-        self._data = mujoco.MjData(model)
-        try:
-            self._renderer = mujoco.Renderer(model, height, width)
-        except (RuntimeError, AttributeError, ImportError, mujoco.FatalError) as cause:
-            raise PictureError(
-                f"MuJoCo cannot draw with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}: {cause}; set it to egl, "
-                "osmesa or glfw before anything imports mujoco"
-            ) from cause
-
-    def picture(self, state: WalkState, around: Surroundings) -> np.ndarray:
-        """Draws one picture, `(height, width, 3)` uint8.
-
-        Args:
-            state: The robot.
-            around: Ground and walls.
-        """
-        data = self._data
-        data.qpos[:] = state.body.qpos
-        if isinstance(around, SceneSurroundings):
-            data.qpos[:3] += np.asarray(around.origin)
+        self._robot, self._track, self._choice = walk.physics.robot, params.track, tunnel
+        self._size = width, height
+        self._renderer: mujoco.Renderer | None = None
+        self._plan: TunnelPlan | None = None
+        self._piece: Piece | None = None
+        if isinstance(walk.physics, ScenePhysics):
+            self._show(walk.physics.bench.model)
         else:
-            data.mocap_pos[:], data.mocap_quat[:] = around.ground
-        return self._draw(around)
+            self._plan = tunnel.plan(0)
 
-    def snap(self, moment: "Moment", around: Surroundings) -> np.ndarray:
-        """Draws one picture of a moment within a step, `(height, width, 3)` uint8.
-
-        Args:
-            moment: Poses of the robot and the window.
-            around: Ground and walls at the end of that step.
-        """
+    def draw(self, qpos: Float[np.ndarray, "19"]) -> np.ndarray:
+        """Draw a robot at a pose in the tunnel frame, `(height, width, 3)` uint8."""
+        middle, ahead = qpos[:3], rotate_vector(qpos[3:7], np.array([1.0, 0.0, 0.0]))
+        if self._plan is not None:
+            self._draw_piece(self._plan, middle, ahead)
         data = self._data
-        data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = moment.qpos, moment.position, moment.quaternion
-        return self._draw(around)
-
-    def _draw(self, around: Surroundings) -> np.ndarray:
-        data, model = self._data, self._physics.bench.model
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_camlight(model, data)
-        middle, ahead = data.qpos[:3].copy(), rotate_vector(data.qpos[3:7], np.array([1.0, 0.0, 0.0]))
-        self._light(middle + 2.0 * ahead)
+        data.qpos[:_N_POSE] = qpos
+        mujoco.mj_kinematics(self._model, data)
+        mujoco.mj_camlight(self._model, data)
+        light_near(self._model, data, middle + 2.0 * ahead)
         camera = mujoco.MjvCamera()
         camera.type, camera.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, middle + _AHEAD * ahead
+        camera.lookat[2] -= _BELOW
         camera.distance, camera.elevation = _BEHIND, _PITCH_DEG
         camera.azimuth = np.rad2deg(np.arctan2(ahead[1], ahead[0])) + _ASIDE_DEG
+        assert self._renderer is not None
         self._renderer.update_scene(data, camera)
-        if not isinstance(around, SceneSurroundings):
-            self._add_walls(around)
         return self._renderer.render().copy()
 
     def close(self) -> None:
         """Releases the renderer."""
-        self._renderer.close()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
 
-    def _light(self, point: np.ndarray) -> None:
-        """Switches on the lamps nearest to a point, and the others off."""
-        model, distance = self._physics.bench.model, np.linalg.norm(self._data.light_xpos - point, axis=1)
-        if len(distance):
-            model.light_active[:] = distance <= np.sort(distance)[min(_MOST_LAMPS, len(distance)) - 1]
+    def _show(self, model: mujoco.MjModel) -> None:
+        """Takes a model; drawing must not change the solver's data, so it has data of its own."""
+        self.close()
+        self._model, self._data = model, mujoco.MjData(model)
+        self._renderer = open_renderer(model, *self._size)
 
-    def _add_walls(self, around: Surroundings) -> None:
-        """Adds two panels where the smooth walls are, straight along the track."""
-        scene: Any = self._renderer.scene
-        matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, np.asarray(around.quaternion, np.float64))
-        size = np.array([_WALL_LENGTH, 0.02, _WALL_HEIGHT])
-        for side in (1.0, -1.0):
-            middle = np.array([0.0, side * (float(around.half_width) + 0.02), _WALL_HEIGHT - 0.1])
-            middle = rotate_vector(np.asarray(around.quaternion), middle)
-            geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, size, middle, matrix, _WALL_COLOUR)
-            scene.ngeom += 1
+    def _draw_piece(self, plan: TunnelPlan, middle: np.ndarray, ahead: np.ndarray) -> None:
+        """Makes the model of the piece around the robot, if the present one does not show it."""
+        node = int(np.argmin(np.sum((plan.centre - middle[:2]) ** 2, axis=1)))
+        station, facing = float(plan.station[node]), float(ahead[:2] @ plan.tangent[node])
+        if self._piece is not None and self._piece.shows(station, facing):
+            return
+        self._piece = Piece.around(plan, self._choice.lining, station, facing)
+        spec = stage_spec(self._piece, leave_out=("rail", "sleeper", "floor"))
+        self._add_track(spec, self._piece)
+        robot = robot_spec(self._robot)
+        spec.option, robot.option.timestep = robot.option, robot.option.timestep
+        spec.attach(robot, prefix=PREFIX, frame=spec.worldbody.add_frame())
+        self._show(spec.compile())
+
+    def _add_track(self, spec: mujoco.MjSpec, piece: Piece) -> None:
+        """Adds the sleepers on which the robot walks, rails beside them and ballast below."""
+        station = np.asarray(self._track.station, np.float64)
+        chosen = np.flatnonzero((station >= piece.start) & (station <= piece.end))
+        position, turn = (np.asarray(part, np.float64) for part in (self._track.position, self._track.quaternion))
+        half = 0.5 * float(np.median(np.diff(station)))
+        depth, (rail, height) = 0.05, track.RAIL_HALF
+        for k in chosen:
+            sunk = position[k] - rotate_vector(turn[k], np.array([0.0, 0.0, depth]))
+            add_box(spec, (*track.SLEEPER_HALF, depth), sunk, turn[k], _SLEEPER)
+            for side in (track.RAIL_OFFSET, -track.RAIL_OFFSET):
+                middle = position[k] + rotate_vector(turn[k], np.array([0.0, side, height]))
+                add_box(spec, (half + 0.01, rail, height), middle, turn[k], _RAIL)
+        add_surface(spec, _bed(piece, float(self._track.protrusion)))
+
+
+def _bed(piece: Piece, protrusion: float) -> Surface:
+    """Return the ballast from wall to wall, `protrusion` m below the ground of the tunnel's file."""
+    plan = piece.plan
+    node = np.flatnonzero((plan.station >= piece.start) & (plan.station <= piece.end))
+    left = np.stack([-plan.tangent[node, 1], plan.tangent[node, 0]], axis=-1)
+    reach = (plan.half_width[node] + _BED_BEYOND)[:, None] * left
+    height = plan.elevation[node, None] - protrusion
+    points = np.concatenate([np.hstack([plan.centre[node] + side * reach, height]) for side in (1.0, -1.0)])
+    first, n = np.arange(len(node) - 1), len(node)
+    faces = [np.stack(corner, 1) for corner in ((first, first + n, first + 1), (first + 1, first + n, first + n + 1))]
+    return Surface("bed", Triangles(points, np.concatenate(faces)), FLOOR, points[:, :2])

@@ -168,7 +168,7 @@ class WalkEnv:
         pose = locate(state.body, sleepers.quaternion[anchor])
         ground = track.window_poses(sleepers, anchor, pose.ahead, self.physics.window)
         half_width = at_station(params.tunnel, sleepers.station[anchor] + pose.ahead)[4]
-        return Surroundings(ground, sleepers.quaternion[anchor], half_width)
+        return Surroundings(ground, sleepers.quaternion[anchor], half_width, sleepers.position[anchor])
 
     def position(self, state: WalkState, params: WalkParams) -> Float[Array, "3"]:
         """Return the middle of the trunk in the tunnel frame, m."""

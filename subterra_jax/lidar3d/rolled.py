@@ -30,15 +30,34 @@ def raise_shell(shell: Shell, lining: str) -> tuple[Axis, Triangles]:
     Raises:
         TunnelError: The shell does not have the variant; or recesses touch and `manifold3d` is not installed.
     """
+    axis, *parts = raise_parts(shell, lining)
+    return axis, join_surfaces(parts)
+
+
+def raise_parts(shell: Shell, lining: str, *, touching: bool = True) -> tuple[Axis, Triangles, Triangles, Triangles]:
+    """Return the axis and, apart, the wall with its recesses, the track and the furniture.
+
+    Args:
+        shell: As for `raise_shell`.
+        lining: As for `raise_shell`.
+        touching: Sink recesses that touch others, the seam or a mouth too; otherwise they are left out.
+
+    Raises:
+        TunnelError: As for `raise_shell`.
+    """
     if lining not in shell.linings:
         raise TunnelError(f"the shell has no lining {lining!r}; it has {', '.join(shell.linings)}")
     own = shell.linings[lining]
     if own.radius is not None:
         shell = replace(shell, radius=own.radius)
-    bricks = brick_corners(np.concatenate([shell.track, own.brick])).reshape(-1, 3)
-    first = 8 * np.arange(len(bricks) // 8)
-    boxes = Triangles(bricks, (first[:, None, None] + BOX_FACES).reshape(-1, 3))
-    return _cut_axis(shell), join_surfaces([_raise_wall(shell, own), boxes])
+    wall = _raise_wall(shell, own, touching)
+    return _cut_axis(shell), wall, _raise_bricks(shell.track), _raise_bricks(own.brick)
+
+
+def _raise_bricks(brick: Float[np.ndarray, "k 13"]) -> Triangles:
+    """Return bricks as triangles, eight vertices and twelve faces each."""
+    first = 8 * np.arange(len(brick))
+    return Triangles(brick_corners(brick).reshape(-1, 3), (first[:, None, None] + BOX_FACES).reshape(-1, 3))
 
 
 def _cut_axis(shell: Shell) -> Axis:
@@ -55,17 +74,18 @@ def _cut_axis(shell: Shell) -> Axis:
     return Axis(station - start, position, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
 
 
-def _raise_wall(shell: Shell, lining: ShellLining) -> Triangles:
+def _raise_wall(shell: Shell, lining: ShellLining, touching: bool) -> Triangles:
     plane = _unroll(shell, lining.seam)
     boxes, apart = _rectangles(shell, plane, lining.pocket)
     fold = np.sort(plane.to_around(_section_corners(shell)))
     near = np.array([shell.window[0] - _AROUND_CUT, shell.window[1] + _AROUND_CUT])
-    if not apart.all():
+    whole = touching and not apart.all()
+    if whole:
         near = np.array([-np.inf, np.inf])  # the union needs the whole, closed at both mouths
     chosen = apart & (boxes[:, 2] > near[0]) & (boxes[:, 3] < near[1])
     sheet = _triangulate(plane, shell.station[-1], fold, boxes[chosen], shell.spacing, near)
     wall = _roll_up(shell, plane, sheet, lining.pocket[chosen])
-    return wall if apart.all() else _sink(wall, sheet, shell, lining.pocket[~apart])
+    return wall if not whole else _sink(wall, sheet, shell, lining.pocket[~apart])
 
 
 @dataclass(frozen=True)

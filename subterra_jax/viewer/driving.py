@@ -34,7 +34,7 @@ class Gait:
         self.walks = walk is not None
         self._poses: list[np.ndarray] = []
         if walk is not None:
-            walk.physics.bench.watch = lambda data: self._poses.append(data.qpos[3:19].astype(np.float32))
+            walk.physics.bench.watch = lambda data, origin: self._poses.append(data.qpos[3:19].astype(np.float32))
 
     def standing(self) -> Float[np.ndarray, "m 16"]:
         """Return the poses before the first step."""

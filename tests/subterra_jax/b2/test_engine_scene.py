@@ -10,7 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import constants as b2
-from subterra_jax.b2.engine import MujocoPhysics, ScenePhysics, SceneSurroundings, SceneWalk
+from subterra_jax.b2.engine import MujocoPhysics, ScenePhysics, walk_in_scene
 from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.b2.model import RobotConfig
 from subterra_jax.b2.params import Body, Build, Surroundings
@@ -65,7 +65,7 @@ def around(k, half_width=2.0):
     rails = np.array([[0.0, 50.0, -9.0], [0.0, -50.0, -9.0]])
     positions = np.concatenate([[[0.0, 0.0, -0.06]], tops, rails]).astype(np.float32)
     window = Surroundings((positions, np.tile(LEVEL, (7, 1))), LEVEL, np.float32(half_width))
-    return window, SceneSurroundings(**vars(window), origin=ORIGIN + np.array([SPACING * k, 0.0, 0.0]))
+    return window, window.replace(origin=ORIGIN + np.array([SPACING * k, 0.0, 0.0]))
 
 
 def test_the_scene_keeps_everything_but_the_scout(scene):
@@ -104,11 +104,11 @@ def test_walls_of_the_scene_hold_it(scene):
 
 def test_sleepers_are_walked_on_where_the_scene_has_them(folder):
     walk, params = make(scene=folder, driven=True)
-    placed = SceneWalk.of(walk, folder, None)
+    placed = walk_in_scene(walk, folder, None)
     assert placed.physics.scene == folder / "scene.xml"
     assert params.track.station.shape == (N_SLEEPERS,)
     with pytest.raises(TrackError, match=r"scene_furnished\.xml is missing"):
-        SceneWalk.of(walk, folder, "furnished")
+        walk_in_scene(walk, folder, "furnished")
 
 
 def test_a_spoiled_scene_is_named(tmp_path):

@@ -1,0 +1,170 @@
+"""A MuJoCo model of a piece of tunnel, for pictures alone: nothing in it collides."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from subterra_jax.pictures.surfaces import Surface, tunnel_surfaces
+from subterra_jax.tunnel.plan import TunnelPlan
+
+if TYPE_CHECKING:
+    import mujoco
+
+BEHIND, AHEAD = 30.0, 70.0  # of the robot, m: the piece that is drawn
+_MARGIN = 20.0  # m from the end of a piece at which the next one is made
+_LAMP_SPACING, _BELOW_CROWN, _CROWN = 8.0, 0.5, 5.0  # m
+_TILE, _PIXELS = 4.0, 512  # of the wall's texture: m, pixels
+_DARK = 0.05  # grey of what lies beyond the fog
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A piece of a tunnel.
+
+    Attributes:
+        plan: The tunnel.
+        lining: Variant of its walls.
+        start: First station, m.
+        end: Last station, m.
+    """
+
+    plan: TunnelPlan
+    lining: str | None
+    start: float
+    end: float
+
+    @classmethod
+    def around(cls, plan: TunnelPlan, lining: str | None, station: float, facing: float = 1.0) -> Piece:
+        """Return the piece to draw for a robot at a station, m, that looks along (1) or against (-1) the axis."""
+        before, after = (BEHIND, AHEAD) if facing > 0.0 else (AHEAD, BEHIND)
+        return cls(plan, lining, max(station - before, 0.0), min(station + after, plan.length))
+
+    def shows(self, station: float, facing: float = 1.0) -> bool:
+        """Return whether a camera at a station, m, that looks along (1) or against (-1) the axis sees no end of it."""
+        before, after = (_MARGIN, 2.0 * _MARGIN) if facing > 0.0 else (2.0 * _MARGIN, _MARGIN)
+        enough = self.start <= 0.0 or station - self.start >= before
+        return bool(enough and (self.end >= self.plan.length or self.end - station >= after))
+
+
+def stage_spec(piece: Piece, *, leave_out: tuple[str, ...] = ()) -> mujoco.MjSpec:
+    """Return the model of a piece: its surfaces in the tunnel frame, lamps below the crown and fog.
+
+    Args:
+        piece: The piece.
+        leave_out: Names of surfaces to leave out.
+
+    Raises:
+        TunnelError: The plan does not have the lining.
+    """
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.modelname = "tunnel"
+    _set_view(spec)
+    _add_sky(spec, piece)
+    pixels = _noise_picture()
+    texture = spec.add_texture(
+        name="wall", type=mujoco.mjtTexture.mjTEXTURE_2D, width=_PIXELS, height=_PIXELS, nchannel=3
+    )
+    texture.data = pixels.tobytes()
+    for surface in tunnel_surfaces(piece.plan, piece.lining, piece.start, piece.end):
+        if surface.name not in leave_out:
+            add_surface(spec, surface)
+    for k, place in enumerate(_lamps(piece)):
+        spec.worldbody.add_light(
+            name=f"lamp_{k}", pos=place, dir=(0.0, 0.0, -1.0), cutoff=180.0, exponent=0.0, castshadow=False,
+            attenuation=(1.0, 0.05, 0.03), diffuse=(0.95, 0.91, 0.80), specular=(0.2, 0.2, 0.18), active=False,
+        )  # fmt: skip
+    return spec
+
+
+def add_surface(spec: mujoco.MjSpec, surface: Surface) -> None:
+    """Adds a surface to the world as a mesh that collides with nothing."""
+    import mujoco
+
+    points, faces = surface.triangles.vertices, surface.triangles.faces
+    origin = np.floor(points.mean(axis=0))  # MuJoCo keeps meshes in single precision
+    own = f"tunnel {surface.name}"
+    mesh = spec.add_mesh(name=own, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.userface = (points - origin).ravel().tolist(), faces.ravel().tolist()
+    textured = surface.rolled is not None
+    if surface.rolled is not None:
+        mesh.usertexcoord = (surface.rolled / _TILE).ravel().tolist()
+        mesh.userfacetexcoord = faces.ravel().tolist()
+    material = spec.add_material(name=own, rgba=(*surface.colour, 1.0), specular=0.1, shininess=0.2)
+    if textured:
+        material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "wall"
+    spec.worldbody.add_geom(
+        name=own, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=own, material=own, pos=origin, contype=0, conaffinity=0,
+        group=1,
+    )  # fmt: skip
+
+
+def add_box(spec: mujoco.MjSpec, half: Any, position: Any, quaternion: Any, colour: tuple[float, float, float]) -> None:
+    """Adds a box to the world that collides with nothing; half sizes and position in m."""
+    import mujoco
+
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=position, quat=quaternion, rgba=(*colour, 1.0), contype=0,
+        conaffinity=0, group=1,
+    )  # fmt: skip
+
+
+def _set_view(spec: mujoco.MjSpec) -> None:
+    """Sets headlight, fog and clipping, as a built scene has them."""
+    spec.stat.extent = 12.0
+    visual = spec.visual
+    visual.headlight.ambient, visual.headlight.diffuse = (0.30, 0.30, 0.31), (0.32, 0.32, 0.30)
+    visual.headlight.specular = (0.0, 0.0, 0.0)
+    visual.map.znear, visual.map.zfar = 0.005, 60.0
+    visual.map.fogstart, visual.map.fogend = 1.5, 5.0
+    visual.rgba.fog = (_DARK, _DARK, _DARK, 1.0)
+    visual.quality.offsamples = 4
+
+
+def _add_sky(spec: mujoco.MjSpec, piece: Piece) -> None:
+    """Adds daylight at mouths, and darkness at other ends of the piece."""
+    import mujoco
+
+    spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.55, 0.70, 0.88), rgb2=(0.90, 0.93, 0.96), width=64, height=384,
+    )  # fmt: skip
+    plan = piece.plan
+    for station, mouth in ((piece.start, 0.0), (piece.end, plan.length)):
+        if station == mouth:
+            continue
+        node = int(np.argmin(np.abs(plan.station - station)))
+        heading = np.arctan2(plan.tangent[node, 1], plan.tangent[node, 0])
+        turn = (np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading))
+        add_box(spec, (0.05, 12.0, 15.0), (*plan.centre[node], plan.elevation[node]), turn, (_DARK, _DARK, _DARK))
+
+
+def _lamps(piece: Piece) -> Float[np.ndarray, "k 3"]:
+    """Return places below the crown, m; of an assumed height where the plan has no shell."""
+    plan = piece.plan
+    station = np.arange(_LAMP_SPACING * np.ceil(piece.start / _LAMP_SPACING) + 0.5 * _LAMP_SPACING, piece.end, 8.0)
+    if len(station) == 0:
+        station = np.array([0.5 * (piece.start + piece.end)])
+    if plan.shell is None:
+        columns = np.column_stack([plan.centre, plan.elevation + _CROWN - _BELOW_CROWN]).T
+        return np.stack([np.interp(station, plan.station, column) for column in columns], axis=-1)
+    shell = plan.shell
+    crown = shell.radius[:, int(np.argmin(np.abs(shell.angle - 0.5 * np.pi)))]
+    columns = (shell.position + (crown - _BELOW_CROWN)[:, None] * shell.up).T
+    return np.stack([np.interp(station + shell.window[0], shell.station, column) for column in columns], axis=-1)
+
+
+def _noise_picture() -> np.ndarray:
+    """Return a grey picture of stains that repeats at its edges, `(n, n, 3)` uint8."""
+    shade = np.full((_PIXELS, _PIXELS), 0.86)
+    for share, size, seed in ((0.03, 1.5, 0), (0.05, 12.0, 1), (0.05, 45.0, 2)):
+        white = np.fft.rfft2(np.random.default_rng(seed).standard_normal(shade.shape))
+        v, u = np.fft.fftfreq(_PIXELS)[:, None] * size, np.fft.rfftfreq(_PIXELS)[None, :] * size
+        field = np.fft.irfft2(white * np.exp(-2.0 * np.pi**2 * (v**2 + u**2)), shade.shape)
+        shade += share * field / field.std()
+    return np.repeat(np.clip(255.0 * shade, 0.0, 255.0).astype(np.uint8)[..., None], 3, axis=2)

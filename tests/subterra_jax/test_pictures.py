@@ -1,0 +1,123 @@
+"""Pictures without a scene: surfaces lie where the tunnel is, face the camera, and the robot stands in them whole."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+import subterra_jax as st
+from subterra_jax.adapters.views import TunnelChoice
+from subterra_jax.pictures.carrier import carrier_parts
+from subterra_jax.pictures.stage import Piece, stage_spec
+from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return st.load_tunnel("metro-asbuilt", solid=True)
+
+
+def test_surfaces_of_a_bore_lie_on_it_and_face_the_air(plan):
+    surfaces = {surface.name: surface for surface in tunnel_surfaces(plan, "pockets", 200.0, 212.0)}
+    assert set(surfaces) == {"wall", "recess", "floor", "rail", "sleeper"}
+    wall, shell = surfaces["wall"].triangles, plan.shell
+    corner = wall.vertices[wall.faces]
+    normal, middle = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), corner.mean(axis=1)
+    node = KDTree(shell.position).query(middle)[1]
+    inward = np.sum(normal * (shell.position[node] - middle), axis=1)
+    assert (inward > 0.0).mean() > 0.999
+    away = np.linalg.norm(wall.vertices - shell.position[node[0]], axis=1)
+    assert 2.0 < away.min() < 3.0
+    deepest = np.sqrt(np.sum(np.cross(middle - shell.position[node], shell.tangent[node]) ** 2, axis=1)).max()
+    assert deepest < shell.radius.max() + 0.05
+
+
+def test_a_short_shell_keeps_its_recesses_in_place(plan):
+    whole = plan.shell
+    short = short_shell(whole, 300.0, 330.0)
+    there = whole.linings["pockets"].pocket
+    kept = short.linings["pockets"].pocket[:, 0] + whole.station[np.searchsorted(whole.station, 294.0)]
+    inside = there[(there[:, 0] > 301.0) & (there[:, 0] < 329.0), 0]
+    assert len(inside) > 50
+    assert all(np.abs(kept - station).min() < 1e-9 for station in inside)
+
+
+def test_a_plan_without_a_bore_has_upright_walls_seen_from_both_sides():
+    plan = st.load_tunnel("procedural:test:0")
+    surfaces = {surface.name: surface for surface in tunnel_surfaces(plan, None, -5.0, 20.0)}
+    assert set(surfaces) == {"wall", "floor"}
+    floor = surfaces["floor"].triangles.vertices
+    assert np.ptp(floor[:, 2]) < 0.5
+    faces = surfaces["wall"].triangles.faces
+    assert len(faces) % 2 == 0
+
+
+def test_the_next_piece_is_made_before_the_robot_sees_the_end(plan):
+    piece = Piece.around(plan, None, 500.0)
+    assert (piece.start, piece.end) == (470.0, 570.0)
+    assert piece.shows(500.0)
+    assert piece.shows(529.0)
+    assert not piece.shows(531.0)
+    assert not piece.shows(500.0, -1.0)
+    assert Piece.around(plan, None, 500.0, -1.0).shows(500.0, -1.0)
+    assert Piece.around(plan, None, 3.0).shows(0.0)
+    assert Piece.around(plan, None, plan.length - 3.0).shows(plan.length)
+
+
+def test_a_stage_is_for_looks_alone(plan):
+    model = stage_spec(Piece(plan, "pockets", 100.0, 110.0)).compile()
+    assert not model.geom_contype.any()
+    assert not model.geom_conaffinity.any()
+    assert model.nbody == 1
+    assert model.nlight >= 1
+
+
+def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
+    choice = TunnelChoice([plan, "control"], piece=(10.0, 60.0))
+    assert choice.plan(0).name == "metro-asbuilt"
+    assert choice.plan(1).length == pytest.approx(60.0)
+    assert TunnelChoice("procedural:test:0-2").plan(1).name == st.load_tunnel("procedural:test:1").name
+    ready = st.make("Subterra/TraverseShort-v0")[1].tunnel
+    with pytest.raises(ValueError, match="holds no heights"):
+        TunnelChoice(ready).plan(0)
+
+
+def test_the_carrier_stands_on_the_ground_within_its_footprint():
+    for part in carrier_parts(0.4, 0.7):
+        reach = part.half if part.kind == "box" else (part.half[0], part.half[0], part.half[0])
+        assert part.middle[2] - reach[2] > -1e-9
+        assert np.hypot(*part.middle[:2]) < 0.4
+
+
+DRAW = """
+import sys
+import gymnasium
+import numpy as np
+env = gymnasium.make("subterra_jax:Subterra/StopAt-v0", tunnel="control", render_mode="rgb_array", view="mujoco")
+env.reset(seed=0, options={"start": 100.0})
+try:
+    np.save(sys.argv[1], env.render())
+except Exception as cause:
+    sys.exit(str(cause))
+"""
+
+
+def test_without_a_scene_the_bore_is_drawn_with_the_robot_and_nothing_is_said_at_exit(tmp_path):
+    """In a process of its own: MuJoCo chooses how to draw when it is imported. The environment is not closed."""
+    file = tmp_path / "picture.npy"
+    done = subprocess.run([sys.executable, "-c", DRAW, str(file)], capture_output=True, text=True, check=False)
+    if "cannot draw" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    picture = np.load(file).astype(int)
+    assert picture.shape == (480, 480, 3)
+    red, _, blue = np.moveaxis(picture, -1, 0)
+    rows, columns = np.nonzero(red > blue + 60)
+    assert len(rows) > 200, "no robot to be seen"
+    assert abs(columns.mean() - 240) < 15
+    wall = picture[200:300, [10, 470]]
+    assert wall.mean() > 40, "the walls are dark"
+    assert (picture.sum(axis=-1) < 30).mean() < 0.2, "a void"
