@@ -1,0 +1,119 @@
+"""Draws success against wall time: `python -m train.locate.figure RUN [RUN ...] --out curve.png`.
+
+Of each run the share of goals in `val` at which the estimate is right to 1 m, as it trains; agents of a table of
+`benchmarks.kinds` on `val` as level lines.
+"""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.files import replace_file, require_file
+from train.config import ConfigError
+from train.locate.session import CURVE
+from train.options import read_settings
+
+_STYLES = ("-", "--", "-.", ":")
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Draws success against wall time.
+
+    Attributes:
+        runs: Folders of `train.locate`.
+        out: File of the figure, `.png`.
+        kinds: `kinds.json` of `benchmarks.kinds` on `val`, for level lines.
+        agents: Agents of that table to draw; all if left out.
+    """
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    out: Path
+    kinds: Path | None = None
+    agents: tuple[str, ...] = ()
+
+
+def command(arguments: Command) -> None:
+    """Draws the figure.
+
+    Raises:
+        ConfigError: A run or the table cannot be read.
+    """
+    require_file(arguments.out, ".png")
+    if not arguments.runs:
+        raise ConfigError("at least one run must be named")
+    curves = {label: curve for run in arguments.runs for label, curve in [read_run(run)]}
+    levels = {} if arguments.kinds is None else read_levels(arguments.kinds, arguments.agents)
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(8.0, 4.5), layout="constrained")
+    for index, (label, seeds) in enumerate(curves.items()):
+        for number, curve in enumerate(seeds):
+            axes.plot(curve[:, 0], 100.0 * curve[:, 1], color=f"C{index}", lw=1.5, label=label if number == 0 else None)
+    for index, (agent, level) in enumerate(levels.items()):
+        axes.axhline(100.0 * level, color="0.4", ls=_STYLES[index % len(_STYLES)], lw=1.0, label=f"{agent} (written)")
+    axes.set(xlabel="training, s (compiling included)", ylabel="right to 1 m, % of goals in val", ylim=(0.0, 100.0))
+    axes.set_xlim(left=0.0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    with replace_file(arguments.out) as fresh:
+        figure.savefig(fresh, dpi=110, format="png")
+    plt.close(figure)
+    print(arguments.out)
+
+
+def read_run(run: Path) -> tuple[str, list[np.ndarray]]:
+    """Returns network and front end of a run, and of each seed seconds and share of right estimates, `(n, 2)`.
+
+    Raises:
+        ConfigError: It is no run of `train.locate`, or has no curve.
+    """
+    settings = read_settings(run / "config.json")
+    found = []
+    for path in sorted(run.glob(f"seed-*/{CURVE}")):
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        found.append(np.array([(row["seconds"], row["within"]) for row in rows]))
+    if not found or "config" not in settings or any(len(curve) == 0 for curve in found):
+        raise ConfigError(f"{run}: holds no curve of train.locate")
+    config = settings["config"]
+    return f"{config['network']}, {config['front']} ({len(found)} seed{'s' * (len(found) > 1)})", found
+
+
+def read_levels(path: Path, agents: tuple[str, ...]) -> dict[str, float]:
+    """Returns the success of agents, the mean over all kinds.
+
+    Raises:
+        ConfigError: The file is no table of `benchmarks.kinds` on `val`, or lacks an agent.
+    """
+    try:
+        table: dict[str, Any] = json.loads(path.read_text())
+        rows, split = table["rows"], table["config"]["split"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: is no table of benchmarks.kinds") from error
+    if split != "val":
+        raise ConfigError(f"{path}: is of split {split}, the curves are of val")
+    if unknown := sorted(set(agents) - set(rows)):
+        raise ConfigError(f"{path}: has no agent {unknown[0]!r}; it has {', '.join(rows)}")
+    return {agent: float(np.mean([cell["success"] for cell in rows[agent].values()])) for agent in agents or rows}
+
+
+def main() -> None:
+    """Runs `python -m train.locate.figure`."""
+    sys.exit(run_command(lambda: command(parse(_read))))
+
+
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m train.locate.figure", description=__doc__)
+
+
+if __name__ == "__main__":
+    main()
