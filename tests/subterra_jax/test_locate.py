@@ -66,7 +66,11 @@ def _random_blocks(n, key=1):
 
 
 @pytest.mark.parametrize(
-    "network", ["gru", *(pytest.param(name, marks=pytest.mark.slow) for name in ("kalman", "s5", "transformer"))]
+    "network",
+    [
+        "gru",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("kalman", "s5", "transformer", "transformer-kalman")),
+    ],
 )
 def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once(network):
     weights = memory.init(network, "match", jax.random.key(2))

@@ -19,7 +19,7 @@ class LocateConfig:
     """Settings of a learnt localiser.
 
     Attributes:
-        network: `kalman`, `gru`, `s5` or `transformer`.
+        network: `kalman`, `gru`, `s5` or `transformer`; the latter with `-kalman` have their answers filtered.
         front: `match` compares what beams ahead and behind saw, `wide` for errors as large as wet rail makes them too;
             `scans` gives the network the scans themselves.
         n_envs: Drives recorded in one iteration.
@@ -125,7 +125,7 @@ class LocateLearner:
     def _gradients(self, weights: Any, part: Drive) -> tuple[tuple[Array, dict[str, Array]], Any]:
         """Returns loss, what is logged, and gradients of a minibatch, summed over its chunks."""
         valid = jax.vmap(lambda record: streams.reached(record, self.n_metres))(part.record)
-        counts = [jnp.maximum(jnp.sum(some), 1.0) for some in (valid, valid[:, _SHORT:], valid[:, _FAR:])]
+        counts = count(valid)
         chunks = jax.tree.map(lambda leaf: leaf.reshape(-1, self.chunk, *leaf.shape[1:]), part)
         gradient = jax.value_and_grad(self._loss, has_aux=True)
 
@@ -142,16 +142,33 @@ class LocateLearner:
         Args:
             weights: Of the localiser.
             drive: The chunk.
-            counts: Metres in the minibatch: all, those `_SHORT` m or more from the start, and those `_FAR` m or more.
+            counts: Of `count`, of the whole minibatch.
         """
         answers, truth, valid = jax.vmap(lambda d: estimate(self.config.network, weights, d, self.n_metres))(drive)
-        error = answers.correction - truth
-        scaled = jnp.abs(error) * jnp.exp(-answers.log_scale)
-        robust = jnp.where(scaled < _MOST, scaled, _MOST * (1.0 + jnp.log(jnp.maximum(scaled, _MOST) / _MOST)))
-        short = jnp.minimum(jnp.abs(error[:, _SHORT:] - error[:, :-_SHORT]), 1.0)
-        total = _sum(robust + answers.log_scale, valid) / counts[0] + _sum(short, valid[:, _SHORT:]) / counts[1]
-        near = _sum(jnp.abs(error) < 1.0, valid & (jnp.arange(self.n_metres) >= _FAR)) / counts[2]
-        return total, {"error": _sum(jnp.abs(error), valid) / counts[0], "within": near}
+        return loss(answers, truth, valid, counts)
+
+
+def count(valid: Bool[Array, "env metre"]) -> list[Array]:
+    """Returns the metres in a minibatch: all, those `_SHORT` m or more from the start, and those `_FAR` m or more."""
+    return [jnp.maximum(jnp.sum(some), 1.0) for some in (valid, valid[:, _SHORT:], valid[:, _FAR:])]
+
+
+def loss(answers: Any, truth: Array, valid: Array, counts: list[Array]) -> tuple[Array, dict[str, Array]]:
+    """Returns a chunk's part of the negative log likelihood of the true stations, and of what is logged.
+
+    Args:
+        answers: Estimates of the metres of drives.
+        truth: True less commanded distance, m.
+        valid: Metres that were completed.
+        counts: Of `count`, of the whole minibatch.
+    """
+    error = answers.correction - truth
+    scaled = jnp.abs(error) * jnp.exp(-answers.log_scale)
+    robust = jnp.where(scaled < _MOST, scaled, _MOST * (1.0 + jnp.log(jnp.maximum(scaled, _MOST) / _MOST)))
+    short = jnp.minimum(jnp.abs(error[:, _SHORT:] - error[:, :-_SHORT]), 1.0)
+    total = _sum(robust + answers.log_scale, valid) / counts[0] + _sum(short, valid[:, _SHORT:]) / counts[1]
+    near = _sum(jnp.abs(error) < 1.0, valid & (jnp.arange(truth.shape[-1]) >= _FAR)) / counts[2]
+    return total, {"error": _sum(jnp.abs(error), valid) / counts[0], "within": near}
 
 
 def estimate(network: str, weights: Any, drive: Drive, n: int) -> tuple[Any, Array, Array]:

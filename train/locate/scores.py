@@ -11,7 +11,7 @@ from jaxtyping import Array, PRNGKeyArray
 from train.locate.drives import Drive, record_drives
 from train.locate.learner import estimate
 
-_FIRST, _STEPS = 60, 1750  # m, the nearest goal; steps, 320 m and what slip adds
+FIRST, _STEPS = 60, 1750  # m, the nearest goal; steps, 320 m and what slip adds
 _BATCH = 16
 FARTHEST = 320  # m, the farthest goal
 
@@ -33,7 +33,7 @@ def make_judge(network: str, last: int = FARTHEST) -> Callable[[Any, Drive], dic
         (median, m), `claimed` (mean absolute error that it claims at the end, m), `found` (error there, m), all `(n,)`.
         A drive that comes less than 60 m far has no goal, and `within` of NaN.
     """
-    goals = jnp.arange(last) >= min(_FIRST, last // 2) - 1
+    goals = jnp.arange(last) >= min(FIRST, last // 2) - 1
 
     @jax.jit
     def judge(weights: Any, drives: Drive) -> dict[str, Array]:

@@ -2,9 +2,11 @@
 
 The filter stands `DELAY` metres behind the robot, where the evidence is complete; from there each answer is predicted
 by the odometer. Sizes of the errors are learnt. Evidence over a range of shares is taken in as the normal
-distribution that has, with the filter's own, the right mean and variance.
+distribution that has, with the filter's own, the right mean and variance. In its place a network may measure the error
+of the command itself, with a variance of its own.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -17,6 +19,7 @@ from subterra_jax.policies.locate.blocks import DELAY, Block, Estimate
 from subterra_jax.policies.locate.matching import SHARES
 
 Weights = dict[str, Any]
+Measure = Callable[[Array, Array], tuple[Array, Array]]  # mean and variance before to value and variance of what is new
 _S, _GAIN, _SLIP, _BIAS, _SCALE = range(5)
 _SLIPS = np.array([0.0, 1.0, 1.0, 0.0, 0.0], np.float32)
 _READS = np.array([0.0, 1.0, 1.0, 1.0, 1.0], np.float32)
@@ -60,16 +63,27 @@ def start(weights: Weights) -> Filter:
     return Filter(jnp.zeros(5), jnp.diag(variance), jnp.zeros(DELAY), jnp.zeros(DELAY), jnp.zeros(()))
 
 
-def step(weights: Weights, now: Filter, block: Block) -> tuple[Filter, Estimate]:
-    """Takes in one metre, and answers."""
-    after = advance(weights, now, block)
+def step(weights: Weights, now: Filter, block: Block, measured: Any = None) -> tuple[Filter, Estimate]:
+    """Takes in one metre, and answers; `measured` as for `advance`."""
+    after = advance(weights, now, block, measured)
     return after, answer(weights, after)
 
 
-def advance(weights: Weights, now: Filter, block: Block) -> Filter:
-    """Takes in one metre."""
+def advance(weights: Weights, now: Filter, block: Block, measured: Any = None) -> Filter:
+    """Takes in one metre.
+
+    Args:
+        weights: Of `init`, trained.
+        now: The filter.
+        block: The metre.
+        measured: Error of the command `DELAY` metres ago, m per m, and its variance; None: by the block's evidence.
+    """
     full = now.age >= DELAY
-    behind = _metre(weights, (now.mean, now.cov), now.reads[0], now.steps[0], block.evidence)
+
+    def measure(mean: Array, variance: Array) -> tuple[Array, Array]:
+        return _as_normal(block.evidence, mean, variance) if measured is None else measured
+
+    behind = _metre(weights, (now.mean, now.cov), now.reads[0], now.steps[0], measure)
     mean, cov = jax.tree.map(lambda new, old: jnp.where(full, new, old), behind, (now.mean, now.cov))
     reads = jnp.concatenate([now.reads[1:], block.read[None]])
     steps = jnp.concatenate([now.steps[1:], block.steps[None]])
@@ -91,27 +105,26 @@ def answer(weights: Weights, now: Filter) -> Estimate:
     return Estimate(mean[_S], mean[_GAIN] + mean[_SLIP], log_scale)
 
 
-def sequence(weights: Weights, blocks: Block) -> Estimate:
+def sequence(weights: Weights, blocks: Block, measured: Any = None) -> Estimate:
     """Returns the answers to all metres of a drive; all predictions at once, which a GPU likes better."""
 
-    def one(now: Filter, block: Block) -> tuple[Filter, Filter]:
-        after = advance(weights, now, block)
+    def one(now: Filter, row: Any) -> tuple[Filter, Filter]:
+        after = advance(weights, now, *row)
         return after, after
 
-    _, filters = jax.lax.scan(one, start(weights), blocks)
+    _, filters = jax.lax.scan(one, start(weights), (blocks, measured))
     return jax.vmap(lambda now: answer(weights, now))(filters)
 
 
 def _metre(
-    weights: Weights, state: tuple[Array, Array], read: Array, steps: Array, evidence: Array | None
+    weights: Weights, state: tuple[Array, Array], read: Array, steps: Array, measure: Measure | None
 ) -> tuple[Array, Array]:
-    """Takes the filter a metre on, by the odometer and, where there is any, by evidence."""
+    """Takes the filter a metre on, by the odometer and, where there is any, by what the walls tell."""
     mean, cov = state
     noise = jnp.maximum(steps, 1.0) * jnp.exp(2.0 * weights["log_noise"])
     mean, cov = _correct(mean, cov, _READS, read, noise)
-    if evidence is not None:
-        prior_mean, prior_variance = _dot(_SLIPS, mean), _dot(_SLIPS, _apply(cov, _SLIPS))
-        value, variance = _as_normal(evidence, prior_mean, prior_variance)
+    if measure is not None:
+        value, variance = measure(_dot(_SLIPS, mean), _dot(_SLIPS, _apply(cov, _SLIPS)))
         mean, cov = _correct(mean, cov, _SLIPS, value, variance)
     mean = mean.at[_S].add(_dot(_SLIPS, mean))
     rows = cov.at[_S].add(_apply(cov, _SLIPS))

@@ -1,4 +1,8 @@
-"""From metres to estimates: a Kalman filter, or a network whose answers are summed; with or without the front end."""
+"""From metres to estimates: a Kalman filter, a network whose answers are summed, or one whose answers are filtered.
+
+`NAME-kalman` is the hybrid: what the network answers to a metre is a measurement, and the filter keeps what lasts over
+the whole drive, the odometer's error foremost, which a network that looks back 30 m forgets.
+"""
 
 from typing import Any
 
@@ -12,10 +16,24 @@ from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block, Estimate, m
 from subterra_jax.policies.locate.recurrent import CELLS, HIDDEN, apply, dense
 
 Weights = dict[str, Any]
-NETWORKS = ("kalman", *CELLS)
+FILTERED = "-kalman"
+NETWORKS = ("kalman", *CELLS, *(f"{name}{FILTERED}" for name in CELLS))
 FRONTS = ("match", "wide", "scans")
 _COMPARED = {"match": matching.SHARES, "wide": matching.WIDE_SHARES}
 _UNIT = 0.02  # of the speed: answers of order 1
+
+
+@struct.dataclass
+class Filtered:
+    """Memory of a network whose answers are filtered.
+
+    Attributes:
+        cell: Memory of its cell.
+        filter: Memory of the filter.
+    """
+
+    cell: Any
+    filter: kalman.Filter
 
 
 @struct.dataclass
@@ -44,6 +62,10 @@ def init(network: str, front: str, key: PRNGKeyArray) -> Weights:
         raise ValueError(f"no network {network!r} with front {front!r}; {known}")
     if network == "kalman" and front != "match":
         raise ValueError("a Kalman filter needs the evidence of the front end for slip: front = match")
+    if network.endswith(FILTERED):
+        plain = init(network.removesuffix(FILTERED), front, key)
+        del plain["out"]  # the filter answers
+        return {**plain, "measure": dense(jax.random.fold_in(key, 1), HIDDEN, 2, 0.1), "kalman": kalman.init(key)}
     keys = jax.random.split(key, 5)
     weights: Weights = {"match": matching.init(keys[0], _COMPARED[front])} if front in _COMPARED else {}
     if network == "kalman":
@@ -69,6 +91,8 @@ def start(network: str, weights: Weights) -> Any:
     """Returns the memory at the start."""
     if network == "kalman":
         return kalman.start(weights["kalman"])
+    if network.endswith(FILTERED):
+        return Filtered(CELLS[network.removesuffix(FILTERED)].start(), kalman.start(weights["kalman"]))
     return Sums(CELLS[network].start(), jnp.zeros(()), jnp.zeros(()))
 
 
@@ -76,6 +100,10 @@ def step(network: str, weights: Weights, memory: Any, block: Block) -> tuple[Any
     """Takes in one metre, and answers."""
     if network == "kalman":
         return kalman.step(weights["kalman"], memory, block)
+    if network.endswith(FILTERED):
+        cell, hidden = CELLS[network.removesuffix(FILTERED)].step(weights["cell"], memory.cell, _embed(weights, block))
+        after, estimate = kalman.step(weights["kalman"], memory.filter, block, measured(weights, hidden))
+        return Filtered(cell, after), estimate
     cell, hidden = CELLS[network].step(weights["cell"], memory.cell, _embed(weights, block))
     passed, coming, log_rate = _answers(weights, hidden)
     age = memory.age + 1.0
@@ -89,11 +117,29 @@ def sequence(network: str, weights: Weights, blocks: Block) -> Estimate:
     """Returns the answers to all metres of a drive; fields of `blocks` have the metres as first axis."""
     if network == "kalman":
         return kalman.sequence(weights["kalman"], blocks)
-    hidden = CELLS[network].sequence(weights["cell"], _embed(weights, blocks))
+    if network.endswith(FILTERED):
+        hidden = hidden_rows(network, weights, blocks)
+        return kalman.sequence(weights["kalman"], blocks, measured(weights, hidden))
+    return summed(weights, hidden_rows(network, weights, blocks))
+
+
+def summed(weights: Weights, hidden: Float[Array, "t n"]) -> Estimate:
+    """Returns the answers of a network without a filter: its answers to the metres, summed."""
     passed, coming, log_rate = _answers(weights, hidden)
     age = jnp.arange(1.0, hidden.shape[0] + 1.0)
     correction = jnp.cumsum(jnp.where(age > DELAY, passed, 0.0))
     return Estimate(correction + jnp.minimum(age, DELAY) * coming, coming, _log_scale(log_rate, age))
+
+
+def hidden_rows(network: str, weights: Weights, blocks: Block) -> Float[Array, "t n"]:
+    """Returns what the cell of a network makes of all metres of a drive."""
+    return CELLS[network.removesuffix(FILTERED)].sequence(weights["cell"], _embed(weights, blocks))
+
+
+def measured(weights: Weights, hidden: Float[Array, "*t n"]) -> tuple[Float[Array, "*t"], Float[Array, "*t"]]:
+    """Returns the error of the command `DELAY` metres ago that a network sees, m per m, and its variance."""
+    out = apply(weights["measure"], hidden)
+    return _UNIT * out[..., 0], _UNIT**2 * jnp.exp(2.0 * jnp.clip(out[..., 1], -4.0, 6.0))
 
 
 def _embed(weights: Weights, block: Block) -> Array:
