@@ -21,7 +21,7 @@ from subterra_jax.baselines import registry
 from tests.test_extend import FILES
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted((ROOT / "docs" / "guide").glob("*.md")), *(ROOT / "docs" / name for name in ("slam.md", "results.md"))]
+PAGES = [*sorted((ROOT / "docs" / "guide").glob("*.md")), ROOT / "docs" / "results.md"]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 YAML = re.compile(r"```yaml\n(.*?)```", re.DOTALL)

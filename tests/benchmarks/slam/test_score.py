@@ -123,6 +123,36 @@ def test_absolute_and_relative_errors_are_those_of_evo(pair, alignment):
             assert getattr(ours, name) == pytest.approx(theirs[name], abs=1e-6), (metric, name)
 
 
+@pytest.mark.parametrize("alignment", ["none", "origin", "se3"])
+def test_errors_along_across_and_up_are_those_of_evo_axis_by_axis(tmp_path, alignment):
+    time, position, rotation = line()
+    # The tunnel leads along x of no frame: turned by 30°, without a slope, as `axis.csv` of a level bore.
+    bore = Rotation.from_euler("z", 30.0, degrees=True)
+    write_axis(tmp_path / "axis.csv", bore.apply(position))
+    # A carrier that sways: a best fit to a path without width could turn about it.
+    sway = np.column_stack([0.0 * time, 0.3 * np.sin(time), 0.1 * np.cos(2.0 * time)])
+    position, rotation = bore.apply(position + sway), bore * rotation
+    rng = np.random.default_rng(5)
+    drift = np.cumsum(rng.normal(0.0, 0.02, (len(time), 3)), axis=0)
+    turn = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.002, (len(time), 3)), axis=0))
+    paths = (write_tum(tmp_path / "e.tum", time, position + drift, rotation * turn),
+             write_tum(tmp_path / "truth.tum", time, position, rotation))  # fmt: skip
+    estimate, truth = (copy.deepcopy(file_interface.read_tum_trajectory_file(str(path))) for path in paths)
+    if alignment == "origin":
+        estimate.align_origin(truth)
+    elif alignment == "se3":
+        estimate.align(truth)
+    metric = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
+    metric.process_data((truth, estimate))
+    theirs = bore.inv().apply(estimate.positions_xyz - truth.positions_xyz)
+    np.testing.assert_allclose(np.linalg.norm(theirs, axis=1), metric.error, atol=1e-9)
+    found, curve = score_files(*paths, alignment=alignment)
+    np.testing.assert_allclose(curve.error, theirs, atol=1e-6)
+    ours = (found.along_rms, found.across_rms, found.up_rms)
+    np.testing.assert_allclose(ours, np.sqrt(np.mean(theirs**2, axis=0)), atol=1e-6)
+    assert found.along_final == pytest.approx(theirs[-1, 0], abs=1e-6)
+
+
 def test_stamps_between_those_of_the_truth_are_scored_against_the_pose_between(tmp_path):
     time, position, rotation = line()
     truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
