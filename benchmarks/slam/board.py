@@ -10,6 +10,7 @@ from typing import Any
 from benchmarks.command import BenchmarkError, require_least
 from benchmarks.results import environment_facts, write_file
 from benchmarks.slam.arena.bound import find_floor
+from benchmarks.slam.arena.gate import find_gate
 from benchmarks.slam.arena.sets import redraw
 from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
 from benchmarks.slam.recordings import TRUTH, recordings_in
@@ -31,6 +32,7 @@ class BoardConfig:
         programs: Programs to run; by default all, the odometer included.
         jobs: Programs run at a time.
         limit: Time after which a program counts as failed on a recording, s.
+        run: Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.
     """
 
     sets: tuple[Path, ...]
@@ -38,6 +40,7 @@ class BoardConfig:
     programs: tuple[str, ...] = (WHEELS, *PROGRAMS)
     jobs: int = 1
     limit: float = 1800.0
+    run: bool = True
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,11 @@ class Case:
     place: Path  # Folder of its poses and facts
 
     @property
+    def facts(self) -> Path:
+        """File of what is known of the run."""
+        return self.place / f"{self.folder.name}.json"
+
+    @property
     def truth(self) -> Path:
         """File of the true poses."""
         return self.folder.parent.parent / TRUTH / self.folder.name / TRUTH_FILE
@@ -58,8 +66,8 @@ def plan_board(config: BoardConfig) -> list[Case]:
     """Returns the cases of a board.
 
     Raises:
-        BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, or two have one
-            name.
+        BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, two have one
+            name, or there is nothing to score.
     """
     require_least(config, jobs=1)
     if not config.sets or not config.programs:
@@ -69,7 +77,7 @@ def plan_board(config: BoardConfig) -> list[Case]:
     for name in config.programs:
         if name not in (*PROGRAMS, WHEELS):
             raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *PROGRAMS])}")
-        if name != WHEELS:
+        if name != WHEELS and config.run:
             find_program(name)
     cases = []
     for folder in config.sets:
@@ -78,6 +86,9 @@ def plan_board(config: BoardConfig) -> list[Case]:
             cases += [Case(program, bag.parent, place / program) for program in config.programs]
             if not cases[-1].truth.is_file():
                 raise BenchmarkError(f"{folder}: holds no truth of {name}")
+    cases = [one for one in cases if config.run or one.program == WHEELS or one.facts.is_file()]
+    if all(one.program == WHEELS for one in cases) and any(name != WHEELS for name in config.programs):
+        raise BenchmarkError(f"{config.out}: holds no poses of {', '.join(config.programs)} to score")
     return cases
 
 
@@ -96,14 +107,18 @@ def make_board(config: BoardConfig) -> Iterator[tuple[str, str]]:
             one = futures[future]
             yield f"{one.place.parent.name} {one.folder.name} {one.program}", _said(future.result())
     rows = [row | read_case(one) for one in cases if (row := _labels(one))]
-    floors = [_floor(folder, name) for folder in config.sets for name, _ in recordings_in(folder)]
+    bounds = [(folder, name) for folder in config.sets for name, _ in recordings_in(folder)]
+    floors = []
+    for folder, name in bounds:
+        floors.append(_floor(folder, name, config.out / "floors" / folder.name / f"{name}.json"))
+        yield f"{folder.name} {name} floor", f"{floors[-1]['drift']:.4f} m per 100 m"
     content = {"schema": SCHEMA, **environment_facts(), "versions": _versions(config), "rows": rows, "floors": floors}
     write_file(config.out / "board.json", (json.dumps(content, indent=1, default=str) + "\n").encode())
 
 
 def _run(case: Case, limit: float) -> dict[str, Any]:
     """Runs a case unless its facts are there; returns them."""
-    facts, target = case.place / f"{case.folder.name}.json", case.place / f"{case.folder.name}.tum"
+    facts, target = case.facts, case.place / f"{case.folder.name}.tum"
     if facts.is_file():
         return json.loads(facts.read_text())
     case.place.mkdir(parents=True, exist_ok=True)
@@ -141,11 +156,14 @@ def read_case(case: Case) -> dict[str, Any]:
     return facts | {name: getattr(score, name) for name in kept} | {"along_rms": score.along_rms}
 
 
-def _floor(folder: Path, name: str) -> dict[str, Any]:
-    """Returns the floor of a recording, which is drawn again from the settings beside its truth."""
-    scene = redraw(folder, name)
-    floor, course = find_floor(scene), scene.course
-    return {"set": folder.name, "recording": name, **floor._asdict(), "walls": course.walls, "sensor": course.sensor}
+def _floor(folder: Path, name: str, kept: Path) -> dict[str, Any]:
+    """Returns floor and gate of a recording, drawn again from the settings beside its truth unless they are kept."""
+    if not kept.is_file():
+        scene = redraw(folder, name)
+        facts = find_floor(scene)._asdict() | {"gate": find_gate(scene)}
+        facts |= {"walls": scene.course.walls, "sensor": scene.course.sensor}
+        write_file(kept, (json.dumps(facts) + "\n").encode())
+    return {"set": folder.name, "recording": name, **json.loads(kept.read_text())}
 
 
 def _versions(config: BoardConfig) -> dict[str, str]:

@@ -36,16 +36,19 @@ def as_markdown(board: dict[str, Any]) -> str:
     """Returns the table, drift per 100 m for each program and recording, and the failures with their reasons."""
     rows, names = board["rows"], [name for name in _NAMES if any(row["recording"] == name for row in board["rows"])]
     programs = list(dict.fromkeys(row["program"] for row in rows))
-    head = ["program", *(_NAMES[name] for name in names), "across, m", "reach, m", "of real time"]
+    head = ["program", "runs", *(_NAMES[name] for name in names), "across, m", "reach, m", "of real time"]
     lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for program in sorted(programs, key=lambda one: _rank(rows, one)):
         cells = [_cell(median_drift(rows, program, name)) for name in names]
-        lines.append(f"| {' | '.join([program, *cells, *_sums(rows, program)])} |")
-    floors = [_of(board["floors"], name, "drift") for name in names]
-    lines.append(f"| *floor* | {' | '.join(f'{value:.4f}' for value in floors)} | | | |")
+        runs = str(sum(row["program"] == program for row in rows))
+        lines.append(f"| {' | '.join([program, runs, *cells, *_sums(rows, program)])} |")
+    for name, digits in (("drift", 4), ("gate", 3)):
+        values = [f"{_of(board['floors'], recording, name):.{digits}f}" for recording in names]
+        lines.append(f"| *{'floor' if name == 'drift' else name}* | | {' | '.join(values)} | | | |")
     note = (
         "Axial drift, m per 100 m: median of the sets (least to largest). *Across*: RMS, median of all recordings. "
-        "*Reach*: distance driven before 1 m of axial error, median of the recordings where it is exceeded."
+        "*Reach*: distance driven before 1 m of axial error, median of the recordings where it is exceeded. "
+        "*Floor*: bound of the drift, whatever program reads the ranges. *Gate*: least eigenvalue of scan matching."
     )
     failed = [f"- {row['program']} on {row['recording']} of {row['set']}: {row['failed']}" for row in rows
               if "failed" in row]  # fmt: skip

@@ -1,6 +1,7 @@
 """The arena's board: bounds along the dial, tables and figure, distances reached, mistakes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam import board, board_page
-from benchmarks.slam.arena import bound
+from benchmarks.slam.arena import bound, gate
 from benchmarks.slam.arena.record import Course, draw_scene
 from benchmarks.slam.score import reach_of
 from tests.benchmarks.slam.tracks import line, write_axis, write_tum
@@ -33,6 +34,32 @@ def test_the_dial_tells_more_the_rougher_the_walls(monkeypatch):
     one = found["joints"]
     sweeps = 10.0 * one.view / 1.5
     assert one.drift == pytest.approx(one.sweep * np.sqrt(2.0 / sweeps) * np.sqrt(100.0 / one.view))
+
+
+def test_the_gate_is_shut_in_a_tube_open_in_a_room_and_opened_by_a_cloud_of_dust():
+    rng = np.random.default_rng(0)
+    angle, along = rng.uniform(0.0, 2.0 * np.pi, 6000), rng.uniform(-15.0, 15.0, 6000)
+    tube = np.column_stack([along, 2.8 * np.cos(angle), 2.8 * np.sin(angle)])
+    walls = rng.uniform(-1.0, 1.0, (6000, 3))
+    walls[np.arange(6000), np.repeat([0, 1, 2], 2000)] = rng.choice([-1.0, 1.0], 6000)
+    assert gate.least_eigenvalue(tube) < 1e-3
+    assert gate.least_eigenvalue(4.0 * walls) == pytest.approx(1.0 / 3.0, abs=0.05)
+    puffs = rng.standard_normal((6000, 3))
+    puffs *= 1.5 / np.linalg.norm(puffs, axis=1, keepdims=True)
+    assert gate.least_eigenvalue(np.concatenate([tube[:3000], puffs])) > 0.05
+    with pytest.raises(ValueError, match="too few points"):
+        gate.least_eigenvalue(tube[:5])
+
+
+def test_the_gate_stays_open_in_the_dust_of_the_robot(monkeypatch):
+    monkeypatch.setattr(gate, "_SWEEPS", 1)
+    monkeypatch.setattr(gate, "_MERGED", 2)
+    course = Course("one", "smooth", distance=10.0)
+    clear, dusty = (
+        gate.find_gate(draw_scene(one, np.random.SeedSequence(2))) for one in (course, replace(course, dust=1.0))
+    )
+    assert clear < 0.002
+    assert dusty > 5.0 * clear
 
 
 def test_a_program_reaches_as_far_as_its_error_stays_within_a_metre():
@@ -63,14 +90,15 @@ def test_a_board_has_medians_over_the_sets_and_names_failures(sets, tmp_path):
     cases = [board.Case("mine", folder / "recordings" / name, tmp_path / "poses" / folder.name / "mine")
              for folder in sets for name in names]  # fmt: skip
     rows = [board._labels(one) | board.read_case(one) for one in cases]
-    floors = [{"recording": name, "drift": 0.01} for name in names]
+    floors = [{"recording": name, "drift": 0.01, "gate": 0.002} for name in names]
     content = {"rows": rows, "floors": floors}
     assert board_page.median_drift(rows, "mine", "walls-smooth") is None
     assert board_page.median_drift(rows, "mine", "walls-sprayed") == pytest.approx((2.0, 1.0, 3.0), abs=1e-6)
     text = board_page.as_markdown(content)
     # 1 % of 100 m is 1 m and no more; 3 % exceed it from 33.5 m on.
     (line,) = [line for line in text.splitlines() if line.startswith("| mine")]
-    assert line == "| mine | failed | 2.00 (1.00 to 3.00) | 0.000 | 34 (1/3) | 25 % |"
+    assert line == "| mine | 4 | failed | 2.00 (1.00 to 3.00) | 0.000 | 34 (1/3) | 25 % |"
+    assert "| *gate* | | 0.002 | 0.002 | | | |" in text
     assert "- mine on walls-smooth of two: crashed" in text
     assert board_page.as_png(content).startswith(b"\x89PNG")
 
@@ -80,6 +108,25 @@ def test_half_a_trajectory_is_a_failure(sets, tmp_path):
     path = case.place / "walls-sprayed.tum"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:200]))
     assert board.read_case(case)["failed"].startswith("gives poses over 50 %")
+
+
+def test_poses_are_scored_without_bags_and_what_was_not_run_is_left_out(sets, tmp_path, monkeypatch):
+    monkeypatch.setitem(board.PROGRAMS, "mine", "no-such-package")
+    for folder in sets:
+        for name in ("walls-smooth", "walls-sprayed"):
+            bag = folder / "recordings" / name / "recording"
+            bag.mkdir(parents=True)
+            (bag / "metadata.yaml").write_text("")
+            (bag / "odometry.tum").write_bytes((folder / "truth" / name / "lidar.tum").read_bytes())
+    (tmp_path / "poses" / "two" / "mine" / "walls-smooth.json").unlink()
+    config = board.BoardConfig(tuple(sets), tmp_path, ("wheel-odometry", "mine"), run=False)
+    cases = board.plan_board(config)
+    assert [one.program for one in cases].count("mine") == 3
+    assert all(board.read_case(one)["drift"] < 1e-6 for one in cases if one.program == "wheel-odometry")
+    with pytest.raises(BenchmarkError, match="holds no poses of wheel-odometry, mine to score"):
+        board.plan_board(board.BoardConfig(tuple(sets), tmp_path / "other", config.programs, run=False))
+    with pytest.raises(BenchmarkError, match="needs no-such-package"):
+        board.plan_board(board.BoardConfig(tuple(sets), tmp_path, config.programs))
 
 
 @pytest.mark.parametrize(("words", "sentence"), [
