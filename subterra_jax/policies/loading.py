@@ -115,7 +115,7 @@ def check_task(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
             raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
     elif isinstance(agent, Locating):
         if errand not in locate.ERRANDS:
-            raise PolicyError(f"{source}: a localiser without a map on its way to a goal; {env.id} asks for a {errand}")
+            raise PolicyError(f"{source}: a localiser on its way to a goal, without a map; {env.id} asks to {errand}")
         if (n := n_ranges(params)) % 16:
             raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
     elif agent.n_observation != size:

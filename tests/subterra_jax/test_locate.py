@@ -1,5 +1,7 @@
 """Learnt localisers: the front end against known walls, and the robot's metres against those of training."""
 
+import dataclasses
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import jax
@@ -7,15 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import subterra_jax as st
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.stations import Driven
 from subterra_jax.baselines.steering import Corridor
-from subterra_jax.policies import from_tensors
+from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
 from subterra_jax.policies.locate import kalman, matching, memory, streams
 from subterra_jax.policies.locate.agent import check_tensors, flat
 from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block
 from subterra_jax.policies.locate.locator import Locator
 from subterra_jax.policies.locate.profiles import Points, find_points
+from subterra_jax.policies.locate.ways import TwoWays
 
 _HALF, _N = 2.7, 40  # m; metres
 
@@ -166,3 +170,70 @@ def test_tensors_of_a_localiser_come_back_as_an_agent_or_are_refused(network):
         check_tensors(from_tensors("locate", layout, {**tensors, name: jnp.zeros((2, 3))}, "one"))
     with pytest.raises(ValueError, match="extra is of no"):
         check_tensors(from_tensors("locate", layout, {**tensors, "extra": jnp.zeros(3)}, "one"))
+
+
+def _trained(env, params):
+    layout = {"network": "kalman", "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
+    tensors = flat(memory.init("kalman", "match", jax.random.key(0)))
+    here = dataclasses.replace(training_conditions(env, params), fields=None)
+    return from_tensors("locate", layout, tensors, "one", here)
+
+
+@pytest.mark.parametrize(
+    ("task", "sensor", "sentence"),
+    [
+        ("Relocalise-v1", None, "one: a localiser on its way to a goal, without a map; .* asks to report"),
+        ("Traverse-v0", None, "asks to cover"),
+        pytest.param("StopAt-v1", "spin16x64", "trained with 16 beams, .* has 1024", marks=pytest.mark.slow),
+        ("Return-v1", None, None),
+        ("Faulted-v1", None, None),
+        ("ObstructedOffset-v1", None, None),
+    ],
+)
+def test_a_localiser_drives_where_it_can_and_is_refused_in_a_sentence_elsewhere(task, sensor, sentence):
+    agent = _trained(*st.make("Subterra/StopAt-v1"))
+    env, params = st.make(f"Subterra/{task}", **({} if sensor is None else {"sensor": sensor}))
+    with nullcontext() if sentence is None else pytest.raises(PolicyError, match=sentence):
+        check_fits(agent, env, params, agent.name)
+
+
+def test_another_number_of_beams_or_another_control_period_is_named():
+    env, params = st.make("Subterra/StopAt-v1")
+    agent = _trained(env, params)
+    for other, sentence in (
+        (params.replace(lidar=params.lidar.replace(n_beams=32)), "trained with 16 beams, Subterra/StopAt-v1 has 32"),
+        (params.replace(lidar=params.lidar.replace(n_beams=20)), "needs 16 level beams or a multiple of them"),
+        (params.replace(vehicle=params.vehicle.replace(period=0.05)), "a control period of 0.1 s, .* has 0.05 s"),
+    ):
+        with pytest.raises(PolicyError, match=sentence):
+            check_fits(agent, env, other, agent.name)
+
+
+def _way(ways, driven, direction, flagged, now, params):
+    """Takes one step of 0.2 m past smooth walls."""
+    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
+    ranges = jnp.full(16, 30.0)
+    obs = Observed(ranges, ranges, distance=jnp.float32(driven), heading=jnp.zeros(()), goal=jnp.float32(63.0))
+    step = Driven(jnp.float32(2.0), jnp.ones(()), jnp.float32(direction), jnp.asarray(flagged), walls)
+    return ways.update(now, obs, step, params, None)
+
+
+def test_a_way_back_begins_at_the_place_that_the_flag_tells():
+    params = SimpleNamespace(
+        errand="return",
+        start=SimpleNamespace(station=50.0, station_sigma=0.0),
+        vehicle=SimpleNamespace(period=0.1),
+        lidar=SimpleNamespace(range_max=30.0),
+        goal=SimpleNamespace(flag_reach=2.0),
+    )
+    ways = TwoWays(Locator(memory.init("kalman", "match", jax.random.key(0)), "kalman"))
+    advance = jax.jit(lambda driven, direction, flagged, now: _way(ways, driven, direction, flagged, now, params))
+    obs = Observed(jnp.zeros(16), jnp.zeros(16), distance=jnp.zeros(()), heading=jnp.zeros(()))
+    now, stations = ways.begin(obs, params), []
+    for k in range(140):
+        # The wheels slip by 2 %: 65 commanded steps bring it to the flag, 13.26 m on.
+        estimate, now = advance(0.204 * (k + 1), 1.0 if k < 70 else -1.0, k == 65, now)
+        stations.append(float(estimate.station))
+    assert stations[64] == pytest.approx(63.1, abs=0.3)
+    assert stations[65] == pytest.approx(61.1, abs=1e-3), "the flag is 2 m before the goal, 0.1 m late"
+    assert stations[139] == pytest.approx(stations[70] - 0.2 * 69, abs=0.4)
