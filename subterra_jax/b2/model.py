@@ -8,11 +8,12 @@ import mujoco
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import standing_pose
+from subterra_jax.b2.shape import shape_of
 from subterra_jax.host.errors import SubterraError
 
 _BOX, _SPHERE = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_SPHERE
 _CAPSULE, _CYLINDER = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER
-_ROBOT = 2  # group of the geoms
+_ROBOT, _HIDDEN = 2, 3  # groups of what is drawn and of what MuJoCo does not draw unless asked to
 _SHELL, _LIMB = (0.30, 0.31, 0.33, 1.0), (0.16, 0.16, 0.17, 1.0)
 _MESH_ENDINGS = (".obj", ".stl")
 
@@ -74,6 +75,31 @@ def add_stand(spec: mujoco.MjSpec) -> None:
     """
     pose, hold = standing_pose()
     spec.add_key(name="stand", qpos=[0.0, 0.0, b2.STAND_HEIGHT, 1.0, 0.0, 0.0, 0.0, *pose.tolist()], ctrl=hold.tolist())
+
+
+def dress(spec: mujoco.MjSpec, prefix: str = "") -> None:
+    """Adds the robot's looks for pictures, as meshes that touch and weigh nothing, and hides its primitives.
+
+    Bodies with a mesh of the user's keep that. Physics never sees this model, and would give the same bits with it.
+
+    Args:
+        spec: A model with the robot in it.
+        prefix: Prefix of the robot's names.
+    """
+    for name in ("base_link", *(f"{leg}_{part}" for leg in b2.LEGS for part in b2.PARTS)):
+        body = spec.body(f"{prefix}{name}")
+        if any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in body.geoms):
+            continue
+        for geom in body.geoms:
+            geom.group = _HIDDEN
+        for k, part in enumerate(shape_of(name)):
+            own = f"{prefix}{name} {k}"
+            mesh = spec.add_mesh(name=own, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+            mesh.uservert, mesh.userface = part.vertices.ravel().tolist(), part.faces.ravel().tolist()
+            body.add_geom(
+                name=own, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=own, mass=0.0, contype=0, conaffinity=0,
+                group=_ROBOT, rgba=(*part.colour, 1.0),
+            )  # fmt: skip
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float) -> None:

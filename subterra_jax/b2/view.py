@@ -9,7 +9,7 @@ from jaxtyping import Float
 from subterra_jax.adapters.views import TunnelChoice
 from subterra_jax.b2 import track
 from subterra_jax.b2.engine import PREFIX, MujocoPhysics, ScenePhysics, rotate_vector
-from subterra_jax.b2.model import robot_spec
+from subterra_jax.b2.model import dress, robot_spec
 from subterra_jax.b2.params import WalkParams
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.lidar3d.surface import Triangles
@@ -54,8 +54,11 @@ class Camera:
         self._renderer: mujoco.Renderer | None = None
         self._plan: TunnelPlan | None = None
         self._piece: Piece | None = None
+        # Drawn is a model of its own, which wears the robot's looks: physics has neither their meshes nor their cost.
         if isinstance(walk.physics, ScenePhysics):
-            self._show(walk.physics.bench.model)
+            spec = walk.physics.scene_spec()
+            dress(spec, PREFIX)
+            self._show(spec.compile())
         else:
             self._plan = tunnel.plan(0)
 
@@ -100,6 +103,7 @@ class Camera:
         spec = stage_spec(self._piece, leave_out=("rail", "sleeper", "floor"))
         self._add_track(spec, self._piece)
         robot = robot_spec(self._robot)
+        dress(robot)
         spec.option, robot.option.timestep = robot.option, robot.option.timestep
         spec.attach(robot, prefix=PREFIX, frame=spec.worldbody.add_frame())
         self._show(spec.compile())

@@ -65,11 +65,11 @@ def tunnel_surfaces(plan: TunnelPlan, lining: str | None, start: float, end: flo
     shell = short_shell(plan.shell, first + start, first + end)
     _, wall, track, furniture = raise_parts(shell, name, touching=find_spec("manifold3d") is not None)
     wall = Triangles(wall.vertices, wall.faces[:, ::-1])  # it faces the rock; a camera stands in the air
-    rolled, sunken = _unrolled(shell, wall.vertices, name)
+    rolled, within, behind = _unrolled(shell, wall.vertices, name)
     centre = wall.vertices[wall.faces]
     normal = np.cross(centre[:, 1] - centre[:, 0], centre[:, 2] - centre[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    sunk = sunken[wall.faces].any(axis=1)
+    sunk = within[wall.faces].all(axis=1) & behind[wall.faces].any(axis=1)
     below = np.sin(_angles(shell, centre.mean(axis=1))) < 0.0
     level = ~sunk & below & (np.abs(normal[:, 2]) > _LEVEL)
     parts = [
@@ -179,18 +179,18 @@ def _angles(shell: Shell, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray,
 
 def _unrolled(
     shell: Shell, points: Float[np.ndarray, "k 3"], lining: str
-) -> tuple[Float[np.ndarray, "k 2"], Bool[np.ndarray, "k"]]:
-    """Return station and distance around the section from the left, m, and whether a point lies within a recess."""
+) -> tuple[Float[np.ndarray, "k 2"], Bool[np.ndarray, "k"], Bool[np.ndarray, "k"]]:
+    """Return station and distance around from the left, m, and whether a point lies in a recess's outline and depth."""
     node, along, left, up = _across(shell, points)
     angle, own = np.arctan2(up, left), shell.linings[lining]
     radius = shell.radius if own.radius is None else own.radius
     column = np.round((angle - shell.angle[0]) * len(shell.angle) / (2.0 * np.pi)).astype(int) % len(shell.angle)
     station, behind = shell.station[node] + along, np.hypot(left, up) - radius[node, column] > _SUNK
     order, reach = np.argsort(station), np.hypot(left, up)
-    sunken = np.zeros(len(points), bool)
+    within = np.zeros(len(points), bool)
     for middle, bearing, length, width, _ in own.pocket:
         first, last = np.searchsorted(station[order], [middle - 0.5 * length - _RIM, middle + 0.5 * length + _RIM])
         near = order[first:last]
         turn = (angle[near] - bearing + np.pi) % (2.0 * np.pi) - np.pi
-        sunken[near] |= behind[near] & (np.abs(turn) * reach[near] < 0.5 * width + _RIM)
-    return np.column_stack([station, angle * np.median(shell.section)]), sunken
+        within[near] |= np.abs(turn) * reach[near] < 0.5 * width + _RIM
+    return np.column_stack([station, angle * np.median(shell.section)]), within, behind

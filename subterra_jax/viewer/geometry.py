@@ -73,7 +73,7 @@ _TRAIL_POINTS = 500  # of a whole trail
 _ELLIPSE_POINTS = 48
 SIGMAS = 2.0  # half axes of the ellipse, in standard deviations
 _SLIM = 0.35  # m, half width of an ellipse without an estimate across the tunnel
-_ON_GROUND = 0.06  # m above the ground, of lines on the ground
+ON_GROUND = 0.06  # m above the ground, of lines on the ground
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +114,7 @@ class EpisodeGeometry:
         reckoned = dead_reckon(start, float(recording.heading[0]), recording.odometry)
         self._truth = centreline.lift(recording.position, recording.station, 0.0)
         self._reckoned = centreline.lift(reckoned, recording.station, 0.0)
+        self._way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self._truth, axis=0), axis=1)))
         self._heading = np.unwrap(recording.heading.astype(np.float64))
         self._reckoned_heading = recording.heading[0] + np.unwrap(recording.odometry[:, 1].astype(np.float64))
 
@@ -146,12 +147,26 @@ class EpisodeGeometry:
             return poses[-1] if len(poses) else np.zeros(0)
         return poses[min(int(share * len(poses)), len(poses) - 1)]
 
+    def way(self, row: int) -> float:
+        """Return the distance driven up to a row, m."""
+        return float(self._way[row])
+
+    def carried(self, row: int, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+        """Return points of the tunnel frame in the robot's frame at a row, m: there they move with the robot."""
+        cos, sin = np.cos(self._heading[row]), np.sin(self._heading[row])
+        apart = points - self._truth[row]
+        x, y = cos * apart[..., 0] + sin * apart[..., 1], cos * apart[..., 1] - sin * apart[..., 0]
+        return np.stack([x, y, apart[..., 2]], axis=-1)
+
     def beams(self, row: int) -> tuple[Float[np.ndarray, "n_beams 2 3"], np.ndarray]:
-        """Return the beams of a row from the LiDAR to their ends, m, and whether each hit something."""
+        """Return the beams of a row from the LiDAR to their ends, in the robot's frame, m, and which hit something.
+
+        In that frame they move with the robot between two rows.
+        """
         recording = self.recording
         ranges = recording.ranges[row].astype(np.float64)
-        angle = recording.heading[row] + np.arange(len(ranges)) * (2.0 * np.pi / len(ranges))
-        lidar = self._truth[row] + np.array([0.0, 0.0, self.centreline.plan.lidar_height])
+        angle = np.arange(len(ranges)) * (2.0 * np.pi / len(ranges))
+        lidar = np.array([0.0, 0.0, self.centreline.plan.lidar_height])
         reach = np.where(np.isfinite(ranges), ranges, 0.0)
         along = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
         tips = lidar + reach[:, None] * along
@@ -162,7 +177,7 @@ class EpisodeGeometry:
         stride = max(1, -(-len(self) // _TRAIL_POINTS))
         rows = np.arange(0, moment.row + 1, stride)
         # At different heights, so that they do not flicker where they coincide.
-        truth, reckoned = (np.array([0.0, 0.0, share * _ON_GROUND]) for share in (1.0, 0.6))
+        truth, reckoned = (np.array([0.0, 0.0, share * ON_GROUND]) for share in (1.0, 0.6))
         return _chain(np.vstack([self._truth[rows], moment.position]) + truth), _chain(
             np.vstack([self._reckoned[rows], moment.odometry]) + reckoned
         )
@@ -181,14 +196,14 @@ class EpisodeGeometry:
         # A straight stretch of an ellipse 100 m long would leave the tunnel in a bend.
         along = np.clip(station + SIGMAS * sigma * np.cos(turn), -5.0, self.centreline.plan.length + 5.0)
         points = self.centreline.points_at(along, middle + across * np.sin(turn))
-        return _chain(points + np.array([0.0, 0.0, 1.5 * _ON_GROUND]))
+        return _chain(points + np.array([0.0, 0.0, 1.5 * ON_GROUND]))
 
     def particles(self, row: int) -> Float[np.ndarray, "k 3"]:
         """Return some of the agent's particles, m."""
         cloud = self.recording.cloud[row].astype(np.float64)
         cloud = cloud[np.isfinite(cloud).all(axis=1)]
         points = self.centreline.points_at(cloud[:, 0], cloud[:, 1])
-        return points + np.array([0.0, 0.0, 2.0 * _ON_GROUND])
+        return points + np.array([0.0, 0.0, 2.0 * ON_GROUND])
 
     def goal(self) -> Float[np.ndarray, "n 2 3"]:
         """Return a gate across the tunnel at the goal, as segments, m; empty without a goal."""
@@ -198,7 +213,7 @@ class EpisodeGeometry:
         half = float(np.interp(station[0], self.centreline.plan.station, self.centreline.plan.half_width)) - 0.05
         left, right = (self.centreline.points_at(station, np.array([side * half]))[0] for side in (1.0, -1.0))
         up = np.array([0.0, 0.0, 2.2])
-        low = np.array([0.0, 0.0, _ON_GROUND])
+        low = np.array([0.0, 0.0, ON_GROUND])
         return _chain(np.array([left + low, left + up, right + up, right + low, left + low]))
 
     def _across(self, row: int) -> tuple[float, float]:

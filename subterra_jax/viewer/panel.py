@@ -37,11 +37,11 @@ def _goal(recording: Recording) -> str:
 def _errors(recording: Recording, row: int) -> str:
     """Return the errors of odometry and estimate along the tunnel."""
     moved = np.linalg.norm(np.diff(recording.position[: row + 1].astype(float), axis=0), axis=1).sum()
-    odometry = f"odometry {recording.odometry[row, 0] - moved:+.2f} m"
+    odometry = f"error of odometry {recording.odometry[row, 0] - moved:+.2f} m"
     station, sigma = recording.estimate[row]
     if not np.isfinite(station):
         return odometry
-    return f"{odometry} · estimate {station - recording.station[row]:+.2f} ± {sigma:.2f} m"
+    return f"{odometry}, of estimate {station - recording.station[row]:+.2f} ± {sigma:.2f} m"
 
 
 def _outcome(recording: Recording, row: int, finished: bool) -> str:
@@ -54,6 +54,7 @@ def _outcome(recording: Recording, row: int, finished: bool) -> str:
 
 
 _POINTS = 300  # of a curve
+_CHART_HEIGHT = 88  # pixels: three charts below the controls fit a screen of 900
 _RETURN = (60, 180, 110)
 
 
@@ -135,7 +136,7 @@ def _chart(
         title=title,
         scales={"x": uplot.Scale(time=False)},
         legend=uplot.Legend(show=False),
-        height=140,
+        height=_CHART_HEIGHT,
         visible=visible,
     )
 
@@ -143,12 +144,17 @@ def _chart(
 SPEEDS = ("0.5 x", "1 x", "2 x", "5 x", "10 x", "25 x")
 PARTS = ("lining", "track", "beams", "truth", "odometry", "estimate")
 NO_RECORDING = "none yet"
-_LEGEND = (
-    "<div style='padding:0 0.75em;font-size:0.8em;line-height:1.6'>"
-    "<b style='color:#409cff'>truth</b> · <b style='color:#ff783c'>odometry</b> · "
-    "<b style='color:#be6eff'>estimate ± 2 sd</b> · <b style='color:#e0a92e'>LiDAR</b> · "
-    "<b style='color:#3cc878'>goal</b></div>"
-)
+_HIT, _GATE = (224, 169, 46), (60, 200, 120)
+
+
+def legend(recording: Recording | None) -> str:
+    """Return the legend as HTML: what an episode shows, and no more; everything before the first episode."""
+    estimates = recording is None or bool(np.isfinite(recording.estimate[:, 0]).any())
+    goal = recording is None or bool(np.isfinite(recording.goal))
+    names = [("truth", TRUTH), ("odometry", ODOMETRY), ("LiDAR", _HIT)]
+    names += [("estimate ± 2 sd", ESTIMATE)] * estimates + [("goal", _GATE)] * goal
+    words = " · ".join(f"<b style='color:rgb{colour}'>{name}</b>" for name, colour in names)
+    return f"<div style='padding:0 0.75em;font-size:0.8em;line-height:1.4'>{words}</div>"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,7 +201,7 @@ class Panel:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label("Subterra")
         self.status = gui.add_markdown("")
-        gui.add_html(_LEGEND)
+        self._legend = gui.add_html(legend(None))
         self.play = gui.add_button("Play")
         self.time = gui.add_slider("time, s", min=0.0, max=1.0, step=0.1, initial_value=0.0)
         self.speed = gui.add_dropdown("speed", SPEEDS, initial_value="2 x")
@@ -232,6 +238,11 @@ class Panel:
             if value in control.options:
                 set_value(control, value)
         set_value(self.seed, choice.seed)
+
+    def show_legend(self, recording: Recording) -> None:
+        """Show the legend of an episode."""
+        if (text := legend(recording)) != self._legend.content:
+            self._legend.content = text
 
     def list_recordings(self, names: tuple[str, ...], chosen: str) -> None:
         """Replace the list of recorded episodes."""

@@ -72,6 +72,12 @@ class Player:
                 rows = round(seconds / self._episode.recording.period, 4)  # 0.3 s are three rows of 0.1 s
                 self._at, self._dirty = min(max(rows, 0.0), len(self._episode) - 1.0), True
 
+    def play(self) -> None:
+        """Play from the present moment."""
+        with self._lock:
+            if self._episode is not None:
+                self.playing, self._dirty = True, True
+
     def toggle(self) -> None:
         """Play or pause; play from the start after the end."""
         with self._lock:

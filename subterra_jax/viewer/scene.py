@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment, Shape
+from subterra_jax.pictures.carrier import carrier_parts
+from subterra_jax.viewer.geometry import ON_GROUND, Centreline, EpisodeGeometry, Moment, Shape
 
 if TYPE_CHECKING:
     import trimesh
@@ -61,10 +62,6 @@ def quaternion_about_z(angle: float) -> tuple[float, float, float, float]:
     return float(np.cos(0.5 * angle)), 0.0, 0.0, float(np.sin(0.5 * angle))
 
 
-_HULL, _WHEEL, _MAST, _SENSOR = (226, 106, 24), (38, 38, 42), (92, 94, 100), (30, 34, 40)
-_WHEEL_RADIUS = 0.4  # of the robot's radius
-
-
 class WheeledRobot:
     """A small four-wheeled carrier with a LiDAR on a mast, as wide as the robot's footprint.
 
@@ -93,29 +90,19 @@ def robot_mesh(radius: float, lidar_height: float) -> "trimesh.Trimesh":
     """
     import trimesh  # takes half a second; the tunnel is shown first
 
-    wheel, deck = _WHEEL_RADIUS * radius, 0.95 * radius
-    top = max(lidar_height, deck + 0.2)
-    parts = [
-        _paint(trimesh.creation.box((1.5 * radius, 0.95 * radius, 0.45 * radius)), (0.0, 0.0, 0.75 * radius), _HULL),
-        _paint(trimesh.creation.box((0.25 * radius, 0.6 * radius, 0.2 * radius)), (0.8 * radius, 0.0, deck), _SENSOR),
-        _paint(trimesh.creation.cylinder(0.06 * radius, top - deck), (0.0, 0.0, 0.5 * (top + deck)), _MAST),
-        _paint(trimesh.creation.cylinder(0.22 * radius, 0.1), (0.0, 0.0, top), _SENSOR),
-    ]
     turned = trimesh.transformations.rotation_matrix(np.pi / 2, (1.0, 0.0, 0.0))
-    for x in (-0.5, 0.5):
-        for y in (-0.6, 0.6):
-            tyre = trimesh.creation.cylinder(wheel, 0.25 * radius, transform=turned)
-            parts.append(_paint(tyre, (x * radius, y * radius, wheel), _WHEEL))
-    mesh: Any = trimesh.util.concatenate(parts)
-    return mesh
-
-
-def _paint(part: Any, middle: tuple[float, float, float], colour: tuple[int, int, int]) -> Any:
-    import trimesh
-
-    part.apply_translation(middle)
-    part.visual = trimesh.visual.ColorVisuals(part, face_colors=(*colour, 255))
-    return part
+    parts = []
+    for part in carrier_parts(radius, lidar_height):
+        if part.kind == "box":
+            mesh = trimesh.creation.box(2.0 * np.array(part.half))
+        else:
+            across = turned if part.across else None
+            mesh = trimesh.creation.cylinder(part.half[0], 2.0 * part.half[1], transform=across)
+        mesh.apply_translation(part.middle)
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, face_colors=(*part.colour, 255))
+        parts.append(mesh)
+    whole: Any = trimesh.util.concatenate(parts)
+    return whole
 
 
 class LeggedRobot:
@@ -137,8 +124,8 @@ class LeggedRobot:
         self._model = robot_spec().compile()
         self._data = mujoco.MjData(self._model)
         self.nodes = [
-            scene.add_mesh_trimesh(f"/robot/{self._model.body(body).name}", _mesh(self._model, body), cast_shadow=False)
-            for body in range(1, self._model.nbody)
+            scene.add_mesh_trimesh(f"/robot/{name}", _body_mesh(name), cast_shadow=False)
+            for name in (self._model.body(body).name for body in range(1, self._model.nbody))
         ]
 
     def place(self, moment: Moment) -> None:
@@ -150,39 +137,36 @@ class LeggedRobot:
             node.position, node.wxyz = data.xpos[body].copy(), data.xquat[body].copy()
 
 
-def _mesh(model: Any, body: int) -> Any:
-    """Return the mesh of one body, in its own frame."""
+def _body_mesh(name: str) -> Any:
+    """Return the looks of one body of the B2, in its own frame."""
     import trimesh
+
+    from subterra_jax.b2.shape import shape_of
 
     parts = []
-    for geom in np.flatnonzero(model.geom_bodyid == body):
-        part = _primitive(int(model.geom_type[geom]), model.geom_size[geom])
-        turn = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
-        turn[:3, 3] = model.geom_pos[geom]
-        part.apply_transform(turn)
-        part.visual = trimesh.visual.ColorVisuals(part, face_colors=(255.0 * model.geom_rgba[geom]).astype(np.uint8))
-        parts.append(part)
+    for part in shape_of(name):
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        colour = np.array([*part.colour, 1.0]) * 255.0
+        mesh.visual = trimesh.visual.ColorVisuals(
+            mesh, vertex_colors=np.tile(colour.astype(np.uint8), (len(mesh.vertices), 1))
+        )
+        parts.append(mesh)
     return trimesh.util.concatenate(parts)
-
-
-def _primitive(kind: int, size: np.ndarray) -> Any:
-    """Return a box, cylinder, capsule or sphere about the origin."""
-    import mujoco
-    import trimesh
-
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return trimesh.creation.box(2.0 * size)
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        return trimesh.creation.cylinder(size[0], 2.0 * size[1], sections=24)
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return trimesh.creation.capsule(2.0 * size[1], size[0], count=[12, 12])
-    return trimesh.creation.icosphere(2, size[0])
 
 
 TRUTH, ODOMETRY, ESTIMATE, _HIT = (64, 156, 255), (255, 120, 60), (190, 110, 255), (255, 214, 102)
 _LINES_EVERY = 0.09  # s; a browser without a GPU drops lines that come more often
 _LINES = ("beams", "truth", "odometry", "estimate")
+# Lines reach the page later than poses. So beams and estimate hang on the robot, and so does each trail's last piece.
+_CARRIED, _RECKONED = "/carried", "/reckoned"
+_TAIL = 2.0  # m
 _HIDDEN = np.array([[[0.0, 0.0, -100.0]] * 2])  # points of an empty set of lines, out of sight
+
+
+def _tail(share: float) -> np.ndarray:
+    """Return the last piece of a trail behind the robot as one segment, m; at a share of the trails' height."""
+    height = share * ON_GROUND
+    return np.array([[[-_TAIL, 0.0, height], [0.0, 0.0, height]]], np.float32)
 
 
 class SceneView:
@@ -205,14 +189,22 @@ class SceneView:
         self._robot: WheeledRobot | LeggedRobot | None = None
         self._ghost: viser.MeshHandle | None = None
         colours = {"beams": _HIT, "truth": TRUTH, "odometry": ODOMETRY, "estimate": ESTIMATE}
+        self._frames = {name: server.scene.add_frame(name, show_axes=False) for name in (_CARRIED, _RECKONED)}
         self._lines = {
             name: server.scene.add_line_segments(
-                f"/{name}", _HIDDEN, colours[name], thickness=0.02 if name == "beams" else 0.07
+                f"{_CARRIED}/{name}" if name in ("beams", "estimate") else f"/{name}",
+                _HIDDEN,
+                colours[name],
+                thickness=0.02 if name == "beams" else 0.07,
             )
             for name in _LINES
         }
-        self._hits = self._points("/hits", _HIT, 0.1)
-        self._particles = self._points("/particles", ESTIMATE, 0.07)
+        self._tails = {
+            name: server.scene.add_line_segments(f"{frame}/tail", _tail(share), colours[name], thickness=0.07)
+            for name, frame, share in (("truth", _CARRIED, 1.0), ("odometry", _RECKONED, 0.6))
+        }
+        self._hits = self._points(f"{_CARRIED}/hits", _HIT, 0.1)
+        self._particles = self._points(f"{_CARRIED}/particles", ESTIMATE, 0.07)
 
     def _points(self, name: str, colour: tuple[int, int, int], size: float) -> viser.PointCloudHandle:
         return self._server.scene.add_point_cloud(
@@ -266,7 +258,8 @@ class SceneView:
         others: dict[str, list[viser.SceneNodeHandle | None]] = {
             "beams": [self._hits],
             "estimate": [self._particles],
-            "odometry": [self._ghost],
+            "odometry": [self._ghost, self._tails["odometry"]],
+            "truth": [self._tails["truth"]],
         }
         for node in [self._lines.get(name), *others.get(name, [])]:
             if node is not None:
@@ -306,16 +299,35 @@ class SceneView:
                 return
             self._robot.place(moment)
             self._ghost.position, self._ghost.wxyz = moment.odometry, quaternion_about_z(moment.odometry_heading)
+            self._carry(episode, moment)
             now = time.monotonic()
             if full or (self._row != (episode, moment.row) and now - self._lines_at >= _LINES_EVERY):
                 self._row, self._lines_at = (episode, moment.row), now
                 self._show_row(episode, moment)
 
+    def _carry(self, episode: EpisodeGeometry, moment: Moment) -> None:
+        """Move what hangs on the robot and on its dead-reckoned ghost; no tail is longer than the way so far."""
+        truth, odometry = self._frames[_CARRIED], self._frames[_RECKONED]
+        truth.position, truth.wxyz = moment.position, quaternion_about_z(moment.heading)
+        odometry.position, odometry.wxyz = moment.odometry, quaternion_about_z(moment.odometry_heading)
+        long_enough = episode.way(moment.row) > _TAIL
+        for name, tail in self._tails.items():
+            if tail.visible != (visible := long_enough and self.visible[name]):
+                tail.visible = visible
+
     def _show_row(self, episode: EpisodeGeometry, moment: Moment) -> None:
         beams, hit = episode.beams(moment.row)
         truth, odometry = episode.trails(moment)
-        lines = {"beams": beams, "truth": truth, "odometry": odometry, "estimate": episode.ellipse(moment.row)}
+        lines = {
+            "beams": beams,
+            "truth": truth,
+            "odometry": odometry,
+            "estimate": episode.carried(moment.row, episode.ellipse(moment.row)),
+        }
         for name, segments in lines.items():
             self._lines[name].points = (segments if len(segments) else _HIDDEN).astype(np.float32)
-        for cloud, points in ((self._hits, beams[hit, 1]), (self._particles, episode.particles(moment.row))):
+        for cloud, points in (
+            (self._hits, beams[hit, 1]),
+            (self._particles, episode.carried(moment.row, episode.particles(moment.row))),
+        ):
             cloud.points = (points if len(points) else _HIDDEN[:, 0]).astype(np.float32)

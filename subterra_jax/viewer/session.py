@@ -51,6 +51,14 @@ class EpisodeView:
         self._moment: Moment | None = None
         self._note = ""
         self._panel_at = 0.0
+        self._visited = False
+
+    def welcome(self, client: viser.ClientHandle) -> None:
+        """Place the camera of a browser that has just connected; the first one starts the episode that waits for it."""
+        self.place_cameras(client)
+        if not self._visited:
+            self._visited = True
+            self.player.play()
 
     def start(self, choice: Choice) -> None:
         """Show the tunnel of a choice, still without an episode, and start the clock.
@@ -125,23 +133,24 @@ class EpisodeView:
                 browsers.move_camera(each, *pose)
 
     def _show_recording(self, recording: Recording, title: str, *, finished: bool) -> EpisodeGeometry:
-        """Show an episode from its start."""
+        """Show an episode from its start; it plays once somebody has come to see it."""
         centreline = self.tunnel_view.show(title, recording.lining, recording.length)
         episode = EpisodeGeometry(recording, centreline, finished=finished)
         self._centreline, self._note = centreline, self.tunnel_view.note(title)
         self.scene_view.set_episode(episode, centreline)
-        self.player.begin(episode, playing=True)
+        self.player.begin(episode, playing=self._visited)
         return episode
 
     def _update_panel(self, episode: EpisodeGeometry, moment: Moment) -> None:
         """Update text, slider, button and charts."""
         panel = self._panel
-        rate = f"  \n<small>{self.player.frames_per_second:.0f} frames/s</small>" if self.player.playing else ""
+        rate = f" <small>· {self.player.frames_per_second:.0f} frames/s</small>" if self.player.playing else ""
         with self._server.atomic():
             panel.time.max = max(episode.recording.duration, 0.1)
             set_value(panel.time, round(moment.row * episode.recording.period, 3))
             panel.play.label = "Pause" if self.player.playing else "Play"
             panel.charts.show(episode, moment.row)
+            panel.show_legend(episode.recording)
             text = status_text(episode.recording, moment.row, finished=episode.finished, note=self._note)
             panel.status.content = text + rate
 
@@ -249,7 +258,7 @@ class Session:
         panel.cutaway.on_update(lambda event: view.tunnel_view.set_cutaway(panel.cutaway.value))
         for name, box in panel.show.items():
             box.on_update(self._set_visibility(name))
-        self._server.on_client_connect(view.place_cameras)
+        self._server.on_client_connect(view.welcome)
         self._set_speed()
 
     def _set_speed(self) -> None:

@@ -34,10 +34,16 @@ def test_a_turn_through_south_is_not_shown_the_long_way_round(centreline):
 
 
 def test_beams_end_where_they_measured(episode):
-    beams, hit = episode.beams(10)
-    np.testing.assert_allclose(beams[:, 0], [[2.0, 0.0, 0.6]] * 4, atol=1e-6)
-    np.testing.assert_allclose(beams[:, 1], [[32, 0, 0.6], [2, 2, 0.6], [-1, 0, 0.6], [2, -4, 0.6]], atol=1e-5)
+    beams, hit = episode.beams(10)  # in the robot's frame
+    np.testing.assert_allclose(beams[:, 0], [[0.0, 0.0, 0.6]] * 4, atol=1e-6)
+    np.testing.assert_allclose(beams[:, 1], [[30, 0, 0.6], [0, 2, 0.6], [-3, 0, 0.6], [0, -4, 0.6]], atol=1e-5)
     assert hit.tolist() == [False, True, True, True]
+
+
+def test_what_hangs_on_the_robot_is_given_in_its_frame(centreline):
+    turned = EpisodeGeometry(straight(heading=np.full(21, np.pi / 2, np.float32)), centreline)
+    there = np.array([[[2.0, 5.0, 0.3]]])  # the robot stands at (2, 0) and looks to +y
+    np.testing.assert_allclose(turned.carried(10, there), [[[5.0, 0.0, 0.3]]], atol=1e-6)
 
 
 def test_odometry_that_turns_too_much_drives_a_circle():

@@ -8,12 +8,14 @@ import time
 import urllib.error
 import urllib.request
 
+import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
 from subterra_jax.tunnel.sources import tunnel_digest
 from subterra_jax.viewer.config import ViewerConfig, ViewerError
 from subterra_jax.viewer.geometry import EpisodeGeometry
+from subterra_jax.viewer.panel import legend, status_text
 from subterra_jax.viewer.recording import load, save
 from subterra_jax.viewer.session import Viewer
 from tests.subterra_jax import tunnels
@@ -65,6 +67,55 @@ def moves(viewer):
     return True
 
 
+def test_the_episode_waits_for_the_first_visitor(folder):
+    config = ViewerConfig(
+        tunnels=(str(folder / "t.npz"),), recordings=folder / "rec", replay=folder / "rec" / "drive.npz", port=0
+    )
+    viewer = Viewer(config)
+    player = viewer.session.view.player
+    try:
+        until(lambda: player.episode is not None)
+        time.sleep(0.3)
+        assert (player.playing, player.time) == (False, 0.0)
+        with join(viewer.url):
+            until(lambda: player.playing and player.time > 0.0)
+        player.pause()
+        with join(viewer.url):
+            time.sleep(0.3)
+        assert not player.playing, "a second visitor does not start what the first has stopped"
+    finally:
+        viewer.stop()
+
+
+def test_beams_and_the_ends_of_trails_are_where_the_robot_is(viewer, plan_of):
+    session = viewer.session
+    session.view.player.pause()
+    time.sleep(0.2)
+    scene, episode = session.view.scene_view, session.view.player.episode
+    for at in (30.4, 30.9, 31.3):  # faster than lines are sent
+        moment = episode.moment(at)
+        scene.show(episode, moment, False)
+        for name, place, heading in (
+            ("/carried", moment.position, moment.heading),
+            ("/reckoned", moment.odometry, moment.odometry_heading),
+        ):
+            frame = scene._frames[name]
+            np.testing.assert_allclose(frame.position, place)
+            np.testing.assert_allclose(2.0 * np.arctan2(frame.wxyz[3], frame.wxyz[0]), heading, atol=1e-9)
+    assert all(tail.visible for tail in scene._tails.values())
+    scene.show(episode, episode.moment(2.0), False)
+    assert not any(tail.visible for tail in scene._tails.values()), "a tail longer than the way"
+
+
+def test_the_legend_names_what_is_shown_alone():
+    whole = legend(straight())
+    assert all(name in whole for name in ("truth", "odometry", "LiDAR", "estimate", "goal"))
+    bare = legend(straight(goal=np.nan, estimate=np.full((21, 2), np.nan, np.float32)))
+    assert "estimate" not in bare
+    assert "goal" not in bare
+    assert "error of odometry +" in status_text(straight(), 10, finished=True)
+
+
 def test_a_client_is_sent_tunnel_robot_and_controls(viewer):
     kinds, names = set(), set()
     with join(viewer.url) as link:
@@ -72,7 +123,7 @@ def test_a_client_is_sent_tunnel_robot_and_controls(viewer):
             for message in heard(link, 10.0):
                 kinds.add(message["type"])
                 names.add(str(message.get("name")))
-    assert {"/robot", "/ghost", "/truth", "/odometry", "/estimate", "/beams"} <= names
+    assert {"/robot", "/ghost", "/truth", "/odometry", "/carried/estimate", "/carried/beams", "/carried/tail"} <= names
 
 
 def test_the_server_side_makes_at_least_30_frames_a_second_of_351_m(viewer, plan_of):
