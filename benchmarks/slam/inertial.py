@@ -49,6 +49,9 @@ def find_program(name: str) -> str:
         raise BenchmarkError(f"{name} needs {package}, which is not installed: pip install {package}") from error
 
 
+_ALONE = "import sys; from benchmarks.slam.inertial import main; sys.exit(main(sys.argv[1:]))"
+
+
 def run_program(name: str, recording: Path, target: Path, limit: float = 3600.0) -> dict[str, Any]:
     """Runs a program on a recording in a process of its own, for `limit` s at most.
 
@@ -61,7 +64,7 @@ def run_program(name: str, recording: Path, target: Path, limit: float = 3600.0)
     Returns:
         `seconds` that the program took, `share` of the recording's duration, `poses`; or `failed` with the reason.
     """
-    words = [sys.executable, "-m", "benchmarks.slam.inertial", name, str(recording.resolve()), str(target.resolve())]
+    words = [sys.executable, "-c", _ALONE, name, str(recording.resolve()), str(target.resolve())]
     path = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
     try:
@@ -167,7 +170,3 @@ def main(words: list[str]) -> int:
     share = seconds / float(times[-1] - times[0])
     print(json.dumps({"poses": len(times), "seconds": round(seconds, 2), "share": round(share, 3)}))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

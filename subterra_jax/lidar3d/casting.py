@@ -186,14 +186,20 @@ def require_free(relief: Relief, position: Any, station: float) -> None:
     way = place - at
     size = np.linalg.norm(way, axis=1)
     origins, directions = jnp.asarray(at, jnp.float32), jnp.asarray(way / np.maximum(size, 1e-9)[:, None], jnp.float32)
-    blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, jnp.float32(station))
-    free = _ranges(relief.shared, origins, directions, blocks, jnp.asarray(size, jnp.float32))
+    free = _free_lengths(relief, origins, directions, jnp.float32(station), jnp.asarray(size, jnp.float32))
     if not np.any(np.asarray(free) >= size - 1e-4):
         x, y, z = place
         raise SubterraError(
             f"the sensor at ({x:.2f}, {y:.2f}, {z:.2f}) m, station {station:.1f} m, is inside the wall, or in a thing: "
             "it is not seen from the axis"
         )
+
+
+@jax.jit
+def _free_lengths(relief: Relief, origins: Array, directions: Array, station: Array, size: Array) -> Array:
+    """Return how far rays from near a station go, m, at most `size`."""
+    blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, station)
+    return _ranges(relief.shared, origins, directions, blocks, size)
 
 
 def device_memory() -> int | None:

@@ -121,12 +121,12 @@ def test_cant_is_measured():
 def test_the_gauge_of_a_canted_track_is_that_of_its_own_plane():
     station, lateral, upward, height = above_floor(*scanned("proud"))
     gauges = []
-    for lean in np.radians([0.0, 12.0]):  # a survey frame that is not level: the very same track, 12° on its side
+    for lean in np.radians([0.0, 7.0]):  # the very same track on its side, by as much as railways are canted
         across = lateral * np.cos(lean) - upward * np.sin(lean)
         upright = lateral * np.sin(lean) + upward * np.cos(lean)
         (line,) = rails_seen.find_rails(station, across, height / np.cos(lean), upright)
         gauges.append(line.gauge)
-    assert gauges[1] == pytest.approx(gauges[0], abs=0.002)
+    assert gauges[1] == pytest.approx(gauges[0], abs=0.001)  # across, not in its plane, it would be 10 mm less
 
 
 def test_rails_on_a_bare_floor_get_no_sleepers_and_the_robot_drives_on_the_floor():

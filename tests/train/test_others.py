@@ -106,6 +106,7 @@ def learns(name, steps, **options):
     return watch.reached is not None
 
 
+@pytest.mark.slow
 def test_a_loop_like_cleanrls_learns_to_drive_a_few_metres():
     pytest.importorskip("torch")
     assert learns("cleanrl_like", 10 * 8192, **FEW_METRES)

@@ -82,7 +82,7 @@ def test_a_perceptron_drives_without_the_trainer_as_it_does_with_it(perceptron):
         assert np.isnan(action[2])
 
 
-@pytest.mark.parametrize("trained", ["gru", "among_boxes"])
+@pytest.mark.parametrize("trained", ["gru", pytest.param("among_boxes", marks=pytest.mark.slow)])
 def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(request, trained):
     nets, weights = request.getfixturevalue(trained)
     agent, start = make_agent(nets, weights), jnp.float32(5.0)

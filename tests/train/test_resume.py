@@ -44,7 +44,7 @@ def cut(whole, out, *kept):
 @pytest.mark.parametrize(
     "kept",
     [
-        None,
+        pytest.param(None, marks=pytest.mark.slow),
         pytest.param((), marks=pytest.mark.slow),
         pytest.param(("config.json",), marks=pytest.mark.slow),
         ("config.json", "log.jsonl", "log.csv", "episodes.csv"),

@@ -29,9 +29,8 @@ def alone(world):
     return [ppo.train(*world, learner.config, learner=learner) for learner in learners(*world)]
 
 
-@pytest.mark.parametrize(
-    "axes", [(), pytest.param((ppo.AXIS,), marks=pytest.mark.slow)], ids=["one after the other", "vmapped"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("axes", [(), (ppo.AXIS,)], ids=["one after the other", "vmapped"])
 def test_a_seed_trained_with_others_comes_to_the_numbers_it_comes_to_alone(world, alone, axes, monkeypatch):
     monkeypatch.setattr(ppo, "seed_axes", lambda: axes)
     together = ppo.train_seeds(learners(*world, axes), world[1], [None, None])

@@ -56,6 +56,7 @@ def one_device(line, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_two_devices_come_to_what_one_does_and_go_on_from_its_checkpoint(line, one_device, tmp_path):
     processes(2, (*line, "--out", str(tmp_path / "two")))
     assert_alike(one_device, tmp_path / "two")

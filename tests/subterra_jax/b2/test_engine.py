@@ -62,6 +62,7 @@ def test_half_a_second_in_both_engines_ends_in_the_same_joint_angles(walking, mo
     assert np.abs(np.asarray(state.body.qvel[:3, 6:])).max() > 0.5, "nothing moved"
 
 
+@pytest.mark.slow
 def test_a_robot_s_step_depends_neither_on_who_was_there_before_nor_on_the_batch(moment, in_c):
     _, state, seen = moment
     what = seen(state)
