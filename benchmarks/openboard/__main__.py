@@ -9,6 +9,7 @@ tables and picture of the cells that are there.
 import dataclasses
 import hashlib
 import json
+import re
 import sys
 import time
 from pathlib import Path
@@ -22,10 +23,10 @@ from benchmarks.command import run_main
 from benchmarks.openboard import columns as board
 from benchmarks.openboard import report
 from benchmarks.results import environment_facts, write_file
-from subterra_jax.baselines import registry
 from subterra_jax.evaluation import evaluate
 from subterra_jax.evaluation.floor import floor
 from subterra_jax.host.files import require_folder
+from subterra_jax.policies import open_agent
 from train.locate.tunnels import load
 
 _progress = Console(stderr=True, highlight=False)
@@ -38,7 +39,7 @@ class OpenboardConfig:
     Attributes:
         out: Folder for the cells, `openboard.md` and `openboard.png`.
         tasks: Tasks without `Subterra/` and `-v1`.
-        agents: Names of agents.
+        agents: Names of agents, released policies, or files of policies.
         splits: Splits of the open world; a choice may be made on `val` alone.
         episodes: Episodes of each kind and split.
         tunnels: Tunnels of each kind and split, over which the episodes are spread.
@@ -86,7 +87,7 @@ def conditions(config: OpenboardConfig) -> str:
 
 def cell_file(config: OpenboardConfig, task: str, agent: str) -> Path:
     """Return the file of a task and an agent."""
-    return config.out / "cells" / f"{task}.{agent}.json"
+    return config.out / "cells" / f"{task}.{re.sub(r'[^A-Za-z0-9_.-]', '_', agent)}.json"
 
 
 def _is_there(file: Path, config: OpenboardConfig) -> bool:
@@ -107,7 +108,7 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
         if task not in floors:
             floors[task] = [floor(params, index) for index in range(len(names))]
         episodes = board.draw_episodes(task, columns, config.tunnels, config.episodes)
-        records = evaluate(env, params, registry.make_agent(agent, params), episodes, len(episodes))
+        records = evaluate(env, params, open_agent(agent, env, params), episodes, len(episodes))
         seconds = time.monotonic() - started
         content: dict[str, Any] = {
             "schema": board.SCHEMA,

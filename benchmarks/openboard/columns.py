@@ -8,6 +8,7 @@ import numpy as np
 from benchmarks.command import BenchmarkError, require_least
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes
+from subterra_jax.policies.opening import policy_source
 from subterra_jax.procedural.open_world import SPLITS, kinds_of
 from subterra_jax.tasks import BUILT_IN, TaskError, find
 
@@ -84,7 +85,7 @@ def check(
             raise BenchmarkError(f"no task {task!r} of version 1; there are {known}") from error
         assert id in BUILT_IN
     for agent in agents:
-        if agent not in registry.names():
+        if agent not in registry.names() and policy_source(agent) is None:
             raise BenchmarkError(f"no agent {agent!r}; there are {', '.join(registry.names())}")
     for split in splits:
         if split not in SPLITS:
