@@ -139,6 +139,7 @@ MISTAKES = {
     "benchmarks.slam arena --out text.txt": "text.txt",
     "benchmarks.slam board --sets empty --out o": "empty: holds no recordings",
     "benchmarks.slam board --sets empty --out o --programs moon": "no program 'moon'; there are wheel-odometry",
+    "benchmarks.slam board --sets empty --out o --no-run": "empty: holds no recordings",
     "benchmarks.slam check --submission none --recordings empty": "none: no such folder",
     "benchmarks.slam check --submission empty --recordings empty": "empty/program.json: is missing",
     "benchmarks.slam run --library evalio-dlio --recordings empty --out o": "empty: holds no recordings",

@@ -13,7 +13,7 @@ from benchmarks.slam.arena.bound import find_floor
 from benchmarks.slam.arena.gate import find_gate
 from benchmarks.slam.arena.sets import redraw
 from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
-from benchmarks.slam.recordings import TRUTH, recordings_in
+from benchmarks.slam.recordings import TRUTH, check_recording, recordings_in
 from benchmarks.slam.run import WHEELS
 from benchmarks.slam.score import TRUTH_FILE, score_files
 from subterra_jax.host.files import replace_file
@@ -66,8 +66,8 @@ def plan_board(config: BoardConfig) -> list[Case]:
     """Returns the cases of a board.
 
     Raises:
-        BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, two have one
-            name, or there is nothing to score.
+        BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, a bag that is
+            to be run on is damaged, two sets have one name, or there is nothing to score.
     """
     require_least(config, jobs=1)
     if not config.sets or not config.programs:
@@ -86,6 +86,8 @@ def plan_board(config: BoardConfig) -> list[Case]:
             cases += [Case(program, bag.parent, place / program) for program in config.programs]
             if not cases[-1].truth.is_file():
                 raise BenchmarkError(f"{folder}: holds no truth of {name}")
+    for folder in {one.folder for one in cases if config.run and not one.facts.is_file()}:
+        check_recording(folder)  # a damaged bag is no failure of a program
     cases = [one for one in cases if config.run or one.program == WHEELS or one.facts.is_file()]
     if all(one.program == WHEELS for one in cases) and any(name != WHEELS for name in config.programs):
         raise BenchmarkError(f"{config.out}: holds no poses of {', '.join(config.programs)} to score")

@@ -20,6 +20,10 @@ _NAMES = {
     "walls-sprayed": "sprayed", "beams-06": "6 beams", "beams-32": "32 beams", "beams-64": "64 beams",
     "dust-half": "thin dust", "dust-lock": "own cloud", "motion-walk": "walked", "motion-b2": "B2",
 }  # fmt: skip
+_OURS = {  # colour, marker and line of what is not a SLAM program
+    "wheel-odometry": ("0.3", "s", ":"), "ring-filter": ("0.0", "D", "-."), "particle-filter": ("0.5", "D", "--"),
+}  # fmt: skip
+_ASIDE = 0.04  # of the distance between two recordings, from one program to the next
 _LEAST = 3e-5  # m per 100 m, lower end of the figure
 
 
@@ -102,16 +106,17 @@ def draw_board(board: dict[str, Any]) -> Figure:
 
 
 def _draw_panel(axes: Axes, board: dict[str, Any], title: str, names: list[str]) -> None:
-    rows, colours = board["rows"], plt.get_cmap("tab10")
-    at = np.arange(len(names))
+    rows, at = board["rows"], np.arange(len(names))
     programs = list(dict.fromkeys(row["program"] for row in rows))
+    others = [name for name in programs if name not in _OURS]
     for k, program in enumerate(programs):
         found = [median_drift(rows, program, name) or (np.nan,) * 3 for name in names]
         middle, low, high = np.maximum(np.array(found, float), _LEAST).T
-        place, wheels = at + 0.05 * (k - 0.5 * len(programs)), program == "wheel-odometry"
+        colour, marker, style = _OURS.get(program) or (f"C{others.index(program) % 10}", "o", "-")
+        place = at + _ASIDE * (k - 0.5 * (len(programs) - 1))
         axes.errorbar(
-            place, middle, [middle - low, high - middle], marker="s" if wheels else "o", ms=4, lw=1.2, capsize=2,
-            color="0.3" if wheels else colours(k % 10), ls=":" if wheels else "-", label=program,
+            place, middle, [middle - low, high - middle], marker=marker, ms=4, lw=1.2, capsize=2, color=colour,
+            ls=style, label=program,
         )  # fmt: skip
     floor = [_of(board["floors"], name, "drift") for name in names]
     axes.plot(at, np.maximum(floor, _LEAST), "k--", lw=1.4, label="floor")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import yaml
 from jaxtyping import Float
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -149,7 +150,7 @@ def recordings_in(folder: Path) -> list[tuple[str, Path]]:
         BenchmarkError: The folder holds no recordings.
     """
     inside = folder / RECORDINGS if (folder / RECORDINGS).is_dir() else folder
-    bags = sorted(path.parent for path in inside.glob("*/recording/metadata.yaml")) if inside.is_dir() else []
+    bags = sorted(path for path in inside.glob("*/recording") if path.is_dir()) if inside.is_dir() else []
     if not bags:
         raise BenchmarkError(f"{folder}: holds no recordings (`python -m benchmarks.slam record` makes some)")
     return [(bag.parent.name, bag) for bag in bags]
@@ -202,6 +203,28 @@ def count_messages(folder: Path) -> dict[str, int]:
         return {connection.topic: connection.msgcount for connection in reader.connections}
 
 
+CALIBRATION = "calibration.yaml"
+
+
+def check_recording(folder: Path) -> None:
+    """Checks that a recording of the arena is whole: its bag, its calibration, and the topics that this names.
+
+    Raises:
+        BenchmarkError: A file is missing or damaged, or the bag lacks a topic.
+    """
+    held, path = count_messages(folder / "recording"), folder / CALIBRATION
+    try:
+        facts = yaml.safe_load(path.read_text())
+        topics = [facts[part]["topic"] for part in ("lidar", "imu")]
+    except OSError as error:
+        raise BenchmarkError(f"{path}: is missing; it names topics, extrinsics and noise") from error
+    except (yaml.YAMLError, KeyError, TypeError) as error:
+        raise BenchmarkError(f"{path}: is no calibration: it must name the topics of lidar and imu") from error
+    for topic in topics:
+        if not held.get(topic):
+            raise BenchmarkError(f"{folder / 'recording'}: has no topic {topic}; it has {', '.join(sorted(held))}")
+
+
 def _messages(folder: Path, topic: str) -> Iterator[Any]:
     types = get_typestore(Stores.ROS2_JAZZY)
     with closing(_open_bag(folder)) as reader:
@@ -215,7 +238,9 @@ def _messages(folder: Path, topic: str) -> Iterator[Any]:
 
 def _open_bag(folder: Path) -> Any:
     if not (folder / "metadata.yaml").is_file():
-        raise BenchmarkError(f"{folder}: is no recording: metadata.yaml is missing")
+        other = " (programs here read bags of ROS 2, as `--formats mcap` writes them)"
+        ros1 = folder.with_suffix(".bag").is_file()
+        raise BenchmarkError(f"{folder}: is no recording: metadata.yaml is missing{other if ros1 else ''}")
     try:
         reader = Reader(folder)
         reader.open()

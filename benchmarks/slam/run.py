@@ -19,7 +19,17 @@ from jaxtyping import Float
 from benchmarks.command import BenchmarkError
 from benchmarks.results import environment_facts, write_file
 from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
-from benchmarks.slam.recordings import CLOUDS, PLANAR, Sweep, count_messages, read_clouds, read_planar, recordings_in
+from benchmarks.slam.recordings import (
+    CALIBRATION,
+    CLOUDS,
+    PLANAR,
+    Sweep,
+    check_recording,
+    count_messages,
+    read_clouds,
+    read_planar,
+    recordings_in,
+)
 from benchmarks.slam.tum import save_tum
 from subterra_jax.host.files import replace_file
 
@@ -117,7 +127,7 @@ def estimate_poses(
 
 SCHEMA = "subterra.slam-run/1"
 WHEELS = "wheel-odometry"
-RUN_FILE, CALIBRATION = "run.json", "calibration.yaml"
+RUN_FILE = "run.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -126,8 +136,8 @@ class RunConfig:
 
     Attributes:
         library: `kiss-icp`, `genz-icp`, `kiss-icp-planar`; one of `evalio-` and `kiss`, `genz`, `mad`, `ct`, `loam`,
-            `liosam`, `dlio`, `form`, or `rko-lio`, on recordings of the arena; or `wheel-odometry`, which copies the
-            robot's own odometry.
+            `liosam`, `dlio`, `form`, or `rko-lio`, `ring-filter`, `particle-filter`, on recordings of the arena; or
+            `wheel-odometry`, which copies the robot's own odometry.
         recordings: Set of recordings, or its `recordings/`.
         out: Folder for the poses, `NAME.tum`; files there already are kept.
         limit: Time after which a program of the arena counts as failed on a recording, s.
@@ -143,7 +153,8 @@ def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
     """Runs on every recording with the library's topic; yields each name and a line about its result.
 
     Raises:
-        BenchmarkError: The library is unknown or not installed, or no recording has its topic.
+        BenchmarkError: The library is unknown or not installed, a bag is missing or damaged, or no recording has its
+            topic.
     """
     if config.library in PROGRAMS:
         yield from _run_inertial(config)
@@ -174,22 +185,23 @@ def _run_inertial(config: RunConfig) -> Iterator[tuple[str, str]]:
     """Runs a program that needs the times of points; those that fail are listed in `run.json` with the reason."""
     number, results = find_program(config.library), _results_so_far(config.out / RUN_FILE)
     bags = [(name, bag.parent) for name, bag in recordings_in(config.recordings)]
-    ready = [(name, folder) for name, folder in bags if (folder / CALIBRATION).is_file()]
-    if not ready:
+    if not any((folder / CALIBRATION).is_file() for _, folder in bags):
         raise BenchmarkError(
             f"{config.recordings}: holds no {CALIBRATION}, which {config.library} needs "
             "(`python -m benchmarks.slam arena` makes such recordings)"
         )
-    for name, folder in ready:
+    for _, folder in bags:
+        check_recording(folder)  # a damaged bag is no failure of the program
+    for name, folder in bags:
         target = config.out / f"{name}.tum"
         if target.is_file():
             yield name, "there already"
             continue
         target.parent.mkdir(parents=True, exist_ok=True)
         results[name] = run_program(config.library, folder, target, config.limit)
-        _write_facts(config, number, [name for name, _ in ready], results)
+        _write_facts(config, number, [name for name, _ in bags], results)
         yield name, describe_run(results[name])
-    _write_facts(config, number, [name for name, _ in ready], results)
+    _write_facts(config, number, [name for name, _ in bags], results)
 
 
 def describe_run(result: dict[str, Any]) -> str:

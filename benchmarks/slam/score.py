@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from benchmarks.command import BenchmarkError
-from benchmarks.slam.tracks import Alignment, Axis, Track, axis_from_file, axis_from_path, read_track
+from benchmarks.slam.tracks import Alignment, Axis, Track, align, axis_from_file, axis_from_path, read_track
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,15 +160,33 @@ def score_files(
         name: Name of the recording; by default the estimate's file name.
 
     Raises:
-        BenchmarkError: A file is missing or wrong, or the trajectories share no times.
+        BenchmarkError: A file is missing or wrong, the trajectories share no times, or the poses are not the LiDAR's.
     """
     if not piece > 0.0:
         raise BenchmarkError(f"piece must be above 0 m, got {piece}")
     track = read_track(estimate, truth, alignment)
+    if alignment == "origin":
+        _check_frame(estimate, track)
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
     line = axis_from_path(track.true_position) if axis is None else axis_from_file(axis)
     return score_track(track, line, alignment, piece, name or estimate.stem)
+
+
+_TURNED, _FITS = 0.3, 0.05  # share of the distance: RMS errors as aligned at the start, and after the best fit
+
+
+def _check_frame(estimate: Path, track: Track) -> None:
+    """Refuses poses whose attitudes belong to another frame, as a camera's: only turned as a whole they fit."""
+    distance = float(track.travelled[-1])
+    fitted = align(track, "se3")
+    before, after = (rms(np.linalg.norm(absolute_errors(one)[0], axis=1)) for one in (track, fitted))
+    if before > _TURNED * distance and after < _FITS * distance:
+        angle = float(np.degrees((fitted.rotation[0] * track.rotation[0].inv()).magnitude()))
+        raise BenchmarkError(
+            f"{estimate}: fits the truth only turned as a whole by {angle:.0f}°: poses must be those of the LiDAR, "
+            "x forward, also at the start"
+        )
 
 
 def score_track(track: Track, axis: Axis, alignment: str, piece: float, name: str) -> tuple[Score, Curve]:

@@ -147,6 +147,34 @@ def test_a_truncated_or_foreign_recording_is_one_sentence(made, tmp_path, capsys
     assert "cannot be written (File exists)" in capsys.readouterr().err
 
 
+def test_a_recording_of_the_arena_must_be_whole_before_a_program_runs_on_it(made, tmp_path, capsys):
+    one = tmp_path / "recordings" / "one"
+    shutil.copytree(made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording", one / "recording")
+    (one.parent / "two").mkdir()
+    shutil.copytree(one / "recording", one.parent / "two" / "recording")
+    (one.parent / "two" / "calibration.yaml").write_text("lidar: {topic: /points}\nimu: {topic: /imu}\n")
+    asked = ("run", "--library", "rko-lio", "--recordings", str(tmp_path), "--out", str(tmp_path / "out"))
+    for text, sentence in (
+        (None, "one/calibration.yaml: is missing"), ("{", "is no calibration"), ("lidar: 3", "is no calibration"),
+        ("lidar: {topic: /moon}\nimu: {topic: /imu}\n", "has no topic /moon; it has /cmd_vel"),
+    ):  # fmt: skip
+        if text is not None:
+            (one / "calibration.yaml").write_text(text)
+        assert command([*asked]) == 2
+        told = capsys.readouterr().err
+        assert sentence in told
+        assert told.count("\n") == 1
+    (one / "calibration.yaml").write_text("lidar: {topic: /points}\nimu: {topic: /imu}\n")
+    data = (one / "recording" / "recording.mcap").read_bytes()
+    (one / "recording" / "recording.mcap").write_bytes(data[: len(data) // 2])
+    assert command([*asked]) == 2
+    assert "one/recording: not a whole recording" in capsys.readouterr().err
+    (one / "recording" / "metadata.yaml").unlink()
+    assert command([*asked]) == 2
+    assert "one/recording: is no recording: metadata.yaml is missing" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_boxes_and_faults_are_recorded_without_clouds_and_a_driver_knows_the_way(tmp_path):
     config = SetConfig(tmp_path, tasks=("StopAt", "Obstructed", "Relocalise"), episodes=2, scene=tmp_path)
     found = dict(plan_set(config))

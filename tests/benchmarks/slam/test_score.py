@@ -153,6 +153,22 @@ def test_errors_along_across_and_up_are_those_of_evo_axis_by_axis(tmp_path, alig
     assert found.along_final == pytest.approx(theirs[-1, 0], abs=1e-6)
 
 
+def test_poses_of_a_camera_are_refused_and_a_bad_program_is_scored(tmp_path):
+    time, position, rotation = bend()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    camera = Rotation.from_matrix([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    other = write_tum(tmp_path / "camera.tum", time, position, rotation * camera)
+    with pytest.raises(BenchmarkError, match=r"camera.tum: fits the truth only turned as a whole by 120°") as told:
+        score_files(other, truth)
+    assert "\n" not in str(told.value)
+    assert score_files(other, truth, alignment="se3")[0].ape.max < 1e-6
+    # One that stands still, and one that turns round half-way, are as bad as they are.
+    still = write_tum(tmp_path / "still.tum", time, np.zeros_like(position), rotation)
+    assert score_files(still, truth)[0].drift == pytest.approx(100.0, abs=1.0)
+    back = np.concatenate([position[:200], position[199::-1]])
+    assert score_files(write_tum(tmp_path / "back.tum", time, back, rotation), truth)[0].drift > 50.0
+
+
 def test_stamps_between_those_of_the_truth_are_scored_against_the_pose_between(tmp_path):
     time, position, rotation = line()
     truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
