@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
 from train.config import ConfigError
-from train.locate import release, scores, session
+from train.locate import filtering, release, scores, session
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner
 
@@ -156,3 +157,20 @@ def test_a_released_localiser_is_loaded_with_its_card(tmp_path):
     assert card["measured"][0]["cut"]["cast"]["success"] == pytest.approx(0.1)
     assert card["success_against_time"]
     assert out.read_bytes() == policy.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_filter_learns_what_lasts_over_a_drive_where_walls_tell_nothing(monkeypatch):
+    monkeypatch.setattr(scores, "FARTHEST", 38)
+    monkeypatch.setattr(scores, "FIRST", 10)
+    weights = memory.init("transformer", "match", jax.random.key(0))
+    drives = _made_up_drive(6, [0.0, 0.01, -0.02, 0.03, -0.03, 0.02])
+    rows = filtering.look("transformer", weights, drives)
+    np.testing.assert_allclose(rows.truth[:, -1], 38.0 * np.array([0.0, 0.01, -0.02, 0.03, -0.03, 0.02]), atol=0.01)
+    before = filtering.judged(filtering.plain_answers("transformer", weights, rows), rows)
+    command = filtering.Command(policy=Path("x"), out=Path("y"), updates=60, minibatch=6)
+    own, log = filtering.learn("transformer", weights, rows, command)
+    after = filtering.judged(filtering.answers_of(own, rows), rows)
+    assert log[-1]["loss"] < log[0]["loss"] - 1.0
+    assert after["found"].max() < 0.1 < before["found"].max()
+    np.testing.assert_allclose(after["within"], 1.0)
