@@ -15,7 +15,7 @@ from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
 from train.config import ConfigError
-from train.locate import filtering, release, scores, session
+from train.locate import filtering, look, release, scores, session
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner
 
@@ -174,3 +174,12 @@ def test_a_filter_learns_what_lasts_over_a_drive_where_walls_tell_nothing(monkey
     assert log[-1]["loss"] < log[0]["loss"] - 1.0
     assert after["found"].max() < 0.1 < before["found"].max()
     np.testing.assert_allclose(after["within"], 1.0)
+
+
+def test_a_look_weighs_kinds_alike_and_leaves_out_drives_without_a_goal():
+    share = np.array([1.0, 0.5, 0.0, 0.0, 0.2, np.nan])
+    found = look.table(share, np.array([0, 0, 1, 1, 2, 2]), np.array(["cast"] * 4 + ["rock"] * 2))
+    assert found["cast"]["success"] == pytest.approx(0.375)
+    assert (found["rock"]["success"], found["rock"]["n"]) == (pytest.approx(0.2), 1)
+    assert found["all"]["success"] == pytest.approx((0.375 + 0.2) / 2)
+    assert found["cast"]["low"] < 0.1 < 0.7 < found["cast"]["high"], "two tunnels that differ leave a wide interval"

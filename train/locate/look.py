@@ -1,0 +1,148 @@
+"""Scores localisers on recorded drives, by kind: `python -m train.locate.look POLICY [POLICY ...] --out DIR`.
+
+All policies, and each with what walls tell cut out, see the same drives. A drive counts for every goal 60 to 320 m from
+its start: the score is the success of stops at goals drawn from these, but for the last step of 0.2 m.
+"""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from subterra_jax.host.command import parse, run_command
+from subterra_jax.host.files import replace_file
+from subterra_jax.policies import load
+from subterra_jax.policies.locate import memory, streams
+from subterra_jax.policies.locate.agent import Locating, nested
+from train.config import ConfigError, at_least
+from train.locate import scores, tunnels
+from train.locate.drives import Drive
+
+_KINDS = ("straight", "universal", "cast", "sprayed", "masonry", "rock")
+_SEED = 2**22
+_RESAMPLES = 2000
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Scores localisers on recorded drives.
+
+    Attributes:
+        policies: Localisers of `train.locate`.
+        out: Folder for `look.json` and `look.md`.
+        task: Task that is driven.
+        tunnels: Tunnels; a choice may be made on `val` alone.
+        drives: Drives, spread over the tunnels.
+        seed: Added to the seed of the drives.
+        cache: Folder in which made tunnels are kept from run to run.
+    """
+
+    policies: tyro.conf.Positional[tuple[str, ...]]
+    out: Path
+    task: str = "Subterra/StopAt-v1"
+    tunnels: str = ",".join(f"open:{kind}:test-unseen:0-9" for kind in _KINDS)
+    drives: int = 300
+    seed: int = 0
+    cache: Path | None = None
+
+
+def command(arguments: Command) -> None:
+    """Records, scores and writes.
+
+    Raises:
+        ConfigError: A policy is no localiser, or a number out of range.
+        SubterraError: There is no such policy, task or tunnel.
+    """
+    at_least(arguments, 1, "drives")
+    at_least(arguments, 0, "seed")
+    agents = {name: load(name)[0] for name in arguments.policies}
+    for name, agent in agents.items():
+        if not isinstance(agent, Locating):
+            raise ConfigError(f"{name}: is no localiser, but {type(agent).__name__}")
+    names = tunnels.names_of(arguments.tunnels)
+    env, params = tunnels.enter(arguments.task, tunnels.load(names, None, arguments.cache))
+    drives = scores.record(env, params, jax.random.key(_SEED + arguments.seed), arguments.drives)
+    kinds = np.array([scores.kind_of(name) for name in names])[np.asarray(drives.tunnel).astype(int)]
+    print(f"{arguments.drives} drives", flush=True)
+    rows: dict[str, Any] = {}
+    for name, agent in agents.items():
+        for blind in (False, True):
+            label = f"{name}, cut" if blind else name
+            rows[label] = table(within(agent, drives, blind), np.asarray(drives.tunnel), kinds)
+            print(label, {kind: round(100 * cell["success"]) for kind, cell in rows[label].items()}, flush=True)
+        _write(arguments, rows)
+    print(arguments.out / "look.md")
+
+
+def within(agent: Locating, drives: Drive, blind: bool) -> np.ndarray:
+    """Returns the share of the goals of each drive at which the estimate is right to 1 m; NaN without a goal."""
+    weights, n = nested(agent.tensors), scores.FARTHEST
+    goals = jnp.arange(n) >= scores.FIRST - 1
+
+    def one(drive: Drive) -> Any:
+        blocks = streams.metres(drive.record, weights.get("match"), n)
+        if blind:
+            blank = {name: jnp.zeros_like(getattr(blocks, name)) for name in ("evidence", "raw")}
+            blocks = dataclasses.replace(blocks, **blank)
+        answers = memory.sequence(agent.network, weights, blocks)
+        ends = jnp.arange(1.0, n + 1.0)
+        error = answers.correction - jnp.interp(ends, drive.record.driven, drive.moved) + ends
+        use = goals & streams.reached(drive.record, n)
+        return jnp.sum(use & (jnp.abs(error) <= 1.0)) / jnp.sum(use)
+
+    return np.asarray(jax.jit(lambda drives: jax.lax.map(one, drives, batch_size=16))(drives))
+
+
+def table(share: np.ndarray, tunnel: np.ndarray, kinds: np.ndarray) -> dict[str, dict[str, float]]:
+    """Returns the mean by kind, and over the kinds as `all`, with 95 % intervals over drawn tunnels and drives."""
+    rng, found, draws = np.random.default_rng(0), {}, []
+    for kind in dict.fromkeys(kinds.tolist()):
+        rows = (kinds == kind) & ~np.isnan(share)
+        groups = [share[rows & (tunnel == one)] for one in np.unique(tunnel[rows])]
+        drawn = [
+            np.concatenate([rng.choice(groups[i], len(groups[i])) for i in rng.integers(len(groups), size=len(groups))])
+            for _ in range(_RESAMPLES)
+        ]
+        draws.append(np.array([one.mean() for one in drawn]))
+        low, high = np.quantile(draws[-1], (0.025, 0.975))
+        found[kind] = {
+            "success": float(share[rows].mean()),
+            "low": float(low),
+            "high": float(high),
+            "n": int(rows.sum()),
+        }
+    low, high = np.quantile(np.mean(draws, axis=0), (0.025, 0.975))
+    mean = float(np.mean([cell["success"] for cell in found.values()]))
+    return {**found, "all": {"success": mean, "low": float(low), "high": float(high), "n": len(share)}}
+
+
+def _write(arguments: Command, rows: dict[str, Any]) -> None:
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    columns = list(next(iter(rows.values())))
+    lines = ["| localiser | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
+    for label, row in rows.items():
+        cells = [f"{100 * c['success']:.0f} ({100 * c['low']:.0f} to {100 * c['high']:.0f})" for c in row.values()]
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    facts = {"task": arguments.task, "tunnels": arguments.tunnels, "drives": arguments.drives, "seed": arguments.seed}
+    for name, text in (("look.md", "\n".join(lines)), ("look.json", json.dumps({**facts, "rows": rows}, indent=1))):
+        with replace_file(arguments.out / name) as fresh:
+            fresh.write_text(f"{text}\n")
+
+
+def main() -> None:
+    """Runs `python -m train.locate.look`."""
+    sys.exit(run_command(lambda: command(parse(_read))))
+
+
+def _read(words: list[str]) -> Command:
+    return tyro.cli(Command, args=words, prog="python -m train.locate.look", description=__doc__)
+
+
+if __name__ == "__main__":
+    main()
