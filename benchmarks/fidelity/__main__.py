@@ -31,6 +31,7 @@ from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import Value, evaluate
 from benchmarks.fidelity.report import write_report
 from benchmarks.fidelity.tools import calibrate
+from benchmarks.fidelity.windows import commands as windows
 from scene.errors import require_input
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import require_folder
@@ -212,7 +213,7 @@ def _write_report(opened: OpenCase) -> dict[str, Any]:
     swept = _kept_result(folder / "sweep.json", opened.case)
     rows = controls["rows"] if controls else None
     leaks = judge.find_leaks(opened.case, opened.values["base"])
-    judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict)
+    judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict, opened.judgement.windows)
     judgement = judge.add_outside(judgement, opened.case, folder, inputs.strict)
     return write_report(folder, opened.case, inputs, judgement, rows, swept)
 
@@ -244,6 +245,7 @@ def main() -> int:
     actions: dict[str, Callable[[Any], None]] = {
         "run": run, "controls": run_controls, "sweep": run_sweep,
         "calibrate": calibrate.run, "split": run_split, "report": run_report,
+        "windows": windows.run_windows, "faults": windows.run_faults, "limits": windows.run_limits,
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}
 

@@ -21,6 +21,7 @@ from benchmarks.fidelity.references import Hold, Truth
 Result = TypeVar("Result")
 NOT_VALUES = (
     "report", "figures", "controls", "tools", "__main__.py", "inputs.py", "judge.py", "scoring.py", "table.py",
+    "windows",
 )  # fmt: skip  # raw values do not depend on these; the results of controls have a key of their own
 SHARED: dict[tuple[Any, ...], Any] = {}  # results from released files, for all cases of this process
 _KEPT_UNTIL: dict[tuple[str, str], str] = {}

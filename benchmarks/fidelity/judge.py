@@ -18,9 +18,11 @@ from benchmarks.fidelity.references import Hold
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
+from benchmarks.fidelity.windows.judge import Windows, dump_windows, judge_windows, load_windows, windows_hash
 from scene.progress import Stages
 
 VALUES_SCHEMA = "subterra.fidelity-values/1"
+WINDOWS_SCHEMA = "subterra.fidelity-windows/1"
 NOISE_BAND = (0.5, 3.0)  # times the sensor's stated sigma
 MEDIAN_FLOOR = 0.5  # of the recording's own noise; the median distance to the mesh must not be smaller
 PATCH_NEIGHBOURS = 12
@@ -59,6 +61,7 @@ class Judgement:
         reasons: Reasons for FAIL; empty for PASS.
         outside: Scores of suite and metrics from outside together, by candidate; empty without such metrics. The
             verdict does not read them.
+        windows: The worst windows, and the stated faults that they must notice.
     """
 
     values: dict[str, Values]
@@ -67,10 +70,11 @@ class Judgement:
     leaks: list[str]
     reasons: list[str]
     outside: dict[str, Scored] = field(default_factory=dict)
+    windows: Windows = Windows()
 
     @property
     def verdict(self) -> str:
-        """`PASS` or `FAIL`, by the suite alone."""
+        """`PASS` or `FAIL`, by suite and windows alone."""
         return "FAIL" if self.reasons else "PASS"
 
     @property
@@ -80,9 +84,21 @@ class Judgement:
 
 
 def judge_case(case: Case, folder: Path, strict: bool = False) -> Judgement:
-    """Computes values, leaks and the verdict without controls."""
+    """Computes values, windows, leaks and the verdict without the controls of `controls`."""
     values = compute_values(case, folder)
-    return make_judgement(values, find_leaks(case, values["base"]), None, strict)
+    return make_judgement(values, find_leaks(case, values["base"]), None, strict, compute_windows(case, folder))
+
+
+def compute_windows(case: Case, folder: Path) -> Windows:
+    """Return the worst windows and the stated faults; those of an earlier run of the same case are read again."""
+    path, key = folder / "windows.json", f"{case_hash(case)} {windows_hash()}"
+    content = json.loads(path.read_text()) if path.exists() else {}
+    if content.get("schema") == WINDOWS_SCHEMA and content.get("key") == key:
+        return load_windows(content)
+    found = judge_windows(case.fresh())
+    write_json(path, {"schema": WINDOWS_SCHEMA, "key": key, **dump_windows(found)}, digits=17)
+    release_memory()
+    return found
 
 
 def compute_values(case: Case, folder: Path) -> dict[str, Values]:
@@ -132,14 +148,19 @@ def geometry_categories() -> tuple[str, ...]:
 
 
 def make_judgement(
-    values: dict[str, Values], leaks: list[str], controls: list[dict[str, Any]] | None = None, strict: bool = False
+    values: dict[str, Values],
+    leaks: list[str],
+    controls: list[dict[str, Any]] | None = None,
+    strict: bool = False,
+    windows: Windows | None = None,
 ) -> Judgement:
-    """Return the verdict over values, leaks and, where they were run, controls."""
+    """Return the verdict over values, leaks, windows and, where they were run, controls."""
     scored = {name: scoring.score_all(entry, strict=strict) for name, entry in values.items()}
     skill = median_skill(values["base"], values)
     rows = controls or []
     reasons = scoring.reasons_against(scored["base"], scored["null"], skill, undetected(rows), loud(rows), leaks)
-    return Judgement(values, scored, skill, leaks, reasons)
+    found = windows or Windows()
+    return Judgement(values, scored, skill, leaks, found.reasons() + reasons, windows=found)
 
 
 def add_outside(judgement: Judgement, case: Case, folder: Path, strict: bool = False) -> Judgement:

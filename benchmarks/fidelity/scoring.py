@@ -173,9 +173,10 @@ def reasons_against(
 
 
 def constants() -> dict[str, Any]:
-    """Return everything frozen that a verdict depends on: metric table, gates, limits, controls, leak detector."""
+    """Return everything frozen that a verdict depends on: metrics, gates, limits, controls, leaks, windows."""
     from benchmarks.fidelity import judge
-    from benchmarks.fidelity.controls import catalogue, runner
+    from benchmarks.fidelity.controls import catalogue, local, runner
+    from benchmarks.fidelity.windows import measures
 
     limits = {name: value for name, value in globals().items() if name.isupper()}
     return {
@@ -187,6 +188,8 @@ def constants() -> dict[str, Any]:
         } | {"global": [catalogue.GLOBAL_LIMIT, catalogue.THINNED_LIMIT]},
         "quiet": [runner.QUIET, runner.MONOTONE, list(runner.KINDS)],
         "leaks": [list(judge.NOISE_BAND), judge.MEDIAN_FLOOR],
+        "windows": measures.limits(),
+        "faults": {name: asdict(one) for name, one in local.stated_faults(100.0).items()},
     }  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from scipy.spatial import cKDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -127,10 +127,21 @@ def sample_surface(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray
 
 def visible_mesh(candidate: Candidate) -> trimesh.Trimesh:
     """Return everything that a sensor can see of a candidate: lining, nails, track, bed, extra surfaces."""
+    return concatenate_meshes([part for part in _visible(candidate).values() if len(part.faces)])
+
+
+def visible_parts(candidate: Candidate) -> Shaped[np.ndarray, " f"]:
+    """Return the name of the part that each face of `visible_mesh` belongs to."""
+    parts = _visible(candidate)
+    return np.repeat(list(parts), [len(part.faces) for part in parts.values()])
+
+
+def _visible(candidate: Candidate) -> dict[str, trimesh.Trimesh]:
     track = candidate.track
-    laid = [track.sleeper_mesh, track.rail_mesh, track.fastening_mesh]
-    parts = [candidate.lining, *laid, candidate.extra, candidate.nails, candidate.bed]
-    return concatenate_meshes([part for part in parts if len(part.faces)])
+    return {
+        "lining": candidate.lining, "sleeper": track.sleeper_mesh, "rail": track.rail_mesh,
+        "fastening": track.fastening_mesh, "extra": candidate.extra, "nail": candidate.nails, "bed": candidate.bed,
+    }  # fmt: skip
 
 
 @kept_until("NAV")

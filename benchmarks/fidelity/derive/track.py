@@ -22,7 +22,14 @@ _GAUGE_STEP = 0.5  # m
 def measure_gauge(
     curve: Curve, mesh: trimesh.Trimesh, left: Float[np.ndarray, "k 3"], right: Float[np.ndarray, "k 3"]
 ) -> Float[np.ndarray, " n"]:
-    """Measures the distance between the inner faces of the rails, every half metre, m.
+    """Return the distance between the inner faces of the rails, every half metre; see `gauge_along`."""
+    return gauge_along(curve, mesh, left, right)[1]
+
+
+def gauge_along(
+    curve: Curve, mesh: trimesh.Trimesh, left: Float[np.ndarray, "k 3"], right: Float[np.ndarray, "k 3"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Measures stations, and the distance between the inner faces of the rails there, every half metre, m.
 
     Args:
         curve: Curve along which the rails lie.
@@ -35,7 +42,7 @@ def measure_gauge(
     """
     if min(len(left), len(right)) < 2 or not len(mesh.faces):
         raise ValueError("there are no two rails")
-    tops = [_sort_along(curve, rail) for rail in (left, right)]
+    tops = [sort_along(curve, rail) for rail in (left, right)]
     start, end = max(top[0, 0] for top in tops), min(top[-1, 0] for top in tops)
     station = np.arange(start + 0.13, end - 0.1, _GAUGE_STEP)
     ends = [
@@ -48,13 +55,13 @@ def measure_gauge(
     middle = (ends[0] + ends[1]) / 2 - BELOW_TOP * up
     caster = Caster(mesh)
     reach = caster.first(middle, across)[0] + caster.first(middle, -across)[0]
-    reach = reach[np.isfinite(reach)]
-    if not len(reach):
+    met = np.isfinite(reach)
+    if not met.any():
         raise ValueError("no ray between the rails meets both")
-    return reach
+    return station[met], reach[met]
 
 
-def _sort_along(curve: Curve, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
+def sort_along(curve: Curve, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
     """Return station, left and up of points, in order of station."""
     local = curve.local(points)
     return local[np.argsort(local[:, 0], kind="stable")]
@@ -228,13 +235,13 @@ _HALF_SPACING = 0.3  # m; half a spacing
 def candidate_sleepers(case: Case) -> Float[np.ndarray, "s 3"]:
     """Return the candidate's sleepers in the known stretch of the reference, in its coordinates, by station, m."""
     reference = reference_railway(case)
-    local = _sort_along(reference.curve, case.candidate.track.sleeper)
+    local = sort_along(reference.curve, case.candidate.track.sleeper)
     return local[(local[:, 0] > reference.start - _HALF_SPACING) & (local[:, 0] < reference.end + _HALF_SPACING)]
 
 
 def reference_sleepers(reference: Railway) -> Float[np.ndarray, "s 3"]:
     """Return the reference's sleepers in its coordinates, by station, m."""
-    return _sort_along(reference.curve, reference.sleeper)
+    return sort_along(reference.curve, reference.sleeper)
 
 
 def sleeper_spacings(sleeper: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, " d"]:
@@ -264,7 +271,7 @@ def rail_offsets(case: Case) -> Float[np.ndarray, "k 3"]:
     station = (real[0][:, 0] + real[1][:, 0]) / 2
     judged = []
     for side in ("left", "right"):
-        local = _sort_along(reference.curve, rail[side])
+        local = sort_along(reference.curve, rail[side])
         known = (station >= local[0, 0]) & (station <= local[-1, 0])
         judged.append([np.where(known, np.interp(station, local[:, 0], local[:, k]), np.nan) for k in (1, 2)])
     gap = np.mean(judged, axis=0).T - (real[0] + real[1])[:, 1:] / 2

@@ -1,0 +1,137 @@
+"""Commands on windows alone, which take seconds: judge a scene, set the limits, put in faults at random."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.fidelity.case import Case, case_hash
+from benchmarks.fidelity.controls import chance
+from benchmarks.fidelity.files import FidelityError, read_json, write_json
+from benchmarks.fidelity.impostors import truth_candidate
+from benchmarks.fidelity.inputs import Inputs, complete_inputs, read_case
+from benchmarks.fidelity.windows.judge import dump_windows, judge_windows, windows_hash, worst_windows
+from benchmarks.fidelity.windows.measures import LIMITS, MEASURES, Series
+from subterra_jax.host.files import require_folder
+
+SCHEMA = "subterra.fidelity-windows/1"
+LIMITS_SCHEMA = "subterra.fidelity-limits/1"
+PERCENTILE = 99.9  # of the windows of calibration surveys in which nothing is wrong
+MARGIN = 1.5  # times that
+FEWEST = 3  # surveys
+
+
+@dataclass(frozen=True)
+class FaultsConfig(Inputs):
+    """Faults to draw.
+
+    Attributes:
+        count: Number of faults.
+        draw: Seed that draws them.
+        kinds: Kinds to draw from; all where empty.
+        join: Output folders of earlier runs on other scenes, whose faults join table and figure.
+    """
+
+    count: int = 200
+    draw: int = 0
+    kinds: tuple[str, ...] = ()
+    join: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class LimitsConfig:
+    """Evidence for the limits.
+
+    Attributes:
+        runs: Output folders of `windows` on simulated surveys with `--truth`.
+        out: File to write.
+    """
+
+    runs: tuple[Path, ...]
+    out: Path = LIMITS
+
+
+def run_windows(inputs: Inputs) -> None:
+    """Judges a scene by its worst windows alone, in seconds.
+
+    Example: python -m benchmarks.fidelity windows --scene build/tunnel --recording held.bag --trajectory poses.tum
+    """
+    require_folder(inputs.out)
+    case = read_case(complete_inputs(inputs))
+    if case.hold is None and case.truth is None:
+        raise FidelityError("windows need a reference: give --recording with --trajectory, or --truth")
+    found = judge_windows(case)
+    candidates = {"base": case}
+    if case.truth is not None:
+        candidates["ceiling"] = replace(case, candidate=truth_candidate(case.truth, case.candidate), cache={})
+    content = {
+        "schema": SCHEMA, "key": f"{case_hash(case)} {windows_hash()}", **dump_windows(found),
+        "series": {name: _series(one) for name, one in candidates.items()},
+    }  # fmt: skip
+    write_json(inputs.out / "windows.json", content, digits=17)
+    reasons = found.reasons()
+    print(f"windows of {case.candidate.name}: {'FAIL' if reasons else 'PASS'}")
+    for reason in reasons:
+        print(f"  {reason}")
+
+
+def _series(case: Case) -> dict[str, dict[str, list[float | None]]]:
+    kept: dict[str, Series] = {}
+    worst_windows(case, kept)
+    return {
+        name: {"start": one.start.tolist(), "value": [v if np.isfinite(v) else None for v in one.value.tolist()]}
+        for name, one in kept.items()
+    }
+
+
+def run_limits(config: LimitsConfig) -> None:
+    """Sets the limits of windows from simulated surveys in which nothing is wrong.
+
+    Example: python -m benchmarks.fidelity limits --runs out/a out/b out/c
+
+    Raises:
+        FidelityError: Fewer than three surveys, or a folder without their results.
+    """
+    if len(config.runs) < FEWEST:
+        raise FidelityError(f"limits need {FEWEST} simulated surveys, {len(config.runs)} were given")
+    values: dict[str, list[float]] = {}
+    for folder in config.runs:
+        content = read_json(folder / "windows.json", SCHEMA)
+        if "ceiling" not in content.get("series", {}):
+            raise FidelityError(f"{folder}: was judged without --truth, so nothing says that nothing is wrong there")
+        for series in content["series"].values():
+            for name, one in series.items():
+                values.setdefault(name, []).extend(v for v in one["value"] if v is not None)
+    frozen = {}
+    for one in MEASURES:
+        for source in ("recording", "truth"):
+            if known := values.get(f"{one.id}.{source}"):
+                usual = float(np.percentile(known, PERCENTILE))
+                limit = float(np.clip(MARGIN * usual, one.floor, one.gate))
+                frozen[f"{one.id}.{source}"] = {"limit": round(limit, 4), "p999": round(usual, 5), "windows": len(known)}
+    surveys = sorted(folder.name for folder in config.runs)
+    write_json(config.out, {"schema": LIMITS_SCHEMA, "surveys": surveys, "limits": frozen})
+    print(f"{config.out}: {len(frozen)} limits from {len(surveys)} surveys")
+
+
+def run_faults(config: FaultsConfig) -> None:
+    """Puts in faults of random kind, place, length and size, and says which the windows notice.
+
+    Finished ones are kept in `--out`: the same command goes on where it was cut short.
+
+    Example: python -m benchmarks.fidelity faults --count 200 --scene build/tunnel --truth build/survey
+    """
+    chance.check_draw(config.count, config.draw, config.kinds)
+    earlier = [row for folder in config.join for row in chance.read_rows(folder)]
+    require_folder(config.out)
+    case = read_case(complete_inputs(config))
+    if case.hold is None and case.truth is None:
+        raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
+    rows = chance.run_faults(case, config.count, config.draw, config.kinds, config.out)
+    summary = chance.write_curves(config.out, rows + earlier)
+    noticed = sum(bool(row["by"]) for row in rows)
+    print(f"{case.candidate.name}: {noticed} of {len(rows)} faults noticed; {config.out / 'curves.csv'} over "
+          f"{len(rows) + len(earlier)}")  # fmt: skip
+    for kind in summary:
+        size = "not reached" if kind["size_95"] is None else f"{kind['size_95']:.3g} {kind['unit']}"
+        print(f"  {kind['kind']}: {kind['noticed']} of {kind['count']}; 95 % from {size}")

@@ -1,0 +1,207 @@
+"""Unrolled maps: how far the candidate's surface lies from held-out points or truth, by station and angle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from benchmarks.fidelity.candidate import concatenate_meshes
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.derive.beams import cast_beams, observed_extent, returns, sensor_path
+from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian, truth_curve
+from benchmarks.fidelity.derive.sections import truth_bore_caster
+from benchmarks.fidelity.derive.surface import Caster, visible_parts
+
+CELL = 0.5  # m along the tunnel
+SECTORS = 72  # cells around it, of 5 degrees
+CAP = 0.5  # m; larger offsets count as this
+LEAST = 3  # returns that make a cell known
+FINE = 0.05  # m along the tunnel between rays of a relief
+COLUMNS = 216  # rays of a relief around the tunnel
+TRACK_SIDE = np.deg2rad(50.0)  # from straight down: what lies there may be track
+_STEEPEST = np.cos(np.deg2rad(80.0))  # beams that graze more steeply say little about where a surface is
+_MOUTH = 0.5  # m at the mouths that the truth's rays leave out
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """Radius of the reference about the middle of its section, and what the candidate's surface lies beyond it.
+
+    Attributes:
+        curve: Curve that stations count along.
+        middle: Middle of the section to the left of and above the curve, m.
+        low: Station where the first cells begin, m.
+        radius: Median radius of the reference, m; NaN where it is not known, `(n, SECTORS)`.
+        offset: Median offset of the candidate, m, outward positive; NaN where it is not known, `(n, SECTORS)`.
+    """
+
+    curve: Curve
+    middle: tuple[float, float]
+    low: float
+    radius: Float[np.ndarray, "n m"]
+    offset: Float[np.ndarray, "n m"]
+
+    def place(self, station: float) -> Float[np.ndarray, "3"]:
+        """Return the middle of the section at a station, tunnel frame, m."""
+        return self.curve.point(np.array([[station, *self.middle]]))[0]
+
+
+def sector_angles(count: int = SECTORS) -> Float[np.ndarray, " m"]:
+    """Return the middle angles of the sectors, from left towards up, rad."""
+    return (np.arange(count) + 0.5) * 2.0 * np.pi / count - np.pi
+
+
+def is_floor(angle: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
+    """Return True for directions in which track may lie."""
+    return np.cos(angle + np.pi / 2) > np.cos(TRACK_SIDE)
+
+
+# By the held-out recording.
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Held-out returns about the middle of the section, along the sensor's path.
+
+    Attributes:
+        local: Station along the path, left and up of the section's middle, m, `(n, 3)`.
+        angle: Angle about the middle from left towards up, rad, `(n,)`.
+        middle: Middle of the section to the left of and above the path, m.
+        low, high: Stations between which returns lie, m.
+        cell: Number of the cell of each return; -1 outside these stations, `(n,)`.
+    """
+
+    local: Float[np.ndarray, "n 3"]
+    angle: Float[np.ndarray, " n"]
+    middle: tuple[float, float]
+    low: float
+    high: float
+    cell: Int[np.ndarray, " n"]
+
+    @property
+    def rows(self) -> int:
+        """Number of cells along the tunnel."""
+        return max(int((self.high - self.low) / CELL), 1)
+
+
+@per_hold
+def hold_frame(case: Case) -> Frame:
+    """Return the frame of the held-out returns; the middle lies half way between their extremes, strays left out."""
+    low, high = observed_extent(case)
+    local = returns(case).local.copy()
+    inside = (local[:, 0] > low) & (local[:, 0] < high)
+    middle = np.percentile(local[inside, 1:], [0.5, 99.5], axis=0).mean(axis=0)
+    local[:, 1:] -= middle
+    angle = np.arctan2(local[:, 2], local[:, 1])
+    row = np.floor((local[:, 0] - low) / CELL).astype(int)
+    column = ((angle + np.pi) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
+    cell = np.where((row >= 0) & (row < max(int((high - low) / CELL), 1)), row * SECTORS + column, -1)
+    return Frame(local, angle, (float(middle[0]), float(middle[1])), low, high, cell)
+
+
+@kept_until("LIN")
+@per_case
+def beam_offsets(case: Case) -> Float[np.ndarray, " n"]:
+    """Return the offset of the candidate's surface along its normal at each return, m; NaN where a beam only grazes it.
+
+    Positive where the candidate lies beyond the return. A beam that leaves the candidate counts as `CAP`.
+    """
+    cast = cast_beams(case)
+    offset = np.where(cast.hit, np.where(cast.hit, cast.difference, 0.0) * cast.cosine, CAP)
+    return np.where(~cast.hit | (cast.cosine > _STEEPEST), np.clip(offset, -CAP, CAP), np.nan)
+
+
+@kept_until("LIN")
+@per_case
+def parts_hit(case: Case) -> np.ndarray:
+    """Return the name of the candidate's part that each beam meets; empty where it meets nothing, `(n,)`."""
+    face = cast_beams(case).face
+    return np.where(face >= 0, visible_parts(case.candidate)[face], "")
+
+
+@per_case
+def hold_map(case: Case) -> Unrolled:
+    """Return the map against the held-out returns; those on the candidate's track are left out."""
+    frame, offset = hold_frame(case), beam_offsets(case)
+    off_track = ~np.isin(parts_hit(case), ("sleeper", "rail", "fastening"))
+    shape = (frame.rows, SECTORS)
+
+    def medians(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return grouped_median(frame.cell[rows], values[rows], shape[0] * shape[1], LEAST).reshape(shape)
+
+    known = (frame.cell >= 0) & off_track
+    radius = medians(known, np.hypot(frame.local[:, 1], frame.local[:, 2]))
+    return Unrolled(sensor_path(case), frame.middle, frame.low, radius, medians(known & np.isfinite(offset), offset))
+
+
+# By the truth.
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Radii of one surface about a curve: rows every `FINE` metres, columns every `COLUMNS`-th of a turn.
+
+    Attributes:
+        station: m, `(n,)`.
+        radius: m; NaN where a ray meets nothing, `(n, COLUMNS)`.
+    """
+
+    station: Float[np.ndarray, " n"]
+    radius: Float[np.ndarray, "n m"]
+
+
+def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], low: float, high: float) -> Relief:
+    """Casts rays from the middle of the section, in the sections' planes."""
+    station, angle = np.arange(low + FINE / 2, high, FINE), sector_angles(COLUMNS)
+    position, _, left, up = curve.frames(station)
+    origin = np.repeat(position + middle[0] * left + middle[1] * up, COLUMNS, axis=0)
+    away = np.cos(angle)[:, None] * left[:, None] + np.sin(angle)[:, None] * up[:, None]
+    reach, _ = caster.first(origin, away.reshape(-1, 3))
+    return Relief(station, np.where(np.isfinite(reach), reach, np.nan).reshape(len(station), COLUMNS))
+
+
+@kept_until("LIN")
+@per_case
+def bore_caster(case: Case) -> Caster:
+    """Return the caster of rays into lining, bed and further bodies of the candidate, without its track."""
+    one = case.candidate
+    return Caster(concatenate_meshes([part for part in (one.lining, one.bed, one.extra) if len(part.faces)]))
+
+
+@per_truth
+def truth_relief(case: Case) -> Relief:
+    """Return the relief of the true bore about its own axis."""
+    curve = truth_curve(case)
+    return cast_relief(truth_bore_caster(case), curve, (0.0, 0.0), _MOUTH, curve.length - _MOUTH)
+
+
+@per_case
+def relief_on_truth(case: Case) -> Relief:
+    """Return the relief of the candidate about the true axis."""
+    curve = truth_curve(case)
+    return cast_relief(bore_caster(case), curve, (0.0, 0.0), _MOUTH, curve.length - _MOUTH)
+
+
+@per_case
+def relief_on_path(case: Case) -> Relief:
+    """Return the relief of the candidate along the sensor's path."""
+    frame = hold_frame(case)
+    return cast_relief(bore_caster(case), sensor_path(case), frame.middle, frame.low, frame.high)
+
+
+def relief_cells(relief: Relief, values: Float[np.ndarray, "n m"] | None = None) -> Float[np.ndarray, "k s"]:
+    """Return the medians of a relief, or of other values on its grid, in the cells of a map."""
+    rows, columns = round(CELL / FINE), COLUMNS // SECTORS
+    grid = relief.radius if values is None else values
+    count = len(grid) // rows
+    blocks = grid[: count * rows].reshape(count, rows, SECTORS, columns)
+    return nanmedian(blocks.transpose(0, 2, 1, 3).reshape(count, SECTORS, -1))
+
+
+@per_case
+def truth_map(case: Case) -> Unrolled:
+    """Return the map against the truth; where the candidate is open it counts as `CAP` too far."""
+    real, judged = truth_relief(case), relief_on_truth(case)
+    offset = np.where(np.isfinite(judged.radius), judged.radius - real.radius, CAP)
+    offset = np.where(np.isfinite(real.radius), np.clip(offset, -CAP, CAP), np.nan)
+    return Unrolled(truth_curve(case), (0.0, 0.0), _MOUTH, relief_cells(real), relief_cells(real, offset))

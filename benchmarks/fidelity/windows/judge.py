@@ -1,0 +1,195 @@
+"""The worst windows of a case, the reasons that they give, and the stated faults that they must notice."""
+
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.controls.local import make_ground, spoil, stated_faults
+from benchmarks.fidelity.derive.curve import candidate_curve
+from benchmarks.fidelity.windows.measures import LIMITS, MEASURES, Measure, Series, Source, limits, sources, unrolled
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The worst window of one measure.
+
+    Attributes:
+        id: Measure.
+        words: Measure for people.
+        source: `recording` or `truth`.
+        unit: Unit of value and limit.
+        value: Value there; `None` where nothing could be judged.
+        limit: Largest value that passes.
+        start, end: Stations of the window on the candidate's centreline, m; `None` without a value.
+        where: Part of the section; empty for all of it.
+        judged: Share of the windows that have a value.
+        error: Cause why there is no value, if the computation broke.
+    """
+
+    id: str
+    words: str
+    source: Source
+    unit: str
+    value: float | None
+    limit: float
+    start: float | None = None
+    end: float | None = None
+    where: str = ""
+    judged: float = 0.0
+    error: str = ""
+
+    @property
+    def beyond(self) -> bool:
+        """True where the window fails; a computation that broke on the candidate fails too."""
+        return bool(self.error) or (self.value is not None and self.value > self.limit)
+
+    def sentence(self) -> str:
+        """Return value, limit and place in words."""
+        if self.error:
+            return f"window {self.id} (against the {self.source}) could not be computed: {self.error}"
+        assert self.value is not None
+        factor, unit, digits = (100.0, " cm", 1) if self.unit == "m" else (1.0, "", 2)
+        if self.id.startswith("gauge"):
+            factor, unit = 1000.0, " mm"
+        place = f" at the {self.where}" if self.where else ""
+        return (
+            f"window {self.id}: {self.words}{place} is {factor * self.value:.{digits}f}{unit} from station "
+            f"{self.start:.0f} to {self.end:.0f} m against the {self.source}; {factor * self.limit:.{digits}f}{unit} "
+            "is the limit"
+        )
+
+
+def worst_windows(case: Case, series: dict[str, Series] | None = None) -> list[Worst]:
+    """Return the worst window of every measure against every reference of the case; empty without a reference.
+
+    Args:
+        case: Candidate and references.
+        series: Filled with the values of all windows by `id.source`, where given.
+    """
+    return [_worst(case, one, source, series) for source in sources(case) for one in MEASURES]
+
+
+def _worst(case: Case, one: Measure, source: Source, kept: dict[str, Series] | None) -> Worst:
+    limit = limits()[f"{one.id}.{source}"]
+    try:
+        series = one.compute(case, source)
+        if kept is not None:
+            kept[f"{one.id}.{source}"] = series
+    except Exception as error:  # a spoilt candidate may break any library
+        return Worst(one.id, one.words, source, one.unit, None, limit, error=f"{type(error).__name__}: {error}"[:200])
+    if not np.isfinite(series.value).any():
+        return Worst(one.id, one.words, source, one.unit, None, limit)
+    k = int(np.nanargmax(series.value))
+    start, end = stations_on_candidate(case, source, series, k)
+    return Worst(
+        one.id, one.words, source, one.unit, float(series.value[k]), limit, start, end, series.where[k], series.judged
+    )
+
+
+def stations_on_candidate(case: Case, source: Source, series: Series, k: int) -> tuple[float, float]:
+    """Return start and end of a window as stations of the candidate's centreline, the smaller first, m."""
+    one = unrolled(case, source)
+    ends = np.array([one.place(series.start[k]), one.place(series.start[k] + series.window)])
+    low, high = np.sort(candidate_curve(case).local(ends)[:, 0])
+    return float(np.clip(low, 0.0, case.candidate.length)), float(np.clip(high, 0.0, case.candidate.length))
+
+
+# Faults that are put in, and must be noticed, before a verdict may be PASS.
+
+
+@dataclass(frozen=True)
+class Noticed:
+    """A stated fault, put into the candidate.
+
+    Attributes:
+        name: Fault in words.
+        by: Windows `id.source` that are beyond their limits with it and not without it.
+        needed: False where nothing at hand could show it: a gauge without a truth, a mirror where left is as right.
+    """
+
+    name: str
+    by: tuple[str, ...]
+    needed: bool = True
+
+
+def notice_faults(case: Case, before: list[Worst]) -> list[Noticed]:
+    """Puts the stated faults into the candidate, one at a time, and says which windows notice them.
+
+    Args:
+        case: Case of the candidate as it is.
+        before: Its worst windows.
+    """
+    if not sources(case):
+        return []
+    ground, judged = make_ground(case.candidate), {f"{one.id}.{one.source}" for one in before if one.value is not None}
+    result = []
+    for name, fault in stated_faults(case.candidate.length).items():
+        if fault.kind in ("rails", "gauge") and not len(case.candidate.track.rail_mesh.faces):
+            continue
+        shows = {"gauge": ("gauge.truth",), "mirror": ("hand.truth", "hand.recording")}.get(fault.kind)
+        needed = shows is None or bool(judged & set(shows))
+        result.append(Noticed(name, noticed_by(case, spoil(ground, fault), before), needed))
+    return result
+
+
+def noticed_by(case: Case, spoilt: Candidate, before: list[Worst]) -> tuple[str, ...]:
+    """Return the windows that are beyond their limits for a spoilt candidate and were not before, `id.source`."""
+    known = {(one.id, one.source) for one in before if one.beyond}
+    after = worst_windows(replace(case, candidate=spoilt, cache={}))
+    return tuple(f"{one.id}.{one.source}" for one in after if one.beyond and (one.id, one.source) not in known)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """What windows say about a candidate.
+
+    Attributes:
+        worst: The worst window of each measure.
+        noticed: The stated faults; empty where they were not put in.
+    """
+
+    worst: tuple[Worst, ...] = ()
+    noticed: tuple[Noticed, ...] = ()
+
+    def reasons(self) -> list[str]:
+        """Return the reasons for FAIL, in sentences; empty for PASS."""
+        beyond = [one.sentence() for one in self.worst if one.beyond]
+        return beyond + [
+            f"the windows would not notice this fault here: {one.name}"
+            for one in self.noticed if one.needed and not one.by
+        ]  # fmt: skip
+
+
+def judge_windows(case: Case) -> Windows:
+    """Return the worst windows of a case, and whether they notice the stated faults."""
+    worst = worst_windows(case)
+    return Windows(tuple(worst), tuple(notice_faults(case, worst)))
+
+
+def dump_windows(found: Windows) -> dict[str, Any]:
+    """Return windows as plain data, with `beyond` for each."""
+    return {
+        "worst": [asdict(one) | {"beyond": one.beyond} for one in found.worst],
+        "faults": [asdict(one) for one in found.noticed],
+    }
+
+
+def load_windows(content: dict[str, Any]) -> Windows:
+    """Return the windows that `dump_windows` wrote."""
+    worst = ({key: value for key, value in row.items() if key != "beyond"} for row in content["worst"])
+    faults = ({**row, "by": tuple(row["by"])} for row in content["faults"])
+    return Windows(tuple(Worst(**row) for row in worst), tuple(Noticed(**row) for row in faults))
+
+
+def windows_hash() -> str:
+    """Return the SHA-256 of the code and limits that windows depend on."""
+    here = Path(__file__).parent
+    files = [*sorted(here.glob("*.py")), here.parent / "controls" / "local.py"]
+    digest = sha256(b"".join(file.read_bytes() for file in files))
+    digest.update(LIMITS.read_bytes() if LIMITS.exists() else b"")
+    return digest.hexdigest()

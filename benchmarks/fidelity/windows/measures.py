@@ -1,0 +1,228 @@
+"""Measures by window: values along the tunnel that a mean over all of it would hide, each with its limit."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.windows import track
+from benchmarks.fidelity.windows.deviation import (
+    CELL,
+    SECTORS,
+    Unrolled,
+    hold_map,
+    relief_on_path,
+    relief_on_truth,
+    sector_angles,
+    truth_map,
+)
+from benchmarks.fidelity.windows.shift import handedness, hold_shift, truth_shift
+from benchmarks.fidelity.windows.track import Profile
+
+LIMITS = Path(__file__).with_name("limits.json")
+Source = Literal["recording", "truth"]
+SHORT, LONG = 5.0, 10.0  # m, lengths of the windows
+STEP = 1.0  # m between the starts of windows
+OFF_CELL = 0.05  # m; a cell of the surface that is farther off counts as off
+PLACES = ("left wall", "left haunch", "crown", "right haunch", "right wall", "right foot", "floor", "left foot")
+_LEAST_CELLS = 0.15  # share of a window's cells that must be known
+_LEAST_SECTOR = 6  # known cells of a window that show a sector
+_LEAST_BEAMS = 20
+_FAINT = 0.0015  # m; where left and right differ by less, no side can be told
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values of one measure, window by window.
+
+    Attributes:
+        start: Starts of the windows along the source's own curve, m, `(n,)`.
+        value: Values; larger is worse, NaN where too little is known, `(n,)`.
+        where: Part of the section that each value belongs to; empty for all of it, `(n,)`.
+        window: Length of the windows, m.
+    """
+
+    start: Float[np.ndarray, " n"]
+    value: Float[np.ndarray, " n"]
+    where: tuple[str, ...]
+    window: float
+
+    @property
+    def judged(self) -> float:
+        """Share of the windows that have a value."""
+        return float(np.isfinite(self.value).mean()) if len(self.value) else 0.0
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A measure by window.
+
+    Attributes:
+        id: Name.
+        words: Name for people.
+        unit: `m` or `1`.
+        floor: Least limit: what a good reconstruction may have, whatever calibration finds.
+        gate: Largest limit, whatever calibration finds.
+        compute: Function from case and source to values.
+    """
+
+    id: str
+    words: str
+    unit: str
+    floor: float
+    gate: float
+    compute: Callable[[Case, Source], Series]
+
+
+def unrolled(case: Case, source: Source) -> Unrolled:
+    """Return the map of deviations against the held-out recording or the truth."""
+    return hold_map(case) if source == "recording" else truth_map(case)
+
+
+def _cells(offset: Float[np.ndarray, "n m"], low: float) -> Iterator[tuple[float, Float[np.ndarray, "k m"]]]:
+    """Yields start and cells of each short window; of one that is longer than the map, all of it."""
+    rows, step = round(SHORT / CELL), round(STEP / CELL)
+    for row in range(0, max(len(offset) - rows, 0) + 1, step):
+        yield low + row * CELL, offset[row : row + rows]
+
+
+def _by_cells(
+    statistic: Callable[[Float[np.ndarray, "k m"]], tuple[float, str]],
+) -> Callable[[Case, Source], Series]:
+    def compute(case: Case, source: Source) -> Series:
+        one = unrolled(case, source)
+        starts, values, places = [], [], []
+        for start, cells in _cells(one.offset, one.low):
+            known = np.isfinite(cells).mean() >= _LEAST_CELLS
+            value, place = statistic(cells) if known else (np.nan, "")
+            starts.append(start)
+            values.append(value)
+            places.append(place)
+        return Series(np.asarray(starts), np.asarray(values, float), tuple(places), SHORT)
+
+    return compute
+
+
+def _mean_magnitude(cells: np.ndarray) -> tuple[float, str]:
+    return float(np.nanmean(np.abs(cells))), ""
+
+
+def _share_off(cells: np.ndarray) -> tuple[float, str]:
+    return float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""
+
+
+def _worst_sector(cells: np.ndarray) -> tuple[float, str]:
+    octant = np.round(sector_angles() / (np.pi / 4)).astype(int) % 8
+    means = []
+    for k in range(8):
+        part = cells[:, octant == k]
+        part = part[np.isfinite(part)]
+        means.append(abs(float(part.mean())) if len(part) >= _LEAST_SECTOR else 0.0)
+    worst = int(np.argmax(means))
+    return means[worst], PLACES[worst]
+
+
+def _moved(direction: Float[np.ndarray, " m"]) -> Callable[[np.ndarray], tuple[float, str]]:
+    """Return the statistic that tells how far the whole section has moved along a direction."""
+
+    def statistic(cells: np.ndarray) -> tuple[float, str]:
+        by_sector = np.array([np.mean(c[np.isfinite(c)]) if np.isfinite(c).any() else np.nan for c in cells.T])
+        known = np.isfinite(by_sector)
+        weight = (direction[known] ** 2).sum()
+        if (direction[known] > 0.5).sum() < 3 or (direction[known] < -0.5).sum() < 3:
+            return np.nan, ""
+        return abs(float((by_sector[known] * direction[known]).sum() / weight)), ""
+
+    return statistic
+
+
+def _shift(case: Case, source: Source) -> Series:
+    one = unrolled(case, source)
+    length = len(one.offset) * CELL
+    starts = one.low + np.arange(0.0, max(length - LONG, 0.0) + 1e-6, STEP)
+    found = (hold_shift if source == "recording" else truth_shift)(case, starts, LONG)
+    return Series(starts, np.abs(found), ("",) * len(starts), LONG)
+
+
+def _hand(case: Case, source: Source) -> Series:
+    one = unrolled(case, source)
+    agreement, size = handedness(one, relief_on_path(case) if source == "recording" else relief_on_truth(case))
+    value = np.nan if size < _FAINT else 1.0 - agreement
+    return Series(np.array([one.low]), np.array([value]), ("",), len(one.offset) * CELL)
+
+
+def _by_profile(
+    true: Callable[[Case], Profile] | None,
+    seen: Callable[[Case], Profile] | None,
+    statistic: Callable[[np.ndarray], float],
+    window: float,
+    least: int = _LEAST_BEAMS,
+) -> Callable[[Case, Source], Series]:
+    def compute(case: Case, source: Source) -> Series:
+        read = true if source == "truth" else seen
+        profile = track.NOTHING if read is None else read(case)
+        if not len(profile.station):
+            return Series(np.empty(0), np.empty(0), (), window)
+        low, high = profile.station.min(), profile.station.max()
+        starts = low + np.arange(0.0, max(high - low - window, 0.0) + 1e-6, STEP)
+        order = np.argsort(profile.station, kind="stable")
+        bounds = np.searchsorted(profile.station[order], [starts, starts + window])
+        values = [
+            abs(statistic(profile.value[order[a:b]])) if b - a >= least else np.nan for a, b in bounds.T
+        ]
+        return Series(starts, np.asarray(values, float), ("",) * len(starts), window)
+
+    return compute
+
+
+def _gauge_change(case: Case) -> Profile:
+    profile = track.true_gauge_error(case)
+    return Profile(profile.station, profile.value - np.median(profile.value)) if len(profile.value) else profile
+
+
+def _root_mean_square(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+_ANGLE = sector_angles(SECTORS)
+MEASURES = tuple(Measure(*row) for row in (
+    ("wall", "mean distance of the walls", "m", 0.02, 0.05, _by_cells(_mean_magnitude)),
+    ("sector", "mean offset of one part of the section", "m", 0.03, 0.08, _by_cells(_worst_sector)),
+    ("aside", "section moved to one side", "m", 0.025, 0.05, _by_cells(_moved(np.cos(_ANGLE)))),
+    ("lift", "section moved up or down", "m", 0.03, 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
+    ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.02, 0.2, _by_cells(_share_off)),
+    ("shift", "relief of the walls moved along the tunnel", "m", 0.08, 0.15, _shift),
+    ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 0.7, 1.0, _hand),
+    ("gauge", "error of the gauge", "m", 0.004, 0.006, _by_profile(track.true_gauge_error, None, np.mean, LONG, 8)),
+    ("gauge_change", "gauge against that of the whole track", "m", 0.002, 0.004,
+     _by_profile(_gauge_change, None, np.mean, LONG, 8)),
+    ("rail_aside", "track moved to one side", "m", 0.015, 0.03,
+     _by_profile(lambda case: track.true_rail_offsets(case)[0], track.seen_rail_side, np.median, SHORT, 8)),
+    ("rail_height", "rails above or below their place", "m", 0.012, 0.02,
+     _by_profile(lambda case: track.true_rail_offsets(case)[1], track.seen_rail_height, np.median, SHORT, 8)),
+    ("bed", "height of bed and sleepers, root mean square", "m", 0.03, 0.05,
+     _by_profile(track.true_bed_error, track.seen_bed_error, _root_mean_square, SHORT, 15)),
+))  # fmt: skip
+
+
+@cache
+def limits() -> dict[str, float]:
+    """Return the frozen limits by `id.source`; without a calibration the gates."""
+    frozen = json.loads(LIMITS.read_text())["limits"] if LIMITS.exists() else {}
+    return {
+        f"{one.id}.{source}": frozen.get(f"{one.id}.{source}", {}).get("limit", one.gate)
+        for one in MEASURES
+        for source in ("recording", "truth")
+    }
+
+
+def sources(case: Case) -> tuple[Source, ...]:
+    """Return what the case can be judged by."""
+    both: tuple[tuple[Source, object], ...] = (("recording", case.hold), ("truth", case.truth))
+    return tuple(name for name, reference in both if reference is not None)

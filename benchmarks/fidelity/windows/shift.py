@@ -1,0 +1,164 @@
+"""Shift along the tunnel by window, and which side is left, from the relief of the walls."""
+
+import numpy as np
+from jaxtyping import Float
+
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.curve import nanmedian
+from benchmarks.fidelity.windows.deviation import (
+    COLUMNS,
+    FINE,
+    SECTORS,
+    Relief,
+    Unrolled,
+    hold_frame,
+    is_floor,
+    parts_hit,
+    relief_cells,
+    relief_on_path,
+    relief_on_truth,
+    sector_angles,
+    truth_relief,
+)
+
+REACH = 0.40  # m; largest shift that is looked for: a quarter of a ring, so that the next one is not taken for it
+_STEP = FINE  # m between shifts that are tried
+_DEEPEST = 0.10  # m; larger differences count as this
+_LEAST_CONTRAST = 0.0008  # m that the best shift must fit better than a wrong one
+_POINTS = 20_000
+_NUDGE = 0.01  # m
+
+
+def shift_by_window(
+    station: Float[np.ndarray, " n"],
+    angle: Float[np.ndarray, " n"],
+    radius: Float[np.ndarray, " n"],
+    judged: Relief,
+    starts: Float[np.ndarray, " k"],
+    window: float,
+) -> Float[np.ndarray, " k"]:
+    """Return how far the relief of the candidate lies along the tunnel from that of points, by window, m.
+
+    Both are taken about their medians in each of 72 directions of the window, so that a wall that is out as a whole
+    does not matter. NaN where the walls are too even to tell.
+
+    Args:
+        station: Station of the points, m.
+        angle: Angle of the points, rad.
+        radius: Distance of the points from the middle, m.
+        judged: Relief of the candidate about the same middle.
+        starts: Starts of the windows, m.
+        window: Their length, m.
+    """
+    order = np.argsort(station, kind="stable")
+    bounds = np.searchsorted(station[order], [starts, starts + window])
+    shifts = np.arange(-REACH, REACH + _STEP / 2, _STEP)
+    result = np.full(len(starts), np.nan)
+    for k, (first, last) in enumerate(bounds.T):
+        rows = order[first:last]
+        rows = rows[:: max(len(rows) // _POINTS, 1)]
+        if len(rows) < 500:
+            continue
+        errors = _misfits(station[rows], angle[rows], radius[rows], judged, starts[k], window, shifts)
+        best = int(np.argmin(errors))
+        if np.median(errors) - errors[best] < _LEAST_CONTRAST:
+            continue
+        result[k] = shifts[best] + _vertex(errors, best)
+    return result
+
+
+def _misfits(
+    station: np.ndarray, angle: np.ndarray, radius: np.ndarray, judged: Relief, start: float, window: float,
+    shifts: np.ndarray,
+) -> Float[np.ndarray, " s"]:  # fmt: skip
+    """Return the mean difference of both reliefs for each shift of the points, m."""
+    sector = ((angle + np.pi) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
+    column = ((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int) % COLUMNS
+    first = judged.station[0]
+    inside = (judged.station >= start) & (judged.station < start + window)
+    level = nanmedian(judged.radius[inside].reshape(-1, SECTORS, COLUMNS // SECTORS).transpose(1, 0, 2).reshape(SECTORS, -1))
+    own = np.full(SECTORS, np.nan)
+    for one in np.unique(sector):
+        own[one] = np.median(radius[sector == one])
+    relief = radius - own[sector]
+    errors = []
+    for shift in shifts:
+        row = np.round((station + shift - first) / FINE).astype(int)
+        within = (row >= 0) & (row < len(judged.station))
+        gap = relief[within] - (judged.radius[row[within], column[within]] - level[sector[within]])
+        errors.append(np.mean(np.minimum(np.abs(gap[np.isfinite(gap)]), _DEEPEST)))
+    return np.asarray(errors)
+
+
+def _vertex(errors: np.ndarray, best: int) -> float:
+    """Return the place of the least error beside the best shift, m, by a parabola."""
+    if not 0 < best < len(errors) - 1:
+        return 0.0
+    before, here, after = errors[best - 1 : best + 2]
+    bend = before - 2.0 * here + after
+    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5) * _STEP) if bend > 0.0 else 0.0
+
+
+def hold_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Float[np.ndarray, " k"]:
+    """Return the shift of the candidate against the held-out returns on its walls, m; ahead positive."""
+    frame = hold_frame(case)
+    wall = (frame.cell >= 0) & ~is_floor(frame.angle) & np.isin(parts_hit(case), ("lining", "nail"))
+    local = frame.local[wall]
+    radius = np.hypot(local[:, 1], local[:, 2])
+    return shift_by_window(local[:, 0], frame.angle[wall], radius, relief_on_path(case), starts, window)
+
+
+def truth_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Float[np.ndarray, " k"]:
+    """Return the shift of the candidate against the truth, m; ahead positive."""
+    real = truth_relief(case)
+    angle = sector_angles(COLUMNS)
+    wall = ~is_floor(angle)
+    station, around = np.meshgrid(real.station, angle[wall], indexing="ij")
+    radius = real.radius[:, wall]
+    known = np.isfinite(radius)
+    return shift_by_window(station[known], around[known], radius[known], relief_on_truth(case), starts, window)
+
+
+def handedness(unrolled: Unrolled, judged: Relief) -> tuple[float, float]:
+    """Return the correlation of what differs left from right in reference and candidate, and its size, m.
+
+    1 where each side is where it belongs, -1 in a mirror. What a sideways shift of the middle does to both is taken
+    out first. NaN where fewer than 50 cells are known on both sides.
+
+    Args:
+        unrolled: Map of the reference.
+        judged: Relief of the candidate about the same middle.
+    """
+    cells = relief_cells(judged)[: len(unrolled.radius)]
+    real, judged_side = _one_sided(unrolled.radius[: len(cells)]), _one_sided(cells)
+    known = np.isfinite(real) & np.isfinite(judged_side)
+    if known.sum() < 50:
+        return float("nan"), 0.0
+    return float(np.corrcoef(real[known], judged_side[known])[0, 1]), float(np.std(real[known]))
+
+
+def _one_sided(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n h"]:
+    """Return half the difference of left and right by cell, without each row's shift and each direction's median."""
+    angle = sector_angles()
+    left = np.flatnonzero((np.abs(angle) < np.pi / 2) & ~is_floor(angle))
+    mirror = np.argmin(np.abs(np.angle(np.exp(1j * (angle[None] - (np.pi - angle[left])[:, None])))), axis=1)
+    half = (radius[:, left] - radius[:, mirror]) / 2.0
+    template = _shift_template(nanmedian(radius.T), angle)[left]
+    known = np.isfinite(half) & np.isfinite(template)
+    weight = np.where(known, template**2, 0.0).sum(axis=1)
+    aside = np.where(known, half * template, 0.0).sum(axis=1) / np.maximum(weight, 1e-9)
+    half = np.clip(half - aside[:, None] * template, -_DEEPEST, _DEEPEST)
+    return half - nanmedian(half.T)[None]
+
+
+def _shift_template(radius: Float[np.ndarray, " m"], angle: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return by how much each radius of a section grows if the section moves to the left, m/m."""
+    known = np.isfinite(radius)
+    x, y = radius[known] * np.cos(angle[known]) + _NUDGE, radius[known] * np.sin(angle[known])
+    turned, grown = np.arctan2(y, x), np.hypot(x, y)
+    return np.where(known, (np.interp(angle, *_sorted(turned, grown), period=2.0 * np.pi) - radius) / _NUDGE, np.nan)
+
+
+def _sorted(key: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(key)
+    return key[order], values[order]
