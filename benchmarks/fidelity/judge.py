@@ -70,7 +70,7 @@ class Judgement:
     leaks: list[str]
     reasons: list[str]
     outside: dict[str, Scored] = field(default_factory=dict)
-    windows: Windows = Windows()
+    windows: Windows = field(default_factory=Windows)
 
     @property
     def verdict(self) -> str:

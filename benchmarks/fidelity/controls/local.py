@@ -3,12 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from benchmarks.fidelity.candidate import Candidate, Track, concatenate_meshes
+from benchmarks.fidelity.candidate import Candidate, concatenate_meshes
 from benchmarks.fidelity.controls.assets import place_box
 from benchmarks.fidelity.controls.shape import axis_of, find_bodies, without_faces
 from benchmarks.fidelity.derive.curve import Curve
@@ -77,7 +78,7 @@ class Ground:
             shift: Function from station, left and up to what is added to them; 0 leaves a vertex exactly alone.
             only: Meshes to move, and `rail` and `sleeper` for their points; all where `None`.
         """
-        changed = {
+        changed: dict[str, Any] = {
             name: trimesh.Trimesh(self._move(np.asarray(mesh.vertices, float), self.local[name], shift), mesh.faces,
                                   process=False)
             for name, mesh in self.meshes().items() if only is None or name in only
@@ -109,7 +110,7 @@ def make_ground(candidate: Candidate) -> Ground:
     fine = trimesh.remesh.subdivide_to_size(track.rail_mesh.vertices, track.rail_mesh.faces, _RAIL_EDGE, max_iter=20)
     rail = {side: _denser(points, line) for side, points in track.rail.items()}
     return Ground(replace(candidate, track=replace(
-        track, rail_mesh=trimesh.Trimesh(*fine, process=False), rail=rail,
+        track, rail_mesh=trimesh.Trimesh(fine[0], fine[1], process=False), rail=rail,
     )))  # fmt: skip
 
 
@@ -190,9 +191,7 @@ def _spread_rails(ground: Ground, fault: Fault) -> Candidate:
 
 
 def _lift_rails(ground: Ground, fault: Fault) -> Candidate:
-    return ground.moved(
-        lambda local: _columns(local, 2, fault.size * fault.share(local[:, 0])), RAILS
-    )
+    return ground.moved(lambda local: _columns(local, 2, fault.size * fault.share(local[:, 0])), RAILS)
 
 
 def _move_track(ground: Ground, fault: Fault) -> Candidate:
@@ -214,7 +213,7 @@ def _roll(ground: Ground, fault: Fault) -> Candidate:
 def _shift_sleepers(ground: Ground, fault: Fault) -> Candidate:
     """Moves sleepers with their fastenings along the track, each as a whole."""
     track, line = ground.candidate.track, ground.line
-    meshes = {}
+    meshes: dict[str, Any] = {}
     for name in ("sleeper_mesh", "fastening_mesh"):
         mesh = getattr(track, name)
         label, middle = find_bodies(mesh)
@@ -280,11 +279,9 @@ def _mirror(ground: Ground, fault: Fault) -> Candidate:
     """Exchanges left and right of everything."""
     mirrored = ground.moved(lambda local: _columns(local, 1, -2.0 * local[:, 1]))
     track = mirrored.track
-    flipped = {name: _inside_out(getattr(mirrored, name)) for name in _MESHES}
-    turned: Track = replace(
-        track, rail={"left": track.rail["right"], "right": track.rail["left"]},
-        **{name: _inside_out(getattr(track, name)) for name in _TRACK},
-    )  # fmt: skip
+    flipped: dict[str, Any] = {name: _inside_out(getattr(mirrored, name)) for name in _MESHES}
+    laid: dict[str, Any] = {name: _inside_out(getattr(track, name)) for name in _TRACK}
+    turned = replace(track, rail={"left": track.rail["right"], "right": track.rail["left"]}, **laid)
     return replace(mirrored, track=turned, **flipped)
 
 

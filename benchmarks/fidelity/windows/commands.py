@@ -108,7 +108,11 @@ def run_limits(config: LimitsConfig) -> None:
             if known := values.get(f"{one.id}.{source}"):
                 usual = float(np.percentile(known, PERCENTILE))
                 limit = float(np.clip(MARGIN * usual, one.floor, one.gate))
-                frozen[f"{one.id}.{source}"] = {"limit": round(limit, 4), "p999": round(usual, 5), "windows": len(known)}
+                frozen[f"{one.id}.{source}"] = {
+                    "limit": round(limit, 4),
+                    "p999": round(usual, 5),
+                    "windows": len(known),
+                }
     surveys = sorted(folder.name for folder in config.runs)
     write_json(config.out, {"schema": LIMITS_SCHEMA, "surveys": surveys, "limits": frozen})
     print(f"{config.out}: {len(frozen)} limits from {len(surveys)} surveys")

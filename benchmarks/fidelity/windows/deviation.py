@@ -15,7 +15,7 @@ from benchmarks.fidelity.derive.surface import Caster, visible_parts
 CELL = 0.5  # m along the tunnel
 SECTORS = 72  # cells around it, of 5 degrees
 CAP = 0.5  # m; larger offsets count as this
-LEAST = 3  # returns that make a cell known
+LEAST = 4  # returns that make a cell known
 FINE = 0.05  # m along the tunnel between rays of a relief
 COLUMNS = 216  # rays of a relief around the tunnel
 TRACK_SIDE = np.deg2rad(50.0)  # from straight down: what lies there may be track

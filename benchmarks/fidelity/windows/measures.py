@@ -17,6 +17,7 @@ from benchmarks.fidelity.windows.deviation import (
     SECTORS,
     Unrolled,
     hold_map,
+    relief_cells,
     relief_on_path,
     relief_on_truth,
     sector_angles,
@@ -27,14 +28,14 @@ from benchmarks.fidelity.windows.track import Profile
 
 LIMITS = Path(__file__).with_name("limits.json")
 Source = Literal["recording", "truth"]
-SHORT, LONG = 5.0, 10.0  # m, lengths of the windows
+SHORT, LONG, HAND = 5.0, 10.0, 30.0  # m, lengths of the windows
 STEP = 1.0  # m between the starts of windows
 OFF_CELL = 0.05  # m; a cell of the surface that is farther off counts as off
 PLACES = ("left wall", "left haunch", "crown", "right haunch", "right wall", "right foot", "floor", "left foot")
 _LEAST_CELLS = 0.15  # share of a window's cells that must be known
 _LEAST_SECTOR = 6  # known cells of a window that show a sector
 _LEAST_BEAMS = 20
-_FAINT = 0.0015  # m; where left and right differ by less, no side can be told
+_FAINT = 0.0015  # m; where left and right of the candidate differ by less, no side can be told
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,12 @@ def _share_off(cells: np.ndarray) -> tuple[float, str]:
     return float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""
 
 
+def _worst_spot(cells: np.ndarray) -> tuple[float, str]:
+    worst = np.unravel_index(np.nanargmax(np.abs(cells)), cells.shape)
+    octant = int(np.round(sector_angles()[worst[1]] / (np.pi / 4))) % 8
+    return abs(float(cells[worst])), PLACES[octant]
+
+
 def _worst_sector(cells: np.ndarray) -> tuple[float, str]:
     octant = np.round(sector_angles() / (np.pi / 4)).astype(int) % 8
     means = []
@@ -152,9 +159,14 @@ def _shift(case: Case, source: Source) -> Series:
 
 def _hand(case: Case, source: Source) -> Series:
     one = unrolled(case, source)
-    agreement, size = handedness(one, relief_on_path(case) if source == "recording" else relief_on_truth(case))
-    value = np.nan if size < _FAINT else 1.0 - agreement
-    return Series(np.array([one.low]), np.array([value]), ("",), len(one.offset) * CELL)
+    relief = relief_on_path(case) if source == "recording" else relief_on_truth(case)
+    judged = relief_cells(relief)
+    count = min(len(judged), len(one.radius))
+    rows, step = min(round(HAND / CELL), count), round(HAND / 3 / CELL)
+    firsts = np.arange(0, max(count - rows, 0) + 1, step)
+    pairs = [handedness(one.radius[k : k + rows], judged[k : k + rows]) for k in firsts]
+    values = [np.nan if size < _FAINT else 1.0 - agreement for agreement, size in pairs]
+    return Series(one.low + firsts * CELL, np.asarray(values, float), ("",) * len(firsts), rows * CELL)
 
 
 def _by_profile(
@@ -173,9 +185,7 @@ def _by_profile(
         starts = low + np.arange(0.0, max(high - low - window, 0.0) + 1e-6, STEP)
         order = np.argsort(profile.station, kind="stable")
         bounds = np.searchsorted(profile.station[order], [starts, starts + window])
-        values = [
-            abs(statistic(profile.value[order[a:b]])) if b - a >= least else np.nan for a, b in bounds.T
-        ]
+        values = [abs(statistic(profile.value[order[a:b]])) if b - a >= least else np.nan for a, b in bounds.T]
         return Series(starts, np.asarray(values, float), ("",) * len(starts), window)
 
     return compute
@@ -190,6 +200,10 @@ def _root_mean_square(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+def _mean_of_magnitudes(values: np.ndarray) -> float:
+    return float(np.mean(np.abs(values)))
+
+
 _ANGLE = sector_angles(SECTORS)
 MEASURES = tuple(Measure(*row) for row in (
     ("wall", "mean distance of the walls", "m", 0.02, 0.05, _by_cells(_mean_magnitude)),
@@ -197,8 +211,9 @@ MEASURES = tuple(Measure(*row) for row in (
     ("aside", "section moved to one side", "m", 0.025, 0.05, _by_cells(_moved(np.cos(_ANGLE)))),
     ("lift", "section moved up or down", "m", 0.03, 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
     ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.02, 0.2, _by_cells(_share_off)),
+    ("spot", f"one spot of {CELL:g} m by {360 // SECTORS:d} degrees", "m", 0.08, 0.3, _by_cells(_worst_spot)),
     ("shift", "relief of the walls moved along the tunnel", "m", 0.08, 0.15, _shift),
-    ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 0.7, 1.0, _hand),
+    ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 1.2, 1.2, _hand),
     ("gauge", "error of the gauge", "m", 0.004, 0.006, _by_profile(track.true_gauge_error, None, np.mean, LONG, 8)),
     ("gauge_change", "gauge against that of the whole track", "m", 0.002, 0.004,
      _by_profile(_gauge_change, None, np.mean, LONG, 8)),
@@ -208,6 +223,8 @@ MEASURES = tuple(Measure(*row) for row in (
      _by_profile(lambda case: track.true_rail_offsets(case)[1], track.seen_rail_height, np.median, SHORT, 8)),
     ("bed", "height of bed and sleepers, root mean square", "m", 0.03, 0.05,
      _by_profile(track.true_bed_error, track.seen_bed_error, _root_mean_square, SHORT, 15)),
+    ("pockets", "mean error of the pockets' depth", "m", 0.03, 0.06,
+     _by_profile(track.true_pocket_error, None, _mean_of_magnitudes, SHORT, 8)),
 ))  # fmt: skip
 
 

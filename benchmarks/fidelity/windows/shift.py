@@ -10,11 +10,9 @@ from benchmarks.fidelity.windows.deviation import (
     FINE,
     SECTORS,
     Relief,
-    Unrolled,
     hold_frame,
     is_floor,
     parts_hit,
-    relief_cells,
     relief_on_path,
     relief_on_truth,
     sector_angles,
@@ -26,6 +24,7 @@ _STEP = FINE  # m between shifts that are tried
 _DEEPEST = 0.10  # m; larger differences count as this
 _LEAST_CONTRAST = 0.0008  # m that the best shift must fit better than a wrong one
 _POINTS = 20_000
+_FEWEST_CELLS = 50
 _NUDGE = 0.01  # m
 
 
@@ -76,7 +75,9 @@ def _misfits(
     column = ((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int) % COLUMNS
     first = judged.station[0]
     inside = (judged.station >= start) & (judged.station < start + window)
-    level = nanmedian(judged.radius[inside].reshape(-1, SECTORS, COLUMNS // SECTORS).transpose(1, 0, 2).reshape(SECTORS, -1))
+    level = nanmedian(
+        judged.radius[inside].reshape(-1, SECTORS, COLUMNS // SECTORS).transpose(1, 0, 2).reshape(SECTORS, -1)
+    )
     own = np.full(SECTORS, np.nan)
     for one in np.unique(sector):
         own[one] = np.median(radius[sector == one])
@@ -119,22 +120,21 @@ def truth_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> F
     return shift_by_window(station[known], around[known], radius[known], relief_on_truth(case), starts, window)
 
 
-def handedness(unrolled: Unrolled, judged: Relief) -> tuple[float, float]:
-    """Return the correlation of what differs left from right in reference and candidate, and its size, m.
+def handedness(reference: Float[np.ndarray, "n m"], judged: Float[np.ndarray, "n m"]) -> tuple[float, float]:
+    """Return the correlation of what differs left from right in two maps of radii, and its size in the second, m.
 
     1 where each side is where it belongs, -1 in a mirror. What a sideways shift of the middle does to both is taken
     out first. NaN where fewer than 50 cells are known on both sides.
 
     Args:
-        unrolled: Map of the reference.
-        judged: Relief of the candidate about the same middle.
+        reference: Radii of the reference by cell, m.
+        judged: Radii of the candidate about the same middle, m.
     """
-    cells = relief_cells(judged)[: len(unrolled.radius)]
-    real, judged_side = _one_sided(unrolled.radius[: len(cells)]), _one_sided(cells)
-    known = np.isfinite(real) & np.isfinite(judged_side)
-    if known.sum() < 50:
+    real, mine = _one_sided(reference), _one_sided(judged)
+    known = np.isfinite(real) & np.isfinite(mine)
+    if known.sum() < _FEWEST_CELLS or min(np.std(real[known]), np.std(mine[known])) <= 0.0:
         return float("nan"), 0.0
-    return float(np.corrcoef(real[known], judged_side[known])[0, 1]), float(np.std(real[known]))
+    return float(np.corrcoef(real[known], mine[known])[0, 1]), float(np.std(mine[known]))
 
 
 def _one_sided(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n h"]:

@@ -1,4 +1,4 @@
-"""Track by station: gauge, place and height of the rails, and the bed with its sleepers, against truth or recording."""
+"""Furniture by station: gauge, place and height of the rails, bed with sleepers, depth of the pockets."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,20 @@ from jaxtyping import Bool, Float
 
 from benchmarks.fidelity.case import Case, per_case, per_truth
 from benchmarks.fidelity.derive.beams import cast_beams, returns, sensor_path
-from benchmarks.fidelity.derive.curve import Curve, grouped_median, truth_curve
+from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian, truth_curve
 from benchmarks.fidelity.derive.sections import true_part, truth_caster
 from benchmarks.fidelity.derive.surface import face_normals, surface_caster
 from benchmarks.fidelity.derive.track import gauge_along, sort_along, truth_railway
-from benchmarks.fidelity.windows.deviation import beam_offsets, hold_frame, parts_hit
+from benchmarks.fidelity.windows.deviation import (
+    COLUMNS,
+    FINE,
+    Relief,
+    beam_offsets,
+    hold_frame,
+    parts_hit,
+    relief_on_truth,
+    truth_relief,
+)
 
 BED_BIN = 0.05  # m along the track
 _BETWEEN = (0.15, 0.55)  # m to either side of the track's middle: bed and sleepers, clear of rails and their shadow
@@ -19,6 +28,7 @@ _UPRIGHT = 0.8  # of a normal that counts as level or as upright
 _LEAST = 4  # returns that make a bin of the bed known
 _LANES = (-0.45, -0.25, 0.25, 0.45)  # m from the track's middle where the true bed is sounded
 _SOUND_FROM = 0.5  # m above the rails
+_RIM = 0.08  # m from the edge of a pocket to where the wall beside it is measured
 
 
 @dataclass(frozen=True)
@@ -98,6 +108,40 @@ def true_bed_error(case: Case) -> Profile:
     depth = [caster.first(origin, down)[0] for caster in (truth_caster(case), surface_caster(case))]
     gap = np.clip(np.where(np.isfinite(depth[1]), depth[0] - depth[1], -1.0), -0.3, 0.3)
     return Profile(np.tile(station, len(_LANES)), np.where(np.isfinite(depth[0]), gap, 0.0))
+
+
+def true_pocket_error(case: Case) -> Profile:
+    """Return by how much each open pocket of the truth is deeper or flatter in the candidate, m."""
+    truth = case.truth
+    assert truth is not None
+    pockets = [one for one in truth.furniture.get("pockets", []) if one.get("open", True)]
+    if not pockets:
+        return NOTHING
+    station, angle, length = (np.array([one[key] for one in pockets]) for key in ("station", "angle", "length"))
+    depths = [_depth_at(relief, station, angle, length) for relief in (truth_relief(case), relief_on_truth(case))]
+    known = np.isfinite(depths[0]) & np.isfinite(depths[1])
+    return Profile(station[known], (depths[1] - depths[0])[known])
+
+
+def _depth_at(
+    relief: Relief, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"], length: Float[np.ndarray, " p"]
+) -> Float[np.ndarray, " p"]:
+    """Return how much farther a surface is in the middle of each pocket than before and behind it, m."""
+    row = np.round((station - relief.station[0]) / FINE).astype(int)
+    column = np.floor((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int)
+    beyond = np.ceil((0.5 * length + _RIM) / FINE).astype(int)
+    inside = (row - beyond - 1 >= 0) & (row + beyond + 1 < len(relief.station))
+    row = np.clip(row, 0, len(relief.station) - 1)
+
+    def patch(rows: np.ndarray) -> np.ndarray:
+        near = [
+            relief.radius[np.clip(rows + i, 0, len(relief.station) - 1), (column + j) % COLUMNS]
+            for i in (-1, 0, 1) for j in (-1, 0, 1)
+        ]  # fmt: skip
+        return nanmedian(np.stack(near, axis=-1))
+
+    around = (patch(row - beyond) + patch(row + beyond)) / 2.0
+    return np.where(inside, patch(row) - around, np.nan)
 
 
 # By the held-out recording: beams that meet the candidate's rails or bed, and where they came back.
