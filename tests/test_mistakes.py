@@ -112,6 +112,12 @@ MISTAKES = {
     "benchmarks.fidelity sweep --scene tunnel --tolerances nan --out o": "tolerances must be positive, got nan",
     "benchmarks.fidelity report --scene tunnel --out empty": "empty: holds no values.json",
     "benchmarks.fidelity calibrate --runs none --out o.json": "calibration needs 3",
+    "benchmarks.fidelity windows --scene none --out o": "none: no such file or folder",
+    "benchmarks.fidelity faults --scene tunnel --count 0 --out o": "count must be at least 1, got 0",
+    "benchmarks.fidelity faults --scene tunnel --draw -1 --out o": "draw must not be negative",
+    "benchmarks.fidelity faults --scene tunnel --kinds ghost --out o": "no kind of fault 'ghost'",
+    "benchmarks.fidelity faults --scene tunnel --join empty --out o": "empty/faults.json: cannot be read",
+    "benchmarks.fidelity calibrate --windows --runs none --out o.json": "limits need 3 simulated surveys, 1 were given",
     "benchmarks.fidelity split junk.bag --out o": "junk.bag",
     "benchmarks.leaderboard --out o --tasks Fly": "no task 'Fly'",
     "benchmarks.dirty empty --out o": "empty: no NAME_truth.npz",
@@ -196,7 +202,8 @@ MISTAKES = {
     "subterra_jax.b2.film o.webp --scene none": "none",
 }
 COMMANDS = sorted({words.split()[0] for words in MISTAKES} - {"benchmarks.fidelity", "benchmarks.slam"}) + [
-    f"benchmarks.fidelity{part}" for part in ("", " run", " controls", " sweep", " calibrate", " split", " report")
+    f"benchmarks.fidelity{part}"
+    for part in ("", " run", " controls", " sweep", " calibrate", " split", " report", " windows", " faults")
 ] + [f"benchmarks.slam{part}" for part in ("", " record", " run", " score")]  # fmt: skip
 
 

@@ -245,7 +245,7 @@ def main() -> int:
     actions: dict[str, Callable[[Any], None]] = {
         "run": run, "controls": run_controls, "sweep": run_sweep,
         "calibrate": calibrate.run, "split": run_split, "report": run_report,
-        "windows": windows.run_windows, "faults": windows.run_faults, "limits": windows.run_limits,
+        "windows": windows.run_windows, "faults": windows.run_faults,
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}
 

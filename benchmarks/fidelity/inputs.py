@@ -20,6 +20,7 @@ from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.files import FidelityError, file_hash, write_json
 from benchmarks.fidelity.references import HoldConfig, load_hold, load_truth
+from benchmarks.fidelity.windows.reach import check_length, check_recording
 from scene.errors import require_input
 from scene.progress import Stages
 from subterra_jax.host.errors import SubterraError
@@ -47,6 +48,7 @@ class Inputs:
         hold: Part of a recording to score.
         seed: Seed of sampling, noise and bootstrap.
         strict: Count metrics without a reference as 0.
+        partial: Judge the part that the recording shows, where it does not show all of the tunnel.
         metrics: Python file with metrics of your own, see docs/guide/extend.md.
         out: Folder for all results.
     """
@@ -60,6 +62,7 @@ class Inputs:
     hold: HoldConfig = field(default_factory=HoldConfig)
     seed: int = 0
     strict: bool = False
+    partial: bool = False
     metrics: Path | None = None
     out: Path = Path("out/fidelity")
 
@@ -101,6 +104,7 @@ def read_case(inputs: Inputs) -> Case:
         hold = load_hold(
             inputs.recording, inputs.trajectory, candidate.origin, with_sigma(inputs.hold, inputs.recording)
         )
+        check_recording(candidate, hold, inputs.scene, inputs.recording, inputs.partial)
     poses = inputs.fit_trajectory or inputs.trajectory
     if inputs.fit_recording is not None and poses is not None:
         fit = load_hold(inputs.fit_recording, poses, candidate.origin, inputs.hold)
@@ -109,6 +113,8 @@ def read_case(inputs: Inputs) -> Case:
                 f"{inputs.fit_recording}: is not what {inputs.scene} was built from; its manifest has another SHA-256"
             )
     truth = None if inputs.truth is None else load_truth(inputs.truth, candidate.origin)
+    if hold is not None or truth is not None:
+        check_length(candidate, inputs.scene)
     return Case(candidate, hold, fit, truth, inputs.seed)
 
 

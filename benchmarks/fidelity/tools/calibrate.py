@@ -23,6 +23,8 @@ from benchmarks.fidelity.controls.runner import OUTCOME_SCHEMA, is_bold, list_jo
 from benchmarks.fidelity.files import FidelityError, read_json, write_json
 from benchmarks.fidelity.registry import Value, load_values
 from benchmarks.fidelity.table import Map, Metric
+from benchmarks.fidelity.windows.commands import set_limits
+from benchmarks.fidelity.windows.measures import LIMITS
 
 DECISIONS = Path(__file__).with_name("decisions.csv")
 Values = dict[str, Value]
@@ -221,11 +223,13 @@ class CalibrateConfig:
         runs: Output folders of `controls` on simulated surveys with `--truth`.
         out: File to write; the table takes its thresholds from there.
         fewest: Smallest number of surveys.
+        windows: Set the limits of windows instead, from output folders of `windows`.
     """
 
     runs: tuple[Path, ...]
     out: Path = table.THRESHOLDS
     fewest: int = FEWEST_SURVEYS
+    windows: bool = False
 
 
 def run(config: CalibrateConfig) -> None:
@@ -236,6 +240,9 @@ def run(config: CalibrateConfig) -> None:
     Raises:
         FidelityError: Fewer surveys than asked, or a folder without their results.
     """
+    if config.windows:
+        set_limits(config.runs, LIMITS if config.out == table.THRESHOLDS else config.out)
+        return
     if len(config.runs) < config.fewest:
         raise FidelityError(f"calibration needs {config.fewest} simulated surveys, {len(config.runs)} were given")
     surveys = [load_survey(folder) for folder in config.runs]

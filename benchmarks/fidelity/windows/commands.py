@@ -1,4 +1,4 @@
-"""Commands on windows alone, which take seconds: judge a scene, set the limits, put in faults at random."""
+"""Commands on windows alone, which take seconds: judge a scene, set the limits of windows, put in faults at random."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,26 +29,13 @@ class FaultsConfig(Inputs):
         count: Number of faults.
         draw: Seed that draws them.
         kinds: Kinds to draw from; all where empty.
-        join: Output folders of earlier runs on other scenes, whose faults join table and figure.
+        join: Folders of such runs on other scenes, for one table.
     """
 
     count: int = 200
     draw: int = 0
     kinds: tuple[str, ...] = ()
     join: tuple[Path, ...] = ()
-
-
-@dataclass(frozen=True)
-class LimitsConfig:
-    """Evidence for the limits.
-
-    Attributes:
-        runs: Output folders of `windows` on simulated surveys with `--truth`.
-        out: File to write.
-    """
-
-    runs: tuple[Path, ...]
-    out: Path = LIMITS
 
 
 def run_windows(inputs: Inputs) -> None:
@@ -84,18 +71,20 @@ def _series(case: Case) -> dict[str, dict[str, list[float | None]]]:
     }
 
 
-def run_limits(config: LimitsConfig) -> None:
+def set_limits(runs: tuple[Path, ...], out: Path = LIMITS) -> None:
     """Sets the limits of windows from simulated surveys in which nothing is wrong.
 
-    Example: python -m benchmarks.fidelity limits --runs out/a out/b out/c
+    Args:
+        runs: Output folders of `windows` on simulated surveys with `--truth`.
+        out: File to write.
 
     Raises:
         FidelityError: Fewer than three surveys, or a folder without their results.
     """
-    if len(config.runs) < FEWEST:
-        raise FidelityError(f"limits need {FEWEST} simulated surveys, {len(config.runs)} were given")
+    if len(runs) < FEWEST:
+        raise FidelityError(f"limits need {FEWEST} simulated surveys, {len(runs)} were given")
     values: dict[str, list[float]] = {}
-    for folder in config.runs:
+    for folder in runs:
         content = read_json(folder / "windows.json", SCHEMA)
         if "ceiling" not in content.get("series", {}):
             raise FidelityError(f"{folder}: was judged without --truth, so nothing says that nothing is wrong there")
@@ -113,15 +102,13 @@ def run_limits(config: LimitsConfig) -> None:
                     "p999": round(usual, 5),
                     "windows": len(known),
                 }
-    surveys = sorted(folder.name for folder in config.runs)
-    write_json(config.out, {"schema": LIMITS_SCHEMA, "surveys": surveys, "limits": frozen})
-    print(f"{config.out}: {len(frozen)} limits from {len(surveys)} surveys")
+    surveys = sorted(folder.name for folder in runs)
+    write_json(out, {"schema": LIMITS_SCHEMA, "surveys": surveys, "limits": frozen})
+    print(f"{out}: {len(frozen)} limits from {len(surveys)} surveys")
 
 
 def run_faults(config: FaultsConfig) -> None:
-    """Puts in faults of random kind, place, length and size, and says which the windows notice.
-
-    Finished ones are kept in `--out`: the same command goes on where it was cut short.
+    """Puts in faults of random kind, place, length and size; goes on where it was cut short.
 
     Example: python -m benchmarks.fidelity faults --count 200 --scene build/tunnel --truth build/survey
     """

@@ -1,0 +1,134 @@
+"""Worst windows: known answers on a tube, faults that must be noticed, and where they are."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.fidelity import judge
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.controls.local import KINDS, Fault, draw_fault, make_ground, spoil, stated_faults
+from benchmarks.fidelity.registry import Value
+from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
+from benchmarks.fidelity.windows.measures import limits
+from tests.benchmarks.fidelity import tube
+
+LENGTH = 24.0
+
+
+@pytest.fixture(scope="module")
+def good() -> Case:
+    return tube.case(tube.Tube(length=LENGTH), beams=2500)
+
+
+@pytest.fixture(scope="module")
+def before(good) -> dict[str, Worst]:
+    return by_name(good)
+
+
+def by_name(case: Case) -> dict[str, Worst]:
+    return {f"{one.id}.{one.source}": one for one in worst_windows(case)}
+
+
+def with_fault(good: Case, fault: Fault) -> dict[str, Worst]:
+    return by_name(replace(good, candidate=spoil(make_ground(good.candidate), fault), cache={}))
+
+
+def test_a_right_tube_has_no_window_beyond_its_limit(before) -> None:
+    assert [name for name, one in before.items() if one.beyond] == []
+    assert before["wall.truth"].value == pytest.approx(0.0, abs=1e-6)
+    assert before["gauge.truth"].value == pytest.approx(0.0, abs=1e-4)
+    assert before["wall.recording"].value < 0.008  # 2 cm of noise, medians of some returns
+    assert before["shift.recording"].value < 0.02
+
+
+def test_a_wall_that_is_out_is_measured_and_placed(good) -> None:
+    found = with_fault(good, Fault("wall", 8.0, 5.0, 0.10, 0.0))
+    for name in ("sector.truth", "sector.recording"):
+        worst = found[name]
+        assert worst.value == pytest.approx(0.10, abs=0.02)
+        assert worst.where == "left wall"
+        assert abs(worst.start - 8.0) < 1.2
+        assert worst.beyond
+    assert found["aside.truth"].value == pytest.approx(0.05, abs=0.015)  # half of it: only one wall has moved
+
+
+def test_what_moves_along_the_tunnel_or_stands_apart_is_measured(good) -> None:
+    along = with_fault(good, Fault("along", 7.0, 10.0, 0.15))
+    assert along["shift.truth"].value == pytest.approx(0.15, abs=0.03)
+    assert along["shift.recording"].value == pytest.approx(0.15, abs=0.03)
+    rails = with_fault(good, Fault("rails", 8.0, 6.0, 0.03))
+    assert rails["rail_height.truth"].value == pytest.approx(0.03, abs=0.003)
+    assert rails["rail_height.recording"].value == pytest.approx(0.03, abs=0.006)
+    gauge = with_fault(good, Fault("gauge", 6.0, 11.0, -0.006))
+    assert gauge["gauge.truth"].value == pytest.approx(0.006, abs=0.001)
+    assert {name for name, one in gauge.items() if one.beyond} == {"gauge.truth", "gauge_change.truth"}
+
+
+def test_filled_pockets_lost_sleepers_and_a_cube_are_noticed(good) -> None:
+    for fault, window in (
+        (Fault("pockets", 8.0, 7.0, 0.9), "pockets.truth"),
+        (Fault("missing", 8.0, 7.0, 1.0), "bed.truth"),
+        (Fault("box", 8.0, 5.0, 0.9, np.pi), "spot.recording"),
+    ):
+        found = with_fault(good, fault)
+        assert found[window].beyond, fault
+
+
+def test_a_mirrored_tube_fails_where_its_sides_differ_and_a_symmetric_one_cannot_tell(good, before) -> None:
+    assert before["hand.truth"].value is None  # its sides are alike
+    mirror = stated_faults(LENGTH)["mirrored left to right"]
+    one_sided = spoil(make_ground(good.candidate), Fault("wall", 6.0, 4.0, 0.08, np.pi / 4))
+    surface = replace(good.truth, surface=one_sided.lining, part=np.zeros(len(one_sided.lining.faces), int), cache={})
+    uneven = replace(good, candidate=one_sided, truth=surface, hold=None, cache={})
+    assert by_name(uneven)["hand.truth"].value == pytest.approx(0.0, abs=0.05)
+    mirrored = replace(uneven, candidate=spoil(make_ground(one_sided), mirror), cache={})
+    found = by_name(mirrored)["hand.truth"]
+    assert found.value == pytest.approx(2.0, abs=0.1)
+    assert found.beyond
+
+
+def test_a_fault_leaves_the_rest_of_the_tunnel_exactly_alone(good) -> None:
+    ground = make_ground(good.candidate)
+    for name, kind in KINDS.items():
+        if kind.sizes is None:
+            continue
+        spoilt = spoil(ground, Fault(name, 10.0, 4.0, kind.sizes[1], kind.sides[0]))
+        lining = good.candidate.lining
+        station = ground.line.local(np.asarray(lining.vertices))[:, 0]
+        moved = np.abs(np.asarray(spoilt.lining.vertices) - lining.vertices).max(axis=1)
+        assert moved[(station < 6.5) | (station > 17.5)].max() == 0.0, name
+
+
+def test_faults_are_drawn_inside_the_tunnel_in_their_ranges() -> None:
+    rng = np.random.default_rng(3)
+    drawn = [draw_fault(rng, 36.0) for _ in range(300)]
+    assert {one.kind for one in drawn} == {name for name, kind in KINDS.items() if kind.sizes}
+    for one in drawn:
+        low, high = KINDS[one.kind].sizes
+        assert low <= abs(one.size) <= high
+        assert 1.0 <= one.start < one.start + one.length <= 35.0
+
+
+def test_windows_and_faults_that_go_unnoticed_decide_the_verdict() -> None:
+    fine = {"base": {}, "null": {}}
+    worst = Worst("wall", "mean distance of the walls", "truth", "m", 0.07, 0.02, 12.0, 17.0, "", 1.0)
+    missed = Windows((), (Noticed("roof 8 cm too low", ()),))
+    other = Windows((replace(worst, value=0.01),), (Noticed("gauge 6 mm too wide", (), needed=False),))
+    assert other.reasons() == []
+    assert "would not notice" in missed.reasons()[0]
+    reason = Windows((worst,)).reasons()[0]
+    assert "7.0 cm from station 12 to 17 m" in reason
+    assert load_windows(dump_windows(Windows((worst,), missed.noticed))) == Windows((worst,), missed.noticed)
+    values = {id: Value(None, reason="none") for id in judge.table.load()}
+    judged = judge.make_judgement(dict.fromkeys(fine, values), [], windows=Windows((worst,)))
+    assert reason in judged.reasons
+    assert judged.verdict == "FAIL"
+
+
+def test_limits_lie_between_their_floor_and_their_gate() -> None:
+    from benchmarks.fidelity.windows.measures import MEASURES
+
+    for one in MEASURES:
+        for source in ("recording", "truth"):
+            assert one.floor <= limits()[f"{one.id}.{source}"] <= one.gate, one.id
