@@ -38,8 +38,8 @@ def shift_by_window(
 ) -> Float[np.ndarray, " k"]:
     """Return how far the relief of the candidate lies along the tunnel from that of points, by window, m.
 
-    Both are taken about their medians in each of 72 directions of the window, so that a wall that is out as a whole
-    does not matter. NaN where the walls are too even to tell.
+    A wall that is out as a whole does not matter. NaN where the walls are too even to tell, or where no shift within
+    `REACH` fits best.
 
     Args:
         station: Station of the points, m.
@@ -58,43 +58,63 @@ def shift_by_window(
         rows = rows[:: max(len(rows) // _POINTS, 1)]
         if len(rows) < 500:
             continue
-        errors = _misfits(station[rows], angle[rows], radius[rows], judged, starts[k], window, shifts)
+        errors = _misfits(station[rows], angle[rows], radius[rows], judged, shifts)
         best = int(np.argmin(errors))
-        if np.median(errors) - errors[best] < _LEAST_CONTRAST:
+        if not 0 < best < len(shifts) - 1 or np.median(errors) - errors[best] < _LEAST_CONTRAST:
             continue
         result[k] = shifts[best] + _vertex(errors, best)
     return result
 
 
 def _misfits(
-    station: np.ndarray, angle: np.ndarray, radius: np.ndarray, judged: Relief, start: float, window: float,
-    shifts: np.ndarray,
-) -> Float[np.ndarray, " s"]:  # fmt: skip
-    """Return the mean difference of both reliefs for each shift of the points, m."""
+    station: np.ndarray, angle: np.ndarray, radius: np.ndarray, judged: Relief, shifts: np.ndarray
+) -> Float[np.ndarray, " s"]:
+    """Return the mean difference of both reliefs for each shift of the points, m.
+
+    Each is taken about its own straight line in each direction, at the same points: a wall that runs askew to the
+    curve, or points that crowd at one end of the window, move nothing.
+    """
     sector = ((angle + np.pi) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
     column = ((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int) % COLUMNS
-    first = judged.station[0]
-    inside = (judged.station >= start) & (judged.station < start + window)
-    level = nanmedian(
-        judged.radius[inside].reshape(-1, SECTORS, COLUMNS // SECTORS).transpose(1, 0, 2).reshape(SECTORS, -1)
-    )
-    own = np.full(SECTORS, np.nan)
-    for one in np.unique(sector):
-        own[one] = np.median(radius[sector == one])
-    relief = radius - own[sector]
+
+    def radius_at(shift: float) -> np.ndarray:
+        row = np.round((station + shift - judged.station[0]) / FINE).astype(int)
+        inside = (row >= 0) & (row < len(judged.station))
+        return np.where(inside, judged.radius[np.clip(row, 0, len(judged.station) - 1), column], np.nan)
+
+    here = radius_at(0.0)
+    known = np.isfinite(here)
+    lines = [_line_by_sector(station[known], values[known], sector[known]) for values in (radius, here)]
+    relief = radius - _on_line(lines[0], station, sector)
     errors = []
     for shift in shifts:
-        row = np.round((station + shift - first) / FINE).astype(int)
-        within = (row >= 0) & (row < len(judged.station))
-        gap = relief[within] - (judged.radius[row[within], column[within]] - level[sector[within]])
+        gap = relief - (radius_at(shift) - _on_line(lines[1], station + shift, sector))
         errors.append(np.mean(np.minimum(np.abs(gap[np.isfinite(gap)]), _DEEPEST)))
     return np.asarray(errors)
 
 
+def _line_by_sector(
+    station: np.ndarray, values: np.ndarray, sector: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fits a straight line along the tunnel in each direction: mean station, mean value and slope."""
+    count = np.maximum(np.bincount(sector, minlength=SECTORS), 1)
+    middle = np.bincount(sector, station, SECTORS) / count
+    level = np.bincount(sector, values, SECTORS) / count
+    off = station - middle[sector]
+    spread = np.bincount(sector, off**2, SECTORS)
+    slope = np.bincount(sector, off * (values - level[sector]), SECTORS) / np.maximum(spread, 1e-9)
+    return middle, level, slope
+
+
+def _on_line(
+    line: tuple[np.ndarray, np.ndarray, np.ndarray], station: np.ndarray, sector: np.ndarray
+) -> Float[np.ndarray, " n"]:
+    middle, level, slope = line
+    return level[sector] + slope[sector] * (station - middle[sector])
+
+
 def _vertex(errors: np.ndarray, best: int) -> float:
     """Return the place of the least error beside the best shift, m, by a parabola."""
-    if not 0 < best < len(errors) - 1:
-        return 0.0
     before, here, after = errors[best - 1 : best + 2]
     bend = before - 2.0 * here + after
     return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5) * _STEP) if bend > 0.0 else 0.0
