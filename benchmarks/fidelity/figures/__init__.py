@@ -23,10 +23,13 @@ from benchmarks.fidelity.figures.tunnel import (
     draw_range_image,
     draw_sensor_distributions,
 )
+from benchmarks.fidelity.figures.windows import draw_unrolled, draw_worst_places
 
 matplotlib.use("Agg")
 
 FIGURES: tuple[tuple[str, Draw], ...] = (
+    ("F17-unrolled", draw_unrolled),
+    ("F18-worst-places", draw_worst_places),
     ("F13-categories", draw_categories),
     ("F14-controls", draw_controls),
     ("F15-sweep", draw_sweep),

@@ -19,6 +19,7 @@ from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.report import forms
 from benchmarks.fidelity.scoring import Score, Scored
 from benchmarks.fidelity.table import Metric
+from benchmarks.fidelity.windows.judge import dump_windows
 
 SOURCE = "Subterra: An Open-Source Validated Benchmark for GNSS-Denied Tunnel Navigation"
 
@@ -106,6 +107,7 @@ def report_content(
         "saturated_frac": scored.saturated,
         "strict": inputs.strict,
         "leaks": judgement.leaks,
+        "windows": dump_windows(judgement.windows),
         "split": _split_entry(case, inputs),
         "seed": inputs.seed,
         "constants": scoring.constants_digest(),
