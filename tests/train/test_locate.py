@@ -74,6 +74,16 @@ def test_a_judge_counts_the_goals_at_which_the_estimate_is_right():
     assert found["found"][0] < found["found"][1] < found["found"][2]
 
 
+@pytest.mark.parametrize("network", ["gru", "transformer-kalman"])
+def test_a_state_before_training_has_the_types_of_one_after_an_iteration(network):
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
+    learner = LocateLearner(env, params, dataclasses.replace(_SMALL, network=network))
+    before = jax.eval_shape(learner.init, 0)
+    after, _ = jax.eval_shape(learner.iterate, before, params, jnp.float32(1.0))
+    for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
+        assert (one.shape, one.dtype, one.weak_type) == (other.shape, other.dtype, other.weak_type)
+
+
 @pytest.mark.slow
 def test_gradients_do_not_depend_on_the_chunks():
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")

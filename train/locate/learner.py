@@ -96,6 +96,8 @@ class LocateLearner:
         """Returns the state before training."""
         key_weights, key = jax.random.split(jax.random.key(seed))
         weights = memory.init(self.config.network, self.config.front, key_weights)
+        # Of definite types, as they come out of an iteration, or the second one is compiled anew.
+        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), weights)
         return TrainState(weights, self.optimizer.init(weights), key, jnp.zeros((), jnp.int32))
 
     def iterate(self, state: TrainState, params: Any, left: Array) -> tuple[TrainState, dict[str, Array]]:
