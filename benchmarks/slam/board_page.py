@@ -54,9 +54,17 @@ def as_markdown(board: dict[str, Any]) -> str:
         "*Reach*: distance driven before 1 m of axial error, median of the recordings where it is exceeded. "
         "*Floor*: bound of the drift, whatever program reads the ranges. *Gate*: least eigenvalue of scan matching."
     )
-    failed = [f"- {row['program']} on {row['recording']} of {row['set']}: {row['failed']}" for row in rows
-              if "failed" in row]  # fmt: skip
+    failed = [f"- {one}" for one in _failures(rows)]
     return "\n".join([*lines, "", note, "", *(["Failed:", "", *failed, ""] if failed else [])])
+
+
+def _failures(rows: list[Row]) -> list[str]:
+    """Returns a line for each program, recording and reason, with the sets in which it failed."""
+    sets: dict[str, list[str]] = {}
+    for row in rows:
+        if "failed" in row:
+            sets.setdefault(f"{row['program']} on {row['recording']}: {row['failed']}", []).append(row["set"])
+    return [f"{text} ({', '.join(names)})" for text, names in sets.items()]
 
 
 def _rank(rows: list[Row], program: str) -> float:

@@ -160,11 +160,11 @@ def main(words: list[str]) -> int:
     try:
         times, poses, seconds = _run(name, recording)
     except (BenchmarkError, ValueError) as error:
-        print(f"{name} {error}", file=sys.stderr)
+        print(error, file=sys.stderr)
         return 1
     if len(times) < _LEAST_POSES or not np.isfinite(poses).all():
         problem = "gives poses that are not finite" if len(times) >= _LEAST_POSES else f"gives {len(times)} poses"
-        print(f"{name} {problem}", file=sys.stderr)
+        print(problem, file=sys.stderr)
         return 1
     save_tum(target, times, poses)
     share = seconds / float(times[-1] - times[0])

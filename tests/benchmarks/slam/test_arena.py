@@ -29,6 +29,13 @@ OUSTER = [
     ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 16, 7), ("t", 20, 6), ("reflectivity", 24, 4), ("ring", 26, 2),
     ("ambient", 28, 4), ("range", 32, 6),
 ], 48  # fmt: skip
+# `CustomMsg.msg` and `CustomPoint.msg` of livox_ros_driver and livox_ros_driver2.
+LIVOX = [("header", ""), ("timebase", "uint64"), ("point_num", "uint32"), ("lidar_id", "uint8"), ("rsvd", "uint8"),
+         ("points", "")]  # fmt: skip
+LIVOX_POINT = [
+    ("offset_time", "uint32"), ("x", "float32"), ("y", "float32"), ("z", "float32"), ("reflectivity", "uint8"),
+    ("tag", "uint8"), ("line", "uint8"),
+]  # fmt: skip
 TOPICS = {"vlp16": "/velodyne_points", "os1-32": "/ouster/points", "avia": "/livox/lidar"}
 SEED = np.random.SeedSequence(4)
 
@@ -122,6 +129,26 @@ def test_layouts_are_those_of_the_drivers(made):
     assert 95_000_000 < points["t"].max() < 100_000_000
     assert len(np.unique(points["ring"])) == {"vlp16": 16, "os1-32": 32, "avia": 6}[name]
     assert points["intensity"].max() > 1.0
+
+
+@pytest.mark.parametrize(("store", "package"), [
+    (bags.ros1_store, "livox_ros_driver"), (bags.ros2_store, "livox_ros_driver2"),
+])  # fmt: skip
+def test_livox_messages_have_the_fields_of_either_driver(store, package):
+    def fields(name: str) -> list[tuple[str, str]]:
+        _, parts = store().fielddefs[f"{package}/msg/{name}"]
+        return [(part, _base(kind)) for part, kind in parts]
+
+    assert fields("CustomMsg") == LIVOX
+    assert fields("CustomPoint") == LIVOX_POINT
+
+
+def _base(kind: tuple) -> str:
+    """The basic type of a field or of its elements; nothing for a message."""
+    node, rest = kind
+    if node.name == "BASE":
+        return rest[0]
+    return _base(rest[0]) if node.name in ("ARRAY", "SEQUENCE") else ""
 
 
 def test_kiss_icp_loads_the_bags_as_they_are(made):

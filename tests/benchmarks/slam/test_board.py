@@ -99,7 +99,7 @@ def test_a_board_has_medians_over_the_sets_and_names_failures(sets, tmp_path):
     (line,) = [line for line in text.splitlines() if line.startswith("| mine")]
     assert line == "| mine | 4 | failed | 2.00 (1.00 to 3.00) | 0.000 | 34 (1/3) | 25 % |"
     assert "| *gate* | | 0.002 | 0.002 | | | |" in text
-    assert "- mine on walls-smooth of two: crashed" in text
+    assert "- mine on walls-smooth: crashed (two)" in text
     assert board_page.as_png(content).startswith(b"\x89PNG")
 
 
