@@ -278,18 +278,18 @@ def test_wrong_settings_are_refused_before_anything_is_written(tmp_path, change,
 
 
 @pytest.mark.slow
-def test_a_set_is_resumed_and_inertial_programs_keep_to_furnished_walls_and_lose_smooth_ones(tmp_path, capsys):
+def test_a_set_is_resumed_and_a_program_keeps_to_furnished_walls_and_loses_smooth_ones_and_dust(tmp_path, capsys):
     wanted = ["--courses", "walls-smooth", "walls-furnished", "dust-lock", "--distance", "12", "--jobs", "2"]
     assert command(["arena", "--out", str(tmp_path / "set"), *wanted]) == 0
     assert command(["arena", "--out", str(tmp_path / "set"), *wanted]) == 0
     assert capsys.readouterr().err.count("there already") == 3
     assert command(["arena", "--out", str(tmp_path / "set"), *wanted, "--seed", "1"]) == 2
     assert "was recorded with other settings" in capsys.readouterr().err
-    run = ["run", "--library", "evalio-dlio", "--recordings", str(tmp_path / "set"), "--out", str(tmp_path / "dlio")]
+    run = ["run", "--library", "evalio-mad", "--recordings", str(tmp_path / "set"), "--out", str(tmp_path / "mad")]
     assert command(run) == 0
     from benchmarks.slam.score import ScoreConfig, score_all
 
-    scores = score_all(ScoreConfig((tmp_path / "dlio",), tmp_path / "set" / "truth"))
+    scores = score_all(ScoreConfig((tmp_path / "mad",), tmp_path / "set" / "truth"))
     drift = {one.score.name: one.score.drift for one in scores}
     assert drift["walls-furnished"] < 1.0
     assert drift["walls-smooth"] > 50.0
