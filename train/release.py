@@ -32,7 +32,7 @@ class Command:
         tunnel: Tunnel file or name of the evaluation; the packaged tunnel if left out.
         lining: Variant of the walls of the evaluation; the tunnel's usual one if left out.
         episodes: Episodes of the evaluation.
-        measured: Tables `kinds.json` of `benchmarks.kinds` whose rows go into the card of a localiser.
+        measured: Tables of `benchmarks.kinds` or `train.locate.look` whose rows go into the card of a localiser.
     """
 
     run: tyro.conf.Positional[Path]

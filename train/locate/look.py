@@ -18,12 +18,14 @@ import tyro
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
 from subterra_jax.policies import load
+from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.locate import memory, streams
 from subterra_jax.policies.locate.agent import Locating, nested
 from train.config import ConfigError, at_least
 from train.locate import scores, tunnels
 from train.locate.drives import Drive
 
+SCHEMA = "subterra.look/1"
 _KINDS = ("straight", "universal", "cast", "sprayed", "masonry", "rock")
 _SEED = 2**22
 _RESAMPLES = 2000
@@ -73,7 +75,7 @@ def command(arguments: Command) -> None:
     rows: dict[str, Any] = {}
     for name, agent in agents.items():
         for blind in (False, True):
-            label = f"{name}, cut" if blind else name
+            label = f"cut:{name}" if blind else name
             rows[label] = table(within(agent, drives, blind), np.asarray(drives.tunnel), kinds)
             print(label, {kind: round(100 * cell["success"]) for kind, cell in rows[label].items()}, flush=True)
         _write(arguments, rows)
@@ -129,8 +131,14 @@ def _write(arguments: Command, rows: dict[str, Any]) -> None:
     for label, row in rows.items():
         cells = [f"{100 * c['success']:.0f} ({100 * c['low']:.0f} to {100 * c['high']:.0f})" for c in row.values()]
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    facts = {"task": arguments.task, "tunnels": arguments.tunnels, "drives": arguments.drives, "seed": arguments.seed}
-    for name, text in (("look.md", "\n".join(lines)), ("look.json", json.dumps({**facts, "rows": rows}, indent=1))):
+    names = ("task", "tunnels", "drives", "seed")
+    facts = {
+        "schema": SCHEMA,
+        "config": {name: getattr(arguments, name) for name in names},
+        "policies": {label: read_facts(label.removeprefix("cut:"))["tensors_sha256"] for label in rows},
+        "rows": rows,
+    }
+    for name, text in (("look.md", "\n".join(lines)), ("look.json", json.dumps(facts, indent=1))):
         with replace_file(arguments.out / name) as fresh:
             fresh.write_text(f"{text}\n")
 

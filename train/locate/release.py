@@ -15,7 +15,7 @@ from train.locate.session import CURVE, POLICY, SCORES
 from train.policies import facts_file
 from train.world import open_world
 
-MEASURED = "subterra.kinds/1"
+MEASURED = ("subterra.kinds/1", "subterra.look/1")
 INPUTS = "16 level ranges, odometer, own commands, start and goal; no ring length, no map, no counter of rings"
 LEARNT = "where the robot is; steering, avoidance and the stop are written"
 _CUT = "cut:"
@@ -33,7 +33,7 @@ def release(folder: Path, out: Path, episodes: int, measured: tuple[Path, ...]) 
         folder: Folder of a seed.
         out: The tensors' file; the card goes beside it.
         episodes: Listed episodes of its task that are driven for the card.
-        measured: Files `kinds.json` of `benchmarks.kinds`, of which the card takes the rows of this policy.
+        measured: Tables of `benchmarks.kinds` and `train.locate.look`, of which the card takes the rows of this policy.
 
     Returns:
         Scores on the listed episodes.
@@ -84,17 +84,18 @@ def _read(path: Path, field: str) -> Any:
 
 def _rows(path: Path, digest: str) -> dict[str, Any]:
     """Returns task, split and the rows of a policy in a table of kinds: as it is, and cut."""
-    if _read(path, "schema") != MEASURED:
-        raise ConfigError(f"{path}: is no table of benchmarks.kinds")
+    if _read(path, "schema") not in MEASURED:
+        raise ConfigError(f"{path}: is no table of benchmarks.kinds or train.locate.look")
     table, digests, config = _read(path, "rows"), _read(path, "policies"), _read(path, "config")
-    kept = ("success", "low", "high", "contact", "median_error")
+    kept = ("success", "low", "high", "contact", "median_error", "n")
     own = {
         "cut" if agent.startswith(_CUT) else "as it is": {
-            column: {name: cell[name] for name in kept} for column, cell in row.items()
+            column: {name: cell[name] for name in kept if name in cell} for column, cell in row.items()
         }
         for agent, row in table.items()
         if digests.get(agent) == digest
     }
     if not own:
         raise ConfigError(f"{path}: has no row of this policy")
-    return {"task": config["task"], "split": config["split"], "episodes": config["episodes"], **own}
+    conditions = {name: config[name] for name in ("task", "split", "tunnels", "episodes", "drives") if name in config}
+    return {**conditions, **own}
