@@ -20,7 +20,8 @@ from scene.bore import Bore, load_bore
 from scene.errors import FitError, RecordingError, require_input
 from scene.report import drawings, sections
 from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, read_design_table
-from scene.report.clearance import clearance, g1, read_gauge, read_rails
+from scene.report.clearance import Rails, clearance, g1, read_gauge, read_rails
+from scene.report.ifc import write_ifc
 from scene.report.landxml import read_landxml, write_landxml
 from scene.report.page import write_report
 from scene.report.tables import write_csv, write_points, write_workbook
@@ -84,9 +85,11 @@ def report(config: ReportConfig) -> Path:
         drawings.write_unrolled(folder, bore, section)
         drawings.draw_alignment(folder / "alignment.png", fit)
         write_landxml(folder / "alignment.xml", fit.alignment)
+        rails = read_rails(config.scene / "scene.xml", bore)
+        write_ifc(folder / "tunnel.ifc", bore, fit.alignment, rails, config.scene / "scene.xml", origin)
         if design is not None and located is not None:
             facts |= _write_offsets(folder, bore, design, located)
-        facts |= _write_clearance(folder, config.scene, bore, gauge, start)
+        facts |= _write_clearance(folder, rails, bore, gauge, start)
         if (config.scene / "cloud.ply").is_file():  # a ring survey has none
             cloud: Any = trimesh.load(config.scene / "cloud.ply")
             points = np.asarray(cloud.vertices, float)
@@ -168,8 +171,7 @@ def _write_offsets(folder: Path, bore: Bore, design: Design, located: np.ndarray
     return {"design axis": f"{design.name}; its chainage grows {grows} the stations; the axis lies {spread}"}
 
 
-def _write_clearance(folder: Path, scene: Path, bore: Bore, gauge: Any, start: float) -> dict[str, str]:
-    rails = read_rails(scene / "scene.xml", bore)
+def _write_clearance(folder: Path, rails: Rails | None, bore: Bore, gauge: Any, start: float) -> dict[str, str]:
     if rails is None:
         return {"clearance": "no track was laid in this scene"}
     free = clearance(bore, rails, gauge, bore.axis.curvature)

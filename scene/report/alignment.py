@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from scene.bore import Axis, Bore, axis_through
 from scene.errors import RecordingError, require_input
-from scene.report.elements import Element, Fit, Profile, fit_plan, fit_profile
+from scene.report.elements import Element, Fit, fit_plan, fit_profile
+from scene.report.profiles import Profile
 
 _SAMPLE = 0.25  # m between the points of a sampled alignment
 

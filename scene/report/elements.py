@@ -1,70 +1,40 @@
 """Design elements fitted to an axis: lines, arcs and clothoids in plan, grades and parabolas in profile.
 
-Both are one problem. Curvature (or grade) is linear between knots: where it is constant there is an arc or a line (a
-straight grade), where it slopes a clothoid (a parabola). A fit with many knots is thinned to the fewest that keep the
-axis within a tolerance; then neighbouring values are made equal, or zero, where that costs next to nothing.
+A fit with many knots is thinned to one with too few. Knots are then put in where they take enough off the misfit, all
+numbers and places being fitted anew each time, and taken out where they do not. At last neighbouring values are made
+equal, or zero, where that costs next to nothing.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.interpolate import interp1d
+from jaxtyping import Float
 
-_STEP = 1.0  # m between the nodes of the integration
+from scene.report.profiles import (
+    LEAST_ELEMENT,
+    HeightTarget,
+    PlanTarget,
+    Profile,
+    Target,
+    Tie,
+    adjust,
+    cumulate,
+    jacobian,
+    knot_costs,
+    normal_equations,
+    on_neighbours,
+    pack,
+    unpack,
+)
+
 _FIRST_SPACING = 8.0  # m between the knots of the first fit
-_LEAST_ELEMENT = 4.0  # m
-_ROUNDS = 30  # of Gauss-Newton
+_COARSE = 0.003  # m; the first fit is thinned by at least this much, for what is missing is put in again
 _STRAIGHT = 2e-5  # 1/m; a curve of a radius above 50 km is a line
-
-
-@dataclass(frozen=True)
-class Profile:
-    """A quantity along the axis that is linear between knots: curvature in plan (1/m), or grade (1).
-
-    Attributes:
-        knot: Stations of the knots, growing, m.
-        value: Value at each knot.
-        start: What the integration begins with: x, y (m) and heading (rad) in plan; height (m) in profile.
-    """
-
-    knot: Float[np.ndarray, " k"]
-    value: Float[np.ndarray, " k"]
-    start: Float[np.ndarray, " i"]
-
-    def at(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the value at stations."""
-        return np.interp(station, self.knot, self.value)
-
-    def integral(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the exact integral from the first knot."""
-        width = np.diff(self.knot)
-        slope = np.diff(self.value) / width
-        sums = np.concatenate([[0.0], np.cumsum(0.5 * (self.value[1:] + self.value[:-1]) * width)])
-        i = np.clip(np.searchsorted(self.knot, station, side="right") - 1, 0, len(width) - 1)
-        beyond = station - self.knot[i]
-        return sums[i] + (self.value[i] + 0.5 * slope[i] * beyond) * beyond
-
-    def plan(self, station: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, " n"]]:
-        """Return positions (m) and headings (rad) of an axis of this curvature."""
-        first, last = self.knot[0], self.knot[-1]
-        node = np.linspace(first, last, max(3, int(np.ceil((last - first) / _STEP)) + 1))
-        along = np.concatenate([np.zeros((1, 2)), np.cumsum(self._chord(node[:-1], node[1:]), axis=0)])
-        i = np.clip(np.searchsorted(node, station, side="right") - 1, 0, len(node) - 1)
-        heading = self.start[2] + self.integral(station)
-        return self.start[:2] + along[i] + self._chord(node[i], station), heading
-
-    def _chord(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the way between two stations by Simpson's rule: to micrometres over half a metre."""
-        heading = self.start[2] + np.stack([self.integral(s) for s in (start, 0.5 * (start + end), end)])
-        weight = np.array([1.0, 4.0, 1.0])[:, None]
-        mean = np.stack([(weight * np.cos(heading)).sum(axis=0), (weight * np.sin(heading)).sum(axis=0)], axis=-1)
-        return (end - start)[:, None] * mean / 6.0
-
-    def height(self, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return heights of a profile of this grade, m."""
-        return self.start[0] + self.integral(station)
+_LEAST_NOISE = 2e-5  # m; no survey is finer than this
+_WORTH = 0.1  # a knot must take this share of the tolerance, squared, off the mean square
+_PLACES = 2.0  # m between the places at which a further knot is thought of
+_TRIES = 4  # knots whose removal, or places whose knot, is tried at a time
 
 
 @dataclass(frozen=True)
@@ -113,79 +83,6 @@ class Fit:
         return float(np.sqrt(np.mean(self.residual**2)))
 
 
-class Target(Protocol):
-    """The points that a profile is fitted to."""
-
-    @property
-    def station(self) -> Float[np.ndarray, " n"]:
-        """Station of each point, m."""
-
-    def miss(self, profile: Profile) -> Float[np.ndarray, " n"]:
-        """Return the distance of each point from the profile, m."""
-
-    def start_columns(self, profile: Profile) -> Float[np.ndarray, "n i"]:
-        """Return the derivative of each point's place on the profile by the numbers of its start."""
-
-    def columns(
-        self, profile: Profile, node: Float[np.ndarray, " m"], turned: Float[np.ndarray, "m p"]
-    ) -> Float[np.ndarray, "n p"]:
-        """Return that by numbers which change the integral of the quantity at the nodes by `turned`."""
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """Points of an axis in plan, m, at their stations; its start may move along `across` alone.
-
-    Moved along the axis, together with all knots, it would change nothing that is measured.
-    """
-
-    points: Float[np.ndarray, "n 2"]
-    station: Float[np.ndarray, " n"]
-    across: Float[np.ndarray, "2"]
-
-    def miss(self, profile: Profile) -> Float[np.ndarray, " n"]:
-        at, heading = profile.plan(self.station)
-        across = self.points - at
-        return across[:, 1] * np.cos(heading) - across[:, 0] * np.sin(heading)
-
-    def start_columns(self, profile: Profile) -> Float[np.ndarray, "n 3"]:
-        at, heading = profile.plan(self.station)
-        moved = at - profile.start[:2]
-        turned = moved[:, 0] * np.cos(heading) + moved[:, 1] * np.sin(heading)
-        aside = self.across[1] * np.cos(heading) - self.across[0] * np.sin(heading)
-        return np.stack([self.across[0] * aside, self.across[1] * aside, turned], axis=1)
-
-    def columns(
-        self, profile: Profile, node: Float[np.ndarray, " m"], turned: Float[np.ndarray, "m p"]
-    ) -> Float[np.ndarray, "n p"]:
-        bearing = profile.start[2] + profile.integral(node)
-        aside = [_cumulate(part[:, None] * turned, node) for part in (-np.sin(bearing), np.cos(bearing))]
-        x, y = (interp1d(node, part, axis=0)(self.station) for part in aside)
-        heading = (profile.start[2] + profile.integral(self.station))[:, None]
-        return y * np.cos(heading) - x * np.sin(heading)
-
-
-@dataclass(frozen=True)
-class _Height:
-    """Heights of an axis, m, at their stations."""
-
-    height: Float[np.ndarray, " n"]
-    station: Float[np.ndarray, " n"]
-
-    def miss(self, profile: Profile) -> Float[np.ndarray, " n"]:
-        return self.height - profile.height(self.station)
-
-    def start_columns(self, profile: Profile) -> Float[np.ndarray, "n 1"]:
-        del profile
-        return np.ones((len(self.station), 1))
-
-    def columns(
-        self, profile: Profile, node: Float[np.ndarray, " m"], turned: Float[np.ndarray, "m p"]
-    ) -> Float[np.ndarray, "n p"]:
-        del profile
-        return interp1d(node, turned, axis=0)(self.station)
-
-
 def fit_plan(points: Float[np.ndarray, "n 2"], station: Float[np.ndarray, " n"], tolerance: float = 0.003) -> Fit:
     """Fit lines, arcs and clothoids to an axis in plan.
 
@@ -200,7 +97,9 @@ def fit_plan(points: Float[np.ndarray, "n 2"], station: Float[np.ndarray, " n"],
     chord = points[min(5, len(points) - 1)] - points[0]
     heading = np.arctan2(chord[1], chord[0])
     across = np.array([-np.sin(heading), np.cos(heading)])
-    return _fit(_Plan(points, station, across), np.array([*points[0], heading]), tolerance, ("line", "arc", "clothoid"))
+    return _fit(
+        PlanTarget(points, station, across), np.array([*points[0], heading]), tolerance, ("line", "arc", "clothoid")
+    )
 
 
 def fit_profile(height: Float[np.ndarray, " n"], station: Float[np.ndarray, " n"], tolerance: float = 0.003) -> Fit:
@@ -209,7 +108,7 @@ def fit_profile(height: Float[np.ndarray, " n"], station: Float[np.ndarray, " n"
     Raises:
         ValueError: There are fewer than ten points, or they lie on less than 20 m.
     """
-    return _fit(_Height(height, station), height[:1], tolerance, ("grade", "grade", "parabola"))
+    return _fit(HeightTarget(height, station), height[:1], tolerance, ("grade", "grade", "parabola"))
 
 
 def _first(station: Float[np.ndarray, " n"], start: Float[np.ndarray, " i"]) -> Profile:
@@ -220,127 +119,73 @@ def _first(station: Float[np.ndarray, " n"], start: Float[np.ndarray, " i"]) -> 
     return Profile(knot, np.zeros(count), np.asarray(start, float))
 
 
-Tie = Int[np.ndarray, " k"]  # number of the value at each knot; knots that share one are equal, -1 is zero
-
-
-def _fit(target: _Plan | _Height, start: Float[np.ndarray, " i"], tolerance: float, kinds: tuple[str, str, str]) -> Fit:
-    """Thin the knots of a fit, make its values equal where they can be, and name its elements."""
+def _fit(
+    target: PlanTarget | HeightTarget, start: Float[np.ndarray, " i"], tolerance: float, kinds: tuple[str, str, str]
+) -> Fit:
+    """Find the knots, make values equal where they can be, and name the elements."""
     first = _first(target.station, start)
-    dense = _adjust(first, np.arange(len(first.knot)), target, move=False)
-    allowed = float(np.mean(target.miss(dense) ** 2)) + tolerance**2
+    dense = adjust(first, np.arange(len(first.knot)), target, move=False)
+    allowed = _square(dense, target) / len(target.station) + max(tolerance, _COARSE) ** 2
     thin = _thin_linear(dense, target, allowed)
-    thin = _thin(_adjust(thin, np.arange(len(thin.knot)), target), target, allowed)
-    profile, tie = _equalise(thin, target, allowed)
+    thin = adjust(thin, np.arange(len(thin.knot)), target)
+    price = _price(target, tolerance)
+    profile, tie = _equalise(_take_out(_put_in(thin, target, price), target, price), target, price)
     return Fit(profile, _name(profile, tie, kinds), target.miss(profile), target.station)
 
 
-def _pack(profile: Profile, tie: Tie, move: bool) -> Float[np.ndarray, " p"]:
-    groups = [profile.value[tie == group].mean() for group in range(tie.max() + 1)]
-    return np.concatenate([profile.start, groups, profile.knot[1:-1] if move else []])
+def _square(profile: Profile, target: Target) -> float:
+    """Return the sum of squares of the misses, m²."""
+    return float(np.sum(target.miss(profile) ** 2))
 
 
-def _unpack(numbers: Float[np.ndarray, " p"], profile: Profile, tie: Tie, move: bool) -> Profile:
-    first, count = len(profile.start), tie.max() + 1
-    value = np.where(tie < 0, 0.0, numbers[first + np.maximum(tie, 0)]) if count else np.zeros(len(tie))
-    knot = profile.knot
-    if move:
-        inner = numbers[first + count :]
-        knot = np.concatenate([knot[:1], inner, knot[-1:]])
-    return Profile(knot, value, numbers[:first])
+def _price(target: PlanTarget | HeightTarget, tolerance: float) -> float:
+    """Return the sum of squares that a knot must save, m².
+
+    That is what chance saves with two more numbers by Schwarz's criterion, and a share of the tolerance.
+    """
+    n = len(target.station)
+    noise = max(target.noise(), _LEAST_NOISE)
+    return max(2.0 * np.log(n) * noise**2, _WORTH * n * tolerance**2)
 
 
-def _jacobian(profile: Profile, tie: Tie, target: Target, move: bool) -> Float[np.ndarray, "n p"]:
-    """Return the derivatives of the misses: start, values of the ties and, with `move`, inner knots."""
-    node = np.linspace(profile.knot[0], profile.knot[-1], round((profile.knot[-1] - profile.knot[0]) / _STEP) + 2)
-    before, after = _hats(profile.knot, node)
-    slope = np.diff(profile.value) / np.diff(profile.knot)
-    parts = [(before + after) @ (tie[:, None] == np.arange(tie.max() + 1))]
-    if move:  # a knot that moves on lowers a rising line on both of its sides
-        parts.append(-(before[:, 1:-1] * slope[:-1] + after[:, 1:-1] * slope[1:]))
-    turned = _cumulate(np.hstack(parts), node)
-    return -np.hstack([target.start_columns(profile), target.columns(profile, node, turned)])
-
-
-def _hats(knot: np.ndarray, node: np.ndarray) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "m k"]]:
-    """Return the rising and the falling half of each knot's hat at the nodes."""
-    i = np.clip(np.searchsorted(knot, node, side="right") - 1, 0, len(knot) - 2)
-    share = (node - knot[i]) / (knot[i + 1] - knot[i])
-    rising, falling = np.zeros((2, len(node), len(knot)))
-    row = np.arange(len(node))
-    rising[row, i + 1], falling[row, i] = share, 1.0 - share
-    return rising, falling
-
-
-def _cumulate(values: Float[np.ndarray, "m p"], node: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m p"]:
-    """Return the integral from the first node."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(node)[:, None]
-    return np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-
-
-def _adjust(profile: Profile, tie: Tie, target: Target, *, move: bool = True, rounds: int = _ROUNDS) -> Profile:
-    """Fit start, values and, with `move`, the places of the knots, by damped Gauss-Newton steps."""
-    damping, cost = 1e-8, float(np.sum(target.miss(profile) ** 2))
-    for _ in range(rounds):
-        matrix = _jacobian(profile, tie, target, move)
-        scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-12)
-        normal, right = (matrix / scale).T @ (matrix / scale), -(matrix / scale).T @ target.miss(profile)
-        for _ in range(6):
-            step = np.linalg.solve(normal + damping * np.eye(len(scale)), right) / scale
-            trial = _stepped(profile, tie, step, move)
-            lower = float(np.sum(target.miss(trial) ** 2))
-            if lower < cost:
+def _put_in(profile: Profile, target: Target, price: float) -> Profile:
+    """Put in knots, the most useful first, as long as each is worth its price."""
+    while True:
+        before = _square(profile, target)
+        for place in _useful_places(profile, target):
+            trial = _with(profile, place)
+            trial = adjust(trial, np.arange(len(trial.knot)), target)
+            if _square(trial, target) < before - price:
+                profile = trial
                 break
-            damping = max(30.0 * damping, 1e-8)
         else:
             return profile
-        gain, profile, cost = (cost - lower) / max(cost, 1e-30), trial, lower
-        damping = max(0.1 * damping, 1e-10)
-        if gain < 1e-5:
-            return profile
-    return profile
 
 
-def _stepped(profile: Profile, tie: Tie, step: Float[np.ndarray, " p"], move: bool) -> Profile:
-    """Return the profile after a step; knots go at most so far that each element keeps its least length."""
-    numbers = _pack(profile, tie, move) + step
-    trial = _unpack(numbers, profile, tie, move)
-    gap = np.diff(profile.knot) - _LEAST_ELEMENT
-    shrunk = np.diff(profile.knot) - np.diff(trial.knot)
-    share = np.min(np.where(shrunk > gap, np.maximum(gap, 0.0) / np.maximum(shrunk, 1e-12), 1.0), initial=1.0)
-    return replace(trial, knot=profile.knot + share * (trial.knot - profile.knot))
+def _useful_places(profile: Profile, target: Target) -> Float[np.ndarray, " t"]:
+    """Return places at which a knot would save most, by the linear problem."""
+    place = np.arange(profile.knot[0] + LEAST_ELEMENT, profile.knot[-1] - LEAST_ELEMENT, _PLACES)
+    place = place[np.abs(place[:, None] - profile.knot).min(axis=1) > LEAST_ELEMENT]
+    if not len(place):
+        return place
+    node = np.linspace(profile.knot[0], profile.knot[-1], round(profile.knot[-1] - profile.knot[0]) + 2)
+    after = np.searchsorted(profile.knot, place)
+    low, high = profile.knot[after - 1], profile.knot[after]
+    hat = np.clip(np.minimum((node[:, None] - low) / (place - low), (high - node[:, None]) / (high - place)), 0.0, None)
+    new = target.columns(profile, node, cumulate(hat, node))
+    old = jacobian(profile, np.arange(len(profile.knot)), target, move=True)
+    basis = np.linalg.qr(old / np.maximum(np.linalg.norm(old, axis=0), 1e-12))[0]
+    own, miss = (part - basis @ (basis.T @ part) for part in (new, target.miss(profile)))
+    size = np.sum(own**2, axis=0)
+    told = size > 1e-9 * np.sum(new**2, axis=0)  # what the present numbers cannot imitate
+    gain = np.where(told, (own.T @ miss) ** 2 / np.maximum(size, 1e-30), 0.0)
+    return place[np.argsort(-gain)[:_TRIES]]
 
 
-def _between(profile: Profile, j: int) -> Float[np.ndarray, " k"]:
-    """Return the condition that the value at knot j lies on the line between its neighbours."""
-    before, here, after = profile.knot[j - 1 : j + 2]
-    share = (here - before) / (after - before)
-    condition = np.zeros(len(profile.knot))
-    condition[j - 1 : j + 2] = [1.0 - share, -1.0, share]
-    return condition
-
-
-def _normal(profile: Profile, target: Target) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
-    """Return the normal matrix of the start's correction and the values, and its right side."""
-    free = np.arange(len(profile.knot))
-    matrix = _jacobian(profile, free, target, move=False)
-    numbers = _pack(profile, free, False)
-    numbers[: len(profile.start)] = 0.0
-    return matrix.T @ matrix, matrix.T @ (matrix @ numbers - target.miss(profile))
-
-
-def _costs(profile: Profile, inverse: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " k"]:
-    """Return by how much the sum of squares would grow if each knot were taken out; infinite for both ends.
-
-    Args:
-        profile: The profile at its least sum.
-        inverse: Inverse of the normal matrix of start and values.
-    """
-    inner = inverse[len(profile.start) :, len(profile.start) :]
-    costs = np.full(len(profile.knot), np.inf)
-    for j in range(1, len(profile.knot) - 1):
-        condition = _between(profile, j)
-        costs[j] = (condition @ profile.value) ** 2 / max(condition @ inner @ condition, 1e-30)
-    return costs
+def _with(profile: Profile, place: float) -> Profile:
+    j = int(np.searchsorted(profile.knot, place))
+    value = float(profile.at(np.array([place]))[0])
+    return replace(profile, knot=np.insert(profile.knot, j, place), value=np.insert(profile.value, j, value))
 
 
 def _without(profile: Profile, j: int) -> Profile:
@@ -352,36 +197,33 @@ def _thin_linear(profile: Profile, target: Target, allowed: float) -> Profile:
 
     Curvature is small, so the problem is linear in start and values, and is set up once.
     """
-    normal, right = _normal(profile, target)
+    normal, right = normal_equations(profile, target)
     spare = (allowed - float(np.mean(target.miss(profile) ** 2))) * len(target.station)
     start, first, spent = profile.start, len(profile.start), 0.0
     while len(profile.knot) > 3:
         inverse = np.linalg.pinv(normal, rcond=1e-14, hermitian=True)
         numbers = inverse @ right
         profile = Profile(profile.knot, numbers[first:], start + numbers[:first])
-        costs = _costs(profile, inverse)
+        costs = knot_costs(profile, inverse)
         j = int(np.argmin(costs))
         spent += float(costs[j])
         if spent > spare:
             break
         # The value at the knot becomes that between its neighbours.
         fold = np.delete(np.eye(len(normal)), first + j, axis=1)
-        share = np.delete(_between(profile, j), j)
+        share = np.delete(on_neighbours(profile, j), j)
         fold[first + j, first:] = share
         normal, right = fold.T @ normal @ fold, fold.T @ right
         profile = _without(profile, j)
-    return _adjust(profile, np.arange(len(profile.knot)), target, move=False)
+    return adjust(profile, np.arange(len(profile.knot)), target, move=False)
 
 
-def _thin(profile: Profile, target: Target, allowed: float, tries: int = 8) -> Profile:
-    """Take out knots while the others, moved, keep the mean square allowed."""
+def _take_out(profile: Profile, target: Target, price: float) -> Profile:
+    """Take out knots that, with the others moved, are not worth their price."""
     while len(profile.knot) > 2:
-        inverse = np.linalg.pinv(_normal(profile, target)[0], rcond=1e-14, hermitian=True)
-        for j in np.argsort(_costs(profile, inverse))[:tries]:
-            if j in (0, len(profile.knot) - 1):
-                continue
-            trial = _adjust(_without(profile, int(j)), np.arange(len(profile.knot) - 1), target, rounds=25)
-            if float(np.mean(target.miss(trial) ** 2)) <= allowed:
+        most = _square(profile, target) + price
+        for trial in _thinner(profile, target):
+            if _square(trial, target) <= most:
                 profile = trial
                 break
         else:
@@ -389,16 +231,25 @@ def _thin(profile: Profile, target: Target, allowed: float, tries: int = 8) -> P
     return profile
 
 
-def _equalise(profile: Profile, target: Target, allowed: float) -> tuple[Profile, Tie]:
-    """Make neighbouring values equal, and small ones zero, the cheapest first, while the mean square stays allowed."""
+def _thinner(profile: Profile, target: Target) -> Iterator[Profile]:
+    """Yield the profile without one of its knots, those first that cost least by the linear problem."""
+    inverse = np.linalg.pinv(normal_equations(profile, target)[0], rcond=1e-14, hermitian=True)
+    for j in np.argsort(knot_costs(profile, inverse))[:_TRIES]:
+        if 0 < j < len(profile.knot) - 1:
+            yield adjust(_without(profile, int(j)), np.arange(len(profile.knot) - 1), target)
+
+
+def _equalise(profile: Profile, target: Target, price: float) -> tuple[Profile, Tie]:
+    """Make neighbouring values equal, and small ones zero, the cheapest first, where that costs less than a price."""
     tie = np.arange(len(profile.knot))
     refused: set[tuple[int, ...]] = set()
     while True:
+        most = _square(profile, target) + price
         for trial_tie in _next_ties(profile, tie):
             if tuple(trial_tie) in refused:
                 continue
-            trial = _adjust(_unpack(_pack(profile, trial_tie, True), profile, trial_tie, True), trial_tie, target)
-            if float(np.mean(target.miss(trial) ** 2)) <= allowed:
+            trial = adjust(unpack(pack(profile, trial_tie, True), profile, trial_tie, True), trial_tie, target)
+            if _square(trial, target) <= most:
                 profile, tie = trial, trial_tie
                 break
             refused.add(tuple(trial_tie))
