@@ -9,7 +9,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -156,8 +155,3 @@ def redraw(folder: Path, name: str) -> Scene:
     course = Course(**{key: facts[key] for key in ("name", "walls", "sensor", "motion", "dust", "distance")})
     config = replace(ArenaConfig(folder), seed=settings["seed"], secret=settings["secret"])
     return draw_scene(course, course_seed(config, course))
-
-
-def describe_courses() -> list[dict[str, Any]]:
-    """Returns all courses for a table."""
-    return [asdict(one) for one in COURSES]
