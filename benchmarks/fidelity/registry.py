@@ -13,6 +13,7 @@ from benchmarks.fidelity.case import Case, release_memory
 
 BLOCK = 10.0  # m along the tunnel; points nearer than this are not independent
 RESAMPLES = 200
+FEWEST_IN_BLOCK = 5  # samples of a stretch that has a value of its own
 
 Statistic = Callable[[Float[np.ndarray, " k"]], float]
 Need = Literal["hold", "truth", "reference"]
@@ -33,6 +34,8 @@ class Value:
         n: Number of samples.
         reason: Cause of a missing value, or remark on the value.
         failed: The computation broke on this candidate; it scores 0 instead of being left out.
+        extremes: Start, m, and value of the stretches of `BLOCK` with the lowest and with the highest value; `None`
+            where the metric has no values along the tunnel.
     """
 
     value: float | None
@@ -40,6 +43,7 @@ class Value:
     n: int = 0
     reason: str = ""
     failed: bool = False
+    extremes: tuple[tuple[float, float], tuple[float, float]] | None = None
 
 
 def number(value: float, n: int = 0, reason: str = "") -> Value:
@@ -110,13 +114,27 @@ def estimate(
     stride = max(1, len(samples) // most)
     order = np.argsort(station[::stride] // BLOCK, kind="stable")
     thin, block = samples[::stride][order], (station[::stride] // BLOCK)[order]
-    groups = np.split(thin, np.flatnonzero(np.diff(block)) + 1)
+    cuts = np.flatnonzero(np.diff(block)) + 1
+    groups = np.split(thin, cuts)
+    extremes = _extremes(statistic, groups, BLOCK * block[np.concatenate([[0], cuts])])
     if len(groups) < 3:
-        return Value(value, None, len(samples), "too short for an interval")
+        return Value(value, None, len(samples), "too short for an interval", extremes=extremes)
     draws = rng.integers(0, len(groups), (RESAMPLES, len(groups)))
     spread = [statistic(np.concatenate([groups[i] for i in draw])) for draw in draws]
     low, high = np.nanpercentile(spread, [2.5, 97.5])
-    return Value(value, (float(low), float(high)), len(samples))
+    return Value(value, (float(low), float(high)), len(samples), extremes=extremes)
+
+
+def _extremes(
+    statistic: Statistic, groups: list[np.ndarray], start: Float[np.ndarray, " b"]
+) -> tuple[tuple[float, float], tuple[float, float]] | None:
+    """Return start and value of the lowest and the highest stretch; those with few samples do not count."""
+    found = [
+        (float(value), float(at))
+        for group, at in zip(groups, start, strict=True)
+        if len(group) >= FEWEST_IN_BLOCK and np.isfinite(value := statistic(group))
+    ]
+    return None if not found else (min(found)[::-1], max(found)[::-1])
 
 
 @dataclass(frozen=True)
@@ -245,6 +263,10 @@ def dump_values(values: dict[str, Value]) -> dict[str, Any]:
 def load_values(content: dict[str, Any]) -> dict[str, Value]:
     """Return the values that `dump_values` wrote."""
     return {
-        id: Value(**{**entry, "interval": tuple(entry["interval"]) if entry["interval"] else None})
+        id: Value(**{
+            **entry,
+            "interval": tuple(entry["interval"]) if entry["interval"] else None,
+            "extremes": tuple(tuple(one) for one in entry["extremes"]) if entry.get("extremes") else None,
+        })
         for id, entry in content.items()
-    }
+    }  # fmt: skip

@@ -7,6 +7,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.case import Case, code_hash
 from benchmarks.fidelity.controls.runner import is_bold, list_jobs
@@ -16,6 +18,7 @@ from benchmarks.fidelity.files import write_json
 from benchmarks.fidelity.impostors import null_tube
 from benchmarks.fidelity.inputs import Inputs
 from benchmarks.fidelity.judge import Judgement
+from benchmarks.fidelity.registry import BLOCK, Value
 from benchmarks.fidelity.report import forms
 from benchmarks.fidelity.scoring import Score, Scored
 from benchmarks.fidelity.table import Metric
@@ -151,7 +154,18 @@ def _metric_entry(row: Metric, scored: dict[str, Scored]) -> dict[str, Any]:
         "ci95": value.interval, "n": value.n, "score": score.score, "role": row.role, "evidence": row.evidence,
         "map": table.map_text(row.map), "null_value": null, "ceiling_value": ceiling,
         "skill": scoring.skill(value.value, null, ceiling), "status": _status(row, score), "reason": value.reason,
+        "worst_stretch": _worst_stretch(row, value),
     }  # fmt: skip
+
+
+def _worst_stretch(row: Metric, value: Value) -> dict[str, float | None] | None:
+    """Return start and end, m, value and score of the 10 m in which a metric is worst; `None` without any."""
+    if value.extremes is None:
+        return None
+    scores = [row.map.score(one) if row.scored else 0.0 for _, one in value.extremes]
+    worst = int(np.argmin(scores)) if row.scored and scores[0] != scores[1] else int(row.direction != "up")
+    start, found = value.extremes[worst]
+    return {"start": start, "end": start + BLOCK, "value": found, "score": scores[worst] if row.scored else None}
 
 
 def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:

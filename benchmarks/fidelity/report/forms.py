@@ -14,7 +14,8 @@ from benchmarks.fidelity.files import write_text
 
 HERE = Path(__file__).parent
 METRIC_COLUMNS = ("id", "category", "value", "unit", "score", "role", "evidence", "status", "ci_low", "ci_high", "n",
-                  "null_value", "ceiling_value", "skill", "map", "reason")  # fmt: skip
+                  "null_value", "ceiling_value", "skill", "map",
+                  "worst_start", "worst_value", "worst_score", "reason")  # fmt: skip
 
 
 def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
@@ -26,7 +27,8 @@ def write_metrics(folder: Path, report: dict[str, Any]) -> Path:
     rows = []
     for entry in report["metrics"] + more:
         low, high = entry["ci95"] or (None, None)
-        rows.append({"source": "suite", **entry, "ci_low": low, "ci_high": high})
+        worst = {f"worst_{key}": value for key, value in (entry["worst_stretch"] or {}).items()}
+        rows.append({"source": "suite", **entry, "ci_low": low, "ci_high": high, **worst})
     columns = METRIC_COLUMNS + (("source",) if more else ())
     return write_csv(folder / "metrics.csv", columns, rows)
 

@@ -2,10 +2,12 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
-from benchmarks.fidelity.registry import all_metrics
+from benchmarks.fidelity.registry import all_metrics, dump_values, estimate, load_values, mean
+from benchmarks.fidelity.report import _worst_stretch
 from benchmarks.fidelity.table import Map
 
 
@@ -58,3 +60,16 @@ def test_a_share_moves_by_its_shortfall_and_never_past_one() -> None:
     assert (moved.good, moved.bad) == (pytest.approx(0.967), pytest.approx(0.835))
     assert table.parse_map("D(1,3)").scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
     assert table.parse_map("P").scaled(1.1) == table.parse_map("P")
+
+
+def test_the_worst_stretch_of_a_metric_along_the_tunnel_is_kept_with_its_place() -> None:
+    station = np.arange(0.0, 50.0, 0.5)
+    error = np.where((station >= 20.0) & (station < 30.0), 0.3, 0.1)
+    found = estimate(mean, error, station, np.random.default_rng(0))
+    assert found.extremes == ((0.0, pytest.approx(0.1)), (20.0, pytest.approx(0.3)))
+    assert load_values(dump_values({"one": found})) == {"one": found}
+    row = table.load()["c2m_mean"]
+    worst = _worst_stretch(row, found)
+    assert worst == {"start": 20.0, "end": 30.0, "value": pytest.approx(0.3), "score": 0.0}
+    assert _worst_stretch(table.load()["cl_icp_translation"], found)["value"] == pytest.approx(0.3)
+    assert estimate(mean, error[:3], station[:3], np.random.default_rng(0)).extremes is None
