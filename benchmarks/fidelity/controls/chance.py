@@ -12,7 +12,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
-from matplotlib.ticker import NullFormatter, ScalarFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from benchmarks.fidelity.case import Case, case_hash, release_memory
 from benchmarks.fidelity.controls.local import KINDS, draw_fault, make_ground, spoil
@@ -155,12 +155,14 @@ def _draw(path: Path, rows: list[dict[str, Any]], table: list[dict[str, Any]]) -
         panel.set_title(one["words"], fontsize=8)
         panel.set_xlabel(unit, fontsize=8)
         panel.tick_params(labelsize=7)
-        panel.xaxis.set_major_formatter(ScalarFormatter())
+        panel.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        panel.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         panel.xaxis.set_minor_formatter(NullFormatter())
         panel.spines[["top", "right"]].set_visible(False)
     figure.suptitle(
         f"{len(rows)} random faults in {scenes} scene{'s' if scenes != 1 else ''}; filled: {LONG_ENOUGH:g} m long or "
-        "more; line: from there on 95 % of those are noticed", fontsize=9,
-    )  # fmt: skip
+        f"more; line: from there on at least 95 % of those drawn, and {_AT_LEAST} or more, were noticed",
+        fontsize=9,
+    )
     figure.savefig(path, dpi=130)
     plt.close(figure)
