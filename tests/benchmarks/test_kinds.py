@@ -28,9 +28,9 @@ def test_every_kind_has_the_same_episodes_spread_over_its_own_tunnels():
 
 
 def test_further_tunnels_are_columns_of_their_own_and_severities_are_spread_over_all_tunnels():
-    config = kinds.KindsConfig(episodes=20, tunnels=2, further=("subterra-351", "control"))
+    config = kinds.KindsConfig(episodes=25, tunnels=5, further=("subterra-351", "control"))
     episodes = kinds.draw_episodes(config, 4, 2, faults=True)
-    np.testing.assert_array_equal(kinds.column_of(episodes.tunnel, config), np.repeat(np.arange(6), 20))
+    np.testing.assert_array_equal(kinds.column_of(episodes.tunnel, config), np.repeat(np.arange(6), 25))
     for tunnel in np.unique(episodes.tunnel):
         severities = episodes.severity[episodes.tunnel == tunnel]
         assert set(np.bincount(severities, minlength=5)) == {len(severities) // 5}
