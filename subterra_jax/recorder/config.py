@@ -16,6 +16,7 @@ from subterra_jax.evaluation import listed_episodes
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
 from subterra_jax.lidar3d import beams
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies import PREFIX
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, find
@@ -23,6 +24,7 @@ from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
 CloudName = Literal["none", "vlp16", "os1"]
+SensorName = Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"]
 _BEAMS: dict[str, tuple[Callable[[int], np.ndarray], int]] = {"vlp16": (beams.vlp16, 16), "os1": (beams.os1, 64)}
 
 
@@ -44,6 +46,8 @@ class RecorderConfig:
         episode: Record this one of the task's 500 listed episodes instead (from 0), as the leaderboard drives it.
         tunnel: Tunnel file or name; the packaged tunnel if left out.
         lining: Variant of the walls; `pockets` if left out.
+        sensor: The robot's own LiDAR: `planar16`, or `spin16x64`, `vlp16`, `os1-64`, `avia` in three dimensions, whose
+            returns are recorded as `/points` in place of `/scan`.
         scene: Built scene folder: its tunnel is driven, and clouds are taken in it.
         cloud: LiDAR in three dimensions, which needs `scene`.
         columns: Columns in a turn of that LiDAR.
@@ -62,6 +66,7 @@ class RecorderConfig:
     episode: int | None = None
     tunnel: str | None = None
     lining: str | None = None
+    sensor: SensorName = "planar16"
     scene: Path | None = None
     cloud: CloudName = "none"
     columns: int = 900
@@ -114,6 +119,11 @@ def check_config(config: RecorderConfig) -> RecorderConfig:
         raise RecorderError(f"no LiDAR {config.cloud!r}; there are {', '.join(_BEAMS)}")
     if config.cloud != "none" and config.scene is None:
         raise RecorderError(f"cloud {config.cloud!r} needs a scene folder (`python -m scene.build` makes one)")
+    if config.sensor != SENSORS[0]:
+        if config.cloud != "none":
+            raise RecorderError(f"the sensor {config.sensor!r} fills /points itself: leave out the cloud")
+        if config.beams:
+            raise RecorderError(f"beams belong to the planar LiDAR, and the sensor is {config.sensor!r}")
     if config.scene is not None and config.tunnel is not None:
         raise RecorderError("either scene or tunnel, not both: a scene brings its own tunnel")
     for folder in (config.recording_folder, config.truth_folder):
@@ -137,6 +147,16 @@ class World:
     params: EnvParams
     plan: TunnelPlan
 
+    @property
+    def is_spatial(self) -> bool:
+        """Whether the robot's LiDAR is one in three dimensions."""
+        return "scan" in self.env.fields(self.params)
+
+    @property
+    def sensor_height(self) -> float:
+        """Height of LiDAR and IMU over the ground, m."""
+        return float(self.params.lidar.mount.height) if self.is_spatial else self.plan.lidar_height
+
 
 def open_world(config: RecorderConfig) -> World:
     """Make the task and read the tunnel of a recording.
@@ -148,9 +168,10 @@ def open_world(config: RecorderConfig) -> World:
     name = find(config.task, short=True)
     if name not in TASKS:
         raise RecorderError(f"{name} cannot be recorded: the recorder drives robots on wheels")
-    plan = st.load_tunnel(config.tunnel if config.scene is None else config.scene / "tunnel.npz")
+    source = config.tunnel if config.scene is None else config.scene / "tunnel.npz"
+    plan = st.load_tunnel(source, solid=config.sensor != SENSORS[0])
     try:
-        env, params = st.make(name, plan, config.lining)
+        env, params = st.make(name, plan, config.lining, sensor=config.sensor)
     except ValueError as error:
         raise RecorderError(str(error)) from error
     unseen = [part for part in ("obstacles", "faults") if part in params.parts]

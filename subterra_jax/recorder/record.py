@@ -91,6 +91,15 @@ def _imu(samples: Inertial) -> Iterator[Message]:
         yield Message(time, "/imu", messages.imu(time, gyro, accel))
 
 
+def _points(trace: Trace, scans: Float[np.ndarray, "rows m"], sensor: Any, every: int) -> Iterator[Message]:
+    """Yield the returns of the agent's own LiDAR in three dimensions, in its frame."""
+    beams = np.asarray(sensor.directions)
+    ring = np.arange(len(beams)) // sensor.shape[1]
+    for time, ranges in zip(trace.time[::every], scans[::every], strict=True):
+        hit = np.isfinite(ranges) & (ranges > 0.0) & (ranges < float(sensor.range_max))
+        yield Message(time, "/points", messages.point_cloud(time, beams[hit] * ranges[hit, None], ring[hit]))
+
+
 def _clouds(
     relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], config: RecorderConfig, seed: int
 ) -> Iterator[Message]:
@@ -111,9 +120,11 @@ _LIBRARIES = ("subterra-jax", "jax", "numpy", "rosbags")
 def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics: dict[str, Any]) -> dict[str, Any]:
     """Return the facts that do not give the truth away: neither seed nor outcome."""
     env, params, plan = world.env, world.params, world.plan
-    parts = {name: where for name, where in env.fields(params).items() if name not in ("ranges", "odometry")}
+    parts = {name: where for name, where in env.fields(params).items() if name not in ("ranges", "scan", "odometry")}
     first = {name: float(trace.observation[0, where][0]) for name, where in parts.items() if name != "flag"}
-    sensors: dict[str, Any] = {"lidar_height": plan.lidar_height, "scan_beams": params.lidar.n_beams}
+    sensors: dict[str, Any] = {"lidar_height": world.sensor_height, "scan_beams": params.lidar.n_beams}
+    if world.is_spatial:
+        sensors |= {"sensor": config.sensor, "every": config.every, "cloud_range": float(params.lidar.range_max)}
     if config.beams:
         sensors["scan_dense_beams"] = config.beams
     if config.cloud != "none":
@@ -215,17 +226,20 @@ def _write_recording(
 ) -> None:
     """Write the messages and facts that the robot itself knows."""
     parts, range_max = world.env.fields(world.params), float(world.params.lidar.range_max)
-    height = world.plan.lidar_height
+    height = world.sensor_height
     reckoned = reckoned_poses(trace, trace.observation[:, parts["odometry"]])
     sensor = true_poses(trace, world.plan).lift(height)
-    mounted = {"laser": True, "lidar": relief is not None, "imu": config.imu}
-    streams = [
+    mounted = {"laser": not world.is_spatial, "lidar": world.is_spatial or relief is not None, "imu": config.imu}
+    streams: list[Iterator[Message]] = [
         _mounts(height, tuple(frame for frame, there in mounted.items() if there)),
         _frames(reckoned, "odom"),
         _odometry("/odom", reckoned, "odom"),
         _commands(trace),
-        _scans("/scan", trace, trace.observation[:, parts["ranges"]], range_max),
     ]
+    if world.is_spatial:
+        streams.append(_points(trace, trace.observation[:, parts["scan"]], world.params.lidar, config.every))
+    else:
+        streams.append(_scans("/scan", trace, trace.observation[:, parts["ranges"]], range_max))
     if config.beams:
         dense = dense_scans(trace, world.env, world.params, config.beams, seed)
         streams.append(_scans("/scan_dense", trace, dense, range_max))
@@ -245,7 +259,7 @@ def _write_truth(
     body = true_poses(trace, world.plan)
     streams: list[Iterator[Message]] = [_frames(body, "map"), _odometry("/truth/odometry", body, "map")]
     topics = write_bag(folder, _merge(streams))
-    _save_tum(folder / "lidar.tum", body.lift(world.plan.lidar_height))
+    _save_tum(folder / "lidar.tum", body.lift(world.sensor_height))
     _save_tum(folder / "base_link.tum", body)
     header = "station,x,y,z"
     np.savetxt(folder / "axis.csv", axis_rows(world.plan), fmt="%.6f", delimiter=",", header=header, comments="")
