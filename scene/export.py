@@ -22,13 +22,14 @@ from jaxtyping import Float, Int
 from trimesh.visual.material import PBRMaterial
 
 from scene.errors import RecordingError, require_input
+from scene.robot import write_urdf
 from subterra_jax.host.command import parse, require_libraries, run_command
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, replace_folder, require_file, require_folder
 
 _DRAWN = (0, 1)  # groups of lining and bed, of track and furniture
 _AROUND = 32  # corners of a cylinder: 0.5 % of its radius
-_ENDINGS = {"glb": (".glb",), "usd": (".usda", ".usdc", ".usd"), "sdf": ()}
+_ENDINGS = {"glb": (".glb",), "usd": (".usda", ".usdc", ".usd"), "sdf": (), "urdf": (".urdf",)}
 
 
 @dataclass(frozen=True)
@@ -37,14 +38,15 @@ class ExportConfig:
 
     Attributes:
         scene: Scene folder, as `scene.build` writes it.
-        to: `glb` (glTF), `usd` (OpenUSD with physics schemas) or `sdf` (a Gazebo model folder).
+        to: `glb` (glTF), `usd` (OpenUSD with physics schemas), `sdf` (a Gazebo model folder), or `urdf`: not the scene
+            but the robot that it comes with.
         out: File to write, for `sdf` a folder; named after the scene, beside it, if not given.
         furnished: With lineside furniture.
         licence: Licence of the scene, put into the file.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    to: Literal["glb", "usd", "sdf"]
+    to: Literal["glb", "usd", "sdf", "urdf"]
     out: Path | None = None
     furnished: bool = False
     licence: str = "as that of the recording"
@@ -236,6 +238,10 @@ def export(config: ExportConfig) -> Path:
         "frame": "tunnel frame, z up, m; add origin for the input's frame",
         "made_by": "Subterra",
     }
+    if config.to == "urdf":
+        with replace_file(out) as fresh:
+            write_urdf(fresh, config.scene / "scene.xml", json.dumps(facts))
+        return out
     parts = read_parts(config.scene / ("scene_furnished.xml" if config.furnished else "scene.xml"))
     if config.to == "sdf":
         with replace_folder(out) as folder:
