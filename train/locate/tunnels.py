@@ -44,7 +44,7 @@ def load(names: list[str], lining: str | None = None, cache: Path | None = None)
     """
     one = functools.partial(_tunnel, lining=lining, cache=cache)
     workers = min(len(names), os.cpu_count() or 1)
-    if workers == 1:
+    if workers <= 1:
         return [one(name) for name in names]
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
