@@ -186,6 +186,7 @@ MISTAKES = {
     "benchmarks.render tunnel --out text.txt/x.png": "text.txt: is a file",
     "benchmarks.paper.camera": "missing",
     "subterra_jax.viewer --seed x": "invalid int value: 'x'",
+    "subterra_jax.viewer --sensor radar": "no sensor 'radar'; there are planar16",
     "subterra_jax.viewer --moon": "unrecognized arguments: --moon",
     "subterra_jax.viewer --task Subterra/StopAt-v7": "has Subterra/StopAt-v0",
     "subterra_jax.viewer --recordings /proc/no/x": "/proc/no/x: cannot be written",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import require_folder
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.tasks import find
 
 
@@ -30,6 +31,7 @@ class ViewerConfig:
             `FILE.py:Class`.
         policies: Trained policies, `.safetensors` files or run folders, offered beside the baselines.
         lining: First variant of the walls.
+        sensor: The robot's LiDAR, as for `subterra_jax.make`; of one in three dimensions the points are shown.
         seed: Seed of the first episode.
         recordings: Folder for saved episodes and pictures.
         replay: First episode, if it is a recorded one.
@@ -43,6 +45,7 @@ class ViewerConfig:
     agent: str = "dead-reckoning"
     policies: tuple[Path, ...] = field(default=())
     lining: str = "pockets"
+    sensor: str = SENSORS[0]
     seed: int = 0
     recordings: Path = Path("out/viewer")
     replay: Path | None = None
@@ -64,6 +67,8 @@ def check_config(config: ViewerConfig) -> ViewerConfig:
         require_folder(config.recordings)  # the default folder need not be writable until something is saved
     if config.lining not in LININGS:
         raise ViewerError(f"lining must be one of {', '.join(LININGS)}, got {config.lining!r}")
+    if config.sensor not in SENSORS:
+        raise ViewerError(f"no sensor {config.sensor!r}; there are {', '.join(SENSORS)}")
     if not 0 <= config.seed < 2**31:
         raise ViewerError(f"seed must be 0 to {2**31 - 1}, got {config.seed}")
     if not 0 <= config.port < 2**16:

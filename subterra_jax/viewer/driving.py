@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.cloud import Cloud
 from subterra_jax.episode import Driver, Episode, Taken
+from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts.boxes import PITCH
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
@@ -53,6 +54,7 @@ class Gait:
 
 
 _CHUNK, _FEW = 100, 5  # steps between two pieces: of a robot on wheels, of one on legs
+_POINTS = 2048  # points of a scan that are kept: a browser without a GPU shows them
 _PARTICLES = 96  # particles that are kept: enough to show the shape of a cloud
 
 
@@ -116,7 +118,8 @@ class _Rows:
             "heading": state.heading,
             "station": state.station,
             "odometry": obs[fields["odometry"]],
-            "ranges": obs[fields["ranges"]],
+            "ranges": _level_ranges(obs, fields, params),
+            "points": _points(obs, fields, params),
             "command": state.command,
             "estimate": jnp.stack([station, sigma]),
             "reward": reward,
@@ -124,6 +127,23 @@ class _Rows:
             "cloud": _particles(memory),
             "trunk": self.env.motion.height(state, params),
         }
+
+
+def _level_ranges(obs: Array, fields: dict[str, slice], params: EnvParams) -> Array:
+    """Return the planar scan, or the level ring of one in three dimensions, m."""
+    return obs[fields["ranges"]] if "ranges" in fields else level_ring(obs[fields["scan"]], params.lidar.shape)
+
+
+def _points(obs: Array, fields: dict[str, slice], params: EnvParams) -> Array:
+    """Return about `_POINTS` returns of a LiDAR in three dimensions, robot's frame, m; none of a planar one."""
+    if "scan" not in fields:
+        return jnp.zeros((0, 3))
+    sensor = params.lidar
+    stride = max(1, -(-sensor.n_beams // _POINTS))
+    ranges, beams = obs[fields["scan"]][::stride], sensor.directions[::stride]
+    seen = (ranges > 0.0) & (ranges < sensor.range_max)
+    points = beams * ranges[:, None] + jnp.stack([0.0, sensor.mount.lateral, sensor.mount.height])
+    return jnp.where(seen[:, None], points, jnp.nan)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -172,6 +172,14 @@ class EpisodeGeometry:
         tips = lidar + reach[:, None] * along
         return np.stack([np.broadcast_to(lidar, tips.shape), tips], axis=1), reach < 0.99 * recording.range_max
 
+    def returns(self, row: int) -> Float[np.ndarray, "k 3"]:
+        """Return where the beams of a row ended, robot's frame, m; of a LiDAR in three dimensions all that are kept."""
+        points = self.recording.points[row].astype(np.float64)
+        if points.shape[0]:
+            return points[np.isfinite(points).all(axis=1)]
+        beams, hit = self.beams(row)
+        return beams[hit, 1]
+
     def trails(self, moment: Moment) -> tuple[Float[np.ndarray, "n 2 3"], Float[np.ndarray, "n 2 3"]]:
         """Return the path so far, true and dead-reckoned, as segments, m."""
         stride = max(1, -(-len(self) // _TRAIL_POINTS))

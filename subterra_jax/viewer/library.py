@@ -14,6 +14,7 @@ from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines import registry
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_object
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.opening import FORMS, call_factory, names_code, policy_source
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest
@@ -69,7 +70,14 @@ def _register(name: str, agent: Any) -> None:
 
 
 def drive_episode(
-    plan: TunnelPlan, digest: str, title: str, lining: str, task: str, agent: str, seed: int
+    plan: TunnelPlan,
+    digest: str,
+    title: str,
+    lining: str,
+    task: str,
+    agent: str,
+    seed: int,
+    sensor: str = SENSORS[0],
 ) -> Iterator[Recording]:
     """Drive an episode; yield the recording so far, again and again.
 
@@ -81,13 +89,14 @@ def drive_episode(
         task: Id of the task.
         agent: Name of the driver.
         seed: Seed of the episode.
+        sensor: The robot's LiDAR.
 
     Raises:
         SubterraError: The agent does not exist, or does not fit the task.
         ValueError: The task does not exist, or the tunnel is too short for it.
     """
     legs: dict[str, Any] = {"engine": "mujoco"} if task in MISSIONS else {}
-    env, params = st.make(task, tunnel=plan, lining=lining, **legs)
+    env, params = st.make(task, tunnel=plan, lining=lining, sensor=sensor, **legs)
     driver = policies.open_agent(agent, env, params)
     names = {"tunnel": title, "tunnel_sha256": digest, "lining": lining, "agent": agent}
     yield from drive(env, params, driver, seed, names)
@@ -120,6 +129,7 @@ class Library:
     Attributes:
         tunnels: Tunnels by title.
         agents: Names of the agents.
+        sensor: The robot's LiDAR.
 
     Raises:
         SubterraError: A tunnel or policy cannot be read, or the driver does not exist.
@@ -127,6 +137,7 @@ class Library:
 
     def __init__(self, config: ViewerConfig):
         self._folder = config.recordings
+        self.sensor = config.sensor
         self._plans: dict[str, TunnelPlan] = {}
         self.tunnels: dict[str, TunnelEntry] = {}
         if config.scene is not None:
@@ -153,7 +164,7 @@ class Library:
         if title not in self.tunnels:
             raise ViewerError(f"no tunnel {title!r}; there are {', '.join(self.tunnels)}")
         if title not in self._plans:
-            self._plans[title] = load_tunnel(self.tunnels[title].source)
+            self._plans[title] = load_tunnel(self.tunnels[title].source, solid=self.sensor != SENSORS[0])
         return self._plans[title]
 
     def digest(self, title: str) -> str:

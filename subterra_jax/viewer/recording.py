@@ -31,6 +31,7 @@ _SHAPES: dict[str, tuple[str | int, ...]] = {
     "boxes": ("b", 6),
     "trunk": ("t",),
     "pose": ("t", "m", N_POSE),
+    "points": ("t", "p", 3),
 }
 
 
@@ -72,6 +73,8 @@ class Recording:
         trunk: Height of a walking robot's trunk, tunnel frame, m; 0 for wheeled robots.
         pose: Orientation w, x, y, z and joints (rad) of a walking robot at even times up to this row, the last at the
             row itself; `m` is 0 for wheeled robots and in older files.
+        points: Returns of a LiDAR in three dimensions in the robot's frame on the ground, m, some of them where it has
+            many beams; NaN without a return. `p` is 0 for a planar LiDAR and in older files.
     """
 
     task: str
@@ -101,6 +104,7 @@ class Recording:
     boxes: Float[np.ndarray, "b 6"]
     trunk: Float[np.ndarray, "t"]
     pose: Float[np.ndarray, "t m 16"]
+    points: Float[np.ndarray, "t p 3"]
 
     def __len__(self) -> int:
         return len(self.station)
@@ -150,6 +154,8 @@ def load(path: Path) -> Recording:
         raise EpisodeFileError(f"{path}: not a readable recording ({describe_damage(path, error)})") from error
     if "station" in fields and "pose" not in fields:
         fields |= {"trunk": np.zeros(len(fields["station"])), "pose": np.zeros((len(fields["station"]), 0, N_POSE))}
+    if "station" in fields and "points" not in fields:
+        fields["points"] = np.zeros((len(fields["station"]), 0, 3))
     schema = str(fields["schema"]) if "schema" in fields else None
     if schema != SCHEMA:
         raise EpisodeFileError(f"{path}: {other_schema(schema, SCHEMA, 'save the episode again in the viewer')}")

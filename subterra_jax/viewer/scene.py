@@ -160,6 +160,7 @@ _LINES = ("beams", "truth", "odometry", "estimate")
 # Lines reach the page later than poses. So beams and estimate hang on the robot, and so does each trail's last piece.
 _CARRIED, _RECKONED = "/carried", "/reckoned"
 _TAIL = 2.0  # m
+_COARSE, _FINE = 0.1, 0.035  # size of the hits of sixteen beams, and of a thousand, m
 _HIDDEN = np.array([[[0.0, 0.0, -100.0]] * 2])  # points of an empty set of lines, out of sight
 
 
@@ -203,7 +204,7 @@ class SceneView:
             name: server.scene.add_line_segments(f"{frame}/tail", _tail(share), colours[name], thickness=0.07)
             for name, frame, share in (("truth", _CARRIED, 1.0), ("odometry", _RECKONED, 0.6))
         }
-        self._hits = self._points(f"{_CARRIED}/hits", _HIT, 0.1)
+        self._hits = self._points(f"{_CARRIED}/hits", _HIT, _COARSE)
         self._particles = self._points(f"{_CARRIED}/particles", ESTIMATE, 0.07)
 
     def _points(self, name: str, colour: tuple[int, int, int], size: float) -> viser.PointCloudHandle:
@@ -274,6 +275,7 @@ class SceneView:
             scene = self._server.scene
             mesh = robot_mesh(recording.radius, height)
             walks = recording.pose.shape[1] > 0
+            self._hits.point_size = _FINE if recording.points.shape[1] else _COARSE
             self._robot = LeggedRobot(scene) if walks else WheeledRobot(scene, mesh)
             self._ghost = scene.add_mesh_simple(
                 "/ghost",
@@ -316,7 +318,7 @@ class SceneView:
                 tail.visible = visible
 
     def _show_row(self, episode: EpisodeGeometry, moment: Moment) -> None:
-        beams, hit = episode.beams(moment.row)
+        beams, _ = episode.beams(moment.row)
         truth, odometry = episode.trails(moment)
         lines = {
             "beams": beams,
@@ -327,7 +329,7 @@ class SceneView:
         for name, segments in lines.items():
             self._lines[name].points = (segments if len(segments) else _HIDDEN).astype(np.float32)
         for cloud, points in (
-            (self._hits, beams[hit, 1]),
+            (self._hits, episode.returns(moment.row)),
             (self._particles, episode.carried(moment.row, episode.particles(moment.row))),
         ):
             cloud.points = (points if len(points) else _HIDDEN[:, 0]).astype(np.float32)

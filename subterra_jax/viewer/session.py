@@ -87,7 +87,8 @@ class EpisodeView:
         self._panel.status.content = f"*making {choice.agent} ready; the first time takes some seconds*"
         plan, digest = self._library.plan(choice.tunnel), self._library.digest(choice.tunnel)
         episode = None
-        for part in drive_episode(plan, digest, choice.tunnel, lining, choice.task, choice.agent, choice.seed):
+        named = (choice.tunnel, lining, choice.task, choice.agent, choice.seed)
+        for part in drive_episode(plan, digest, *named, self._library.sensor):
             if stale():
                 return
             if episode is None:

@@ -41,5 +41,6 @@ def straight(n: int = 21, **changes: Any) -> Recording:
         "boxes": np.zeros((0, 6), np.float32),
         "trunk": zero,
         "pose": np.zeros((n, 0, N_POSE), np.float32),
+        "points": np.zeros((n, 0, 3), np.float32),
     }
     return Recording(**{**fields, **changes})

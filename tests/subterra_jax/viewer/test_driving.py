@@ -63,5 +63,21 @@ def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
         next(library.drive_episode(plan, "0", "t", "smooth", "Subterra/Traverse-v0", "few", 0))
 
 
+@pytest.mark.slow
+def test_the_points_of_a_lidar_in_three_dimensions_are_recorded_and_shown():
+    plan = st.load_tunnel("metro-asbuilt", solid=True)
+    words = ("0", "t", "smooth", "Subterra/TraverseShort-v0", "dead-reckoning", 0, "spin16x64")
+    first = next(library.drive_episode(plan, *words))
+    assert first.points.shape == (1, 1024, 3)
+    points = first.points[0][np.isfinite(first.points[0]).all(axis=1)]
+    assert len(points) > 500
+    assert np.ptp(points[:, 2]) > 1.0  # not a plane
+    assert points[:, 2].min() > -0.5  # nothing far below the ground
+    assert first.ranges.shape == (1, 16)
+    from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry
+
+    np.testing.assert_allclose(EpisodeGeometry(first, Centreline(plan)).returns(0), points, atol=1e-6)
+
+
 def test_baselines_and_released_policies_are_offered():
     assert {"particle-filter", "oracle", "policy:StopAt-v0"} <= set(library.register_agents(()))
