@@ -148,8 +148,6 @@ def test_misuse_is_told_in_one_sentence(env):
         SubterraEnv(TASK, render_mode="human")
     with pytest.raises(ValueError, match="'side'"):
         SubterraEnv(TASK, view="side")
-    with pytest.raises(ValueError, match="scene="):
-        SubterraEnv(TASK, view="mujoco")
 
 
 def test_a_task_that_adds_fields_gives_a_dict_and_the_vector_when_asked(made):
