@@ -43,7 +43,7 @@ class ReportConfig:
         radius: Design radius of a round bore, m.
         gauge: Loading gauge: `g1`, or CSV of a closed polygon of rows `left, height over rail`, m.
         start: Chainage of station 0, m; that of the manifest if neither this nor a design is given.
-        tolerance: Misfit by which the alignment may use fewer elements, m.
+        tolerance: Root mean square that an alignment of fewer elements may add to what many elements leave, m.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
