@@ -49,7 +49,7 @@ class SurveyConfig:
     truth: TruthName = "paper"
     length: float = 60.0  # Length of the bore along its centreline, m.
     seed: int = 0  # Draws the bore, the walk and all noise. The same seed gives the same bytes.
-    # Draw gauge, rails, rings, pockets and sleepers within building tolerance; otherwise they are as designed.
+    # Draw sizes (gauge, rings, pockets ...) within building tolerance.
     tolerances: bool = False
     correlation: float = 2.0  # Correlation length of the walls of `irregular`, m.
     # LiDARs on the rack, each with its own recording. With none, only truth and clouds are written.
