@@ -149,7 +149,7 @@ class World:
 
     @property
     def is_spatial(self) -> bool:
-        """Whether the robot's LiDAR is one in three dimensions."""
+        """True where the robot's LiDAR is one in three dimensions."""
         return "scan" in self.env.fields(self.params)
 
     @property

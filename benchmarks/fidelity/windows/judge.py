@@ -146,7 +146,7 @@ def noticed_by(case: Case, spoilt: Candidate, before: list[Worst]) -> tuple[str,
 
 @dataclass(frozen=True)
 class Windows:
-    """What windows say about a candidate.
+    """Result of the windows of a candidate.
 
     Attributes:
         worst: The worst window of each measure.

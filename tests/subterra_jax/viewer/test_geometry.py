@@ -1,4 +1,4 @@
-"""What is to be seen at a moment, against geometry that is known."""
+"""Drawn geometry of a moment, against geometry that is known."""
 
 import numpy as np
 import pytest

@@ -55,7 +55,7 @@ def until(holds, seconds=20.0):
 
 
 def moves(viewer):
-    """Whether the replay goes on: the clock, and a client that hears the robot move."""
+    """Tells if the replay goes on: the clock, and a client that hears the robot move."""
     player = viewer.session.view.player
     player.seek(0.0)
     if not player.playing:
@@ -186,7 +186,7 @@ def test_a_recording_outside_the_folder_is_not_read(viewer):
 
 
 def nonsense(viewer, seed):
-    """What one unkind client says: noise, half messages, and real controls set to what they cannot be."""
+    """Messages of an unkind client: noise, half messages, and real controls set to what they cannot be."""
     draw = random.Random(seed)
     panel = viewer.session.panel
     uuids = [handle._impl.uuid for handle in (panel.play, panel.time, panel.tunnel, panel.seed, panel.recorded)]
