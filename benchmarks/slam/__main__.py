@@ -20,6 +20,8 @@ from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
 from benchmarks.slam.board_page import as_markdown as board_markdown
 from benchmarks.slam.board_page import as_png as board_png
+from benchmarks.slam.board_page import as_table as board_table
+from benchmarks.slam.board_page import split_page
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import SCHEMA, ProgramScore, ScoreConfig, score_all
@@ -76,9 +78,12 @@ def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | SubmissionC
         for name, result in run_all(config):
             _progress.print(f"{name}: {result}")
     elif isinstance(config, BoardConfig):
+        page = None if config.page is None else split_page(config.page)
         for name, result in make_board(config):
             _progress.print(f"{name}: {result}")
-        _write_board(config.out)
+        board = _write_board(config.out)
+        if page is not None and config.page is not None:
+            write_file(config.page, board_table(board).join(page).encode())
     elif isinstance(config, SubmissionConfig):
         print("\n".join(check_submission(config)))
     else:
@@ -105,12 +110,13 @@ def _write(folder: Path, scores: list[ProgramScore]) -> None:
     write_file(folder / "scores.png", as_png(scores))
 
 
-def _write_board(folder: Path) -> None:
-    """Writes a board's table and figure beside its `board.json`, and prints the table."""
+def _write_board(folder: Path) -> dict[str, Any]:
+    """Writes a board's table and figure beside its `board.json`, prints the table, and returns the board."""
     board = json.loads((folder / "board.json").read_text())
     write_file(folder / "board.md", board_markdown(board).encode())
     write_file(folder / "board.png", board_png(board))
     print(board_markdown(board))
+    return board
 
 
 def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:

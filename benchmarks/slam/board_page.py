@@ -1,6 +1,7 @@
 """The arena's board as a Markdown table and as the figure of the dial."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -8,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.command import BenchmarkError
 from benchmarks.results import png_bytes
 
 Row = dict[str, Any]
@@ -25,6 +27,7 @@ _OURS = {  # colour, marker and line of what is not a SLAM program
 }  # fmt: skip
 _ASIDE = 0.04  # of the distance between two recordings, from one program to the next
 _LEAST = 3e-5  # m per 100 m, lower end of the figure
+_MARKS = ("<!-- arena -->\n", "<!-- end of arena -->\n")  # around the table of a page
 
 
 def median_drift(rows: list[Row], program: str, recording: str) -> tuple[float, float, float] | None:
@@ -36,8 +39,8 @@ def median_drift(rows: list[Row], program: str, recording: str) -> tuple[float, 
     return float(np.median(values)), min(values), max(values)
 
 
-def as_markdown(board: dict[str, Any]) -> str:
-    """Returns the table, drift per 100 m for each program and recording, and the failures with their reasons."""
+def as_table(board: dict[str, Any]) -> str:
+    """Returns the table as Markdown: drift per 100 m for each program and recording."""
     rows, names = board["rows"], [name for name in _NAMES if any(row["recording"] == name for row in board["rows"])]
     programs = list(dict.fromkeys(row["program"] for row in rows))
     head = ["program", "runs", *(_NAMES[name] for name in names), "across, m", "reach, m", "of real time"]
@@ -49,13 +52,31 @@ def as_markdown(board: dict[str, Any]) -> str:
     for name, digits in (("drift", 4), ("gate", 3)):
         values = [f"{_of(board['floors'], recording, name):.{digits}f}" for recording in names]
         lines.append(f"| *{'floor' if name == 'drift' else name}* | | {' | '.join(values)} | | | |")
+    return "\n".join([*lines, ""])
+
+
+def as_markdown(board: dict[str, Any]) -> str:
+    """Returns the table, what its columns are, and the failures with their reasons."""
     note = (
         "Axial drift, m per 100 m: median of the sets (least to largest). *Across*: RMS, median of all recordings. "
         "*Reach*: distance driven before 1 m of axial error, median of the recordings where it is exceeded. "
         "*Floor*: bound of the drift, whatever program reads the ranges. *Gate*: least eigenvalue of scan matching."
     )
-    failed = [f"- {one}" for one in _failures(rows)]
-    return "\n".join([*lines, "", note, "", *(["Failed:", "", *failed, ""] if failed else [])])
+    failed = [f"- {one}" for one in _failures(board["rows"])]
+    return "\n".join([as_table(board), note, "", *(["Failed:", "", *failed, ""] if failed else [])])
+
+
+def split_page(path: Path) -> tuple[str, str]:
+    """Returns what stands on a Markdown page before and behind its table, marks included.
+
+    Raises:
+        BenchmarkError: The page is missing or has no marks.
+    """
+    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    if any(text.count(mark) != 1 for mark in _MARKS):
+        raise BenchmarkError(f"{path}: has no marks {' and '.join(mark.strip() for mark in _MARKS)} around a table")
+    before, rest = text.split(_MARKS[0])
+    return before + _MARKS[0], _MARKS[1] + rest.split(_MARKS[1])[-1]
 
 
 def _failures(rows: list[Row]) -> list[str]:

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam import board, board_page
+from benchmarks.slam.__main__ import command
 from benchmarks.slam.arena import bound, gate
 from benchmarks.slam.arena.record import Course, draw_scene
 from benchmarks.slam.score import reach_of
@@ -103,6 +104,50 @@ def test_a_board_has_medians_over_the_sets_and_names_failures(sets, tmp_path):
     assert board_page.as_png(content).startswith(b"\x89PNG")
 
 
+def test_runs_of_other_days_stand_on_the_board_beside_new_ones(sets, tmp_path):
+    """Kept as a file of a row a run, which the page's table is written from; a run made again replaces its row."""
+    old = {"set": "one", "recording": "walls-smooth", "program": "other", "version": "1.0", "date": "2026-01-02",
+           "machine": "abacus", "drift": 100.0, "across_rms": 0.25, "reach": 4.0, "share": 0.5}  # fmt: skip
+    crashed = {**{name: old[name] for name in ("set", "program")}, "recording": "walls-sprayed", "failed": "crashed"}
+    redone = {**old, "program": "mine", "drift": 77.0}
+    floors = [{"set": "one", "recording": name, "program": board.FLOOR, "drift": 0.01, "gate": 0.002}
+              for name in ("walls-smooth", "walls-sprayed")]  # fmt: skip
+    path, page = tmp_path / "runs.csv", tmp_path / "page.md"
+    path.write_text(board.runs_as_csv([old, crashed, redone, *floors]))
+    page.write_text("Before.\n<!-- arena -->\nold\n<!-- end of arena -->\nBehind.\n")
+    place = tmp_path / "poses" / "one" / "mine"
+    mine = board.Case("mine", sets[0] / "recordings" / "walls-smooth", place)
+    every = board.merge_runs(board.read_runs(path), [board._labels(mine) | board.read_case(mine)])
+    path.write_text(board.runs_as_csv(every))
+    assert board.read_runs(path) == board.read_runs(path)
+    rows = {(row["recording"], row["program"]): row for row in board.read_runs(path)}
+    assert rows["walls-smooth", "other"] == old
+    assert rows["walls-sprayed", "other"] == crashed
+    assert rows["walls-smooth", "mine"]["drift"] == pytest.approx(1.0, abs=1e-6)
+    out = tmp_path / "out"
+    assert command(["board", "--runs", str(path), "--out", str(out), "--page", str(page)]) == 0
+    assert page.read_text().startswith("Before.\n<!-- arena -->\n| program | runs |")
+    assert page.read_text().endswith("| | | |\n<!-- end of arena -->\nBehind.\n")
+    assert "| other | 2 | 100 | failed | 0.250 | 4 (1/1) | 50 % |" in page.read_text()
+    assert json.loads((out / "board.json").read_text())["floors"][0]["gate"] == 0.002
+    assert (out / "board.png").is_file()
+
+
+def test_a_page_or_file_of_runs_that_is_none_is_refused_before_anything_runs(tmp_path, capsys):
+    (tmp_path / "page.md").write_text("<!-- arena -->\n")
+    (tmp_path / "runs.csv").write_text("set,recording\none,walls-smooth\n")
+    words = ["board", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs.csv")]
+    assert command([*words, "--page", str(tmp_path / "page.md")]) == 2
+    assert "page.md: has no marks <!-- arena --> and <!-- end of arena --> around a table" in capsys.readouterr().err
+    assert command(words) == 2
+    assert "runs.csv: not a file of runs, for its columns are others" in capsys.readouterr().err
+    good = board.runs_as_csv([{"set": "one", "recording": "a", "program": "b", "drift": 1.0}])
+    (tmp_path / "runs.csv").write_text(good.replace(",1,", ",one,"))
+    assert command(words) == 2
+    assert "runs.csv: not a file of runs (could not convert string to float: 'one')" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_half_a_trajectory_is_a_failure(sets, tmp_path):
     case = board.Case("mine", sets[0] / "recordings" / "walls-sprayed", tmp_path / "poses" / "one" / "mine")
     path = case.place / "walls-sprayed.tum"
@@ -119,14 +164,14 @@ def test_poses_are_scored_without_bags_and_what_was_not_run_is_left_out(sets, tm
             (bag / "metadata.yaml").write_text("")
             (bag / "odometry.tum").write_bytes((folder / "truth" / name / "lidar.tum").read_bytes())
     (tmp_path / "poses" / "two" / "mine" / "walls-smooth.json").unlink()
-    config = board.BoardConfig(tuple(sets), tmp_path, ("wheel-odometry", "mine"), run=False)
+    config = board.BoardConfig(tmp_path, tuple(sets), ("wheel-odometry", "mine"), run=False)
     cases = board.plan_board(config)
     assert [one.program for one in cases].count("mine") == 3
     assert all(board.read_case(one)["drift"] < 1e-6 for one in cases if one.program == "wheel-odometry")
     with pytest.raises(BenchmarkError, match="holds no poses of wheel-odometry, mine to score"):
-        board.plan_board(board.BoardConfig(tuple(sets), tmp_path / "other", config.programs, run=False))
+        board.plan_board(board.BoardConfig(tmp_path / "other", tuple(sets), config.programs, run=False))
     with pytest.raises(BenchmarkError, match="needs no-such-package"):
-        board.plan_board(board.BoardConfig(tuple(sets), tmp_path, config.programs))
+        board.plan_board(board.BoardConfig(tmp_path, tuple(sets), config.programs))
 
 
 @pytest.mark.parametrize(("words", "sentence"), [
