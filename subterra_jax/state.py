@@ -34,6 +34,12 @@ def as_array(value: Any, like: Any = None) -> Any:
     return jax.lax.convert_element_type(value, wanted)
 
 
+def as_arrays(tree: Any) -> Any:
+    """Make every leaf an array of 32 bits, as `as_array` does; a tuple of numbers becomes one array."""
+    one = lambda leaf: as_array(np.asarray(leaf) if isinstance(leaf, tuple) else leaf)  # noqa: E731
+    return jax.tree.map(one, tree, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
+
+
 def make_alike(tree: Any) -> Any:
     """Give each leaf a type of its own of at most 32 bits and, inside `jax.shard_map`, all leaves the same axes.
 

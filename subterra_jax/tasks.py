@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from flax.core import FrozenDict
 
 from subterra_jax import constants as c
 from subterra_jax.adapters import register_tasks
@@ -20,6 +19,7 @@ from subterra_jax.b2 import MISSIONS, WALK
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_module
 from subterra_jax.host.versions import no_task
+from subterra_jax.params import check_length, check_robot, check_together, collect_entries, make_params
 from subterra_jax.parts import DrawnFaults, Faults, Imu, Obstacles, ObstaclesAhead, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
@@ -38,9 +38,7 @@ from subterra_jax.rules import (
     TurnBackInside,
 )
 from subterra_jax.rules.rule import ERRANDS
-from subterra_jax.state import EnvParams, as_array
-from subterra_jax.tunnel import CONTACT_REACH
-from subterra_jax.tunnel.blocks import LIDAR_GAP
+from subterra_jax.state import EnvParams
 from subterra_jax.tunnel.sources import Source, resolve
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -253,10 +251,10 @@ def make(
     env = TunnelEnv(id=id, rule=task.rule, parts=(*own, *brought, *parts), estimates=estimates)
     horizon = overrides.pop("horizon", task.horizon)
     entries = collect_entries(env, {**task.params, **overrides})
-    _check_robot(entries)
+    check_robot(entries)
     reach = c.RANGE_MAX if spatial else float(np.max(entries["lidar"].range_max))
     params = make_params(env, resolve(tunnel, lining, task.piece, reach, spatial), horizon, entries)
-    env.check(params)
+    check_together(env, params)
     check_length(env, params)
     return env, params
 
@@ -267,36 +265,6 @@ def _require_planar(id: str, sensor: Any, sweep: bool) -> None:
         raise ValueError(f"{id} has the sensor {SENSORS[0]!r} alone, got {sensor!r}")
     if sweep:
         raise ValueError(f"{SENSORS[0]!r} measures a scan at one moment: sweep=True needs a LiDAR in three dimensions")
-
-
-def collect_entries(env: TunnelEnv, overrides: Mapping[str, Any]) -> dict[str, Any]:
-    """Gather the entries of `EnvParams` that motion, parts and rule of an environment read.
-
-    Args:
-        env: The environment.
-        overrides: Entries in place of the defaults.
-
-    Raises:
-        ValueError: An override names no entry, or is of another type than the entry.
-    """
-    entries: dict[str, Any] = {}
-    sources: list[Part | Rule] = [env.motion, *env.parts, env.rule]
-    for source in sources:
-        entries |= source.defaults()
-    if unknown := set(overrides) - set(entries):
-        raise ValueError(f"no field {sorted(unknown)} in {env.id}; there are {sorted([*entries, 'horizon'])}")
-    for name, value in overrides.items():
-        wanted = type(entries[name])
-        if dataclasses.is_dataclass(entries[name]) and not isinstance(value, wanted):
-            raise ValueError(f"{name} must be {wanted.__name__} for {env.id}, got {type(value).__name__}")
-    return {**entries, **overrides}
-
-
-def make_params(env: TunnelEnv, tunnel: Any, horizon: Any, entries: Mapping[str, Any]) -> EnvParams:
-    """Make params whose every leaf is a 32-bit array; a weakly typed one would compile each function a second time."""
-    params = EnvParams(tunnel=tunnel, horizon=horizon, parts=FrozenDict(entries), errand=env.rule.errand)
-    as_leaf = lambda leaf: as_array(np.asarray(leaf) if isinstance(leaf, tuple) else leaf)  # noqa: E731
-    return jax.tree.map(as_leaf, params, is_leaf=lambda leaf: isinstance(leaf, tuple) and leaf != ())
 
 
 def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None, version: str = "v0") -> str:
@@ -342,28 +310,3 @@ def _figures(env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
 
 def _digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def _check_robot(entries: Mapping[str, Any]) -> None:
-    """Refuse, with the value, what the simulator would otherwise get silently wrong."""
-    n_beams, robot = entries["lidar"].n_beams, entries["vehicle"]
-    if n_beams < 1:
-        raise ValueError(f"n_beams must be at least 1, got {n_beams}")
-    if not np.all((np.asarray(robot.radius) > 0.0) & (np.asarray(robot.radius) <= CONTACT_REACH)):
-        raise ValueError(f"radius must be in (0, {CONTACT_REACH}] m, got {robot.radius}")
-    if np.any(robot.radius - np.asarray(robot.speed_max) * robot.period < LIDAR_GAP - 1e-6):
-        raise ValueError(
-            f"radius {robot.radius} m less one step of {robot.speed_max} m/s for {robot.period} s must leave "
-            f"{LIDAR_GAP} m between LiDAR and walls"
-        )
-
-
-def check_length(env: TunnelEnv, params: EnvParams) -> None:
-    """Refuse a tunnel in which the task has no room.
-
-    Raises:
-        ValueError: The tunnel is too short.
-    """
-    shortest, needed = float(np.min(np.asarray(params.tunnel.length))), env.rule.least_length(params)
-    if shortest < needed:
-        raise ValueError(f"{env.id} needs a tunnel of {needed:g} m, this one has {shortest:.1f} m")

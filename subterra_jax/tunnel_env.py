@@ -14,10 +14,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from subterra_jax.compiled import compiled
 from subterra_jax.env import Box, Info, Stepped
 from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, Sight, Step, Unicycle
+from subterra_jax.parts.odometer import hold
 from subterra_jax.parts.part import Batch, Bounds
 from subterra_jax.parts.unicycle import clearance, in_contact, wrap
 from subterra_jax.rows import vary_like
-from subterra_jax.rules import Rule, Start, Traverse
+from subterra_jax.rules import Rule, Traverse
 from subterra_jax.state import EnvParams, State, make_alike
 from subterra_jax.tunnel import Tunnel, at_station, foot
 
@@ -88,7 +89,7 @@ class TunnelEnv:
     def draw_reset(self, key: PRNGKeyArray, batch: Batch, params: EnvParams) -> dict[str, Any]:
         """Draw the random numbers of a batch of resets; see `Env`."""
         sources: dict[str, Any] = {part.name: part for part in (self.motion, *self.parts)} | {"rule": self.rule}
-        streams = {name: _streams(source) for name, source in sources.items()}
+        streams = {name: source.random_streams() for name, source in sources.items()}
         numbers = [2, *(number for of_source in streams.values() for number in of_source)]
         keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.array(numbers, jnp.uint32))
         draws, first = {}, 1
@@ -320,24 +321,6 @@ class TunnelEnv:
         tunnel = params.tunnel.pick(state.tunnel)
         return [b for part in self.parts for b in part.boxes(state.parts[part.name], state.station, tunnel, params)]
 
-    def check(self, params: EnvParams) -> None:
-        """Refuse parts and a rule that do not go together.
-
-        Raises:
-            ValueError: Two parts share a name or an observed entry, the rule needs a part that is missing, or its start
-                is malformed.
-        """
-        names = [part.name for part in (self.motion, *self.parts)]
-        if twice := {name for name in names if names.count(name) > 1}:
-            raise ValueError(f"{self.id}: two parts are called {min(twice)!r}; a name must be one part's own")
-        if missing := set(self.rule.needs) - set(names):
-            rule = type(self.rule).__name__
-            raise ValueError(f"{self.id}: the rule {rule} needs the part {min(missing)!r}; there are {sorted(names)}")
-        _check_start(self, params)
-        self._space(params)
-        for part in self.parts:
-            part.check(frozenset(names), params)
-
     def _observers(self) -> list[Part | Rule]:
         """Parts and rule in the order of their entries in the observation."""
         first = [part for part in sorted(self.parts, key=lambda part: part.place) if part.place < 2]
@@ -374,7 +357,7 @@ class TunnelEnv:
         for part in self.parts:
             own = part.advance(before.parts[part.name], step, noise.get(part.name, _NOTHING), params)
             if part.name == Odometer.name:
-                own = _hold(before.parts[part.name], own, held)
+                own = hold(before.parts[part.name], own, held)
             step = dataclasses.replace(step, after={**step.after, part.name: own})
         return step
 
@@ -415,43 +398,7 @@ class TunnelEnv:
         return {"estimate_error": step.report[0] - step.place.station, "estimate_log_sigma": step.report[1]}
 
 
-def _streams(source: Part | Rule) -> tuple[int, ...]:
-    return source.random_streams() if isinstance(source, Part) else source.streams
-
-
 def _sliced(values: Float[Array, "*batch n"], counts: Mapping[str, int]) -> dict[str, Float[Array, "*batch k"]]:
     """One array as several, by name."""
     ends = np.cumsum(list(counts.values())).tolist()
     return {name: values[..., end - n : end] for (name, n), end in zip(counts.items(), ends, strict=True)}
-
-
-def _hold(before: Any, after: Any, held: list[Any]) -> Any:
-    """The odometer after a step; while a part holds it, its readings stay and its errors go on."""
-    for holds in held:
-        if holds is not False:
-            after = dataclasses.replace(
-                after,
-                distance=jnp.where(holds, before.distance, after.distance),
-                heading=jnp.where(holds, before.heading, after.heading),
-            )
-    return after
-
-
-def _check_start(env: TunnelEnv, params: EnvParams) -> None:
-    """Refuse a start that is not one, naming the rule and what it returned."""
-
-    def start() -> Any:
-        draws = env.draw_reset(jax.random.key(0), (), params)
-        made = env.rule.start(draws["rule"], params.tunnel.pick(0), params)
-        if not isinstance(made, Start):
-            raise ValueError(f"{name}.start must return a Start, got {type(made).__name__}")
-        return {field.name: getattr(made, field.name) for field in dataclasses.fields(Start)}
-
-    name = f"{env.id}: the rule {type(env.rule).__name__}"
-    try:
-        shapes = jax.eval_shape(start)
-    except TypeError as error:
-        raise ValueError(f"{name}.start returned something that is no array ({error})") from error
-    for field in ("station", "lateral", "heading", "backwards"):
-        if shapes[field].shape != ():
-            raise ValueError(f"{name}.start must return one number as {field}, got an array of {shapes[field].shape}")

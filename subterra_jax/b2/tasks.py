@@ -4,7 +4,6 @@ import dataclasses
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,12 +19,12 @@ from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.constants import DISTANCE_BIAS_SIGMA
 from subterra_jax.lidar3d.relief import Relief
+from subterra_jax.params import collect_entries, make_params
 from subterra_jax.parts import Odometer
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.rules import StartParams, Traverse
-from subterra_jax.state import EnvParams
-from subterra_jax.tasks import collect_entries, make_params
+from subterra_jax.state import EnvParams, as_arrays
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import load_tunnel
@@ -93,16 +92,6 @@ def make(
     params = WalkParams(tunnel=Tunnel.from_plan(plan, lining), track=track, **fields)
     env = WalkEnv(id=id, physics=physics or Physics(), driven=driven, privileged=privileged)
     return env, as_arrays(params)
-
-
-def as_arrays(params: Any) -> Any:
-    """Turns every leaf of params into a 32-bit array; a tuple of numbers becomes one array."""
-
-    def array(leaf: Any) -> jax.Array:
-        leaf = jnp.asarray(leaf)
-        return leaf.astype(jnp.int32 if jnp.issubdtype(leaf.dtype, jnp.integer) else jnp.float32)
-
-    return jax.tree.map(array, params, is_leaf=lambda leaf: isinstance(leaf, tuple))
 
 
 def check_width(plan: TunnelPlan) -> None:

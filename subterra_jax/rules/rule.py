@@ -170,6 +170,11 @@ class Rule(abc.ABC):
         del params
         return 0.0
 
+    @classmethod
+    def random_streams(cls) -> tuple[int, ...]:
+        """Return the numbers of the rule's random streams."""
+        return cls.streams
+
 
 def chosen(choice: Any, drawn: Any) -> Array:
     """Return a caller's choice, or what was drawn where that is NaN."""
