@@ -1,9 +1,9 @@
 """The parts of an environment, one file each; `part.py` is their contract."""
 
-from subterra_jax.parts.boxes import Obstacles, ObstaclesAhead
 from subterra_jax.parts.drawn_faults import DrawnFaultParams, DrawnFaults
 from subterra_jax.parts.faults import Faults
 from subterra_jax.parts.imu import Imu, ImuParams
+from subterra_jax.parts.obstacles import Obstacles, ObstaclesAhead
 from subterra_jax.parts.odometer import Odometer
 from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, Sight, Step
 from subterra_jax.parts.planar_lidar import PlanarLidar

@@ -14,7 +14,7 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.cloud import Cloud
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.lidar3d.beams import level_ring
-from subterra_jax.parts.boxes import PITCH
+from subterra_jax.parts.obstacles import PITCH
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
 from subterra_jax.viewer.recording import N_POSE, Recording

@@ -10,7 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.lidar import LidarParams
-from subterra_jax.parts.boxes import ObstacleParams
+from subterra_jax.parts.obstacles import ObstacleParams
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.rules import StartParams

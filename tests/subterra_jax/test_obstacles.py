@@ -7,16 +7,24 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.lidar import reference
-from subterra_jax.parts import boxes as obstacles
-from subterra_jax.parts import hashing
+from subterra_jax.parts import hashing, obstacles
+from subterra_jax.parts.boxes import Boxes, distance_along
 from subterra_jax.tunnel import Tunnel
 
 PARAMS = jax.tree.map(jnp.float32, obstacles.ObstacleParams())
 
 
+def segments(made):
+    """The sides of boxes as segments `x0, y0, x1, y1`, m, four to a box."""
+    long = made.axis * made.half[:, :1]
+    wide = jnp.stack([-made.axis[:, 1], made.axis[:, 0]], axis=-1) * made.half[:, 1:]
+    corner = jnp.stack([long + wide, wide - long, -long - wide, long - wide], axis=1) + made.centre[:, None]
+    return jnp.concatenate([corner, jnp.roll(corner, -1, axis=1)], axis=-1)
+
+
 def square(x=5.0, y=0.0, turn=0.0):
     axis = jnp.array([[np.cos(turn), np.sin(turn)]], jnp.float32)
-    return obstacles.Boxes(jnp.array([[x, y]]), axis, jnp.array([[0.5, 0.5]]))
+    return Boxes(jnp.array([[x, y]]), axis, jnp.array([[0.5, 0.5]]))
 
 
 @pytest.fixture(scope="module")
@@ -30,13 +38,11 @@ def tunnel():
 )
 def test_a_beam_meets_a_box_where_geometry_says(turn, bearing, expected):
     direction = jnp.array([[np.cos(bearing), np.sin(bearing)]], jnp.float32)
-    assert float(obstacles.distance_along(square(turn=turn), jnp.zeros(2), direction)[0]) == pytest.approx(
-        expected, abs=1e-5
-    )
+    assert float(distance_along(square(turn=turn), jnp.zeros(2), direction)[0]) == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_beam_from_inside_a_box_meets_it_at_once():
-    assert float(obstacles.distance_along(square(0.1), jnp.zeros(2), jnp.array([[1.0, 0.0]]))[0]) == 0.0
+    assert float(distance_along(square(0.1), jnp.zeros(2), jnp.array([[1.0, 0.0]]))[0]) == 0.0
 
 
 def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
@@ -47,7 +53,7 @@ def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
     _, state = jax.jit(env.reset)(jax.random.key(3), params)
     slots = jnp.arange(int(plan.length / obstacles.PITCH) + 1)
     boxes = obstacles.boxes_in(state.obstacles, slots, params.tunnel, params.obstacles)
-    sides = np.asarray(obstacles.segments(boxes), np.float64).reshape(-1, 4)
+    sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     everything = np.concatenate([walls, sides])
     free = reference.clearance(sides, poses.position) > 0.3
     inside = np.asarray(
@@ -73,7 +79,7 @@ def test_there_is_always_a_way_past(tunnel):
     slots = jnp.arange(1, 23)
     seeds = jax.random.bits(jax.random.key(0), (200,))
     boxes = jax.vmap(obstacles.boxes_in, (0, None, None, None))(seeds, slots, tunnel, PARAMS)
-    corners = np.asarray(jax.vmap(obstacles.segments)(boxes))[..., :2]
+    corners = np.asarray(jax.vmap(segments)(boxes))[..., :2]
     plan = st.load_tunnel()
     free, trolleys = [], 0
     for box, half in zip(corners.reshape(-1, 4, 2), np.asarray(boxes.half).reshape(-1, 2), strict=True):
@@ -96,7 +102,7 @@ def test_there_is_always_a_way_past(tunnel):
 def test_the_clearance_is_the_distance_to_the_nearest_side(tunnel):
     slots = jnp.arange(1, 20)
     boxes = obstacles.boxes_in(jnp.uint32(5), slots, tunnel, PARAMS)
-    sides = np.asarray(obstacles.segments(boxes), np.float64).reshape(-1, 4)
+    sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     plan, compared = st.load_tunnel(), 0
     clearance = jax.jit(obstacles.clearance)
     for node in range(40, 1000, 9):

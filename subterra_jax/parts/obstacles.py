@@ -1,0 +1,175 @@
+"""Obstacles, a part of an environment: where the boxes of an episode stand, and what they do to robot and beams."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int, UInt32
+
+from subterra_jax import constants
+from subterra_jax.parts.boxes import Boxes, distance_along, distance_to
+from subterra_jax.parts.hashing import uniform
+from subterra_jax.parts.part import Batch, Keys, Part, Sight
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel import Tunnel, at_station
+
+PITCH = constants.BOX_PITCH  # m of tunnel for each box
+REACH = 33.0  # m of arc on which anything within 30 m lies
+N_SLOTS = 6  # cover twice the reach, wherever it begins
+_N_NEAR = 2  # slots next to a point on either side of it, for contact
+
+
+@struct.dataclass
+class ObstacleParams:
+    """Boxes, one in every 15 m of tunnel, and one parked trolley among them.
+
+    Attributes:
+        size_min: Least side of a box, m.
+        size_max: Largest side of a box, m.
+        gap: Free width left on one side of each box, m.
+        first: No obstacle stands before this station, m.
+        trolley_length: Length of the trolley, along the tunnel, m.
+        trolley_width: Its width, m.
+    """
+
+    size_min: float = constants.BOX_SIZE_MIN
+    size_max: float = constants.BOX_SIZE_MAX
+    gap: float = constants.BOX_GAP
+    first: float = constants.BOX_FIRST
+    trolley_length: float = constants.TROLLEY_LENGTH
+    trolley_width: float = constants.TROLLEY_WIDTH
+
+
+def boxes_near(
+    seed: UInt32[Array, ""], station: Float[Array, ""], reach: float, n: int, tunnel: Tunnel, params: ObstacleParams
+) -> Boxes:
+    """Return the boxes of `n` slots, from `reach` before a station on.
+
+    Args:
+        seed: Seed of the episode; equal seeds give equal boxes.
+        station: Station of the observer, m.
+        reach: Distance back to the first slot, m.
+        n: Number of slots.
+        tunnel: The tunnel they stand in.
+        params: Their sizes.
+    """
+    slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n, dtype=jnp.int32)
+    return boxes_in(seed, slot, tunnel, params)
+
+
+def boxes_in(seed: UInt32[Array, ""], slot: Int[Array, "n"], tunnel: Tunnel, params: ObstacleParams) -> Boxes:
+    """Return the boxes of given slots; slot k has the stations from 15 k to 15 (k + 1) m."""
+    u = lambda index: uniform(seed, slot, index)  # noqa: E731
+    n_slots = jnp.maximum(jnp.floor(tunnel.length / PITCH), 2.0)
+    trolley = slot == 1 + jnp.floor(uniform(seed, jnp.zeros((), jnp.int32), 9) * (n_slots - 1.0)).astype(jnp.int32)
+    side = 0.5 * (params.size_min + (params.size_max - params.size_min) * jnp.stack([u(0), u(1)], axis=-1))
+    parked = 0.5 * jnp.stack([jnp.asarray(params.trolley_length), jnp.asarray(params.trolley_width)])
+    half = jnp.where(trolley[:, None], parked[None], side)
+    turn = jnp.where(trolley, 0.0, jnp.pi * u(2))
+    # A margin of a trolley's half at both ends keeps the boxes of two slots apart.
+    station = PITCH * slot.astype(jnp.float32) + 1.5 + (PITCH - 3.0) * u(3)
+    x, y, tangent_x, tangent_y, half_width = jax.vmap(at_station, (None, 0), 1)(tunnel, station)
+    cos, sin = jnp.cos(turn), jnp.sin(turn)
+    across = jnp.abs(sin) * half[:, 0] + jnp.abs(cos) * half[:, 1]
+    lateral = jnp.maximum((half_width - across) * u(4), params.gap + across - half_width)
+    lateral = jnp.where(u(5) < 0.5, -lateral, lateral)
+    there = (station - half[:, 0] - half[:, 1] > params.first) & (station < tunnel.length)
+    centre = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x], axis=-1)
+    return Boxes(
+        centre=jnp.where(there[:, None], centre, 1e6),
+        axis=jnp.stack([tangent_x * cos - tangent_y * sin, tangent_x * sin + tangent_y * cos], axis=-1),
+        half=half,
+    )
+
+
+def clearance(
+    seed: UInt32[Array, ""],
+    station: Float[Array, ""],
+    position: Float[Array, "2"],
+    tunnel: Tunnel,
+    params: ObstacleParams,
+) -> Float[Array, ""]:
+    """Measure the distance from a point to the nearest box, m; 0 inside; exact up to 0.8 m."""
+    return distance_to(boxes_near(seed, station, 3.0, _N_NEAR, tunnel, params), position)
+
+
+@dataclasses.dataclass(frozen=True)
+class Obstacles(Part):
+    """Boxes that stand in the way; its state is the seed of the episode's boxes."""
+
+    name: ClassVar[str] = "obstacles"
+    streams: ClassVar[tuple[int, ...]] = (6,)
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `obstacles`."""
+        return {"obstacles": ObstacleParams()}
+
+    def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> UInt32[Array, "*batch 2"]:
+        """Draw random bits, the first of two words: the second is that of the faults."""
+        del params
+        return jax.random.bits(key, (*batch, 2), jnp.uint32)
+
+    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> UInt32[Array, ""]:
+        """Return the seed."""
+        del state, params
+        return draw[0]
+
+    def clearance(self, own: Array, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Array:
+        """Measure the distance to the nearest box, m."""
+        return clearance(own, station, position, tunnel, params.obstacles)
+
+    def hits(
+        self, own: Array, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
+    ) -> Float[Array, "n_beams"]:
+        """Measure where beams meet boxes, m."""
+        boxes = boxes_near(own, sight.station, REACH, N_SLOTS, sight.tunnel, params.obstacles)
+        return distance_along(boxes, sight.position, directions)
+
+    def boxes(self, own: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
+        """Return the boxes within a LiDAR's reach."""
+        return [boxes_near(own, station, REACH, N_SLOTS, tunnel, params.obstacles)]
+
+
+@struct.dataclass
+class ClearStartState:
+    """Boxes of an episode that begins inside.
+
+    Attributes:
+        seed: Seed of the boxes.
+        start: Station of the start, m.
+    """
+
+    seed: UInt32[Array, ""]
+    start: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class ObstaclesAhead(Obstacles):
+    """Boxes ahead of a start that may lie anywhere: `obstacles.first` is a distance from the start."""
+
+    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> Any:
+        """Return the seed, and where the boxes begin."""
+        return ClearStartState(draw[0], state.station)
+
+    def clearance(self, own: Any, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Array:
+        """Measure the distance to the nearest box, m."""
+        return super().clearance(own.seed, position, station, tunnel, self._ahead(own, params))
+
+    def hits(
+        self, own: Any, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
+    ) -> Float[Array, "n_beams"]:
+        """Measure where beams meet boxes, m."""
+        return super().hits(own.seed, sight, directions, self._ahead(own, params))
+
+    def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
+        """Return the boxes within a LiDAR's reach."""
+        return super().boxes(own.seed, station, tunnel, self._ahead(own, params))
+
+    def _ahead(self, own: ClearStartState, params: EnvParams) -> EnvParams:
+        """Params of the boxes of an episode."""
+        sizes = params.obstacles
+        return dataclasses.replace(
+            params, parts=params.parts.copy({"obstacles": sizes.replace(first=sizes.first + own.start)})
+        )
