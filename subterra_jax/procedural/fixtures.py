@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from subterra_jax.procedural.kinds import BENCHES, FIXTURES, FixtureRanges
-
-if TYPE_CHECKING:
-    from subterra_jax.procedural.bore import Section
+from subterra_jax.procedural.section import Section
 
 _END = 2.0  # ends of a tunnel without fixtures, m
 _APART = 0.3  # least distance of two fixtures at one wall, m
