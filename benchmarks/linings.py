@@ -18,8 +18,9 @@ from PIL import Image
 from benchmarks.command import BenchmarkError, run_main
 from benchmarks.results import png_bytes, write_file
 from subterra_jax.host.files import require_folder
+from subterra_jax.host.loading import load_module
 from subterra_jax.procedural.bore import Bore
-from subterra_jax.procedural.kinds import KINDS
+from subterra_jax.procedural.kinds import KINDS, all_kinds
 from subterra_jax.procedural.open_world import HELD_OUT, UNSEEN, Drawn, draw, plan
 
 _COLOURS = 48  # of a picture, to keep it small
@@ -31,7 +32,7 @@ class LiningsConfig:
     """Settings of the pictures.
 
     Attributes:
-        kinds: Kinds of lining; all if not given.
+        kinds: Kinds of lining, `FILE.py:NAME` for one of your own; all of the benchmark if not given.
         index: Index of the tunnel in its split; the default lies behind every tunnel that results are made with.
         length: Length of tunnel to draw, m.
         out: Folder for a PNG of each kind.
@@ -49,16 +50,24 @@ def run(config: LiningsConfig) -> None:
     Raises:
         SubterraError: A kind is unknown, the length is too small, or the folder cannot be written.
     """
-    for kind in config.kinds:
-        if kind not in KINDS:
-            raise BenchmarkError(f"there is no kind {kind!r}; there are {', '.join(KINDS)}")
+    kinds = [_find_kind(kind) for kind in config.kinds or KINDS]
     if not config.length >= 20.0:
         raise BenchmarkError(f"length must be at least 20 m, got {config.length:g}")
     require_folder(config.out)
-    for kind in config.kinds or tuple(KINDS):
+    for kind in kinds:
         name = f"open:{kind}:{'train' if kind in HELD_OUT else UNSEEN}:{config.index}"
         write_file(config.out / f"{kind}.png", few_colours(png_bytes(picture(name, config.length), 80)))
         print(config.out / f"{kind}.png")
+
+
+def _find_kind(name: str) -> str:
+    """Returns the name of a kind; before a colon may stand a user's module, which is run and registers it."""
+    source, _, kind = name.rpartition(":")
+    if source:
+        load_module(source)
+    if kind not in (known := all_kinds()):
+        raise BenchmarkError(f"there is no kind {kind!r}; there are {', '.join(known)}")
+    return kind
 
 
 def picture(name: str, length: float) -> Figure:

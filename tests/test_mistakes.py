@@ -38,6 +38,8 @@ MISTAKES = {
     "benchmarks.atlas control --linings pockets": "tunnel 'control' has no lining 'pockets'; it has smooth",
     "benchmarks.atlas control --sensors radar": "there is no sensor 'radar'; there are planar, spin16x64",
     "benchmarks.linings --kinds brick": "there is no kind 'brick'; there are straight, universal",
+    "benchmarks.linings --kinds none.py:steel": "none.py: cannot be read",
+    "benchmarks.atlas none.py:open:steel:val:0": "none.py: cannot be read",
     "benchmarks.kinds --split dev": "there is no split 'dev'; there are train, val, test-seen, test-unseen",
     "benchmarks.kinds --agents nobody": "no agent 'nobody'",
     "benchmarks.openboard": "missing: --out",

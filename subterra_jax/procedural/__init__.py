@@ -12,6 +12,7 @@ import re
 import numpy as np
 
 from subterra_jax.host.errors import TunnelError
+from subterra_jax.host.loading import load_module
 from subterra_jax.procedural import geometry, open_world
 from subterra_jax.procedural.geometry import Alignment, ProceduralConfig, wall
 from subterra_jax.tunnel.arrays import cut_pockets
@@ -199,7 +200,8 @@ def control() -> TunnelPlan:
 SPLIT_SIZE = 1_000_000
 SPLITS = {"train": 0, "val": SPLIT_SIZE, "test": 2 * SPLIT_SIZE}
 _NAME = re.compile(r"procedural:(\w+):(\d+)")
-_SEVERAL = re.compile(r"(procedural:\w+|open:[a-z:-]+):(\d+)-(\d+)")
+_SEVERAL = re.compile(r"(procedural:\w+|(?:.+:)?open:[a-z:-]+):(\d+)-(\d+)")
+_OPEN = re.compile(r"(?:(.+):)?(open:.*)")  # a tunnel of the open world; before it, a user's module that adds a kind
 
 
 def seed_of(split: str, index: int) -> int:
@@ -257,25 +259,28 @@ def expand(name: str) -> list[str]:
 
 def default_lining(name: str) -> str:
     """Return the variant of the walls that a generated tunnel has by default."""
-    return "smooth" if name == "control" else open_world.VARIANTS[0] if name.startswith("open:") else "pockets"
+    return "smooth" if name == "control" else open_world.VARIANTS[0] if _OPEN.fullmatch(name) else "pockets"
 
 
 def generate(name: str, linings: tuple[str, ...] | None = None, solid: bool = False) -> TunnelPlan:
     """Generate a tunnel by its name: `control`, `procedural:SPLIT:INDEX`, or one of the open world.
 
     Args:
-        name: The name.
+        name: The name; `FILE.py:open:KIND:SPLIT:INDEX` first runs a user's file, which registers the kind.
         linings: Variants to make, where the family has them; `None` for all.
         solid: Make the bore in three dimensions too, where the family has one.
 
     Raises:
         TunnelError: The tunnel does not exist.
+        UserCodeError: The user's file cannot be run.
     """
     if name == "control":
         _known(name, linings, ("smooth",))
         return control()
-    if name.startswith("open:"):
-        return open_world.plan(name, variants=_known(name, linings, open_world.VARIANTS), solid=solid)
+    if match := _OPEN.fullmatch(name):
+        if match[1]:
+            load_module(match[1])
+        return open_world.plan(match[2], variants=_known(name, linings, open_world.VARIANTS), solid=solid)
     match = _NAME.fullmatch(name)
     if match is None:
         raise TunnelError(

@@ -17,7 +17,7 @@ from subterra_jax.host.errors import TunnelError
 from subterra_jax.procedural.bore import Bore, draw_bore
 from subterra_jax.procedural.cut import Cut, cut_lining, plane_walls
 from subterra_jax.procedural.geometry import Alignment, ProceduralConfig, draw_alignment, wander
-from subterra_jax.procedural.kinds import KINDS, LENGTH
+from subterra_jax.procedural.kinds import KINDS, LENGTH, all_kinds, kind_number
 from subterra_jax.procedural.solid import make_shell
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -98,18 +98,19 @@ def draw(name: str, length: float | None = None) -> Drawn:
         TunnelError: There is no such kind, split or tunnel, or the split does not have the kind.
     """
     kind, split, index = _parse(name)
-    sequence = np.random.SeedSequence([_FAMILY, list(KINDS).index(kind), SPLITS[split] + index])
+    sequence = np.random.SeedSequence([_FAMILY, kind_number(kind), SPLITS[split] + index])
     rng = dict(zip(_STREAMS, (np.random.default_rng(child) for child in sequence.spawn(len(_STREAMS))), strict=True))
+    ranges = all_kinds()[kind]
     level = str(rng["items"].choice(levels_of(kind, split)))
     share = {"none": 0.0, "some": _HALF, "all": 1.0}[level]
-    items = tuple(item for item in KINDS[kind].fixtures if rng["items"].random() < share)
+    items = tuple(item for item in ranges.fixtures if rng["items"].random() < share)
     drawn_length = float(np.exp(rng["line"].uniform(*np.log(LENGTH))))
     length = drawn_length if length is None else length
     alignment = draw_alignment(rng["line"], length, LINE)
     step = alignment.station[1]
     slope = np.clip(wander(rng["grade"], alignment.station, GRADE_SD, GRADE_WAVE), -GRADE_MOST, GRADE_MOST)
     height = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * step)])
-    bore = draw_bore(KINDS[kind], length, items, [rng[name] for name in _STREAMS[1:6]])
+    bore = draw_bore(ranges, length, items, [rng[name] for name in _STREAMS[1:6]])
     return Drawn(name, level, items, alignment, height, bore)
 
 
@@ -168,13 +169,13 @@ def _parse(name: str) -> tuple[str, str, int]:
             f"open:cast:val:7; kinds are {', '.join(KINDS)}, splits {', '.join(SPLITS)}"
         )
     kind, split, index = match[1], match[2], int(match[3])
-    if kind is not None and kind not in KINDS:
-        raise TunnelError(f"no tunnel {name!r}: there is no kind {kind!r}; there are {', '.join(KINDS)}")
+    if kind is not None and kind not in (known := all_kinds()):
+        raise TunnelError(f"no tunnel {name!r}: there is no kind {kind!r}; there are {', '.join(known)}")
     if split not in SPLITS:
         raise TunnelError(f"no tunnel {name!r}: there is no split {split!r}; there are {', '.join(SPLITS)}")
     if index >= SPLIT_SIZE:
         raise TunnelError(f"no tunnel {name!r}: split {split!r} has tunnels 0 to {SPLIT_SIZE - 1}")
     there = kinds_of(split)
-    if kind is not None and kind not in there:
+    if kind in KINDS and kind not in there:
         raise TunnelError(f"no tunnel {name!r}: {kind!r} is in {UNSEEN} alone; {split!r} has {', '.join(there)}")
     return kind or there[index % len(there)], split, index

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -190,7 +191,11 @@ class Patches:
         return total
 
 
-Layer = Waves | Rings | Stretches | Patches  # one cause of relief
+class Layer(Protocol):
+    """One cause of relief; the relief of a wall is the sum of its layers."""
+
+    def relief(self, grid: Grid, columns: Int[np.ndarray, " c"]) -> Float[np.ndarray, "n c"]:
+        """Return how far the wall lies outside the design section, m, at all stations and some angles of a grid."""
 
 
 def draw_layers(
@@ -217,4 +222,4 @@ def draw_layers(
     fine = float(np.exp(rng.uniform(*np.log(surface.fine_length))))
     layers.append(Waves.draw(rng, float(rng.uniform(*surface.fine_sd)), fine))
     layers.append(Waves.draw(rng, float(rng.uniform(*surface.coarse_sd)), float(rng.uniform(*surface.coarse_length))))
-    return layers
+    return [*layers, *kind.draw_relief(rng, length, radius)]

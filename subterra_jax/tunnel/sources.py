@@ -196,7 +196,7 @@ PACKAGED = ("subterra-351", "metro-asbuilt")  # the first is the default
 # The walls of the packaged tunnels stay, byte for byte, since every score depends on them; the bore in three dimensions
 # lies beside them, from the same survey built again.
 SOLID = "-solid.npz"
-GENERATED = re.compile(r"control|procedural:.*|open:.*")  # names of generated tunnels
+GENERATED = re.compile(r"control|procedural:.*|(.+:)?open:.*")  # names of generated tunnels
 
 Source = Tunnel | TunnelPlan | str | Path | None
 
@@ -212,8 +212,9 @@ def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> Tunne
 
     Args:
         path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`); `control`, the bore without
-            landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`, one of the open world; or
-            `procedural:SPLIT:INDEX`, one of the older family. `None` is the first packaged one.
+            landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`, one of the open world, after `FILE.py:` where a
+            user's file registers the kind; or `procedural:SPLIT:INDEX`, one of the older family. `None` is the first
+            packaged one.
         solid: Give a tunnel of the open world its shell too, the bore in three dimensions; a file that has one always
             comes with it.
 
