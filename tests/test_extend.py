@@ -27,6 +27,13 @@ FILES = dict(re.findall(r"`(\w+\.py)`:?\s*\n\s*```python\n(.*?)```", PAGE.read_t
 TASK = "keep_left.py:Mine/KeepLeft-v0"
 
 
+def forget() -> None:
+    """Lets the page's files run anew when they are asked for: a file runs once in a process."""
+    for stem in (Path(name).stem for name in FILES):
+        for loaded in [name for name in sys.modules if re.fullmatch(rf"{stem}(_[0-9a-f]{{12}})?", name)]:
+            del sys.modules[loaded]
+
+
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
     """A folder outside the package that holds the page's files; nothing that they register outlasts a test."""
@@ -34,13 +41,12 @@ def desk(tmp_path, monkeypatch):
         (tmp_path / name).write_text(text)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(kinds, "_OWN", {})
+    forget()
     yield tmp_path
-    for stem in (Path(name).stem for name in FILES):
-        for loaded in [name for name in sys.modules if re.fullmatch(rf"{stem}(_[0-9a-f]{{12}})?", name)]:
-            del sys.modules[loaded]
+    forget()
     for added in set(tasks.TASKS) - set(tasks.BUILT_IN):
         del tasks.TASKS[added]
-    kinds._OWN.clear()
 
 
 def test_a_sensor_from_outside_is_observed_with_its_noise_and_its_bias(desk):
