@@ -18,10 +18,9 @@ from __future__ import annotations
 import dataclasses
 import re
 import zlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
 
 Range = tuple[float, float]
 

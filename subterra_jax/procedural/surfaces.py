@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -191,6 +191,7 @@ class Patches:
         return total
 
 
+@runtime_checkable
 class Layer(Protocol):
     """One cause of relief; the relief of a wall is the sum of its layers."""
 
