@@ -49,24 +49,29 @@ class Agent(Protocol):
 
     It is asked about one environment at a time, in pure JAX; whoever drives it vmaps it. An agent receives only the
     inputs that it declares: without `uses_lidar` the ranges are NaN, without `uses_map` everything in `params.tunnel`
-    but its length and ring pitch is NaN, and only with `privileged` is `known` not None.
+    but its length and ring pitch is NaN, and only with `privileged` is `known` not None. A class that inherits declares
+    by a line in its body, `uses_lidar = True`; any other class may be an agent if it has these four and both methods.
     """
 
     @property
     def name(self) -> str:
-        """Name on the leaderboard."""
+        """Name on the leaderboard; that of the class if it says none."""
+        return type(self).__name__
 
     @property
     def uses_lidar(self) -> bool:
         """True where it reads the ranges."""
+        return False
 
     @property
     def uses_map(self) -> bool:
         """True where it reads the tunnel in `params`: the one it is in, of a stack."""
+        return False
 
     @property
     def privileged(self) -> bool:
         """True where it gets the truth of `TunnelEnv.privileged`."""
+        return False
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
         """Returns the memory at the start of an episode: any pytree of arrays.

@@ -13,6 +13,7 @@ from subterra_jax.baselines.steering import (
     CentreLine,
     Corridor,
     Robot,
+    Steering,
     find_walls,
     mirror_walls,
     predict_walls,
@@ -50,7 +51,7 @@ class Surroundings:
 
 
 @struct.dataclass
-class Avoidance:
+class Avoidance(Steering):
     """Takes the nearest free lane, and slows down where its own is blocked.
 
     Attributes:
@@ -68,7 +69,6 @@ class Avoidance:
     look_ahead: float = 4.0
     offset_gain: float = 0.8
     angle_gain: float = 4.0
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: Robot) -> Surroundings:
         """Finds the walls; no hits yet."""

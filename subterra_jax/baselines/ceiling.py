@@ -53,8 +53,8 @@ class ExactLocaliser(ParticleLocaliser):
         exact: Settings of the likelihood.
     """
 
+    privileged = True
     exact: ExactParams = struct.field(default_factory=ExactParams)
-    privileged: bool = struct.field(pytree_node=False, default=True)
 
     def update(
         self, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known

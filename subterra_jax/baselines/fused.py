@@ -7,7 +7,7 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed
-from subterra_jax.baselines.stations import Driven, Station, believed_start, slip_sizes
+from subterra_jax.baselines.stations import Driven, Localiser, Station, believed_start, slip_sizes
 from subterra_jax.parts.wander import WanderParams
 from subterra_jax.state import EnvParams
 
@@ -32,14 +32,12 @@ class Belief:
 
 
 @struct.dataclass
-class FusedCount:
+class FusedCount(Localiser):
     """Fuses commands and odometry; to the first order in the errors, which are some percent, it is exact.
 
     The truth of a step is command × (1 + gain + slip), the odometer's reading truth × (1 + bias + scale) + noise; gain
     and bias last an episode, slip and scale wander. In tasks with a flag, its raising is a fix.
     """
-
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> Belief:
         """Begins with the nominal errors of the task."""

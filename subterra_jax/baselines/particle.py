@@ -11,13 +11,13 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import Cloud, CloudParams, cloud_params, move, new_cloud, resample, summarise, weigh
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
 from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit_roughly
-from subterra_jax.baselines.stations import Driven, Station, told_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.state import EnvParams
@@ -42,7 +42,7 @@ class FilterMemory:
 
 
 @struct.dataclass
-class ParticleLocaliser:
+class ParticleLocaliser(Localiser):
     """Estimates the station from dead reckoning and scans, by particles.
 
     Its random numbers depend on `seed` and the step alone, so equal observations give equal estimates.
@@ -62,7 +62,6 @@ class ParticleLocaliser:
     odometer_share: float | Float[Array, ""]
     seed: int = 0
     n_particles: int = struct.field(pytree_node=False, default=256)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     @classmethod
     def of(cls, params: EnvParams, n_particles: int = 256) -> "ParticleLocaliser":
@@ -139,7 +138,7 @@ class RelocaliserMemory:
 
 
 @struct.dataclass
-class Relocaliser:
+class Relocaliser(Agent):
     """Finds an unknown start: drives along the axis until the estimate has been sure for a while, then reports.
 
     Particles begin everywhere, facing both ways.
@@ -152,13 +151,12 @@ class Relocaliser:
             reckoning.
     """
 
+    uses_lidar = uses_map = True
     filter: ParticleLocaliser
     steering: CentreLine
     sure_for: float = 30.0
     furthest: float = 0.9
     name: str = struct.field(pytree_node=False, default="particle-filter")
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
-    uses_map: bool = struct.field(pytree_node=False, default=True)
     privileged: bool = struct.field(pytree_node=False, default=False)
 
     @classmethod

@@ -35,13 +35,10 @@ class AgentError(SubterraError):
 
 
 @struct.dataclass
-class Random:
+class Random(Agent):
     """Draws uniform commands, and gives no estimate."""
 
-    name: str = struct.field(pytree_node=False, default="random")
-    uses_lidar: bool = struct.field(pytree_node=False, default=False)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
+    name = "random"
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Float[Array, ""]:
         """Returns an empty memory."""

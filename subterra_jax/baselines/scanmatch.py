@@ -16,7 +16,7 @@ from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
-from subterra_jax.baselines.stations import Driven, Station, told_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
 from subterra_jax.baselines.steering import CentreLine, find_walls
 from subterra_jax.lidar import bearings
 from subterra_jax.state import EnvParams
@@ -258,7 +258,7 @@ class MatchMemory:
 
 
 @struct.dataclass
-class ScanMatcher:
+class ScanMatcher(Localiser):
     """Dead reckoning and scan matching in a Kalman filter of station and scale.
 
     Attributes:
@@ -272,7 +272,6 @@ class ScanMatcher:
     params: MatchParams
     odometer_share: float | Float[Array, ""]
     window: float = 5.0
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     @classmethod
     def of(cls, params: EnvParams) -> "ScanMatcher":

@@ -102,7 +102,10 @@ class Driven:
 class Localiser(Protocol):
     """Estimates the station; a `flax.struct.dataclass` without state."""
 
-    privileged: bool
+    @property
+    def privileged(self) -> bool:
+        """True where it gets the truth of `TunnelEnv.privileged`."""
+        return False
 
     def begin(self, obs: Observed, params: EnvParams) -> Any:
         """Returns the memory at the start."""
@@ -143,27 +146,24 @@ def _add_step(memory: Count, step: Float[Array, ""], driven: Driven, reading: Fl
     )
 
 
-def _start(obs: Observed, params: EnvParams) -> Count:
-    """Begins at the believed start."""
-    zero = jnp.zeros(())
-    return Count(*believed_start(obs, params), zero, zero, obs.distance)
-
-
 def _station(memory: Count, sigma: Float[Array, ""], driven: Driven) -> Station:
     """Returns the estimate with the errors of start and counting."""
     variance = jnp.maximum(sigma * sigma + memory.start_sigma * memory.start_sigma, _LEAST * _LEAST)
     return Station(memory.station, 0.5 * jnp.log(variance), driven.direction)
 
 
-@struct.dataclass
-class CommandCount:
-    """Sums the commands. In a task without slip this is a perfect odometer."""
-
-    privileged: bool = struct.field(pytree_node=False, default=False)
+class _Summed(Localiser):
+    """A localiser that sums distances from the believed start."""
 
     def begin(self, obs: Observed, params: EnvParams) -> Count:
         """Begins at the believed start."""
-        return _start(obs, params)
+        zero = jnp.zeros(())
+        return Count(*believed_start(obs, params), zero, zero, obs.distance)
+
+
+@struct.dataclass
+class CommandCount(_Summed):
+    """Sums the commands. In a task without slip this is a perfect odometer."""
 
     def update(
         self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
@@ -175,14 +175,8 @@ class CommandCount:
 
 
 @struct.dataclass
-class OdometerCount:
+class OdometerCount(_Summed):
     """Sums the odometer's readings."""
-
-    privileged: bool = struct.field(pytree_node=False, default=False)
-
-    def begin(self, obs: Observed, params: EnvParams) -> Count:
-        """Begins at the believed start."""
-        return _start(obs, params)
 
     def update(
         self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
@@ -194,10 +188,10 @@ class OdometerCount:
 
 
 @struct.dataclass
-class Truth:
+class Truth(Localiser):
     """Knows the truth: the best possible localiser."""
 
-    privileged: bool = struct.field(pytree_node=False, default=True)
+    privileged = True
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, ""]:
         """Returns an empty memory."""

@@ -115,7 +115,10 @@ def _side(
 class Steering(Protocol):
     """Turns a target speed into a command; a `flax.struct.dataclass` without state."""
 
-    uses_lidar: bool
+    @property
+    def uses_lidar(self) -> bool:
+        """True where it reads the ranges."""
+        return True
 
     def begin(self, obs: Observed, params: EnvParams) -> Any:
         """Returns the memory at the start."""
@@ -134,7 +137,7 @@ class Steering(Protocol):
 
 
 @struct.dataclass
-class CentreLine:
+class CentreLine(Steering):
     """PD controller of offset and angle between the walls.
 
     Attributes:
@@ -144,7 +147,6 @@ class CentreLine:
 
     offset_gain: float = 0.8
     angle_gain: float = 2.0
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: EnvParams) -> Corridor:
         """Finds the walls in the first scan."""
@@ -169,7 +171,7 @@ class CentreLine:
 
 
 @struct.dataclass
-class Pursuit:
+class Pursuit(Steering):
     """Pure pursuit of a point midway between the walls, from one scan alone.
 
     Attributes:
@@ -180,7 +182,6 @@ class Pursuit:
     """
 
     beam: int = struct.field(pytree_node=False, default=2)
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, "2"]:
         """Returns the point in the first scan."""
@@ -211,15 +212,15 @@ class Pursuit:
 
 
 @struct.dataclass
-class HeadingHold:
+class HeadingHold(Steering):
     """Holds the heading of the start by the odometer, without LiDAR.
 
     Attributes:
         gain: Yaw rate for an angle, 1/s; 0 drives straight on and ignores the odometer.
     """
 
+    uses_lidar = False
     gain: float = 2.0
-    uses_lidar: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> Float[Array, "2"]:
         """Returns the heading read and the heading to hold, rad."""

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.navigator import TURN_SPEED
 from subterra_jax.baselines.rings import loop as rings
 from subterra_jax.baselines.steering import CentreLine, Corridor
@@ -118,7 +118,7 @@ class BeliefMemory:
 
 
 @struct.dataclass
-class Belief:
+class Belief(Agent):
     """Drives along the axis until it is sure of one place, or may go no further.
 
     Attributes:
@@ -130,11 +130,9 @@ class Belief:
         habits: Settings of the filter.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
-        uses_lidar: Always true: it reads the ranges.
-        uses_map: Always true.
-        privileged: Always false: it gets no truth.
     """
 
+    uses_lidar = uses_map = True
     tensors: Tensors
     low: Float[Array, "2"]
     high: Float[Array, "2"]
@@ -143,9 +141,6 @@ class Belief:
     habits: Habits = struct.field(pytree_node=False, default=Habits())
     name: str = struct.field(pytree_node=False, default="belief")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
-    uses_map: bool = struct.field(pytree_node=False, default=True)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def with_map(self, params: EnvParams) -> "Belief":
         """Returns the agent with the map of a task, whose tunnel may be a stack; runs on the host."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.stations import told_start
 from subterra_jax.policies import senses
 from subterra_jax.policies.files import Conditions
@@ -44,7 +44,7 @@ def squash(mean: Float[Array, "*batch n"], low: Float[Array, "n"], high: Float[A
 
 
 @struct.dataclass
-class FeedForward:
+class FeedForward(Agent):
     """A multilayer perceptron. It estimates its station only where the task asks for a report.
 
     Attributes:
@@ -54,20 +54,15 @@ class FeedForward:
         frames: Number of observations in its input.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
-        uses_lidar: Always true: it reads the ranges.
-        uses_map: Always false.
-        privileged: Always false: it gets no truth.
     """
 
+    uses_lidar = True
     tensors: Tensors
     low: Float[Array, "n_action"]
     high: Float[Array, "n_action"]
     frames: int = struct.field(pytree_node=False)
     name: str = struct.field(pytree_node=False, default="ppo-mlp")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def n_observation(self) -> int:
@@ -110,7 +105,7 @@ class RecurrentMemory:
 
 
 @struct.dataclass
-class Recurrent:
+class Recurrent(Agent):
     """A GRU with an estimation head, which drives towards a goal and says where it is.
 
     Attributes:
@@ -123,11 +118,9 @@ class Recurrent:
         image: Rows and columns of the scan of a LiDAR in three dimensions that it sees; None without one.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
-        uses_lidar: Always true: it reads the ranges.
-        uses_map: Always false.
-        privileged: Always false: it gets no truth.
     """
 
+    uses_lidar = True
     tensors: Tensors
     low: Float[Array, "2"]
     high: Float[Array, "2"]
@@ -136,9 +129,6 @@ class Recurrent:
     image: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
     name: str = struct.field(pytree_node=False, default="ppo-gru")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def n_features(self) -> int:

@@ -11,7 +11,7 @@ from flax import struct
 
 import subterra_jax as st
 from subterra_jax import episode
-from subterra_jax.baselines.agent import observed, shown
+from subterra_jax.baselines.agent import Agent, observed, shown
 from subterra_jax.baselines.registry import AgentError, make_agent, register
 from subterra_jax.evaluation import Records, evaluate, listed_episodes
 from subterra_jax.evaluation import episodes as lists
@@ -60,14 +60,12 @@ def test_a_number_of_episodes_that_the_list_has_not_is_refused(n):
 
 
 @struct.dataclass
-class Dawdler:
+class Dawdler(Agent):
     """Drives straight on at a speed drawn at the start and stops for good at a station of its own estimate."""
 
+    name = "dawdler"
+    privileged = True
     stop: float = 1e6
-    name: str = struct.field(pytree_node=False, default="dawdler")
-    uses_lidar: bool = struct.field(pytree_node=False, default=False)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, key, obs, params):
         return jnp.zeros(())
@@ -76,6 +74,16 @@ class Dawdler:
         speed = jnp.where(known["station"] < self.stop, 2.0, 0.0)
         yaw_rate = -2.0 * known["heading_sin"] - 0.8 * known["lateral"]
         return jnp.stack([speed, yaw_rate, known["station"] + 1.0, jnp.zeros(()), jnp.ones(())]), memory + 1.0
+
+
+def test_an_agent_that_declares_no_input_gets_none_and_bears_the_name_of_its_class():
+    class Silent(Agent):
+        def begin(self, key, obs, params):
+            return ()
+
+    silent = Silent()
+    assert (silent.uses_lidar, silent.uses_map, silent.privileged, silent.name) == (False, False, False, "Silent")
+    assert (Dawdler().uses_lidar, Dawdler().privileged, Dawdler().name) == (False, True, "dawdler")
 
 
 def test_an_episode_depends_on_its_seed_and_its_tunnel_and_not_on_the_others_driven_with_it(plan_of):

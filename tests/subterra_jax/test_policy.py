@@ -13,6 +13,7 @@ from flax import struct
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines import registry
+from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import AgentError
 from subterra_jax.episode import Driver
 from subterra_jax.evaluation import Episodes, evaluate
@@ -111,13 +112,10 @@ BEGUN: list[int] = []
 
 
 @struct.dataclass
-class Drawn:
+class Drawn(Agent):
     """Drives at a speed drawn when its episode begins, a little faster each step, and notes how many it draws for."""
 
-    name: str = struct.field(pytree_node=False, default="drawn")
-    uses_lidar: bool = struct.field(pytree_node=False, default=False)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
+    name = "drawn"
 
     def begin(self, key, obs, params):
         speed = jax.random.uniform(key)

@@ -23,7 +23,7 @@ _BATCH = 500
 
 
 @struct.dataclass
-class Act:
+class Act(Agent):
     """An agent without memory: a function of weights and observation, in JAX.
 
     Attributes:
@@ -32,12 +32,10 @@ class Act:
         weights: Any pytree of arrays.
     """
 
+    name = "trained elsewhere"
+    uses_lidar = True
     function: Callable[[Any, Array], Array] = struct.field(pytree_node=False)
     weights: Any = ()
-    name: str = struct.field(pytree_node=False, default="trained elsewhere")
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> tuple[()]:
         """Returns no memory."""

@@ -36,7 +36,7 @@ from subterra_jax.baselines.reckoning import (
 from subterra_jax.baselines.rings import bank
 from subterra_jax.baselines.rings.loop import RingMemory, begin_memory
 from subterra_jax.baselines.rings.walls import Bumps, Walls, begin_walls, track_walls
-from subterra_jax.baselines.stations import Driven, Station, fault_sizes
+from subterra_jax.baselines.stations import Driven, Localiser, Station, fault_sizes
 from subterra_jax.baselines.steering import CentreLine, Steering
 from subterra_jax.parts.faults import FaultParams
 from subterra_jax.state import EnvParams
@@ -238,16 +238,14 @@ def _rate(rate: Array, drive: _Drive, news: Array) -> Array:
 
 
 @struct.dataclass
-class RingFilter:
+class RingFilter(Localiser):
     """Counts rings where the walls have any, on wet rail too, and falls back on commands and odometry elsewhere.
 
     Attributes:
         wet: Whether the task may have wet rail, as its params say.
-        privileged: False: it receives no truth.
     """
 
     wet: bool = struct.field(pytree_node=False, default=True)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> RingMemory:
         """Begins at the believed start."""
@@ -286,7 +284,7 @@ class PaceMemory:
 
 
 @struct.dataclass
-class PacedSteering:
+class PacedSteering(Steering):
     """A steering that drives slowly past the first rings, and no faster than they can be counted, towards a goal.
 
     Attributes:
@@ -294,14 +292,12 @@ class PacedSteering:
         cruise: Largest speed, m/s.
         slow: Largest speed over the first distance, m/s.
         learning: That first distance, m.
-        uses_lidar: Whether the steering uses the LiDAR.
     """
 
     steering: Steering
     cruise: float = _CRUISE
     slow: float = _SLOW
     learning: float = _LEARNING
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
 
     def begin(self, obs: Observed, params: EnvParams) -> PaceMemory:
         """Return the memory at the start."""

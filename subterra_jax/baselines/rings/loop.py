@@ -20,7 +20,7 @@ from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.fused import Belief, FusedCount
 from subterra_jax.baselines.reckoning import ODOMETER_SHARE
 from subterra_jax.baselines.rings.walls import fit_careful, fit_plain, side_beams
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven, Localiser, Station
 from subterra_jax.state import EnvParams
 
 HARMONICS = 4  # pockets are 0.2 m long and 0.4 m apart; a fifth harmonic adds more noise than information
@@ -202,10 +202,8 @@ def begin_memory(track: Any, obs: Observed, params: EnvParams) -> RingMemory:
 
 
 @struct.dataclass
-class RingCount:
+class RingCount(Localiser):
     """Counts rings where the walls have any, and falls back on commands and odometry elsewhere."""
-
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: EnvParams) -> RingMemory:
         """Begins at the believed start."""

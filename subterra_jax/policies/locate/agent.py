@@ -11,7 +11,7 @@ import jax
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.agent import Action, Agent, Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.navigator import Memory, Navigator
 from subterra_jax.baselines.steering import CentreLine
@@ -27,7 +27,7 @@ ERRANDS = ("stop", "return")
 
 
 @struct.dataclass
-class Locating:
+class Locating(Agent):
     """Drives to a goal by a learnt localiser.
 
     Attributes:
@@ -38,11 +38,9 @@ class Locating:
         blind: Cut what the walls tell: the ablation of the learnt estimate.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
-        uses_lidar: Always true.
-        uses_map: Always false: it has no map.
-        privileged: Always false: it gets no truth.
     """
 
+    uses_lidar = True
     tensors: Tensors
     low: Float[Array, "2"]
     high: Float[Array, "2"]
@@ -50,9 +48,6 @@ class Locating:
     blind: bool = struct.field(pytree_node=False, default=False)
     name: str = struct.field(pytree_node=False, default=KIND)
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
-    uses_lidar: bool = struct.field(pytree_node=False, default=True)
-    uses_map: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def without_walls(self) -> "Locating":
         """Returns the agent with its learnt estimate cut out: the same weights, and nothing that the walls tell."""

@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.baselines.agent import Known, Observed
-from subterra_jax.baselines.stations import Driven, Station, believed_start
+from subterra_jax.baselines.stations import Driven, Localiser, Station, believed_start
 from subterra_jax.policies.locate import matching, memory, profiles
 from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, N_ROW, Block, Estimate
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, REACH, WINDOW, Profiles
@@ -54,7 +54,7 @@ class LocatorMemory:
 
 
 @struct.dataclass
-class Locator:
+class Locator(Localiser):
     """Estimates the station by commands, corrected by what it has learnt of the walls.
 
     Attributes:
@@ -66,7 +66,6 @@ class Locator:
     weights: Any
     network: str = struct.field(pytree_node=False)
     blind: bool = struct.field(pytree_node=False, default=False)
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: Any) -> LocatorMemory:
         """Begins at the believed start."""

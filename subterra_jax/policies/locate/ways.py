@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax.baselines.agent import Known, Observed
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven, Localiser, Station
 from subterra_jax.policies.locate.locator import Locator, LocatorMemory
 
 _LATE = 0.1  # m driven, in the mean, before the step at which the flag is seen
@@ -33,7 +33,7 @@ class WayMemory:
 
 
 @struct.dataclass
-class TwoWays:
+class TwoWays(Localiser):
     """Counts each way by a learnt localiser, which only knows driving forward.
 
     Attributes:
@@ -41,7 +41,6 @@ class TwoWays:
     """
 
     locator: Locator
-    privileged: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: Any) -> WayMemory:
         """Begins on the way out, at the believed start."""
