@@ -13,6 +13,7 @@ from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines.agent import shown
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.episode import ask, in_tunnel, look
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.files import GAIT, PolicyError, read_facts
 from subterra_jax.policies.loading import load
 from subterra_jax.policies.opening import open_agent, policy_source
@@ -227,7 +228,8 @@ def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | N
             name = source if isinstance(source, str) else getattr(source, "name", type(source).__name__)
             raise PolicyError(f"{name}: drives any task, so name one: load_policy({name!r}, env, params)")
         walks = facts.get("world", {}).get("embodiment") == "b2"
-        env, params = make(MISSIONS[0] if walks else facts["task"])
+        sensor = facts.get("world", {}).get("sensor", SENSORS[0])
+        env, params = make(MISSIONS[0]) if walks else make(facts["task"], sensor=sensor)
     return DrivingPolicy(open_agent(source, env, params), params, env)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.steering import CentreLine
-from subterra_jax.policies.locate.profiles import find_points
+from subterra_jax.policies.locate.bends import look as look_at
 from subterra_jax.policies.locate.streams import Record
 from subterra_jax.rules.rule import Choice
 
@@ -68,12 +68,14 @@ def record_drives(
     seen = jax.vmap(look)(state, first)
     walls = jax.vmap(lambda obs: CentreLine().begin(obs, params))(seen)
     command, driven, over = jnp.zeros((n_envs, 2)), jnp.zeros(n_envs), jnp.zeros(n_envs, bool)
+    bend = jnp.zeros(n_envs)
 
     def step(carry: Any, t: Array) -> Any:
-        state, seen, walls, command, driven, over = carry
+        state, seen, walls, command, driven, over, bend = carry
         walls = jax.vmap(lambda w, obs, c: CentreLine().look(w, obs, c, params))(walls, seen, command)
-        driven = driven + command[:, 0] * params.vehicle.period * jnp.cos(walls.angle)
-        points = jax.vmap(lambda obs, w: find_points(obs.ranges, w, params.lidar.range_max))(seen, walls)
+        moved = command[:, 0] * params.vehicle.period * jnp.cos(walls.angle)
+        driven = driven + moved
+        points, bend = jax.vmap(lambda b, obs, w, m: look_at(b, obs, w, m, params))(bend, seen, walls, moved)
         kept = Record(driven, seen.distance, points), state.station
         share = jnp.where(from_mouth, 1.0, jax.vmap(lambda p: _speed(p, t))(pace))
         end = jax.vmap(lambda s: params.tunnel.pick(s.tunnel).length)(state) - 5.0
@@ -85,10 +87,10 @@ def record_drives(
         action = jnp.pad(command, ((0, 0), (0, env.action_size - 2)))
         state = jax.vmap(lambda s, a, z: env.advance(s, a, z, params)[0])(state, action, noise)
         seen = jax.vmap(look)(state, noise)
-        return (state, seen, walls, command, driven, over), kept
+        return (state, seen, walls, command, driven, over, bend), kept
 
     start = state.station
-    carry: Any = (state, seen, walls, command, driven, over)
+    carry: Any = (state, seen, walls, command, driven, over, bend)
     (state, *_), (record, station) = jax.lax.scan(step, carry, jnp.arange(n_steps))
     record = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), record)
     return Drive(record, jnp.swapaxes(station, 0, 1) - start[:, None], state.tunnel)

@@ -17,7 +17,7 @@ import tyro
 
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
-from subterra_jax.policies import load
+from subterra_jax.policies import check_fits, load
 from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.locate import memory, streams
 from subterra_jax.policies.locate.agent import Locating, nested
@@ -39,6 +39,7 @@ class Command:
         policies: Localisers of `train.locate`.
         out: Folder for `look.json` and `look.md`.
         task: Task that is driven.
+        sensor: The LiDAR, by name.
         tunnels: Tunnels; a choice may be made on `val` alone.
         drives: Drives, spread over the tunnels.
         seed: Added to the seed of the drives.
@@ -48,6 +49,7 @@ class Command:
     policies: tyro.conf.Positional[tuple[str, ...]]
     out: Path
     task: str = "Subterra/StopAt-v1"
+    sensor: str = tunnels.PLANAR
     tunnels: str = ",".join(f"open:{kind}:test-unseen:0-9" for kind in _KINDS)
     drives: int = 300
     seed: int = 0
@@ -59,7 +61,7 @@ def command(arguments: Command) -> None:
 
     Raises:
         ConfigError: A policy is no localiser, or a number out of range.
-        SubterraError: There is no such policy, task or tunnel.
+        SubterraError: There is no such policy, task or tunnel, or a policy does not fit the sensor.
     """
     at_least(arguments, 1, "drives")
     at_least(arguments, 0, "seed")
@@ -68,7 +70,10 @@ def command(arguments: Command) -> None:
         if not isinstance(agent, Locating):
             raise ConfigError(f"{name}: is no localiser, but {type(agent).__name__}")
     names = tunnels.names_of(arguments.tunnels)
-    env, params = tunnels.enter(arguments.task, tunnels.load(names, None, arguments.cache))
+    found = tunnels.load(names, None, arguments.cache, arguments.sensor)
+    env, params = tunnels.enter(arguments.task, found, arguments.sensor)
+    for name, agent in agents.items():
+        check_fits(agent, env, params, name)
     drives = scores.record(env, params, jax.random.key(_SEED + arguments.seed), arguments.drives)
     kinds = np.array([scores.kind_of(name) for name in names])[np.asarray(drives.tunnel).astype(int)]
     print(f"{arguments.drives} drives", flush=True)
@@ -131,7 +136,7 @@ def _write(arguments: Command, rows: dict[str, Any]) -> None:
     for label, row in rows.items():
         cells = [f"{100 * c['success']:.0f} ({100 * c['low']:.0f} to {100 * c['high']:.0f})" for c in row.values()]
         lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    names = ("task", "tunnels", "drives", "seed")
+    names = ("task", "sensor", "tunnels", "drives", "seed")
     facts = {
         "schema": SCHEMA,
         "config": {name: getattr(arguments, name) for name in names},

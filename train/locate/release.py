@@ -12,11 +12,13 @@ from subterra_jax.policies.files import TENSORS
 from train.config import ConfigError
 from train.evaluate import evaluate
 from train.locate.session import CURVE, POLICY, SCORES
+from train.locate.tunnels import PLANAR
 from train.policies import facts_file
 from train.world import open_world
 
 MEASURED = ("subterra.kinds/1", "subterra.look/1")
-INPUTS = "16 level ranges, odometer, own commands, start and goal; no ring length, no map, no counter of rings"
+INPUTS = "odometer, own commands, start and goal; no ring length, no map, no counter of rings"
+_SEES = {PLANAR: "16 level ranges"}
 LEARNT = "where the robot is; steering, avoidance and the stop are written"
 _CUT = "cut:"
 
@@ -46,14 +48,15 @@ def release(folder: Path, out: Path, episodes: int, measured: tuple[Path, ...]) 
     tensors = (folder / POLICY).read_bytes()
     rows = [_rows(path, facts["tensors_sha256"]) for path in measured]
     curve, scores = _curve(folder), _read(folder / SCORES, "scores")
-    world = open_world(facts["task"], None)
+    sensor = facts.get("world", {}).get("sensor", PLANAR)
+    world = open_world(facts["task"], None, None, sensor)
     found = evaluate(world, dataclasses.replace(agent, name=out.name.removesuffix(TENSORS)), episodes)
     card = {
         **facts,
         "name": out.name.removesuffix(TENSORS),
         "constants_v1_sha256": st.constants_digest(version="v1"),
-        "world": {"tunnel": facts["tunnels"], "lining": None, "sensor": "planar16"},
-        "inputs": INPUTS,
+        "world": {"tunnel": facts["tunnels"], "lining": None, "sensor": sensor},
+        "inputs": f"{_SEES.get(sensor, f'the image of {sensor}')}, {INPUTS}",
         "learnt": LEARNT,
         "val": scores,
         "success_against_time": curve,

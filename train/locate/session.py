@@ -39,6 +39,7 @@ class Command:
         out: Folder with one `seed-<k>` for each seed (`policy.safetensors` and its facts, `log.jsonl`, `curve.jsonl`
             with scores on `val` against time, `scores.json`), with `config.json` and `checkpoint/`.
         task: Task that is driven, one that starts facing growing stations.
+        sensor: The LiDAR, by name: `planar16`, or a spinning one as `spin16x64`.
         tunnels: Tunnels to learn in.
         val: Tunnels to score in.
         drives: Drives of the score, the same for every seed and network.
@@ -54,6 +55,7 @@ class Command:
 
     out: Path
     task: str = "Subterra/StopAt-v1"
+    sensor: str = tunnels.PLANAR
     tunnels: str = ",".join(f"open:{kind}:train:0-15" for kind in _KINDS)
     val: str = ",".join(f"open:{kind}:val:0-9" for kind in _KINDS)
     drives: int = 512
@@ -101,11 +103,14 @@ def run(arguments: Command) -> None:
     check(arguments)
     begin = time.monotonic()
     everything = tunnels.load(
-        tunnels.names_of(arguments.tunnels) + tunnels.names_of(arguments.val), None, arguments.cache
+        tunnels.names_of(arguments.tunnels) + tunnels.names_of(arguments.val),
+        None,
+        arguments.cache,
+        arguments.sensor,
     )
     n_train = len(tunnels.names_of(arguments.tunnels))
-    env, params = tunnels.enter(arguments.task, everything[:n_train])
-    val_env, val_params = tunnels.enter(arguments.task, everything[n_train:])
+    env, params = tunnels.enter(arguments.task, everything[:n_train], arguments.sensor)
+    val_env, val_params = tunnels.enter(arguments.task, everything[n_train:], arguments.sensor)
     print(f"{len(everything)} tunnels: {time.monotonic() - begin:.0f} s", flush=True)
     _write_config(arguments)
     drives = scores.record(val_env, val_params, jax.random.key(_VAL_SEED), arguments.drives)
@@ -254,6 +259,7 @@ def save(path: Path, weights: Any, updates: int, seed: int, env: Any, params: An
         "config": dataclasses.asdict(arguments.config),
         "seed": seed,
         "tunnels": arguments.tunnels,
+        "world": {"tunnel": arguments.tunnels, "lining": None, "sensor": arguments.sensor},
         "updates": updates,
         "versions": library_versions(),
     }
@@ -271,7 +277,13 @@ def _identity(arguments: Command) -> dict[str, Any]:
     """Returns the settings that a run must keep when it goes on; the time may be another."""
     config = dataclasses.asdict(arguments.config)
     config.pop("minutes")
-    plain = {"task": arguments.task, "tunnels": arguments.tunnels, "seeds": list(arguments.seeds), **config}
+    plain = {
+        "task": arguments.task,
+        "sensor": arguments.sensor,
+        "tunnels": arguments.tunnels,
+        "seeds": list(arguments.seeds),
+        **config,
+    }
     return json.loads(json.dumps(plain))
 
 

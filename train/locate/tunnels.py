@@ -11,10 +11,15 @@ from typing import Any
 import jax
 
 import subterra_jax as st
+from subterra_jax import constants
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import VERSION
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.sources import resolve
+
+PLANAR = SENSORS[0]
 
 
 def names_of(names: str) -> list[str]:
@@ -26,23 +31,24 @@ def names_of(names: str) -> list[str]:
     return [name for part in names.split(",") for name in expand(part)]
 
 
-def enter(task: str, tunnels: list[Tunnel]) -> tuple[Any, Any]:
-    """Returns a task in one or several tunnels."""
-    return st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0])
+def enter(task: str, tunnels: list[Tunnel], sensor: str = PLANAR) -> tuple[Any, Any]:
+    """Returns a task in one or several tunnels, which must have been loaded for the sensor."""
+    return st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0], sensor=sensor)
 
 
-def load(names: list[str], lining: str | None = None, cache: Path | None = None) -> list[Tunnel]:
+def load(names: list[str], lining: str | None = None, cache: Path | None = None, sensor: str = PLANAR) -> list[Tunnel]:
     """Returns the tunnels of these names.
 
     Args:
         names: Names of single tunnels.
         lining: Variant of the walls; None is the usual one.
         cache: Folder of this command's own in which tunnels are kept from run to run; None keeps none.
+        sensor: The LiDAR; one in three dimensions needs the bore.
 
     Raises:
         TunnelError: There is no such tunnel or lining.
     """
-    one = functools.partial(_tunnel, lining=lining, cache=cache)
+    one = functools.partial(_tunnel, lining=lining, cache=cache, spatial=sensor != PLANAR)
     workers = min(len(names), os.cpu_count() or 1)
     if workers <= 1:
         return [one(name) for name in names]
@@ -51,13 +57,13 @@ def load(names: list[str], lining: str | None = None, cache: Path | None = None)
         return list(pool.map(one, names, chunksize=1))
 
 
-def _tunnel(name: str, lining: str | None, cache: Path | None) -> Tunnel:
+def _tunnel(name: str, lining: str | None, cache: Path | None, spatial: bool = False) -> Tunnel:
     """Returns a tunnel whose arrays are of the host, so that they go from one process to another."""
-    kept = None if cache is None else cache / f"{VERSION}-{name}-{lining}.pickle".replace("/", "_")
+    bore = "-bore" if spatial else ""
+    kept = None if cache is None else cache / f"{VERSION}-{name}-{lining}{bore}.pickle".replace("/", "_")
     if kept is not None and kept.is_file():
         return pickle.loads(kept.read_bytes())
-    plan = st.load_tunnel(name)
-    made = jax.device_get(Tunnel.from_plan(plan, lining or plan.default_lining))
+    made = jax.device_get(resolve(name, lining, None, constants.RANGE_MAX, spatial))
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         with replace_file(kept) as fresh:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.stations import Driven, Localiser, Station, believed_start
-from subterra_jax.policies.locate import matching, memory, profiles
+from subterra_jax.policies.locate import bends, matching, memory, profiles, strips
 from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, N_ROW, Block, Estimate
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, REACH, WINDOW, Profiles
 from subterra_jax.policies.locate.streams import raw_rows
@@ -32,6 +32,7 @@ class LocatorMemory:
         metres: Metres completed.
         read_before: Reading at the end of the last metre, m, interpolated.
         steps_before: Steps at that time, interpolated.
+        bend: Curvature of the tunnel, 1/m.
         window: Profiles about the robot.
         raw: Sums of the scans in the parts of this metre.
         counts: Scans in each part.
@@ -46,6 +47,7 @@ class LocatorMemory:
     metres: Int[Array, ""]
     read_before: Float[Array, ""]
     steps_before: Float[Array, ""]
+    bend: Float[Array, ""]
     window: Profiles
     raw: Float[Array, "parts row"]
     counts: Float[Array, "parts"]
@@ -78,7 +80,8 @@ class Locator(Localiser):
             metres=jnp.zeros((), jnp.int32),
             read_before=obs.distance,
             steps_before=zero,
-            window=profiles.blank(WINDOW),
+            bend=zero,
+            window=profiles.blank(WINDOW, strips.n_sides(params.lidar)),
             raw=jnp.zeros((N_RECENT, N_ROW)),
             counts=jnp.zeros(N_RECENT),
             cell=memory.start(self.network, self.weights),
@@ -117,7 +120,7 @@ class Locator(Localiser):
     ) -> tuple[Block, LocatorMemory]:
         """Returns the metre that may have ended, and the memory with the scan."""
         walls = getattr(driven.walls, "corridor", driven.walls)  # steering round boxes keeps them with its hits
-        points = profiles.find_points(obs.ranges, walls, params.lidar.range_max)
+        points, bend = bends.look(before.bend, obs, walls, now.driven - before.driven, params)
         window = profiles.forget(before.window, _newest(before.driven), _newest(now.driven))
         window = profiles.add_points(window, points, (now.driven + points.along) / BIN, wrapped=True)
         metre = before.metres
@@ -139,7 +142,7 @@ class Locator(Localiser):
         part = jnp.clip(part, 0, N_RECENT - 1)
         sums, counts = (jnp.where(ended, 0.0, old) for old in (before.raw, before.counts))
         return block, dataclasses.replace(
-            now, window=window, raw=sums.at[part].add(raw_rows(points)), counts=counts.at[part].add(1.0)
+            now, bend=bend, window=window, raw=sums.at[part].add(raw_rows(points)), counts=counts.at[part].add(1.0)
         )
 
 

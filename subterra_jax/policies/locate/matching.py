@@ -41,8 +41,8 @@ def init(key: PRNGKeyArray, compared: Any = SHARES) -> Weights:
     So the former meet walls that come nearer sharply, and the latter walls that recede.
     """
     taps = 0.1 * jax.random.normal(key, (N_BEARINGS, _TAPS, 3, _CHANNELS + 1)) / np.sqrt(_TAPS)
-    recede = jnp.array([0.0, -0.25, -0.25, -0.25, 0.0, 0.25, 0.25, 0.25, 0.0])
-    smooth = jnp.array([0.0, 0.0, 0.0, 0.25, 0.5, 0.25, 0.0, 0.0, 0.0])
+    recede = _in_middle([-0.25, -0.25, -0.25, 0.0, 0.25, 0.25, 0.25])
+    smooth = _in_middle([0.25, 0.5, 0.25])
     for channel, filters in enumerate((-recede, recede)):
         taps = taps.at[:, :, 0, channel].add(filters)
     taps = taps.at[..., _CHANNELS].set(0.0).at[:, :, 2, _CHANNELS].set(-4.0 / _TAPS)
@@ -61,12 +61,17 @@ def init(key: PRNGKeyArray, compared: Any = SHARES) -> Weights:
     }
 
 
+def _in_middle(taps: list[float]) -> Float[Array, "tap"]:
+    """Returns a filter of `_TAPS` bins with an odd number of taps in its middle."""
+    return jnp.pad(jnp.array(taps), (_TAPS - len(taps)) // 2)
+
+
 def shares(weights: Weights) -> Float[Array, "n_shares"]:
     """Returns the errors of the command that are compared."""
     return jax.lax.stop_gradient(weights["shares"])
 
 
-def encode(weights: Weights, profiles: Profiles) -> tuple[Float[Array, "2 7 bins c"], Float[Array, "2 7 bins c"]]:
+def encode(weights: Weights, profiles: Profiles) -> tuple[Float[Array, "side 7 bins c"], Float[Array, "side 7 bins c"]]:
     """Returns features of the profiles and their weights, 0 to 1; `MARGIN` bins at either end are lost."""
     there = jnp.minimum(profiles.weight, 1.0)
     out = profiles.out / jnp.maximum(profiles.weight, 1e-3)
@@ -109,9 +114,9 @@ def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_shares"]:
 
 def compare(
     weights: Weights,
-    features: Float[Array, "2 7 bins c"],
-    there: Float[Array, "2 7 bins c"],
-    along: Float[Array, "2 7"],
+    features: Float[Array, "side 7 bins c"],
+    there: Float[Array, "side 7 bins c"],
+    along: Float[Array, "side 7"],
 ) -> Float[Array, "n_shares"]:
     """Compares the pairs of beams on either side.
 

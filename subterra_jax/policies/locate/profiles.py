@@ -12,27 +12,37 @@ BIN = 0.1  # m of a profile's bin
 BLOCK = 10  # bins of a block, over which evidence is summed
 REACH = 9.5  # m ahead or behind; points further away are left out
 WINDOW = 288  # bins that a robot keeps
-N_SIDES, N_BEARINGS = 2, 7  # of 16 beams, those that are neither ahead nor behind
-_ECHO = 1e-3  # m below `range_max`: no echo
-_OUT = 1.5  # m; points further from the tracked wall than this are not of the wall
+N_BEARINGS = 7  # on either side: of 16 beams, those that are neither ahead nor behind
+ECHO = 1e-3  # m below `range_max`: no echo
+OUT = 1.5  # m; points further from the tracked wall than this are not of the wall
 _SPREAD = 2.0  # bins to either side over which a point counts, with falling weight
 
-Grid = Float[Array, "2 7 bins"]
+Grid = Float[Array, "side 7 bins"]
 
 
 @struct.dataclass
 class Points:
     """Points that a scan found on the walls, by side (left, right) and bearing (from ahead to behind).
 
+    Of a LiDAR in three dimensions there are further sides, left and right at other heights (`strips`), and `rays` rows
+    of points for each.
+
     Attributes:
         along: Distance ahead, m.
         out: Distance beyond the tracked wall, m.
         seen: True where there is a point.
+        rays: Rows of points that belong to one side.
     """
 
-    along: Float[Array, "2 7"]
-    out: Float[Array, "2 7"]
-    seen: Bool[Array, "2 7"]
+    along: Float[Array, "row 7"]
+    out: Float[Array, "row 7"]
+    seen: Bool[Array, "row 7"]
+    rays: int = struct.field(pytree_node=False, default=1)
+
+    @property
+    def n_sides(self) -> int:
+        """Number of sides."""
+        return self.seen.shape[-2] // self.rays
 
 
 @struct.dataclass
@@ -59,16 +69,16 @@ def find_points(ranges: Float[Array, "n_beams"], walls: Corridor, range_max: Flo
     reach = ranges[chosen]
     along, across = reach * jnp.cos(angle), reach * jnp.abs(jnp.sin(angle))
     out = across - jnp.stack([walls.left, walls.right])[:, None]
-    seen = (reach < range_max - _ECHO) & (jnp.abs(along) < REACH) & (jnp.abs(out) < _OUT)
+    seen = (reach < range_max - ECHO) & (jnp.abs(along) < REACH) & (jnp.abs(out) < OUT)
     return Points(along, out, seen)
 
 
-def blank(n_bins: int) -> Profiles:
+def blank(n_bins: int, n_sides: int) -> Profiles:
     """Returns profiles without a point."""
-    return Profiles(*(jnp.zeros((N_SIDES, N_BEARINGS, n_bins)) for _ in range(3)))
+    return Profiles(*(jnp.zeros((n_sides, N_BEARINGS, n_bins)) for _ in range(3)))
 
 
-def add_points(profiles: Profiles, points: Points, bins: Float[Array, "*t 2 7"], wrapped: bool = False) -> Profiles:
+def add_points(profiles: Profiles, points: Points, bins: Float[Array, "*t row 7"], wrapped: bool = False) -> Profiles:
     """Adds points, of one scan or of many.
 
     Args:
@@ -83,7 +93,8 @@ def add_points(profiles: Profiles, points: Points, bins: Float[Array, "*t 2 7"],
     weight = jnp.maximum(1.0 - jnp.abs(index - bins[..., None]) / _SPREAD, 0.0) * points.seen[..., None]
     inside = (index >= 0) & (index < n_bins) if not wrapped else jnp.ones_like(index, bool)
     weight, index = jnp.where(inside, weight, 0.0), jnp.mod(index, n_bins)
-    side, beam = np.arange(N_SIDES)[:, None, None], np.arange(N_BEARINGS)[None, :, None]
+    side = (np.arange(points.seen.shape[-2]) // points.rays)[:, None, None]
+    beam = np.arange(N_BEARINGS)[None, :, None]
 
     def add(sums: Grid, values: Array) -> Grid:
         return sums.at[side, beam, index].add(weight * values)
@@ -111,7 +122,7 @@ def cut(profiles: Profiles, first: Int[Array, ""], n: int) -> Profiles:
     return Profiles(*(sums[..., index] for sums in (profiles.weight, profiles.out, profiles.along)))
 
 
-def mean_along(profiles: Profiles) -> Float[Array, "2 7"]:
+def mean_along(profiles: Profiles) -> Float[Array, "side 7"]:
     """Returns the mean distance ahead at which the points were seen, m; 0 where there are none."""
     total = jnp.sum(profiles.weight, axis=-1)
     return jnp.sum(profiles.along, axis=-1) / jnp.maximum(total, 1e-3)

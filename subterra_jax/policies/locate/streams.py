@@ -52,7 +52,9 @@ def reached(record: Record, n: int) -> Bool[Array, "n"]:
 def _evidence(record: Record, weights: matching.Weights, n: int) -> Float[Array, "n n_shares"]:
     """Returns the evidence of the block `DELAY` metres before each metre."""
     where = (record.driven[:, None, None] + record.points.along) / BIN + _BEFORE
-    whole = profiles.add_points(profiles.blank(BLOCK * n + _BEFORE + _AFTER), record.points, where)
+    whole = profiles.add_points(
+        profiles.blank(BLOCK * n + _BEFORE + _AFTER, record.points.n_sides), record.points, where
+    )
     features, there = matching.encode(weights, whole)
     first = _BEFORE - matching.MARGIN - matching.LAGS  # of the first block's cut, in features
 
@@ -78,8 +80,9 @@ def _raw(record: Record, n: int) -> Float[Array, "n n_raw"]:
 
 
 def raw_rows(points: Points) -> Float[Array, "*t row"]:
-    """Returns a scan as numbers of order 1."""
-    batch = points.seen.shape[:-2]
-    out = jnp.where(points.seen, jnp.arcsinh(points.out / 0.03), 0.0)
-    along = jnp.where(points.seen, points.along / 10.0, 0.0)
+    """Returns a scan as numbers of order 1; of several heights the first, and of several rays the first."""
+    first = slice(0, 2 * points.rays, points.rays)
+    seen, batch = points.seen[..., first, :], points.seen.shape[:-2]
+    out = jnp.where(seen, jnp.arcsinh(points.out[..., first, :] / 0.03), 0.0)
+    along = jnp.where(seen, points.along[..., first, :] / 10.0, 0.0)
     return jnp.concatenate([out.reshape(*batch, -1), along.reshape(*batch, -1)], axis=-1)
