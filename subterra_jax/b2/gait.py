@@ -182,9 +182,11 @@ def _size(velocity: Float[Array, "3"]) -> Float[Array, ""]:
     return jnp.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1] + 0.25 * velocity[2] * velocity[2])
 
 
-@struct.dataclass
+@struct.dataclass(eq=False)
 class WalkPolicy:
     """Twelve joint offsets for one observation of `WalkEnv`: the mean of the distribution that was trained.
+
+    It equals itself alone, so that `jax.jit(policy)` takes it.
 
     Attributes:
         tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `policy.hidden_<i>`.

@@ -63,9 +63,11 @@ class DrivingMemory:
     agent: Any
 
 
-@struct.dataclass
+@struct.dataclass(eq=False)
 class DrivingPolicy:
     """An agent that drives one task, as a `Policy`; a pytree, so that it may be handed to jitted functions.
+
+    It equals itself alone, so that it has a hash and `jax.jit(policy)` takes it, arrays inside or not.
 
     It draws as `subterra_jax.episode` has agents draw: with the key of an episode's agent it drives that very episode.
 
@@ -105,11 +107,15 @@ class DrivingPolicy:
         """Returns action and memory; see `Policy`. Compiled at the first call.
 
         Raises:
-            PolicyError: The observation has another size, or the agent needs the state and is not given it.
+            PolicyError: The observation has another size, there is no memory, or the agent needs the state and is not
+                given it.
         """
         size, count = self.env.observation_size(self.params), self.params.tunnel.count
         if jnp.shape(obs)[-1:] != (size,):
             raise PolicyError(f"{self.name}: {self.env.id} has {size} numbers, got an array of shape {jnp.shape(obs)}")
+        if not isinstance(memory, DrivingMemory):
+            wrong = type(memory).__name__
+            raise PolicyError(f"{self.name}: the first memory is policy.initial_memory(), got a {wrong}")
         if state is None and self.agent.privileged:
             raise PolicyError(f"{self.name}: is told the truth, so call it as policy(obs, memory, state)")
         if state is None and count > 1:

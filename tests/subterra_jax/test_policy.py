@@ -171,6 +171,17 @@ def test_a_policy_knows_its_own_task_and_a_gait_is_a_policy_too():
     action, memory = gait(jnp.zeros((5, 56)), gait.initial_memory(n_envs=5))
     assert action.shape == (5, 12)
     assert gait.restart(memory, jnp.ones(5, bool)) == ()
+    np.testing.assert_allclose(jax.jit(gait)(jnp.zeros((5, 56)), memory)[0], action, atol=1e-6)
+
+
+@pytest.mark.parametrize("source", ["TraverseShort-v0", "dead-reckoning"])
+def test_a_policy_itself_can_be_compiled(source):
+    """It holds arrays and dicts of arrays, which have no hash; `jax.jit` asks for one."""
+    policy = st.load_policy(source, *st.make(DRIVEN))
+    obs, memory = jnp.ones(18), policy.initial_memory()
+    (action, after), (same, alike) = policy(obs, memory), jax.jit(policy)(obs, memory)
+    np.testing.assert_allclose(same, action, atol=1e-6)
+    assert int(alike.steps) == int(after.steps) == 1
 
 
 @pytest.mark.parametrize("source", ["policy:own.safetensors", "own.safetensors", "run", "policy:run", "run/checkpoint"])
@@ -234,6 +245,9 @@ def test_a_call_that_lacks_something_is_refused_in_one_sentence(world):
     policy = load_policy("fused", env, params)
     with pytest.raises(PolicyError, match=r"fused: Subterra/StopAtShort-v0 has 20 numbers, got .* \(18,"):
         policy(jnp.zeros(18), policy.initial_memory())
+    for wrong in (None, ()):
+        with pytest.raises(PolicyError, match=r"fused: the first memory is policy.initial_memory\(\), got a"):
+            policy(jnp.zeros(20), wrong)
     oracle = load_policy("oracle", env, params)
     with pytest.raises(PolicyError, match=r"oracle: is told the truth, so call it as policy\(obs, memory, state\)"):
         oracle(jnp.zeros(20), oracle.initial_memory())
