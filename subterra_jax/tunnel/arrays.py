@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.tunnel.blocks import distance_to_segment
+from subterra_jax.tunnel.distances import crossings, gaps_near
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 ArrayLike = Any  # a number, an array or nested lists of numbers
@@ -22,7 +22,6 @@ _UNEVEN = 5.0  # m: a smooth wall is the median over this length, so that pocket
 _OFF = 0.1  # m, tolerance between given half widths and walls
 _BACK = 1.0  # m, that a wall may run backwards, as in the corner of a niche
 _SHORT = 3.0  # m, that a wall may end before or behind a mouth, as in a skew portal
-_CHUNK = 256  # nodes at a time, against memory
 
 
 def from_centreline(
@@ -167,7 +166,8 @@ def _numbers(name: str, values: ArrayLike, shape: tuple[int | None, ...]) -> np.
         wanted = ", ".join("n" if n is None else str(n) for n in shape)
         raise TunnelError(f"{name} must have shape ({wanted}), got {array.shape}")
     if not np.all(np.isfinite(array)):
-        raise TunnelError(f"{name} is not finite at index {np.argwhere(~np.isfinite(array))[0].tolist()}")
+        place = f" at index {np.argwhere(~np.isfinite(array))[0].tolist()}" if array.ndim else ""
+        raise TunnelError(f"{name} is not finite{place}")
     return array
 
 
@@ -205,7 +205,8 @@ def _bare_plan(
         raise TunnelError(f"centreline repeats the vertex at index {int(np.argmax(size < 1e-6))}")
     back = np.sum(step[1:] * step[:-1], axis=1) <= 0.0
     if np.any(back):
-        raise TunnelError(f"centreline doubles back at index {int(np.argmax(back)) + 1}")
+        corner = int(np.argmax(back)) + 1
+        raise TunnelError(f"centreline doubles back at index {corner}, or has a corner of 90 degrees there")
     at = np.concatenate([[0.0], np.cumsum(size)])
     station = np.linspace(0.0, at[-1], max(2, round(at[-1] / _SPACING) + 1))
 
@@ -275,24 +276,6 @@ def _check_pockets(rows: Float[np.ndarray, "p 4"], length: float) -> None:
             raise TunnelError(f"a pocket lies outside the tunnel's 0..{length:.1f} m")
 
 
-def _crossings(
-    origin: Float[np.ndarray, "n 2"], direction: Float[np.ndarray, "n 2"], vertex: Float[np.ndarray, "k 2"]
-) -> Float[np.ndarray, " n"]:
-    """Return the distance along each ray to a polyline, m; `inf` where it is not met."""
-    start, edge = vertex[:-1], np.diff(vertex, axis=0)
-    distance = np.empty(len(origin))
-    for first in range(0, len(origin), _CHUNK):
-        rows = slice(first, first + _CHUNK)
-        d_x, d_y = direction[rows, :1], direction[rows, 1:]
-        g_x, g_y = start[:, 0] - origin[rows, :1], start[:, 1] - origin[rows, 1:]
-        size = d_x * edge[:, 1] - d_y * edge[:, 0]
-        safe = np.where(np.abs(size) < 1e-12, 1.0, size)
-        along, share = (g_x * edge[:, 1] - g_y * edge[:, 0]) / safe, (g_x * d_y - g_y * d_x) / safe
-        meets = (np.abs(size) >= 1e-12) & (share >= -1e-9) & (share <= 1.0 + 1e-9) & (along >= 0.0)
-        distance[rows] = np.where(meets, along, np.inf).min(axis=1)
-    return distance
-
-
 def _smooth(values: Float[np.ndarray, " n"], spacing: float) -> Float[np.ndarray, " n"]:
     """Return the median over `_UNEVEN` metres; values that are not finite are filled from their neighbours."""
     known = np.flatnonzero(np.isfinite(values))
@@ -340,9 +323,9 @@ def _reaches(
     centre: Float[np.ndarray, "n 2"], normal: Float[np.ndarray, "n 2"], left: np.ndarray, right: np.ndarray
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return the distances across the tunnel to the left and right walls, m; `inf` where there is none."""
-    to_left, to_right = _crossings(centre, normal, left), _crossings(centre, -normal, right)
+    to_left, to_right = crossings(centre, normal, left), crossings(centre, -normal, right)
     if not np.isfinite(to_left + to_right).any():
-        swapped = np.isfinite(_crossings(centre, -normal, left) + _crossings(centre, normal, right)).any()
+        swapped = np.isfinite(crossings(centre, -normal, left) + crossings(centre, normal, right)).any()
         raise TunnelError("left and right are swapped" if swapped else "the walls are not beside the centreline")
     return to_left, to_right
 
@@ -380,12 +363,7 @@ def _check_drivable(plan: TunnelPlan) -> TunnelPlan:
             there = plan.station[near[np.argmax(apart)]]
             raise TunnelError(f"centreline comes back to itself: stations {plan.station[i]:.0f} and {there:.0f} m meet")
     for lining in plan.linings.values():
-        segments = lining.segments
-        middle, half = 0.5 * (segments[:, 2:] + segments[:, :2]), 0.5 * (segments[:, 2:] - segments[:, :2])
-        gap = np.concatenate([
-            distance_to_segment(plan.centre[i : i + _CHUNK, None], middle, half).min(axis=1)
-            for i in range(0, len(plan.centre), _CHUNK)
-        ])  # fmt: skip
+        gap = gaps_near(tree, lining.segments, ROBOT_RADIUS)
         at, least = plan.station[int(np.argmin(gap))], float(gap.min())
         if least <= 0.5 * plan.station[1]:
             raise TunnelError(f"a wall stands across the way at station {at:.1f} m")

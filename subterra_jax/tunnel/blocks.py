@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from subterra_jax.tunnel.distances import distance_to_segment
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
 # Boxes are larger than their walls by this, m, so that rounding on the device cannot move a wall out of its box.
@@ -83,18 +84,6 @@ def _recess(
     # Padding is a point on the hull's end, which is never nearer than the last lid.
     behind = distance_to_segment(vertex[:, :, None], middle[:, None], half[:, None])
     return np.hypot(half[..., 0], half[..., 1]).max(axis=1), behind.min(axis=2).max(axis=1)
-
-
-def distance_to_segment(
-    point: Float[np.ndarray, "*n 2"], middle: Float[np.ndarray, "*m 2"], half: Float[np.ndarray, "*m 2"]
-) -> Float[np.ndarray, "*nm"]:
-    """Return the distance from points to segments `middle ± half`, m; the shapes broadcast."""
-    from_x, from_y = point[..., 0] - middle[..., 0], point[..., 1] - middle[..., 1]
-    half_x, half_y = half[..., 0], half[..., 1]
-    along = (from_x * half_x + from_y * half_y) / np.maximum(half_x * half_x + half_y * half_y, 1e-12)
-    along = np.clip(along, -1.0, 1.0)
-    off_x, off_y = from_x - along * half_x, from_y - along * half_y
-    return np.sqrt(off_x * off_x + off_y * off_y)
 
 
 def thin_boxes(

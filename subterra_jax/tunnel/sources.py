@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -281,6 +281,8 @@ def resolve(
     if isinstance(tunnel, str | Path) and len(names := expand(str(tunnel))) > 1:
         tunnel = names
     if tunnel is not None and not isinstance(tunnel, TunnelPlan | str | Path):
+        if not isinstance(tunnel, Iterable):
+            raise ValueError(f"a tunnel is a name, a file, a plan, a Tunnel or a list of these, got {tunnel!r}")
         return stack([resolve(each, lining, piece, reach, spatial) for each in tunnel])
     if isinstance(tunnel, TunnelPlan):
         plan = tunnel

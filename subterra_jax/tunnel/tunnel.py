@@ -11,10 +11,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from subterra_jax.host.errors import TunnelError
 from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, pad, separation, windows
 from subterra_jax.tunnel.plan import TunnelPlan
 
 CONTACT_REACH = 0.8
+FARTHEST = 2.0**14  # m from the origin: up to there neighbouring numbers of 32 bits are less than 1 mm apart
 _CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
 
 
@@ -121,9 +123,14 @@ class Tunnel:
                 `None` is 3, and 8 with furniture, beside which a beam grazes more boxes.
 
         Raises:
-            TunnelError: The plan does not have the lining.
+            TunnelError: The plan does not have the lining, or lies so far from its origin that 32 bits blur it.
         """
         walls = plan.lining(lining or plan.default_lining)
+        if (far := float(np.abs(plan.centre).max())) > FARTHEST:
+            raise TunnelError(
+                f"tunnel {plan.name!r} reaches {far:.0f} m from the origin of its coordinates, where 32 bits blur "
+                f"millimetres: shift it to within {FARTHEST:.0f} m"
+            )
         blocks = build_blocks(plan, walls, block_length, max_segments)
         if n_candidates is None:
             n_candidates = _CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED

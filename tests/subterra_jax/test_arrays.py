@@ -1,17 +1,20 @@
 """Tunnels from arrays: their geometry is analytic, tasks run in them, and each mistake is one sentence."""
 
 import functools
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.lidar import reference
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.tunnel.arrays import ROBOT_RADIUS
+from subterra_jax.tunnel.distances import gaps_near
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
 LINE = np.column_stack([np.linspace(0.0, 120.0, 121), np.zeros(121)])
@@ -137,7 +140,9 @@ RING = 20.0 * np.column_stack([np.cos(np.linspace(0.0, 7.0, 200)), np.sin(np.lin
         (lambda: st.tunnel.from_centreline(LINE, np.full(7, 2.5)), "half_width has 7 values, the centreline 121"),
         (lambda: st.tunnel.from_centreline(LINE, 2.5, elevation=np.zeros(5)), "elevation has 5 values"),
         (lambda: st.tunnel.from_centreline(np.where(LINE == 7.0, np.nan, LINE), 2.5), r"not finite at index \[7, 0\]"),
-        (lambda: st.tunnel.from_centreline(LINE, np.nan), "half_width is not finite"),
+        (lambda: st.tunnel.from_centreline(LINE, np.nan), "half_width is not finite$"),
+        (lambda: st.tunnel.from_centreline([[0, 0], [50, 0], [50, 50]], 2.5), "at index 1, or has a corner of 90 deg"),
+        (lambda: st.Tunnel.from_plan(st.tunnel.from_centreline(LINE + 5e5, 2.5)), "reaches 500120 m from the origin"),
         (lambda: st.tunnel.from_polylines(LEFT, np.full_like(RIGHT, np.inf)), "right is not finite"),
         (lambda: st.tunnel.from_centreline([*LINE, LINE[100]], 2.5), "centreline doubles back at index 120"),
         (lambda: st.tunnel.from_centreline(np.repeat(LINE, 2, axis=0), 2.5), "repeats the vertex at index 0"),
@@ -157,6 +162,32 @@ def test_a_mistake_is_refused_in_one_sentence(make, message):
     with pytest.raises(st.TunnelError, match=message) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_the_gaps_to_walls_are_those_of_brute_force():
+    rng = np.random.default_rng(0)
+    nodes = rng.uniform(0.0, 60.0, (300, 2))
+    start = rng.uniform(0.0, 60.0, (40, 2))
+    segments = np.hstack([start, start + rng.normal(0.0, 1.0, (40, 2)) * rng.uniform(0.01, 30.0, (40, 1))])
+    gap = gaps_near(KDTree(nodes), segments, 1.4)
+    exact = reference.clearance(segments, nodes)
+    near = exact <= 1.4
+    assert 20 < near.sum() < 280
+    np.testing.assert_allclose(gap[near], exact[near], atol=1e-9)
+    assert (gap[~near] > 1.4).all()
+
+
+def test_a_tunnel_of_20_km_is_checked_in_a_moment():
+    """Every node against every wall takes minutes."""
+    x = np.arange(-10_000.0, 10_001.0)
+    began = time.process_time()
+    plan = st.tunnel.from_centreline(np.column_stack([x, 20.0 * np.sin(x / 300.0)]), 2.5)
+    assert time.process_time() - began < 20.0
+    assert plan.length == pytest.approx(20_022.0, abs=1.0)
+    pinched = np.where(x == 9000.0, 0.41, 2.5)
+    with pytest.raises(st.TunnelError, match="narrower than the robot: at station"):
+        st.tunnel.from_polylines(*(np.column_stack([x, side * pinched - 0.02]) for side in (1.0, -1.0)),
+                                 centreline=np.column_stack([x, np.zeros_like(x)]))  # fmt: skip
 
 
 @pytest.mark.door
@@ -181,8 +212,8 @@ def test_an_unknown_tunnel_is_told_those_there_are():
     ],
 )
 def test_a_file_written_by_hand_is_checked_like_arrays(plan_of, spoil, message):
-    arrays = tunnel_arrays(straight(40.0))
-    plan_of(arrays)
+    whole = tunnel_arrays(straight(40.0))
+    plan_of(whole)
     with pytest.raises(st.TunnelError, match=message) as caught:
-        plan_of({**arrays, **spoil(arrays)})
+        plan_of({**whole, **spoil(whole)})
     assert "\n" not in str(caught.value)

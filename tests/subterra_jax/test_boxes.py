@@ -7,6 +7,7 @@ from subterra_jax import procedural
 from subterra_jax.lidar import reference
 from subterra_jax.tunnel import Tunnel, blocks
 from subterra_jax.tunnel.blocks import separation, windows
+from subterra_jax.tunnel.distances import distance_to_segment
 
 
 def test_the_box_of_a_turned_rectangle_is_that_rectangle():
@@ -57,7 +58,7 @@ def test_a_pocket_gets_a_lid_and_a_deep_wide_niche_does_not():
 
 def test_the_distance_to_a_segment_is_that_to_its_line_or_its_nearer_end():
     point = np.array([[0.0, 2.0], [5.0, 4.0], [-4.0, 0.0]])
-    np.testing.assert_allclose(blocks.distance_to_segment(point, np.zeros(2), np.array([2.0, 0.0])), [2.0, 5.0, 2.0])
+    np.testing.assert_allclose(distance_to_segment(point, np.zeros(2), np.array([2.0, 0.0])), [2.0, 5.0, 2.0])
 
 
 def test_windows_hold_every_block_within_reach_found_one_by_one():
