@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.compiled import compiled, run_compiled
@@ -44,7 +45,12 @@ class AutoReset:
 
         Returns:
             Observations `(n_envs, n_obs)` and the batched state.
+
+        Raises:
+            ValueError: `n_envs` is no whole number, or less than 1.
         """
+        if not isinstance(n_envs, int | np.integer) or n_envs < 1:
+            raise ValueError(f"n_envs must be a whole number, at least 1, got {n_envs!r}")
         start_key, scan_key = jax.random.split(key)
         state = self._vmap(self.env.begin, 1)(self.env.draw_reset(start_key, (n_envs,), params), params)
         noise = self.env.draw_step(scan_key, (n_envs,), params)
@@ -187,7 +193,12 @@ def rollout(
         Last observations, last state, and every step's `obs` (before the step), `action`, `reward`, `terminated`,
         `truncated` and `info`, each with the steps as first axis. Of a policy with memory also `memory`, the one after
         the last step.
+
+    Raises:
+        ValueError: `n_steps` is no whole number, or less than 0.
     """
+    if not isinstance(n_steps, int | np.integer) or n_steps < 0:
+        raise ValueError(f"n_steps must be a whole number, at least 0, got {n_steps!r}")
     return run_compiled(partial(_roll, env, policy, n_steps), key, obs, state, params, memory)
 
 

@@ -182,6 +182,8 @@ def find(id: str, short: bool = False) -> str:
         TaskError: There is no such task.
         UserCodeError: The module cannot be run.
     """
+    if not isinstance(id, str):
+        raise TaskError(f"a task is named by its id, as Subterra/StopAt-v0, got {id!r}")
     source, _, name = id.rpartition(":")
     if source:
         load_module(source)
@@ -246,10 +248,12 @@ def make(
     else:
         _require_planar(id, sensor, sweep)
     own = [SpatialLidar() if spatial and isinstance(part, PlanarLidar) else part for part in task.parts]
+    if wrong := [part for part in parts if not isinstance(part, Part)]:
+        raise ValueError(f"parts must hold subterra_jax.parts.Part alone, got {wrong[0]!r}")
     named = {part.name for part in (*own, *parts)}
     brought = (part for part in OPTIONAL if part.name in overrides and part.name not in named)
     env = TunnelEnv(id=id, rule=task.rule, parts=(*own, *brought, *parts), estimates=estimates)
-    horizon = overrides.pop("horizon", task.horizon)
+    horizon = _checked_horizon(overrides.pop("horizon", task.horizon))
     entries = collect_entries(env, {**task.params, **overrides})
     check_robot(entries)
     reach = c.RANGE_MAX if spatial else float(np.max(entries["lidar"].range_max))
@@ -257,6 +261,16 @@ def make(
     check_together(env, params)
     check_length(env, params)
     return env, params
+
+
+def _checked_horizon(horizon: Any) -> Any:
+    """Refuse a horizon that is no whole number of steps; what is traced has no value yet and is taken."""
+    if isinstance(horizon, jax.core.Tracer):
+        return horizon
+    steps = np.asarray(horizon)
+    if not np.issubdtype(steps.dtype, np.number) or not np.all((steps >= 1) & (steps == np.round(steps))):
+        raise ValueError(f"horizon must be a whole number of steps, at least 1, got {horizon!r}")
+    return horizon
 
 
 def _require_planar(id: str, sensor: Any, sweep: bool) -> None:

@@ -37,8 +37,10 @@ def no_task(task: str, known: Iterable[str]) -> str:
     """
     known = tuple(known)
     name, _, number = task.removeprefix("Subterra/").partition("-v")
-    for candidate in known:
-        if candidate.removeprefix("Subterra/").partition("-v")[0] == name:
-            of_another = f"Subterra {VERSION} has {candidate}; results of two versions do not compare"
-            return f"no task {task!r}: {of_another if number else f'its id is {candidate}'}"
+    alike = [candidate for candidate in known if candidate.removeprefix("Subterra/").partition("-v")[0] == name]
+    if alike and (not number or f"Subterra/{task}" in alike):
+        return f"no task {task!r}: its id is {f'Subterra/{task}' if number else alike[0]}"
+    if alike:
+        there_is = " and ".join(alike)
+        return f"no task {task!r}: Subterra {VERSION} has {there_is}; results of two versions do not compare"
     return f"no task {task!r}; there are {', '.join(known)}"

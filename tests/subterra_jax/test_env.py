@@ -233,9 +233,17 @@ def test_actions_that_are_not_numbers_leave_everything_finite(task, bad):
         ({"vehicle": VehicleParams(radius=1.5)}, "radius must be in"),
         ({"vehicle": VehicleParams(speed_max=5.0)}, "must leave 0.2 m"),
         ({"lining": "velvet"}, "no lining 'velvet'"),
+        ({"id": 5}, "a task is named by its id, as Subterra/StopAt-v0, got 5"),
+        ({"tunnel": 5}, "a tunnel is a name, a file, a plan, a Tunnel or a list of these, got 5"),
+        ({"parts": [LidarParams()]}, "parts must hold subterra_jax.parts.Part alone, got LidarParams"),
+        ({"horizon": 0}, "horizon must be a whole number of steps, at least 1, got 0"),
+        ({"horizon": 2.5}, "horizon must be .*, got 2.5"),
+        ({"horizon": np.nan}, "horizon must be .*, got nan"),
+        ({"horizon": "long"}, "horizon must be .*, got 'long'"),
     ],
 )
-def test_a_mistake_is_refused_with_its_value(arguments, message):
+def test_a_mistake_is_refused_with_its_value(arguments, message, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checker would come first
     with pytest.raises((ValueError, st.TunnelError), match=message):
         st.make(**{"id": "Subterra/TraverseShort-v0", **arguments})
 
@@ -270,3 +278,18 @@ def test_an_action_of_another_shape_is_refused_in_one_sentence(estimates, size, 
                 jax.eval_shape(step, jax.random.key(0), state, jax.ShapeDtypeStruct(shape, jnp.float32), params)
             assert "\n" not in str(caught.value)
     jax.eval_shape(env.step, jax.random.key(0), one, [0.0] * size, params)  # a list will do
+
+
+@pytest.mark.door
+@pytest.mark.parametrize("count", [0, -1, 2.5, "4", None])
+def test_a_batch_of_no_size_and_a_rollout_of_no_length_are_refused(count, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    env, params = st.make("Subterra/TraverseShort-v0")
+    batch, key = st.AutoReset(env), jax.random.key(0)
+    with pytest.raises(ValueError, match=f"n_envs must be a whole number, at least 1, got {count!r}"):
+        batch.reset(key, params, count)
+    if count == 0:
+        return  # no step at all is a rollout
+    obs, state = jax.eval_shape(lambda: batch.reset(key, params, 4))
+    with pytest.raises(ValueError, match=f"n_steps must be a whole number, at least 0, got {count!r}"):
+        st.rollout(batch, lambda key, obs: jnp.zeros((4, 2)), key, obs, state, params, count)

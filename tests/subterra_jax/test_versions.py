@@ -128,6 +128,10 @@ def test_an_episode_of_another_version_says_what_to_do(tmp_path):
 
 def test_an_id_of_another_version_names_the_one_there_is():
     known = ("Subterra/StopAt-v0", "Subterra/Return-v0")
+    both = (*known, "Subterra/StopAt-v1")
+    assert "has Subterra/StopAt-v0 and Subterra/StopAt-v1; results" in no_task("Subterra/StopAt-v7", both)
+    assert no_task("StopAt-v1", both) == "no task 'StopAt-v1': its id is Subterra/StopAt-v1"
+    assert no_task("StopAt", both) == "no task 'StopAt': its id is Subterra/StopAt-v0"
     assert no_task("Subterra/StopAt-v1", known).endswith(
         "has Subterra/StopAt-v0; results of two versions do not compare"
     )
