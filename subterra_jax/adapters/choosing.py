@@ -93,7 +93,8 @@ def check_clear(clear: Any, choice: Choice) -> None:
         index = int(np.argmin(np.atleast_1d(clear)))
         station, lateral = (np.atleast_1d(values)[index] for values in (choice.station, choice.lateral))
         side = "" if np.isnan(lateral) else f", {lateral:g} m to the left of the centreline"
-        raise OptionError(f"options['start']: at {station:g} m{side} the robot would touch a wall or an obstacle")
+        place = "the drawn station" if np.isnan(station) else f"{station:g} m"
+        raise OptionError(f"options['start']: at {place}{side} the robot would touch a wall or an obstacle")
 
 
 def _numbers(name: str, wish: Any, n_envs: int | None) -> np.ndarray:

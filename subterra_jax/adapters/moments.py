@@ -31,16 +31,19 @@ class Moment(NamedTuple):
     obs: np.ndarray
     pending: np.ndarray | None = None
 
-    def check(self, task: str, words: tuple[int, ...], obs: tuple[int, ...]) -> None:
-        """Refuse a moment of another task or of another number of environments.
 
-        Raises:
-            MomentError: Naming both.
-        """
-        if self.task != task:
-            raise MomentError(f"a moment of {self.task} cannot be set in {task}")
-        if (self.words.shape, self.obs.shape) != (words, obs):
-            raise MomentError(f"a moment of shape {self.words.shape} cannot be set in an environment of {words}")
+def check_moment(moment: Moment, task: str, words: tuple[int, ...], obs: tuple[int, ...]) -> None:
+    """Refuse what is no moment, a moment of another task, and one of another number of environments.
+
+    Raises:
+        MomentError: Naming what was given and what is wanted.
+    """
+    if not isinstance(moment, Moment):
+        raise MomentError(f"set_state takes what get_state returned, got {type(moment).__name__}")
+    if moment.task != task:
+        raise MomentError(f"a moment of {moment.task} cannot be set in {task}")
+    if (moment.words.shape, moment.obs.shape) != (words, obs):
+        raise MomentError(f"a moment of shape {moment.words.shape} cannot be set in an environment of {words}")
 
 
 _first_process: int | None = None

@@ -19,7 +19,7 @@ from gymnasium.core import Env
 
 from subterra_jax.adapters import packing
 from subterra_jax.adapters.choosing import check_clear, read_choice, reset_chosen
-from subterra_jax.adapters.moments import Moment, refuse_fork
+from subterra_jax.adapters.moments import Moment, check_moment, refuse_fork
 from subterra_jax.adapters.packing import Observation, as_observation, pack, start_streams, take_key, unpacker
 from subterra_jax.adapters.views import view_for
 from subterra_jax.compiled import hashable
@@ -263,7 +263,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         Raises:
             MomentError: It belongs to another task.
         """
-        moment.check(self._env.id, self._n_words, self._obs.shape)
+        check_moment(moment, self._env.id, self._n_words, self._obs.shape)
         self._packed, self._obs = moment.words.copy(), moment.obs.copy()
         return as_observation(self._obs, self._fields)
 

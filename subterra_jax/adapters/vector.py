@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 from subterra_jax.adapters import packing
 from subterra_jax.adapters.batch import Batch
 from subterra_jax.adapters.choosing import read_choice
-from subterra_jax.adapters.moments import Moment, refuse_fork
+from subterra_jax.adapters.moments import Moment, check_moment, refuse_fork
 from subterra_jax.adapters.packing import Fields, Observation, Report, as_observation, start_streams
 from subterra_jax.adapters.views import view_for
 from subterra_jax.tasks import make
@@ -182,7 +182,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             MomentError: It belongs to another task, or to another number of environments.
         """
         n_obs = self.batch.env.observation_size(self.batch.params)
-        moment.check(self.batch.env.id, (self.num_envs, self.batch.n_words), (self.num_envs, n_obs))
+        check_moment(moment, self.batch.env.id, (self.num_envs, self.batch.n_words), (self.num_envs, n_obs))
         self.batch.set_words(moment.words, moment.obs)
         self._obs = moment.obs.copy()
         self._pending = np.zeros(self.num_envs, bool) if moment.pending is None else moment.pending.copy()

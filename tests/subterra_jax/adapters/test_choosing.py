@@ -124,6 +124,7 @@ def test_sb3_passes_the_options_of_each_environment_once():
         ({"goal": [3.0, 4.0]}, "must be one number, got"),
         ({"start": {"station": 20.0, "lateral": 2.5}}, "at 20 m, 2.5 m to the left .* would touch a wall"),
         ({"start": {"station": 20.0, "lateral": -9.0}}, "would touch a wall"),
+        ({"start": {"lateral": 9.0}}, "at the drawn station, 9 m to the left .* would touch a wall"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence_and_nothing_changes(env, options, message):

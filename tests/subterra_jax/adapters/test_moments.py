@@ -92,6 +92,9 @@ def test_a_moment_of_another_environment_is_refused(env, envs):
         env.set_state(envs.get_state())
     with pytest.raises(MomentError, match="shape"):
         envs.set_state(env.get_state())
+    for one in (env, envs):
+        with pytest.raises(MomentError, match="set_state takes what get_state returned, got NoneType"):
+            one.set_state(None)
 
 
 @WAYS

@@ -70,6 +70,14 @@ def test_registering_again_changes_nothing():
     assert set(st.TASKS) <= set(gymnasium.registry)
 
 
+@pytest.mark.parametrize(("id", "newer"), [("StopAtShort-v0", True), ("TraverseShort-v0", False), ("StopAt-v1", False)])
+def test_gymnasium_names_the_newer_version_of_a_task_that_has_one(id, newer):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        gymnasium.make(f"subterra_jax:Subterra/{id}")
+    assert any("upgrading to version `v1`" in str(w.message) for w in caught) == newer
+
+
 def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(env):
     def episodes(seed):
         first, _ = env.reset(seed=seed)
