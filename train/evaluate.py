@@ -14,7 +14,7 @@ from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation.episodes import N_LISTED, SHA256
 from subterra_jax.evaluation.records import summarise
 from subterra_jax.host.command import parse, run_command
-from subterra_jax.policies.loading import Agent
+from subterra_jax.policies.trained import Trained
 from train.config import ConfigError
 from train.log import print_table
 from train.policies import open_agent
@@ -31,7 +31,7 @@ def check_episodes(n: int, name: str = "episodes") -> None:
         raise ConfigError(f"{name} must be at most {N_LISTED}, which is what the list has, got {n}")
 
 
-def evaluate(world: World, agent: Agent, n_episodes: int) -> dict[str, Any]:
+def evaluate(world: World, agent: Trained, n_episodes: int) -> dict[str, Any]:
     """Evaluates an agent on the first listed episodes.
 
     Args:

@@ -16,7 +16,7 @@ from subterra_jax.host.files import replace_file
 from subterra_jax.policies import Conditions
 from subterra_jax.policies.files import CHECKPOINT_POLICY, GAIT, SCHEMA, TENSORS
 from subterra_jax.policies.files import FACTS as POLICY_FACTS
-from subterra_jax.policies.loading import Agent
+from subterra_jax.policies.trained import Trained
 from train.belief.learner import BeliefLayout, BeliefNetworks
 from train.checkpoint import FACTS, CheckpointError, load_checkpoint
 from train.config import ConfigError
@@ -51,7 +51,7 @@ def load_policy(folder: Path) -> tuple[AnyNetworks, Any, dict[str, Any]]:
     return networks, stored.restore("policy", networks.policy_shapes()), stored.facts
 
 
-def open_agent(policy: Path | None, task: str | None) -> tuple[Agent, dict[str, Any]]:
+def open_agent(policy: Path | None, task: str | None) -> tuple[Trained, dict[str, Any]]:
     """Opens a policy by its file, folder or name, or the one released for a task.
 
     Returns:
@@ -75,7 +75,7 @@ def open_agent(policy: Path | None, task: str | None) -> tuple[Agent, dict[str, 
 
 def make_agent(
     networks: AnyNetworks, policy: Any, name: str | None = None, conditions: Conditions | None = None
-) -> Agent:
+) -> Trained:
     """Makes an agent that drives without exploration noise.
 
     Args:

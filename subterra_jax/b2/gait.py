@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read
-from subterra_jax.policies.networks import Tensors, perceptron
+from subterra_jax.policies.networks import perceptron
+from subterra_jax.policies.trained import Tensors
 
 _OFFSET = np.array([0.0, 0.5, 0.5, 0.0], np.float32)  # of each leg's clock: diagonal legs together
 _WEIGHT = b2.TOTAL_MASS * b2.GRAVITY

@@ -51,12 +51,12 @@ class Agent(Protocol):
     inputs that it declares: without `uses_lidar` the ranges are NaN, without `uses_map` everything in `params.tunnel`
     but its length and ring pitch is NaN, and only with `privileged` is `known` not None. A class that inherits declares
     by a line in its body, `uses_lidar = True`; any other class may be an agent if it has these four and both methods.
+
+    Attributes:
+        name: Name on the leaderboard.
     """
 
-    @property
-    def name(self) -> str:
-        """Name on the leaderboard; that of the class if it says none."""
-        return type(self).__name__
+    name: str
 
     @property
     def uses_lidar(self) -> bool:

@@ -13,7 +13,7 @@ from subterra_jax.evaluation.episodes import Episodes, EvaluationError
 from subterra_jax.evaluation.records import Records, make_records
 from subterra_jax.evaluation.tally import Tally, add_step, start_tally
 from subterra_jax.policies import DrivingPolicy, check_task
-from subterra_jax.policies.loading import Agent as Trained
+from subterra_jax.policies.trained import Trained
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
 

@@ -7,6 +7,9 @@ Learnt is how well a scan fits a place (`belief_scan`). The steering is the cent
 """
 
 import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +17,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Agent, Known, Observed
+from subterra_jax.baselines.agent import Action, Known, Observed
 from subterra_jax.baselines.navigator import TURN_SPEED
 from subterra_jax.baselines.rings import loop as rings
 from subterra_jax.baselines.steering import CentreLine, Corridor
@@ -22,8 +25,9 @@ from subterra_jax.baselines.wallmap import WallMap, wall_map
 from subterra_jax.parts.unicycle import wrap
 from subterra_jax.policies import belief_grid, belief_scan
 from subterra_jax.policies.files import Conditions, PolicyError
-from subterra_jax.policies.networks import Tensors
+from subterra_jax.policies.trained import Tensors, Trained
 from subterra_jax.state import EnvParams
+from subterra_jax.tunnel_env import TunnelEnv
 
 KIND = "belief"
 _MOUTH_BEAMS = (1, -1)  # the slanting beams ahead: without an echo on either side a mouth is some metres away
@@ -118,7 +122,7 @@ class BeliefMemory:
 
 
 @struct.dataclass
-class Belief(Agent):
+class Belief(Trained):
     """Drives along the axis until it is sure of one place, or may go no further.
 
     Attributes:
@@ -132,6 +136,7 @@ class Belief(Agent):
         conditions: Conditions of its training; None: any.
     """
 
+    kind: ClassVar[str] = KIND
     uses_lidar = uses_map = True
     tensors: Tensors
     low: Float[Array, "2"]
@@ -141,6 +146,22 @@ class Belief(Agent):
     habits: Habits = struct.field(pytree_node=False, default=Habits())
     name: str = struct.field(pytree_node=False, default="belief")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
+
+    @classmethod
+    def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Belief":
+        """Makes the agent of a layout with `habits`."""
+        return cls(**common, habits=Habits(**layout["habits"]))
+
+    def try_out(self) -> None:
+        """Scores two beams, by shapes alone."""
+        no_beams = jnp.zeros((2, belief_scan.N_FEATURES)), jnp.zeros(2)
+        jax.eval_shape(belief_scan.beam_scores, self.tensors, *no_beams)
+
+    def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+        """Refuses a task that asks for no report."""
+        del params
+        if env.rule.errand != "report":
+            raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
 
     def with_map(self, params: EnvParams) -> "Belief":
         """Returns the agent with the map of a task, whose tunnel may be a stack; runs on the host."""
@@ -242,8 +263,3 @@ class Belief(Agent):
         spent = now.travelled + now.track.station >= allowed
         stopped = now.stopped | (sure_for >= habits.sure_for) | spent
         return dataclasses.replace(now, sure=sure_for, stopped=stopped, turn=now.turn.start(mouth & ~stopped))
-
-
-def try_scan(tensors: Tensors) -> Float[Array, "2"]:
-    """Scores two beams, so that missing tensors or wrong shapes raise."""
-    return belief_scan.beam_scores(tensors, jnp.zeros((2, belief_scan.N_FEATURES)), jnp.zeros(2))

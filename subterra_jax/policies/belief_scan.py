@@ -13,7 +13,8 @@ from subterra_jax.baselines.scanmodel import Endpoints, ScanModel, TunnelPose, e
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.lidar import bearings
-from subterra_jax.policies.networks import Tensors, perceptron
+from subterra_jax.policies.networks import perceptron
+from subterra_jax.policies.trained import Tensors
 
 N_FEATURES = 11
 MOST = 3.0  # largest learnt log likelihood of one beam, either way

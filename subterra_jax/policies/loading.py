@@ -5,31 +5,27 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from subterra_jax.baselines import registry
-from subterra_jax.baselines.agent import Observed, n_ranges
 from subterra_jax.compiled import in_32_bits
-from subterra_jax.policies import belief, senses
-from subterra_jax.policies.belief import Belief, Habits
+from subterra_jax.policies.belief import Belief
 from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
-from subterra_jax.policies.locate import agent as locate
 from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.networks import FeedForward, Recurrent
+from subterra_jax.policies.trained import Trained
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, constants_digest
 from subterra_jax.tunnel_env import TunnelEnv
 
-Agent = FeedForward | Recurrent | Belief | Locating
-KINDS = ("mlp", "gru", belief.KIND, locate.KIND)
+KINDS: dict[str, type[Trained]] = {one.kind: one for one in (FeedForward, Recurrent, Belief, Locating)}
 PREFIX = "policy:"  # of the names of released policies among the agents
 
 
 @in_32_bits()
 def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
-    """A policy and its facts: an `Agent`, or of a gait the `WalkPolicy` of `subterra_jax.b2.gait`.
+    """A policy and its facts: a `Trained`, or of a gait the `WalkPolicy` of `subterra_jax.b2.gait`.
 
     Args:
         source: A `.safetensors` file, a run folder of `train`, or the name of a released policy.
@@ -47,7 +43,7 @@ def load(source: str | Path) -> tuple[Any, dict[str, Any]]:
 
 def from_tensors(
     kind: str, layout: dict[str, Any], tensors: Mapping[str, Any], name: str, conditions: Conditions | None = None
-) -> Agent:
+) -> Trained:
     """An agent of tensors in memory.
 
     Args:
@@ -61,30 +57,19 @@ def from_tensors(
         KeyError: Something is missing in the layout.
         ValueError: There is no such kind.
     """
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
     low, high = (jnp.asarray(layout[key], jnp.float32) for key in ("action_low", "action_high"))
     arrays = {key: jnp.asarray(value) for key, value in tensors.items()}
-    if kind == "mlp":
-        return FeedForward(arrays, low, high, frames=int(layout["frames"]), name=name, conditions=conditions)
-    if kind == "gru":
-        if (version := int(layout.get("senses", 1))) != senses.VERSION:
-            raise ValueError(f"made for senses of version {version}, this release has {senses.VERSION}; train it anew")
-        shown = senses.Senses(str(layout.get("tracker", "loop")), bool(layout.get("boxes", False)))
-        width = float(layout["bin_width"])
-        image = tuple(layout["image"]) if layout.get("image") else None
-        return Recurrent(arrays, low, high, bin_width=width, shown=shown, image=image, name=name, conditions=conditions)
-    if kind == belief.KIND:
-        return Belief(arrays, low, high, habits=Habits(**layout["habits"]), name=name, conditions=conditions)
-    if kind == locate.KIND:
-        return Locating(arrays, low, high, network=str(layout["network"]), name=name, conditions=conditions)
-    raise ValueError(f"kind must be one of {', '.join(KINDS)}, got {kind!r}")
+    return KINDS[kind].of_layout(layout, tensors=arrays, low=low, high=high, name=name, conditions=conditions)
 
 
 def with_map(agent: Any, params: EnvParams) -> Any:
     """Returns the agent with the map of a task if it uses one, any other unchanged."""
-    return agent.with_map(params) if isinstance(agent, Belief) else agent
+    return agent.with_map(params) if isinstance(agent, Trained) else agent
 
 
-def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+def check_fits(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
     """Refuses a policy that cannot drive here, or was trained under other conditions.
 
     Raises:
@@ -95,36 +80,19 @@ def check_fits(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Pa
         _check_conditions(agent.conditions, training_conditions(env, params), source)
 
 
-def check_task(agent: Agent, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+def check_task(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
     """Refuses a policy of another task: one that cannot read the observation, or has learnt something else.
 
     Raises:
         PolicyError: Observations, errand, actions or control period are others than those it was trained with.
     """
-    size, bounds, errand = env.observation_size(params), env.action_space(params), env.rule.errand
-    if isinstance(agent, Recurrent):
-        if errand not in ("stop", "return"):
-            raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
-        wanted, made_for = n_ranges(params), agent.n_beams
-        if wanted != made_for:
-            raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
-        if (image := env.images(params).get("scan")) != agent.image:
-            raise PolicyError(f"{source}: made for images of shape {agent.image}, {env.id} has {image}")
-    elif isinstance(agent, Belief):
-        if errand != "report":
-            raise PolicyError(f"{source}: a policy that finds out where it is, which {env.id} does not ask for")
-    elif isinstance(agent, Locating):
-        if errand not in locate.ERRANDS:
-            raise PolicyError(f"{source}: a localiser on its way to a goal, without a map; {env.id} asks to {errand}")
-        if (n := n_ranges(params)) % 16:
-            raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
-    elif agent.n_observation != size:
-        raise PolicyError(f"{source}: made for observations of {agent.n_observation} numbers, {env.id} has {size}")
+    agent.check_task(env, params, source)
+    bounds, errand = env.action_space(params), env.rule.errand
     conditions = agent.conditions
     if conditions is not None:
         _check_period(conditions.period, _period(params), source, env.id)
         learnt = TASKS[conditions.task].rule.errand if conditions.task in TASKS else errand
-        if learnt != errand and not isinstance(agent, Locating):  # what a localiser has learnt is not the errand
+        if agent.learns_errand and learnt != errand:
             raise PolicyError(f"{source}: has learnt {conditions.task} (to {learnt}); {env.id} asks to {errand}")
     high = np.asarray(agent.high)
     if not np.allclose(high, bounds.high[: len(high)]):
@@ -174,7 +142,7 @@ def register_released() -> tuple[str, ...]:
     return names
 
 
-def _make_released(name: str, params: EnvParams) -> Agent:
+def _make_released(name: str, params: EnvParams) -> Trained:
     """Makes the agent of a released policy for a task.
 
     Raises:
@@ -185,29 +153,12 @@ def _make_released(name: str, params: EnvParams) -> Agent:
     return with_map(agent, params)
 
 
-def _checked(file: PolicyFile) -> Agent:
+def _checked(file: PolicyFile) -> Trained:
     """The agent of a file, driven once on paper so that a missing or misshapen tensor is found here."""
     facts = file.facts
     try:
         agent = from_tensors(facts["kind"], facts["layout"], file.tensors, facts["name"], Conditions.from_facts(facts))
-        _try(agent)
+        agent.try_out()
     except (KeyError, TypeError, ValueError) as error:
         raise PolicyError(f"{file.path}: tensors and layout do not belong together ({error})") from error
     return agent
-
-
-def _try(agent: Agent) -> None:
-    """Lets it act on shapes alone."""
-    if isinstance(agent, FeedForward):
-        jax.eval_shape(agent.answer, jax.ShapeDtypeStruct((agent.frames, agent.n_observation), jnp.float32))
-        return
-    if isinstance(agent, Belief):
-        jax.eval_shape(belief.try_scan, agent.tensors)
-        return
-    if isinstance(agent, Locating):
-        locate.check_tensors(agent)
-        return
-    zero, ranges = jnp.zeros(()), jnp.zeros(agent.n_beams)
-    entries = {} if agent.image is None else {"scan": jnp.zeros(agent.image[0] * agent.image[1])}
-    seen = Observed(ranges, ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero, entries=entries)
-    jax.eval_shape(agent.answer, agent.blank(), seen, zero)

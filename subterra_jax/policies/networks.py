@@ -3,20 +3,23 @@
 Both act by the mean of their distribution. Their weights are tensors by name, as a policy's file holds them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Agent, Known, Observed
+from subterra_jax.baselines.agent import Action, Known, Observed, n_ranges
 from subterra_jax.baselines.stations import told_start
 from subterra_jax.policies import senses
-from subterra_jax.policies.files import Conditions
+from subterra_jax.policies.files import Conditions, PolicyError
+from subterra_jax.policies.trained import Tensors, Trained
 from subterra_jax.state import EnvParams
+from subterra_jax.tunnel_env import TunnelEnv
 
-Tensors = dict[str, Float[Array, "..."]]
 _CLIP = 10.0  # standard deviations
 
 
@@ -44,7 +47,7 @@ def squash(mean: Float[Array, "*batch n"], low: Float[Array, "n"], high: Float[A
 
 
 @struct.dataclass
-class FeedForward(Agent):
+class FeedForward(Trained):
     """A multilayer perceptron. It estimates its station only where the task asks for a report.
 
     Attributes:
@@ -56,6 +59,7 @@ class FeedForward(Agent):
         conditions: Conditions of its training; None: any.
     """
 
+    kind: ClassVar[str] = "mlp"
     uses_lidar = True
     tensors: Tensors
     low: Float[Array, "n_action"]
@@ -63,6 +67,20 @@ class FeedForward(Agent):
     frames: int = struct.field(pytree_node=False)
     name: str = struct.field(pytree_node=False, default="ppo-mlp")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
+
+    @classmethod
+    def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "FeedForward":
+        """Makes the agent of a layout with `frames`."""
+        return cls(**common, frames=int(layout["frames"]))
+
+    def try_out(self) -> None:
+        """Answers a stack of observations, by shapes alone."""
+        jax.eval_shape(self.answer, jax.ShapeDtypeStruct((self.frames, self.n_observation), jnp.float32))
+
+    def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+        """Refuses observations of another length."""
+        if self.n_observation != (size := env.observation_size(params)):
+            raise PolicyError(f"{source}: made for observations of {self.n_observation} numbers, {env.id} has {size}")
 
     @property
     def n_observation(self) -> int:
@@ -105,7 +123,7 @@ class RecurrentMemory:
 
 
 @struct.dataclass
-class Recurrent(Agent):
+class Recurrent(Trained):
     """A GRU with an estimation head, which drives towards a goal and says where it is.
 
     Attributes:
@@ -120,6 +138,7 @@ class Recurrent(Agent):
         conditions: Conditions of its training; None: any.
     """
 
+    kind: ClassVar[str] = "gru"
     uses_lidar = True
     tensors: Tensors
     low: Float[Array, "2"]
@@ -129,6 +148,32 @@ class Recurrent(Agent):
     image: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
     name: str = struct.field(pytree_node=False, default="ppo-gru")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
+
+    @classmethod
+    def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Recurrent":
+        """Makes the agent of a layout with `bin_width`, and `senses`, `tracker`, `boxes` and `image` if need be."""
+        if (version := int(layout.get("senses", 1))) != senses.VERSION:
+            raise ValueError(f"made for senses of version {version}, this release has {senses.VERSION}; train it anew")
+        shown = senses.Senses(str(layout.get("tracker", "loop")), bool(layout.get("boxes", False)))
+        image = tuple(layout["image"]) if layout.get("image") else None
+        return cls(**common, bin_width=float(layout["bin_width"]), shown=shown, image=image)
+
+    def try_out(self) -> None:
+        """Answers one observation, by shapes alone."""
+        zero, ranges = jnp.zeros(()), jnp.zeros(self.n_beams)
+        entries = {} if self.image is None else {"scan": jnp.zeros(self.image[0] * self.image[1])}
+        seen = Observed(ranges, ranges, distance=zero, heading=zero, goal=zero, ring_pitch=zero, entries=entries)
+        jax.eval_shape(self.answer, self.blank(), seen, zero)
+
+    def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+        """Refuses a task without a goal to stop at, and other beams or images."""
+        if env.rule.errand not in ("stop", "return"):
+            raise PolicyError(f"{source}: a policy that drives to a goal and stops, which {env.id} does not ask for")
+        wanted, made_for = n_ranges(params), self.n_beams
+        if wanted != made_for:
+            raise PolicyError(f"{source}: made for {made_for} beams, {env.id} has {wanted}")
+        if (image := env.images(params).get("scan")) != self.image:
+            raise PolicyError(f"{source}: made for images of shape {self.image}, {env.id} has {image}")
 
     @property
     def n_features(self) -> int:

@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from subterra_jax.baselines import registry
-from subterra_jax.baselines.agent import Agent as AnyAgent
+from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import AgentError
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.loading import load_object
 from subterra_jax.policies.files import PolicyError, is_policy
-from subterra_jax.policies.loading import PREFIX, Agent, check_fits, load, with_map
+from subterra_jax.policies.loading import PREFIX, check_fits, load, with_map
+from subterra_jax.policies.trained import Trained
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -35,7 +36,7 @@ def names_code(name: str) -> bool:
 
 
 @in_32_bits()
-def open_agent(source: Any, env: TunnelEnv, params: EnvParams) -> AnyAgent:
+def open_agent(source: Any, env: TunnelEnv, params: EnvParams) -> Agent:
     """Makes the agent that drives a task.
 
     Args:
@@ -51,10 +52,10 @@ def open_agent(source: Any, env: TunnelEnv, params: EnvParams) -> AnyAgent:
         UserCodeError: The class cannot be loaded.
     """
     agent = _make(source, params)
-    if isinstance(agent, Agent):
+    if isinstance(agent, Trained):
         check_fits(agent, env, params, str(source) if isinstance(source, (str, Path)) else agent.name)
         return with_map(agent, params)
-    if missing := [one for one in (*TRAITS, "begin", "act") if not hasattr(agent, one)]:
+    if missing := [one for one in (*TRAITS, "name", "begin", "act") if not hasattr(agent, one)]:
         raise AgentError(f"agent {str(source)!r} has no {', '.join(missing)}")
     return agent
 
@@ -68,7 +69,7 @@ def _make(source: Any, params: EnvParams) -> Any:
         return registry.make_agent(name, params)
     if (policy := policy_source(name)) is not None:
         agent, facts = load(policy)
-        if not isinstance(agent, Agent):
+        if not isinstance(agent, Trained):
             raise PolicyError(f"{name}: a policy of kind {facts['kind']!r}, which moves legs and drives no task")
         return agent
     if names_code(name):

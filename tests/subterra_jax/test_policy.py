@@ -17,7 +17,8 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import AgentError
 from subterra_jax.episode import Driver
 from subterra_jax.evaluation import Episodes, evaluate
-from subterra_jax.policies import PolicyError, load_policy
+from subterra_jax.policies import PolicyError, load_policy, loading
+from subterra_jax.policies.trained import Trained
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.viewer import library
 from subterra_jax.viewer.config import ViewerConfig
@@ -293,3 +294,48 @@ def test_an_evaluation_takes_a_policy_as_it_takes_its_agent():
     by_function, by_agent = (evaluate(env, params, one, episodes) for one in (policy, policy.agent))
     assert by_function.travelled.min() > 0.0
     np.testing.assert_array_equal(by_function.travelled, by_agent.travelled)
+
+
+@struct.dataclass
+class Constant(Trained):
+    """A kind of network of one tensor, its command."""
+
+    kind = "constant"
+    tensors: dict
+    low: jnp.ndarray
+    high: jnp.ndarray
+    name: str = struct.field(pytree_node=False)
+    conditions: policies.Conditions | None = struct.field(pytree_node=False)
+
+    @classmethod
+    def of_layout(cls, layout, **common):
+        return cls(**common)
+
+    def try_out(self):
+        assert self.tensors["command"].shape == (2,)
+
+    def check_task(self, env, params, source):
+        if env.rule.errand != "cover":
+            raise PolicyError(f"{source}: only drives on")
+
+    def begin(self, key, obs, params):
+        return ()
+
+    def act(self, key, memory, obs, params, known):
+        return jnp.concatenate([self.tensors["command"], jnp.array([jnp.nan, 0.0, 0.0])]), memory
+
+
+def test_a_new_kind_of_network_is_one_class_and_one_row(world, monkeypatch):
+    monkeypatch.setitem(loading.KINDS, Constant.kind, Constant)
+    layout = {"action_low": (0.0, -1.5), "action_high": (2.0, 1.5)}
+    agent = policies.from_tensors("constant", layout, {"command": np.array([1.0, 0.25])}, "one")
+    env, params = st.make(DRIVEN)
+    assert policies.with_map(agent, params) is agent
+    policies.check_fits(agent, env, params, "one")
+    policy = load_policy(agent, env, params)
+    action, _ = policy(jnp.zeros(env.observation_size(params)), policy.initial_memory())
+    np.testing.assert_allclose(action[:2], [1.0, 0.25])
+    with pytest.raises(PolicyError, match="one: only drives on"):
+        policies.check_fits(agent, *world, "one")
+    with pytest.raises(ValueError, match="kind must be one of mlp, gru, belief, locate, constant, got 'lstm'"):
+        policies.from_tensors("lstm", layout, {}, "one")

@@ -5,29 +5,31 @@ Round boxes it steers by the written avoidance: what is learnt is where the robo
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import jax
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Agent, Known, Observed
+from subterra_jax.baselines.agent import Action, Known, Observed, n_ranges
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.navigator import Memory, Navigator
 from subterra_jax.baselines.steering import CentreLine
-from subterra_jax.policies.files import Conditions
+from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.locator import Locator
 from subterra_jax.policies.locate.ways import TwoWays
-from subterra_jax.policies.networks import Tensors
+from subterra_jax.policies.trained import Tensors, Trained
 from subterra_jax.state import EnvParams
+from subterra_jax.tunnel_env import TunnelEnv
 
 KIND = "locate"
 ERRANDS = ("stop", "return")
 
 
 @struct.dataclass
-class Locating(Agent):
+class Locating(Trained):
     """Drives to a goal by a learnt localiser.
 
     Attributes:
@@ -40,6 +42,8 @@ class Locating(Agent):
         conditions: Conditions of its training; None: any.
     """
 
+    kind: ClassVar[str] = KIND
+    learns_errand: ClassVar[bool] = False
     uses_lidar = True
     tensors: Tensors
     low: Float[Array, "2"]
@@ -48,6 +52,22 @@ class Locating(Agent):
     blind: bool = struct.field(pytree_node=False, default=False)
     name: str = struct.field(pytree_node=False, default=KIND)
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
+
+    @classmethod
+    def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Locating":
+        """Makes the agent of a layout with `network`."""
+        return cls(**common, network=str(layout["network"]))
+
+    def try_out(self) -> None:
+        """Compares names and shapes of the tensors with the network's."""
+        check_tensors(self)
+
+    def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+        """Refuses a task without a goal on the way, and beams that are no multiple of 16."""
+        if (errand := env.rule.errand) not in ERRANDS:
+            raise PolicyError(f"{source}: a localiser on its way to a goal, without a map; {env.id} asks to {errand}")
+        if (n := n_ranges(params)) % 16:
+            raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
 
     def without_walls(self) -> "Locating":
         """Returns the agent with its learnt estimate cut out: the same weights, and nothing that the walls tell."""

@@ -1,0 +1,77 @@
+"""The contract of a trained network as an agent: how a policy file becomes one, and which tasks it can do."""
+
+import abc
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+from jaxtyping import Array, Float
+
+from subterra_jax.baselines.agent import Agent
+from subterra_jax.policies.files import Conditions
+from subterra_jax.state import EnvParams
+from subterra_jax.tunnel_env import TunnelEnv
+
+Tensors = dict[str, Float[Array, "..."]]
+
+
+class Trained(Agent):
+    """A trained agent. One class a kind of network, a `flax.struct.dataclass`; `loading.KINDS` lists them.
+
+    Attributes:
+        kind: Name of the kind in a policy's facts.
+        learns_errand: It has learnt one errand, and drives no task with another.
+        tensors: Weights by name, as a policy's file holds them.
+        low: Smallest action, m/s and rad/s.
+        high: Largest action, m/s and rad/s.
+        conditions: Conditions of its training; None: any.
+    """
+
+    kind: ClassVar[str]
+    learns_errand: ClassVar[bool] = True
+    tensors: Any
+    low: Any
+    high: Any
+    conditions: Conditions | None
+
+    @classmethod
+    @abc.abstractmethod
+    def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Trained":
+        """Makes the agent.
+
+        Args:
+            layout: The layout in the policy's facts.
+            **common: `tensors`, `low`, `high`, `name` and `conditions`.
+
+        Raises:
+            KeyError: Something is missing in the layout.
+            ValueError: A value in it is none that this release knows.
+        """
+
+    @abc.abstractmethod
+    def try_out(self) -> None:
+        """Lets it act on shapes alone, so that a missing or misshapen tensor is found before it drives.
+
+        Raises:
+            KeyError: A tensor is missing.
+            TypeError: Tensors do not fit each other.
+            ValueError: Tensors do not fit each other.
+        """
+
+    @abc.abstractmethod
+    def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
+        """Refuses a task whose errand or observation it does not know.
+
+        Args:
+            env: The environment.
+            params: The task.
+            source: Origin of the policy, with which the message begins.
+
+        Raises:
+            PolicyError: It cannot do this task.
+        """
+
+    def with_map(self, params: EnvParams) -> "Trained":
+        """Returns the agent with the map of a task; itself if it uses none."""
+        del params
+        return self
