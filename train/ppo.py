@@ -7,7 +7,7 @@ The host only counts finished episodes, keeps the best policy and decides when t
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,15 +43,7 @@ def check_config(config: TrainConfig) -> None:
     Raises:
         ConfigError: Naming the first setting that does not, and its value.
     """
-    if isinstance(config, DistillConfig):
-        check_distill(config)
-    elif isinstance(config, RecurrentConfig):
-        check_recurrent(config)
-    elif isinstance(config, BeliefConfig):
-        check_belief(config)
-    else:
-        assert isinstance(config, PPOConfig)
-        check(config)
+    _method(config).check(config)
 
 
 def make_learner(world: World, config: TrainConfig, axes: tuple[str, ...] = ()) -> Trainable:
@@ -62,18 +54,50 @@ def make_learner(world: World, config: TrainConfig, axes: tuple[str, ...] = ()) 
     """
     spreads = config.parts > 1
     names: tuple[Parts, Parts] = ((PART,), SPLIT) if spreads else (axes, ())
-    learner: Any
-    if isinstance(config, DistillConfig):
-        teacher = open_teacher(config.teacher, world)
-        learner = DistillLearner(world.env, world.params, config, teacher, *names, begun=_begun(world, config))
-    elif isinstance(config, RecurrentConfig):
-        learner = RecurrentLearner(world.env, world.params, config, *names, begun=_begun(world, config))
-    elif isinstance(config, BeliefConfig):
-        learner = BeliefLearner(world.env, world.params, config, *names)
-    else:
-        assert isinstance(config, PPOConfig)
-        learner = Learner(world.env, world.params, config, *names)
+    learner = _method(config).learner(world, config, *names)
     return Spread(learner) if spreads else learner
+
+
+class Method(NamedTuple):
+    """A way to train.
+
+    Attributes:
+        check: Refuses settings that make no sense.
+        learner: Makes the learner of world, config, and the names of its axes and of those along which it is split.
+    """
+
+    check: Callable[[Any], Any]
+    learner: Callable[[World, Any, Parts, Parts], Any]
+
+
+def _by_reward(world: World, config: PPOConfig, axes: Parts, split: Parts) -> Learner:
+    return Learner(world.env, world.params, config, axes, split)
+
+
+def _with_memory(world: World, config: RecurrentConfig, axes: Parts, split: Parts) -> RecurrentLearner:
+    return RecurrentLearner(world.env, world.params, config, axes, split, _begun(world, config))
+
+
+def _from_teacher(world: World, config: DistillConfig, axes: Parts, split: Parts) -> DistillLearner:
+    teacher = open_teacher(config.teacher, world)
+    return DistillLearner(world.env, world.params, config, teacher, axes, split, _begun(world, config))
+
+
+def _sensor_on_map(world: World, config: BeliefConfig, axes: Parts, split: Parts) -> BeliefLearner:
+    return BeliefLearner(world.env, world.params, config, axes, split)
+
+
+METHODS: dict[type[TrainConfig], Method] = {
+    PPOConfig: Method(check, _by_reward),
+    RecurrentConfig: Method(check_recurrent, _with_memory),
+    DistillConfig: Method(check_distill, _from_teacher),
+    BeliefConfig: Method(check_belief, _sensor_on_map),
+}
+
+
+def _method(config: TrainConfig) -> Method:
+    """Finds the method of a config: that of its class, or of the nearest class that it inherits from."""
+    return next(METHODS[one] for one in type(config).__mro__ if one in METHODS)
 
 
 def _begun(world: World, config: RecurrentConfig) -> dict[str, Any] | None:
