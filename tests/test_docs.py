@@ -108,6 +108,19 @@ def test_the_pages_have_python_and_commands_in_them():
     assert len(_commands()) >= 25
 
 
+def _lost(text: str) -> list[str]:
+    """Paths of ours that a text names and that are not there."""
+    named = re.findall(rf"`((?:{'|'.join((*OURS, 'tests', 'docs'))})/[\w./-]*)`", text)
+    return [path for path in named if not (ROOT / path).exists()]
+
+
+def test_files_and_folders_that_the_pages_name_are_there():
+    """But for the measurements, which are dated: they name what was there on the day."""
+    for page in {ROOT / "README.md", *(ROOT / "docs").rglob("*.md")} - {ROOT / "docs" / "measurements.md"}:
+        assert not (lost := _lost(page.read_text())), f"{page.relative_to(ROOT)}: {lost}"
+    assert _lost("`train/nowhere.py`, `train/ppo.py` and `scene/`") == ["train/nowhere.py"]
+
+
 def _stopping(real: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that reads a command line, and then has nothing follow."""
 
