@@ -24,10 +24,15 @@ class Cloud:
 
 def thin_cloud(cloud: Cloud, voxel: float) -> Float[np.ndarray, "k 3"]:
     """Return the cloud's points in the tunnel frame, one mean a voxel, m."""
+    return thin_and_count(cloud, voxel)[0]
+
+
+def thin_and_count(cloud: Cloud, voxel: float) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Return the cloud's points in the tunnel frame, one mean a voxel, m, and the number of points in each voxel."""
     again = VoxelMean(voxel)
     again.add(cloud.points.astype(np.float64))
     coarse = again.cloud()
-    return (coarse.points + coarse.origin).astype(np.float32)
+    return (coarse.points + coarse.origin).astype(np.float32), coarse.weights
 
 
 class VoxelMean:

@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from scene.bore import Axis
-from scene.cleaning.follow import Course, follow_bore
+from scene.cleaning.follow import Course, follow_bore, join_courses
 from scene.cleaning.refusal import name_cloud
 from scene.cleaning.removed import INSIDE, KEPT, SCATTERED, Cleaned, list_removed, part_of_cloud
 from scene.cleaning.seeds import Seed, find_seeds
 from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
 from scene.cleaning.tube import Tube, measure_tube
-from scene.cloud import Cloud, thin_cloud
+from scene.cloud import Cloud, thin_and_count
 from scene.errors import FitError
 from scene.fitting.centreline import CentrelineConfig, centre_axis, fit_centreline, smooth_axis
 
@@ -24,7 +24,7 @@ _COARSE = 0.15  # m, voxel of the cloud that is followed
 _REACH = 3.0  # times the template: as far as the wall is looked for
 _STRETCH = 3.0  # m between two stretches of what was removed
 _LITTLE = 0.002  # share of the points: with less to remove, the cloud is clean
-_SAME = 0.10  # m between two axes of one bore
+_SAME, _SHORTER = 0.10, 2.0  # m between two axes of one bore; m that the one may be shorter
 _FEWEST = 200  # points
 _TRIED = 8  # seeds followed
 _ENCLOSED = 0.65  # share of the directions
@@ -48,7 +48,8 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     Raises `FitError` where no bore can be seen, naming the cause, and with `config.strict` where it has a branch.
     """
     supported = has_support(cloud.points)
-    coarse = thin_cloud(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE).astype(np.float64)
+    thinned, count = thin_and_count(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE)
+    coarse = thinned.astype(np.float64)
     if len(coarse) < _FEWEST:
         return _as_it_is(cloud, centreline)  # which says what is missing
     seeds = find_seeds(coarse)
@@ -58,9 +59,9 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     axis = smooth_axis(course.position, centreline.cutoff)
     reach = _REACH * float(np.nanmax(np.nanmedian(course.radius, axis=0)))
     for _ in range(2):
-        tube, ends, own = _sorted_coarse(coarse, axis, reach)
+        tube, ends, own = _sorted_coarse(coarse, count, axis, reach)
         axis = centre_axis(coarse[own], axis, centreline, _usual_section(axis, tube))
-    tube, ends, _own = _sorted_coarse(coarse, axis, reach)
+    tube, ends, _own = _sorted_coarse(coarse, count, axis, reach)
     require_crown(tube)
     points = cloud.points.astype(np.float64)
     around = look_around(points, axis)
@@ -91,11 +92,14 @@ def _filter(cause: Int[np.ndarray, " n"], config: CleaningConfig) -> Int[np.ndar
 
 
 def _sorted_coarse(
-    coarse: np.ndarray, axis: Axis, reach: float
+    coarse: np.ndarray, count: np.ndarray, axis: Axis, reach: float
 ) -> tuple[Tube, tuple[float, float], Bool[np.ndarray, " n"]]:
-    """Return the tube about an axis, its ends, and which points are the bore's."""
+    """Return the tube about an axis, its ends, and which points are the bore's.
+
+    `count` is the number of points that each coarse point stands for.
+    """
     around = look_around(coarse, axis)
-    tube = measure_tube(around.station, around.angle, around.radius, axis.length, reach)
+    tube = measure_tube(around.station, around.angle, around.radius, count, axis.length, reach)
     ends = end_stations(tube, around)
     return tube, ends, sort_points(around, tube, np.ones(len(coarse), bool), ends)[1] == KEPT
 
@@ -110,10 +114,10 @@ def require_crown(tube: Tube) -> None:
 
 
 def _agree(one: Axis, other: Axis) -> bool:
-    """Return whether two axes are the same but for noise; where a wall was not seen, they may not be."""
+    """Return whether two axes are the same but for noise; where a wall was not seen, or hardly, they may not be."""
     station, lateral, upward = other.local(one.position)
     inside = (station > 0) & (station < other.length)
-    return bool(np.hypot(lateral, upward)[inside].max(initial=0.0) < _SAME)
+    return one.length > other.length - _SHORTER and bool(np.hypot(lateral, upward)[inside].max(initial=0.0) < _SAME)
 
 
 def _as_it_is(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
@@ -122,7 +126,10 @@ def _as_it_is(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
 
 
 def longest_course(points: Float[np.ndarray, "n 3"], seeds: list[Seed]) -> Course | None:
-    """Follows the likeliest places and returns the longest bore; `None` where no place is enclosed."""
+    """Follows the likeliest places and returns the longest bore; `None` where no place is enclosed.
+
+    Bores that go on from one another are one.
+    """
     tree = cKDTree(points)
     courses: list[Course] = []
     for seed in seeds:
@@ -131,7 +138,7 @@ def longest_course(points: Float[np.ndarray, "n 3"], seeds: list[Seed]) -> Cours
         if any(_holds(course, seed.position) for course in courses):
             continue
         courses.append(follow_bore(points, tree, seed))
-    return max(courses, key=lambda course: course.length, default=None)
+    return max(join_courses(courses), key=lambda course: course.length, default=None)
 
 
 def _holds(course: Course, position: np.ndarray) -> bool:

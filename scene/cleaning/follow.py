@@ -39,6 +39,11 @@ class Course:
     steady: Bool[np.ndarray, " n"]  # The section fits those of the last 12 m; elsewhere the middle is interpolated
     radius: Float[np.ndarray, "n rays"]  # Template about the middle, m
 
+    def reversed(self) -> "Course":
+        """Return the same bore from the other end, in which left and right change places."""
+        turned = self.radius[::-1, (N_RAYS // 2 - 1 - np.arange(N_RAYS)) % N_RAYS]
+        return Course(self.position[::-1], self.steady[::-1], turned)
+
     @property
     def length(self) -> float:
         """Length of the polygon, m."""
@@ -59,6 +64,52 @@ def follow_bore(points: Float[np.ndarray, "n 3"], tree: cKDTree, seed: Seed) -> 
     both = [*back[::-1], *ahead[1:]]
     steady = np.array([step[1] for step in both])
     return Course(_bridged(np.array([step[0] for step in both]), steady), steady, np.array([step[2] for step in both]))
+
+
+_TAIL = 8  # sections that tell where a course heads at its end
+_ACROSS, _OVERLAP = 10.0, -4.0  # m from the end of one course to the begin of the next, along the first
+_BESIDE = 2.0  # m aside of its line
+_ALIGNED = 0.9  # cosine between both headings
+
+
+def join_courses(courses: list[Course]) -> list[Course]:
+    """Return courses with those in one that go on from one another: between them the section changes at once."""
+    left = sorted(courses, key=lambda course: -course.length)
+    k = 0
+    while k < len(left):
+        for other in range(k + 1, len(left)):
+            both = _join(left[k], left[other])
+            if both is not None:
+                left[k] = both
+                del left[other]
+                break
+        else:
+            k += 1
+    return left
+
+
+def _join(one: Course, other: Course) -> Course | None:
+    """Return two courses in a row; `None` where neither goes on from the other."""
+    if min(len(one.position), len(other.position)) < _TAIL:
+        return None
+    for first in (one, one.reversed()):
+        for second in (other, other.reversed()):
+            tail, head = first.position[-_TAIL:], second.position[:_TAIL]
+            heading, onwards = (part[-1] - part[0] for part in (tail, head))
+            heading, onwards = heading / np.linalg.norm(heading), onwards / np.linalg.norm(onwards)
+            ahead = (head - tail[-1]) @ heading
+            aside = float(np.linalg.norm(head[0] - tail[-1] - ahead[0] * heading))
+            if not _OVERLAP < ahead[0] < _ACROSS or aside > _BESIDE or heading @ onwards < _ALIGNED:
+                continue
+            fresh = int(np.argmax(ahead > STEP / 2))  # before it both were followed
+            if ahead[fresh] > 0.0:
+                parts = (
+                    (first.position, second.position),
+                    (first.steady, second.steady),
+                    (first.radius, second.radius),
+                )
+                return Course(*(np.concatenate([a, b[fresh:]]) for a, b in parts))
+    return None
 
 
 def _bridged(position: np.ndarray, steady: np.ndarray) -> np.ndarray:

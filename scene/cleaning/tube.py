@@ -71,10 +71,14 @@ def measure_tube(
     station: Float[np.ndarray, " n"],
     angle: Float[np.ndarray, " n"],
     radius: Float[np.ndarray, " n"],
+    count: Float[np.ndarray, " n"],
     length: float,
     reach: float,
 ) -> Tube:
-    """Return the wall that persists along an axis of some length, m, within `reach` m of it."""
+    """Return the wall that persists along an axis of some length, m, within `reach` m of it.
+
+    `count` is the number of returns that each point stands for.
+    """
     grid = Grid.over(-_OVERRUN, length + _OVERRUN, ROW, COLUMNS)
     cell = grid.cell(station, angle)
     good = (cell >= 0) & (radius < reach)
@@ -82,6 +86,7 @@ def measure_tube(
     flat = np.zeros((grid.rows * COLUMNS, bins), bool)
     flat[cell[good], (radius[good] / _BIN).astype(np.intp)] = True
     hit = flat.reshape(grid.rows, COLUMNS, bins)
+    hit &= ~_mirrored(grid, cell[good], (radius[good] / _BIN).astype(np.intp), count[good], hit)
     wide = hit.copy()  # a wall wavers by a bin
     wide[..., 1:] |= hit[..., :-1]
     wide[..., :-1] |= hit[..., 1:]
@@ -98,6 +103,44 @@ def measure_tube(
     nearest = np.where(hit.any(axis=2), hit.argmax(axis=2) * _BIN, np.inf)
     closed = nearest < np.maximum(wall + _DIFFERENT, _WIDEST * usual)
     return Tube(grid, wall, usual, np.isfinite(present), matched, closed)
+
+
+_DOWN = -0.5  # sine of the highest direction in which a floor lies
+_BLOCK = 80  # rows
+_UNBROKEN, _FAINT = 0.8, 0.4  # share of the rows that show a floor; of its density, what lies below it
+_BELOW = 5  # bins
+
+
+def _mirrored(
+    grid: Grid, cell: np.ndarray, index: np.ndarray, returns: np.ndarray, hit: np.ndarray
+) -> Bool[np.ndarray, "rows cols bins"]:
+    """Places below an unbroken floor with far fewer returns than it: water shows there what is above it.
+
+    Args:
+        grid: Stations and directions.
+        cell: Cell of each point.
+        index: Bin of each point's radius.
+        returns: Returns that each point stands for.
+        hit: Bins of each cell that hold a point.
+    """
+    result = np.zeros_like(hit)
+    bins = hit.shape[2]
+    low = np.flatnonzero(np.sin(grid.angle) < _DOWN)
+    row, column = np.divmod(cell, grid.columns)
+    for first in range(0, grid.rows, _BLOCK):
+        here = slice(first, min(first + _BLOCK, grid.rows))
+        inside = (row >= here.start) & (row < here.stop)
+        count = np.bincount(column[inside] * bins + index[inside], returns[inside], grid.columns * bins)
+        density = count.reshape(grid.columns, bins) / (np.arange(bins) + 0.5)  # a direction is wider further out
+        density = uniform_filter1d(density, 3, axis=1, mode="constant")
+        for k in low:
+            floor = int(density[k].argmax())
+            rows = hit[here, k]
+            shown = rows[:, max(floor - 1, 0) : floor + 2].any(axis=1).sum()
+            if shown >= _UNBROKEN * max(rows.any(axis=1).sum(), 1):
+                below = floor + _BELOW
+                result[here, k, below:] = density[k, below:] < _FAINT * density[k, floor]
+    return result
 
 
 def _outermost(wide: np.ndarray, hit: np.ndarray, window: float, share: float) -> Float[np.ndarray, "rows cols"]:

@@ -103,7 +103,8 @@ def _bridges(nodes: np.ndarray, labels: np.ndarray) -> list[np.ndarray]:
 
 _HERE = np.zeros(3)
 _OVERRUN = 6.0
-_FULL_SHARE = 0.5
+_FULL_SHARE, _THIN_SHARE = 0.5, 0.05  # of the usual number of points: a full section; one of a bore that is known
+_THIN = 20  # points of a thin section
 _UNUSUAL = 0.3  # m from the usual section
 _SPACING = 1.0
 _PASSES = 4
@@ -177,8 +178,10 @@ def section_middles(
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(len(extended.station) + 1))
     middles = []
-    full = _FULL_SHARE * np.median(np.diff(bounds)[np.diff(bounds) > 0])
-    enough = np.flatnonzero(np.diff(bounds) >= max(full, 1))
+    count = np.diff(bounds)
+    share = _FULL_SHARE if usual is None else _THIN_SHARE  # far from the last tripod a bore is thin, but goes on
+    least = max(share * float(np.median(count[count > 0])), 1 if usual is None else _THIN)
+    enough = np.flatnonzero(count >= least)
     if usual is not None:
         stand_in = usual(extended)
         if not len(enough):

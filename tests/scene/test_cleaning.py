@@ -182,7 +182,7 @@ def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, bore)
     station, angle = rng.uniform(0.0, 90.0, 200_000), rng.uniform(-np.pi, np.pi, 200_000)
     beside = (np.abs(station - 45.0) < length / 2) & (np.abs(angle) < 0.5)
     radius = np.where(beside, 4.0, 2.75) + rng.normal(0.0, 0.01, len(station))
-    tube = measure_tube(station, angle, radius, 90.0, 8.0)
+    tube = measure_tube(station, angle, radius, np.ones(len(station)), 90.0, 8.0)
     row = round((45.0 - tube.grid.start) / tube.grid.step)
     wall = float(np.median(tube.wall[row - 2 : row + 3][:, np.abs(tube.grid.angle) < 0.3]))
     assert wall == pytest.approx(4.0 if bore else 2.75, abs=0.15)
@@ -199,6 +199,35 @@ def test_a_mouth_at_which_no_direction_shows_the_wall_ends_where_its_last_row_do
     first, last = end_stations(tube, around)
     assert first == pytest.approx(-1.0, abs=0.3)  # where nothing lies beyond, the rim stays whole
     assert last == pytest.approx(41.0, abs=0.3)
+
+
+def test_a_section_that_changes_at_once_ends_no_bore():
+    wide = Tube((LENGTH / 2, 0), (LENGTH, 0), 8.0, 7.0)
+    result = cleaned(turned(cavity(Tube((0, 0), (LENGTH / 2, 0)), wide) - PLACE))
+    station, aside, _ = axis_offsets(result).T
+    assert min(station) < 1.5
+    assert max(station) > LENGTH - 1.5
+    assert np.abs(aside).max() < 0.1
+
+
+def test_a_bore_goes_on_where_its_returns_grow_thin():
+    points = arch()
+    rng = np.random.default_rng(4)
+    thin_end = (points[:, 0] < 0.7 * LENGTH) | (rng.random(len(points)) < 0.25)
+    station = axis_offsets(cleaned(turned(points[thin_end])))[:, 0]
+    assert np.ptp(station) == pytest.approx(LENGTH, abs=2.0)
+
+
+def test_what_a_wet_floor_mirrors_is_no_bore():
+    points = arch()
+    rng = np.random.default_rng(7)
+    seen = points[(np.abs(points[:, 1]) < 1.4) & (points[:, 2] > 1.0) & (rng.random(len(points)) < 0.3)]
+    result = cleaned(turned(np.concatenate([points, seen * (1.0, 1.0, -1.0)])))
+    require_axis_in_the_middle(result)
+    kept = (result.cloud.points + result.cloud.origin - PLACE) @ np.stack(
+        [placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)]
+    ).T
+    assert np.mean(kept[:, 2] < -0.5) < 1e-3
 
 
 def test_the_user_may_keep_outliers_and_what_stands_inside():
