@@ -17,6 +17,7 @@ from scene.bore import Bore
 from scene.cloud import thin_cloud
 from scene.errors import FitError
 from scene.judging.judge import STATION, DoubtError, Judgement, JudgingConfig, judge_bore, require_trust
+from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
 from scene.judging.returns import TrackZone
 from scene.judging.sanity import doubt_bore
@@ -141,6 +142,7 @@ def judge_reconstruction(result: Reconstruction, track: Track, config: JudgingCo
     """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
     odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
     odd += doubt_track(track, result.seen)
+    odd += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
     if result.everything is None:
         judgement = Judgement(config.tolerance, ())
     else:

@@ -1,4 +1,4 @@
-"""The wall that nobody saw: parts of the built surface without returns on them, and where they lie."""
+"""The wall that nobody saw, where the built surface lacks returns, and the wall that was seen and not built."""
 
 from dataclasses import dataclass
 
@@ -65,6 +65,27 @@ def find_unseen(bore: Bore, returns: Returns, spacing: float = 0.0) -> Coverage:
     usual = float(np.median(density[count > 0])) if (count > 0).any() else 1.0
     seen = density > _SPARSE * usual
     return Coverage(edges[:-1], edges[1:], seen, _list_pieces(seen, area, edges))
+
+
+_BEYOND = 20  # m beyond an end that are looked at
+_ON_LINING = 0.25  # m from the wall of the last section, carried on straight
+_OVERHEAD = 0.2  # sine of the directions that count: floor and walls go on into a cutting, a crown does not
+_GOES_ON = 0.6  # of these directions
+
+
+def measure_overruns(bore: Bore, returns: Returns) -> tuple[float, float]:
+    """Return how far the cloud shows a lining before the first and behind the last station of a bore, at least, m."""
+    overhead = (np.sin(returns.angle) > _OVERHEAD) & (np.abs(returns.outward) < _ON_LINING)
+    column = np.floor((returns.angle + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
+    all_columns = np.sin(-np.pi + (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS) > _OVERHEAD
+    result = []
+    for beyond in (-returns.station, returns.station - bore.length):
+        rows = np.flatnonzero(overhead & (beyond > 0.0) & (beyond < _BEYOND))
+        seen = np.zeros((_BEYOND, SECTORS), bool)
+        seen[beyond[rows].astype(np.intp), column[rows]] = True
+        full = seen[:, all_columns].mean(axis=1) > _GOES_ON
+        result.append(max(float(np.argmin(np.append(full, False))) - 1.0, 0.0))  # the last metre may be begun
+    return result[0], result[1]
 
 
 def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:

@@ -11,7 +11,7 @@ from scene.bore import Bore
 from scene.cleaning.removed import CAUSES, KEPT, Removed
 from scene.cloud import Cloud
 from scene.errors import FitError
-from scene.judging.coverage import Coverage, find_unseen
+from scene.judging.coverage import Coverage, find_unseen, measure_overruns
 from scene.judging.places import Place, find_places
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
 from scene.judging.words import name_span
@@ -146,6 +146,7 @@ def judge_bore(
     warnings = [
         *_warn_of_share(returns, cause, places, worst, config),
         *(Warned("cut", part.warning, part.start, part.end) for part in removed if part.warning),
+        *_warn_of_ends(bore, returns),
         *_warn_of_unseen(coverage),
         *_warn_of_places(places, config.tolerance),
     ]
@@ -178,6 +179,23 @@ def _warn_of_share(
             refuses=inside + behind > config.refuse_above,
         ))  # fmt: skip
     return result
+
+
+_CUT_SHORT = 2.0  # m of lining beyond an end that are worth a word
+
+
+def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
+    return [
+        Warned(
+            "cut_short",
+            f"the lining goes on for at least {beyond:.0f} m {where} {station:.0f} m, which were not built: is it seen "
+            "from too far away there, or hidden?",
+            station, station,
+        )
+        for beyond, where, station in zip(
+            measure_overruns(bore, returns), ("before station", "beyond station"), (0.0, bore.length), strict=True
+        ) if beyond >= _CUT_SHORT
+    ]  # fmt: skip
 
 
 def _warn_of_unseen(coverage: Coverage) -> list[Warned]:

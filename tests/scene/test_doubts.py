@@ -13,6 +13,7 @@ from scene.bore import STATION_STEP, Bore, axis_through
 from scene.build import build
 from scene.cleaning.crop import ExtentConfig
 from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
+from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
 from scene.judging.sanity import doubt_bore
 from scene.output import BuildConfig
@@ -185,3 +186,25 @@ def test_a_build_says_where_its_stations_begin_and_which_way_they_grow(with_vehi
     assert re.search(r"stations: 0 m, chainage 1202 m at \(\d.*\); they grow arbitrarily: a registered cloud", shown)
     detected = json.loads((tmp_path / "bore" / "manifest.json").read_text())["detected"]
     assert detected["chainage_start"] == 1202.0
+
+
+@pytest.mark.parametrize(
+    ("apart", "said"), [(0.0, None), (0.01, None), (0.05, " 5 cm apart"), (0.15, "1[45] cm apart")]
+)
+def test_a_wall_that_two_passes_show_twice_is_told(bore, apart, said):
+    rng = np.random.default_rng(2)
+    first, second = (np.array(on_wall(bore, 60_000, seed=seed)) for seed in (1, 2))
+    second[1:] += np.array([[0.8 * apart], [0.6 * apart]])
+    points = [about(bore, *part) + 0.004 * rng.standard_normal((60_000, 3)) for part in (first, second)]
+    told = doubt_layers(bore, cloud_of(*points))
+    assert [warning.code for warning in told] == ([] if said is None else ["doubled"])
+    assert said is None or re.search(said, told[0].text)
+
+
+def test_panels_side_by_side_are_no_second_wall(bore):
+    rng = np.random.default_rng(3)
+    station, lateral, upward = on_wall(bore, 120_000)
+    raised = ((station / 0.3).astype(int) + (np.arctan2(upward, lateral) / 0.15).astype(int)) % 2 == 0
+    out = 1.0 + np.where(raised, 0.08, 0.0) / np.hypot(lateral, upward)
+    points = about(bore, station, lateral * out, upward * out) + 0.004 * rng.standard_normal((120_000, 3))
+    assert doubt_layers(bore, cloud_of(points)) == []

@@ -187,3 +187,17 @@ def test_the_table_of_stations_says_what_was_seen_and_unexplained(bore, wall):
     assert table["inside"][11] == pytest.approx(667 / (667 + 2500), abs=0.05)
     assert table["inside"][3] == 0.0
     np.testing.assert_allclose(table["explained"] + table["inside"] + table["behind"], 1.0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("overhead", "length", "said"), [(False, 8.0, False), (True, 1.2, False), (True, 8.0, True)])
+def test_a_lining_that_goes_on_beyond_an_end_is_told_and_a_cutting_is_not(bore, wall, overhead, length, said):
+    rng = np.random.default_rng(9)
+    before = rng.uniform(-length, 0.0, 8000)
+    angle = rng.uniform(-np.pi, np.pi, 8000)
+    radius = wall_radius(bore, before, angle)
+    kept = overhead | (radius * np.sin(angle) < 0.5)  # floor and foot of the walls alone
+    more = about(bore, before[kept], (radius * np.cos(angle))[kept], (radius * np.sin(angle))[kept])
+    warnings = judge_bore(bore, cloud_of(wall, more), JudgingConfig()).warnings
+    told = [warning.text for warning in warnings if warning.code == "cut_short"]
+    assert bool(told) == said
+    assert not said or "goes on for at least 7 m before station 0 m" in told[0]
