@@ -37,6 +37,7 @@ def doubt_bore(bore: Bore, facts: dict[str, Any], provenance: dict[str, str], su
         *doubt_shaft(bore, str(facts.get("axes", ""))),
         *_doubt_dents(bore),
         *_doubt_poses(facts),
+        *_doubt_rounding(facts),
         *(_tell_standard(bore, provenance) if surveyed else []),
     ]
 
@@ -166,6 +167,15 @@ def _doubt_poses(facts: dict[str, Any]) -> list[Warned]:
     if "nothing measured" in str(facts.get("length_fixed_by", "")):
         result.append(Warned("length", "nothing measured the length: along smooth walls LiDAR odometry does not"))
     return result
+
+
+def _doubt_rounding(facts: dict[str, Any]) -> list[Warned]:
+    step = float(facts.get("rounded_to", 0.0))
+    return [Warned(
+        "rounded",
+        f"the coordinates of the cloud are rounded to {100 * step:.1f} cm, and the wall is known no better: 32-bit "
+        "numbers far from the origin do so; export it with an offset, in 64 bits or with more digits",
+    )] if step else []  # fmt: skip
 
 
 def _tell_standard(bore: Bore, provenance: dict[str, str]) -> list[Warned]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import RecordingError
@@ -15,6 +16,8 @@ from scene.reading.tables import parse_columns
 from scene.resume import Partial
 
 _TABLES = ("table", "parquet")
+_COARSE, _HOPELESS = 0.02, 0.25  # m: coordinates rounded so far are told, and refused
+_REPEATED = 10  # points for each value of a coordinate: on a grid they repeat
 _MOST_OUTSIDE = 0.5  # share of the points that may lie too far from the first to be thinned
 
 
@@ -35,7 +38,7 @@ def read_cloud(
     if detected.format.kind != "cloud":
         raise RecordingError(f"{path}: is no registered cloud")
     partial = partial or Partial(None)
-    thinned, read, skip = VoxelMean(voxel), 0, 0
+    thinned, read, skip, step = VoxelMean(voxel), 0, 0, None
     if (known := partial.load("cloud")) is not None:
         thinned, (read, skip) = VoxelMean.restored(voxel, known), (int(n) for n in known["read"])
     with refuse_damage(path, f"a readable {detected.format.label} cloud", RecordingError):
@@ -53,7 +56,8 @@ def read_cloud(
         # Chunks that an earlier build had thinned are decoded again, which most formats cannot do without.
         for index, chunk in enumerate(itertools.islice(source.chunks(), skip, None), skip + 1):
             read += len(chunk)
-            thinned.add(frame.apply(chunk))
+            thinned.add(placed := frame.apply(chunk))
+            step = measure_rounding(placed) if step is None else step
             if stage is not None:
                 stage.advance(len(chunk))
             if partial.due():
@@ -67,8 +71,24 @@ def read_cloud(
             f"{path}: most of its points lie further apart than any tunnel is long (unit {frame.unit}); "
             "is the unit mm? --unit says so"
         )
-    facts = {"kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
+    if step is not None and max(step) >= _HOPELESS:
+        raise RecordingError(
+            f"{path}: its coordinates are rounded to {max(step):.2g} m, so no wall can be seen: 32-bit numbers far "
+            "from the origin do so; export it with an offset, in 64 bits or with more digits"
+        )
+    rounded = {"rounded_to": max(step)} if step is not None and max(step) >= _COARSE else {}
+    facts = {**rounded, "kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
     return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
+
+
+def measure_rounding(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, float]:
+    """Return the step of the grid that each coordinate lies on, m; 0 where its values do not repeat."""
+    steps = []
+    for column in points[np.isfinite(points).all(axis=1)].T:
+        values = np.unique(column)
+        on_grid = len(values) > 1 and len(column) >= _REPEATED * len(values)
+        steps.append(float(np.diff(values).min()) if on_grid else 0.0)
+    return steps[0], steps[1], steps[2]
 
 
 def _open_cloud(path: Path, row: Format, columns: str | None) -> CloudSource:

@@ -10,6 +10,7 @@ from scene.errors import RecordingError
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig
 from scene.reading.tables import plain_name
+from tests.scene.clouds import curved_d_bore
 from tests.scene.files import write_las, write_text
 
 POINTS = np.random.default_rng(0).uniform(0, 1, (500, 3)) * [90.0, 20.0, 15.0]
@@ -94,3 +95,13 @@ def test_a_table_whose_header_says_feet_is_read_in_feet(tmp_path):
     cloud, facts = read_cloud(write_text(tmp_path / "a.csv", POINTS, ",", "X (ft),Y (ft),Z (ft)"), 1e-4)
     assert facts["unit"] == "ft (declared)"
     np.testing.assert_allclose(np.ptp(cloud.points, axis=0), np.ptp(POINTS, axis=0) * 0.3048, atol=1e-3)
+
+
+def test_coordinates_rounded_to_centimetres_are_told_and_those_rounded_to_half_a_metre_refused(tmp_path):
+    bore = curved_d_bore(length=20.0, per_metre=1500, offset=(0.0, 0.0, 0.0)).points
+    for step in (0.001, 0.05, 0.5):
+        np.savetxt(tmp_path / f"{step}.xyz", np.round(bore / step) * step, fmt="%.3f")
+    assert "rounded_to" not in read_cloud(tmp_path / "0.001.xyz", 0.04)[1]
+    assert read_cloud(tmp_path / "0.05.xyz", 0.04)[1]["rounded_to"] == pytest.approx(0.05, abs=1e-6)
+    with pytest.raises(RecordingError, match=r"rounded to 0\.5 m"):
+        read_cloud(tmp_path / "0.5.xyz", 0.04)
