@@ -16,8 +16,8 @@ import tyro
 from rich.console import Console
 
 from benchmarks.command import BenchmarkError, require_least, run_main
-from benchmarks.dirty.clouds import others, recordings, troubles
-from benchmarks.dirty.clouds.files import FOOT, write_e57, write_laz, write_truth, y_up
+from benchmarks.dirty.clouds import odd, others, recordings, troubles
+from benchmarks.dirty.clouds.files import FOOT, write_e57, write_laz, write_ply, write_truth, y_up
 from benchmarks.dirty.clouds.mutations import MUTATIONS, Mutant, read_mutant
 from benchmarks.dirty.clouds.troubles import Cloud
 from benchmarks.dirty.truth import find_cases
@@ -35,7 +35,7 @@ class CloudCase:
 
     make: Maker  # Makes points in m and their truth
     stored: Frame = np.asarray  # Takes points in m to what is stored
-    ending: str = ".laz"  # `.laz` or `.e57`
+    ending: str = ".laz"  # A key of `_WRITERS`
     cause: tuple[str, ...] = ()  # As for a recording; that of the truth where it has one
 
 
@@ -86,6 +86,26 @@ REFUSED: dict[str, CloudCase | RecordingCase] = {
     "clock-0.5s": RecordingCase(recordings.late(0.5), _CLOCK),
     "e57-mm": CloudCase(troubles.clean, lambda points: 1000.0 * points, ".e57", _FRAME),
 }
+# ... what was tried later, of other kinds ...
+ODD: dict[str, CloudCase | RecordingCase] = {
+    "s-curve": CloudCase(odd.s_curve),
+    "hairpin": CloudCase(odd.hairpin),
+    "steep": CloudCase(odd.steep),
+    "section-change": CloudCase(odd.section_change),
+    "t-junction": CloudCase(odd.junction(np.pi / 2)),
+    "y-junction": CloudCase(odd.junction(np.pi / 6)),
+    "passes-5cm": CloudCase(odd.two_passes(0.05)),
+    "passes-15cm": CloudCase(odd.two_passes(0.15)),
+    "few-stations": CloudCase(odd.few_stations),
+    "profiles": CloudCase(odd.profiles),
+    "wet-floor": CloudCase(odd.wet_floor),
+    "pipe": CloudCase(odd.pipe),
+    "hall": CloudCase(odd.hall),
+    "rounded": CloudCase(odd.rounded, ending=".ply"),
+    "origin-rows": CloudCase(odd.origin_rows),
+    "rock": CloudCase(odd.rock),
+    "floor-step": CloudCase(odd.floor_step),
+}
 # ... and what is no tunnel, or two.
 BAD: dict[str, CloudCase | RecordingCase] = {
     "room": CloudCase(others.room),
@@ -94,8 +114,9 @@ BAD: dict[str, CloudCase | RecordingCase] = {
     "shaft": CloudCase(others.shaft),
     "two-tunnels": CloudCase(others.two_tunnels),
 }
-TROUBLES = {name: (kind, case) for kind, cases in (("silent", SILENT), ("refused", REFUSED), ("bad", BAD))
-            for name, case in cases.items()}  # fmt: skip
+_KINDS = (("silent", SILENT), ("refused", REFUSED), ("odd", ODD), ("bad", BAD))
+_WRITERS = {".laz": write_laz, ".e57": write_e57, ".ply": write_ply}
+TROUBLES = {name: (kind, case) for kind, cases in _KINDS for name, case in cases.items()}
 
 
 @dataclass(frozen=True)
@@ -141,8 +162,7 @@ def _write_cloud(
 ) -> None:
     points, truth = case.make(rng)
     stored = case.stored(points)
-    write = write_laz if case.ending == ".laz" else write_e57
-    write(config.out / f"{name}{case.ending}", stored)
+    _WRITERS[case.ending](config.out / f"{name}{case.ending}", stored)
     write_truth(path, kind, {"cause": case.cause, **truth})
 
 

@@ -20,6 +20,7 @@ _FLOOR_HALF, _FLOOR_SLACK = (
     0.5,
     0.12,
 )  # m beside the axis, and about the nominal floor: tops of proud sleepers are above
+_EVEN, _LEAP = 10.0, 0.03  # m before and behind a place that tell its floor; m that it may be off them
 _FLOOR_THICK = 0.03  # m about the lower quartile that count as floor; the flanks of sleepers are above
 
 
@@ -63,9 +64,15 @@ def measure_sizes(
     low = (np.abs(y) < _FLOOR_HALF) & (np.abs(z + told.axis_above_floor) < _FLOOR_SLACK)
     lower = np.interp(at, station, _quantiles(station, at[low], z[low], 0.25))
     low &= np.abs(z - lower) < _FLOOR_THICK
-    above = -_quantiles(station, at[low], z[low])
+    above = _without_leaps(station, -_quantiles(station, at[low], z[low]))
     middle = 0.5 * (sides[0] + sides[1])
     return {"axis_above_floor": above, "width": sides[0] - sides[1], "height": above + top, "middle": middle}
+
+
+def _without_leaps(station: np.ndarray, above: np.ndarray) -> np.ndarray:
+    """Heights of a floor without those that leap: where ballast hides in shadow, flanks of sleepers stand in for it."""
+    usual = np.array([np.nanmedian(above[np.abs(station - at) < _EVEN]) for at in station])
+    return np.where(np.abs(above - usual) < _LEAP, above, np.nan)
 
 
 def local_places(

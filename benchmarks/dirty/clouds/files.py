@@ -6,6 +6,7 @@ from typing import Any
 import laspy
 import numpy as np
 from jaxtyping import Float
+from plyfile import PlyData, PlyElement
 
 from subterra_jax.host.files import replace_file
 
@@ -20,6 +21,14 @@ def write_laz(path: Path, points: Float[np.ndarray, "p 3"]) -> None:
     cloud.x, cloud.y, cloud.z = points.T
     with replace_file(path) as part, part.open("wb") as file:
         cloud.write(file, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
+
+
+def write_ply(path: Path, points: Float[np.ndarray, "p 3"]) -> None:
+    """Writes points as binary PLY in 32-bit numbers, as most programs do."""
+    table = np.zeros(len(points), [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    table["x"], table["y"], table["z"] = points.T
+    with replace_file(path) as part:
+        PlyData([PlyElement.describe(table, "vertex")]).write(str(part))
 
 
 def write_e57(path: Path, points: Float[np.ndarray, "p 3"]) -> None:
