@@ -20,7 +20,7 @@ _FLOOR_HALF, _FLOOR_SLACK = (
     0.5,
     0.12,
 )  # m beside the axis, and about the nominal floor: tops of proud sleepers are above
-_EVEN, _LEAP = 10.0, 0.03  # m before and behind a place that tell its floor; m that it may be off them
+_EVEN, _LEAP = 10.0, 0.02  # m before and behind a place that tell its floor; m that it may be off them
 _FLOOR_THICK = 0.03  # m about the lower quartile that count as floor; the flanks of sleepers are above
 
 
