@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ from scipy.spatial import cKDTree
 from benchmarks.fidelity import outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash, release_memory
+from benchmarks.fidelity.controls import catalogue, local
 from benchmarks.fidelity.files import write_json
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.references import Hold
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
+from benchmarks.fidelity.windows import measures
 from benchmarks.fidelity.windows.judge import Windows, dump_windows, judge_windows, load_windows, windows_hash
 from scene.progress import Stages
 
@@ -291,3 +294,28 @@ def provenance_leaks(case: Case, recorded: str | None) -> list[str]:
     if recorded is not None and recorded != hold.hash:
         leaks.append("the scored points do not come from the recording that was held out: its hash is another")
     return leaks
+
+
+# Everything frozen that a verdict depends on.
+
+
+def constants() -> dict[str, Any]:
+    """Return everything frozen that a verdict depends on: metrics, gates, limits, controls, leaks, windows."""
+    return {
+        "metrics": [asdict(row) for row in table.load().values()],
+        "scoring": {name: value for name, value in vars(scoring).items() if name.isupper()},
+        "controls": [asdict(control) for control in catalogue.load_controls().values()],
+        "invariances": {
+            id: [one.category_limit, list(one.exempt)] for id, one in catalogue.INVARIANCES.items()
+        } | {"global": [catalogue.GLOBAL_LIMIT, catalogue.THINNED_LIMIT]},
+        "quiet": [catalogue.QUIET_LIMIT, catalogue.MONOTONE, list(catalogue.UNORDERED)],
+        "leaks": [list(NOISE_BAND), MEDIAN_FLOOR],
+        "windows": measures.limits(),
+        "faults": {name: asdict(one) for name, one in local.stated_faults(100.0).items()},
+    }  # fmt: skip
+
+
+def constants_digest() -> str:
+    """Return the SHA-256 of `constants` as canonical JSON; a report with another digest was judged by other rules."""
+    text = json.dumps(constants(), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return sha256(text.encode()).hexdigest()

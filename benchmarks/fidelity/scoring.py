@@ -1,9 +1,7 @@
 """Scores, categories, the global figure and the verdict; and how far they depend on thresholds, tolerances and seed."""
 
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from hashlib import sha256
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -170,33 +168,6 @@ def reasons_against(
     reasons += [f"negative control {id} was not detected" for id in undetected]
     reasons += [f"invariance control {id} moved the scores" for id in loud]
     return reasons + [f"leak: {leak}" for leak in leaks]
-
-
-def constants() -> dict[str, Any]:
-    """Return everything frozen that a verdict depends on: metrics, gates, limits, controls, leaks, windows."""
-    from benchmarks.fidelity import judge
-    from benchmarks.fidelity.controls import catalogue, local, runner
-    from benchmarks.fidelity.windows import measures
-
-    limits = {name: value for name, value in globals().items() if name.isupper()}
-    return {
-        "metrics": [asdict(row) for row in table.load().values()],
-        "scoring": limits,
-        "controls": [asdict(control) for control in catalogue.load_controls().values()],
-        "invariances": {
-            id: [one.category_limit, list(one.exempt)] for id, one in catalogue.INVARIANCES.items()
-        } | {"global": [catalogue.GLOBAL_LIMIT, catalogue.THINNED_LIMIT]},
-        "quiet": [runner.QUIET, runner.MONOTONE, list(runner.KINDS)],
-        "leaks": [list(judge.NOISE_BAND), judge.MEDIAN_FLOOR],
-        "windows": measures.limits(),
-        "faults": {name: asdict(one) for name, one in local.stated_faults(100.0).items()},
-    }  # fmt: skip
-
-
-def constants_digest() -> str:
-    """Return the SHA-256 of `constants` as canonical JSON; a report with another digest was judged by other rules."""
-    text = json.dumps(constants(), sort_keys=True, separators=(",", ":"), allow_nan=False)
-    return sha256(text.encode()).hexdigest()
 
 
 # The sweep: other thresholds, tolerances and seeds.

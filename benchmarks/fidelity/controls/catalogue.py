@@ -61,6 +61,9 @@ from benchmarks.fidelity.references import Hold
 
 TABLE = Path(__file__).with_name("controls.csv")
 OUT_OF_SCENE = "all but SCN PAR"
+QUIET_LIMIT = 2.0  # points that a category named as quiet may move
+MONOTONE = -0.9
+UNORDERED = ("N20", "N26", "N32", "N34", "N35")  # their doses are kinds, not amounts
 
 
 @dataclass(frozen=True)

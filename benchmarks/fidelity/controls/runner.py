@@ -21,7 +21,9 @@ from benchmarks.fidelity.controls.catalogue import (
     GLOBAL_LIMIT,
     INVARIANCES,
     OUT_OF_SCENE,
+    QUIET_LIMIT,
     THINNED_LIMIT,
+    UNORDERED,
     Control,
     Setting,
     load_controls,
@@ -219,10 +221,6 @@ def _compute_outcomes(bench: Bench, todo: list[Job], processes: int) -> Iterator
 
 # The judgement: whether each control was noticed, and whether the rest stayed quiet.
 
-QUIET = 2.0
-MONOTONE = -0.9
-KINDS = ("N20", "N26", "N32", "N34", "N35")  # their doses are kinds, not amounts
-
 
 def judge_outcomes(outcomes: list[Outcome], base: Base) -> list[dict[str, Any]]:
     """Return a row per control and dose, for `controls.csv` and the heat map.
@@ -257,7 +255,7 @@ def _negative_row(row: dict[str, Any]) -> dict[str, Any]:
     control = load_controls()[row["id"]]
     bold = row["dose"] in control.bold
     short = {c: (row["falls"][c], asked) for c, asked in control.falls.items() if (row["falls"][c] or 0.0) < asked}
-    moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > QUIET}
+    moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > QUIET_LIMIT}
     return {
         "kind": "negative", "corruption": control.corruption, "bold": bold, "short": short if bold else {},
         "detected": row["verdict"] == "FAIL" and not short, "quiet": not moved, "moved": moved,
@@ -284,7 +282,7 @@ def _fall(before: float | None, after: float | None) -> float | None:
 
 def _spearman(same: list[dict[str, Any]], control: Control | None, base: Base) -> float | None:
     """Return the rank correlation of dose and mean score of the named categories; the reconstruction is dose 0."""
-    if control is None or len(same) < 2 or control.id in KINDS or not control.falls:
+    if control is None or len(same) < 2 or control.id in UNORDERED or not control.falls:
         return None
     order = sorted(same, key=lambda row: control.doses.index(row["dose"]))
     before = [base.scored.categories[c] or 0.0 for c in control.falls]

@@ -113,7 +113,7 @@ def report_content(
         "windows": dump_windows(judgement.windows),
         "split": _split_entry(case, inputs),
         "seed": inputs.seed,
-        "constants": scoring.constants_digest(),
+        "constants": judge.constants_digest(),
         "thresholds_hash": table.thresholds_hash(),
         "code_hash": code_hash(),
         "commit": _commit(),

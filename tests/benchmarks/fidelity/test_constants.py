@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fidelity import scoring, table
+from benchmarks.fidelity import judge, scoring, table
 from benchmarks.fidelity.registry import Value
 
 # Whoever changes a threshold, weight, gate, limit or row on purpose writes the new digest here, with the reason.
@@ -23,7 +23,7 @@ def worst(row: table.Metric) -> Value:
 
 
 def test_the_frozen_constants_are_the_pinned_ones() -> None:
-    assert scoring.constants_digest() == DIGEST
+    assert judge.constants_digest() == DIGEST
 
 
 @pytest.mark.parametrize("id", [id for id, row in table.load().items() if row.map.kind in "DUB"])
@@ -31,13 +31,13 @@ def test_a_threshold_ten_times_looser_changes_the_digest(id: str, monkeypatch: p
     rows = dict(table.load())
     rows[id] = replace(rows[id], map=replace(rows[id].map, bad=10.0 * rows[id].map.bad))
     monkeypatch.setattr(table, "load", lambda: rows)
-    assert scoring.constants_digest() != DIGEST
+    assert judge.constants_digest() != DIGEST
 
 
 @pytest.mark.parametrize("name", [name for name in vars(scoring) if name.isupper()])
 def test_a_changed_limit_of_the_verdict_changes_the_digest(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scoring, name, "another")
-    assert scoring.constants_digest() != DIGEST
+    assert judge.constants_digest() != DIGEST
 
 
 @pytest.mark.parametrize("gate", [id for id, row in table.load().items() if row.role == "G"])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fidelity import judge, outside, scoring, table
+from benchmarks.fidelity import judge, outside, table
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.registry import Value, number
@@ -82,9 +82,9 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
 
 
 def test_metrics_from_outside_do_not_move_the_digest_of_the_constants() -> None:
-    before = scoring.constants_digest()
+    before = judge.constants_digest()
     outside.register("lin_more", lambda case: 1.0, category="LIN", definition="more", map="U(0,1)")
-    assert scoring.constants_digest() == before
+    assert judge.constants_digest() == before
 
 
 def test_a_value_that_is_no_number_counts_as_failed(tmp_path: Path) -> None:

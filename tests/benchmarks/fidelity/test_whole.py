@@ -14,8 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from benchmarks.fidelity import judge
 from benchmarks.fidelity import report as report_module
-from benchmarks.fidelity import scoring
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.figures import FIGURES
 from benchmarks.fidelity.files import file_hash
@@ -92,7 +92,7 @@ def test_a_run_scores_all_18_categories_of_a_right_tube(scored, recording) -> No
     assert report["global"] > report["global_null"]
     assert report["split"]["hold"]["sha256"] == sha256(recording[0].read_bytes()).hexdigest()
     assert report["outside"] is None
-    assert report["constants"] == scoring.constants_digest()
+    assert report["constants"] == judge.constants_digest()
     assert report["constants"] in (folder / "report.html").read_text()
     assert report["constants"] in (folder / "report.md").read_text()
     with (folder / "metrics.csv").open(newline="") as file:
