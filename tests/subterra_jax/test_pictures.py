@@ -1,8 +1,5 @@
 """Pictures without a scene: surfaces lie where the tunnel is, face the camera, and the robot stands in them whole."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
@@ -12,6 +9,7 @@ from subterra_jax.adapters.views import TunnelChoice
 from subterra_jax.pictures.carrier import carrier_parts
 from subterra_jax.pictures.stage import Piece, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces
+from tests.subterra_jax.drawn import draw
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +103,10 @@ except Exception as cause:
 
 
 def test_without_a_scene_the_bore_is_drawn_with_the_robot_and_nothing_is_said_at_exit(tmp_path):
-    """In a process of its own: MuJoCo chooses how to draw when it is imported. The environment is not closed."""
-    file = tmp_path / "picture.npy"
-    done = subprocess.run([sys.executable, "-c", DRAW, str(file)], capture_output=True, text=True, check=False)
-    if "cannot draw" in done.stderr:
-        pytest.skip(done.stderr)
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-    picture = np.load(file).astype(int)
+    """The environment is not closed."""
+    picture, said = draw(DRAW, tmp_path / "picture.npy")
+    assert "Traceback" not in said
+    picture = picture.astype(int)
     assert picture.shape == (480, 480, 3)
     red, _, blue = np.moveaxis(picture, -1, 0)
     rows, columns = np.nonzero(red > blue + 60)

@@ -13,21 +13,9 @@ from subterra_jax.baselines.rings import loop as rings
 from subterra_jax.baselines.rings.grid import PacedSteering, PaceMemory
 from subterra_jax.baselines.steering import HeadingHold
 from subterra_jax.evaluation import evaluate, listed_episodes
+from tests.subterra_jax.ringscans import N_BEAMS, PITCH, scans
 
-HALF_WIDTH, DEPTH, PITCH, N_BEAMS, STEPS, DELAY = 2.8, 0.13, 1.35, 16, 640, 4
-ANGLE = 2.0 * np.pi * np.arange(N_BEAMS) / N_BEAMS
-
-
-def scans(station, direction, rng, pockets=True):
-    """Ranges on the axis of a straight tunnel whose left wall has pairs of pockets and whose right wall single ones."""
-    with np.errstate(divide="ignore"):
-        smooth = np.minimum(HALF_WIDTH / np.abs(np.sin(ANGLE)), 30.0)
-    hit = station[:, None] + direction[:, None] * smooth * np.cos(ANGLE)
-    left = direction[:, None] * np.sin(ANGLE) > 0.0
-    place = np.mod(hit - 0.4, PITCH)
-    inside = (np.abs(place - 0.5) < 0.1) | (left & (np.abs(place - 0.9) < 0.1))
-    ranges = smooth * np.where(inside & pockets, 1.0 + DEPTH / HALF_WIDTH, 1.0)
-    return np.clip(ranges + rng.normal(scale=0.05, size=ranges.shape), 0.0, 30.0).astype(np.float32)
+STEPS, DELAY = 640, 4
 
 
 def drive(wet=(), back=False, pockets=True, faults=False, pitch=PITCH, scale=1.03):
