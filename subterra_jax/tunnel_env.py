@@ -18,7 +18,7 @@ from subterra_jax.parts.odometer import hold
 from subterra_jax.parts.part import Batch, Bounds
 from subterra_jax.parts.unicycle import clearance, in_contact, wrap
 from subterra_jax.rows import vary_like
-from subterra_jax.rules import Rule, Traverse
+from subterra_jax.rules import Rule, Traverse, Verdict
 from subterra_jax.state import EnvParams, State, make_alike
 from subterra_jax.tunnel import Tunnel, at_station, foot
 
@@ -105,13 +105,13 @@ class TunnelEnv:
         """Draw the random numbers of one step of a batch; see `Env`. All parts share one call of each kind."""
         normals = {part.name: n for part in self.parts if (n := part.normals(params))}
         uniforms = {part.name: n for part in self.parts if (n := part.uniforms(params))}
-        normal = (
-            _sliced(jax.random.normal(key, (*batch, sum(normals.values())), jnp.float32), normals) if normals else {}
-        )
-        uniform = {}
+        normal, uniform = {}, {}
+        if normals:
+            drawn = jax.random.normal(key, (*batch, sum(normals.values())), jnp.float32)
+            normal = {name: drawn[..., where] for name, where in _slices(normals).items()}
         if uniforms:
-            count = sum(uniforms.values())
-            uniform = _sliced(jax.random.uniform(jax.random.fold_in(key, 1), (*batch, count), jnp.float32), uniforms)
+            drawn = jax.random.uniform(jax.random.fold_in(key, 1), (*batch, sum(uniforms.values())), jnp.float32)
+            uniform = {name: drawn[..., where] for name, where in _slices(uniforms).items()}
         noise: dict[str, Any] = {
             name: Noise(normal.get(name, ()), uniform.get(name, ())) for name in {**normals, **uniforms}
         }
@@ -163,12 +163,7 @@ class TunnelEnv:
         Raises:
             ValueError: The action has another shape, seen when the step is traced.
         """
-        action = jnp.asarray(action)
-        if action.shape != (self.action_size,):
-            raise ValueError(
-                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {action.shape}"
-            )
-        action = action.astype(state.command.dtype)
+        action = self._checked(action).astype(state.command.dtype)
         tunnel = params.tunnel.pick(state.tunnel)
         command = self.motion.obey(action, state, params)
         drive = Drive(command, command)
@@ -195,21 +190,7 @@ class TunnelEnv:
         verdict = self.rule.judge(step, params)
         steps = state.steps + 1
         terminated = step.contact | verdict.ended
-        info = {
-            **verdict.terms,
-            **verdict.info,
-            **moved.info,
-            **self._estimate_info(step),
-            "coverage": jnp.clip(step.furthest / tunnel.length, 0.0, 1.0),
-            "station": place.station,
-            "lateral": place.lateral,
-            "half_width": place.half_width,
-            "clearance": clear,
-            "contact": contact,
-            "success": verdict.success & ~jnp.asarray(moved.fallen),
-        }
-        for part in self.parts:
-            info |= part.info(state.parts[part.name])
+        info = self._info(step, moved, verdict, clear, contact)
         after = State(
             position=moved.position,
             heading=moved.heading,
@@ -264,9 +245,7 @@ class TunnelEnv:
 
     def fields(self, params: EnvParams) -> dict[str, slice]:
         """Return the place of each named entry in an observation."""
-        sizes = {name: jnp.size(low) for name, (low, _) in self._space(params).items()}
-        ends = np.cumsum(list(sizes.values())).tolist()
-        return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        return _slices({name: jnp.size(low) for name, (low, _) in self._space(params).items()})
 
     def observation_space(self, params: EnvParams) -> Box:
         """Return the bounds of an observation."""
@@ -392,13 +371,38 @@ class TunnelEnv:
         given = jnp.concatenate([action[2:size], jnp.zeros(REPORT - size, action.dtype)])
         return jnp.clip(jnp.where(jnp.isnan(given), 0.0, given), low, high)
 
-    def _estimate_info(self, step: Step) -> Info:
-        if self.action_size == 2:
-            return {}
-        return {"estimate_error": step.report[0] - step.place.station, "estimate_log_sigma": step.report[1]}
+    def _info(
+        self, step: Step, moved: Moved, verdict: Verdict, clear: Float[Array, ""], contact: Bool[Array, ""]
+    ) -> Info:
+        """Entries of `info`: those of rule, motion, estimate, environment and parts, in this order."""
+        info = {**verdict.terms, **verdict.info, **moved.info}
+        if self.action_size > 2:
+            info["estimate_error"] = step.report[0] - step.place.station
+            info["estimate_log_sigma"] = step.report[1]
+        info |= {
+            "coverage": jnp.clip(step.furthest / step.tunnel.length, 0.0, 1.0),
+            "station": step.place.station,
+            "lateral": step.place.lateral,
+            "half_width": step.place.half_width,
+            "clearance": clear,
+            "contact": contact,
+            "success": verdict.success & ~jnp.asarray(moved.fallen),
+        }
+        for part in self.parts:
+            info |= part.info(step.before.parts[part.name])
+        return info
+
+    def _checked(self, action: Any) -> Array:
+        """An action as an array, refused where it has another shape than it must have."""
+        action = jnp.asarray(action)
+        if action.shape != (self.action_size,):
+            raise ValueError(
+                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {action.shape}"
+            )
+        return action
 
 
-def _sliced(values: Float[Array, "*batch n"], counts: Mapping[str, int]) -> dict[str, Float[Array, "*batch k"]]:
-    """One array as several, by name."""
-    ends = np.cumsum(list(counts.values())).tolist()
-    return {name: values[..., end - n : end] for (name, n), end in zip(counts.items(), ends, strict=True)}
+def _slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """Places of named pieces that stand one after another."""
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}

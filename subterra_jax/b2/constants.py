@@ -14,7 +14,6 @@ import dataclasses
 LEGS = ("FL", "FR", "RL", "RR")
 PARTS = ("hip", "thigh", "calf")
 JOINTS = tuple(f"{leg}_{part}_joint" for leg in LEGS for part in PARTS)
-N_JOINTS = len(JOINTS)
 
 Vector = tuple[float, float, float]
 

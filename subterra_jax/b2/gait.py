@@ -255,8 +255,3 @@ def check_fits(policy: WalkPolicy, size: int, source: str | Path) -> None:
     """Raises `PolicyError` where a gait was made for observations of another size than `size`."""
     if policy.n_observation != size:
         raise PolicyError(f"{source}: made for observations of {policy.n_observation} numbers, the B2 gives {size}")
-
-
-def zero_action(observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
-    """Return the action that leaves the trot unchanged."""
-    return jnp.zeros((*observation.shape[:-1], 12))
