@@ -14,7 +14,8 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.host.errors import MissingLibraryError
 from train import devices
@@ -31,6 +32,7 @@ __all__ = [
     "MLP",
     "NormalTanhDistribution",
     "Statistics",
+    "TrainState",
     "advantages",
     "clipped_adam",
     "clipped_objective",
@@ -47,6 +49,25 @@ Statistics: TypeAlias = running_statistics.RunningStatisticsState
 # A reading that has not moved yet, such as odometry at a start, would otherwise be divided by nothing.
 _STD_MIN = 1e-3
 _LARGEST = 10.0
+
+
+@struct.dataclass
+class TrainState:
+    """State of a run between two iterations, of a learner that needs nothing else.
+
+    Attributes:
+        weights: Of the networks.
+        moments: State of the optimiser.
+        drive: State of the environments.
+        key: Source of all later randomness.
+        iteration: Iterations done.
+    """
+
+    weights: Any
+    moments: Any
+    drive: Any
+    key: PRNGKeyArray
+    iteration: Int[Array, ""]
 
 
 def start_statistics(shape: tuple[int, ...]) -> Statistics:

@@ -6,8 +6,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 import subterra_jax as st
 from subterra_jax.baselines.wallmap import WallMap, wall_map
@@ -27,6 +26,7 @@ from train.config import (
     positive,
     share,
 )
+from train.learning import TrainState
 from train.report import Finished, Report, report
 
 
@@ -156,25 +156,6 @@ def layout_of(env: Any, params: Any, config: BeliefConfig) -> BeliefLayout:
 
 
 _OUTSIDE = -3.0  # log likelihood of a scan from beyond a mouth
-
-
-@struct.dataclass
-class TrainState:
-    """State of a run between two iterations.
-
-    Attributes:
-        weights: Of the sensor.
-        moments: State of the optimiser.
-        drive: State of the environments.
-        key: Source of all later randomness.
-        iteration: Iterations done.
-    """
-
-    weights: Weights
-    moments: Any
-    drive: lessons.Drive
-    key: PRNGKeyArray
-    iteration: Int[Array, ""]
 
 
 class BeliefLearner(devices.Whole):

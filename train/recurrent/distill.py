@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 import subterra_jax as st
 from subterra_jax.baselines.agent import Agent
 from train import devices, learning
+from train.learning import TrainState
 from train.recurrent import drive as driving
 from train.recurrent import lessons
 from train.recurrent.config import DistillConfig, check_distill
@@ -31,25 +31,6 @@ _KNEE = 0.05
 # the tanh, a student at full speed would not feel that it ought to stop.
 _END = 0.98
 _STANDS = 0.05  # m/s
-
-
-@struct.dataclass
-class TrainState:
-    """State of a run between two iterations.
-
-    Attributes:
-        weights: Of the networks.
-        moments: State of the optimiser.
-        drive: State of the environments.
-        key: Source of all later randomness.
-        iteration: Iterations done.
-    """
-
-    weights: dict[str, Weights]
-    moments: Any
-    drive: lessons.Classroom
-    key: PRNGKeyArray
-    iteration: Int[Array, ""]
 
 
 class DistillLearner(devices.Whole):
