@@ -4,6 +4,7 @@ Example: python -m scene.report build/tunnel --design axis.xml --out build/tunne
 """
 
 import csv
+import dataclasses
 import json
 import sys
 from collections.abc import Iterable
@@ -19,7 +20,7 @@ import tyro
 from scene.bore import Bore, load_bore
 from scene.errors import FitError, RecordingError, require_input
 from scene.report import drawings, sections
-from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, read_design_table
+from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, read_design_table, turn_around
 from scene.report.clearance import Rails, clearance, g1, read_gauge, read_rails
 from scene.report.ifc import write_ifc
 from scene.report.landxml import read_landxml, write_landxml
@@ -43,7 +44,8 @@ class ReportConfig:
         radius: Design radius of a round bore, m.
         gauge: Loading gauge: `g1`, or CSV of a closed polygon of rows `left, height over rail`, m.
         start: Chainage of station 0, m; that of the manifest if neither this nor a design is given.
-        tolerance: Root mean square that an alignment of fewer elements may add to what many elements leave, m.
+        tolerance: Root mean square that an alignment of fewer elements may add to what many elements leave, m; if not
+            given, elements are kept as long as the noise of the axis does not explain them.
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -53,7 +55,7 @@ class ReportConfig:
     radius: float | None = None
     gauge: Literal["g1"] | Path = "g1"
     start: float | None = None
-    tolerance: float = 0.002
+    tolerance: float | None = None
 
 
 def report(config: ReportConfig) -> Path:
@@ -68,20 +70,22 @@ def report(config: ReportConfig) -> Path:
     origin = np.asarray(manifest["frame"]["origin"], float)
     design = None if config.design is None else _read_design(config.design, origin)
     located = None if design is None else _locate(bore, design, config.design)
-    start = _first_chainage(config, manifest, located)
+    chainage = _chainages(config, manifest, bore, design)
     section = _read_section(bore, config)
     gauge = g1() if config.gauge == "g1" else read_gauge(Path(config.gauge))
-    fit = align_bore(bore, str(manifest["name"]), origin, start, config.tolerance)
+    fit = align_bore(bore, str(manifest["name"]), origin, float(chainage[0]), config.tolerance)
+    if chainage[-1] < chainage[0]:
+        fit = dataclasses.replace(fit, alignment=turn_around(fit.alignment, float(chainage[-1])))
     with replace_folder(out) as folder:
-        facts = _facts(bore, manifest, section.name, start, fit)
-        tables = {"metres": sections.tabulate(bore, section, origin, start)}
+        facts = _facts(bore, manifest, section.name, chainage, fit)
+        tables = {"metres": sections.tabulate(bore, section, origin, chainage)}
         if len(bore.ring_station):
-            tables["rings"] = sections.tabulate(bore, section, origin, start, rings=True)
+            tables["rings"] = sections.tabulate(bore, section, origin, chainage, rings=True)
         over, under = sections.volumes(tables["metres"])
         facts |= {"overbreak": f"{over:.2f} m³", "underbreak": f"{under:.2f} m³"}
         ezdxf.options.write_fixed_meta_data_for_testing = True  # no times of day
-        drawings.write_sections(folder / "sections.dxf", bore, section, start)
-        drawings.write_plan_profile(folder / "plan_profile.dxf", bore, origin, start)
+        drawings.write_sections(folder / "sections.dxf", bore, section, chainage)
+        drawings.write_plan_profile(folder / "plan_profile.dxf", bore, origin, chainage)
         drawings.write_unrolled(folder, bore, section)
         drawings.draw_alignment(folder / "alignment.png", fit)
         write_landxml(folder / "alignment.xml", fit.alignment)
@@ -89,14 +93,14 @@ def report(config: ReportConfig) -> Path:
         write_ifc(folder / "tunnel.ifc", bore, fit.alignment, rails, config.scene / "scene.xml", origin)
         if design is not None and located is not None:
             facts |= _write_offsets(folder, bore, design, located)
-        facts |= _write_clearance(folder, rails, bore, gauge, start)
+        facts |= _write_clearance(folder, rails, bore, gauge, chainage)
         if (config.scene / "cloud.ply").is_file():  # a ring survey has none
             cloud: Any = trimesh.load(config.scene / "cloud.ply")
             points = np.asarray(cloud.vertices, float)
-            write_points(folder / "points.laz", bore, points, origin, start)
+            write_points(folder / "points.laz", bore, points, origin, chainage)
         write_csv(folder / "sections.csv", tables["metres"])
         write_workbook(folder / "rings.xlsx", tables, facts)
-        write_report(folder, str(manifest["name"]), facts, tables["metres"], _element_rows(fit))
+        write_report(folder, str(manifest["name"]), facts, tables["metres"], _element_rows(fit, chainage))
     return out
 
 
@@ -128,12 +132,12 @@ def _locate(bore: Bore, design: Design, path: Path | None) -> np.ndarray:
     return located
 
 
-def _first_chainage(config: ReportConfig, manifest: dict[str, Any], located: np.ndarray | None) -> float:
-    if config.start is not None:
-        return config.start
-    if located is not None:
-        return float(located[0, 0])
-    return float(manifest.get("detected", {}).get("chainage_start") or 0.0)
+def _chainages(config: ReportConfig, manifest: dict[str, Any], bore: Bore, design: Design | None) -> np.ndarray:
+    """Return the chainage at each station, m: the design's unless `start` is given; it may fall along the bore."""
+    if config.start is None and design is not None:
+        return design.chainages(bore)
+    found = manifest.get("detected", {}).get("chainage_start") or 0.0
+    return bore.station + float(found if config.start is None else config.start)
 
 
 def _read_section(bore: Bore, config: ReportConfig) -> sections.DesignSection:
@@ -147,10 +151,12 @@ def _read_section(bore: Bore, config: ReportConfig) -> sections.DesignSection:
     return sections.own_section(bore)
 
 
-def _facts(bore: Bore, manifest: dict[str, Any], section: str, start: float, fit: AlignmentFit) -> dict[str, str]:
+def _facts(
+    bore: Bore, manifest: dict[str, Any], section: str, chainage: np.ndarray, fit: AlignmentFit
+) -> dict[str, str]:
     kinds = [element.kind for element in fit.plan.elements]
     return {
-        "length": f"{bore.length:.2f} m, chainage {start:.2f} to {start + bore.length:.2f} m",
+        "length": f"{bore.length:.2f} m, chainage {chainage[0]:.2f} to {chainage[-1]:.2f} m",
         "recording": str(manifest.get("input_provenance", "unknown")),
         "stations that were interpolated": f"{bore.filled.mean():.0%}",
         "design section": section,
@@ -171,12 +177,11 @@ def _write_offsets(folder: Path, bore: Bore, design: Design, located: np.ndarray
     return {"design axis": f"{design.name}; its chainage grows {grows} the stations; the axis lies {spread}"}
 
 
-def _write_clearance(folder: Path, rails: Rails | None, bore: Bore, gauge: Any, start: float) -> dict[str, str]:
+def _write_clearance(folder: Path, rails: Rails | None, bore: Bore, gauge: Any, chainage: np.ndarray) -> dict[str, str]:
     if rails is None:
         return {"clearance": "no track was laid in this scene"}
     free = clearance(bore, rails, gauge, bore.axis.curvature)
     every = max(1, round(1.0 / (bore.station[1] - bore.station[0])))
-    chainage = start + bore.station
     rows = (
         tuple(f"{value:.4f}" for value in (c, *place))
         for c, place in zip(chainage[::every], free[::every], strict=True)
@@ -194,12 +199,13 @@ def _write_rows(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...
         writer.writerows(rows)
 
 
-def _element_rows(fit: AlignmentFit) -> list[tuple[str, ...]]:
-    rows = []
+def _element_rows(fit: AlignmentFit, chainage: np.ndarray) -> list[tuple[str, ...]]:
+    """Return the elements in the order of the stations; their chainages fall where the design's do."""
+    rows, way = [], float(np.sign(chainage[-1] - chainage[0]))
     for number, part in enumerate((fit.plan, fit.profile)):
         for one in part.elements:
             ends = [_describe_bend(value) if number == 0 else f"{value:+.3%}" for value in (one.first, one.last)]
-            rows.append((one.kind, f"{fit.alignment.start + one.start:.2f} m", f"{one.length:.2f} m", *ends))
+            rows.append((one.kind, f"{chainage[0] + way * one.start:.2f} m", f"{one.length:.2f} m", *ends))
     return rows
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from scene.bore import Axis, Bore, axis_through
 from scene.errors import RecordingError, require_input
@@ -13,6 +13,8 @@ from scene.report.elements import Element, Fit, fit_plan, fit_profile
 from scene.report.profiles import Profile
 
 _SAMPLE = 0.25  # m between the points of a sampled alignment
+_MOSTLY = 0.5  # share of interpolated sections from which on a bore with rings is a ring survey's
+_FEWEST = 20  # rings of one
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,18 @@ class Design:
         station, left, up = self.axis.local(flat)
         return np.column_stack([np.interp(station, self.axis.station, self.chainage), -left, up])
 
+    def chainages(self, bore: Bore) -> Float[np.ndarray, " n"]:
+        """Return the chainage at each station of a bore, m; where the design does not reach, arc length goes on."""
+        found = self.locate(bore.position)[:, 0]
+        inside = np.flatnonzero((found > self.chainage.min()) & (found < self.chainage.max()))
+        if len(inside) < 2:
+            return found
+        first, last = inside[0], inside[-1]
+        way = np.sign(found[last] - found[first])
+        found[:first] = found[first] - way * (bore.station[first] - bore.station[:first])
+        found[last + 1 :] = found[last] + way * (bore.station[last + 1 :] - bore.station[last])
+        return found
+
 
 @dataclass(frozen=True)
 class AlignmentFit:
@@ -154,8 +168,10 @@ class AlignmentFit:
     profile: Fit
 
 
-def align_bore(bore: Bore, name: str, origin: Float[np.ndarray, "3"], start: float, tolerance: float) -> AlignmentFit:
-    """Fit an alignment to the axis of a bore.
+def align_bore(
+    bore: Bore, name: str, origin: Float[np.ndarray, "3"], start: float, tolerance: float | None = None
+) -> AlignmentFit:
+    """Fit an alignment to the axis of a bore: a point a metre, or a ring survey's rings.
 
     Args:
         bore: The bore.
@@ -167,8 +183,7 @@ def align_bore(bore: Bore, name: str, origin: Float[np.ndarray, "3"], start: flo
     Raises:
         FitError: The bore is too short.
     """
-    every = max(1, round(1.0 / (bore.station[1] - bore.station[0])))
-    rows = np.unique(np.append(np.arange(0, len(bore.station), every), len(bore.station) - 1))
+    rows = _rows_to_fit(bore)
     points = bore.position[rows]
     run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(bore.position[:, :2], axis=0).T))])[rows]
     plan, profile = fit_plan(points[:, :2], run, tolerance), fit_profile(points[:, 2], run, tolerance)
@@ -179,6 +194,29 @@ def align_bore(bore: Bore, name: str, origin: Float[np.ndarray, "3"], start: flo
         for one in profile.elements
     ]  # fmt: skip
     return AlignmentFit(Alignment(name, start, tuple(pieces), tuple(verticals)), plan, profile)
+
+
+def turn_around(alignment: Alignment, start: float) -> Alignment:
+    """Return the same line run from its other end, whose chainage is `start`, m."""
+    plan = []
+    for piece in reversed(alignment.plan):
+        place, heading = piece.at(np.array([piece.length]))
+        plan.append(Piece(place[0], float(heading[0]) + np.pi, piece.length, -piece.last, -piece.first))
+    profile = tuple(
+        Vertical(alignment.length - one.start - one.length, float(one.at(np.array([one.length]))[0]), one.length,
+                 -one.last, -one.first)
+        for one in reversed(alignment.profile)
+    )  # fmt: skip
+    return Alignment(alignment.name, start, tuple(plan), profile)
+
+
+def _rows_to_fit(bore: Bore) -> Int[np.ndarray, " r"]:
+    """Return rows a metre apart; of a ring survey, whose axis is interpolated in between, those of its rings."""
+    last = len(bore.station) - 1
+    if bore.filled.mean() > _MOSTLY and len(bore.ring_station) >= _FEWEST:
+        return np.unique(np.searchsorted(bore.station, bore.ring_station - 0.5 * bore.station[1]).clip(0, last))
+    every = max(1, round(1.0 / (bore.station[1] - bore.station[0])))
+    return np.unique(np.append(np.arange(0, last + 1, every), last))
 
 
 def _split(element: Element) -> list[Element]:

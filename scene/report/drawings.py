@@ -16,6 +16,7 @@ from scene.report.sections import DesignSection
 
 _LAYERS = {"MEASURED": 5, "DESIGN": 3, "AXIS": 1, "TEXT": 7, "GRID": 8}
 _TEXT = 0.25  # height of text, m
+_BELOW = 20.0  # m from the plan down to the profile
 _PAD = 2.0  # m between two sections in a drawing
 
 
@@ -27,14 +28,16 @@ def _drawing() -> Drawing:
     return document
 
 
-def write_sections(path: Path, bore: Bore, design: DesignSection, start: float, every: float = 10.0) -> int:
-    """Write sections as measured and as designed, side by side, looking ahead; returns their number.
+def write_sections(
+    path: Path, bore: Bore, design: DesignSection, chainage: Float[np.ndarray, " n"], every: float = 10.0
+) -> int:
+    """Write sections as measured and as designed, side by side, looking towards growing stations; returns their number.
 
     Args:
         path: The DXF file.
         bore: The bore.
         design: The section that was to be built.
-        start: Chainage of station 0, m.
+        chainage: Chainage of each station, m.
         every: Distance from section to section, m.
     """
     document = _drawing()
@@ -51,13 +54,15 @@ def write_sections(path: Path, bore: Bore, design: DesignSection, start: float, 
             space.add_lwpolyline(points.tolist(), close=True, dxfattribs={"layer": layer})
         for end in ((0.3, 0.0), (0.0, 0.3)):
             space.add_line(middle - end, middle + end, dxfattribs={"layer": "AXIS"})
-        label = space.add_text(f"{start + bore.station[row]:.2f}", height=_TEXT, dxfattribs={"layer": "TEXT"})
+        label = space.add_text(f"{chainage[row]:.2f}", height=_TEXT, dxfattribs={"layer": "TEXT"})
         label.set_placement(middle - [0.0, 0.5 * pitch[1] - 0.5], align=ezdxf.enums.TextEntityAlignment.MIDDLE_CENTER)
     document.saveas(path)
     return len(rows)
 
 
-def write_plan_profile(path: Path, bore: Bore, origin: Float[np.ndarray, "3"], start: float) -> None:
+def write_plan_profile(
+    path: Path, bore: Bore, origin: Float[np.ndarray, "3"], chainage: Float[np.ndarray, " n"]
+) -> None:
     """Write the plan with walls in the input's frame, and below it the profile, heights ten times as large."""
     document = _drawing()
     space = document.modelspace()
@@ -67,17 +72,17 @@ def write_plan_profile(path: Path, bore: Bore, origin: Float[np.ndarray, "3"], s
         space.add_lwpolyline(line.tolist(), dxfattribs={"layer": layer})
     for row in _each(bore, 20.0):
         space.add_line(plan[row] - half[row], plan[row] + half[row], dxfattribs={"layer": "GRID"})
-        _write_label(space, f"{start + bore.station[row]:.0f}", plan[row] + 1.3 * half[row])
-    corner = plan.min(axis=0) - [0.0, 60.0]
+        _write_label(space, f"{chainage[row]:.0f}", plan[row] + 1.3 * half[row])
     down, up = (int(np.argmin(np.abs(bore.angle - angle))) for angle in (-np.pi / 2, np.pi / 2))
     axis = bore.position[:, 2]
     lines = (axis, axis - bore.radius[:, down] * bore.up[:, 2], axis + bore.radius[:, up] * bore.up[:, 2])
     least = float(lines[1].min())
+    corner = plan.min(axis=0) - [0.0, 10.0 * (float(lines[2].max()) - least) + _BELOW]
     for layer, line in zip(("AXIS", "MEASURED", "MEASURED"), lines, strict=True):
         points = corner + np.column_stack([bore.station, 10.0 * (line - least)])
         space.add_lwpolyline(points.tolist(), dxfattribs={"layer": layer})
     for row in _each(bore, 20.0):
-        _write_label(space, f"{start + bore.station[row]:.0f}", np.add(corner, [bore.station[row], -2.0]))
+        _write_label(space, f"{chainage[row]:.0f}", np.add(corner, [bore.station[row], -2.0]))
     _write_label(space, f"profile, heights x 10, from {least + origin[2]:.2f} m", np.add(corner, [0.0, -5.0]))
     document.saveas(path)
 
@@ -108,7 +113,7 @@ def write_unrolled(folder: Path, bore: Bore, design: DesignSection) -> tuple[flo
     seen = np.abs(field[np.isfinite(field)])
     limit = max(0.005, float(np.quantile(seen, 0.99)) if len(seen) else 0.0)
     rows = max(1, int(np.ceil(bore.length / 200.0)))
-    figure, axes = plt.subplots(rows, 1, figsize=(11, 2.0 * rows + 0.6), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(rows, 1, figsize=(11, 2.0 * rows + 1.0), squeeze=False, layout="constrained")
     around = bore.radius.mean() * 2.0 * np.pi
     names = ["floor", "left", "crown", "right", "floor"]
     for k, one in enumerate(axes[:, 0]):
@@ -122,7 +127,7 @@ def write_unrolled(folder: Path, bore: Bore, design: DesignSection) -> tuple[flo
         one.set_xlim(200.0 * k, min(200.0 * (k + 1), bore.length) if rows == 1 else 200.0 * (k + 1))
         one.set_yticks(np.linspace(0.0, around, 5), names)
     axes[-1, 0].set_xlabel("station, m")
-    figure.colorbar(image, ax=axes, label="outside (+) or inside (-) the design, m", shrink=0.9)
+    figure.colorbar(image, ax=axes, label="outside (+) or\ninside (-) the design, m", shrink=0.9)
     _save(figure, folder / "unrolled.png")
     return float(bore.station[1] - bore.station[0]), around / field.shape[1]
 

@@ -2,7 +2,8 @@
 
 A fit with many knots is thinned to one with too few. Knots are then put in where they take enough off the misfit, all
 numbers and places being fitted anew each time, and taken out where they do not. At last neighbouring values are made
-equal, or zero, where that costs next to nothing.
+equal, or zero, where that costs next to nothing. Enough is more than noise would save by chance, with noise taken from
+the points: an axis out of a smoothed cloud errs alike over some metres, one of measured rings from ring to ring.
 """
 
 from collections.abc import Iterator
@@ -29,10 +30,12 @@ from scene.report.profiles import (
 )
 
 _FIRST_SPACING = 8.0  # m between the knots of the first fit
+_FEWEST = 2.5  # points to a knot of the first fit
 _COARSE = 0.003  # m; the first fit is thinned by at least this much, for what is missing is put in again
 _STRAIGHT = 2e-5  # 1/m; a curve of a radius above 50 km is a line
 _LEAST_NOISE = 2e-5  # m; no survey is finer than this
 _WORTH = 0.1  # a knot must take this share of the tolerance, squared, off the mean square
+_STAGE = 30.0  # from one price of a knot to the next lower one, on the way to the last
 _PLACES = 2.0  # m between the places at which a further knot is thought of
 _TRIES = 4  # knots whose removal, or places whose knot, is tried at a time
 
@@ -83,13 +86,15 @@ class Fit:
         return float(np.sqrt(np.mean(self.residual**2)))
 
 
-def fit_plan(points: Float[np.ndarray, "n 2"], station: Float[np.ndarray, " n"], tolerance: float = 0.003) -> Fit:
+def fit_plan(points: Float[np.ndarray, "n 2"], station: Float[np.ndarray, " n"], tolerance: float | None = None) -> Fit:
     """Fit lines, arcs and clothoids to an axis in plan.
 
     Args:
         points: Points of the axis in order, m.
         station: Their stations, growing: arc length in plan, m.
-        tolerance: Root mean square by which fewer elements may be further from the points than many, m.
+        tolerance: Root mean square by which fewer elements may be further from the points than many, m; 0 asks for
+            as many as noise that is independent from point to point does not explain, `None` for as many as noise
+            that errs alike over some metres does not.
 
     Raises:
         ValueError: There are fewer than ten points, or they lie on less than 20 m.
@@ -102,7 +107,9 @@ def fit_plan(points: Float[np.ndarray, "n 2"], station: Float[np.ndarray, " n"],
     )
 
 
-def fit_profile(height: Float[np.ndarray, " n"], station: Float[np.ndarray, " n"], tolerance: float = 0.003) -> Fit:
+def fit_profile(
+    height: Float[np.ndarray, " n"], station: Float[np.ndarray, " n"], tolerance: float | None = None
+) -> Fit:
     """Fit straight grades and parabolas to heights over station; as `fit_plan`.
 
     Raises:
@@ -114,22 +121,31 @@ def fit_profile(height: Float[np.ndarray, " n"], station: Float[np.ndarray, " n"
 def _first(station: Float[np.ndarray, " n"], start: Float[np.ndarray, " i"]) -> Profile:
     if len(station) < 10 or station[-1] - station[0] < 20.0:
         raise ValueError(f"elements need an axis of 20 m and ten points, got {len(station)} points")
-    count = max(3, round((station[-1] - station[0]) / _FIRST_SPACING) + 1)
+    spacing = max(_FIRST_SPACING, _FEWEST * float(np.median(np.diff(station))))
+    count = max(3, round((station[-1] - station[0]) / spacing) + 1)
     knot = np.linspace(station[0], station[-1], count)
     return Profile(knot, np.zeros(count), np.asarray(start, float))
 
 
 def _fit(
-    target: PlanTarget | HeightTarget, start: Float[np.ndarray, " i"], tolerance: float, kinds: tuple[str, str, str]
-) -> Fit:
+    target: PlanTarget | HeightTarget, start: Float[np.ndarray, " i"], tolerance: float | None,
+    kinds: tuple[str, str, str],
+) -> Fit:  # fmt: skip
     """Find the knots, make values equal where they can be, and name the elements."""
     first = _first(target.station, start)
     dense = adjust(first, np.arange(len(first.knot)), target, move=False)
-    allowed = _square(dense, target) / len(target.station) + max(tolerance, _COARSE) ** 2
+    allowed = _square(dense, target) / len(target.station) + max(tolerance or 0.0, _COARSE) ** 2
     thin = _thin_linear(dense, target, allowed)
     thin = adjust(thin, np.arange(len(thin.knot)), target)
-    price = _price(target, tolerance)
-    profile, tie = _equalise(_take_out(_put_in(thin, target, price), target, price), target, price)
+    price = _price(target, dense, tolerance)
+    # The dearest knots first: put in all at once, they settle where none of them can leave alone.
+    profile, stage = thin, max(price, _WORTH * len(target.station) * _COARSE**2)
+    while True:
+        profile = _take_out(_put_in(profile, target, stage), target, stage)
+        if stage <= price:
+            break
+        stage = max(price, stage / _STAGE)
+    profile, tie = _equalise(profile, target, price)
     return Fit(profile, _name(profile, tie, kinds), target.miss(profile), target.station)
 
 
@@ -138,14 +154,37 @@ def _square(profile: Profile, target: Target) -> float:
     return float(np.sum(target.miss(profile) ** 2))
 
 
-def _price(target: PlanTarget | HeightTarget, tolerance: float) -> float:
+def _price(target: PlanTarget | HeightTarget, dense: Profile, tolerance: float | None) -> float:
     """Return the sum of squares that a knot must save, m².
 
-    That is what chance saves with two more numbers by Schwarz's criterion, and a share of the tolerance.
+    That is what chance saves with two more numbers by Schwarz's criterion, and a share of the tolerance. Without one,
+    noise is what the dense fit leaves: elements are longer than its knots are apart.
     """
     n = len(target.station)
+    if tolerance is None:
+        sigma, alike = correlated_noise(target.miss(dense), len(dense.knot) + len(dense.start))
+        return 2.0 * np.log(n / alike) * alike * max(sigma, _LEAST_NOISE) ** 2
     noise = max(target.noise(), _LEAST_NOISE)
     return max(2.0 * np.log(n) * noise**2, _WORTH * n * tolerance**2)
+
+
+def correlated_noise(residual: Float[np.ndarray, " n"], numbers: int) -> tuple[float, float]:
+    """Return the noise of points and over how many of them it errs alike, by what a fit leaves.
+
+    Args:
+        residual: Distances of the points from the fit, m.
+        numbers: Numbers that were fitted.
+
+    Returns:
+        Standard deviation, m, by the median, which a few misfits do not change; sum of the correlations with all
+        points, up to the first that is negative: 1 where each point errs on its own.
+    """
+    n = len(residual)
+    sigma = 1.4826 * float(np.median(np.abs(residual))) * np.sqrt(n / max(1, n - numbers))
+    power = float(np.mean(residual**2))
+    shared = [float(residual[k:] @ residual[: n - k]) / n for k in range(1, n // 4)]
+    until = next((k for k, value in enumerate(shared) if value <= 0.0), len(shared))
+    return sigma, 1.0 + 2.0 * sum(shared[:until]) / max(power, 1e-30)
 
 
 def _put_in(profile: Profile, target: Target, price: float) -> Profile:
@@ -154,7 +193,9 @@ def _put_in(profile: Profile, target: Target, price: float) -> Profile:
         before = _square(profile, target)
         for place in _useful_places(profile, target):
             trial = _with(profile, place)
-            trial = adjust(trial, np.arange(len(trial.knot)), target)
+            free = np.arange(len(trial.knot))
+            # Values first: from there on moving knots can only gain, whatever they run into.
+            trial = adjust(adjust(trial, free, target, move=False), free, target)
             if _square(trial, target) < before - price:
                 profile = trial
                 break

@@ -289,8 +289,11 @@ def _add_clear_bore(
     wall = _ring(bore, rows, _SECTION_POINTS)
     chainage, axis = alignment.sample()
     axis = axis - origin
+    begin, end = (float(np.hypot(*(one - bore.position[0])[:2])) for one in axis[[0, -1]])
+    if begin > end:  # the alignment runs against the stations
+        rows, wall, run = rows[::-1], wall[::-1], run[-1] - run
     heading = np.unwrap(np.arctan2(*np.gradient(axis[:, :2], axis=0).T[::-1]))
-    place = run[rows] * alignment.length / run[-1]
+    place = run[rows] * alignment.length / run.max()
     middle = np.stack([np.interp(place, chainage - alignment.start, part) for part in axis.T], axis=-1)
     turn = np.interp(place, chainage - alignment.start, heading)
     apart = wall - middle[:, None]

@@ -106,7 +106,11 @@ def fit_circles(bore: Bore) -> tuple[Float[np.ndarray, " n"], ...]:
 
 
 def tabulate(
-    bore: Bore, design: DesignSection, origin: Float[np.ndarray, "3"], start: float, rings: bool = False
+    bore: Bore,
+    design: DesignSection,
+    origin: Float[np.ndarray, "3"],
+    chainage: Float[np.ndarray, " n"],
+    rings: bool = False,
 ) -> np.ndarray:
     """Return the table, `(k,)` of `ROW`; m, m².
 
@@ -114,7 +118,7 @@ def tabulate(
         bore: The bore.
         design: The section that was to be built.
         origin: Offset of the tunnel frame, m.
-        start: Chainage of station 0, m.
+        chainage: Chainage of each station, m.
         rings: One row for each ring joint instead of one for each metre.
     """
     wanted = bore.ring_station if rings and len(bore.ring_station) else np.arange(0.0, bore.length + 1e-9, 1.0)
@@ -127,7 +131,7 @@ def tabulate(
     table = np.zeros(len(rows), ROW)
     place = bore.position[rows] + origin
     values = {
-        "station": bore.station[rows], "chainage": start + bore.station[rows], "easting": place[:, 0],
+        "station": bore.station[rows], "chainage": chainage[rows], "easting": place[:, 0],
         "northing": place[:, 1], "elevation": place[:, 2], "width": bore.width[rows], "height": bore.height[rows],
         "area": 0.5 * step * np.sum(bore.radius[rows] ** 2, axis=1), "circle_radius": radius, "circle_left": left,
         "circle_up": up, "circle_rms": rms, "largest_diameter": most, "smallest_diameter": least,

@@ -71,7 +71,11 @@ def _cell(value: np.generic) -> float | str:
 
 
 def write_points(
-    path: Path, bore: Bore, points: Float[np.ndarray, "n 3"], origin: Float[np.ndarray, "3"], start: float
+    path: Path,
+    bore: Bore,
+    points: Float[np.ndarray, "p 3"],
+    origin: Float[np.ndarray, "3"],
+    chainage: Float[np.ndarray, " n"],
 ) -> None:
     """Write points as LAZ in the input's frame, each with its place on the bore as extra dimensions.
 
@@ -83,7 +87,7 @@ def write_points(
         bore: The bore.
         points: Points in the tunnel frame, m.
         origin: Offset of the tunnel frame, m.
-        start: Chainage of station 0, m.
+        chainage: Chainage of each station of the bore, m.
     """
     station, left, up = bore.axis.local(points)
     inside = (station >= 0.0) & (station <= bore.length)
@@ -92,7 +96,7 @@ def write_points(
     header.offsets, header.scales = np.floor(origin), np.full(3, 1e-4)
     header.creation_date = datetime.date(2000, 1, 1)  # no times of day
     values = {
-        "station": start + station,
+        "station": np.interp(station, bore.station, chainage),
         "offset": -left,
         "height": up,
         "deviation": _deviation(bore, station, left, up),

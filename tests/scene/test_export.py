@@ -12,6 +12,7 @@ from scene.export import main
 from tests.scene.test_report import ORIGIN, scene  # noqa: F401 (a fixture)
 
 GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)
+N = 10_000  # rays
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +23,13 @@ def rays(scene):  # noqa: F811
     mujoco.mj_forward(model, data)
     rng = np.random.default_rng(0)
     with np.load(scene / "bore.npz") as bore:
-        rows = rng.integers(8, len(bore["station"]) - 8, 2000)
-        origins = bore["position"][rows] + rng.uniform(-0.5, 0.5, (2000, 3))
-    headings = rng.normal(size=(2000, 3))
+        rows = rng.integers(8, len(bore["station"]) - 8, N)
+        origins = bore["position"][rows] + rng.uniform(-0.5, 0.5, (N, 3))
+    headings = rng.normal(size=(N, 3))
     headings /= np.linalg.norm(headings, axis=1, keepdims=True)
-    distance = np.empty(2000)
+    distance = np.empty(N)
     geom = np.zeros(1, np.int32)
-    for k in range(2000):
+    for k in range(N):
         distance[k] = mujoco.mj_ray(model, data, origins[k], headings[k], GROUPS, 1, -1, geom)
     return origins, headings, np.where(distance < 0.0, np.inf, distance)
 

@@ -1,10 +1,12 @@
-"""Takeaways for surveyors: alignment, LandXML, tables, drawings, clearance, and what is refused."""
+"""Takeaways for surveyors: tables, chainages, drawings, clearance, and what is refused."""
 
 import csv
 import dataclasses
 import json
 
 import ezdxf
+import ifcopenshell
+import ifcopenshell.geom
 import laspy
 import numpy as np
 import openpyxl
@@ -17,12 +19,9 @@ from scene.errors import FitError, RecordingError
 from scene.output import write_geometry
 from scene.report import sections
 from scene.report.__main__ import main
-from scene.report.alignment import Alignment, Piece, Vertical, align_bore, design_of
+from scene.report.alignment import align_bore, design_of
 from scene.report.clearance import Gauge, Rails, clearance, g1, read_gauge, throw
-from scene.report.elements import fit_plan, fit_profile
-from scene.report.landxml import read_landxml, write_landxml
-from scene.report.profiles import LEAST_ELEMENT, Profile, stepped
-from scene.survey.alignment import draw_railway, lay_out, metro_elements
+from scene.report.landxml import read_landxml
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 
@@ -49,155 +48,6 @@ def cloud_of(bore: Bore) -> np.ndarray:
     return np.concatenate([points, points + 100.0 * frame.tangent])
 
 
-def railway(length: float = 240.0):
-    """A drawn railway, its points in plan with their run, and the knots that made it."""
-    elements = draw_railway(np.random.default_rng(3), length)
-    line = lay_out(np.random.default_rng(0), length, elements)
-    points = line.frames(np.arange(0.0, length + 0.01, 1.0)).position
-    run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points[:, :2], axis=0).T))])
-    return elements, points, run
-
-
-def test_lines_arcs_and_clothoids_of_a_railway_are_found_in_a_noisy_axis():
-    truth, points, run = railway()
-    noisy = points + np.random.default_rng(1).normal(0.0, 0.003, points.shape)
-    fit = fit_plan(noisy[:, :2], run, 0.001)
-    assert fit.rms < 0.004
-    inner = truth.plan[(truth.plan > 5.0) & (truth.plan < 235.0)]
-    knots = fit.profile.knot
-    assert np.median([np.abs(knots - place).min() for place in inner]) < 1.5
-    for start, end, bend in ((45.0, 66.0, -2.8545e-3), (146.0, 169.0, 5.265e-3)):  # arcs of the truth
-        assert fit.profile.at(np.linspace(start, end, 20)).mean() == pytest.approx(bend, rel=0.01)
-
-
-def known(elements, fit, length):
-    """Errors of the clothoids of a truth, as shares: of their lengths, and of the curvature at their sharper ends."""
-    knot, value, rows = fit.profile.knot, fit.profile.value, []
-    for start, end, first, last in zip(
-        elements.plan[:-1], elements.plan[1:], elements.curvature[:-1], elements.curvature[1:], strict=True
-    ):
-        if start < 1.0 or end > length - 1.0 or first == last:
-            continue
-        i, j = (int(np.argmin(np.abs(knot - place))) for place in (start, end))
-        sharper, found = (last, value[j]) if abs(last) > abs(first) else (first, value[i])
-        rows.append(((knot[j] - knot[i]) / (end - start) - 1.0, found / sharper - 1.0))
-    return np.abs(rows).T
-
-
-def points_of(elements, length, sigma, seed):
-    """Points of a known alignment every metre, m, and their run."""
-    line = lay_out(np.random.default_rng(0), length, elements)
-    points = line.frames(np.arange(0.0, length + 0.01, 1.0)).position[:, :2]
-    run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    return points + np.random.default_rng(seed).normal(0.0, sigma, points.shape), run
-
-
-@pytest.mark.slow
-def test_every_clothoid_of_the_metro_is_found_to_a_thousandth_where_nothing_is_uncertain():
-    elements = metro_elements(np.random.default_rng(0), 351.0)
-    fit = fit_plan(*points_of(elements, 351.0, 0.0, 0), 0.0)
-    length, bend = known(elements, fit, 351.0)
-    assert len(length) >= 9
-    assert max(length.max(), bend.max()) < 0.001
-
-
-@pytest.mark.slow
-def test_clothoids_are_found_to_a_hundredth_where_noise_leaves_that_much():
-    """Two tenths of a millimetre of noise; with 3 mm even the best estimate of these lengths is off by more."""
-    elements = draw_railway(np.random.default_rng(13), 351.0)
-    fit = fit_plan(*points_of(elements, 351.0, 0.0002, 5), 0.0)
-    length, bend = known(elements, fit, 351.0)
-    assert len(length) >= 5
-    assert max(length.max(), bend.max()) < 0.01
-
-
-def test_a_knot_as_near_as_may_be_to_another_does_not_hold_the_rest():
-    knot = np.array([0.0, 20.0, 20.0 + LEAST_ELEMENT, 60.0, 90.0])
-    profile = Profile(knot, np.zeros(5), np.zeros(3))
-    tie = np.full(5, -1)
-    moved = stepped(profile, tie, np.array([0.0, 0.0, 0.0, 2.0, 0.0, 5.0]), True).knot
-    assert moved == pytest.approx([0.0, 22.0, 22.0 + LEAST_ELEMENT, 65.0, 90.0])
-
-
-def test_fewer_elements_are_used_where_more_misfit_is_allowed():
-    _, points, run = railway()
-    counts = [len(fit_plan(points[:, :2], run, tolerance).profile.knot) for tolerance in (0.001, 0.05)]
-    assert counts[1] < counts[0] < 40
-
-
-def test_a_grade_with_a_parabola_is_found():
-    station = np.arange(0.0, 121.0)
-    profile = Profile(np.array([0.0, 40.0, 80.0, 120.0]), np.array([-0.01, -0.01, 0.02, 0.02]), np.array([5.0]))
-    fit = fit_profile(profile.height(station), station, 5e-4)
-    assert [element.kind for element in fit.elements] == ["grade", "parabola", "grade"]
-    assert [element.start for element in fit.elements[1:]] == pytest.approx([40.0, 80.0], abs=1.0)
-    assert fit.elements[-1].last == pytest.approx(0.02, abs=1e-4)
-
-
-def test_curvature_integrates_to_a_circle():
-    bend = Profile(np.array([0.0, 100.0]), np.array([0.01, 0.01]), np.array([0.0, 0.0, 0.0]))
-    at, heading = bend.plan(np.array([50.0 * np.pi]))  # beyond the last knot the last value holds
-    assert heading[0] == pytest.approx(np.pi / 2)
-    at, _ = bend.plan(np.array([100.0]))
-    assert at[0] == pytest.approx([100.0 * np.sin(1.0), 100.0 * (1.0 - np.cos(1.0))], abs=1e-6)
-
-
-ALIGNMENT = Alignment(
-    "made by hand", 1000.0,
-    (Piece(np.array([271_100.0, 2_103_050.0]), 0.3, 40.0, 0.0, 0.0),),
-    (Vertical(0.0, -12.0, 30.0, 0.01, 0.01), Vertical(30.0, -11.7, 40.0, 0.01, -0.02)),
-)  # fmt: skip
-
-
-def chained(*bends: tuple[float, float, float]) -> Alignment:
-    """Elements of length, first and last curvature, each where the one before ends."""
-    pieces = [ALIGNMENT.plan[0]]
-    for length, first, last in bends:
-        place, heading = pieces[-1].at(np.array([pieces[-1].length]))
-        pieces.append(Piece(place[0], float(heading[0]), length, first, last))
-    return dataclasses.replace(ALIGNMENT, plan=tuple(pieces))
-
-
-def test_landxml_reads_back_to_under_a_micrometre(tmp_path):
-    there = chained(
-        (30.0, 0.0, 0.004), (50.0, 0.004, 0.004), (25.0, 0.004, 0.0), (20.0, 0.0, -0.01), (9.0, -0.01, -0.02)
-    )
-    write_landxml(tmp_path / "a.xml", there)
-    back = read_landxml(tmp_path / "a.xml")
-    for one, other in zip(there.sample(), back.sample(), strict=True):
-        assert np.abs(one - other).max() < 1e-6
-    assert [piece.kind for piece in back.plan] == ["line", "clothoid", "arc", "clothoid", "clothoid", "clothoid"]
-    write_landxml(tmp_path / "b.xml", back)
-    again = read_landxml(tmp_path / "b.xml")
-    assert np.abs(again.sample()[1] - there.sample()[1]).max() < 1e-6
-
-
-def test_landxml_in_feet_is_read_in_metres(tmp_path):
-    write_landxml(tmp_path / "a.xml", chained((30.0, 0.0, 0.004)))
-    text = (tmp_path / "a.xml").read_text().replace('linearUnit="meter"', 'linearUnit="foot"')
-    (tmp_path / "a.xml").write_text(text)
-    assert read_landxml(tmp_path / "a.xml").length == pytest.approx(70.0 * 0.3048)
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (("<LandXML", "<Other"), "not an XML file|no LandXML"),
-        (("clothoid", "bloss"), "'bloss' is not read"),
-        (('linearUnit="meter"', 'linearUnit="cubit"'), "unit 'cubit'"),
-        (('radiusEnd="250.0"', 'radiusEnd="25.0"'), "ends .* m from the beginning of the next"),
-        (('rot="ccw"', 'turn="ccw"'), "lacks a part"),
-    ],
-)
-def test_landxml_that_is_none_is_refused_in_a_sentence(tmp_path, change, sentence):
-    write_landxml(tmp_path / "a.xml", chained((30.0, 0.0, 0.004), (20.0, 0.004, 0.004)))
-    text = (tmp_path / "a.xml").read_text()
-    assert change[0] in text
-    (tmp_path / "a.xml").write_text(text.replace(*change))
-    with pytest.raises(RecordingError, match=sentence):
-        read_landxml(tmp_path / "a.xml")
-
-
 def test_points_are_located_on_a_design(bore: Bore):
     fit = align_bore(bore, "arc", ORIGIN, 500.0, 0.001)
     design = design_of(fit.alignment, ORIGIN)
@@ -219,7 +69,7 @@ def test_the_best_fit_circle_ovality_and_breaks_of_a_known_section(bore: Bore):
     assert radius[0] == pytest.approx(2.9, abs=1e-3)
     assert rms[0] == pytest.approx(0.03 / np.sqrt(2.0), rel=0.02)
     design = sections.circle_section(round_bore, 2.9)
-    table = sections.tabulate(round_bore, design, ORIGIN, 0.0)
+    table = sections.tabulate(round_bore, design, ORIGIN, round_bore.station)
     assert table["largest_diameter"][0] - table["smallest_diameter"][0] == pytest.approx(0.12, abs=1e-3)
     # ∫ of the positive half: 2.9 · 0.03 · 2 ∫ cos over a quarter, to the first order.
     assert table["over"][0] == pytest.approx(2.9 * 0.03 * 2.0, rel=0.02)
@@ -300,7 +150,7 @@ def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
     assert offsets[10:-10, 2] == pytest.approx(-0.1, abs=0.003)  # the bore lies to the left of the design
     points = laspy.read(out / "points.laz")
     assert len(points) == 3  # those 100 m on are beyond the end
-    assert points["station"] == pytest.approx(712.0, abs=0.02)
+    assert points["station"] == pytest.approx(700.0 + 0.25 * 12.0 / bore.station[1], abs=0.02)  # the design's
     assert points["offset"] == pytest.approx([0.0, -1.0, 2.85], abs=0.002)
     assert points["height"] == pytest.approx([2.8, 0.5, -0.5], abs=0.002)
     assert points["deviation"] == pytest.approx(
@@ -323,6 +173,47 @@ def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
         "tunnel.ifc",
     )
     assert all((out / name).read_bytes() == (again / name).read_bytes() for name in same)
+
+
+def test_chainages_that_fall_along_the_bore_fall_in_every_file(scene, bore: Bore, tmp_path):
+    """A design from the other portal: it counts from 700 at the bore's end, 24 m off, and 5 % shorter."""
+    design, out = tmp_path / "design.csv", tmp_path / "report"
+    chainage = 700.0 + 0.95 * (24.0 - bore.station)
+    rows = np.column_stack([chainage, bore.position + ORIGIN])[::-1]
+    np.savetxt(design, rows, delimiter=",", header="CHAINAGE,EASTING,NORTHING,ELEVATION", comments="", fmt="%.5f")
+    assert main([str(scene), "--design", str(design), "--out", str(out)]) == 0
+    whole = np.rint(np.interp(np.arange(0.0, bore.length), bore.station, np.arange(len(bore.station)))).astype(int)
+    every = round(1.0 / bore.station[1])
+    for name, column, wanted in (
+        ("sections.csv", 1, chainage[whole]),
+        ("clearance.csv", 0, chainage[::every]),
+        ("offsets.csv", 1, chainage),
+    ):
+        with (out / name).open() as file:
+            found = np.array([float(row[column]) for row in list(csv.reader(file))[1:]])
+        assert found == pytest.approx(wanted, abs=0.02), name
+    points = laspy.read(out / "points.laz")
+    assert points["station"] == pytest.approx(700.0 + 0.95 * 12.0, abs=0.03)
+    there = read_landxml(out / "alignment.xml")  # runs from 700 on, from the bore's end to its beginning
+    assert there.start == pytest.approx(700.0, abs=0.02)
+    _, line = there.sample()
+    assert line[0] == pytest.approx(bore.position[-1] + ORIGIN, abs=0.01)
+    assert line[-1] == pytest.approx(bore.position[0] + ORIGIN, abs=0.01)
+    labels = [one.dxf.text for one in ezdxf.readfile(out / "sections.dxf").modelspace().query("TEXT")]
+    assert [float(one) for one in labels] == pytest.approx(chainage[whole[[0, 10, 20]]], abs=0.01)
+    model = ifcopenshell.open(out / "tunnel.ifc")
+    (sign,) = model.by_type("IfcReferent")
+    assert float(sign.Name) == pytest.approx(700.0, abs=0.02)
+    swept = model.by_type("IfcSpatialZone")[0]
+    settings = ifcopenshell.geom.settings()
+    settings.set("use-world-coords", True)
+    corners = np.array(ifcopenshell.geom.create_shape(settings, swept).geometry.verts).reshape(-1, 3) - ORIGIN
+    _, left, up = bore.axis.local(corners)
+    wall = np.interp(np.arctan2(up, left), bore.angle, bore.radius[0], period=2.0 * np.pi)
+    assert np.median(np.abs(np.hypot(left, up) - wall)) < 0.005
+    pieces = ezdxf.readfile(out / "plan_profile.dxf").modelspace().query("LWPOLYLINE")
+    heights = [np.array(one.get_points("xy"))[:, 1] for one in pieces]
+    assert max(one.max() for one in heights[3:]) < min(one.min() for one in heights[:3])  # the profile, below the plan
 
 
 @pytest.mark.parametrize(
