@@ -20,8 +20,11 @@ from scene.bore import Bore
 from scene.errors import RecordingError, require_input
 
 # Upper part of the reference contour G1 of UIC 505-1, right half, distance from the middle and height over rail, m.
-# From memory of the leaflet's figure: check it against your own copy, or give a polygon of your own.
-_G1 = ((1.250, 0.400), (1.620, 0.400), (1.645, 1.170), (1.645, 3.250), (1.425, 3.700), (1.120, 4.010), (0.525, 4.310))
+# The side, 0.4 to 3.25 m, is as in the coordinates of GA, GB and GC, which share it with G1, in a public program for
+# gauges after EN 15273. The three points of the roof are from memory of the leaflet's figure, which could not be read:
+# check them against your own copy, or give a polygon of your own.
+_G1 = ((1.250, 0.400), (1.620, 0.400), (1.620, 1.170), (1.645, 1.170), (1.645, 3.250), (1.425, 3.700), (1.120, 4.010),
+       (0.525, 4.310))  # fmt: skip
 BOGIES, OVERHANG = 19.0, 3.7  # m; a passenger coach of 26.4 m
 
 
@@ -42,7 +45,7 @@ def g1() -> Gauge:
     """Return the upper part of UIC G1, without allowances."""
     right = np.array(_G1)
     left = right[::-1] * [-1.0, 1.0]
-    return Gauge("UIC G1, upper part, from memory", np.concatenate([right, left]))
+    return Gauge("UIC G1, upper part, roof from memory", np.concatenate([right, left]))
 
 
 def read_gauge(path: Path) -> Gauge:

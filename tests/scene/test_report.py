@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import openpyxl
 import pytest
+import shapely
 import tifffile
 import trimesh
 
@@ -125,6 +126,13 @@ def test_g1_is_a_polygon_of_its_known_size():
     points = g1().points
     assert np.ptp(points[:, 0]) == pytest.approx(3.29)
     assert points[:, 1].max() == pytest.approx(4.31)
+    body = shapely.Polygon(points)
+    assert body.is_valid
+    # GA, GB and GC share its side and are wider above it.
+    assert not body.contains(shapely.Point(1.63, 0.8))
+    assert body.contains(shapely.Point(1.63, 1.2))
+    ga = [(1.62, 0.4), (1.62, 1.17), (1.645, 1.17), (1.645, 3.25), (1.36, 3.88), (1.09, 4.08), (0.545, 4.35)]
+    assert shapely.Polygon([*ga, *((-y, z) for y, z in ga[::-1])]).buffer(1e-6).contains(body)
 
 
 def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
