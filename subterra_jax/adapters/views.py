@@ -9,13 +9,13 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from subterra_jax.drawing import top_down, wall_points
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts.boxes import Boxes
 from subterra_jax.pictures.carrier import add_carrier
 from subterra_jax.pictures.renderer import import_mujoco, light_near, open_renderer
 from subterra_jax.pictures.stage import Piece, stage_spec
+from subterra_jax.pictures.top_down import top_down, wall_points
 from subterra_jax.procedural import expand
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import TASKS, find

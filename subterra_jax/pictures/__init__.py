@@ -1,4 +1,5 @@
 """Pictures of a tunnel without a scene folder: its surfaces, a MuJoCo model of them, and a renderer.
 
 plan ─► surfaces ─► stage (a MuJoCo model of a piece) ─► renderer ◄─ robot
+walls on the device ─► top_down (NumPy alone)
 """

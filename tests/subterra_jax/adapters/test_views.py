@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import drawing
 from subterra_jax.adapters.views import make_view
 from subterra_jax.parts.boxes import Boxes
+from subterra_jax.pictures import top_down as drawing
 from tests.subterra_jax.drawn import draw
 
 
