@@ -18,7 +18,7 @@ from subterra_jax import native
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d import fused
-from subterra_jax.lidar3d.march import Hits, Point, Tools, normals
+from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relay import march_in_relay
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 from subterra_jax.rows import axes, spread

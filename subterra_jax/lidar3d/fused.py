@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.lidar3d.march import Hits, Point, Tools, march, normals
+from subterra_jax.lidar3d.march import march
+from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 
 # Rays of one program: one warp, one ray a lane.
@@ -40,7 +41,7 @@ def find_facing(
     block: Int[Array, n],
     limit: Float[Array, n],
 ) -> tuple[Hits, Point]:
-    """Find the first triangle that each ray meets, and its normal, as `march.march` and `march.normals`."""
+    """Find the first triangle that each ray meets, and its normal, as `march.march` and `meeting.normals`."""
     rows = _launch(relief, origin, direction, block, limit, facing=True)
     return Hits(*rows[:3]), rows[3:]
 

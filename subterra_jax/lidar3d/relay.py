@@ -13,21 +13,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.lidar3d.march import (
-    Hits,
-    Ray,
     Rays,
     Stay,
     Step,
-    Tools,
     Way,
     enter_block,
     enter_cell,
     first_step,
     leave_block,
     leave_cell,
-    meet_one,
     ray_in_cells,
 )
+from subterra_jax.lidar3d.meeting import Hits, Ray, Tools, meet_one
 
 # Rays in step, and triangles that each meets in a round.
 N_PLACES, _AT_ONCE = 256, 8

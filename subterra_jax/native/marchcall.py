@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numba import njit
 
-from subterra_jax.lidar3d.march import Hits
+from subterra_jax.lidar3d.meeting import Hits
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.native.calls import register
 from subterra_jax.native.frames import argument, floats, ints, result, run_on_all_threads, size, wants_work

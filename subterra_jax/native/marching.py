@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from subterra_jax.lidar3d.cells import FACES, MARGIN, N_FACES, N_WEDGES, NEAR_UNIT, X_BITS
-from subterra_jax.lidar3d.march import FINE, PAST, SEAM
+from subterra_jax.lidar3d.meeting import FINE, PAST, SEAM
 from subterra_jax.lidar3d.relief import N_FRAME, N_LINK
 from subterra_jax.native.gathers import load_corners, load_rows
 from subterra_jax.native.lanes import (
