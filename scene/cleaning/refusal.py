@@ -8,6 +8,8 @@ from scene.cleaning.seeds import Seed
 
 _FLAT = 0.04  # of the longest extent
 _OPEN = 0.6  # share of the unseen directions that lie above
+_THIN, _LOW = 0.3, 2.0  # m, heights between which a cloud may be a culvert or a pipe
+_NARROW = "no tunnel was found in the cloud: a bore under about 1.5 m is too narrow to be followed, "
 _TALL = 1.2  # times the larger extent in plan
 
 
@@ -25,6 +27,8 @@ def name_cloud(points: Float[np.ndarray, "n 3"], seeds: list[Seed], course: Cour
     size = f"{run:.0f} m by {across:.0f} m in plan and {height:.0f} m high"
     if max(run, height) < min_length:
         return f"the tunnel is at most {run:.1f} m long; at least {min_length:g} m are needed"
+    if across < _LOW and _THIN < height < _LOW:
+        return _NARROW + size
     if thickness < _FLAT * max(run, across, height):
         return f"no tunnel in the cloud: its points lie on a plane, {size}"
     if height > max(_TALL * run, min_length):
@@ -39,6 +43,8 @@ def name_cloud(points: Float[np.ndarray, "n 3"], seeds: list[Seed], course: Cour
             f"a room, not a tunnel: {size}; the longest way enclosed by walls is {course.length:.0f} m long "
             f"and {course.width:.0f} m wide"
         )
+    if _THIN < height < _LOW:
+        return _NARROW + size
     return f"no tunnel in the cloud: no place in it is enclosed all around, {size}"
 
 

@@ -33,7 +33,7 @@ _LEAST_ROWS = 3
 _DIFFERENT = 0.3  # m
 _LAYBY = 7.0  # m: shorter is a niche
 _LONGER = (1 - 2 * _PERSISTENT) * (2 * _PRESENT + ROW)  # m by which what persists is longer than what is there
-_WIDEST = 2.0  # times the usual radius
+_WIDEST, _WIDENED = 2.0, 2.6  # times the usual radius: a flare, and what lasts for the length of a lay-by
 _AROUND = 0.5  # share of the directions that change at once where the section changes
 _HIDDEN = 0.3  # share of the directions with returns behind: what is in front stands inside
 _JUMP = 0.4  # m from one direction to the next
@@ -164,7 +164,7 @@ def _decide(
 ) -> Float[np.ndarray, "rows cols"]:
     wall = usual.copy()
     # Wider for a lay-by's length: the bore is wider here.
-    wider = (present > usual + _DIFFERENT) & (present < _WIDEST * usual)
+    wider = (present > usual + _DIFFERENT) & (present < _WIDENED * usual)
     rows = round((_LAYBY + _LONGER) / ROW)
     line = np.ones((rows, 1), bool)
     padded = np.pad(wider, ((rows, rows), (0, 0)), mode="edge")

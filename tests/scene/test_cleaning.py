@@ -156,8 +156,13 @@ def room(_rng: np.random.Generator) -> np.ndarray:
     return cavity(Box((0, 0), (14, 11), 4)) - PLACE
 
 
+def culvert(_rng: np.random.Generator) -> np.ndarray:
+    return cavity(Tube((0, 0), (30, 0), 1.0, 1.2)) - PLACE
+
+
 @pytest.mark.parametrize(
-    ("make", "reason"), [(street, "street"), (shaft, "shaft"), (plane, "plane"), (room, "room, not a tunnel")]
+    ("make", "reason"),
+    [(street, "street"), (shaft, "shaft"), (plane, "plane"), (room, "room, not a tunnel"), (culvert, "too narrow")],
 )
 def test_what_is_no_bore_is_refused_by_its_name(make, reason):
     with pytest.raises(FitError, match=reason):
@@ -176,16 +181,18 @@ def test_a_wall_unseen_beside_a_train_goes_on_as_before_and_behind():
     assert np.nanmax(np.abs(fill_nearest(field) - seen)) > 0.2  # which would bulge here
 
 
-@pytest.mark.parametrize(("length", "bore"), [(5.0, False), (9.0, True)])
-def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, bore):
+@pytest.mark.parametrize(
+    ("length", "out", "bore"), [(5.0, 4.0, False), (9.0, 4.0, True), (9.0, 5.9, True), (9.0, 7.6, False)]
+)
+def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, out, bore):
     rng = np.random.default_rng(6)
     station, angle = rng.uniform(0.0, 90.0, 200_000), rng.uniform(-np.pi, np.pi, 200_000)
     beside = (np.abs(station - 45.0) < length / 2) & (np.abs(angle) < 0.5)
-    radius = np.where(beside, 4.0, 2.75) + rng.normal(0.0, 0.01, len(station))
+    radius = np.where(beside, out, 2.75) + rng.normal(0.0, 0.01, len(station))
     tube = measure_tube(station, angle, radius, np.ones(len(station)), 90.0, 8.0)
     row = round((45.0 - tube.grid.start) / tube.grid.step)
     wall = float(np.median(tube.wall[row - 2 : row + 3][:, np.abs(tube.grid.angle) < 0.3]))
-    assert wall == pytest.approx(4.0 if bore else 2.75, abs=0.15)
+    assert wall == pytest.approx(out if bore else 2.75, abs=0.15)
 
 
 def test_a_mouth_at_which_no_direction_shows_the_wall_ends_where_its_last_row_does():
