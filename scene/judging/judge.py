@@ -181,21 +181,28 @@ def _warn_of_share(
     return result
 
 
+_WARN_BEYOND = 0.25  # of all returns
 _CUT_SHORT = 2.0  # m of lining beyond an end that are worth a word
 
 
 def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
-    return [
-        Warned(
-            "cut_short",
-            f"the lining goes on for at least {beyond:.0f} m {where} {station:.0f} m, which were not built: is it seen "
-            "from too far away there, or hidden?",
-            station, station,
-        )
-        for beyond, where, station in zip(
-            measure_overruns(bore, returns), ("before station", "beyond station"), (0.0, bore.length), strict=True
-        ) if beyond >= _CUT_SHORT
-    ]  # fmt: skip
+    result = []
+    if returns.share(BEYOND) > _WARN_BEYOND:
+        result.append(Warned(
+            "beyond",
+            f"{returns.share(BEYOND):.0%} of all returns lie beyond the ends of what was built, at 0 and "
+            f"{bore.length:.0f} m: terrain, a hall, or a piece of tunnel behind a gap, which is a cloud of its own",
+        ))  # fmt: skip
+    for beyond, where, station in zip(measure_overruns(bore, returns), ("before", "beyond"), (0.0, bore.length),
+                                      strict=True):  # fmt: skip
+        if beyond >= _CUT_SHORT:
+            result.append(Warned(
+                "cut_short",
+                f"the lining goes on for at least {beyond:.0f} m {where} station {station:.0f} m, which were not "
+                "built: is it seen from too far away there, or hidden?",
+                station, station,
+            ))  # fmt: skip
+    return result
 
 
 def _warn_of_unseen(coverage: Coverage) -> list[Warned]:

@@ -201,3 +201,10 @@ def test_a_lining_that_goes_on_beyond_an_end_is_told_and_a_cutting_is_not(bore, 
     told = [warning.text for warning in warnings if warning.code == "cut_short"]
     assert bool(told) == said
     assert not said or "goes on for at least 7 m before station 0 m" in told[0]
+
+
+def test_a_large_part_of_the_cloud_beyond_the_ends_is_told(bore, wall):
+    far = block(bore, (-60.0, -30.0), (-2.0, 2.0), (-2.0, 2.0), 30_000)  # half as many as on the wall
+    for points, said in ((far[:9000], False), (far, True)):
+        codes = [warning.code for warning in judge_bore(bore, cloud_of(wall, points), JudgingConfig()).warnings]
+        assert ("beyond" in codes) == said
