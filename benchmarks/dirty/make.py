@@ -105,6 +105,11 @@ ODD: dict[str, CloudCase | RecordingCase] = {
     "origin-rows": CloudCase(odd.origin_rows),
     "rock": CloudCase(odd.rock),
     "floor-step": CloudCase(odd.floor_step),
+    "culvert": CloudCase(odd.culvert),
+    "three-lanes": CloudCase(odd.three_lanes),
+    "mine-bend": CloudCase(odd.mine_bend),
+    "two-pieces": CloudCase(odd.two_pieces),
+    "twin": CloudCase(odd.twin),
 }
 # ... and what is no tunnel, or two.
 BAD: dict[str, CloudCase | RecordingCase] = {

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.dirty.clouds.air import Alignment, Arch, box, draw_alignment, prism
-from benchmarks.dirty.clouds.scanner import HEIGHT
+from benchmarks.dirty.clouds.scanner import HEIGHT, choose
 from benchmarks.dirty.clouds.site import LENGTH, bore
 from benchmarks.dirty.clouds.troubles import CLEARED, OPENINGS, UNSEEN, Cloud, finish
 
@@ -232,3 +232,51 @@ def floor_step(rng: np.random.Generator) -> Cloud:
         "cause": ("floor", "step"),
     }
     return finish(rng, replace(site, tripods=site.tripods + np.array([0.0, 0.0, 0.3])).telling(**told))
+
+
+def culvert(rng: np.random.Generator) -> Cloud:
+    """Return an arched culvert of 1.2 × 1.6 m, scanned from a low tripod every 3 m."""
+    site = bore(draw_alignment(rng), Arch(1.2, 1.6, 1.0), length=30.0)
+    station = np.arange(1.0, 29.5, 3.0)
+    stands = np.stack([station, 0.1 + 0 * station, np.full_like(station, 0.8)], axis=1)
+    return finish(rng, replace(site, tripods=stands).telling(track="none", cause=("narrow",)))
+
+
+def three_lanes(rng: np.random.Generator) -> Cloud:
+    """Return a road bore of 16 × 9.5 m."""
+    return finish(rng, bore(draw_alignment(rng), Arch(16.0, 9.5, 2.0)).telling(track="none"))
+
+
+def mine_bend(rng: np.random.Generator) -> Cloud:
+    """Return a drift of 4 m that turns through 90° at 10 m radius, as in a mine."""
+    arcs = ((18.0, np.inf), (5.0 * np.pi, 10.0), (18.0, np.inf))
+    return finish(rng, bore(_course(rng, arcs), Arch(4.0, 4.0, 2.0), length=sum(length for length, _ in arcs)))
+
+
+def two_pieces(rng: np.random.Generator) -> Cloud:
+    """Return an arch of 120 m of which nobody scanned 30 m: 35 m before them, 55 m behind them."""
+    site = bore(draw_alignment(rng), length=120.0)
+    site = site.telling(span=(67.0, 118.0), ends=(65.0, 120.0), cause=(*UNSEEN, "beyond"), must_say=True)
+    whole = site.scanned(rng)
+    seen = (whole.local[:, 0] < 35.0) | (whole.local[:, 0] > 65.0)
+    return choose(whole, seen).point, site.truth(rng, choose(whole, seen))
+
+
+def twin(rng: np.random.Generator) -> Cloud:
+    """Return two arches 14 m from axis to axis, of 60 and 50 m, joined by a passage 2 m wide."""
+    first = bore(draw_alignment(rng))
+    low, high, at = 5.0, 55.0, rng.uniform(22.0, 36.0)
+    second = prism(first.arch.outline() + np.array([14.0, 0.0]), low, high)
+    passage = box((at, 2.0, 0.0), (at + 2.0, 12.0, 2.4))
+    stands = first.tripods[(first.tripods[:, 0] > low + 1) & (first.tripods[:, 0] < high - 1)] + np.array([0, 14.0, 0])
+    middle = np.array([[at + 1.0, left, HEIGHT] for left in (5.0, 9.0)])
+
+    def sky(local: np.ndarray) -> np.ndarray:
+        aside = local[:, 1] > 7.0
+        start, end = np.where(aside, low, 0.0), np.where(aside, high, LENGTH)
+        return (local[:, 0] < start + 1e-3) | (local[:, 0] > end - 1e-3)
+
+    both = replace(first, air=first.air + second + passage, tripods=np.concatenate([first.tripods, stands, middle]),
+                   sky=sky)  # fmt: skip
+    told = {"must_say": True, "trouble": (at, at + 2.0), "cause": (*OPENINGS, "another tunnel"), "bulge": ["aside"]}
+    return finish(rng, both.telling(**told))

@@ -69,6 +69,7 @@ def survey_truth(folder: Path, rng: np.random.Generator) -> dict[str, Any]:
         "height": np.array(truth["height"]), "track": tracks, "gauge": truth["rails"]["gauge"],
         "sleepers": sleepers, "proud": truth["sleepers"]["top_above_floor"] if len(sleepers) else 0.0,
         "bulge": ["aside", "width", "height"] if uneven else ["aside"],
+        "middle": np.array(truth["middle"])[:, 0],
     }  # fmt: skip
 
 

@@ -176,6 +176,10 @@ def test_cases_of_surveys_are_judged_by_the_wall_that_the_carrier_could_see(tmp_
     truth = load_truth(second)
     assert len(truth.sleepers) == len(np.unique(truth.sleepers, axis=0)) > 20
     assert (truth.track, truth.bulge) == ("single", ("aside", "width", "height"))
+    # The wall behind the platform stands 3 m further out, so the middle between both walls 1.5 m.
+    middle = np.broadcast_to(truth.middle, len(truth.axis))
+    assert np.median(middle[np.abs(truth.station - 7.0) < 1.5]) == pytest.approx(1.5, abs=0.1)
+    assert np.median(middle[truth.station < 3.0]) == pytest.approx(0.0, abs=0.1)
     # The platform hides the foot of the wall behind it: 1 m high from 1.75 to about 5.8 m, seen from 1.6 m.
     station = truth.station[cKDTree(truth.axis).query(truth.wall)[1]]
     tangent = np.gradient(truth.axis, truth.station, axis=0)[cKDTree(truth.axis).query(truth.wall)[1]]
