@@ -166,7 +166,7 @@ def _parse(name: str) -> tuple[str, str, int]:
     if match is None:
         raise TunnelError(
             f"no tunnel {name!r}; one of the open world is called open:SPLIT:INDEX or open:KIND:SPLIT:INDEX, as in "
-            f"open:cast:val:7; kinds are {', '.join(KINDS)}, splits {', '.join(SPLITS)}"
+            f"open:cast:val:7; kinds are {', '.join(all_kinds())}, splits {', '.join(SPLITS)}"
         )
     kind, split, index = match[1], match[2], int(match[3])
     if kind is not None and kind not in (known := all_kinds()):
