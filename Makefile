@@ -25,7 +25,7 @@ doors: $(STAMP)    ## modes of JAX, adapters, policies and training; a part of t
 reproduce: $(STAMP)  ## the numbers of README and docs/results.md again, those that a CPU can measure, about 45 minutes; says which differ
 	$(BIN)/python -m benchmarks.reproduce --shared $(SHARED)
 
-arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 10 minutes and 3 GB; goes on where it stopped
+arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 8 to 10 minutes and 2.2 GB; goes on where it stopped
 	$(BIN)/python -m benchmarks.slam arena --jobs 2 --out out/arena
 
 figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores; goes on where it stopped

@@ -165,12 +165,40 @@ def score_files(
     if not piece > 0.0:
         raise BenchmarkError(f"piece must be above 0 m, got {piece}")
     track = read_track(estimate, truth, alignment)
+    _check_rate(estimate, track)
     if alignment == "origin":
         _check_frame(estimate, track)
+    elif alignment == "none":
+        _check_place(estimate, track)
     if axis is None and (truth.parent / AXIS_FILE).is_file():
         axis = truth.parent / AXIS_FILE
     line = axis_from_path(track.true_position) if axis is None else axis_from_file(axis)
     return score_track(track, line, alignment, piece, name or estimate.stem)
+
+
+LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
+
+
+def _check_rate(estimate: Path, track: Track) -> None:
+    """Refuses an estimate of so few poses that the way between them is not scored."""
+    count, run = len(track.time), float(track.time[-1] - track.time[0])
+    if count < LEAST_RATE * run:
+        raise BenchmarkError(
+            f"{estimate}: has {count} poses in {run:.0f} s; at least {LEAST_RATE:g} a second are needed"
+        )
+
+
+_AWAY = 1000.0  # m; nobody is as lost as that in a tunnel
+
+
+def _check_place(estimate: Path, track: Track) -> None:
+    """Refuses poses that are compared as they are and lie beyond any tunnel: those of another frame."""
+    nearest = float(np.linalg.norm(absolute_errors(track)[0], axis=1).min())
+    if nearest > _AWAY + 10.0 * float(track.travelled[-1]):
+        raise BenchmarkError(
+            f"{estimate}: lies {1e-3 * nearest:.0f} km from the truth: poses must be in the tunnel's frame, or aligned "
+            "by `--alignment origin`"
+        )
 
 
 _TURNED, _FITS = 0.3, 0.05  # share of the distance: RMS errors as aligned at the start, and after the best fit

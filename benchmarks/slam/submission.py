@@ -11,11 +11,12 @@ import numpy as np
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam.recordings import recordings_in
+from benchmarks.slam.score import LEAST_RATE
 from scene.errors import RecordingError
 from scene.poses.trajectory import load_tum
 
 FACTS, KEYS = "program.json", ("name", "version", "command")
-LEAST_RATE, LEAST_COVERED = 1.0, 0.9  # Hz, poses a second; share of the recording between the first and the last
+LEAST_COVERED = 0.9  # share of the recording between the first pose and the last
 _ODOMETRY = "odometry.tum"
 
 

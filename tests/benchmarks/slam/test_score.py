@@ -169,6 +169,30 @@ def test_poses_of_a_camera_are_refused_and_a_bad_program_is_scored(tmp_path):
     assert score_files(write_tum(tmp_path / "back.tum", time, back, rotation), truth)[0].drift > 50.0
 
 
+def test_the_first_and_the_last_pose_alone_are_no_estimate(tmp_path):
+    """They may be right to the millimetre; what lies between would not be scored."""
+    time, position, rotation = line()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    for rows, refused in ((slice(None, None, 400), True), (slice(None, None, 16), True), (slice(None, None, 8), False)):
+        few = write_tum(tmp_path / "few.tum", time[rows], position[rows], rotation[rows])
+        if refused:
+            with pytest.raises(BenchmarkError, match=r"few.tum: has \d+ poses in 40 s; at least 1 a second are needed"):
+                score_files(few, truth)
+        else:
+            assert score_files(few, truth)[0].drift == pytest.approx(0.0, abs=1e-6)
+
+
+def test_poses_of_another_frame_are_not_compared_as_they_are(tmp_path):
+    time, position, rotation = line()
+    truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
+    far = write_tum(tmp_path / "far.tum", time, position + np.array([271_000.0, 2_103_000.0, 0.0]), rotation)
+    with pytest.raises(BenchmarkError, match=r"far.tum: lies 2120 km from the truth: poses must be in the tunnel's"):
+        score_files(far, truth, alignment="none")
+    assert score_files(far, truth)[0].ape.max < 1e-6
+    lost = write_tum(tmp_path / "lost.tum", time, position + np.array([900.0, 0.0, 0.0]), rotation)
+    assert score_files(lost, truth, alignment="none")[0].along_rms == pytest.approx(900.0)
+
+
 def test_stamps_between_those_of_the_truth_are_scored_against_the_pose_between(tmp_path):
     time, position, rotation = line()
     truth = write_tum(tmp_path / "truth.tum", time, position, rotation)
