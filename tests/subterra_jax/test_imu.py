@@ -13,6 +13,16 @@ from subterra_jax.parts.imu import GRAVITY
 
 TASK, GRADE = "Subterra/TraverseShort-v0", 0.04
 IDEAL = ImuParams(*[0.0] * 6)
+# Written down a second time, from the calibration of the Avia's BMI088 in GEODE; the first biases are ours.
+STATED = {
+    "accel_density": 5.574e-3,  # m/s²/√Hz
+    "gyro_density": 5.144e-3,  # rad/s/√Hz
+    "accel_walk": 1.208e-4,  # m/s²/√s
+    "gyro_walk": 1.088e-4,  # rad/s/√s
+    "accel_bias": 0.02,  # m/s²
+    "gyro_bias": 0.003,  # rad/s
+    "rate": 200,
+}
 
 
 def made(imu, grade=GRADE):
@@ -95,32 +105,36 @@ def allan(values, rate, tau):
     return np.sqrt(np.mean(second**2) / 2.0) / tau
 
 
-def check_densities(n_steps, white_at, walk_at):
-    params = ImuParams(rate=100)
-    env, made_params = made(params, grade=0.0)
-    _, states = drive(env, made_params, np.zeros((n_steps, 2)))
+def check_densities(n_steps, taus):
+    """Compare the noise at rest with the stated sizes, in each axis: those of `STATED`, whatever the params say."""
+    env, params = made(ImuParams(rate=100), grade=0.0)
+    _, states = drive(env, params, np.zeros((n_steps, 2)))
     samples = np.asarray(states.imu.samples, np.float64).reshape(-1, 6)
-    for axis in range(6):
-        density, walk = (
-            (params.accel_density, params.accel_walk) if axis < 3 else (params.gyro_density, params.gyro_walk)
-        )
-        for tau in white_at:
-            wanted = np.hypot(density / np.sqrt(tau), walk * np.sqrt(tau / 3.0))
-            assert allan(samples[:, axis], 100, tau) == pytest.approx(wanted, rel=0.15)
     bias = np.asarray(states.imu.bias, np.float64)
-    for axis, walk in ((slice(0, 3), params.accel_walk), (slice(3, 6), params.gyro_walk)):
-        steps = np.diff(bias[:, axis], axis=0)
-        assert np.std(steps) == pytest.approx(walk * np.sqrt(0.1), rel=0.05)
-    assert walk_at is None or len(samples) >= 100 * walk_at
+    deviation = {tau: np.array([allan(values, 100, tau) for values in samples.T]) for tau in taus}
+    for name, axes in (("accel", slice(0, 3)), ("gyro", slice(3, 6))):
+        density, walk = STATED[f"{name}_density"], STATED[f"{name}_walk"]
+        for tau, found in deviation.items():
+            wanted = np.hypot(density / np.sqrt(tau), walk * np.sqrt(tau / 3.0))
+            if tau <= 30.0:
+                np.testing.assert_allclose(found[axes], wanted, rtol=0.15)
+            else:  # an hour has few intervals of this length, so the three axes together
+                assert np.sqrt(np.mean(found[axes] ** 2)) == pytest.approx(wanted, rel=0.15)
+        assert np.std(np.diff(bias[:, axes], axis=0)) == pytest.approx(walk * np.sqrt(0.1), rel=0.05)
 
 
-def test_the_noise_of_a_minute_has_the_densities():
-    check_densities(900, (0.05, 0.5), None)
+def test_the_noise_of_a_minute_and_a_half_has_the_stated_densities():
+    check_densities(900, (0.05, 0.5))
 
 
 @pytest.mark.slow
-def test_the_allan_deviation_of_an_hour_has_the_densities():
-    check_densities(36_000, (0.05, 1.0, 10.0, 30.0), 3600)
+def test_the_allan_deviation_of_an_hour_at_rest_has_the_stated_densities_and_walks():
+    """At 60 s the white noise alone gives four fifths of it: without the walk of the biases this fails."""
+    check_densities(36_000, (0.05, 1.0, 10.0, 30.0, 60.0))
+
+
+def test_sizes_are_those_stated():
+    assert {field.name: getattr(ImuParams(), field.name) for field in dataclasses.fields(ImuParams)} == STATED
 
 
 def test_a_rate_that_does_not_go_into_a_step_is_refused():

@@ -88,6 +88,8 @@ def test_a_mount_turns_as_its_words_say(graded):
     _, axes = stand(tunnel, *here, Mount(roll=0.3))
     np.testing.assert_allclose(axes[1], [0.0, np.cos(0.3), np.sin(0.3)], atol=1e-6)  # the left side rises
     np.testing.assert_allclose(np.asarray(axes) @ np.asarray(axes).T, np.eye(3), atol=1e-6)
+    _, axes = stand(tunnel, *here, Mount(pitch=0.3))
+    np.testing.assert_allclose(axes[0], [np.cos(0.3), 0.0, -np.sin(0.3)], atol=1e-6)  # it looks down
 
 
 @pytest.mark.slow
@@ -246,6 +248,47 @@ def test_every_named_sensor_has_unit_beams_in_order_of_its_image(name):
         elevation = np.arcsin(rays[..., 2])
         np.testing.assert_allclose(np.ptp(elevation, axis=1), 0.0, atol=1e-5)
         assert (np.diff(times, axis=1) > 0.0).all()
+
+
+# Written down a second time. Noise, height and shares of lost and mixed returns are those of every sensor.
+ECHO = {"sigma": 0.019, "sigma_per_metre": 1e-4, "sigma_slant": 0.002, "lost": 0.004, "mixed": 0.1,
+        "losing": True, "mixing": False}  # fmt: skip
+RINGS = list(range(-15, 16, 2))  # degrees
+NUMBERS = {  # rings (degrees), azimuths, least and largest range (m), weakest echo (1/m²), divergence (rad)
+    "spin16x64": (RINGS, 64, 0.0, 30.0, 0.0, 1.5e-3),
+    "vlp16": (RINGS, 1800, 0.4, 100.0, 0.5 / 10_000, 1.5e-3),
+    "os1-64": (np.linspace(22.5, -22.5, 64), 1024, 0.5, 120.0, 0.1 / 2025, 1.6e-3),
+    "avia": (None, 24_000, 1.0, 190.0, 0.1 / 36_100, 0.5 * np.deg2rad(0.0917)),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS[1:])
+def test_every_number_of_a_named_sensor_is_the_one_written_here(name):
+    rings, n_columns, least, largest, weakest, divergence = NUMBERS[name]
+    made = make_sensor(name)
+    assert (made.range_min, made.range_max, made.shape[1]) == (least, largest, n_columns)
+    assert dataclasses.asdict(made.mount) == {"height": 0.7, "lateral": 0.0, "roll": 0.0, "pitch": 0.0, "yaw": 0.0}
+    errors = dataclasses.asdict(made.echo)
+    assert errors.pop("weakest") == pytest.approx(weakest)
+    assert errors.pop("divergence") == pytest.approx(divergence, rel=1e-3)
+    assert errors == ECHO
+    assert not made.sweep
+    assert not made.intensity
+    rays = np.asarray(made.directions, np.float64).reshape(*made.shape, 3)
+    azimuth, elevation = np.rad2deg(np.arctan2(rays[..., 1], rays[..., 0])), np.rad2deg(np.arcsin(rays[..., 2]))
+    if rings is None:
+        assert np.abs(azimuth).max() == pytest.approx(35.2, abs=0.1)
+        assert np.abs(elevation).max() == pytest.approx(38.6, abs=0.1)
+        return
+    np.testing.assert_allclose(elevation[:, 0], rings, atol=1e-3)
+    np.testing.assert_allclose(azimuth[0] % 360.0, np.arange(n_columns) * 360.0 / n_columns, atol=1e-3)
+
+
+def test_the_vlp16_fires_its_lasers_in_the_order_of_the_manual():
+    """Lowest, the one 16 degrees above it, the second lowest: 2.304 µs apart."""
+    times = np.asarray(make_sensor("vlp16").times, np.float64).reshape(16, 1800)
+    after = (times[:, 0] - times[0, 0]) / 2.304e-6
+    np.testing.assert_allclose(after, [*range(0, 16, 2), *range(1, 16, 2)], atol=0.02)
 
 
 def test_what_no_sensor_can_honour_is_one_sentence(graded, tmp_path, monkeypatch):
