@@ -53,7 +53,7 @@ def test_the_lidar_in_three_dimensions_and_its_derivatives_run_in_it(settings, k
         monkeypatch.setattr(native, "supported", lambda: False)
 
     def scan(position, orientation, station):
-        return lidar3d.scan(relief, position, orientation, station, beams.planar(5), 30.0)
+        return lidar3d.scan(relief, position, orientation, station, jnp.asarray(beams.planar(5)), 30.0)
 
     where = jnp.array([6.0, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.float32(6.0)
     with settings():
