@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,8 @@ class Map:
 
     Attributes:
         kind: `D` less is better, `U` more is better, `B` near `target` is better, `P` pass or fail, `-` not scored.
-        good: Value from which on the score is 100; for `B` a distance from the target.
+        good: Value from which on the score is 100: the noise floor where the metric has a reference; for `B` a distance
+            from the target.
         bad: Value from which on the score is 0.
         target: Best value of a `B` map.
     """
@@ -122,18 +124,31 @@ def map_text(map: Map) -> str:
     return texts.get(map.kind, map.kind)
 
 
+def load(frozen: dict[str, Any] | None = None) -> dict[str, Metric]:
+    """Return the table by id, in its order, with calibrated thresholds, roles and noise floors.
+
+    Args:
+        frozen: Content of a calibration; that of the suite where not given.
+    """
+    return _load() if frozen is None else _with_thresholds(frozen)
+
+
 @cache
-def load() -> dict[str, Metric]:
-    """Return the table by id, in its order, with the calibrated thresholds and roles."""
-    calibrated = json.loads(THRESHOLDS.read_text())["maps"] if THRESHOLDS.exists() else {}
+def _load() -> dict[str, Metric]:
+    return _with_thresholds(json.loads(THRESHOLDS.read_text()) if THRESHOLDS.exists() else {})
+
+
+def _with_thresholds(frozen: dict[str, Any]) -> dict[str, Metric]:
+    calibrated, floors = frozen.get("maps", {}), frozen.get("floors", {})
     table: dict[str, Metric] = {}
     with METRICS.open(newline="") as file:
         for row in csv.DictReader(file):
             moved = calibrated.get(row["id"], {})
             text, role = moved.get("map", row["map"]), moved.get("role", row["role"])
+            map = parse_map(text)
             table[row["id"]] = Metric(
                 int(row["n"]), row["cat"], row["cat_name"], row["id"], row["definition"], row["unit"],
-                row["direction"], role, parse_map(text), row["evidence"], row["lib"],
+                row["direction"], role, replace(map, good=floors.get(row["id"], map.good)), row["evidence"], row["lib"],
             )  # fmt: skip
     return table
 

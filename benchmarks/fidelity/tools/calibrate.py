@@ -1,6 +1,9 @@
 """Sets thresholds from simulated surveys with known truth, before any real recording is scored.
 
-Three rules may move a threshold:
+A score is 100 at the noise floor and falls in a straight line to 0 at the bad end. The noise floor of a metric that has
+a reference is what the truth itself, scored as a candidate, comes to on the worst of the surveys: a perfect
+reconstruction has 100, and one that is merely good has not. Three rules set the ends that the floor then replaces or
+leaves:
 
 - *Null rule*: the null tube gets half marks or more though it is plainly worse than the truth. The good end moves to
   half of the null tube's error, not below 1.5 times the truth's own, nor below what the references resolve, nor below
@@ -138,6 +141,7 @@ RESOLVED = {
     "m": 0.01, "m/100 m": 0.01, "%": 0.3, "1": 0.01, "deg": 0.1, "mm": 0.5, "nat": 0.1, "count": 0.5,
     "1/100 scans": 0.5,
 }  # fmt: skip  # by unit: a third of a LiDAR's range noise
+FINEST = 1e-6  # what arithmetic may leave of no error at all
 
 
 def null_rule(row: Metric, surveys: list[Survey]) -> tuple[float, float, str] | None:
@@ -183,6 +187,31 @@ def bad_end_rule(rows: dict[str, Metric], surveys: list[Survey]) -> dict[str, tu
     return ends
 
 
+def noise_floor(row: Metric, surveys: list[Survey]) -> float | None:
+    """Return the good end at which the truth itself has 100 on every survey; `None` without a reference.
+
+    Rounded to three digits, away from the ideal.
+
+    Raises:
+        FidelityError: The truth scores 0 somewhere, so that the metric tells nothing.
+    """
+    reached = ideal_distances(row, [survey.ceiling for survey in surveys]) if _is_measured(row) else []
+    if not reached:
+        return None
+    floor = _round_up(max(reached))
+    if floor >= map_ends(row.map)[1]:
+        raise FidelityError(f"{row.id}: the truth itself comes no nearer than {max(reached):.3g} and scores 0")
+    return max(1.0, row.map.good) - floor if row.map.kind == "U" else floor
+
+
+def _round_up(value: float) -> float:
+    if value <= FINEST:
+        return FINEST
+    least = value * (1.0 + 1e-9)  # rounding of floats is no error of the truth
+    step = 10.0 ** (np.floor(np.log10(least)) - 2)
+    return float(f"{step * np.ceil(least / step):.3g}")
+
+
 def _is_measured(row: Metric) -> bool:
     return row.scored and row.map.kind in "DUB" and bool(set(row.evidence) & set("HT"))
 
@@ -223,12 +252,14 @@ class CalibrateConfig:
         runs: Output folders of `controls` on simulated surveys with `--truth`.
         out: File to write; the table takes its thresholds from there.
         fewest: Smallest number of surveys.
+        floors: Set the noise floors alone; all other ends stay as they are.
         windows: Set the limits of windows instead, from output folders of `windows`.
     """
 
     runs: tuple[Path, ...]
     out: Path = table.THRESHOLDS
     fewest: int = FEWEST_SURVEYS
+    floors: bool = False
     windows: bool = False
 
 
@@ -246,8 +277,20 @@ def run(config: CalibrateConfig) -> None:
     if len(config.runs) < config.fewest:
         raise FidelityError(f"calibration needs {config.fewest} simulated surveys, {len(config.runs)} were given")
     surveys = [load_survey(folder) for folder in config.runs]
+    if config.floors:
+        content = read_json(config.out, THRESHOLDS_SCHEMA)
+    else:
+        content = {"schema": THRESHOLDS_SCHEMA, "surveys": [s.name for s in surveys], "maps": _calibrated_maps(surveys)}
+    rows = table.load(content | {"floors": {}})
+    floors = {id: floor for id, row in rows.items() if (floor := noise_floor(row, surveys)) is not None}
+    content |= {"floors": floors, "floor_surveys": [survey.name for survey in surveys]}
+    write_json(config.out, content)
+    print(f"{config.out}: {len(content['maps'])} of {table.COUNT} thresholds moved, {len(floors)} noise floors")
+
+
+def _calibrated_maps(surveys: list[Survey]) -> dict[str, dict[str, str]]:
     drafted = draft_table()
-    maps = {
+    return {
         id: {
             "map": table.map_text(row.map),
             "role": row.role,
@@ -256,8 +299,6 @@ def run(config: CalibrateConfig) -> None:
         }
         for id, (row, why) in calibrate(drafted, decided_rows(drafted), surveys).items()
     }
-    write_json(config.out, {"schema": THRESHOLDS_SCHEMA, "surveys": [survey.name for survey in surveys], "maps": maps})
-    print(f"{config.out}: {len(maps)} of {table.COUNT} thresholds moved")
 
 
 def calibrate(

@@ -1,10 +1,12 @@
 """Thresholds move only where evidence says so, and to where it says."""
 
+import json
 from dataclasses import replace
 
 import pytest
 
 from benchmarks.fidelity import table
+from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.table import Metric
 from benchmarks.fidelity.tools import calibrate
@@ -105,3 +107,40 @@ def test_a_threshold_is_not_tightened_beyond_what_an_invariance_moves_it() -> No
     null = {id: Value(distant(row)) for id, row in ROWS.items()} | {"c2m_p95": Value(0.9 * good)}
     restless = replace(survey(at(0.1), null), same={"I7": at(0.1, c2m_p95=0.25 * good)})
     assert moves(restless)["c2m_p95"][0].map.good == pytest.approx(5.0 * 0.15 * good, rel=0.06)
+
+
+def test_at_the_noise_floor_the_truth_has_full_marks_on_every_survey_and_nothing_worse_has() -> None:
+    reached = [at(0.5), at(0.9)]
+    surveys = [survey(one) for one in reached]
+    for row in ROWS.values():
+        floor = calibrate.noise_floor(row, surveys)
+        if floor is None:
+            assert not row.scored or row.map.kind == "P" or not set(row.evidence) & set("HT"), row.id
+            continue
+        honest = replace(row.map, good=floor)
+        assert [honest.score(one[row.id].value) for one in reached] == [100.0, 100.0], row.id
+        if calibrate.map_ends(row.map)[0] == 0.0:  # a count, which is none or some
+            continue
+        worse = at(1.0)[row.id].value
+        assert row.map.score(worse) == pytest.approx(100.0)
+        assert honest.score(worse) < 99.999, row.id
+
+
+def test_a_metric_on_which_the_truth_scores_nothing_has_no_floor() -> None:
+    row = ROWS["c2m_mean"]
+    with pytest.raises(FidelityError, match="c2m_mean: the truth itself"):
+        calibrate.noise_floor(row, [survey(at(0.1, c2m_mean=row.map.bad))])
+
+
+def test_every_metric_with_a_reference_is_scored_from_its_noise_floor() -> None:
+    frozen = json.loads(table.THRESHOLDS.read_text())
+    assert frozen["floor_surveys"] == ["411", "412", "413"]
+    rows = table.load()
+    measured = [
+        id for id, row in rows.items() if row.scored and row.map.kind in "DUB" and set(row.evidence) & set("HT")
+    ]
+    without = {"c2m_fit_hold_gap"}  # nothing for it without the recording that the builder read
+    assert set(frozen["floors"]) == set(measured) - without
+    for id, floor in frozen["floors"].items():
+        assert rows[id].map.good == floor
+        assert rows[id].map.good != rows[id].map.bad
