@@ -121,6 +121,7 @@ MISTAKES = {
     "benchmarks.fidelity faults --scene tunnel --kinds ghost --out o": "no kind of fault 'ghost'",
     "benchmarks.fidelity faults --scene tunnel --join empty --out o": "empty/faults.json: cannot be read",
     "benchmarks.fidelity calibrate --windows --runs none --out o.json": "limits need 3 simulated surveys, 1 were given",
+    "benchmarks.fidelity calibrate --windows --sensor kinect --runs none --out o.json": "no sensor 'kinect'",
     "benchmarks.fidelity split junk.bag --out o": "junk.bag",
     "benchmarks.leaderboard --out o --tasks Fly": "no task 'Fly'",
     "benchmarks.dirty empty --out o": "empty: no NAME_truth.npz",

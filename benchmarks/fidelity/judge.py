@@ -310,7 +310,7 @@ def constants() -> dict[str, Any]:
         } | {"global": [catalogue.GLOBAL_LIMIT, catalogue.THINNED_LIMIT]},
         "quiet": [catalogue.QUIET_LIMIT, catalogue.MONOTONE, list(catalogue.UNORDERED)],
         "leaks": [list(NOISE_BAND), MEDIAN_FLOOR],
-        "windows": measures.limits(),
+        "windows": {sensor: measures.limits(sensor) for sensor in measures.SENSORS},
         "faults": {name: asdict(one) for name, one in local.stated_faults(100.0).items()},
     }  # fmt: skip
 

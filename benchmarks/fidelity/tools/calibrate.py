@@ -27,7 +27,7 @@ from benchmarks.fidelity.files import FidelityError, read_json, write_json
 from benchmarks.fidelity.registry import Value, load_values
 from benchmarks.fidelity.table import Map, Metric
 from benchmarks.fidelity.windows.commands import set_limits
-from benchmarks.fidelity.windows.measures import LIMITS
+from benchmarks.fidelity.windows.measures import LIMITS, STANDARD_SENSOR
 
 DECISIONS = Path(__file__).with_name("decisions.csv")
 Values = dict[str, Value]
@@ -254,6 +254,7 @@ class CalibrateConfig:
         fewest: Smallest number of surveys.
         floors: Set the noise floors alone; all other ends stay as they are.
         windows: Set the limits of windows instead, from output folders of `windows`.
+        sensor: LiDAR of the recordings, for the limits of windows: os1, avia or vlp16.
     """
 
     runs: tuple[Path, ...]
@@ -261,6 +262,7 @@ class CalibrateConfig:
     fewest: int = FEWEST_SURVEYS
     floors: bool = False
     windows: bool = False
+    sensor: str = STANDARD_SENSOR
 
 
 def run(config: CalibrateConfig) -> None:
@@ -272,7 +274,7 @@ def run(config: CalibrateConfig) -> None:
         FidelityError: Fewer surveys than asked, or a folder without their results.
     """
     if config.windows:
-        set_limits(config.runs, LIMITS if config.out == table.THRESHOLDS else config.out)
+        set_limits(config.runs, LIMITS if config.out == table.THRESHOLDS else config.out, config.sensor)
         return
     if len(config.runs) < config.fewest:
         raise FidelityError(f"calibration needs {config.fewest} simulated surveys, {len(config.runs)} were given")

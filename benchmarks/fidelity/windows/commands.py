@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from benchmarks.fidelity.files import FidelityError, read_json, write_json
 from benchmarks.fidelity.impostors import truth_candidate
 from benchmarks.fidelity.inputs import Inputs, complete_inputs, read_case
 from benchmarks.fidelity.windows.judge import dump_windows, judge_windows, windows_hash, worst_windows
-from benchmarks.fidelity.windows.measures import LIMITS, MEASURES, Series
+from benchmarks.fidelity.windows.measures import LIMITS, MEASURES, SENSORS, STANDARD_SENSOR, Series
 from subterra_jax.host.files import require_folder
 
 SCHEMA = "subterra.fidelity-windows/1"
@@ -71,16 +72,20 @@ def _series(case: Case) -> dict[str, dict[str, list[float | None]]]:
     }
 
 
-def set_limits(runs: tuple[Path, ...], out: Path = LIMITS) -> None:
+def set_limits(runs: tuple[Path, ...], out: Path = LIMITS, sensor: str = STANDARD_SENSOR) -> None:
     """Sets the limits of windows from simulated surveys in which nothing is wrong.
 
     Args:
         runs: Output folders of `windows` on simulated surveys with `--truth`.
         out: File to write.
+        sensor: LiDAR that recorded them; of another than the standard one only limits against a recording are set,
+            beside what the file holds.
 
     Raises:
-        FidelityError: Fewer than three surveys, or a folder without their results.
+        FidelityError: Fewer than three surveys, a folder without their results, or an unknown sensor.
     """
+    if sensor not in SENSORS:
+        raise FidelityError(f"no sensor {sensor!r}; there are {', '.join(SENSORS)}")
     if len(runs) < FEWEST:
         raise FidelityError(f"limits need {FEWEST} simulated surveys, {len(runs)} were given")
     values: dict[str, list[float]] = {}
@@ -96,14 +101,20 @@ def set_limits(runs: tuple[Path, ...], out: Path = LIMITS) -> None:
         for source in ("recording", "truth"):
             if known := values.get(f"{one.id}.{source}"):
                 usual = float(np.percentile(known, PERCENTILE))
-                limit = float(np.clip(MARGIN * usual, one.floor, one.gate))
+                limit = None if usual > one.gate else round(float(np.clip(MARGIN * usual, one.floor, one.gate)), 4)
                 frozen[f"{one.id}.{source}"] = {
-                    "limit": round(limit, 4),
+                    "limit": limit,
                     "p999": round(usual, 5),
                     "windows": len(known),
                 }
     surveys = sorted(folder.name for folder in runs)
-    write_json(out, {"schema": LIMITS_SCHEMA, "surveys": surveys, "limits": frozen})
+    content: dict[str, Any] = read_json(out, LIMITS_SCHEMA) if out.exists() else {"schema": LIMITS_SCHEMA}
+    if sensor == STANDARD_SENSOR:
+        content |= {"surveys": surveys, "limits": frozen}
+    else:
+        own = {name: one for name, one in frozen.items() if name.endswith(".recording")}
+        content["sensors"] = content.get("sensors", {}) | {sensor: own}
+    write_json(out, content)
     print(f"{out}: {len(frozen)} limits from {len(surveys)} surveys")
 
 

@@ -11,7 +11,18 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.controls.local import make_ground, spoil, stated_faults
 from benchmarks.fidelity.derive.curve import candidate_curve
-from benchmarks.fidelity.windows.measures import LIMITS, MEASURES, Measure, Series, Source, limits, sources, unrolled
+from benchmarks.fidelity.windows.measures import (
+    LIMITS,
+    MEASURES,
+    STANDARD_SENSOR,
+    Measure,
+    Series,
+    Source,
+    limits,
+    sensor_of,
+    sources,
+    unrolled,
+)
 
 
 @dataclass(frozen=True)
@@ -29,6 +40,7 @@ class Worst:
         where: Part of the section; empty for all of it.
         judged: Share of the windows that have a value.
         error: Cause why there is no value, if the computation broke.
+        foreign: Topic of a recording by a sensor that the limit was not set with; empty otherwise.
     """
 
     id: str
@@ -42,6 +54,7 @@ class Worst:
     where: str = ""
     judged: float = 0.0
     error: str = ""
+    foreign: str = ""
 
     @property
     def beyond(self) -> bool:
@@ -60,7 +73,7 @@ class Worst:
         return (
             f"window {self.id}: {self.words}{place} is {factor * self.value:.{digits}f}{unit} from station "
             f"{self.start:.0f} to {self.end:.0f} m against the {self.source}; {factor * self.limit:.{digits}f}{unit} "
-            "is the limit"
+            f"is the limit{f', which was not set with the sensor of {self.foreign}' if self.foreign else ''}"
         )
 
 
@@ -75,20 +88,26 @@ def worst_windows(case: Case, series: dict[str, Series] | None = None) -> list[W
 
 
 def _worst(case: Case, one: Measure, source: Source, kept: dict[str, Series] | None) -> Worst:
-    limit = limits()[f"{one.id}.{source}"]
+    topic = case.hold.sensor if source == "recording" and case.hold is not None else ""
+    sensor = sensor_of(topic) if topic else STANDARD_SENSOR
+    limit, foreign = limits(sensor or STANDARD_SENSOR)[f"{one.id}.{source}"], "" if sensor else topic
+    if limit is None:
+        return Worst(one.id, one.words, source, one.unit, None, one.gate)
     try:
         series = one.compute(case, source)
         if kept is not None:
             kept[f"{one.id}.{source}"] = series
     except Exception as error:  # a spoilt candidate may break any library
-        return Worst(one.id, one.words, source, one.unit, None, limit, error=f"{type(error).__name__}: {error}"[:200])
+        reason = f"{type(error).__name__}: {error}"[:200]
+        return Worst(one.id, one.words, source, one.unit, None, limit, error=reason, foreign=foreign)
     if not np.isfinite(series.value).any():
-        return Worst(one.id, one.words, source, one.unit, None, limit)
+        return Worst(one.id, one.words, source, one.unit, None, limit, foreign=foreign)
     k = int(np.nanargmax(series.value))
     start, end = stations_on_candidate(case, source, series, k)
     return Worst(
-        one.id, one.words, source, one.unit, float(series.value[k]), limit, start, end, series.where[k], series.judged
-    )
+        one.id, one.words, source, one.unit, float(series.value[k]), limit, start, end, series.where[k], series.judged,
+        foreign=foreign,
+    )  # fmt: skip
 
 
 def stations_on_candidate(case: Case, source: Source, series: Series, k: int) -> tuple[float, float]:

@@ -228,12 +228,29 @@ MEASURES = tuple(Measure(*row) for row in (
 ))  # fmt: skip
 
 
+SENSORS = {"os1": ("ouster", "os1", "os_cloud"), "avia": ("livox",), "vlp16": ("velodyne", "vlp")}
+STANDARD_SENSOR = "os1"  # of which the limits against the truth come, and those of a sensor that is none of `SENSORS`
+
+
+def sensor_of(topic: str) -> str | None:
+    """Return the LiDAR of `SENSORS` that a recording's topic names; `None` for another."""
+    known = [sensor for sensor, words in SENSORS.items() if any(word in topic.lower() for word in words)]
+    return known[0] if known else None
+
+
 @cache
-def limits() -> dict[str, float]:
-    """Return the frozen limits by `id.source`; without a calibration the gates."""
-    frozen = json.loads(LIMITS.read_text())["limits"] if LIMITS.exists() else {}
+def limits(sensor: str = STANDARD_SENSOR) -> dict[str, float | None]:
+    """Return the frozen limits by `id.source`; without a calibration the gates.
+
+    `None` where windows in which nothing is wrong lie beyond the gate with this sensor: it cannot judge that measure.
+
+    Args:
+        sensor: LiDAR of the recording; limits that were not set with it are those of the standard one.
+    """
+    frozen = json.loads(LIMITS.read_text()) if LIMITS.exists() else {}
+    rows = frozen.get("limits", {}) | frozen.get("sensors", {}).get(sensor, {})
     return {
-        f"{one.id}.{source}": frozen.get(f"{one.id}.{source}", {}).get("limit", one.gate)
+        f"{one.id}.{source}": rows.get(f"{one.id}.{source}", {}).get("limit", one.gate)
         for one in MEASURES
         for source in ("recording", "truth")
     }

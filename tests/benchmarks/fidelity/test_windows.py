@@ -1,6 +1,8 @@
 """Worst windows: known answers on a tube, faults that must be noticed, and where they are."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,9 +10,11 @@ import pytest
 from benchmarks.fidelity import judge
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.controls.local import KINDS, Fault, draw_fault, make_ground, spoil, stated_faults
+from benchmarks.fidelity.files import FidelityError, write_json
 from benchmarks.fidelity.registry import Value
+from benchmarks.fidelity.windows import commands
 from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
-from benchmarks.fidelity.windows.measures import limits
+from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
 from tests.benchmarks.fidelity import tube
 
 LENGTH = 24.0
@@ -132,3 +136,59 @@ def test_limits_lie_between_their_floor_and_their_gate() -> None:
     for one in MEASURES:
         for source in ("recording", "truth"):
             assert one.floor <= limits()[f"{one.id}.{source}"] <= one.gate, one.id
+    for sensor in SENSORS:
+        blind = {name for name, limit in limits(sensor).items() if limit is None}
+        assert blind == ({"bed.recording", "spot.recording"} if sensor == "avia" else set())
+
+
+def test_a_recording_is_judged_by_the_limits_of_its_own_sensor() -> None:
+    topics = {"/ouster/points": "os1", "/livox/lidar": "avia", "/velodyne_points": "vlp16", "/rslidar": None}
+    assert {topic: sensor_of(topic) for topic in topics} == topics
+    for sensor in SENSORS:
+        assert {name: limit for name, limit in limits(sensor).items() if name.endswith("truth")} == {
+            name: limit for name, limit in limits().items() if name.endswith("truth")
+        }
+
+
+def test_a_window_beyond_a_limit_that_another_sensor_set_says_so(good) -> None:
+    beams = replace(good.hold, range=good.hold.range + 0.2, cache={})
+    said = {}
+    for topic in ("/rslidar_points", "/ouster/points"):
+        found = by_name(replace(good, hold=replace(beams, sensor=topic, cache={}), cache={}))
+        assert found["wall.recording"].beyond
+        said[topic] = found["wall.recording"].sentence()
+    assert "which was not set with the sensor of /rslidar_points" in said["/rslidar_points"]
+    assert "not set with" not in said["/ouster/points"]
+
+
+def test_what_a_sensor_cannot_judge_is_not_judged_by_it(good, before) -> None:
+    livox = by_name(replace(good, hold=replace(good.hold, sensor="/livox/lidar", cache={}), cache={}))
+    assert livox["spot.recording"].value is None
+    assert not livox["spot.recording"].beyond
+    assert before["spot.recording"].value is not None
+    assert livox["sector.recording"].value == before["sector.recording"].value
+
+
+def test_limits_of_another_sensor_are_set_beside_those_of_the_standard_one(tmp_path) -> None:
+    def runs(name: str, value: float) -> tuple[Path, ...]:
+        for k in range(3):
+            one = {f"{measure}.{source}": {"start": [0.0], "value": [value]}
+                   for measure in ("wall", "spot") for source in ("recording", "truth")}  # fmt: skip
+            write_json(
+                tmp_path / f"{name}{k}" / "windows.json", {"schema": commands.SCHEMA, "series": {"ceiling": one}}
+            )
+        return tuple(tmp_path / f"{name}{k}" for k in range(3))
+
+    out = tmp_path / "limits.json"
+    commands.set_limits(runs("o", 0.001), out)
+    before = json.loads(out.read_text())
+    commands.set_limits(runs("a", 0.03), out, "avia")
+    commands.set_limits(runs("v", 0.4), out, "vlp16")
+    after, own = json.loads(out.read_text()), ("wall.recording", "spot.recording")
+    assert after["limits"] == before["limits"]
+    assert {name: one["limit"] for name, one in after["sensors"]["avia"].items()} == {
+        "wall.recording": 0.045, "spot.recording": 0.08,
+    }  # fmt: skip
+    assert {name: one["limit"] for name, one in after["sensors"]["vlp16"].items()} == dict.fromkeys(own)
+    with pytest.raises(FidelityError, match="no sensor 'kinect'"):
+        commands.set_limits(runs("o", 0.001), out, "kinect")
