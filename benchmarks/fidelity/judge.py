@@ -32,6 +32,8 @@ PATCH_NEIGHBOURS = 12
 PATCH_RADIUS = 0.25  # m within which neighbours must lie to make a plane
 PATCH_SAMPLES = 8_000
 
+WITHOUT_TRACK = ("SEC", "MSH", "TRI")  # categories that read nothing of the track
+
 Values = dict[str, Value]
 
 
@@ -116,8 +118,8 @@ def compute_values(case: Case, folder: Path) -> dict[str, Values]:
         for name in [name for name in candidates if name not in values]:
             stage = progress.start(f"metrics of {name}", table.COUNT)
             one = replace(case, candidate=candidates[name](), cache={})
-            chosen = None if name == "base" else geometry_categories()
-            values[name] = evaluate(one, chosen, values.get("base"), lambda id, stage=stage: stage.advance())  # type: ignore[misc]
+            chosen, reused = _what_differs(name, values)
+            values[name] = evaluate(one, chosen, reused, lambda id, stage=stage: stage.advance())  # type: ignore[misc]
             dumped = {name: dump_values(entry) for name, entry in values.items()}
             write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
             one.cache.clear()
@@ -143,6 +145,15 @@ def _kept_values(path: Path, key: str) -> dict[str, Values]:
     if content.get("schema") != VALUES_SCHEMA or content.get("key") != key:
         return {}
     return {name: load_values(entry) for name, entry in content["values"].items()}
+
+
+def _what_differs(name: str, values: dict[str, Values]) -> tuple[tuple[str, ...] | None, Values | None]:
+    """Return the categories to compute for a candidate, and the values that the others are taken from."""
+    if name == "base":
+        return None, None
+    if name == "null_bare" and "null" in values:
+        return tuple(c for c in geometry_categories() if c not in WITHOUT_TRACK), values["null"]
+    return geometry_categories(), values["base"]
 
 
 def geometry_categories() -> tuple[str, ...]:
