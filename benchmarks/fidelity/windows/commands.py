@@ -108,13 +108,13 @@ def set_limits(runs: tuple[Path, ...], out: Path = LIMITS, sensor: str = STANDAR
                     "windows": len(known),
                 }
     surveys = sorted(folder.name for folder in runs)
-    content: dict[str, Any] = read_json(out, LIMITS_SCHEMA) if out.exists() else {"schema": LIMITS_SCHEMA}
+    kept: dict[str, Any] = read_json(out, LIMITS_SCHEMA) if out.exists() else {"schema": LIMITS_SCHEMA}
     if sensor == STANDARD_SENSOR:
-        content |= {"surveys": surveys, "limits": frozen}
+        kept |= {"surveys": surveys, "limits": frozen}
     else:
         own = {name: one for name, one in frozen.items() if name.endswith(".recording")}
-        content["sensors"] = content.get("sensors", {}) | {sensor: own}
-    write_json(out, content)
+        kept["sensors"] = kept.get("sensors", {}) | {sensor: own}
+    write_json(out, kept)
     print(f"{out}: {len(frozen)} limits from {len(surveys)} surveys")
 
 
