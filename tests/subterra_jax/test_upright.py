@@ -28,7 +28,7 @@ def scans(relief: lidar3d.Relief, which: np.ndarray, poses: reference.Poses, hei
     place = np.column_stack([poses.position, np.full(len(half), height)]).astype(np.float32)
 
     def one(k, p, q, s):
-        return lidar3d.scan(relief.pick(k), p, q, s, beam, 30.0)
+        return lidar3d.scan(relief.pick(k), p, q, s, jnp.asarray(beam), 30.0)
 
     return np.asarray(jax.jit(jax.vmap(one))(which, place, turn, poses.station))
 
@@ -61,7 +61,7 @@ def test_a_packaged_tunnel_is_raised_along_its_grade_and_a_crown_below_the_lidar
     assert relief.n_bytes < 2e6
     mid = len(plan.station) // 2
     place = jnp.asarray([*plan.centre[mid], plan.elevation[mid] + 1.0], jnp.float32)
-    down = lidar3d.cast(relief, place, np.float32([[0.0, 0.0, -1.0]]), jnp.float32(plan.station[mid]), 30.0)
+    down = lidar3d.cast(relief, place, jnp.array([[0.0, 0.0, -1.0]]), jnp.float32(plan.station[mid]), 30.0)
     np.testing.assert_allclose(down, [1.0], atol=1e-3)
     with pytest.raises(st.SubterraError, match=r"crown must be above the LiDAR at 0.7 m, got crown=0.5 m"):
         lidar3d.Relief.from_plan(plan, crown=0.5)
