@@ -141,6 +141,7 @@ RESOLVED = {
     "m": 0.01, "m/100 m": 0.01, "%": 0.3, "1": 0.01, "deg": 0.1, "mm": 0.5, "nat": 0.1, "count": 0.5,
     "1/100 scans": 0.5,
 }  # fmt: skip  # by unit: a third of a LiDAR's range noise
+RESTLESS = 5.0  # points
 FINEST = 1e-6  # what arithmetic may leave of no error at all
 
 
@@ -190,7 +191,8 @@ def bad_end_rule(rows: dict[str, Metric], surveys: list[Survey]) -> dict[str, tu
 def noise_floor(row: Metric, surveys: list[Survey]) -> float | None:
     """Return the good end at which the truth itself has 100 on every survey; `None` without a reference.
 
-    Rounded to three digits, away from the ideal.
+    Rounded to three digits, away from the ideal. `None` also where a change that changes nothing, half of the beams for
+    instance, would cost or bring more than `RESTLESS` points from there: the metric then keeps its wider end.
 
     Raises:
         FidelityError: The truth scores 0 somewhere, so that the metric tells nothing.
@@ -201,7 +203,15 @@ def noise_floor(row: Metric, surveys: list[Survey]) -> float | None:
     floor = _round_up(max(reached))
     if floor >= map_ends(row.map)[1]:
         raise FidelityError(f"{row.id}: the truth itself comes no nearer than {max(reached):.3g} and scores 0")
-    return max(1.0, row.map.good) - floor if row.map.kind == "U" else floor
+    good = max(1.0, row.map.good) - floor if row.map.kind == "U" else floor
+    honest = replace(row.map, good=good)
+    moves = [
+        abs(honest.score(changed) - honest.score(base))
+        for survey in surveys
+        for values in survey.same.values()
+        if (base := survey.base[row.id].value) is not None and (changed := values[row.id].value) is not None
+    ]
+    return None if max(moves, default=0.0) > RESTLESS else good
 
 
 def _round_up(value: float) -> float:
