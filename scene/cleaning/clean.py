@@ -7,6 +7,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import maximum_filter1d
 from scipy.spatial import cKDTree
 
 from scene.bore import Axis
@@ -21,7 +22,7 @@ from scene.errors import FitError
 from scene.fitting.centreline import CentrelineConfig, centre_axis, fit_centreline, smooth_axis
 
 _COARSE = 0.15  # m, voxel of the cloud that is followed
-_REACH = 3.0  # times the template: as far as the wall is looked for
+_REACH, _AROUND = 3.0, 5  # times the template, and directions around: as far as the wall is looked for
 _STRETCH = 3.0  # m between two stretches of what was removed
 _LITTLE = 0.002  # share of the points: with less to remove, the cloud is clean
 _SAME, _SHORTER = 0.10, 2.0  # m between two axes of one bore; m that the one may be shorter
@@ -57,7 +58,7 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     if course is None or course.length < max(centreline.min_length, _ELONGATION * course.width):
         raise FitError(name_cloud(coarse, seeds, course, centreline.min_length))
     axis = smooth_axis(course.position, centreline.cutoff)
-    reach = _REACH * float(np.nanmax(np.nanmedian(course.radius, axis=0)))
+    reach = _REACH * maximum_filter1d(course.usual, _AROUND, mode="wrap")
     for _ in range(2):
         tube, ends, own = _sorted_coarse(coarse, count, axis, reach)
         axis = centre_axis(coarse[own], axis, centreline, _usual_section(axis, tube))
@@ -92,7 +93,7 @@ def _filter(cause: Int[np.ndarray, " n"], config: CleaningConfig) -> Int[np.ndar
 
 
 def _sorted_coarse(
-    coarse: np.ndarray, count: np.ndarray, axis: Axis, reach: float
+    coarse: np.ndarray, count: np.ndarray, axis: Axis, reach: np.ndarray
 ) -> tuple[Tube, tuple[float, float], Bool[np.ndarray, " n"]]:
     """Return the tube about an axis, its ends, and which points are the bore's.
 

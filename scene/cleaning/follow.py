@@ -50,11 +50,15 @@ class Course:
         return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
 
     @property
+    def usual(self) -> Float[np.ndarray, " rays"]:
+        """Distance of the wall from the middle in each direction, in the median along the bore, m."""
+        return _filled(np.nanmedian(self.radius, axis=0))
+
+    @property
     def width(self) -> float:
         """Distance of the walls to the left and right of the middle from each other, m."""
-        usual = _filled(np.nanmedian(self.radius, axis=0))
         side = np.abs(np.cos(_TURN)) > _LEVEL
-        return 2 * float(np.mean(usual[side]))
+        return 2 * float(np.mean(self.usual[side]))
 
 
 def follow_bore(points: Float[np.ndarray, "n 3"], tree: cKDTree, seed: Seed) -> Course:

@@ -73,16 +73,18 @@ def measure_tube(
     radius: Float[np.ndarray, " n"],
     count: Float[np.ndarray, " n"],
     length: float,
-    reach: float,
+    reach: Float[np.ndarray, " rays"],
 ) -> Tube:
-    """Return the wall that persists along an axis of some length, m, within `reach` m of it.
+    """Return the wall that persists along an axis of some length, m.
 
-    `count` is the number of returns that each point stands for.
+    `count` is the number of returns that each point stands for, and `reach` how far the wall is looked for in evenly
+    spaced directions, m: what persists further out is the wall of another tunnel.
     """
     grid = Grid.over(-_OVERRUN, length + _OVERRUN, ROW, COLUMNS)
     cell = grid.cell(station, angle)
-    good = (cell >= 0) & (radius < reach)
-    bins = int(np.ceil(reach / _BIN)) + 1
+    rays = -np.pi + 2 * np.pi * (np.arange(len(reach)) + 0.5) / len(reach)
+    good = (cell >= 0) & (radius < np.interp(angle, rays, reach, period=2 * np.pi))
+    bins = int(np.ceil(reach.max() / _BIN)) + 1
     flat = np.zeros((grid.rows * COLUMNS, bins), bool)
     flat[cell[good], (radius[good] / _BIN).astype(np.intp)] = True
     hit = flat.reshape(grid.rows, COLUMNS, bins)

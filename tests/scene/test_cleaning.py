@@ -130,6 +130,15 @@ def test_of_two_tunnels_the_longer_is_built_with_a_warning():
     assert part.cause == CAUSES[ELSEWHERE]
 
 
+def test_the_wall_of_a_twin_beside_the_tunnel_is_not_taken_for_its_own():
+    twin = Tube((3, 13), (27, 13))
+    passage = Tube((14, 0), (14, 13), 2.0, 2.4)
+    result = cleaned(turned(arch(twin, passage)))
+    require_axis_in_the_middle(result)
+    assert {part.cause for part in result.removed if part.warning} <= {CAUSES[ELSEWHERE], CAUSES[BRANCH]}
+    assert any(part.warning for part in result.removed)
+
+
 def test_an_unseen_wall_does_not_move_the_axis():
     points = arch()
     unseen = (points[:, 1] > 1.5) & (points[:, 2] > 0.05) & (np.abs(points[:, 0] - 15) < 6)
@@ -189,7 +198,7 @@ def test_a_widening_of_a_lay_bys_length_is_bore_and_a_niche_is_not(length, out, 
     station, angle = rng.uniform(0.0, 90.0, 200_000), rng.uniform(-np.pi, np.pi, 200_000)
     beside = (np.abs(station - 45.0) < length / 2) & (np.abs(angle) < 0.5)
     radius = np.where(beside, out, 2.75) + rng.normal(0.0, 0.01, len(station))
-    tube = measure_tube(station, angle, radius, np.ones(len(station)), 90.0, 8.0)
+    tube = measure_tube(station, angle, radius, np.ones(len(station)), 90.0, np.full(72, 8.0))
     row = round((45.0 - tube.grid.start) / tube.grid.step)
     wall = float(np.median(tube.wall[row - 2 : row + 3][:, np.abs(tube.grid.angle) < 0.3]))
     assert wall == pytest.approx(out if bore else 2.75, abs=0.15)
