@@ -11,7 +11,6 @@ from subterra_jax.policies.locate.profiles import BIN, BLOCK, Points, Profiles
 
 _BEFORE = 120  # bins of the profiles before the start
 _AFTER = 120  # bins behind the last metre
-FIRST_CUT = BLOCK * DELAY + matching.LAGS + matching.MARGIN  # bins from the begin of a cut to that of the newest block
 
 
 @struct.dataclass

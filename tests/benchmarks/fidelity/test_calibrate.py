@@ -41,7 +41,7 @@ def survey(ceiling: dict[str, Value], null: dict[str, Value] | None = None, **sp
 
 
 def distant(row: Metric) -> float:
-    """What scores 0."""
+    """The value of a metric that scores 0."""
     return row.map.bad + (row.map.target if row.map.kind == "B" else 0.0)
 
 
