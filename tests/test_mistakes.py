@@ -46,6 +46,7 @@ MISTAKES = {
     "benchmarks.openboard --out o --tasks Fly": "no task 'Fly' of version 1; there are StopAt, Return",
     "benchmarks.openboard --out o --agents nobody": "no agent 'nobody'",
     "benchmarks.openboard --out o --splits dev": "there is no split 'dev'; there are train, val",
+    "benchmarks.openboard --out o --sensor sonar": "no sensor 'sonar'; there are planar16, spin16x64",
     "benchmarks.openboard --out o --tunnels 0": "tunnels must be at least 1, got 0",
     "benchmarks.openboard --out o --report-only": "holds no cell of these tunnels",
     "benchmarks.openboard.ablations --out o --agents nobody": "no agent 'nobody'",

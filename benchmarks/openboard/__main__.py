@@ -19,15 +19,16 @@ import numpy as np
 from rich.console import Console
 
 import subterra_jax as st
-from benchmarks.command import run_main
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.openboard import columns as board
 from benchmarks.openboard import report
 from benchmarks.results import environment_facts, write_file
 from subterra_jax.evaluation import evaluate
 from subterra_jax.evaluation.floor import floor
 from subterra_jax.host.files import require_folder
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies import open_agent
-from train.locate.tunnels import load
+from train.locate.tunnels import PLANAR, load
 
 _progress = Console(stderr=True, highlight=False)
 
@@ -43,6 +44,7 @@ class OpenboardConfig:
         splits: Splits of the open world; a choice may be made on `val` alone.
         episodes: Episodes of each kind and split.
         tunnels: Tunnels of each kind and split, over which the episodes are spread.
+        sensor: The LiDAR, by name; use a folder of its own for each.
         cache: Folder in which made tunnels are kept from run to run.
         report_only: Drive nothing.
     """
@@ -53,6 +55,7 @@ class OpenboardConfig:
     splits: tuple[str, ...] = ("val", "test-seen", "test-unseen")
     episodes: int = 50
     tunnels: int = 5
+    sensor: str = PLANAR
     cache: Path | None = None
     report_only: bool = False
 
@@ -64,6 +67,8 @@ def run(config: OpenboardConfig) -> None:
         SubterraError: A task, split or agent is unknown, or the folder cannot be written.
     """
     board.check(config.tasks, config.agents, config.splits, config.tunnels, config.episodes)
+    if config.sensor not in SENSORS:
+        raise BenchmarkError(f"no sensor {config.sensor!r}; there are {', '.join(SENSORS)}")
     require_folder(config.out)
     missing = [
         (task, agent)
@@ -80,8 +85,10 @@ def run(config: OpenboardConfig) -> None:
 
 
 def conditions(config: OpenboardConfig) -> str:
-    """Return a digest of what a cell depends on: constants, world, tunnels and episodes."""
+    """Return a digest of what a cell depends on: constants, world, tunnels, episodes and LiDAR."""
     content = [st.constants_digest(version="v1"), config.splits, config.episodes, config.tunnels, board.FIRST]
+    if config.sensor != PLANAR:
+        content.append(config.sensor)
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -99,12 +106,13 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
     columns = board.columns_of(config.splits)
     names = board.tunnel_names(columns, config.tunnels)
     started = time.monotonic()
-    tunnel = st.make(f"Subterra/{missing[0][0]}-v1", tunnel=load(names, cache=config.cache))[1].tunnel
+    made = load(names, cache=config.cache, sensor=config.sensor)
+    tunnel = st.make(f"Subterra/{missing[0][0]}-v1", tunnel=made, sensor=config.sensor)[1].tunnel
     _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
     floors: dict[str, list[float]] = {}
     for task, agent in missing:
         started = time.monotonic()
-        env, params = st.make(f"Subterra/{task}-v1", tunnel=tunnel, estimates=True)
+        env, params = st.make(f"Subterra/{task}-v1", tunnel=tunnel, estimates=True, sensor=config.sensor)
         if task not in floors:
             floors[task] = [floor(params, index) for index in range(len(names))]
         episodes = board.draw_episodes(task, columns, config.tunnels, config.episodes)
@@ -117,6 +125,7 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
             "agent": agent,
             "columns": [dataclasses.asdict(column) for column in columns],
             "tunnels": config.tunnels,
+            "sensor": config.sensor,
             "success": records.success.astype(int).tolist(),
             "contact": records.contact.astype(int).tolist(),
             "goal_error": [None if np.isnan(e) else round(float(e), 3) for e in records.goal_error],
