@@ -14,7 +14,9 @@ from subterra_jax import policies
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
+from train.checkpoint import iterations
 from train.config import ConfigError
+from train.folder import RunFolderError
 from train.locate import filtering, look, release, scores, session, tunnels
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner
@@ -96,6 +98,23 @@ def test_gradients_do_not_depend_on_the_chunks():
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=1e-5)
 
 
+def test_a_folder_that_holds_a_run_is_neither_written_over_nor_gone_on_with_as_another(tmp_path):
+    command = _command(tmp_path)
+    session._write_config(command)  # a run that was killed before its first checkpoint
+    begun = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(RunFolderError, match="holds a run already; --resume goes on with it, --overwrite replaces it"):
+        session.run(command)
+    other = dataclasses.replace(_command(tmp_path, n_steps=220), resume=True)
+    with pytest.raises(ConfigError, match="was begun with another n_steps"):
+        session.run(other)
+    with pytest.raises(ConfigError, match="was begun with another seeds"):
+        session.run(dataclasses.replace(command, seeds=(5,), resume=True))
+    assert (tmp_path / "config.json").read_bytes() == begun
+    (tmp_path / "config.json").write_text("{")
+    with pytest.raises(ConfigError, match="cannot be read; --overwrite begins anew"):
+        session.run(dataclasses.replace(command, resume=True))
+
+
 @pytest.mark.slow
 def test_a_run_writes_policies_that_load_and_goes_on_as_what_it_was(tmp_path, monkeypatch):
     settings = {"tunnels": "control", "val": "control", "task": "Subterra/StopAtShort-v1", "drives": 2, "seeds": (3, 4)}
@@ -107,14 +126,24 @@ def test_a_run_writes_policies_that_load_and_goes_on_as_what_it_was(tmp_path, mo
     first = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert len(first) == 1
     assert json.loads((folder / "scores.json").read_text())["seed"] == 3
+    begun = (tmp_path / "config.json").read_bytes()
     with pytest.raises(ConfigError, match="was begun with another n_steps"):
         session.run(dataclasses.replace(command, resume=True, config=dataclasses.replace(command.config, n_steps=220)))
+    assert (tmp_path / "config.json").read_bytes() == begun
+    with (folder / "log.jsonl").open("a") as log:
+        log.write('{"step": 80')  # a line that a kill cut off
     longer = dataclasses.replace(command.config, minutes=(first[0]["seconds"] + 30.0) / 60.0)
     session.run(dataclasses.replace(command, resume=True, config=longer))
     second = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert second[0] == first[0]
     assert [row["step"] for row in second] == [400 * (i + 1) for i in range(len(second))]
     assert len(second) > 1
+    steps = iterations(tmp_path)[-1]
+    with pytest.raises(RunFolderError, match="holds a run already"):
+        session.run(command)
+    session.run(dataclasses.replace(command, overwrite=True))
+    assert len((folder / "log.jsonl").read_text().splitlines()) == 1
+    assert iterations(tmp_path) == [1] != [steps], "a checkpoint of the run that was thrown away is still there"
 
 
 def _table(path, digest, agents):

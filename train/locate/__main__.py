@@ -13,8 +13,9 @@ PROG = "python -m train.locate"
 
 def read(words: list[str]) -> Command:
     """Reads the command line, and the file that it may name."""
-    whole = insert_file(words, lambda some: tyro.cli(Command, args=some, prog=PROG, description=__doc__))
-    return tyro.cli(Command, args=whole, prog=PROG, description=__doc__)
+    plain = (tyro.conf.FlagCreatePairsOff,)
+    whole = insert_file(words, lambda some: tyro.cli(Command, args=some, prog=PROG, description=__doc__, config=plain))
+    return tyro.cli(Command, args=whole, prog=PROG, description=__doc__, config=plain)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import json
+import shutil
+import sys
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,17 +15,18 @@ import numpy as np
 import safetensors.numpy
 import tyro
 
-from subterra_jax.host.files import replace_file
+from subterra_jax.host.files import replace_file, require_folder
 from subterra_jax.policies import TRAINED_UNDER, training_conditions
 from subterra_jax.policies.files import SCHEMA
 from subterra_jax.policies.locate.agent import KIND, flat
-from train.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
+from train.checkpoint import FOLDER, has_checkpoint, load_checkpoint, remove_folder, save_checkpoint
 from train.config import ConfigError, at_least, positive
+from train.folder import RunFolderError
 from train.locate import scores, tunnels
 from train.locate.learner import LocateConfig, LocateLearner
 from train.options import settings_of
 from train.policies import facts_file
-from train.sinks import Board, check_tensorboard
+from train.sinks import TENSORBOARD, Board, check_tensorboard
 from train.world import library_versions
 
 POLICY, LOG, CURVE, SCORES, CONFIG = "policy.safetensors", "log.jsonl", "curve.jsonl", "scores.json", "config.json"
@@ -48,6 +51,7 @@ class Command:
         score_every: Time between two scores, s.
         save_every: Time between two checkpoints, s.
         resume: Go on from the newest checkpoint, or from the beginning.
+        overwrite: Throw away the run that `out` holds.
         tensorboard: Write the log for TensorBoard as well.
         settings: YAML, TOML or JSON file with options, or a run's `config.json`; options override it.
         config: Settings.
@@ -64,6 +68,7 @@ class Command:
     score_every: float = 15.0
     save_every: float = 60.0
     resume: bool = False
+    overwrite: bool = False
     tensorboard: bool = False
     settings: Annotated[Path | None, tyro.conf.arg(name="config")] = None
     config: Annotated[LocateConfig, tyro.conf.OmitArgPrefixes] = dataclasses.field(default_factory=LocateConfig)
@@ -98,9 +103,11 @@ def run(arguments: Command) -> None:
 
     Raises:
         ConfigError: A setting is wrong, or a run to go on with was begun with others.
+        RunFolderError: The folder holds a run, and neither `resume` nor `overwrite` is said.
         SubterraError: There is no such task or tunnel, or a folder cannot be written.
     """
     check(arguments)
+    _check_folder(arguments)
     begin = time.monotonic()
     everything = tunnels.load(
         tunnels.names_of(arguments.tunnels) + tunnels.names_of(arguments.val),
@@ -112,9 +119,11 @@ def run(arguments: Command) -> None:
     env, params = tunnels.enter(arguments.task, everything[:n_train], arguments.sensor)
     val_env, val_params = tunnels.enter(arguments.task, everything[n_train:], arguments.sensor)
     print(f"{len(everything)} tunnels: {time.monotonic() - begin:.0f} s", flush=True)
-    _write_config(arguments)
     drives = scores.record(val_env, val_params, jax.random.key(_VAL_SEED), arguments.drives)
     session = Session(arguments, env, params, drives)
+    if not session.spent:
+        _clear(arguments.out)
+    _write_config(arguments)  # not before a run of other settings has been refused: it would take these for its own
     session.train()
     for index, seed in enumerate(arguments.seeds):
         folder = arguments.out / f"seed-{seed}"
@@ -229,9 +238,7 @@ class Session:
 
     def _restore(self) -> None:
         stored = load_checkpoint(self._arguments.out)
-        if (was := stored.facts.get("settings")) != (now := _identity(self._arguments)):
-            other = next(name for name in now if was is None or was.get(name) != now[name])
-            raise ConfigError(f"{self._arguments.out}: was begun with another {other}; train into another folder")
+        _check_same(self._arguments, stored.facts.get("settings"))
         plain = dataclasses.replace(self.state, key=jax.random.key_data(self.state.key))
         state = jax.tree.map(jnp.asarray, stored.restore("state", plain))
         self.state = dataclasses.replace(state, key=jax.random.wrap_key_data(state.key))
@@ -287,9 +294,47 @@ def _identity(arguments: Command) -> dict[str, Any]:
     return json.loads(json.dumps(plain))
 
 
+def _check_same(arguments: Command, was: dict[str, Any] | None) -> None:
+    if was != (now := _identity(arguments)):
+        other = next(name for name in now if was is None or was.get(name) != now[name])
+        raise ConfigError(f"{arguments.out}: was begun with another {other}; train into another folder")
+
+
+def _check_folder(arguments: Command) -> None:
+    """Refuses a folder that holds a run, unless it is to be gone on with as what it was, or thrown away."""
+    require_folder(arguments.out)
+    place = arguments.out / CONFIG
+    if arguments.resume:
+        if has_checkpoint(arguments.out):
+            return  # the checkpoint itself says what it is of
+        if place.exists():
+            try:
+                was = json.loads(place.read_text())["settings"]
+            except (OSError, ValueError, KeyError, TypeError) as error:
+                raise ConfigError(f"{place}: cannot be read; --overwrite begins anew") from error
+            _check_same(arguments, was)
+        print(f"{arguments.out}: no checkpoint yet; begins at the beginning", file=sys.stderr)
+    elif not arguments.overwrite and (has_checkpoint(arguments.out) or place.exists()):
+        raise RunFolderError(f"{arguments.out}: holds a run already; --resume goes on with it, --overwrite replaces it")
+
+
+def _clear(out: Path) -> None:
+    """Throws away what a folder holds of another run; the checkpoints first, which a later `--resume` believes."""
+    remove_folder(out / FOLDER)
+    for folder in out.glob("seed-*"):
+        for place in (folder / POLICY, facts_file(folder / POLICY), folder / LOG, folder / CURVE, folder / SCORES):
+            place.unlink(missing_ok=True)
+        shutil.rmtree(folder / TENSORBOARD, ignore_errors=True)
+
+
 def _write_config(arguments: Command) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
-    facts = {"schema": "subterra.locate/1", "command": settings_of(arguments), "versions": library_versions()}
+    facts = {
+        "schema": "subterra.locate/1",
+        "command": settings_of(arguments),
+        "settings": _identity(arguments),
+        "versions": library_versions(),
+    }
     with replace_file(arguments.out / CONFIG) as fresh:
         fresh.write_text(json.dumps(facts, indent=1) + "\n")
 
@@ -303,6 +348,7 @@ def _forget(folder: Path, seconds: float) -> None:
     """Leaves out the lines of a log after the checkpoint that is gone on from."""
     for name in (LOG, CURVE):
         if (path := folder / name).exists():
-            kept = [line for line in path.read_text().splitlines() if json.loads(line)["seconds"] <= seconds]
+            # A line without its end is one that a kill cut off.
+            lines = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
             with replace_file(path) as fresh:
-                fresh.write_text("".join(f"{line}\n" for line in kept))
+                fresh.write_text("".join(line for line in lines if json.loads(line)["seconds"] <= round(seconds, 2)))
