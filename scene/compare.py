@@ -20,7 +20,7 @@ import numpy as np
 import trimesh
 import tyro
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import label
+from scipy.ndimage import binary_erosion, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -66,7 +66,8 @@ class Change:
         end: Station at which it ends, m.
         angle: Direction of its middle from the axis, rad, from the left upwards.
         area: Its area, m².
-        median: Median movement, outwards positive, m.
+        median: Median movement, outwards positive, m; of the places further from the patch's rim than their points are
+            averaged over, where it has any, since those at the rim average over moved and unmoved wall.
         most: Largest movement by size, m.
         detection: Median level of detection there, 95 %, m.
     """
@@ -169,15 +170,22 @@ def _patches(
             s, a = np.nonzero(names == name)
             if cell[s, a].sum() < config.least_area:
                 continue
+            inner = _inside(names == name, max(1, int(np.ceil(config.radius / config.step))))
             values = moved[s, a]
             turn = np.angle(np.mean(np.exp(1j * angle[a])))
             half = 0.5 * config.step
             most = float(values[np.argmax(np.abs(values))])
             found.append(Change(
                 float(station[s].min() - half), float(station[s].max() + half), float(turn), float(cell[s, a].sum()),
-                float(np.median(values)), most, float(np.median(detection[s, a])),
+                float(np.median(moved[inner] if inner.any() else values)), most, float(np.median(detection[s, a])),
             ))  # fmt: skip
     return tuple(sorted(found, key=lambda change: -change.area))
+
+
+def _inside(mask: Bool[np.ndarray, "s a"], rim: int) -> Bool[np.ndarray, "s a"]:
+    """Return the places of a patch with a rim of so many places taken off; the wall closes on itself."""
+    closed = np.pad(mask, ((0, 0), (rim, rim)), mode="wrap")
+    return binary_erosion(closed, np.ones((3, 3)), iterations=rim)[:, rim:-rim]
 
 
 def _label_closed(mask: Bool[np.ndarray, "s a"]) -> tuple[Int[np.ndarray, "s a"], int]:

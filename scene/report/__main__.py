@@ -21,7 +21,7 @@ from scene.bore import Bore, load_bore
 from scene.errors import FitError, RecordingError, require_input
 from scene.report import drawings, sections
 from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, read_design_table, turn_around
-from scene.report.clearance import Rails, clearance, g1, read_gauge, read_rails
+from scene.report.clearance import Rails, bend, clearance, g1, read_gauge, read_rails
 from scene.report.ifc import write_ifc
 from scene.report.landxml import read_landxml, write_landxml
 from scene.report.page import write_report
@@ -30,6 +30,10 @@ from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_folder, require_folder
 
 _MEETS = 5.0  # m; a design axis further from the bore than this is another tunnel's
+_SHORT = 20.0  # m; elements are longer where an axis was built to elements, and not just as rough as its walls
+_WANDERS = (
+    f"; half of the elements are shorter than {_SHORT:.0f} m: the axis wanders, and --tolerance 0.02 asks for fewer"
+)
 
 
 @dataclass(frozen=True)
@@ -78,16 +82,17 @@ def report(config: ReportConfig) -> Path:
         fit = dataclasses.replace(fit, alignment=turn_around(fit.alignment, float(chainage[-1])))
     with replace_folder(out) as folder:
         facts = _facts(bore, manifest, section.name, chainage, fit)
-        tables = {"metres": sections.tabulate(bore, section, origin, chainage)}
-        if len(bore.ring_station):
-            tables["rings"] = sections.tabulate(bore, section, origin, chainage, rings=True)
-        over, under = sections.volumes(tables["metres"])
+        wanted = {"metres": sections.at_round_chainages(bore, chainage, 1.0), "rings": bore.ring_station}
+        tables = {
+            name: sections.tabulate(bore, section, origin, chainage, rows) for name, rows in wanted.items() if len(rows)
+        }
+        over, under = sections.volumes(bore, section)
         facts |= {"overbreak": f"{over:.2f} m³", "underbreak": f"{under:.2f} m³"}
         ezdxf.options.write_fixed_meta_data_for_testing = True  # no times of day
         drawings.write_sections(folder / "sections.dxf", bore, section, chainage)
         drawings.write_plan_profile(folder / "plan_profile.dxf", bore, origin, chainage)
-        drawings.write_unrolled(folder, bore, section)
-        drawings.draw_alignment(folder / "alignment.png", fit)
+        drawings.write_unrolled(folder, bore, section, chainage)
+        drawings.draw_alignment(folder / "alignment.png", bore, fit, chainage)
         write_landxml(folder / "alignment.xml", fit.alignment)
         rails = read_rails(config.scene / "scene.xml", bore)
         write_ifc(folder / "tunnel.ifc", bore, fit.alignment, rails, config.scene / "scene.xml", origin)
@@ -100,7 +105,9 @@ def report(config: ReportConfig) -> Path:
             write_points(folder / "points.laz", bore, points, origin, chainage)
         write_csv(folder / "sections.csv", tables["metres"])
         write_workbook(folder / "rings.xlsx", tables, facts)
-        write_report(folder, str(manifest["name"]), facts, tables["metres"], _element_rows(fit, chainage))
+        # Of a ring survey the rows between rings are interpolated: they show no place that is worse.
+        judged = tables["rings" if bore.filled.mean() > 0.5 and "rings" in tables else "metres"]
+        write_report(folder, str(manifest["name"]), facts, judged, _element_rows(fit, chainage))
     return out
 
 
@@ -162,9 +169,15 @@ def _facts(
         "design section": section,
         "width": f"{bore.width.mean():.3f} m in the mean, {bore.width.min():.3f} to {bore.width.max():.3f} m",
         "height": f"{bore.height.mean():.3f} m in the mean, {bore.height.min():.3f} to {bore.height.max():.3f} m",
-        "alignment": f"{kinds.count('line')} lines, {kinds.count('arc')} arcs, {kinds.count('clothoid')} clothoids; "
-        f"the axis is {1e3 * fit.plan.rms:.1f} mm off in plan and {1e3 * fit.profile.rms:.1f} mm in height, RMS",
+        "alignment": f"{', '.join(_count(kinds, kind) for kind in ('line', 'arc', 'clothoid'))}; "
+        f"the axis is {1e3 * fit.plan.rms:.1f} mm off in plan and {1e3 * fit.profile.rms:.1f} mm in height, RMS"
+        + (_WANDERS if np.median([element.length for element in fit.plan.elements]) < _SHORT else ""),
     }  # fmt: skip
+
+
+def _count(kinds: list[str], kind: str) -> str:
+    number = kinds.count(kind)
+    return f"{number} {kind}{'' if number == 1 else 's'}"
 
 
 def _write_offsets(folder: Path, bore: Bore, design: Design, located: np.ndarray) -> dict[str, str]:
@@ -180,12 +193,11 @@ def _write_offsets(folder: Path, bore: Bore, design: Design, located: np.ndarray
 def _write_clearance(folder: Path, rails: Rails | None, bore: Bore, gauge: Any, chainage: np.ndarray) -> dict[str, str]:
     if rails is None:
         return {"clearance": "no track was laid in this scene"}
-    free = clearance(bore, rails, gauge, bore.axis.curvature)
-    every = max(1, round(1.0 / (bore.station[1] - bore.station[0])))
-    rows = (
-        tuple(f"{value:.4f}" for value in (c, *place))
-        for c, place in zip(chainage[::every], free[::every], strict=True)
-    )
+    free = clearance(bore, rails, gauge, bend(bore, rails))
+    wanted = sections.at_round_chainages(bore, chainage, 1.0)
+    at = np.interp(wanted, bore.station, chainage)
+    near = free[sections.nearest_rows(bore, wanted)]
+    rows = (tuple(f"{value:.4f}" for value in (c, *place)) for c, place in zip(at, near, strict=True))
     _write_rows(folder / "clearance.csv", ("chainage [m]", "free [m]", "left of the axis [m]", "above it [m]"), rows)
     drawings.draw_clearance(folder / "clearance.png", chainage, free[:, 0], gauge.name)
     worst = int(np.argmin(free[:, 0]))
@@ -199,13 +211,14 @@ def _write_rows(path: Path, head: tuple[str, ...], rows: Iterable[tuple[str, ...
         writer.writerows(rows)
 
 
-def _element_rows(fit: AlignmentFit, chainage: np.ndarray) -> list[tuple[str, ...]]:
-    """Return the elements in the order of the stations; their chainages fall where the design's do."""
-    rows, way = [], float(np.sign(chainage[-1] - chainage[0]))
+def _element_rows(fit: AlignmentFit, chainage: np.ndarray) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]]:
+    """Return elements in plan and in profile by their stations; their chainages fall where the design's do."""
+    rows: tuple[list[tuple[str, ...]], list[tuple[str, ...]]] = ([], [])
+    way = float(np.sign(chainage[-1] - chainage[0]))
     for number, part in enumerate((fit.plan, fit.profile)):
         for one in part.elements:
             ends = [_describe_bend(value) if number == 0 else f"{value:+.3%}" for value in (one.first, one.last)]
-            rows.append((one.kind, f"{chainage[0] + way * one.start:.2f} m", f"{one.length:.2f} m", *ends))
+            rows[number].append((one.kind, f"{chainage[0] + way * one.start:.2f} m", f"{one.length:.2f} m", *ends))
     return rows
 
 

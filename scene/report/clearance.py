@@ -112,12 +112,33 @@ def read_rails(scene: Path, bore: Bore) -> Rails | None:
     )
 
 
+def bend(bore: Bore, rails: Rails, bogies: float = BOGIES) -> Float[np.ndarray, " n"]:
+    """Return the curvature of the track that a vehicle's bogies see at each station, 1/m, to the left positive.
+
+    It is 8 v / a² of the versine v over a chord of `bogies` (a) about the station: half a vehicle's length smooths the
+    wander of a measured axis, of which the local curvature would make throws of decimetres. Within half a chord of the
+    ends that of the last whole chord is taken; on a track shorter than a chord the whole of it is the chord.
+    """
+    track = (bore.position + rails.left[:, None] * bore.lateral)[:, :2]
+    run = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(track, axis=0).T))])
+    half = 0.5 * min(bogies, run[-1])
+    middle = np.clip(run, half, run[-1] - half)
+    before, at, after = (
+        np.column_stack([np.interp(middle + shift, run, track[:, k]) for k in (0, 1)]) for shift in (-half, 0.0, half)
+    )
+    chord = after - before
+    length = np.hypot(*chord.T)
+    # Of a bend to the left the middle lies to the right of its chord.
+    versine = (chord[:, 1] * (at - before)[:, 0] - chord[:, 0] * (at - before)[:, 1]) / length
+    return 8.0 * versine / length**2
+
+
 def throw(
     curvature: Float[np.ndarray, " n"], bogies: float = BOGIES, overhang: float = OVERHANG
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return how far a vehicle's middle moves to the inner side, and its ends to the outer side, m."""
-    bend = np.abs(curvature)
-    return bogies**2 / 8.0 * bend, overhang * (bogies + overhang) / 2.0 * bend
+    size = np.abs(curvature)
+    return bogies**2 / 8.0 * size, overhang * (bogies + overhang) / 2.0 * size
 
 
 def clearance(bore: Bore, rails: Rails, gauge: Gauge, curvature: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

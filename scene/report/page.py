@@ -9,10 +9,15 @@ from scene.judging.drawing import text
 from scene.judging.page import STYLE, make_table
 
 _WORST = 12
+_APART = 5.0  # m between two worst places
 
 
 def write_report(
-    folder: Path, name: str, facts: dict[str, str], table: np.ndarray, elements: list[tuple[str, ...]]
+    folder: Path,
+    name: str,
+    facts: dict[str, str],
+    table: np.ndarray,
+    elements: tuple[list[tuple[str, ...]], list[tuple[str, ...]]],
 ) -> None:
     """Write the page; pictures of the folder are put into it.
 
@@ -21,10 +26,10 @@ def write_report(
         name: Name of the tunnel.
         facts: Rows of the first table.
         table: Rows of `sections.ROW`.
-        elements: Rows of the table of the alignment.
+        elements: Rows of the tables of the alignment, in plan and in profile.
     """
     parts = [f"<h1>{text(name)}</h1>", make_table("In short", list(facts.items()))]
-    worst = np.argsort(-np.maximum(table["deviation_most"], -table["deviation_least"]))[:_WORST]
+    worst = _apart(table["station"], np.maximum(table["deviation_most"], -table["deviation_least"]))
     rows = [
         (f"{table['chainage'][k]:.2f} m", f"{100 * table['deviation_most'][k]:+.1f} cm",
          f"{100 * table['deviation_least'][k]:+.1f} cm", f"{table['over'][k]:.3f} m²", f"{table['under'][k]:.3f} m²",
@@ -44,7 +49,8 @@ def write_report(
                 f'<h2>{title}</h2><img style="width:100%" alt="{title}" src="data:image/png;base64,{picture}">'
             )
         if file == "alignment.png":
-            parts.append(make_table("Elements", [("element", "begins", "length", "from", "to"), *elements]))
+            for title, some in zip(("Elements in plan", "Elements in profile"), elements, strict=True):
+                parts.append(make_table(title, [("element", "begins", "length", "from", "to"), *some]))
     files = [(file.name, _FILES.get(file.name, "")) for file in sorted(folder.iterdir())]
     parts.append(make_table("Beside this page", files))
     page = (
@@ -55,8 +61,24 @@ def write_report(
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
+def _apart(station: np.ndarray, size: np.ndarray) -> list[int]:
+    """Return the rows of the largest sizes, each at least `_APART` from those before it."""
+    chosen: list[int] = []
+    for row in np.argsort(-size):
+        if len(chosen) == _WORST:
+            break
+        if all(abs(station[row] - station[one]) >= _APART for one in chosen):
+            chosen.append(int(row))
+    return chosen
+
+
 _FILES = {
-    "sections.csv": "a row for each metre",
+    "tunnel.ifc": "IFC 4.3: alignment, inner surface of the lining, clear bore, rails and sleepers",
+    "alignment.png": "the picture above",
+    "clearance.png": "the picture above",
+    "offsets.png": "the picture above",
+    "unrolled.png": "the picture above",
+    "sections.csv": "a row for each metre of chainage",
     "rings.xlsx": "the same, and a row for each ring, as a spreadsheet",
     "points.laz": "the cloud, thinned to one point a 6 cm voxel, with station, offset, height and deviation",
     "alignment.xml": "LandXML 1.2: lines, arcs and clothoids, grades and parabolas",

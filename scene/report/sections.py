@@ -1,9 +1,9 @@
-"""The bore as a table: one row a metre, or one a ring, with sizes, best-fit circle and deviation from a design."""
+"""The bore as a table: a row a metre of chainage or a ring, with sizes, best-fit circle, deviation from a design."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from scene.bore import Bore
 from scene.errors import FitError
@@ -105,33 +105,54 @@ def fit_circles(bore: Bore) -> tuple[Float[np.ndarray, " n"], ...]:
     return left, up, radius, np.sqrt(np.mean(miss**2, axis=1))
 
 
+def at_round_chainages(bore: Bore, chainage: Float[np.ndarray, " n"], every: float) -> Float[np.ndarray, " k"]:
+    """Return the stations at which the chainage is a multiple of `every`, in the order of the bore, m.
+
+    Args:
+        bore: The bore.
+        chainage: Chainage of each station, growing or falling along the bore, m.
+        every: Distance from row to row in chainage, m.
+    """
+    way = 1.0 if chainage[-1] > chainage[0] else -1.0
+    first, last = np.sort(chainage[[0, -1]])
+    rounding = 1e-3 / every  # an end a millimetre short of a round chainage is at it
+    wanted = np.arange(np.ceil(first / every - rounding), np.floor(last / every + rounding) + 1.0) * every
+    return np.interp(way * wanted[:: int(way)], way * chainage, bore.station)
+
+
+def nearest_rows(bore: Bore, station: Float[np.ndarray, " k"]) -> Int[np.ndarray, " k"]:
+    """Return the rows of the bore nearest to stations."""
+    return np.rint(np.interp(station, bore.station, np.arange(len(bore.station)))).astype(int)
+
+
 def tabulate(
     bore: Bore,
     design: DesignSection,
     origin: Float[np.ndarray, "3"],
     chainage: Float[np.ndarray, " n"],
-    rings: bool = False,
+    wanted: Float[np.ndarray, " k"],
 ) -> np.ndarray:
     """Return the table, `(k,)` of `ROW`; m, m².
+
+    Places are those of the stations asked for; sizes are those of the bore's section nearest to each.
 
     Args:
         bore: The bore.
         design: The section that was to be built.
         origin: Offset of the tunnel frame, m.
-        chainage: Chainage of each station, m.
-        rings: One row for each ring joint instead of one for each metre.
+        chainage: Chainage of each station of the bore, m.
+        wanted: Stations of the rows, m.
     """
-    wanted = bore.ring_station if rings and len(bore.ring_station) else np.arange(0.0, bore.length + 1e-9, 1.0)
-    rows = np.rint(np.interp(wanted, bore.station, np.arange(len(bore.station)))).astype(int)
+    rows = nearest_rows(bore, wanted)
     left, up, radius, rms = (values[rows] for values in fit_circles(bore))
     off = bore.radius[rows] - design.radius[rows]
     step = 2.0 * np.pi / len(bore.angle)
     slice_area = 0.5 * (bore.radius[rows] ** 2 - design.radius[rows] ** 2) * step
     most, least = diameters(bore.radius[rows], bore.angle)
     table = np.zeros(len(rows), ROW)
-    place = bore.position[rows] + origin
+    place = bore.axis.at(wanted).position + origin
     values = {
-        "station": bore.station[rows], "chainage": chainage[rows], "easting": place[:, 0],
+        "station": wanted, "chainage": np.interp(wanted, bore.station, chainage), "easting": place[:, 0],
         "northing": place[:, 1], "elevation": place[:, 2], "width": bore.width[rows], "height": bore.height[rows],
         "area": 0.5 * step * np.sum(bore.radius[rows] ** 2, axis=1), "circle_radius": radius, "circle_left": left,
         "circle_up": up, "circle_rms": rms, "largest_diameter": most, "smallest_diameter": least,
@@ -155,7 +176,8 @@ def diameters(
     return np.max(extent, axis=0), np.min(extent, axis=0)
 
 
-def volumes(table: np.ndarray) -> tuple[float, float]:
-    """Return over- and underbreak of a table by the trapezoidal rule, m³."""
-    over, under = (float(np.trapezoid(table[name], table["station"])) for name in ("over", "under"))
-    return over, under
+def volumes(bore: Bore, design: DesignSection) -> tuple[float, float]:
+    """Return over- and underbreak of the whole bore by the trapezoidal rule, m³."""
+    slices = (bore.radius**2 - design.radius**2) * np.pi / len(bore.angle)
+    over, under = (np.maximum(way * slices, 0.0).sum(axis=1) for way in (1.0, -1.0))
+    return float(np.trapezoid(over, bore.station)), float(np.trapezoid(under, bore.station))

@@ -8,6 +8,7 @@ import ezdxf
 import ifcopenshell
 import ifcopenshell.geom
 import laspy
+import matplotlib.pyplot as plt
 import numpy as np
 import openpyxl
 import pytest
@@ -15,14 +16,15 @@ import shapely
 import tifffile
 import trimesh
 
-from scene.bore import Bore
+from scene.bore import Bore, axis_through
 from scene.errors import FitError, RecordingError
 from scene.output import write_geometry
-from scene.report import sections
+from scene.report import drawings, sections
 from scene.report.__main__ import main
 from scene.report.alignment import align_bore, design_of
-from scene.report.clearance import Gauge, Rails, clearance, g1, read_gauge, throw
+from scene.report.clearance import Gauge, Rails, bend, clearance, g1, read_gauge, throw
 from scene.report.landxml import read_landxml
+from scene.report.page import _apart
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 
@@ -70,12 +72,15 @@ def test_the_best_fit_circle_ovality_and_breaks_of_a_known_section(bore: Bore):
     assert radius[0] == pytest.approx(2.9, abs=1e-3)
     assert rms[0] == pytest.approx(0.03 / np.sqrt(2.0), rel=0.02)
     design = sections.circle_section(round_bore, 2.9)
-    table = sections.tabulate(round_bore, design, ORIGIN, round_bore.station)
+    table = sections.tabulate(round_bore, design, ORIGIN, round_bore.station, np.array([3.1, 12.0]))
+    assert table["station"] == pytest.approx([3.1, 12.0])
+    place = round_bore.axis.at(np.array([3.1])).position[0] + ORIGIN  # not of the next row of the bore
+    assert [table[name][0] for name in ("easting", "northing", "elevation")] == pytest.approx(place, abs=1e-6)
     assert table["largest_diameter"][0] - table["smallest_diameter"][0] == pytest.approx(0.12, abs=1e-3)
     # ∫ of the positive half: 2.9 · 0.03 · 2 ∫ cos over a quarter, to the first order.
     assert table["over"][0] == pytest.approx(2.9 * 0.03 * 2.0, rel=0.02)
     assert table["under"][0] == pytest.approx(2.9 * 0.03 * 2.0, rel=0.02)
-    over, under = sections.volumes(table)
+    over, under = sections.volumes(round_bore, design)
     assert over == pytest.approx(table["over"][0] * 24.0, rel=0.02)
     assert under == pytest.approx(over, rel=0.02)
 
@@ -100,6 +105,55 @@ def test_clearance_of_a_d_section_is_exact(bore: Bore):
     exact = min(2.8 - abs(y) if z < 0.0 else 2.8 - np.hypot(y, z) for y, z in corners)
     assert canted[:, 0] == pytest.approx(exact, abs=0.005)
     assert (canted[:, 1] < 0.0).all()
+
+
+def test_the_throw_is_of_the_bend_that_both_bogies_stand_on(bore: Bore):
+    turn = np.linspace(0.0, 0.5, 201)
+    circle = axis_through(100.0 * np.column_stack([np.sin(turn), 1.0 - np.cos(turn), 0.0 * turn]), 0.25)
+    n = len(circle.station)
+    around = dataclasses.replace(
+        bore, station=circle.station, position=circle.position, tangent=circle.tangent, lateral=circle.lateral,
+        up=circle.up,
+    )  # fmt: skip
+    rails = Rails(np.zeros(n), np.zeros(n), np.zeros(n), 1.435)
+    # 8 v / a² of an arc is 1 / R but for (a / 4 R)².
+    assert bend(around, rails) == pytest.approx(0.01, rel=0.003)
+    assert bend(around, dataclasses.replace(rails, left=rails.left + 2.0)) == pytest.approx(1.0 / 98.0, rel=0.003)
+    back = dataclasses.replace(around, position=circle.position * [1.0, -1.0, 1.0], lateral=-circle.lateral)
+    assert bend(back, rails) == pytest.approx(-0.01, rel=0.003)
+    # A wander of 5 mm over 16 m, as rough walls leave in an axis, is a bend of R = 1,300 m where it is taken locally,
+    # a throw of 35 mm; a vehicle does not see the most of it.
+    wander = dataclasses.replace(rails, left=0.005 * np.sin(2.0 * np.pi * circle.station / 16.0))
+    inner, _ = throw(bend(around, wander) - bend(around, rails))
+    assert inner.max() < 0.011
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_rows_stand_at_round_chainages_whichever_way_they_count(bore: Bore, way: float):
+    chainage = 100.3 + way * bore.station
+    station = sections.at_round_chainages(bore, chainage, 10.0)
+    assert np.all(np.diff(station) > 0.0)
+    assert np.interp(station, bore.station, chainage) == pytest.approx(
+        [110.0, 120.0] if way > 0 else [100.0, 90.0, 80.0]
+    )
+
+
+def test_worst_places_are_no_neighbours():
+    station, size = np.arange(30.0), np.zeros(30)
+    size[[10, 11, 12, 20]] = 4.0, 5.0, 3.0, 2.0
+    assert _apart(station, size)[:2] == [11, 20]
+
+
+def test_a_wide_mouth_does_not_hide_what_the_wall_does(bore: Bore, tmp_path):
+    radius = bore.radius.copy()
+    radius[:5] += 3.0
+    radius[40:, :] += 0.02
+    design = sections.polygon_section(bore, np.array([[-9.0, -9.0], [9.0, -9.0], [9.0, 9.0], [-9.0, 9.0]]), "wide")
+    design = dataclasses.replace(design, radius=np.broadcast_to(bore.radius[0], bore.radius.shape))
+    drawings.write_unrolled(tmp_path, dataclasses.replace(bore, radius=radius), design, bore.station)
+    picture = plt.imread(tmp_path / "unrolled.png")[..., :3]
+    middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]
+    assert middle[0] - middle[2] > 0.1  # 2 cm are red, not as white as on a scale of 3 m
 
 
 def test_a_gauge_that_cuts_the_wall_has_less_than_nothing(bore: Bore):
@@ -147,8 +201,14 @@ def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
         assert not ezdxf.readfile(out / name).audit().errors
     book = openpyxl.load_workbook(out / "rings.xlsx")
     assert book.sheetnames == ["facts", "metres", "rings"]
+    # The design's chainage, at its whole metres.
+    assert [row[1] for row in book["metres"].iter_rows(min_row=2, values_only=True)] == pytest.approx(
+        np.arange(700.0, book["metres"].max_row + 698.5), abs=1e-3
+    )
     assert book["metres"].max_row == 26
-    assert book["metres"]["B2"].value == pytest.approx(700.0, abs=0.01)  # the design's chainage
+    rings = np.array([row[:5] for row in book["rings"].iter_rows(min_row=2, values_only=True)], float)
+    assert rings[:, 0] == pytest.approx(bore.ring_station)  # and not the row of the bore next to it
+    assert rings[:, 2:] == pytest.approx(bore.axis.at(bore.ring_station).position + ORIGIN, abs=1e-5)
     assert read_landxml(out / "alignment.xml").length == pytest.approx(24.0, abs=0.02)
     field = tifffile.imread(out / "unrolled.tif")
     assert field.shape[1] == 360
@@ -190,11 +250,10 @@ def test_chainages_that_fall_along_the_bore_fall_in_every_file(scene, bore: Bore
     rows = np.column_stack([chainage, bore.position + ORIGIN])[::-1]
     np.savetxt(design, rows, delimiter=",", header="CHAINAGE,EASTING,NORTHING,ELEVATION", comments="", fmt="%.5f")
     assert main([str(scene), "--design", str(design), "--out", str(out)]) == 0
-    whole = np.rint(np.interp(np.arange(0.0, bore.length), bore.station, np.arange(len(bore.station)))).astype(int)
-    every = round(1.0 / bore.station[1])
+    whole = np.arange(722.0, 699.5, -1.0)
     for name, column, wanted in (
-        ("sections.csv", 1, chainage[whole]),
-        ("clearance.csv", 0, chainage[::every]),
+        ("sections.csv", 1, whole),
+        ("clearance.csv", 0, whole),
         ("offsets.csv", 1, chainage),
     ):
         with (out / name).open() as file:
@@ -208,7 +267,7 @@ def test_chainages_that_fall_along_the_bore_fall_in_every_file(scene, bore: Bore
     assert line[0] == pytest.approx(bore.position[-1] + ORIGIN, abs=0.01)
     assert line[-1] == pytest.approx(bore.position[0] + ORIGIN, abs=0.01)
     labels = [one.dxf.text for one in ezdxf.readfile(out / "sections.dxf").modelspace().query("TEXT")]
-    assert [float(one) for one in labels] == pytest.approx(chainage[whole[[0, 10, 20]]], abs=0.01)
+    assert [float(one) for one in labels] == pytest.approx([720.0, 710.0, 700.0], abs=0.01)
     model = ifcopenshell.open(out / "tunnel.ifc")
     (sign,) = model.by_type("IfcReferent")
     assert float(sign.Name) == pytest.approx(700.0, abs=0.02)
