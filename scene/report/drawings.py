@@ -143,9 +143,10 @@ def _mark_chainages(one: Axes, along: np.ndarray, chainage: np.ndarray) -> None:
     """Label the places `along` a picture with round chainages, which may fall from left to right."""
     way = 1.0 if chainage[-1] > chainage[0] else -1.0
     low, high = np.sort(chainage[[0, -1]])
-    shown = np.diff(one.get_xlim())[0] / (along[-1] - along[0])  # a stretch that fills a part has room for fewer
-    marks = np.array([mark for mark in MaxNLocator(max(1, round(9 / max(1.0, shown))), steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
-                      if low - 1e-6 <= mark <= high + 1e-6])  # fmt: skip
+    # A stretch that fills a part of the picture has room for fewer.
+    room = max(1, round(9.0 * min(1.0, (along[-1] - along[0]) / np.diff(one.get_xlim())[0])))
+    marks = MaxNLocator(room, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    marks = marks[(marks >= low - 1e-6) & (marks <= high + 1e-6)]
     one.set_xticks(np.interp(way * marks, way * chainage, along), [f"{mark:g}" for mark in marks])
 
 
