@@ -3,7 +3,7 @@
 Example: python -m scene.compare build/2024 build/2026 --out build/change
 
 Both clouds are held against the axis of A, along the wall's own normals. A change counts where it is larger than its
-level of detection, over patches of a least size.
+level of detection, over patches of a least size that as a whole moved by three of their levels of detection.
 
 Source: M3C2 and its level of detection, Lague, Brodu and Leroux 2013, ISPRS J. Photogramm. 82, 10-26; by py4dgeo.
 """
@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_erosion, label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.stats import t as student
 
 from scene.bore import Bore, load_bore
 from scene.errors import FitError, RecordingError, require_input
@@ -31,6 +32,7 @@ from subterra_jax.host.files import replace_folder, require_folder
 
 _AROUND = 90  # places around the section: 4 degrees
 _FEWEST = 5  # points of either survey at a place
+_SURE = 3.0  # levels of detection by which a patch as a whole must have moved: 6 standard deviations
 _MEETS = 3.0  # m; surveys whose axes are further apart are of two tunnels, or in two frames
 
 
@@ -154,8 +156,15 @@ def _move(
         corepoint_normals=normal, cyl_radius=config.radius, max_distance=0.5, registration_error=config.registration,
     )  # fmt: skip
     moved, uncertainty = m3c2.run()
-    enough = np.minimum(uncertainty["num_samples1"], uncertainty["num_samples2"]) >= _FEWEST
-    return np.where(enough, moved, np.nan), np.where(enough, uncertainty["lodetection"], np.nan)
+    count = np.stack([uncertainty["num_samples1"], uncertainty["num_samples2"]]).astype(float)
+    enough = count.min(axis=0) >= _FEWEST
+    share = np.stack([uncertainty["spread1"], uncertainty["spread2"]])[:, enough] ** 2 / count[:, enough]
+    # Spreads of a few points are themselves uncertain: Student's t with Welch's degrees of freedom in place of 1.96.
+    total = np.maximum(share.sum(axis=0), 1e-18)
+    freedom = total**2 / np.maximum((share**2 / (count[:, enough] - 1.0)).sum(axis=0), 1e-36)
+    detection = np.full(len(moved), np.nan)
+    detection[enough] = student.ppf(0.975, np.maximum(freedom, 1.0)) * np.sqrt(total) + 1.96 * config.registration
+    return np.where(enough, moved, np.nan), detection
 
 
 def _patches(
@@ -168,7 +177,11 @@ def _patches(
         names, count = _label_closed(real & (way * moved > 0.0))
         for name in range(count):
             s, a = np.nonzero(names == name)
-            if cell[s, a].sum() < config.least_area:
+            area = float(cell[s, a].sum())
+            # A patch averages over so many places that share no points, and a chance one is among thousands.
+            apart = max(1.0, area / (np.pi * config.radius**2))
+            sure = np.median(np.abs(moved[s, a]) / detection[s, a]) * np.sqrt(apart)
+            if area < config.least_area or sure < _SURE:
                 continue
             inner = _inside(names == name, max(1, int(np.ceil(config.radius / config.step))))
             values = moved[s, a]
@@ -176,7 +189,7 @@ def _patches(
             half = 0.5 * config.step
             most = float(values[np.argmax(np.abs(values))])
             found.append(Change(
-                float(station[s].min() - half), float(station[s].max() + half), float(turn), float(cell[s, a].sum()),
+                float(station[s].min() - half), float(station[s].max() + half), float(turn), area,
                 float(np.median(moved[inner] if inner.any() else values)), most, float(np.median(detection[s, a])),
             ))  # fmt: skip
     return tuple(sorted(found, key=lambda change: -change.area))

@@ -129,6 +129,12 @@ def _read_design(path: Path, origin: np.ndarray) -> Design:
 
 def _locate(bore: Bore, design: Design, path: Path | None) -> np.ndarray:
     """Return chainage, offset to the right and height above the design of the bore's axis."""
+    grows = np.ptp(design.chainage) / design.axis.length
+    if not 0.5 < grows < 2.0:
+        raise FitError(
+            f"{path}: the chainage grows by {grows:.3g} m on a metre of the design axis; has it another unit than its "
+            "coordinates?"
+        )
     located = design.locate(bore.position)
     away = np.hypot(located[:, 1], located[:, 2] if design.has_heights else 0.0)
     if np.median(away) > _MEETS:

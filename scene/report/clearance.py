@@ -25,6 +25,7 @@ from scene.errors import RecordingError, require_input
 # check them against your own copy, or give a polygon of your own.
 _G1 = ((1.250, 0.400), (1.620, 0.400), (1.620, 1.170), (1.645, 1.170), (1.645, 3.250), (1.425, 3.700), (1.120, 4.010),
        (0.525, 4.310))  # fmt: skip
+_WIDEST = 60.0  # m; no section of a tunnel, and no gauge, is as large
 BOGIES, OVERHANG = 19.0, 3.7  # m; a passenger coach of 26.4 m
 
 
@@ -52,7 +53,8 @@ def read_gauge(path: Path) -> Gauge:
     """Read a polygon: a CSV of rows `left, height` (m), the first row again at the end.
 
     Raises:
-        RecordingError: A row holds no two numbers, or the polygon is not closed, crosses itself or has no area.
+        RecordingError: A row holds no two numbers, or the polygon is not closed, crosses itself, has no area or is
+            larger than any tunnel.
     """
     try:
         with require_input(path).open(newline="", encoding="utf-8-sig") as file:
@@ -61,11 +63,15 @@ def read_gauge(path: Path) -> Gauge:
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
             raise ValueError("rows must be two numbers: left, height")
     except ValueError as error:
-        raise RecordingError(f"{path}: not a gauge polygon ({error})") from error
+        raise RecordingError(f"{path}: not a polygon ({error})") from error
     if len(points) < 4 or np.any(np.abs(points[0] - points[-1]) > 1e-6):
-        raise RecordingError(f"{path}: the gauge polygon is not closed: its last row must be its first row again")
+        raise RecordingError(f"{path}: the polygon is not closed: its last row must be its first row again")
     if not shapely.Polygon(points).is_valid or shapely.Polygon(points).area <= 0.0:
-        raise RecordingError(f"{path}: the gauge polygon crosses itself")
+        raise RecordingError(f"{path}: the polygon crosses itself")
+    if np.ptp(points, axis=0).max() > _WIDEST:
+        raise RecordingError(
+            f"{path}: the polygon is {np.ptp(points, axis=0).max():.0f} m large; is it in millimetres?"
+        )
     return Gauge(path.name, points[:-1])
 
 

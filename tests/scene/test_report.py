@@ -167,7 +167,8 @@ def test_a_gauge_that_cuts_the_wall_has_less_than_nothing(bore: Bore):
     [
         ("0,1\n1,1\n1,2\n", "not closed"),
         ("0,0\n1,1\n1,0\n0,1\n0,0\n", "crosses itself"),
-        ("a,b\n1,1\n1,0\n0,1\n", "not a gauge polygon"),
+        ("a,b\n1,1\n1,0\n0,1\n", "not a polygon"),
+        ("-1500,400\n1500,400\n1500,3000\n-1500,400\n", "3000 m large; is it in millimetres"),
     ],
 )
 def test_a_gauge_that_is_no_polygon_is_refused(tmp_path, rows, sentence):
@@ -288,6 +289,7 @@ def test_chainages_that_fall_along_the_bore_fall_in_every_file(scene, bore: Bore
     [
         (["nowhere"], "not a scene folder"),
         (["{scene}", "--design", "{far}"], "does not meet the tunnel"),
+        (["{scene}", "--design", "{km}"], "grows by 0.001 m on a metre of the design axis"),
         (["{scene}", "--radius", "0.1"], "between 0.5 and 30 m"),
         (["{scene}", "--radius", "2.0", "--section", "x.csv"], "exclude each other"),
         (["{scene}", "--gauge", "x.csv"], "no such file"),
@@ -296,8 +298,12 @@ def test_chainages_that_fall_along_the_bore_fall_in_every_file(scene, bore: Bore
 def test_mistakes_end_in_a_sentence_and_write_nothing(scene, tmp_path, capsys, words, sentence):
     far = tmp_path / "far.csv"
     far.write_text("CHAINAGE,EASTING,NORTHING,ELEVATION\n" + "".join(f"{k},{k},0,0\n" for k in range(9)))
+    km = tmp_path / "km.csv"  # where the tunnel is, its chainage in kilometres
+    with np.load(scene / "bore.npz") as data:
+        rows = np.column_stack([data["station"] / 1e3, data["position"] + ORIGIN])
+    np.savetxt(km, rows, delimiter=",", header="CHAINAGE,EASTING,NORTHING,ELEVATION", comments="", fmt="%.6f")
     out = tmp_path / "out"
-    assert main([*(word.format(scene=scene, far=far) for word in words), "--out", str(out)]) == 2
+    assert main([*(word.format(scene=scene, far=far, km=km) for word in words), "--out", str(out)]) == 2
     assert sentence in capsys.readouterr().err
     assert not out.exists()
 
