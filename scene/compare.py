@@ -27,7 +27,7 @@ from scipy.stats import t as student
 
 from scene.bore import Bore, load_bore
 from scene.errors import FitError, RecordingError, require_input
-from subterra_jax.host.command import parse, require_libraries, run_command
+from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_folder, require_folder
 
 _AROUND = 90  # places around the section: 4 degrees
@@ -294,7 +294,6 @@ def _draw(path: Path, bore: Bore, result: Comparison, config: CompareConfig) -> 
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command and returns its exit status."""
-    require_libraries("scene.compare", "survey", "py4dgeo", "matplotlib")
     config = parse(
         lambda given: tyro.cli(CompareConfig, prog="python -m scene.compare", args=given, description=__doc__), words
     )

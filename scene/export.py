@@ -23,7 +23,7 @@ from trimesh.visual.material import PBRMaterial
 
 from scene.errors import RecordingError, require_input
 from scene.robot import write_urdf
-from subterra_jax.host.command import parse, require_libraries, run_command
+from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, replace_folder, require_file, require_folder
 
@@ -152,7 +152,10 @@ def write_glb(path: Path, parts: list[Part], facts: dict[str, Any]) -> None:
 
 def write_usd(path: Path, parts: list[Part], facts: dict[str, Any]) -> None:
     """Write OpenUSD: metres, z up, a mesh for each material with a preview surface and a static collider."""
-    from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+    try:
+        from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+    except ModuleNotFoundError as error:
+        raise RecordingError("USD needs pxr, which is not installed: pip install 'subterra-jax[survey]'") from error
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
@@ -260,8 +263,6 @@ def main(words: list[str] | None = None) -> int:
     config = parse(
         lambda given: tyro.cli(ExportConfig, prog="python -m scene.export", args=given, description=__doc__), words
     )
-    if config.to == "usd":
-        require_libraries("scene.export", "survey", "pxr")
     return run_command(lambda: print(export(config)), mistakes=(SubterraError,))
 
 

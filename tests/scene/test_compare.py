@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -117,3 +120,26 @@ def test_folders_with_other_origins_are_compared_and_written(bore: Bore, tmp_pat
     assert main([str(one), str(far), "--out", str(tmp_path / "no")]) == 2
     assert "of one tunnel, and in one frame?" in capsys.readouterr().err
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [("scene.compare a b --out o", "py4dgeo"), ("scene.report a", "ezdxf")],
+)
+def test_a_missing_extra_is_named_in_one_sentence(tmp_path, command, module):
+    """With `python -m`, since what a command lacks is looked for while its package is imported."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import importlib.machinery as m, sys\n"
+        "class Without(m.PathFinder):\n"
+        "    @classmethod\n"
+        "    def find_spec(cls, name, path=None, target=None):\n"
+        f"        return None if name == {module!r} else super().find_spec(name, path, target)\n"
+        "sys.meta_path[:] = [Without if one is m.PathFinder else one for one in sys.meta_path]\n"
+    )
+    paths = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
+    run = subprocess.run(
+        [sys.executable, "-m", *command.split()], cwd=tmp_path, env={**os.environ, "PYTHONPATH": paths},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (run.returncode, len(run.stderr.splitlines())) == (2, 1), run.stderr
+    assert f"{module} is not installed" in run.stderr
