@@ -172,9 +172,11 @@ def _walkway(space: TunnelSpace) -> list[Piece]:
 def _cables(space: TunnelSpace) -> list[Piece]:
     config, pieces = space.config, []
     low, high = min(config.tiers) - 0.1, max(config.tiers) + 0.15
+    # An arm begins at the wall at its own height: a wall that is dented there is the nearest.
+    heights = (*np.linspace(low, high, 5), *config.tiers)
     for station in _stations(space, config.bracket_spacing):
         span = (station - 0.025, station + 0.025)
-        near = min(space.wall(station, station, height, -1)[0] for height in np.linspace(low, high, 5))
+        near = min(space.wall(station, station, height, -1)[0] for height in heights)
         if near - config.bracket_length < config.gauge:
             continue
         pieces.append(space.box("bracket", "galvanised", span, (-near, -near + 0.05), (low, high)))
@@ -183,7 +185,7 @@ def _cables(space: TunnelSpace) -> list[Piece]:
             arm = (-far, -near + config.bracket_length)
             pieces.append(space.box("bracket_arm", "galvanised", span, arm, (tier - 0.04, tier)))
     for start, end in _stretches(space, 2 * config.bracket_spacing):
-        near = min(space.wall(start, end, height, -1)[0] for height in np.linspace(low, high, 5))
+        near = min(space.wall(start, end, height, -1)[0] for height in heights)
         if near - config.bracket_length < config.gauge:
             continue
         middle, half = -near + config.bracket_length / 2, config.cable_diameter / 2

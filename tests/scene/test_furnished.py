@@ -8,7 +8,7 @@ import pytest
 
 from scene.output import write_geometry
 from scene.writing.furnished import furnish_bore, planar_segments
-from scene.writing.furniture import FurnitureConfig, count_pieces
+from scene.writing.furniture import FurnitureConfig, TunnelSpace, count_pieces
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 from tests.scene.conftest import arc_bore
@@ -82,6 +82,19 @@ def test_nothing_enters_the_robots_gauge(level, laid):
         if low.min() < 2.0:
             assert np.abs(lateral).min() > 0.9, piece.kind
             assert (np.sign(lateral) == np.sign(lateral[0])).all(), piece.kind
+
+
+def test_no_piece_is_without_size_where_the_wall_is_dented_at_an_arm(level, laid, monkeypatch):
+    whole = TunnelSpace.wall
+
+    def dented(space, start, end, height, side):
+        near, far = whole(space, start, end, height, side)
+        return (near - 0.4, far - 0.4) if side < 0 and abs(height - WITH_DOOR.tiers[1]) < 0.02 else (near, far)
+
+    monkeypatch.setattr(TunnelSpace, "wall", dented)
+    pieces = furnish_bore(level, laid, WITH_DOOR).pieces
+    assert count_pieces(pieces)["bracket_arm"] == 4 * 24
+    assert min(piece.half.min() for piece in pieces) > 0.0
 
 
 def test_walkway_and_third_rail_are_left_out_where_the_bore_is_too_narrow():
