@@ -1,5 +1,6 @@
 """`python -m scene.build INPUT --out DIR`: builds a scene folder from a recording."""
 
+import json
 import math
 import sys
 import time
@@ -111,6 +112,7 @@ def build(
     finally:
         partial.close()
     print(judgement.summary(), flush=True)
+    print(describe_track(out), flush=True)
     for warning in judgement.warnings:
         print(f"warning: {warning.text}", file=sys.stderr, flush=True)
     print(f"{out / 'scene.xml'}")
@@ -123,6 +125,12 @@ def _describe_stations(result: Reconstruction) -> str:
     start = float(result.facts["chainage_start"])
     chainage = f", chainage {start:g} m" if start else ""
     return f"stations: 0 m{chainage} at ({x:.1f}, {y:.1f}, {z:.1f}); they grow {result.facts['chainage_grows']}"
+
+
+def describe_track(folder: Path) -> str:
+    """Return where a scene's track comes from, and what to do where there is none that one may have looked for."""
+    laid = str(json.loads((folder / "manifest.json").read_text())["track"]["laid"])
+    return f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else "")
 
 
 def _write(folder: Path, source: Path, name: str, result: Reconstruction, config: BuildConfig) -> Judgement:
