@@ -16,7 +16,7 @@ from subterra_jax.episode import ask, in_tunnel, look
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.files import GAIT, PolicyError, read_facts
 from subterra_jax.policies.loading import load
-from subterra_jax.policies.opening import open_agent, policy_source
+from subterra_jax.policies.opening import open_agent, policy_source, require_known
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import make
 from subterra_jax.tunnel_env import TunnelEnv
@@ -231,6 +231,8 @@ def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | N
         return _gait(file, env, params)
     if env is None or params is None:
         if facts is None:
+            if isinstance(source, (str, Path)):
+                require_known(str(source))
             name = source if isinstance(source, str) else getattr(source, "name", type(source).__name__)
             raise PolicyError(f"{name}: drives any task, so name one: load_policy({name!r}, env, params)")
         walks = facts.get("world", {}).get("embodiment") == "b2"

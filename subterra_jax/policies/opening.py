@@ -74,7 +74,21 @@ def _make(source: Any, params: EnvParams) -> Any:
         return agent
     if names_code(name):
         return call_factory(load_object(name), params)
-    raise AgentError(f"no agent {name!r}; there are {', '.join(registry.names())}; or {FORMS}")
+    raise AgentError(_no_agent(name))
+
+
+def require_known(name: str) -> None:
+    """Refuses a name of no baseline, policy or class, before a task is known.
+
+    Raises:
+        AgentError: There is no such agent.
+    """
+    if name not in registry.names() and policy_source(name) is None and not names_code(name):
+        raise AgentError(_no_agent(name))
+
+
+def _no_agent(name: str) -> str:
+    return f"no agent {name!r}; there are {', '.join(registry.names())}; or {FORMS}"
 
 
 def call_factory(factory: Any, params: EnvParams) -> Any:

@@ -225,6 +225,7 @@ def test_leaderboard_recorder_and_viewer_drive_with_each_of_them(places):
         ("nobody", TASK, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
         ("policy:nobody", TASK, PolicyError, r"nobody: no such policy; released are"),
         ("empty", TASK, PolicyError, r"empty: holds no policy.safetensors; release it again"),
+        ("nobody", None, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
         ("ring-count", None, PolicyError, r"ring-count: drives any task, so name one"),
         ("StopAt-v0", "Subterra/TraverseShort-v0", PolicyError, r"StopAt-v0: a policy that drives to a goal"),
         ("TraverseShort-v0", TASK, PolicyError, r"TraverseShort-v0: made for observations of 18 numbers"),
