@@ -112,7 +112,7 @@ def build(
     finally:
         partial.close()
     print(judgement.summary(), flush=True)
-    print(describe_track(out), flush=True)
+    print(_tell_track(out), flush=True)
     for warning in judgement.warnings:
         print(f"warning: {warning.text}", file=sys.stderr, flush=True)
     print(f"{out / 'scene.xml'}")
@@ -127,7 +127,7 @@ def _describe_stations(result: Reconstruction) -> str:
     return f"stations: 0 m{chainage} at ({x:.1f}, {y:.1f}, {z:.1f}); they grow {result.facts['chainage_grows']}"
 
 
-def describe_track(folder: Path) -> str:
+def _tell_track(folder: Path) -> str:
     """Return where a scene's track comes from, and what to do where there is none that one may have looked for."""
     laid = str(json.loads((folder / "manifest.json").read_text())["track"]["laid"])
     return f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else "")
