@@ -12,6 +12,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.policies.locate import memory
+from subterra_jax.policies.locate.agent import flat
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
 from train.checkpoint import iterations
@@ -36,6 +37,10 @@ def _command(tmp_path, **changes):
         ({"network": "kalman", "front": "wide"}, "needs the evidence"),
         ({"n_steps": 100}, "n_steps must be at least 200, got 100"),
         ({"minutes": 0.0}, "minutes must be positive"),
+        ({"begin_from": "nobody"}, "nobody"),
+        ({"begin_from": "StopAt-v0"}, "StopAt-v0: is no localiser"),
+        ({"begin_from": "locate-transformer"}, "is of network transformer with front match, not gru"),
+        ({"begin_from": "locate-faulted", "network": "transformer"}, "with front wide, not transformer with match"),
     ],
 )
 def test_settings_that_cannot_be_trained_with_are_refused_by_name(tmp_path, changes, sentence):
@@ -84,6 +89,19 @@ def test_a_state_before_training_has_the_types_of_one_after_an_iteration(network
     after, _ = jax.eval_shape(learner.iterate, before, params, jnp.float32(1.0))
     for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         assert (one.shape, one.dtype, one.weak_type) == (other.shape, other.dtype, other.weak_type)
+
+
+@pytest.mark.parametrize(("sensor", "sides"), [("planar16", 2), ("spin16x64", 12)])
+def test_a_training_begins_with_the_weights_that_it_is_told_to_begin_from(sensor, sides):
+    tunnel = tunnels.load(["control"], sensor=sensor)[0]
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel=tunnel, sensor=sensor)
+    config = dataclasses.replace(_SMALL, network="transformer", begin_from="locate-transformer")
+    weights = flat(jax.vmap(LocateLearner(env, params, config).init)(jnp.arange(2)).weights)
+    given = policies.load("locate-transformer")[0].tensors
+    assert set(weights) == set(given)
+    for name, tensor in given.items():
+        less = np.log(sides / 2) if name == "match.count" else 0.0  # the evidence of all sides is summed
+        np.testing.assert_allclose(weights[name], np.broadcast_to(tensor - less, weights[name].shape), rtol=1e-6)
 
 
 @pytest.mark.slow

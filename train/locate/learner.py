@@ -10,8 +10,11 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from subterra_jax.policies.locate import memory, streams
+from subterra_jax.policies import load
+from subterra_jax.policies.locate import memory, streams, strips
+from subterra_jax.policies.locate.agent import Locating, nested
 from train.locate.drives import Drive, record_drives
+from train.locate.tunnels import PLANAR
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +33,7 @@ class LocateConfig:
         learning_rate: Of Adam, at most; it rises over the first steps and falls with the time that is left.
         max_grad_norm: Norm to which gradients are clipped.
         minutes: Time of the training, with compiling.
+        begin_from: Localiser whose weights all seeds begin with, by name or file; it may be of another LiDAR.
     """
 
     network: str = "kalman"
@@ -42,6 +46,7 @@ class LocateConfig:
     learning_rate: float = 2e-3
     max_grad_norm: float = 1.0
     minutes: float = 20.0
+    begin_from: str | None = None
 
 
 @struct.dataclass
@@ -82,20 +87,24 @@ class LocateLearner:
         self.chunk = math.gcd(config.minibatch, config.chunk)
         self.n_metres = int(config.n_steps * period)
         self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(b2=0.99))
+        self.given = None if config.begin_from is None else begun(config, strips.n_sides(params.lidar))
 
     @staticmethod
     def check(config: LocateConfig) -> None:
-        """Refuses a network or front end that there is not.
+        """Refuses a network or front end that there is not, and weights to begin with that do not fit.
 
         Raises:
-            ValueError: There is no such one.
+            ValueError: There is no such one, or they are of another network or front end.
+            PolicyError: There are no such weights.
         """
         jax.eval_shape(lambda key: memory.init(config.network, config.front, key), jax.random.key(0))
+        if config.begin_from is not None:
+            begun(config, 2)
 
     def init(self, seed: Array | int) -> TrainState:
         """Returns the state before training."""
         key_weights, key = jax.random.split(jax.random.key(seed))
-        weights = memory.init(self.config.network, self.config.front, key_weights)
+        weights = memory.init(self.config.network, self.config.front, key_weights) if self.given is None else self.given
         # Of definite types, as they come out of an iteration, or the second one is compiled anew.
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), weights)
         return TrainState(weights, self.optimizer.init(weights), key, jnp.zeros((), jnp.int32))
@@ -148,6 +157,33 @@ class LocateLearner:
         """
         answers, truth, valid = jax.vmap(lambda d: estimate(self.config.network, weights, d, self.n_metres))(drive)
         return loss(answers, truth, valid, counts)
+
+
+def begun(config: LocateConfig, n_sides: int) -> Any:
+    """Returns the weights of `begin_from`; their evidence is told as that of as many sides as they learnt on.
+
+    Args:
+        config: Settings.
+        n_sides: Sides that the points of the LiDAR are of.
+
+    Raises:
+        ValueError: They are of another network or front end, or of no localiser.
+        PolicyError: There are no such weights.
+    """
+    agent, facts = load(config.begin_from or "")
+    if not isinstance(agent, Locating):
+        raise ValueError(f"begin_from = {config.begin_from}: is no localiser, but {type(agent).__name__}")
+    found = (agent.network, memory.front_of(agent.tensors))
+    if found != (config.network, config.front):
+        raise ValueError(
+            f"begin_from = {config.begin_from}: is of network {found[0]} with front {found[1]}, "
+            f"not {config.network} with {config.front}"
+        )
+    weights = nested(agent.tensors)
+    if "match" in weights:  # the evidence of all sides is summed
+        learnt_on = 2 if facts.get("world", {}).get("sensor", PLANAR) == PLANAR else 2 * len(strips.HEIGHTS)
+        weights["match"]["count"] = weights["match"]["count"] + math.log(learnt_on / n_sides)
+    return weights
 
 
 def count(valid: Bool[Array, "env metre"]) -> list[Array]:

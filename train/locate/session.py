@@ -16,7 +16,7 @@ import safetensors.numpy
 import tyro
 
 from subterra_jax.host.files import replace_file, require_folder
-from subterra_jax.policies import TRAINED_UNDER, training_conditions
+from subterra_jax.policies import TRAINED_UNDER, PolicyError, training_conditions
 from subterra_jax.policies.files import SCHEMA
 from subterra_jax.policies.locate.agent import KIND, flat
 from train.checkpoint import FOLDER, has_checkpoint, load_checkpoint, remove_folder, save_checkpoint
@@ -92,7 +92,7 @@ def check(arguments: Command) -> None:
         raise ConfigError(f"seeds must differ and be at least 0, got {' '.join(map(str, arguments.seeds)) or 'none'}")
     try:
         LocateLearner.check(config)
-    except ValueError as error:
+    except (ValueError, PolicyError) as error:
         raise ConfigError(str(error)) from error
     if arguments.tensorboard:
         check_tensorboard()
@@ -295,9 +295,9 @@ def _identity(arguments: Command) -> dict[str, Any]:
 
 
 def _check_same(arguments: Command, was: dict[str, Any] | None) -> None:
-    if was != (now := _identity(arguments)):
-        other = next(name for name in now if was is None or was.get(name) != now[name])
-        raise ConfigError(f"{arguments.out}: was begun with another {other}; train into another folder")
+    other = [name for name, value in _identity(arguments).items() if was is None or was.get(name) != value]
+    if other:
+        raise ConfigError(f"{arguments.out}: was begun with another {other[0]}; train into another folder")
 
 
 def _check_folder(arguments: Command) -> None:
