@@ -144,6 +144,25 @@ class Driver:
         """
         return _go(self, n_steps, agent, params, jnp.int32(first), now)
 
+    @in_32_bits()
+    def bytes_needed(self, params: EnvParams, agent: Agent, n: int, n_steps: int) -> int:
+        """Return the bytes that `begin` and `go` take for `n` episodes at once, as compiled, beside params and agent.
+
+        What is compiled here is not compiled again by `begin` and `go` of as many episodes and steps.
+
+        Args:
+            params: The task, not batched.
+            agent: The agent that drives.
+            n: Number of episodes.
+            n_steps: Steps of one call of `go`.
+        """
+        seed, whole = jax.ShapeDtypeStruct((n,), jnp.uint32), jax.ShapeDtypeStruct((n,), jnp.int32)
+        begun = _begin.lower(self, agent, params, seed, whole, whole)
+        first = jax.ShapeDtypeStruct((), jnp.int32)
+        gone = _go.lower(self, n_steps, agent, params, first, begun.out_info)
+        found = (program.compile().memory_analysis() for program in (begun, gone))
+        return max(int(one.temp_size_in_bytes + one.output_size_in_bytes) for one in found)
+
     def drive(
         self, params: EnvParams, agent: Agent, now: Episode, chunk: int, limit: int | None = None
     ) -> Iterator[tuple[Episode, Any]]:

@@ -48,6 +48,7 @@ MISTAKES = {
     "benchmarks.openboard --out o --splits dev": "there is no split 'dev'; there are train, val",
     "benchmarks.openboard --out o --sensor sonar": "no sensor 'sonar'; there are planar16, spin16x64",
     "benchmarks.openboard --out o --tunnels 0": "tunnels must be at least 1, got 0",
+    "benchmarks.openboard --out o --memory 0": "memory must be above 0, got 0",
     "benchmarks.openboard --out o --report-only": "holds no cell of these tunnels",
     "benchmarks.openboard.ablations --out o --agents nobody": "no agent 'nobody'",
     "benchmarks.openboard.bound --out o --tunnels none:smooth": "none: no such tunnel file; by name there are",

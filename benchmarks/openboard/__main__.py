@@ -25,6 +25,7 @@ from benchmarks.openboard import report
 from benchmarks.results import environment_facts, write_file
 from subterra_jax.evaluation import evaluate
 from subterra_jax.evaluation.floor import floor
+from subterra_jax.evaluation.harness import fitting_batch
 from subterra_jax.host.files import require_folder
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies import open_agent
@@ -45,6 +46,7 @@ class OpenboardConfig:
         episodes: Episodes of each kind and split.
         tunnels: Tunnels of each kind and split, over which the episodes are spread.
         sensor: The LiDAR, by name; use a folder of its own for each.
+        memory: Memory that driving may take at once, GB; an agent that needs more is driven in parts of the episodes.
         cache: Folder in which made tunnels are kept from run to run.
         report_only: Drive nothing.
     """
@@ -56,6 +58,7 @@ class OpenboardConfig:
     episodes: int = 50
     tunnels: int = 5
     sensor: str = PLANAR
+    memory: float = 8.0
     cache: Path | None = None
     report_only: bool = False
 
@@ -69,6 +72,8 @@ def run(config: OpenboardConfig) -> None:
     board.check(config.tasks, config.agents, config.splits, config.tunnels, config.episodes)
     if config.sensor not in SENSORS:
         raise BenchmarkError(f"no sensor {config.sensor!r}; there are {', '.join(SENSORS)}")
+    if not config.memory > 0.0:
+        raise BenchmarkError(f"memory must be above 0, got {config.memory}")
     require_folder(config.out)
     missing = [
         (task, agent)
@@ -116,7 +121,9 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
         if task not in floors:
             floors[task] = [floor(params, index) for index in range(len(names))]
         episodes = board.draw_episodes(task, columns, config.tunnels, config.episodes)
-        records = evaluate(env, params, open_agent(agent, env, params), episodes, len(episodes))
+        driver = open_agent(agent, env, params)
+        at_once = fitting_batch(env, params, driver, len(episodes), config.memory)
+        records = evaluate(env, params, driver, episodes, at_once)
         seconds = time.monotonic() - started
         content: dict[str, Any] = {
             "schema": board.SCHEMA,

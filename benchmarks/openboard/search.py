@@ -30,13 +30,17 @@ SCHEMA = "subterra.search/1"
 _SEEDS = 2**28  # below those of the leaderboard
 _progress = Console(stderr=True, highlight=False)
 
-# Agent: where its settings are (field of the localiser), and the values of each that are tried.
+# Agent: where its settings are (field within field), and the values of each that are tried.
 SPACES: dict[str, tuple[str, dict[str, tuple[float, ...]]]] = {
     "scan-matching": (
-        "params",
+        "localiser.params",
         {"wall_sigma": (0.05, 0.02, 0.1), "least_information": (5000.0, 1000.0, 20000.0), "least_age": (1.0, 3.0)},
     ),
-    "particle-filter": ("scan", {"map_sigma": (0.01, 0.03), "power": (0.5, 0.25, 1.0), "outlier_share": (0.05, 0.15)}),
+    "ring-filter": ("steering", {"cruise": (1.2, 0.8, 2.0), "slow": (0.5, 1.0), "learning": (15.0, 30.0)}),
+    "particle-filter": (
+        "localiser.scan",
+        {"map_sigma": (0.01, 0.03), "power": (0.5, 0.25, 1.0), "outlier_share": (0.05, 0.15)},
+    ),
 }
 
 
@@ -102,12 +106,16 @@ def with_settings(agent: str, settings: dict[str, float]) -> Callable[[Any], Any
     """Return a factory of the agent with other settings."""
 
     def make(params: Any) -> Any:
-        made: Any = registry.make_agent(agent, params)
-        field = SPACES[agent][0]
-        localiser = made.localiser
-        return made.replace(localiser=localiser.replace(**{field: getattr(localiser, field).replace(**settings)}))
+        return _replace(registry.make_agent(agent, params), SPACES[agent][0].split("."), settings)
 
     return make
+
+
+def _replace(made: Any, path: list[str], settings: dict[str, float]) -> Any:
+    """Return what was made with other settings at the end of a path of fields."""
+    if not path:
+        return made.replace(**settings)
+    return made.replace(**{path[0]: _replace(getattr(made, path[0]), path[1:], settings)})
 
 
 def choose(rows: list[dict[str, Any]], n: int) -> dict[str, float]:

@@ -44,11 +44,7 @@ def evaluate(
     """
     if batch < 1:
         raise EvaluationError(f"batch must be at least 1, got {batch}")
-    agent = agent.agent if isinstance(agent, DrivingPolicy) else agent
-    if isinstance(agent, Trained):
-        check_task(agent, env, params, agent.name)
-    env = dataclasses.replace(env, estimates=True)
-    driver = Driver(env, start=_Start(env), add=_Add(env))
+    env, agent, driver = _prepare(env, params, agent)
     tallies = []
     for first in range(0, len(episodes), batch):
         # The last batch is filled up with its last episode, or it would be compiled anew.
@@ -60,6 +56,32 @@ def evaluate(
         tallies.append(jax.device_get(now.tally))
     tally = jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(episodes)], *tallies)
     return make_records(tally, episodes, env, jax.device_get(params))
+
+
+def fitting_batch(env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolicy, most: int, gigabytes: float) -> int:
+    """Return how many episodes `evaluate` can drive at the same time within some memory: at least 1, at most `most`.
+
+    Args:
+        env: The environment, as for `evaluate`.
+        params: The task, not batched.
+        agent: The agent that drives.
+        most: Number of episodes to drive.
+        gigabytes: Memory that driving may take beside params and agent, GB. One episode may take more.
+    """
+    _, agent, driver = _prepare(env, params, agent)
+    batch, limit = most, 1e9 * gigabytes
+    while batch > 1 and (needed := driver.bytes_needed(params, agent, batch, _CHUNK)) > limit:
+        batch = max(1, min(int(batch * limit / needed), batch - 1))
+    return batch
+
+
+def _prepare(env: TunnelEnv, params: EnvParams, agent: Agent | DrivingPolicy) -> tuple[TunnelEnv, Agent, Driver]:
+    """Return the environment, the agent and the driver of an evaluation."""
+    agent = agent.agent if isinstance(agent, DrivingPolicy) else agent
+    if isinstance(agent, Trained):
+        check_task(agent, env, params, agent.name)
+    env = dataclasses.replace(env, estimates=True)
+    return env, agent, Driver(env, start=_Start(env), add=_Add(env))
 
 
 # Two of one environment are equal, as two bound methods would not be, so that evaluations share a compiled program.

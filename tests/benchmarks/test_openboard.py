@@ -1,6 +1,7 @@
 """The leaderboard of version 1: its columns, its resumption, and that a figure beyond a bound is named."""
 
 import json
+import operator
 
 import jax
 import numpy as np
@@ -10,8 +11,11 @@ import subterra_jax as st
 from benchmarks.openboard import __main__ as command
 from benchmarks.openboard import ablations, bound, columns, report, search
 from subterra_jax.baselines import registry
+from subterra_jax.episode import Driver
+from subterra_jax.evaluation import harness
 
 SPLITS = ("val", "test-unseen")
+LITTLE = 1.2e-5  # GB; some episodes, not a dozen
 
 
 def cell(agent, success, task="StopAt", n=40, floor=0.3):
@@ -77,15 +81,50 @@ def test_a_cell_that_is_there_is_not_driven_again(tmp_path, monkeypatch, capsys)
         command.run(command.OpenboardConfig(**{**vars(changed), "report_only": True}))
 
 
+def test_an_agent_that_needs_more_memory_is_driven_in_parts_of_the_same_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(columns, "columns_of", lambda splits: (columns.Column("cast", "val"),))
+    parts = []
+    begin = Driver.begin
+    monkeypatch.setattr(
+        Driver, "begin", lambda self, p, a, seed, *rest: parts.append(seed) or begin(self, p, a, seed, *rest)
+    )
+    found = {}
+    for memory in (8.0, LITTLE):
+        out = tmp_path / str(memory)
+        config = command.OpenboardConfig(out, ("StopAtShort",), ("dead-reckoning",), ("val",), 12, 1, memory=memory)
+        command.run(config)
+        found[memory] = json.loads(command.cell_file(config, "StopAtShort", "dead-reckoning").read_text())
+    whole, *some = parts
+    assert len(whole) == 12
+    assert 1 < len(some) < 12
+    assert set(np.concatenate(some).tolist()) == set(whole.tolist())
+    for name in ("success", "contact", "floor"):
+        assert found[8.0][name] == found[LITTLE][name], name
+    np.testing.assert_allclose(found[8.0]["goal_error"], found[LITTLE]["goal_error"], atol=0.002)
+
+
+def test_a_batch_takes_no_more_than_the_memory_that_it_may_unless_it_is_one_episode():
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="control", estimates=True)
+    agent = registry.make_agent("dead-reckoning", params)
+    driver = harness._prepare(env, params, agent)[2]
+    needed = driver.bytes_needed(params, agent, 64, harness._CHUNK)
+    assert needed > driver.bytes_needed(params, agent, 16, harness._CHUNK) > 0
+    assert harness.fitting_batch(env, params, agent, 64, needed * 1e-9) == 64
+    least = harness.fitting_batch(env, params, agent, 64, 0.4e-9 * needed)
+    assert 1 < least < 40
+    assert driver.bytes_needed(params, agent, least, harness._CHUNK) <= 0.4 * needed
+    assert harness.fitting_batch(env, params, agent, 64, 1e-9) == 1
+
+
 @pytest.mark.parametrize("agent", search.SPACES)
 def test_a_search_begins_with_the_default_and_keeps_it_unless_another_is_clearly_better(agent):
     _, params = st.make("Subterra/StopAt-v1", tunnel="control")
     first, *others = search.candidates(agent)
-    field = search.SPACES[agent][0]
-    default = getattr(registry.make_agent(agent, params).localiser, field)
+    at = operator.attrgetter(search.SPACES[agent][0])
+    default = at(registry.make_agent(agent, params))
     for name, value in first.items():
         assert getattr(default, name) == pytest.approx(value), name
-    made = getattr(search.with_settings(agent, others[-1])(params).localiser, field)
+    made = at(search.with_settings(agent, others[-1])(params))
     assert {name: getattr(made, name) for name in first} == others[-1]
     rows = [{"settings": s, "success": x} for s, x in ((first, 0.5), (others[0], 0.52), (others[1], 0.51))]
     assert search.choose(rows, 400) == first
