@@ -148,7 +148,8 @@ class Driver:
     def bytes_needed(self, params: EnvParams, agent: Agent, n: int, n_steps: int) -> int:
         """Return the bytes that `begin` and `go` take for `n` episodes at once, as compiled, beside params and agent.
 
-        What is compiled here is not compiled again by `begin` and `go` of as many episodes and steps.
+        What is compiled here is not compiled again by `begin` and `go` of as many episodes and steps. 0 where the
+        device does not tell.
 
         Args:
             params: The task, not batched.
@@ -161,7 +162,7 @@ class Driver:
         first = jax.ShapeDtypeStruct((), jnp.int32)
         gone = _go.lower(self, n_steps, agent, params, first, begun.out_info)
         found = (program.compile().memory_analysis() for program in (begun, gone))
-        return max(int(one.temp_size_in_bytes + one.output_size_in_bytes) for one in found)
+        return max(int(one.temp_size_in_bytes + one.output_size_in_bytes) if one else 0 for one in found)
 
     def drive(
         self, params: EnvParams, agent: Agent, now: Episode, chunk: int, limit: int | None = None
