@@ -1,6 +1,7 @@
 """A learnt localiser in the written controller: it keeps to the middle and stops where it believes the goal to be.
 
-Round boxes it steers by the written avoidance: what is learnt is where the robot is.
+Round boxes it steers by the written avoidance: what is learnt is where the robot is. A policy that has tensors of a
+steering as well steers by these everywhere; when to stop stays written.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.locator import Locator
+from subterra_jax.policies.locate.steering import PREFIX, LearntSteering, check_steering
 from subterra_jax.policies.locate.ways import TwoWays
 from subterra_jax.policies.trained import Tensors, Trained
 from subterra_jax.state import EnvParams
@@ -37,6 +39,7 @@ class Locating(Trained):
         low: Smallest action, m/s and rad/s.
         high: Largest action, m/s and rad/s.
         network: Memory behind the front end, of `memory.NETWORKS`.
+        frames: Moments that its learnt steering reads; 0 where the steering is written.
         blind: Cut what the walls tell: the ablation of the learnt estimate.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
@@ -49,14 +52,15 @@ class Locating(Trained):
     low: Float[Array, "2"]
     high: Float[Array, "2"]
     network: str = struct.field(pytree_node=False, default="kalman")
+    frames: int = struct.field(pytree_node=False, default=0)
     blind: bool = struct.field(pytree_node=False, default=False)
     name: str = struct.field(pytree_node=False, default=KIND)
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
 
     @classmethod
     def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Locating":
-        """Makes the agent of a layout with `network`."""
-        return cls(**common, network=str(layout["network"]))
+        """Makes the agent of a layout with `network`, and `frames` if its steering is learnt."""
+        return cls(**common, network=str(layout["network"]), frames=int(layout.get("frames", 0)))
 
     def try_out(self) -> None:
         """Compares names and shapes of the tensors with the network's."""
@@ -84,9 +88,17 @@ class Locating(Trained):
         return self._navigator(params).act(key, memory, obs, params, known)
 
     def _navigator(self, params: EnvParams) -> Navigator:
-        locator = Locator(nested(self.tensors), self.network, self.blind)
+        mine, steering = parted(self.tensors)
+        locator = Locator(nested(mine), self.network, self.blind)
         localiser = TwoWays(locator) if params.errand == "return" else locator
-        return Navigator(localiser, steering_of(params, CentreLine()), name=self.name)
+        learnt = LearntSteering(steering, self.frames) if steering else steering_of(params, CentreLine())
+        return Navigator(localiser, learnt, name=self.name)
+
+
+def parted(tensors: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns the tensors of the localiser, and those of a learnt steering without their prefix."""
+    mine = {name: tensor for name, tensor in tensors.items() if not name.startswith(PREFIX)}
+    return mine, {name.removeprefix(PREFIX): tensors[name] for name in tensors if name not in mine}
 
 
 def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,12 +121,14 @@ def check_tensors(agent: Locating) -> None:
         ValueError: There is no such network, or a tensor has another shape or name.
     """
     front = memory.front_of(agent.tensors)
+    tensors, steering = parted(agent.tensors)
+    check_steering(steering, agent.frames)
     shapes = jax.eval_shape(lambda key: memory.init(agent.network, front, key), jax.random.key(0))
     wanted = flat(shapes)
     for name, leaf in wanted.items():
-        if agent.tensors[name].shape != leaf.shape:
-            raise ValueError(f"{name} is {agent.tensors[name].shape}, not {leaf.shape}")
-    if further := sorted(set(agent.tensors) - set(wanted)):
+        if tensors[name].shape != leaf.shape:
+            raise ValueError(f"{name} is {tensors[name].shape}, not {leaf.shape}")
+    if further := sorted(set(tensors) - set(wanted)):
         raise ValueError(f"{further[0]} is of no {agent.network}")
 
 
