@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.lidar3d.beams import level_ring, n_level
+from subterra_jax.lidar3d.beams import level_ring, level_row, n_level
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -108,6 +108,17 @@ def n_ranges(params: EnvParams) -> int:
     """Return the number of `Observed.ranges`."""
     sensor = params.lidar
     return n_level(sensor.shape) if hasattr(sensor, "shape") else sensor.n_beams
+
+
+def level_ranges(obs: Observed, params: EnvParams) -> Float[Array, "n"]:
+    """Return all level beams that there are, m: `Observed.ranges`, or the whole ring of a LiDAR in three dimensions."""
+    return level_row(obs.entries["scan"], params.lidar.shape) if "scan" in obs.entries else obs.ranges
+
+
+def range_sigma(params: EnvParams) -> float:
+    """Return the standard deviation of a range met near and squarely, m, of either kind of LiDAR; on the host."""
+    sensor = params.lidar
+    return float(sensor.echo.sigma if hasattr(sensor, "echo") else sensor.range_sigma)
 
 
 def observed(env: TunnelEnv, params: EnvParams, flat: Float[Array, "n_obs"], sees: bool = True) -> Observed:

@@ -12,9 +12,9 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax import lidar
-from subterra_jax.baselines.agent import Known, Observed
+from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.cloud import log_weights, move, resample, summarise
+from subterra_jax.baselines.cloud import commanded_cloud, log_weights, move, resample, summarise, weigh_odometer
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import FilterMemory, ParticleLocaliser, Relocaliser
 from subterra_jax.baselines.reckoning import Reckoning, reckon, unobserved_distance
@@ -27,6 +27,7 @@ from subterra_jax.tunnel import at_station
 
 NAME = "ceiling"
 _LEAST_SIGMA = 0.01  # m
+_DENSE_LEAST, _DENSE_DUE = 0.02, 0.3  # shares of a cloud about a known start: below the second it is resampled
 _ECHO = 1e-3  # m below `range_max`: no echo
 
 
@@ -63,14 +64,17 @@ class ExactLocaliser(ParticleLocaliser):
         move_key, draw_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), 1 + memory.step))
         walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
         before = with_known_delay(memory.reckoning, params, known)
-        distance, turn, reckoning = reckon(before, obs, driven.speed, self.odometer_share, period)
-        motion = self.motion
+        # The odometer's noise of each step would otherwise be noise of the motion: it is weighed apart.
+        motion, apart = self.motion, self.motion.odometer is not None
+        distance, turn, reckoning = reckon(before, obs, driven.speed, 0.0 if apart else self.odometer_share, period)
+        read = obs.distance - memory.reckoning.distance
+        told, heard = weigh_odometer(memory.cloud, distance, read, turn, motion) if apart else (memory.cloud, 0.0)
         if known is not None and "fault_wet_loss" in known:
             motion = dataclasses.replace(motion, slip_loss=params.faults.wet_loss * known["fault_wet_loss"])
-        cloud = move(move_key, memory.cloud, walls, distance, turn, motion)
+        cloud = move(move_key, told, walls, distance, turn, motion)
         _, pose = fit(walls, cloud.pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
         cloud = dataclasses.replace(cloud, pose=pose)
-        cloud = log_weights(cloud, exact_likelihood(pose, obs.ranges, params, self.exact), motion)
+        cloud = log_weights(cloud, heard + exact_likelihood(pose, obs.ranges, params, self.exact), motion)
         summary = summarise(cloud, motion)
         station = summary.station + unobserved_distance(reckoning, period) * jnp.cos(summary.heading)
         direction = jnp.where(jnp.cos(summary.heading) > 0.0, 1.0, -1.0)
@@ -128,8 +132,14 @@ def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator | Re
     hidden = float(params.start.station_sigma.max()) > 0.0
     usual = 4096 if params.errand == "report" else 1024 if hidden or "faults" in params.parts else 512
     made = ParticleLocaliser.of(params, n_particles or usual)
+    motion = made.motion
+    if params.errand != "report":
+        # A dense cloud: a likelihood that is flattened to spare its particles throws away what the walls tell. One that
+        # is spread over a tunnel has too few particles at any place for that.
+        motion = dataclasses.replace(commanded_cloud(params), least_share=_DENSE_LEAST, ess_share=_DENSE_DUE)
     fields = {field.name: getattr(made, field.name) for field in dataclasses.fields(made) if field.name != "privileged"}
-    localiser = ExactLocaliser(**{**fields, "scan": ScanModel(range_sigma=float(params.lidar.range_sigma))})
+    fields |= {"scan": ScanModel(range_sigma=range_sigma(params)), "motion": motion}
+    localiser = ExactLocaliser(**fields)
     if params.errand == "report":
         return Relocaliser(localiser, CentreLine(), name=NAME, privileged=True)
     return Navigator(localiser, steering_of(params, CentreLine()), name=NAME, uses_map=True)

@@ -19,6 +19,30 @@ _POWERS = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # exponents by which a likelihood 
 _CANDIDATES = 32  # particles tried as the middle of the heaviest cluster
 # As often as 10 m patches change, 1/m, in a cloud of which some particles must be right at once.
 _SLIP_RATE = 0.1
+_STIR = 0.001  # m; noise of a step where the model has none, so that particles do not fall together
+_SPIN = 0.05  # rad in a step beyond which the robot is turning round
+
+
+@struct.dataclass
+class OdometerNoise:
+    """Errors of an odometer that a cloud weighs apart, where its particles move by the command.
+
+    Attributes:
+        step_sigma: Standard deviation of the noise of one step, m.
+        bias_sigma: Standard deviation of the relative error that lasts an episode, 1.
+        wander: The relative error that changes along the way.
+        turn_sigma: Standard deviation of what half a turn adds to the relative error, 1.
+    """
+
+    step_sigma: float
+    bias_sigma: float
+    wander: WanderParams
+    turn_sigma: float = 0.0
+
+    @property
+    def variance(self) -> float:
+        """Variance of the relative error before any step."""
+        return self.bias_sigma**2 + self.wander.sigma**2
 
 
 @struct.dataclass
@@ -37,6 +61,7 @@ class CloudParams:
         roughening: Standard deviation of the noise on the lasting scale error of a resampled particle, 1.
         jitter: Standard deviation of the noise on its station, in lengths of the cloud over its particles.
         cluster: Half the length of one cluster, m: half the shortest distance at which a wall repeats.
+        odometer: The odometer, where it is weighed apart; None where it is part of the dead reckoning.
     """
 
     scale_sigma: float | Float[Array, ""]
@@ -49,6 +74,27 @@ class CloudParams:
     roughening: float = 0.0005
     jitter: float = 0.2
     cluster: float = 0.6
+    odometer: OdometerNoise | None = None
+
+
+def commanded_cloud(params: EnvParams) -> CloudParams:
+    """Return the motion of a cloud that moves by commands and weighs the odometer apart; on the host."""
+    lasting, changing = command_errors(params)
+    bias, wandering = odometer_errors(params)
+    length = lambda wander: 30.0 if wander is None else float(wander.length)  # noqa: E731
+    backward = params.odometry.backward_bias_sigma
+    return dataclasses.replace(
+        cloud_params(params),
+        scale_sigma=lasting,
+        wander=WanderParams(changing, length(params.slip.wander if "slip" in params.parts else None)),
+        step_sigma=_STIR,
+        odometer=OdometerNoise(
+            max(_STIR, float(params.odometry.distance_sigma)),
+            bias,
+            WanderParams(wandering, length(params.odometry.wander)),
+            0.0 if backward is None else float(backward),
+        ),
+    )
 
 
 def cloud_params(params: EnvParams) -> CloudParams:
@@ -76,6 +122,8 @@ class Cloud:
         wander: Changing relative error, 1.
         wet: 1 where the particle assumes wet rail, else 0.
         log_weight: Log of the weight; the weights sum to 1 after `weigh`.
+        odometer: Mean and variance of the odometer's relative error, given the particle's way; None where the odometer
+            is not weighed apart.
     """
 
     pose: TunnelPose
@@ -83,6 +131,7 @@ class Cloud:
     wander: Float[Array, "n"]
     wet: Float[Array, "n"]
     log_weight: Float[Array, "n"]
+    odometer: Float[Array, "n 2"] | None = None
 
 
 def new_cloud(key: PRNGKeyArray, pose: TunnelPose, params: CloudParams) -> Cloud:
@@ -95,6 +144,7 @@ def new_cloud(key: PRNGKeyArray, pose: TunnelPose, params: CloudParams) -> Cloud
         wander=params.wander.sigma * normal[1],
         wet=jnp.zeros(n),
         log_weight=jnp.full(n, -jnp.log(float(n))),
+        odometer=None if params.odometer is None else jnp.tile(jnp.asarray([0.0, params.odometer.variance]), (n, 1)),
     )
 
 
@@ -134,6 +184,40 @@ def move(
     )
     wander = jax.vmap(advance_wander, (0, None, 0, None))(cloud.wander, travelled, normal[1], params.wander)
     return dataclasses.replace(cloud, pose=after, wander=wander, wet=wet)
+
+
+def weigh_odometer(
+    cloud: Cloud, commanded: Float[Array, ""], read: Float[Array, ""], turned: Float[Array, ""], params: CloudParams
+) -> tuple[Cloud, Float[Array, "n"]]:
+    """Computes the log likelihood of an odometer's step for each particle's way, and learns the odometer's error.
+
+    A Kalman filter of the relative error for each particle, whose way is given; the odometer counts wheels, on wet rail
+    too.
+
+    Args:
+        cloud: The cloud, before it moves.
+        commanded: Commanded distance of the step, m.
+        read: Step of the odometer, m.
+        turned: Step of its heading, rad; NaN where the odometer stands, which tells nothing.
+        params: Motion of the cloud, with an odometer.
+
+    Returns:
+        The cloud with the errors that it has learnt, and the log likelihood up to a constant.
+    """
+    noise = params.odometer
+    assert noise is not None
+    assert cloud.odometer is not None
+    way = commanded * (1.0 + cloud.scale + cloud.wander)
+    mean, variance = cloud.odometer.T
+    spin = jnp.where(jnp.abs(turned) > _SPIN, jnp.abs(turned) / jnp.pi, 0.0)
+    news = 2.0 * noise.wander.sigma**2 / noise.wander.length * jnp.abs(commanded) + noise.turn_sigma**2 * spin
+    variance = jnp.minimum(variance + news, noise.variance + noise.turn_sigma**2)
+    rest, total = read - way * (1.0 + mean), way * way * variance + noise.step_sigma**2
+    gain = way * variance / total
+    learnt = jnp.stack([mean + gain * rest, variance * (1.0 - gain * way)], axis=-1)
+    told = ~jnp.isnan(turned)
+    likely = jnp.where(told, -0.5 * (rest * rest / total + jnp.log(total)), 0.0)
+    return dataclasses.replace(cloud, odometer=jnp.where(told, learnt, cloud.odometer)), likely
 
 
 def weigh(

@@ -11,7 +11,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Agent, Known, Observed
+from subterra_jax.baselines.agent import Action, Agent, Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import Cloud, CloudParams, cloud_params, move, new_cloud, resample, summarise, weigh
 from subterra_jax.baselines.navigator import Navigator
@@ -69,7 +69,7 @@ class ParticleLocaliser(Localiser):
         return cls(
             walls=wall_map(params.tunnel),
             motion=cloud_params(params),
-            scan=ScanModel(range_sigma=float(params.lidar.range_sigma)),
+            scan=ScanModel(range_sigma=range_sigma(params)),
             odometer_share=odometer_share(params),
             n_particles=n_particles,
         )

@@ -1,7 +1,8 @@
 """LiDAR odometry without a map: dead reckoning whose scale is corrected by matched scans where the walls allow it.
 
 The walls seen lately are kept as two profiles, distance from the axis over station, in a ring of bins. New scans are
-matched with them at several shifts along the axis. A Kalman filter of station and scale uses informative matches.
+matched with them at several shifts along the axis. A Kalman filter of station and scale uses informative matches. Of a
+LiDAR in three dimensions it uses a whole level ring.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from subterra_jax.baselines.agent import Known, Observed
+from subterra_jax.baselines.agent import Known, Observed, level_ranges, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import CloudParams, cloud_params
 from subterra_jax.baselines.navigator import Navigator
@@ -236,7 +237,7 @@ class MatchMemory:
     """Memory of the scan matcher.
 
     Attributes:
-        profile: The walls seen lately.
+        profile: Of a LiDAR in three dimensions it uses a whole level ring. The walls seen lately.
         pose: Estimated pose.
         scale: Relative error of dead reckoning, 1.
         covariance: Variance of the station against the profile (m²), covariance with the scale (m), variance of the
@@ -276,7 +277,7 @@ class ScanMatcher(Localiser):
     @classmethod
     def of(cls, params: EnvParams) -> "ScanMatcher":
         """Makes a matcher for the nominal errors of a task."""
-        return cls(cloud_params(params), MatchParams(float(params.lidar.range_sigma)), odometer_share(params))
+        return cls(cloud_params(params), MatchParams(range_sigma(params)), odometer_share(params))
 
     def begin(self, obs: Observed, params: EnvParams) -> MatchMemory:
         """Begins at the believed start, on an axis that is taken to be straight."""
@@ -304,15 +305,16 @@ class ScanMatcher(Localiser):
         distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
         pose = _move(memory.pose, distance * (1.0 + memory.scale), turn)
         covariance = _propagate(memory.covariance, distance, self.motion)
-        pose = centre(pose, obs.ranges, self.params)
-        cost = memory.cost + mismatch(memory.profile, pose, obs.ranges, self.params)
+        ranges = level_ranges(obs, params)
+        pose = centre(pose, ranges, self.params)
+        cost = memory.cost + mismatch(memory.profile, pose, ranges, self.params)
         travelled = memory.travelled + jnp.abs(distance)
         due = travelled >= self.window
         match = best_match(cost, self.params)
         match = dataclasses.replace(match, informative=match.informative & due)
         pose, scale, covariance = _fuse(pose, match, memory.scale, covariance)
         cost, travelled = jnp.where(due, 0.0, cost), jnp.where(due, 0.0, travelled)
-        profile = add_scan(memory.profile, pose, obs.ranges, self.params)
+        profile = add_scan(memory.profile, pose, ranges, self.params)
         # The station is never corrected against the start: errors of the scale add up.
         sigma = memory.sigma + jnp.abs(distance) * jnp.sqrt(covariance[2])
         forward = jnp.cos(pose.heading)

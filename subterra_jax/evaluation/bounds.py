@@ -61,12 +61,15 @@ def _wandered(distance: Float[np.ndarray, " n"], wander: WanderParams | None) ->
 def _fused(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
     """Variance of the true distance given commands and readings, m²: a Kalman filter's, which needs no data."""
     n = math.ceil(distance.max() / _STRETCH)
-    variance = _station_variance(np.zeros(n), params, 0.0)
+    variance = _station_variance(np.zeros((n, 1)), params, 0.0)
     return np.interp(distance, _STRETCH * np.arange(n + 1), variance)
 
 
 def filter_variance(
-    station: Float[np.ndarray, " n"], information: Float[np.ndarray, " n"], params: EnvParams
+    station: Float[np.ndarray, " n"],
+    information: Float[np.ndarray, " n"] | Float[np.ndarray, "n blur"],
+    params: EnvParams,
+    blurs: tuple[float, ...] = (),
 ) -> Float[np.ndarray, " n"]:
     """Compute the variance of the station that a perfect filter keeps on the way through a tunnel at full speed, m².
 
@@ -74,8 +77,10 @@ def filter_variance(
 
     Args:
         station: Stations, m, growing.
-        information: Information of one scan about the station there, 1/m².
+        information: Information of one scan about the station there, 1/m²; with `blurs` a column for each of them.
         params: A task with slip; its start and its errors of commands and odometry.
+        blurs: Standard deviations of the station for which the columns hold, m, growing. Each scan then answers a
+            filter as uncertain as this one is at that place, within their range.
 
     Returns:
         Variances; behind the start, that of the start.
@@ -86,14 +91,18 @@ def filter_variance(
     n = max(1, math.ceil((station[-1] - begin) / _STRETCH))
     at = begin + _STRETCH * (np.arange(n) + 1.0)
     scans = _STRETCH / float(np.max(params.vehicle.speed_max * params.vehicle.period))
-    variance = _station_variance(scans * np.interp(at, station, information), params, start)
+    columns = information.reshape(len(station), -1).T
+    told = scans * np.stack([np.interp(at, station, column) for column in columns], axis=-1)
+    variance = _station_variance(told, params, start, blurs)
     return np.interp(station, begin + _STRETCH * np.arange(n + 1), variance)
 
 
 def _station_variance(
-    information: Float[np.ndarray, " n"], params: EnvParams, start: float
+    information: Float[np.ndarray, "n blur"], params: EnvParams, start: float, blurs: tuple[float, ...] = ()
 ) -> Float[np.ndarray, " n+1"]:
     """Variance of the station after each stretch, m², given what is learnt about it at the end of each, 1/m².
+
+    Of several columns, each for a blur, the one counts that is as blurred as the station then is.
 
     The state is the station, the constant and the wandering slip, the constant and the wandering scale error.
     """
@@ -106,11 +115,12 @@ def _station_variance(
     moved, read, here = np.eye(5), np.array([0.0, 1.0, 1.0, 1.0, 1.0]), np.eye(5)[0]
     moved[0, 1:3] = _STRETCH
     covariance, found = np.diag(sigma**2 + stationary + start * here), [start]
-    for told in information:
+    for row in information:
         covariance = _learn(covariance, read, noise)
         # The error of the whole stretch becomes known as the reading of that stretch is.
         covariance = moved @ covariance @ moved.T
         covariance = covariance * np.outer(keep, keep) + np.diag((1.0 - keep**2) * stationary)
+        told = row[0] if not blurs else np.interp(0.5 * np.log(max(covariance[0, 0], 1e-12)), np.log(blurs), row)
         if told > 0.0:
             covariance = _learn(covariance, here, 1.0 / told)
         found.append(covariance[0, 0])

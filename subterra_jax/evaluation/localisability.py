@@ -8,7 +8,9 @@ at it. So the slope is that of the best straight line through the ranges of pose
 distributed with a standard deviation `blur` (statistical linearisation), and what the line leaves over counts as
 noise: g = Cov(r, x) / Var(x) and v = Var(r) − g² Var(x), each beam counts g gᵀ / (σ² + v). Where ranges are smooth this
 is the plain Fisher information; a jump of height h counts, on average over stations, as a slope of h over some `blur`.
-It answers a filter that knows its station to about `blur`, no other.
+It answers a filter that knows its station to about `blur`, no other. So the drift of a perfect filter takes at each
+place the blur that this filter has there itself, but no less than `blur`: it reads edges that it cannot tell apart as
+the noise that they are to it.
 
 Maps are chains of chords, which a filter must not read: slopes over the station below `LEAST_SLOPE` count as none.
 
@@ -33,6 +35,7 @@ from subterra_jax.tunnel import Tunnel, at_station
 from subterra_jax.tunnel.plan import TunnelPlan
 
 BLUR = 0.05  # m
+WIDER = (1.0, 2.0, 4.0, 8.0, 16.0)  # blurs for the drift, in units of the first
 LEAST_SLOPE = (
     0.005  # 1: a range that changes by less than 5 mm a metre of station says more of the map than of the wall
 )
@@ -54,7 +57,8 @@ class Localisability:
         offset_bound: The same for the offset, m.
         heading_bound: The same for the heading, rad.
         drift: Standard deviation of the station that a perfect filter with the map keeps. It starts at the task's
-            start, drives to the far mouth at full speed, and has commands, odometry and every scan, m, `(n,)`.
+            start, drives to the far mouth at full speed, and has commands, odometry and every scan, m, `(n,)`. A scan
+            tells it as much as it tells a filter as uncertain, of at least `blur` and at most 16 times that.
         blind_drift: The same without scans, m, `(n,)`.
     """
 
@@ -106,33 +110,58 @@ def localisability(
         raise ValueError(f"blur must be above 0 and step at least as large, got blur={blur:g} m and step={step:g} m")
     tunnel = params.tunnel.pick(index)
     length = float(tunnel.length)
-    fine = np.linspace(0.0, length, round(length / (0.5 * blur)) + 1)
-    turn = _TURN * blur / BLUR
     cast = _caster(_planar(tunnel, params) if solid is None else _spatial(params, solid), tunnel)
-    ranges = [cast(fine, offset * blur, heading * turn) for offset, heading in _POSES]
-    information = scan_information(ranges, fine[1], blur, turn, float(np.max(params.lidar.range_sigma)))
     n = max(1, round(length / step))
+    sigma = float(np.max(params.lidar.range_sigma))
+    blurs = tuple(blur * factor for factor in WIDER)
+    means = [_cell_information(cast, length, n, one, blur, sigma) for one in blurs]
+    station = (np.arange(n) + 0.5) * length / n
+    along, aside, turned = (marginal_bound(means[0], i) for i in range(3))
+    told = np.stack([marginal_bound(mean, 0) ** -2.0 for mean in means], axis=-1)
+    seen = filter_variance(station, told, params, blurs)
+    blind = filter_variance(station, np.zeros(n), params)
+    return Localisability(station, means[0], along, aside, turned, np.sqrt(seen), np.sqrt(blind))
+
+
+def _cell_information(
+    cast: Callable[[np.ndarray, float, float], Float[np.ndarray, "n beams"]],
+    length: float,
+    n: int,
+    blur: float,
+    offset: float,
+    sigma: float,
+) -> Float[np.ndarray, "n 3 3"]:
+    """Mean information of one scan over each of `n` cells.
+
+    The blur of the offset and of the heading stays as it is where that of the station grows: walls tell them anywhere.
+    """
+    spacing = 0.5 * min(blur, length / n)
+    fine = np.linspace(0.0, length, round(length / spacing) + 1)
+    turn = _TURN * offset / BLUR
+    ranges = [cast(fine, aside * offset, heading * turn) for aside, heading in _POSES]
+    information = scan_information(ranges, fine[1], blur, turn, sigma, offset)
     cell = np.minimum((fine / length * n).astype(int), n - 1)
     total = np.stack([np.bincount(cell, column, n) for column in information.reshape(len(fine), 9).T], axis=-1)
-    mean = (total / np.bincount(cell, minlength=n)[:, None]).reshape(n, 3, 3)
-    station = (np.arange(n) + 0.5) * length / n
-    along, aside, turned = (marginal_bound(mean, i) for i in range(3))
-    seen = filter_variance(station, along**-2.0, params)
-    blind = filter_variance(station, np.zeros(n), params)
-    return Localisability(station, mean, along, aside, turned, np.sqrt(seen), np.sqrt(blind))
+    return (total / np.bincount(cell, minlength=n)[:, None]).reshape(n, 3, 3)
 
 
 def scan_information(
-    ranges: list[Float[np.ndarray, "n n_beams"]], step: float, blur: float, turn: float, sigma: float
+    ranges: list[Float[np.ndarray, "n n_beams"]],
+    step: float,
+    blur: float,
+    turn: float,
+    sigma: float,
+    offset: float | None = None,
 ) -> Float[np.ndarray, "n 3 3"]:
     """Compute the information of a scan at each station, by statistical linearisation.
 
     Args:
-        ranges: Ranges at uniform stations: in the middle, at an offset of ± `blur`, and turned by ± `turn`, m.
+        ranges: Ranges at uniform stations: in the middle, at an offset of ± `offset`, and turned by ± `turn`, m.
         step: Step of the stations, m.
-        blur: Standard deviation of station and offset, m.
+        blur: Standard deviation of the station, m.
         turn: Standard deviation of the heading, rad.
         sigma: Standard deviation of a range, m.
+        offset: Standard deviation of the offset, m; None is `blur`.
     """
     reach = int(np.ceil(_REACH * blur / step))
     at = step * np.arange(-reach, reach + 1)
@@ -144,13 +173,15 @@ def scan_information(
         padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
         return sum(k * padded[i : i + len(values)] for i, k in enumerate(kernel))
 
-    middle = ranges[0]
+    middle, aside_by = ranges[0], blur if offset is None else offset
     mean = blurred(middle, weight)
     # About the mean of the beam: squares of ranges would lose the digits of a small variance.
     level = middle.mean(axis=0)
     second = blurred((middle - level) ** 2, weight) - (mean - level) ** 2
     along = blurred(middle, weight * at) / variance
-    aside, turned = (blurred(ranges[i] - ranges[i + 1], weight) / (2.0 * size) for i, size in ((1, blur), (3, turn)))
+    aside, turned = (
+        blurred(ranges[i] - ranges[i + 1], weight) / (2.0 * size) for i, size in ((1, aside_by), (3, turn))
+    )
     left_over = np.maximum(second - along**2 * variance, 0.0)
     slope = np.stack([np.where(np.abs(along) < LEAST_SLOPE, 0.0, along), aside, turned], axis=-1)
     return np.einsum("nbi,nbj,nb->nij", slope, slope, 1.0 / (sigma**2 + left_over))

@@ -89,6 +89,12 @@ def level_ring(scan: Any, shape: tuple[int, int]) -> Any:
     return scan[..., (rows // 2) * columns + np.arange(n_level(shape)) * columns // N_LEVEL]
 
 
+def level_row(scan: Any, shape: tuple[int, int]) -> Any:
+    """Return every beam of the ring that `level_ring` takes, ahead first; arguments as there."""
+    rows, columns = shape
+    return scan[..., (rows // 2) * columns : (rows // 2 + 1) * columns]
+
+
 def n_level(shape: tuple[int, int]) -> int:
     """Return the number of beams of `level_ring`."""
     return shape[1] if shape[0] == 1 else N_LEVEL

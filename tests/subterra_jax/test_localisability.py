@@ -168,3 +168,30 @@ def test_what_cannot_be_asked_is_refused(params):
         localisability(params[True], index=1)
     with pytest.raises(ValueError, match=r"blur=0 m and step=0\.5 m"):
         localisability(params[True], blur=0.0)
+
+
+def test_a_scan_tells_a_filter_that_knows_less_what_its_own_spread_leaves_of_an_edge(params):
+    station = np.arange(2.0, 79.0)
+    # Edges tell a filter that knows its place to 5 cm a lot, and one that knows it to 40 cm nothing.
+    told = np.tile([400.0, 0.0], (len(station), 1))
+    wide = params[True].replace(start=params[True].start.replace(station_sigma=3.0))
+    for at, of in ((params[True], True), (wide, False)):
+        found = bounds.filter_variance(station, told, at, (0.05, 0.4))
+        sharp, blind = (bounds.filter_variance(station, column, at) for column in told.T)
+        assert (found[-1] < 0.5 * blind[-1]) == of, "whoever begins lost stays lost"
+        assert np.all(found >= sharp - 1e-12)
+    between = bounds.filter_variance(np.array([0.0, 0.5, 1.0]), np.tile([8.0, 4.0], (3, 1)), wide, (1.5, 6.0))
+    first = bounds.filter_variance(np.array([0.0, 0.5, 1.0]), np.full(3, 6.0), wide)
+    assert between[1] == pytest.approx(first[1], rel=1e-3), "half way in the log between two blurs"
+
+
+def test_the_drift_of_a_perfect_filter_takes_each_scan_as_blurred_as_the_filter_is(params, found):
+    # Alone in a smooth corridor with edges that stand far apart, it may not read them as if it knew where it was.
+    one = found[True]
+    sharp = np.sqrt(bounds.filter_variance(one.station, one.station_bound**-2.0, params[True]))
+    assert np.all(one.drift >= sharp - 1e-9)
+    hidden = params[True].replace(start=params[True].start.replace(station_sigma=3.0))
+    lost = localisability(hidden)
+    naive = np.sqrt(bounds.filter_variance(lost.station, lost.station_bound**-2.0, hidden))
+    at = np.searchsorted(lost.station, 33.0)
+    assert lost.drift[at] > naive[at]

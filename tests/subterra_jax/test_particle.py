@@ -11,7 +11,8 @@ import subterra_jax as st
 from subterra_jax.baselines import cloud as particle_cloud
 from subterra_jax.baselines import reckoning
 from subterra_jax.baselines.agent import Observed
-from subterra_jax.baselines.cloud import Cloud, CloudParams, new_cloud
+from subterra_jax.baselines.ceiling import ceiling
+from subterra_jax.baselines.cloud import Cloud, CloudParams, OdometerNoise, new_cloud, weigh_odometer
 from subterra_jax.baselines.particle import particle_filter
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.scanmodel import TunnelPose
@@ -164,3 +165,37 @@ def test_relocalisation_finds_place_and_direction():
     env, params = st.make("Subterra/Relocalise-v0")
     found = evaluate(env, params, make_agent("particle-filter", params), listed_episodes(env, params, 20))
     assert found.success.mean() >= 0.7
+
+
+def test_an_odometer_weighed_apart_learns_its_error_and_tells_ways_of_other_lengths_apart():
+    noise = OdometerNoise(0.01, 0.02, WanderParams(0.0, 30.0), turn_sigma=0.02)
+    motion = CloudParams(scale_sigma=0.0, wander=WanderParams(0.0, 30.0), odometer=noise)
+    zero = jnp.zeros(2)
+    cloud = new_cloud(jax.random.key(0), TunnelPose(zero, zero, zero), motion)
+    cloud = dataclasses.replace(cloud, scale=jnp.asarray([0.0, 0.1]))
+    step, read, ahead = jnp.asarray(0.2), jnp.asarray(0.2 * 1.02), jnp.zeros(())
+    total = jnp.zeros(2)
+    learn = jax.jit(weigh_odometer)
+    for _ in range(400):
+        cloud, likely = learn(cloud, step, read, ahead, motion)
+        total += likely
+    mean, variance = cloud.odometer.T
+    # 400 readings of 5 % each: the mean of what they say and of 0 ± 2 %.
+    told, prior = 400.0 / 0.05**2, 1.0 / 0.02**2
+    assert float(mean[0]) == pytest.approx(0.02 * told / (told + prior), rel=0.01)
+    assert float(variance[0]) == pytest.approx(1.0 / (told + prior), rel=0.01)
+    assert float(total[0] - total[1]) > 5.0, "a way 10 % longer asks for an odometer four standard deviations off"
+    stands, nothing = weigh_odometer(cloud, step, jnp.zeros(()), jnp.asarray(jnp.nan), motion)
+    np.testing.assert_array_equal(stands.odometer, cloud.odometer)
+    assert not nothing.any()
+    turned, _ = weigh_odometer(cloud, jnp.zeros(()), jnp.zeros(()), jnp.asarray(1.5), motion)
+    assert float(turned.odometer[0, 1]) == pytest.approx(float(variance[0]) + 0.02**2 * 1.5 / np.pi, rel=0.01)
+
+
+def test_only_a_cloud_about_a_known_start_takes_a_likelihood_whole():
+    for task, whole in (("StopAtShort", True), ("Relocalise", False)):
+        _, params = st.make(f"Subterra/{task}-v1", tunnel="control")
+        made = ceiling(params)
+        motion = (made.localiser if whole else made.filter).motion
+        assert (motion.odometer is not None) == whole
+        assert (motion.least_share < 0.1) == whole

@@ -7,6 +7,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar
+from subterra_jax.baselines.agent import observed
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.scanmatch import (
     N_SHIFTS,
@@ -19,6 +20,7 @@ from subterra_jax.baselines.scanmatch import (
     mismatch,
     scan_matching,
 )
+from subterra_jax.baselines.stations import Driven
 from subterra_jax.evaluation import evaluate, listed_episodes
 from tests.subterra_jax import tunnels
 
@@ -108,3 +110,22 @@ def test_scan_matching_beats_dead_reckoning_between_pockets():
     found = evaluate(env, params, scan_matching(params), episodes)
     blind = evaluate(env, params, make_agent("fused", params), episodes)
     assert found.success.mean() > blind.success.mean() + 0.1
+
+
+def test_of_a_lidar_in_three_dimensions_a_whole_level_ring_is_matched():
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="control", sensor="spin16x64", estimates=True)
+    matcher = make_agent("scan-matching", params).localiser
+    obs, _ = env.reset(jax.random.key(0), params)
+    rows, columns = params.lidar.shape
+    still = Driven(jnp.zeros(()), jnp.ones(()), jnp.ones(()), jnp.zeros((), bool))
+
+    def profile(flat):
+        seen = observed(env, params, flat)
+        return matcher.update(matcher.begin(seen, params), seen, still, params, None)[1].profile
+
+    first = int(env.fields(params)["scan"].start)
+    # One of the ring's beams that the 16 of a planar LiDAR leave out, and one of the ring below.
+    between, below = (first + row * columns + columns // 4 + 1 for row in (rows // 2, rows // 2 - 1))
+    assert int(profile(obs).count.sum()) > 32
+    assert float(abs(profile(obs.at[between].add(-0.5)).total - profile(obs).total).max()) > 0.1
+    np.testing.assert_array_equal(profile(obs.at[below].add(-0.5)).total, profile(obs).total)
