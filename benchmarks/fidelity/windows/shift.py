@@ -1,7 +1,7 @@
 """Shift along the tunnel by window, and which side is left, from the relief of the walls."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import nanmedian
@@ -20,7 +20,7 @@ from benchmarks.fidelity.windows.deviation import (
 )
 
 REACH = 0.40  # m; largest shift that is looked for: a quarter of a ring, so that the next one is not taken for it
-_STEP = FINE  # m between shifts that are tried
+_STEPS = round(REACH / FINE)  # shifts that are tried to either side, `FINE` apart
 _DEEPEST = 0.10  # m; larger differences count as this
 _LEAST_CONTRAST = 0.0008  # m that the best shift must fit better than a wrong one
 _POINTS = 20_000
@@ -50,47 +50,60 @@ def shift_by_window(
         window: Their length, m.
     """
     order = np.argsort(station, kind="stable")
-    bounds = np.searchsorted(station[order], [starts, starts + window])
-    shifts = np.arange(-REACH, REACH + _STEP / 2, _STEP)
+    station, radius = station[order], radius[order]
+    turn = (angle[order] + np.pi) / (2.0 * np.pi)
+    sector = (turn * SECTORS).astype(int) % SECTORS
+    padded, cell = _cells_of(station, (turn * COLUMNS).astype(int) % COLUMNS, judged)
+    steps = np.arange(-_STEPS, _STEPS + 1)
     result = np.full(len(starts), np.nan)
-    for k, (first, last) in enumerate(bounds.T):
-        rows = order[first:last]
-        rows = rows[:: max(len(rows) // _POINTS, 1)]
-        if len(rows) < 500:
+    for k, (first, last) in enumerate(np.searchsorted(station, [starts, starts + window]).T):
+        rows = slice(first, last, max((last - first) // _POINTS, 1))
+        if len(station[rows]) < 500:
             continue
-        errors = _misfits(station[rows], angle[rows], radius[rows], judged, shifts)
+        errors = _misfits(station[rows], sector[rows], radius[rows], cell[rows], padded, steps)
         best = int(np.argmin(errors))
-        if not 0 < best < len(shifts) - 1 or np.median(errors) - errors[best] < _LEAST_CONTRAST:
+        if not 0 < best < len(steps) - 1 or np.median(errors) - errors[best] < _LEAST_CONTRAST:
             continue
-        result[k] = shifts[best] + _vertex(errors, best)
+        result[k] = steps[best] * FINE + _vertex(errors, best)
     return result
 
 
+def _cells_of(
+    station: Float[np.ndarray, " n"], column: Int[np.ndarray, " n"], judged: Relief
+) -> tuple[Float[np.ndarray, " c"], Int[np.ndarray, " n"]]:
+    """Return the radii of a relief in one row, NaN before and behind it, and the place of each point in them.
+
+    A point that moves by one step lies `COLUMNS` places on: all shifts of a window read the same places.
+    """
+    beyond = np.full((2 * _STEPS + 1, COLUMNS), np.nan)
+    padded = np.concatenate([beyond, judged.radius, beyond])
+    row = np.round((station - judged.station[0]) / FINE).astype(int)
+    row = np.clip(row, -_STEPS - 1, len(judged.station) + _STEPS) + len(beyond)
+    return padded.ravel(), row * COLUMNS + column
+
+
 def _misfits(
-    station: np.ndarray, angle: np.ndarray, radius: np.ndarray, judged: Relief, shifts: np.ndarray
+    station: np.ndarray, sector: np.ndarray, radius: np.ndarray, cell: np.ndarray, judged: np.ndarray, steps: np.ndarray
 ) -> Float[np.ndarray, " s"]:
-    """Return the mean difference of both reliefs for each shift of the points, m.
+    """Return the mean difference of both reliefs for each shift of the points, m; NaN where none is known.
 
     Each is taken about its own straight line in each direction, at the same points: a wall that runs askew to the
     curve, or points that crowd at one end of the window, move nothing.
     """
-    sector = ((angle + np.pi) / (2.0 * np.pi) * SECTORS).astype(int) % SECTORS
-    column = ((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int) % COLUMNS
-
-    def radius_at(shift: float) -> np.ndarray:
-        row = np.round((station + shift - judged.station[0]) / FINE).astype(int)
-        inside = (row >= 0) & (row < len(judged.station))
-        return np.where(inside, judged.radius[np.clip(row, 0, len(judged.station) - 1), column], np.nan)
-
-    here = radius_at(0.0)
+    here = judged[cell]
     known = np.isfinite(here)
     lines = [_line_by_sector(station[known], values[known], sector[known]) for values in (radius, here)]
-    relief = radius - _on_line(lines[0], station, sector)
-    errors = []
-    for shift in shifts:
-        gap = relief - (radius_at(shift) - _on_line(lines[1], station + shift, sector))
-        errors.append(np.mean(np.minimum(np.abs(gap[np.isfinite(gap)]), _DEEPEST)))
-    return np.asarray(errors)
+    apart = radius - _on_line(lines[0], station, sector) + _on_line(lines[1], station, sector)
+    slope = lines[1][2][sector]
+    errors = np.full(len(steps), np.nan)
+    for k, step in enumerate(steps):
+        gap = judged[cell + step * COLUMNS]
+        np.subtract(apart + slope * (step * FINE), gap, out=gap)
+        unknown = int(np.count_nonzero(np.isnan(gap)))
+        if unknown < len(gap):
+            total = np.fmin(np.abs(gap, out=gap), _DEEPEST, out=gap).sum()  # what is unknown counts as `_DEEPEST` here
+            errors[k] = (total - unknown * _DEEPEST) / (len(gap) - unknown)
+    return errors
 
 
 def _line_by_sector(
@@ -117,7 +130,7 @@ def _vertex(errors: np.ndarray, best: int) -> float:
     """Return the place of the least error beside the best shift, m, by a parabola."""
     before, here, after = errors[best - 1 : best + 2]
     bend = before - 2.0 * here + after
-    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5) * _STEP) if bend > 0.0 else 0.0
+    return float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5) * FINE) if bend > 0.0 else 0.0
 
 
 def hold_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Float[np.ndarray, " k"]:

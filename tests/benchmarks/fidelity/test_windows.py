@@ -13,8 +13,10 @@ from benchmarks.fidelity.controls.local import KINDS, Fault, draw_fault, make_gr
 from benchmarks.fidelity.files import FidelityError, write_json
 from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.windows import commands
+from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, Relief
 from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
 from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
+from benchmarks.fidelity.windows.shift import REACH, shift_by_window
 from tests.benchmarks.fidelity import tube
 
 LENGTH = 24.0
@@ -67,6 +69,28 @@ def test_what_moves_along_the_tunnel_or_stands_apart_is_measured(good) -> None:
     gauge = with_fault(good, Fault("gauge", 6.0, 11.0, -0.006))
     assert gauge["gauge.truth"].value == pytest.approx(0.006, abs=0.001)
     assert {name for name, one in gauge.items() if one.beyond} == {"gauge.truth", "gauge_change.truth"}
+
+
+def test_a_relief_is_found_where_it_was_moved_to_and_points_beyond_its_ends_count_for_nothing() -> None:
+    rng = np.random.default_rng(3)
+    station = np.arange(0.025, 40.0, FINE)
+    blocks = np.repeat(np.repeat(rng.normal(0.0, 0.03, (80, COLUMNS // 6)), 10, 0), 6, 1)
+    judged = Relief(station, 2.5 + blocks)
+    judged.radius[rng.random(judged.radius.shape) < 0.02] = np.nan
+    at, angle = rng.uniform(-2.0, 42.0, 60_000), rng.uniform(-np.pi, np.pi, 60_000)
+    starts = np.array([-1.5, 0.0, 12.0, 31.0, 60.0])
+
+    def found(shift: float) -> np.ndarray:
+        row = np.clip(((at + shift) / FINE).astype(int), 0, len(station) - 1)
+        seen = 2.6 + blocks[row, ((angle + np.pi) / (2.0 * np.pi) * COLUMNS).astype(int) % COLUMNS]
+        return shift_by_window(at, angle, seen + 0.004 * at, judged, starts, 10.0)
+
+    for shift in (-0.35, 0.0, 0.1, 0.35):
+        np.testing.assert_allclose(found(shift)[:4], shift, atol=0.004)
+        assert np.isnan(found(shift)[4])  # no points there
+    assert np.isnan(found(REACH + 0.1)).all()
+    smooth = Relief(station, np.full((len(station), COLUMNS), 2.5))
+    assert np.isnan(shift_by_window(at, angle, np.full(len(at), 2.5), smooth, starts, 10.0)).all()
 
 
 def test_filled_pockets_lost_sleepers_and_a_cube_are_noticed(good) -> None:
