@@ -226,7 +226,7 @@ def judge_outcomes(outcomes: list[Outcome], base: Base) -> list[dict[str, Any]]:
     """Return a row per control and dose, for `controls.csv` and the heat map.
 
     A control is *detected* where its bold doses fail for a reason that the reconstruction has not, and every category
-    named for it falls by its points.
+    named for it falls by its points, or to the cap of a gate of its own that the control made fail: deeper it need not.
     """
     judged = [_outcome_row(outcome, base) for outcome in outcomes]
     for row in judged:
@@ -242,11 +242,13 @@ def _outcome_row(outcome: Outcome, base: Base) -> dict[str, Any]:
     )
     falls = {c: _fall(base.scored.categories[c], scored.categories[c]) for c in base.scored.categories}
     new = sorted(without_figures(reasons) - without_figures(base.reasons))
+    gates = set(scored.failed_gates) - set(base.scored.failed_gates)
     row = {
         "id": outcome.job.control, "dose": outcome.job.dose, "overall": scored.overall,
         "verdict": "FAIL" if new else "PASS",
         "why": [reason for reason in reasons if without_figures([reason]) & set(new)], "falls": falls,
         "categories": scored.categories, "base": base.scored.overall,
+        "capped": sorted({table.load()[id].category for id in gates}),
     }  # fmt: skip
     return {**row, **(_invariance_row(row) if outcome.job.control in INVARIANCES else _negative_row(row))}
 
@@ -254,7 +256,10 @@ def _outcome_row(outcome: Outcome, base: Base) -> dict[str, Any]:
 def _negative_row(row: dict[str, Any]) -> dict[str, Any]:
     control = load_controls()[row["id"]]
     bold = row["dose"] in control.bold
-    short = {c: (row["falls"][c], asked) for c, asked in control.falls.items() if (row["falls"][c] or 0.0) < asked}
+    short = {
+        c: (row["falls"][c], asked) for c, asked in control.falls.items()
+        if (row["falls"][c] or 0.0) < asked and c not in row["capped"]
+    }  # fmt: skip
     moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > QUIET_LIMIT}
     return {
         "kind": "negative", "corruption": control.corruption, "bold": bold, "short": short if bold else {},

@@ -83,6 +83,25 @@ def test_a_control_that_fails_only_by_another_category_is_not_detected() -> None
     assert not rows[0]["quiet"]
 
 
+def test_a_fall_to_the_cap_of_a_gate_that_newly_fails_is_deep_enough_and_no_other_is() -> None:
+    low = values(0.98, ("PAR",), 0.74)  # a circle's, from which 30 points cannot be lost
+    scored = scoring.score_all(low)
+    assert scored.categories["PAR"] - scoring.GATE_FLOOR < 30.0
+    bare = replace(base(), scored=scored, values=base().values | {"base": low})
+    apart = low | {"env_lidar_vs_mesh": values(0.4)["env_lidar_vs_mesh"]}
+    (row,) = judge_outcomes([outcome("N31", 0.3, apart)], bare)
+    assert row["categories"]["PAR"] == scoring.GATE_FLOOR
+    assert row["detected"], row["short"]
+
+    before = replace(bare, scored=scoring.score_all(apart), values=bare.values | {"base": apart})
+    (row,) = judge_outcomes([outcome("N31", 0.3, apart)], before)  # the gate failed without the control already
+    assert row["short"] == {"PAR": (0.0, 30.0)}
+    gone = low | {"mjx_ray_parity": values(0.0)["mjx_ray_parity"]}
+    (row,) = judge_outcomes([outcome("N31", 0.3, gone)], bare)  # it falls, and by no gate
+    assert "PAR" in row["short"]
+    assert not row["detected"]
+
+
 def test_a_cheat_is_detected_by_its_leak_alone() -> None:
     rows = judge_outcomes([outcome("N35", 1, values(1.0), ("no noise",)), outcome("N35", 2, values(1.0))], base())
     assert [row["detected"] for row in rows] == [True, False]
