@@ -113,6 +113,7 @@ MISTAKES = {
     "benchmarks.fidelity run --scene none --out o": "none: no such file or folder",
     "benchmarks.fidelity run --scene empty --out o": "empty: is no scene folder",
     "benchmarks.fidelity run --scene tunnel --seed -1 --out o": "seed must not be negative",
+    "benchmarks.fidelity run --scene tunnel --processes 0 --out o": "processes must be at least 1, got 0",
     "benchmarks.fidelity run --metrics none.py --out o": "none.py: cannot be read",
     "benchmarks.fidelity run --scene tunnel --out text.txt": "text.txt: is a file",
     "benchmarks.fidelity controls --scene tunnel --only N999 --out o": "no control 'N999'",

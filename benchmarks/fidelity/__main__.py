@@ -43,6 +43,17 @@ _PROG = "python -m benchmarks.fidelity"
 
 
 @dataclass(frozen=True)
+class RunConfig(Inputs):
+    """Run of the suite.
+
+    Attributes:
+        processes: With 2, the null tubes and the truth are scored beside the reconstruction.
+    """
+
+    processes: int = 2
+
+
+@dataclass(frozen=True)
 class ControlsConfig(Inputs):
     """Controls to run.
 
@@ -97,24 +108,26 @@ class OpenCase:
     values: dict[str, dict[str, Value]] = field(default_factory=dict)
 
 
-def open_case(inputs: Inputs) -> OpenCase:
+def open_case(inputs: Inputs, processes: int = 1) -> OpenCase:
     """Reads the inputs and judges the case without controls; values of an earlier command are read again."""
+    if processes < 1:
+        raise FidelityError(f"processes must be at least 1, got {processes}")
     require_folder(inputs.out)
     outside.clear()
     if inputs.metrics is not None:
         outside.load_metrics(inputs.metrics)
     resolved = complete_inputs(inputs)
     case = read_case(resolved)
-    judgement = judge.judge_case(case, resolved.out, resolved.strict)
+    judgement = judge.judge_case(case, resolved.out, resolved.strict, processes)
     return OpenCase(resolved, case, judgement, judgement.values)
 
 
-def run(inputs: Inputs) -> None:
+def run(config: RunConfig) -> None:
     """Scores a scene against its references and writes the report.
 
     Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held.bag --trajectory poses.tum
     """
-    _print_summary(_write_report(open_case(inputs)))
+    _print_summary(_write_report(open_case(config, config.processes)))
 
 
 def run_controls(config: ControlsConfig) -> None:
@@ -123,7 +136,7 @@ def run_controls(config: ControlsConfig) -> None:
     Example: python -m benchmarks.fidelity controls --bold-only --out out/fidelity
     """
     _check_controls(config)
-    opened = open_case(config)
+    opened = open_case(config, config.processes)
     foreign = config.foreign
     if foreign is None and (not config.only or "N33" in config.only):
         foreign = foreign_scene(opened.case, config.out)
@@ -194,7 +207,7 @@ def run_report(inputs: Inputs) -> None:
     resolved = complete_inputs(inputs)
     if not (resolved.out / "values.json").exists():
         raise FidelityError(f"{resolved.out}: holds no values.json; run the suite first")
-    run(inputs)
+    _print_summary(_write_report(open_case(inputs)))
 
 
 def run_split(config: SplitCommand) -> None:

@@ -1,7 +1,10 @@
 """The judgement of a case: values of reconstruction, null tubes and truth, the leak detector, and the verdict."""
 
 import json
-from collections.abc import Callable
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
@@ -17,7 +20,7 @@ from benchmarks.fidelity.controls import catalogue, local
 from benchmarks.fidelity.files import write_json
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.references import Hold
-from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
+from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values, missing
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
 from benchmarks.fidelity.windows import measures
@@ -33,6 +36,8 @@ PATCH_RADIUS = 0.25  # m within which neighbours must lie to make a plane
 PATCH_SAMPLES = 8_000
 
 WITHOUT_TRACK = ("SEC", "MSH", "TRI")  # categories that read nothing of the track
+
+NOT_COMPUTED = missing("taken from another candidate")  # in the categories in which both are the same
 
 Values = dict[str, Value]
 
@@ -88,10 +93,18 @@ class Judgement:
         return Base(self.scored["base"], self.scored["null"], self.values, self.reasons)
 
 
-def judge_case(case: Case, folder: Path, strict: bool = False) -> Judgement:
-    """Computes values, windows, leaks and the verdict without the controls of `controls`."""
-    values = compute_values(case, folder)
-    return make_judgement(values, find_leaks(case, values["base"]), None, strict, compute_windows(case, folder))
+def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 1) -> Judgement:
+    """Computes values, windows, leaks and the verdict without the controls of `controls`.
+
+    Args:
+        case: Reconstruction and references.
+        folder: Folder that keeps what is done.
+        strict: Count metrics without a reference as 0.
+        processes: With 2 or more, tubes and truth are computed in a second process beside reconstruction and windows.
+    """
+    with open_values(case, folder, processes) as values:
+        leaks, windows = find_leaks(case, values["base"]), compute_windows(case, folder)
+    return make_judgement(values, leaks, None, strict, windows)
 
 
 def compute_windows(case: Case, folder: Path) -> Windows:
@@ -106,25 +119,74 @@ def compute_windows(case: Case, folder: Path) -> Windows:
     return found
 
 
-def compute_values(case: Case, folder: Path) -> dict[str, Values]:
+def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Values]:
     """Return the raw values of the reconstruction, its null tubes and the truth.
 
     Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
     """
+    with open_values(case, folder, processes) as values:
+        pass
+    return values
+
+
+@contextmanager
+def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[str, Values]]:
+    """Yields the values of the reconstruction; those of tubes and truth join them by the end of the block.
+
+    Args:
+        case: Reconstruction and references.
+        folder: Folder for `values.json`.
+        processes: With 2 or more, tubes and truth are computed in a second process meanwhile.
+    """
     path, key = folder / "values.json", case_hash(case)
     values = _kept_values(path, key)
-    candidates = make_candidates(case)
-    with Stages() as progress:
-        for name in [name for name in candidates if name not in values]:
-            stage = progress.start(f"metrics of {name}", table.COUNT)
-            one = replace(case, candidate=candidates[name](), cache={})
-            chosen, reused = _what_differs(name, values)
-            values[name] = evaluate(one, chosen, reused, lambda id, stage=stage: stage.advance())  # type: ignore[misc]
-            dumped = {name: dump_values(entry) for name, entry in values.items()}
-            write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
-            one.cache.clear()
-            release_memory()
-    return values
+    names = [name for name in make_candidates(case) if name not in values]
+    others = [name for name in names if name != "base"]
+
+    def keep(name: str, found: Values) -> None:
+        values[name] = _with_reused(name, found, values)
+        dumped = {name: dump_values(values[name]) for name in make_candidates(case) if name in values}
+        write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
+
+    with Stages() as progress, ExitStack() as second:
+        stages = {name: progress.start(f"metrics of {name}", table.COUNT) for name in names}
+        beside: dict[str, Future[Values]] = {}
+        if processes > 1 and others:
+            context = multiprocessing.get_context("spawn")
+            pool = second.enter_context(ProcessPoolExecutor(1, context, _start_second, (case.fresh(),)))
+            second.callback(pool.shutdown, cancel_futures=True)  # an interrupt waits for what is under way alone
+            beside = {name: pool.submit(_value_in_second, name) for name in others}
+        if "base" in names:
+            stage = stages["base"]
+            keep("base", _value_candidate(case, "base", lambda id: stage.advance()))
+        yield values
+        for name in others:
+            stage = stages[name]
+            if name in beside:
+                keep(name, beside[name].result())
+                stage.advance(table.COUNT)
+            else:
+                keep(name, _value_candidate(case, name, lambda id, stage=stage: stage.advance()))  # type: ignore[misc]
+
+
+def _value_candidate(case: Case, name: str, advance: Callable[[str], None] = lambda id: None) -> Values:
+    """Return the values of one candidate in the categories in which it differs from another; NOT_COMPUTED elsewhere."""
+    one = replace(case, candidate=make_candidates(case)[name](), cache={})
+    found = evaluate(one, _what_differs(name)[0], dict.fromkeys(table.load(), NOT_COMPUTED), advance)
+    one.cache.clear()
+    release_memory()
+    return found
+
+
+_second: dict[str, Case] = {}
+
+
+def _start_second(case: Case) -> None:
+    _second["case"] = case
+
+
+def _value_in_second(name: str) -> Values:
+    return _value_candidate(_second["case"], name)
 
 
 def make_candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
@@ -147,13 +209,19 @@ def _kept_values(path: Path, key: str) -> dict[str, Values]:
     return {name: load_values(entry) for name, entry in content["values"].items()}
 
 
-def _what_differs(name: str, values: dict[str, Values]) -> tuple[tuple[str, ...] | None, Values | None]:
-    """Return the categories to compute for a candidate, and the values that the others are taken from."""
+def _what_differs(name: str) -> tuple[tuple[str, ...], str]:
+    """Return the categories to compute for a candidate, and the candidate that the others are taken from."""
     if name == "base":
-        return None, None
-    if name == "null_bare" and "null" in values:
-        return tuple(c for c in geometry_categories() if c not in WITHOUT_TRACK), values["null"]
-    return geometry_categories(), values["base"]
+        return tuple(table.categories()), ""
+    if name == "null_bare":
+        return tuple(c for c in geometry_categories() if c not in WITHOUT_TRACK), "null"
+    return geometry_categories(), "base"
+
+
+def _with_reused(name: str, found: Values, values: dict[str, Values]) -> Values:
+    """Return the values of a candidate with those of another where it does not differ from it."""
+    chosen, other = _what_differs(name)
+    return {id: found[id] if row.category in chosen else values[other][id] for id, row in table.load().items()}
 
 
 def geometry_categories() -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import json
 import shutil
 import sys
 from contextlib import redirect_stdout
+from dataclasses import replace
 from hashlib import sha256
 from io import StringIO
 from pathlib import Path
@@ -14,11 +15,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from benchmarks.fidelity import judge
+from benchmarks.fidelity import judge, table
 from benchmarks.fidelity import report as report_module
 from benchmarks.fidelity.__main__ import main
 from benchmarks.fidelity.figures import FIGURES
 from benchmarks.fidelity.files import file_hash
+from benchmarks.fidelity.inputs import Inputs, read_case
+from benchmarks.fidelity.references import HoldConfig
+from benchmarks.fidelity.registry import all_metrics, compute_metric, dump_values
 from tests.benchmarks.fidelity import tubescene
 from tests.benchmarks.fidelity.tube import Tube, hold
 from tests.scene.bags import write_bag, write_tum
@@ -104,6 +108,27 @@ def test_a_run_scores_all_18_categories_of_a_right_tube(scored, recording) -> No
     assert "is left out" not in said
     drawn = {file.stem for file in (folder / "figures").glob("*.png")}
     assert drawn == {name for name, _ in FIGURES} - {"F14-controls", "F15-sweep"}  # these need their commands
+
+
+@pytest.mark.timeout(900)
+def test_what_a_second_process_computed_is_what_this_one_computes(scored, scene, recording) -> None:
+    folder, words, _ = scored
+    kept = json.loads((folder / "values.json").read_text())["values"]
+    assert list(kept) == ["base", "null", "null_bare"]
+    beams = Inputs(scene=scene, recording=recording[0], trajectory=recording[1],
+                   hold=HoldConfig(beams_per_scan=int(str(words[-1]))))  # fmt: skip
+    case = read_case(beams)
+    for name in ("null", "null_bare"):
+        one = replace(case, candidate=judge.make_candidates(case)[name](), cache={})
+        for id in ("c2m_median", "sec_radial_rmse", "beam_range_mae"):
+            here = dump_values({id: compute_metric(one, id, all_metrics()[id])})
+            assert kept[name][id] == json.loads(json.dumps(here[id])), id
+    for id, row in table.load().items():
+        if row.category in ("SCN", "PAR"):
+            assert kept["null"][id] == kept["null_bare"][id] == kept["base"][id], id
+        if row.category in judge.WITHOUT_TRACK:
+            assert kept["null_bare"][id] == kept["null"][id], id
+    assert all("taken from another" not in row["reason"] for values in kept.values() for row in values.values())
 
 
 @pytest.mark.slow
