@@ -47,7 +47,7 @@ class RunConfig(Inputs):
     """Run of the suite.
 
     Attributes:
-        processes: With 2, the null tubes and the truth are scored beside the reconstruction.
+        processes: With 2, the null tubes are scored beside the reconstruction.
     """
 
     processes: int = 2

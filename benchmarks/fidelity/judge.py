@@ -35,6 +35,7 @@ PATCH_NEIGHBOURS = 12
 PATCH_RADIUS = 0.25  # m within which neighbours must lie to make a plane
 PATCH_SAMPLES = 8_000
 
+TUBES = ("null", "null_bare")
 WITHOUT_TRACK = ("SEC", "MSH", "TRI")  # categories that read nothing of the track
 
 NOT_COMPUTED = missing("taken from another candidate")  # in the categories in which both are the same
@@ -100,7 +101,7 @@ def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 
         case: Reconstruction and references.
         folder: Folder that keeps what is done.
         strict: Count metrics without a reference as 0.
-        processes: With 2 or more, tubes and truth are computed in a second process beside reconstruction and windows.
+        processes: With 2 or more, the tubes are computed in a second process beside reconstruction and windows.
     """
     with open_values(case, folder, processes) as values:
         leaks, windows = find_leaks(case, values["base"]), compute_windows(case, folder)
@@ -122,7 +123,8 @@ def compute_windows(case: Case, folder: Path) -> Windows:
 def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Values]:
     """Return the raw values of the reconstruction, its null tubes and the truth.
 
-    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
+    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next; those of a
+    second process when the first is through with its own.
     """
     with open_values(case, folder, processes) as values:
         pass
@@ -136,7 +138,8 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
     Args:
         case: Reconstruction and references.
         folder: Folder for `values.json`.
-        processes: With 2 or more, tubes and truth are computed in a second process meanwhile.
+        processes: With 2 or more, the tubes are computed in a second process meanwhile; the truth, which needs the
+            most memory, waits for the end of the block.
     """
     path, key = folder / "values.json", case_hash(case)
     values = _kept_values(path, key)
@@ -151,21 +154,27 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
     with Stages() as progress, ExitStack() as second:
         stages = {name: progress.start(f"metrics of {name}", table.COUNT) for name in names}
         beside: dict[str, Future[Values]] = {}
-        if processes > 1 and others:
+        if processes > 1 and set(others) & set(TUBES):
             context = multiprocessing.get_context("spawn")
             pool = second.enter_context(ProcessPoolExecutor(1, context, _start_second, (case.fresh(),)))
             second.callback(pool.shutdown, cancel_futures=True)  # an interrupt waits for what is under way alone
-            beside = {name: pool.submit(_value_in_second, name) for name in others}
+            beside = {name: pool.submit(_value_in_second, name) for name in others if name in TUBES}
         if "base" in names:
             stage = stages["base"]
             keep("base", _value_candidate(case, "base", lambda id: stage.advance()))
+        if beside:  # what windows and second process do not share would lie there for nothing
+            for reference in (case.hold, case.fit, case.truth):
+                if reference is not None:
+                    reference.cache.clear()
+            release_memory()
         yield values
+        for name, future in beside.items():
+            keep(name, future.result())
+            stages[name].advance(table.COUNT)
+        second.close()
         for name in others:
             stage = stages[name]
-            if name in beside:
-                keep(name, beside[name].result())
-                stage.advance(table.COUNT)
-            else:
+            if name not in beside:
                 keep(name, _value_candidate(case, name, lambda id, stage=stage: stage.advance()))  # type: ignore[misc]
 
 
