@@ -78,6 +78,9 @@ def test_a_policy_localises_as_before_and_steers_as_it_learnt(written, task):
     env, params = task
     agent, facts = policies.load(written)
     assert (agent.frames, facts["steering"]["task"]) == (3, "Subterra/Obstructed-v1")
+    assert "by reward how to steer" in facts["learnt"], "the card says what was learnt"
+    assert facts["task"] == "Subterra/Obstructed-v1"
+    assert "scores" not in facts, "scores of the localiser under the written steering"
     given = policies.load("locate-transformer")[0].tensors
     for name, tensor in given.items():
         np.testing.assert_array_equal(agent.tensors[name], tensor)

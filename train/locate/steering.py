@@ -35,6 +35,9 @@ from train.session import Session
 from train.world import World, library_versions
 
 _KINDS = ("straight", "cast", "sprayed", "masonry")
+_LEARNT = "where the robot is, and by reward how to steer; how fast to go at most and the stop are written"
+# What a card tells of the localiser under the written steering does not hold for another steering.
+_OF_THE_WRITTEN = ("scores", "measured", "success_against_time")
 
 
 @struct.dataclass
@@ -174,6 +177,7 @@ def run(arguments: Command) -> None:
     last = session.train(resume=arguments.resume, overwrite=arguments.overwrite)
     if last is None:
         sys.exit(130)
+    facts = {**facts, **world.trained_under}
     save(arguments.out / POLICY, agent, facts, policy_tensors(learner.networks, last.policy), arguments)
     print(arguments.out / POLICY)
 
@@ -191,8 +195,10 @@ def save(path: Path, agent: Locating, facts: dict[str, Any], steering: dict[str,
         "localiser": facts["tensors_sha256"],
     }
     whole = {
-        **facts,
+        **{name: value for name, value in facts.items() if name not in _OF_THE_WRITTEN},
         "name": f"{facts['name']}-steering",
+        "task": arguments.task,
+        "learnt": _LEARNT,
         "layout": {**facts["layout"], "frames": arguments.config.frames},
         "tensors_sha256": hashlib.sha256(content).hexdigest(),
         "steering": steered,
