@@ -88,6 +88,8 @@ def error_sentence(error: BaseException) -> str:
 def require_libraries(commands: str | tuple[str, ...], extra: str, *modules: str) -> None:
     """Ends a command whose libraries are not installed, with status 2; does nothing in any other process.
 
+    It stands in the `__init__` of a package whose files import them at their top, or in a command's `main`.
+
     Args:
         commands: Beginnings of the names of the commands that need the libraries, as `scene`.
         extra: The optional dependencies that bring them.
@@ -103,11 +105,15 @@ def require_libraries(commands: str | tuple[str, ...], extra: str, *modules: str
 
 
 def _command_name() -> str:
-    """Returns the module that `python -m` is about to run; empty for any other process."""
-    words = sys.orig_argv
-    if sys.argv[:1] != [_MODULE_FLAG] or _MODULE_FLAG not in words[:-1]:
-        return ""
-    return words[words.index(_MODULE_FLAG) + 1]
+    """Returns the module that `python -m` runs or is about to run; empty for any other process."""
+    running = getattr(sys.modules.get("__main__"), "__spec__", None)  # `None` until the module has been located
+    if running is not None:
+        return running.name.removesuffix(".__main__")
+    words = sys.orig_argv[1:] if sys.argv[:1] == [_MODULE_FLAG] else []
+    for index, word in enumerate(words):
+        if word.startswith(_MODULE_FLAG):
+            return word.removeprefix(_MODULE_FLAG) or "".join(words[index + 1 : index + 2])
+    return ""
 
 
 def _installed(module: str) -> bool:
