@@ -159,14 +159,15 @@ def end_figures(scene: Path, origin: np.ndarray, truth: Truth) -> dict[str, floa
         ends = bore["position"][[0, -1]] + origin
         length = float(bore["station"][-1])
         filled = float(bore["filled"].mean())
-    station = np.sort([project_station(point, truth) for point in ends])
+    first, last = (project_station(point, truth) for point in ends)
+    station = np.sort([first, last])
     beyond = [truth.ends[0] - station[0], station[1] - truth.ends[1]]
     worst = float(np.nanmax(beyond)) if np.isfinite(beyond).any() else float("nan")
     covered = np.clip(station, *truth.span)
     share = float((covered[1] - covered[0]) / (truth.span[1] - truth.span[0]))
     return {
         "length": length, "from": float(station[0]), "to": float(station[1]), "beyond": worst, "covered": share,
-        "filled": filled,
+        "filled": filled, "reversed": first > last,
     }  # fmt: skip
 
 

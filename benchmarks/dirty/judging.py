@@ -17,7 +17,7 @@ import tyro
 from benchmarks.dirty.building import build_case, take_processor
 from benchmarks.dirty.figures import judge_scene
 from benchmarks.dirty.truth import Case, load_truth
-from benchmarks.dirty.verdict import judge_row, list_faults
+from benchmarks.dirty.verdict import judge_row, list_faults, untold_faults
 from benchmarks.results import write_file
 
 
@@ -57,6 +57,7 @@ def judge_case(case: Case, config: JudgeConfig) -> dict[str, Any]:
     if built.status == 0:
         row |= judge_scene(scene, truth)
         row["faults"] = list_faults(row, truth)
+        row["untold"] = untold_faults(row, truth)
     row["verdict"] = judge_row(row, truth)
     if not config.keep:
         shutil.rmtree(scene, ignore_errors=True)

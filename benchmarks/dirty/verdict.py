@@ -16,6 +16,32 @@ _PROUD = 0.05  # m: sleepers that stand out so far must be seen
 _PLACE_SLACK = 4.0  # m between the place that a warning names and that of the trouble
 _PATH = re.compile(r"\S*/\S+")  # the name of a file may hold the very word that is looked for
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?=\s*(?:m\b|\u2013|-|to\b|and\b))")
+_FAULT_SLACK = 2.0  # m between the stretch that a warning names and the place of a fault
+_FAULT_PLACE = re.compile(r" at (-?\d+) m$")
+_STATION = r"(-?\d+(?:\.\d+)?)"
+_RANGE = re.compile(rf"from (?:station )?{_STATION} to {_STATION} m\b|\bat {_STATION} m\b")
+_GUESS = re.compile(r"(?:inside it|behind it|looks like)\b.*")
+# Causes that spoil all of a scene, so that each fault may come from them.
+_EVERYWHERE = re.compile(
+    r"--axes|--unit|--calibration|--trajectory|poses|clock|mount|quaternion|wall shows twice|grid of", re.IGNORECASE
+)
+_WALL_WORDS = r"left wall|right wall|crown|all around|branch|opens into"
+# What a fault begins with, and the words of the warnings that are of it.
+_TOLD_BY = tuple(
+    (re.compile(fault), re.compile(words))
+    for fault, words in (
+        (r"^walls |within 10 cm", rf"{_WALL_WORDS}|floor|further than 10 cm"),
+        (r"^width|^aside", _WALL_WORDS),
+        (r"^height", "crown|floor|all around"),
+        (r"^floor", "floor|all around"),
+        ("too long", "mouth|portal|beyond the ends|end of the bore|ends? of the lining"),
+        ("of the span built", "cut away|cut at|left out|beyond the ends|gap"),
+        ("sleeper", "sleeper|no rails|track"),
+        ("gauge", "gauge"),
+        ("rings", "rings"),
+        ("pockets", "pockets"),
+    )
+)
 
 RIGHT, WARNED, VAGUE, SILENT = "right", "warned", "vague", "SILENT"
 REFUSED, MISLED, FAILED = "refused", "MISLED", "FAILED"  # with a true reason; with another; not by a sentence
@@ -73,17 +99,79 @@ def _lining_faults(row: dict[str, Any], truth: Truth) -> list[str]:
 
 
 def judge_row(row: dict[str, Any], truth: Truth) -> str:
-    """Return the verdict on a row that has status, message, warnings and faults."""
+    """Return the verdict on a row that has status, message, warnings and faults.
+
+    A wrong scene counts as warned where each of its faults is told (see `untold_faults`), and the cause too where the
+    truth asks for it. Warnings of other things leave it vague.
+    """
     if row["status"] not in (0, 2, 3):
         return FAILED
     if row["status"]:
         return REFUSED if names_cause([_PATH.sub("", row["message"])], truth) else MISLED
-    said = bool(row["warnings"]) and names_cause(row["warnings"], truth)
-    if truth.expect == "built" and not row["faults"] and (said or not truth.must_say):
-        return RIGHT
-    if said and names_place(row["warnings"], truth):
-        return WARNED
+    asked = truth.must_say or truth.expect != "built"
+    said = not asked or _names_trouble(row["warnings"], truth)
+    untold = untold_faults(row, truth)
+    if said and not untold:
+        return RIGHT if truth.expect == "built" and not row["faults"] else WARNED
     return VAGUE if row["warnings"] else SILENT
+
+
+def untold_faults(row: dict[str, Any], truth: Truth | None = None) -> list[str]:
+    """Return the faults of a row of which no warning speaks.
+
+    A warning speaks of a fault where it names what is wrong (the floor of a floor, the track of sleepers) near its
+    place, or a cause that spoils the whole scene, such as axes or poses. One that names the trouble which the truth
+    knows, and its place, speaks of all faults there.
+
+    Args:
+        row: A row with faults and warnings.
+        truth: Its truth; `None` where only the row was kept: then no trouble is known.
+    """
+    trouble = truth is not None and bool(truth.cause) and _names_trouble(row["warnings"], truth)
+    untold = []
+    for fault in row["faults"]:
+        place = _fault_place(fault)
+        if trouble and (math.isnan(place) or _in_trouble(place, truth)):
+            continue
+        where = truth.trouble if math.isnan(place) and truth is not None else (place, place)
+        if not any(_speaks_of(text, fault, where, row) for text in row["warnings"]):
+            untold.append(fault)
+    return untold
+
+
+def _names_trouble(warnings: list[str] | tuple[str, ...], truth: Truth) -> bool:
+    """Return whether the warnings that name the true cause also name its place."""
+    told = [text for text in warnings if names_cause([text], truth)]
+    return bool(told) and names_place(told, truth)
+
+
+def _in_trouble(place: float, truth: Truth | None) -> bool:
+    """Return whether a true station lies at the trouble; true where the trouble has no place."""
+    start, end = truth.trouble if truth is not None else (math.nan, math.nan)
+    return math.isnan(start) or start - _PLACE_SLACK <= place <= end + _PLACE_SLACK
+
+
+def _fault_place(fault: str) -> float:
+    """Return the true station of a fault, m; NaN where it has none."""
+    found = _FAULT_PLACE.search(fault)
+    return float(found[1]) if found else math.nan
+
+
+def _speaks_of(warning: str, fault: str, where: tuple[float, float], row: dict[str, Any]) -> bool:
+    """Return whether a warning is of a fault, and of its true stations where both have a place."""
+    if _EVERYWHERE.search(warning):
+        return True
+    named = _GUESS.sub("", warning)  # what it looks like names floor and walls, whatever is wrong
+    if not any(words.search(named) for beginning, words in _TOLD_BY if beginning.search(fault)):
+        return False
+    ranges = [(float(a or c), float(b or c)) for a, b, c in _RANGE.findall(warning)]
+    if math.isnan(where[0]) or not ranges:
+        return True
+    start, end = where[0] - _FAULT_SLACK, where[1] + _FAULT_SLACK
+    # The scene counts from its own start, which may be either end; rows of before do not say which.
+    ways = {False: (start - row["from"], end - row["from"]), True: (row["to"] - end, row["to"] - start)}
+    spans = [ways[row["reversed"]]] if "reversed" in row else list(ways.values())
+    return any(low <= b and a <= high for a, b in ranges for low, high in spans)
 
 
 def names_cause(sentences: list[str] | tuple[str, ...], truth: Truth) -> bool:

@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,19 @@ import trimesh
 from benchmarks.command import BenchmarkError
 from benchmarks.dirty.figures import judge_scene
 from benchmarks.dirty.truth import Case, Truth, find_cases, load_truth
-from benchmarks.dirty.verdict import FAILED, MISLED, REFUSED, SILENT, VAGUE, WARNED, judge_row, list_faults
+from benchmarks.dirty.verdict import (
+    FAILED,
+    MISLED,
+    REFUSED,
+    SILENT,
+    VAGUE,
+    WARNED,
+    judge_row,
+    list_faults,
+    untold_faults,
+)
 
+_ROW: dict[str, Any] = {"status": 0, "message": "", "from": 2.0, "to": 18.0, "reversed": False}
 LENGTH, HALF, WALL = 20.0, 2.5, 2.5  # a straight arch 5 m wide and 5 m high
 
 
@@ -101,12 +113,55 @@ def test_an_axis_is_judged_by_where_the_true_walls_stand(tmp_path: Path, truth: 
 
 def test_a_wrong_scene_needs_a_warning_that_names_place_and_cause(truth: Truth) -> None:
     truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
-    row = {"status": 0, "message": "", "faults": ["floor +70 cm"]}
+    row = {**_ROW, "faults": ["floor +70 cm"]}
     said = "a vehicle hides the floor from 12.5 to 13.9 m"
     assert judge_row({**row, "warnings": []}, truth) == SILENT
     assert judge_row({**row, "warnings": ["something is odd"]}, truth) == VAGUE
     assert judge_row({**row, "warnings": ["a vehicle hides the floor from 0.5 to 1.0 m"]}, truth) == VAGUE
     assert judge_row({**row, "warnings": [said]}, truth) == WARNED
+
+
+@pytest.mark.parametrize(
+    ("fault", "warning", "told"),
+    [
+        ("floor -4 cm at 10 m", "from 7 to 9 m hardly a return lies on the floor (40% of the girth)", True),
+        ("floor -4 cm at 10 m", "from 12 to 15 m hardly a return lies on the floor (40% of the girth)", False),
+        ("floor -4 cm at 10 m", "from 7 to 9 m hardly a return lies on the crown (40% of the girth)", False),
+        ("width +9 cm at 10 m", "from 7 to 9 m, floor: 9% of the returns there are not the wall that was built", False),
+        ("width +9 cm at 10 m", "from 7 to 9 m, left wall: 9% inside it: something along the wall", True),
+        ("floor -4 cm at 10 m", "from 7 to 9 m, left wall: 9% inside it: a box on the floor", False),
+        ("no sleeper seen", "3 sleepers lie where a spacing of 0.60 m asks for them, and none of them was seen", True),
+        ("no sleeper seen", "from 7 to 9 m hardly a return lies on the crown (40% of the girth)", False),
+        ("gauge -33 mm", "from 7 to 9 m, floor: 9% of the returns there are not the wall that was built", False),
+        ("0.17 m too long", "from 15 to 16 m hardly a return lies on the crown (40% of the girth)", False),
+        ("90.0 % within 10 cm", "11% of the returns lie further than 10 cm from the tunnel that was built", True),
+        ("floor -4 cm at 10 m", "the bore climbs at up to 30%: is z up (--axes)?", True),
+    ],
+)
+def test_a_warning_excuses_the_fault_that_it_speaks_of_and_no_other(
+    truth: Truth, fault: str, warning: str, told: bool
+) -> None:
+    row = {**_ROW, "faults": [fault], "warnings": [warning]}
+    assert judge_row(row, truth) == (WARNED if told else VAGUE)
+    assert untold_faults(row, truth) == ([] if told else [fault])
+    both = {**row, "faults": [fault, "2 rings measured that do not exist"]}
+    assert "2 rings measured that do not exist" in untold_faults(both, truth) or "--axes" in warning
+
+
+def test_a_scene_may_count_from_the_other_end(truth: Truth) -> None:
+    row = {**_ROW, "faults": ["floor -4 cm at 4 m"], "warnings": ["from 13 to 15 m, floor: 9% of the returns"]}
+    assert judge_row(row, truth) == VAGUE
+    assert judge_row({**row, "reversed": True}, truth) == WARNED
+    assert not untold_faults({key: value for key, value in row.items() if key != "reversed"})  # rows of before
+
+
+def test_a_known_trouble_excuses_no_fault_elsewhere(truth: Truth) -> None:
+    truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
+    row = {**_ROW, "warnings": ["a vehicle hides the rest, from 10 to 12 m"]}
+    assert judge_row({**row, "faults": ["floor +70 cm at 13 m"]}, truth) == WARNED
+    assert judge_row({**row, "faults": ["floor +70 cm at 13 m", "floor +70 cm at 3 m"]}, truth) == VAGUE
+    row["warnings"] = ["a vehicle stands in the bore at 1 m", "from 10 to 12 m the pipes were cut"]
+    assert judge_row({**row, "faults": ["floor +70 cm at 13 m"]}, truth) == VAGUE  # cause here, place there
 
 
 def test_a_refusal_must_name_the_cause_and_the_name_of_the_file_does_not_count(truth: Truth) -> None:
