@@ -36,6 +36,7 @@ from train.locate.tunnels import load
 SCHEMA = "subterra.kinds/1"
 N_GROUPS = 10
 CUT = "cut:"  # before the file of a learnt localiser: the ablation
+NO_MAP = "nomap:"  # before one that takes a map: drive without
 AGENTS = ("dead-reckoning", "fused", "ring-count", "ring-filter", "particle-filter", "oracle")
 _OLD = "`subterra-351` and the older family"
 TUNED_ON = {
@@ -58,7 +59,8 @@ class KindsConfig:
     Attributes:
         task: Task id.
         split: Split of the open world; a choice may be made on `val` alone.
-        agents: Names of agents, or files of policies; `cut:FILE` is a learnt localiser without what walls tell it.
+        agents: Names of agents, or files of policies; `cut:FILE` is a learnt localiser without what walls tell it,
+            `nomap:FILE` one that takes a map, without it.
         episodes: Episodes of each kind.
         tunnels: Tunnels of each kind, over which the episodes are spread; 0 leaves the kinds out.
         lining: `built`, `bare` or `smooth`.
@@ -104,7 +106,7 @@ def run(config: KindsConfig) -> None:
     rows: dict[str, list] = {}
     for agent in config.agents:
         started = time.monotonic()
-        records = evaluate(env, params, _agent(agent, env, params), episodes, config.batch or len(episodes))
+        records = evaluate(env, params, make_agent(agent, env, params), episodes, config.batch or len(episodes))
         rows[agent] = [summary(records, config, column) for column in range(len(columns))]
         _progress.print(f"{agent}: {100 * records.success.mean():.1f} % ({time.monotonic() - started:.0f} s)")
         if config.out is not None:  # after each agent, so that nothing is lost where one takes too long
@@ -132,7 +134,7 @@ def _write(config: KindsConfig, columns: tuple[str, ...], rows: dict[str, list],
 
 def _digest(agent: str) -> str | None:
     """Returns the digest of a policy's tensors; None of a baseline."""
-    source = policy_source(agent.removeprefix(CUT))
+    source = policy_source(bare(agent))
     return None if source is None else read_facts(source)["tensors_sha256"]
 
 
@@ -158,19 +160,28 @@ def column_of(tunnel: Any, config: KindsConfig) -> Any:
     return np.where(np.asarray(tunnel) < n_of_kinds, by_kind, further)
 
 
-def _agent(name: str, env: Any, params: EnvParams) -> Any:
+def make_agent(name: str, env: Any, params: EnvParams) -> Any:
     """Makes an agent by its name.
 
     Raises:
         BenchmarkError: What shall be cut is not a learnt localiser.
         SubterraError: There is no such agent or policy, or it does not fit the task.
     """
-    agent = open_agent(name.removeprefix(CUT), env, params)
-    if not name.startswith(CUT):
+    agent = open_agent(bare(name), env, params)
+    if name == bare(name):
         return agent
     if not isinstance(agent, Locating):
         raise BenchmarkError(f"{name}: only a learnt localiser can be cut, and this is {type(agent).__name__}")
-    return agent.without_walls()
+    if name.startswith(CUT):
+        return agent.without_walls()
+    if not agent.takes_map:
+        raise BenchmarkError(f"{name}: has no map to go without")
+    return agent.without_map()
+
+
+def bare(name: str) -> str:
+    """Returns the name of an agent without the prefix that says what it is to do without."""
+    return name.removeprefix(CUT).removeprefix(NO_MAP)
 
 
 def check(config: KindsConfig) -> None:
@@ -183,7 +194,7 @@ def check(config: KindsConfig) -> None:
     if config.split not in SPLITS:
         raise BenchmarkError(f"there is no split {config.split!r}; there are {', '.join(SPLITS)}")
     for agent in config.agents:
-        if agent not in registry.names() and policy_source(agent.removeprefix(CUT)) is None:
+        if agent not in registry.names() and policy_source(bare(agent)) is None:
             known = ", ".join(registry.names())
             raise BenchmarkError(f"no agent {agent!r}; there are {known}, or a policy's file or folder")
     if config.out is not None:

@@ -20,6 +20,7 @@ from rich.console import Console
 
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
+from benchmarks.kinds import make_agent
 from benchmarks.openboard import columns as board
 from benchmarks.openboard import report
 from benchmarks.results import environment_facts, write_file
@@ -28,7 +29,6 @@ from subterra_jax.evaluation.floor import floor
 from subterra_jax.evaluation.harness import fitting_batch
 from subterra_jax.host.files import require_folder
 from subterra_jax.parts.spatial_lidar import SENSORS
-from subterra_jax.policies import open_agent
 from train.locate.tunnels import PLANAR, load
 
 _progress = Console(stderr=True, highlight=False)
@@ -41,7 +41,8 @@ class OpenboardConfig:
     Attributes:
         out: Folder for the cells, `openboard.md` and `openboard.png`.
         tasks: Tasks without `Subterra/` and `-v1`.
-        agents: Names of agents, released policies, or files of policies.
+        agents: Names of agents, released policies, or files of policies; `cut:FILE` and `nomap:FILE` as in
+            `benchmarks.kinds`.
         splits: Splits of the open world; a choice may be made on `val` alone.
         episodes: Episodes of each kind and split.
         tunnels: Tunnels of each kind and split, over which the episodes are spread.
@@ -121,7 +122,7 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
         if task not in floors:
             floors[task] = [floor(params, index) for index in range(len(names))]
         episodes = board.draw_episodes(task, columns, config.tunnels, config.episodes)
-        driver = open_agent(agent, env, params)
+        driver = make_agent(agent, env, params)
         at_once = fitting_batch(env, params, driver, len(episodes), config.memory)
         records = evaluate(env, params, driver, episodes, at_once)
         seconds = time.monotonic() - started

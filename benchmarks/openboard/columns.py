@@ -6,6 +6,7 @@ import zlib
 import numpy as np
 
 from benchmarks.command import BenchmarkError, require_least
+from benchmarks.kinds import bare
 from subterra_jax.baselines import registry
 from subterra_jax.evaluation import Episodes
 from subterra_jax.policies.opening import policy_source
@@ -85,7 +86,7 @@ def check(
             raise BenchmarkError(f"no task {task!r} of version 1; there are {known}") from error
         assert id in BUILT_IN
     for agent in agents:
-        if agent not in registry.names() and policy_source(agent) is None:
+        if agent not in registry.names() and policy_source(bare(agent)) is None:
             raise BenchmarkError(f"no agent {agent!r}; there are {', '.join(registry.names())}")
     for split in splits:
         if split not in SPLITS:

@@ -16,12 +16,14 @@ from subterra_jax.baselines.steering import Corridor
 from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts import make_sensor
 from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
-from subterra_jax.policies.locate import bends, kalman, matching, memory, streams, strips
+from subterra_jax.policies.locate import bends, kalman, map_filter, matching, memory, streams, strips
 from subterra_jax.policies.locate.agent import check_tensors, flat
-from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block
+from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block, Estimate
 from subterra_jax.policies.locate.locator import Locator
-from subterra_jax.policies.locate.profiles import Points
+from subterra_jax.policies.locate.map_strip import MapStrip, map_strip
+from subterra_jax.policies.locate.profiles import BIN, Points
 from subterra_jax.policies.locate.ways import TwoWays
+from subterra_jax.tunnel import Tunnel
 
 _HALF, _N = 2.7, 40  # m; metres
 
@@ -234,9 +236,14 @@ def _looked_at(ranges, driven, walls):
 
 
 @pytest.mark.parametrize(
-    ("network", "front"), [("kalman", "match"), pytest.param("s5", "scans", marks=pytest.mark.slow)]
+    ("network", "front", "with_map"),
+    [
+        ("kalman", "match", False),
+        ("gru", "match", True),
+        pytest.param("s5", "scans", False, marks=pytest.mark.slow),
+    ],
 )
-def test_a_robot_makes_the_metres_of_its_training(network, front):
+def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
     rng = np.random.default_rng(7)
     speed = np.where(np.arange(240) % 9 < 7, 2.0, 0.7)  # not all metres have five steps
     speed[0] = 0.0
@@ -245,17 +252,25 @@ def test_a_robot_makes_the_metres_of_its_training(network, front):
     read = jnp.asarray(np.cumsum(0.1 * speed * 1.02 + 0.01 * rng.standard_normal(240)) + 5.0, jnp.float32)
     walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
     points = _looked_at(ranges, driven, walls)
-    weights = memory.init(network, front, jax.random.key(4))
+    weights = memory.init(network, front, jax.random.key(4), with_map)
     n = int(driven[-1])
     record = streams.Record(jnp.asarray(driven, jnp.float32), read, points)
     whole = memory.sequence(network, weights, streams.metres(record, weights.get("match"), n))
+    strip = _strip(first=-3.0 - 0.7) if with_map else None  # told 0.7 m too far back
+    if strip is not None:
+        age = jnp.arange(1.0, n + 1.0)
+        passed, rate = memory.passed(whole, age), memory.log_rate(whole, age)
+        seen, told, sure = streams.profiles_of(record, n), jnp.float32(3.0), jnp.float32(0.0)
+        beliefs = map_filter.sequence(weights["map"], seen, streams.BEFORE, strip.pick(0), told, sure, passed, rate)
+        whole = jax.vmap(map_filter.corrected, (0, 0, 0, None))(beliefs, whole, age, sure)
     params = SimpleNamespace(
         errand="stop",
+        tunnel=SimpleNamespace(first_node=jnp.zeros((), jnp.int32)),
         start=SimpleNamespace(station=3.0, station_sigma=0.0),
         vehicle=SimpleNamespace(period=0.1),
         lidar=SimpleNamespace(range_max=30.0),
     )
-    locator, one, no = Locator(weights, network), jnp.ones(()), jnp.zeros((), bool)
+    locator, one, no = Locator(weights, network, strip), jnp.ones(()), jnp.zeros((), bool)
 
     def step(now, row):
         r, distance, v = row
@@ -354,3 +369,72 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
     assert stations[64] == pytest.approx(63.1, abs=0.3)
     assert stations[65] == pytest.approx(61.1, abs=1e-3), "the flag is 2 m before the goal, 0.1 m late"
     assert stations[139] == pytest.approx(stations[70] - 0.2 * 69, abs=0.4)
+
+
+def _strip(first=0.0, n_metres=160, seed=3, side=7.3):
+    """The map of two walls with the relief of `_relief`; the right one shows it `side` metres on."""
+    centre = BIN * (np.arange(10 * n_metres) + 0.5)
+    left, right = (_patches(first + centre + off, seed) for off in (0.0, side))
+    one = lambda value: jnp.full(1, value, jnp.int32)  # noqa: E731
+    return MapStrip(jnp.asarray(_HALF + np.stack([left, right]), jnp.float32), one(0), one(10 * n_metres), one(0))
+
+
+def _patches(station, seed):
+    edges = np.cumsum(np.random.default_rng(seed).uniform(0.3, 1.5, 200)) - 20.0
+    return np.where(np.searchsorted(edges, station) % 2 == 0, 0.06, 0.0)
+
+
+def _beliefs(weights, share, told, sigma, strip, passed):
+    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, _drive(share))
+    whole = streams.profiles_of(record, _N)
+    rate = jnp.full(_N, 0.0)
+    scalar = jnp.float32
+    return map_filter.sequence(
+        weights, whole, streams.BEFORE, strip.pick(0), scalar(told), scalar(sigma), jnp.asarray(passed), rate
+    )
+
+
+# The relief is met from station 0 of `_relief` on; the map begins 50 m before.
+@pytest.mark.parametrize(("offset", "share"), [(0.0, 0.0), (3.0, 0.0), (-4.2, 0.02), (2.0, -0.03)])
+def test_a_map_tells_how_far_the_start_is_off(offset, share):
+    weights = map_filter.init(jax.random.key(0))
+    passed = np.maximum(np.arange(_N) - DELAY + 1.0, 0.0) * share  # what a perfect localiser says of the metres passed
+    beliefs = _beliefs(weights, share, 50.0 - offset, 3.0, _strip(first=-50.0), passed.astype(np.float32))
+    found, sigma, believed = map_filter.place(jax.tree.map(lambda leaf: leaf[-1], beliefs))
+    assert float(found) == pytest.approx(offset, abs=0.15)
+    assert float(sigma) < 0.5
+    assert bool(believed)
+    assert float(beliefs.log_odds[-1]) > float(beliefs.log_odds[0]) + 2.0
+
+
+def test_a_map_of_another_tunnel_is_not_believed():
+    weights = map_filter.init(jax.random.key(0))
+    beliefs = _beliefs(weights, 0.0, 50.0, 0.0, _strip(first=-50.0, seed=8, side=4.1), np.zeros(_N, np.float32))
+    last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
+    assert not bool(map_filter.place(last)[2])
+    plain = Estimate(jnp.float32(1.0), jnp.float32(0.02), jnp.float32(-1.0))
+    kept = map_filter.corrected(last, plain, jnp.float32(_N), jnp.float32(0.0))
+    assert float(kept.correction) == 1.0
+    assert float(kept.log_scale) == pytest.approx(-1.0)
+
+
+def test_a_strip_gives_the_walls_of_its_tunnel_and_says_where_it_ends():
+    strip = _strip(n_metres=20)
+    wall, inside = strip.pick(0).sample(jnp.float32(-1.0), 300)
+    station = -1.0 + BIN * np.arange(300)
+    np.testing.assert_array_equal(np.asarray(inside), (station > 0.049) & (station < 19.94))
+    near = np.abs(np.asarray(wall[0]) - _HALF - _patches(station, 3)) < 1e-6
+    assert np.mean(near[np.asarray(inside)]) > 0.7, "only at the edges of patches two bins are mixed"
+
+
+def test_the_strip_of_a_stack_holds_the_walls_of_each_tunnel():
+    tunnels = [st.load_tunnel("control"), st.load_tunnel("subterra-351")]
+    _, params = st.make("Subterra/StopAt-v1", tunnel=[Tunnel.from_plan(one) for one in tunnels])
+    strip = map_strip(params.tunnel)
+    for index in range(2):
+        here = strip.of(params.tunnel.pick(index))
+        wall, inside = here.sample(jnp.float32(100.0), 50)
+        alone = map_strip(Tunnel.from_plan(tunnels[index])).pick(0).sample(jnp.float32(100.0), 50)[0]
+        assert bool(inside.all())
+        np.testing.assert_allclose(wall, alone, atol=1e-6)
+    assert np.ptp(np.asarray(wall)) > 0.05, "pockets stand in the plane of subterra-351"

@@ -3,16 +3,20 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import subterra_jax as st
 from subterra_jax import policies
-from subterra_jax.policies.locate import memory
+from subterra_jax.policies.locate import map_filter, memory
 from subterra_jax.policies.locate.agent import flat
+from subterra_jax.policies.locate.blocks import Estimate
+from subterra_jax.policies.locate.map_strip import MapStrip, map_strip
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
 from train.checkpoint import iterations
@@ -20,7 +24,7 @@ from train.config import ConfigError
 from train.folder import RunFolderError
 from train.locate import filtering, look, release, scores, session, tunnels
 from train.locate.drives import Drive
-from train.locate.learner import LocateConfig, LocateLearner
+from train.locate.learner import LocateConfig, LocateLearner, draw_told, map_loss
 
 _SMALL = LocateConfig("gru", n_envs=2, n_steps=200, minibatch=2, chunk=1)
 
@@ -41,12 +45,20 @@ def _command(tmp_path, **changes):
         ({"begin_from": "StopAt-v0"}, "StopAt-v0: is no localiser"),
         ({"begin_from": "locate-transformer"}, "is of network transformer with front match, not gru"),
         ({"begin_from": "locate-faulted", "network": "transformer"}, "with front wide, not transformer with match"),
+        ({"map": True, "network": "kalman"}, "a map is taken by gru, s5, transformer with front match"),
+        ({"map": True, "front": "wide"}, "a map is taken by gru, s5, transformer with front match"),
+        ({"wrong": 1.0}, "wrong must be at least 0 and below 1"),
     ],
 )
 def test_settings_that_cannot_be_trained_with_are_refused_by_name(tmp_path, changes, sentence):
     with pytest.raises(ConfigError, match=sentence):
         session.run(_command(tmp_path / "run", **changes))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_map_of_the_plane_is_not_learnt_with_a_spinning_lidar(tmp_path):
+    with pytest.raises(ConfigError, match="a map is of the walls in the plane of planar16; spin16x64 sees others"):
+        session.run(dataclasses.replace(_command(tmp_path / "run", map=True), sensor="spin16x64"))
 
 
 @pytest.mark.parametrize("seeds", [(), (1, 1), (-1,)])
@@ -69,7 +81,8 @@ def _made_up_drive(n_envs, share):
     driven = jnp.broadcast_to(0.2 * jnp.arange(200.0), (n_envs, 200))
     points = Points(jnp.zeros((n_envs, 200, 2, 7)), jnp.zeros((n_envs, 200, 2, 7)), jnp.ones((n_envs, 200, 2, 7), bool))
     scale = 1.0 + jnp.asarray(share)[:, None]
-    return Drive(Record(driven, scale * driven, points), scale * driven, jnp.zeros(n_envs, jnp.int32))
+    start = jnp.full(n_envs, 70.0)
+    return Drive(Record(driven, scale * driven, points), scale * driven, start, jnp.zeros(n_envs, jnp.int32))
 
 
 def test_a_judge_counts_the_goals_at_which_the_estimate_is_right():
@@ -81,12 +94,13 @@ def test_a_judge_counts_the_goals_at_which_the_estimate_is_right():
     assert found["found"][0] < found["found"][1] < found["found"][2]
 
 
-@pytest.mark.parametrize("network", ["gru", "transformer-kalman"])
-def test_a_state_before_training_has_the_types_of_one_after_an_iteration(network):
+@pytest.mark.parametrize(("network", "with_map"), [("gru", True), ("transformer-kalman", False)])
+def test_a_state_before_training_has_the_types_of_one_after_an_iteration(network, with_map):
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
-    learner = LocateLearner(env, params, dataclasses.replace(_SMALL, network=network))
+    learner = LocateLearner(env, params, dataclasses.replace(_SMALL, network=network, map=with_map))
     before = jax.eval_shape(learner.init, 0)
-    after, _ = jax.eval_shape(learner.iterate, before, params, jnp.float32(1.0))
+    strip = map_strip(params.tunnel) if with_map else None
+    after, _ = jax.eval_shape(learner.iterate, before, params, jnp.float32(1.0), strip)
     for one, other in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
         assert (one.shape, one.dtype, one.weak_type) == (other.shape, other.dtype, other.weak_type)
 
@@ -104,6 +118,78 @@ def test_a_training_begins_with_the_weights_that_it_is_told_to_begin_from(sensor
         np.testing.assert_allclose(weights[name], np.broadcast_to(tensor - less, weights[name].shape), rtol=1e-6)
 
 
+def _patches(station):
+    edges = np.cumsum(np.random.default_rng(3).uniform(0.3, 1.5, 400))
+    return np.where(np.searchsorted(edges, station) % 2 == 0, 0.03, 0.0)
+
+
+def _drives_past_relief(n_envs, n_steps=160):
+    """Robots that drive exactly what is commanded, past relief of 3 cm under noise of 5 cm; and the map of it."""
+    driven = np.broadcast_to(0.2 * np.arange(float(n_steps)), (n_envs, n_steps))
+    along = np.broadcast_to(2.7 / np.tan(np.deg2rad(22.5) * np.arange(1, 8)), (n_envs, n_steps, 2, 7))
+    rng = np.random.default_rng(0)
+    start = rng.uniform(60.0, 120.0, n_envs)
+    out = _patches(start[:, None, None, None] + driven[..., None, None] + along) + 0.05 * rng.standard_normal(
+        along.shape
+    )
+    points = Points(jnp.asarray(along, jnp.float32), jnp.asarray(out, jnp.float32), jnp.ones(along.shape, bool))
+    real = jnp.asarray(driven, jnp.float32)
+    drive = Drive(Record(real, real, points), real, jnp.asarray(start, jnp.float32), jnp.zeros(n_envs, jnp.int32))
+    wall = 2.7 + np.broadcast_to(_patches(0.1 * (np.arange(2400) + 0.5)), (2, 2400))
+    zero, many = jnp.zeros(1, jnp.int32), jnp.full(1, 2400, jnp.int32)
+    return drive, MapStrip(jnp.asarray(wall, jnp.float32), zero, many, zero)
+
+
+@pytest.mark.slow
+def test_what_is_learnt_with_a_map_finds_hidden_starts_and_leaves_wrong_maps_aside():
+    drive, strip = _drives_past_relief(12)
+    params = SimpleNamespace(tunnel=SimpleNamespace(count=1, length=jnp.float32(240.0)))
+    config = dataclasses.replace(_SMALL, hidden=0.7, wrong=0.4)
+    answers = Estimate(jnp.zeros((12, 30)), jnp.zeros((12, 30)), jnp.full((12, 30), -2.0))
+    truth, valid = jnp.zeros((12, 30)), jnp.ones((12, 30), bool)
+
+    def loss(own, told):
+        taught, terms = jax.vmap(lambda *one: map_loss({"map": own}, *one, strip))(drive, told, answers, truth, valid)
+        return jnp.mean(taught), terms
+
+    weights = map_filter.init(jax.random.key(1))
+    weights["log_odds"] = weights["log_odds"] + 4.0  # it begins by believing every map
+    optimizer = optax.adam(0.03)
+    step = jax.jit(jax.value_and_grad(loss, has_aux=True))
+    moments, losses = optimizer.init(weights), []
+    for index in range(25):
+        told = draw_told(jax.random.key(index % 3), drive, params, config)
+        (value, _), gradients = step(weights, told)
+        changes, moments = optimizer.update(gradients, moments)
+        weights = optax.apply_updates(weights, changes)
+        losses.append(float(value))
+    assert np.mean(losses[-3:]) < 0.8 * np.mean(losses[:3])
+    told = draw_told(jax.random.key(99), drive, params, config)
+    assert 0 < int(told.right.sum()) < 12
+    _, terms = loss(weights, told)
+    of = lambda name, rows: float(jnp.sum(terms[name] * rows) / jnp.sum(rows)) / 18.0  # noqa: E731
+    assert of("mapped", told.right) > 0.7
+    assert of("misled", ~told.right) < 0.3
+
+
+def test_what_is_told_is_off_as_a_hidden_start_is_and_a_wrong_map_is_of_another_place():
+    drive = _made_up_drive(4000, np.zeros(4000))
+    params = SimpleNamespace(tunnel=SimpleNamespace(count=3, length=jnp.array([500.0, 600.0, 700.0])))
+    told = draw_told(jax.random.key(0), drive, params, dataclasses.replace(_SMALL, hidden=0.5, wrong=0.2))
+    hidden, right = np.asarray(told.sigma) > 0.0, np.asarray(told.right)
+    assert np.mean(hidden) == pytest.approx(0.5, abs=0.03)
+    assert np.mean(right) == pytest.approx(0.8, abs=0.03)
+    assert np.all(np.asarray(told.offset)[~hidden] == 0.0)
+    assert np.std(np.asarray(told.offset)[hidden]) == pytest.approx(3.0, abs=0.15)
+    assert np.all(np.asarray(told.tunnel)[right] == 0)
+    assert np.all(np.asarray(told.shift)[right] == 0.0)
+    assert set(np.asarray(told.tunnel)[~right]) == {1, 2}
+    one = SimpleNamespace(tunnel=SimpleNamespace(count=1, length=jnp.float32(500.0)))
+    alone = draw_told(jax.random.key(0), drive, one, dataclasses.replace(_SMALL, wrong=0.5))
+    away = np.abs(np.asarray(alone.shift))[~np.asarray(alone.right)]
+    assert away.min() > 49.0, "of one tunnel a wrong map is another part of it"
+
+
 @pytest.mark.slow
 def test_gradients_do_not_depend_on_the_chunks():
     env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
@@ -111,7 +197,7 @@ def test_gradients_do_not_depend_on_the_chunks():
     found = []
     for chunk in (4, 1):
         learner = LocateLearner(env, params, dataclasses.replace(_SMALL, n_envs=4, minibatch=4, chunk=chunk))
-        found.append(jax.jit(learner._gradients)(learner.init(0).weights, drives))
+        found.append(jax.jit(learner._gradients)(learner.init(0).weights, (drives, None), None))
     for one, other in zip(jax.tree.leaves(found[0]), jax.tree.leaves(found[1]), strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-3, atol=1e-5)
 

@@ -1,5 +1,9 @@
-"""Drives to learn from: along the axis at speeds that vary, from anywhere, with the truth beside them."""
+"""Drives to learn from: along the axis at speeds that vary, from anywhere, with the truth beside them.
 
+Round boxes the written avoidance steers, as in the agent; in training also faster than it does there.
+"""
+
+import dataclasses
 from typing import Any
 
 import jax
@@ -8,6 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import observed
+from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.locate.bends import look as look_at
 from subterra_jax.policies.locate.streams import Record
@@ -25,11 +30,13 @@ class Drive:
     Attributes:
         record: As the robots saw them.
         moved: True distance along the axis since the start, m.
+        start: True station of the start, m.
         tunnel: Number of the tunnel.
     """
 
     record: Record
     moved: Float[Array, "env time"]
+    start: Float[Array, "env"]
     tunnel: Float[Array, "env"]
 
 
@@ -66,22 +73,24 @@ def record_drives(
 
     first = env.draw_step(keys[3], (n_envs,), params)
     seen = jax.vmap(look)(state, first)
-    walls = jax.vmap(lambda obs: CentreLine().begin(obs, params))(seen)
+    steering = _steerings(steering_of(params, CentreLine()), keys[2], n_envs, speed_max, from_mouth)
+    walls = jax.vmap(lambda s, obs: s.begin(obs, params))(steering, seen)
     command, driven, over = jnp.zeros((n_envs, 2)), jnp.zeros(n_envs), jnp.zeros(n_envs, bool)
     bend = jnp.zeros(n_envs)
 
     def step(carry: Any, t: Array) -> Any:
         state, seen, walls, command, driven, over, bend = carry
-        walls = jax.vmap(lambda w, obs, c: CentreLine().look(w, obs, c, params))(walls, seen, command)
-        moved = command[:, 0] * params.vehicle.period * jnp.cos(walls.angle)
+        walls = jax.vmap(lambda s, w, obs, c: s.look(w, obs, c, params))(steering, walls, seen, command)
+        moved = command[:, 0] * params.vehicle.period * jax.vmap(lambda s, w: s.cosine(w))(steering, walls)
         driven = driven + moved
-        points, bend = jax.vmap(lambda b, obs, w, m: look_at(b, obs, w, m, params))(bend, seen, walls, moved)
+        sides = getattr(walls, "corridor", walls)
+        points, bend = jax.vmap(lambda b, obs, w, m: look_at(b, obs, w, m, params))(bend, seen, sides, moved)
         kept = Record(driven, seen.distance, points), state.station
         share = jnp.where(from_mouth, 1.0, jax.vmap(lambda p: _speed(p, t))(pace))
         end = jax.vmap(lambda s: params.tunnel.pick(s.tunnel).length)(state) - 5.0
         over = over | (state.station > end)
         speed = jnp.where(over, 0.0, share * speed_max)
-        command = jax.vmap(lambda w, v: CentreLine().steer(w, v, params))(walls, speed)
+        command = jax.vmap(lambda s, w, v: s.steer(w, v, params))(steering, walls, speed)
         command = jnp.where(over[:, None], 0.0, command)
         noise = env.draw_step(jax.random.fold_in(keys[3], t + 1), (n_envs,), params)
         action = jnp.pad(command, ((0, 0), (0, env.action_size - 2)))
@@ -93,7 +102,18 @@ def record_drives(
     carry: Any = (state, seen, walls, command, driven, over, bend)
     (state, *_), (record, station) = jax.lax.scan(step, carry, jnp.arange(n_steps))
     record = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), record)
-    return Drive(record, jnp.swapaxes(station, 0, 1) - start[:, None], state.tunnel)
+    return Drive(record, jnp.swapaxes(station, 0, 1) - start[:, None], start, state.tunnel)
+
+
+def _steerings(steering: Any, key: PRNGKeyArray, n: int, speed_max: Any, as_it_is: bool) -> Any:
+    """Returns a steering for each robot: the same, but that one round boxes drives up to a speed of its own."""
+    fields = {
+        field.name: jnp.broadcast_to(getattr(steering, field.name), (n,)) for field in dataclasses.fields(steering)
+    }
+    if "speed" in fields and not as_it_is:
+        share = jax.random.uniform(jax.random.fold_in(key, 1), (n,))
+        fields["speed"] = steering.speed + share * (speed_max - steering.speed)
+    return dataclasses.replace(steering, **fields)
 
 
 def _pace(key: PRNGKeyArray) -> Float[Array, "4"]:

@@ -1,7 +1,8 @@
 """Draws success against wall time: `python -m train.locate.figure RUN [RUN ...] --out curve.png`.
 
-Of each run the share of goals in `val` at which the estimate is right to 1 m, as it trains; agents of a table of
-`benchmarks.kinds` on `val` as level lines.
+Of each run the share of goals in `val` at which the estimate is right to 1 m, as it trains; of one that takes a map
+also with the map, and with the map where the start is hidden. Agents of a table of `benchmarks.kinds` on `val` are
+level lines.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ from train.config import ConfigError
 from train.locate.session import CURVE
 from train.options import read_settings
 
+_CURVES = {"within": "", "mapped": ", with map", "hidden_mapped": ", with map, hidden start"}
 _STYLES = ("-", "--", "-.", ":")
 
 
@@ -48,7 +50,7 @@ def command(arguments: Command) -> None:
     require_file(arguments.out, ".png")
     if not arguments.runs:
         raise ConfigError("at least one run must be named")
-    curves = {label: curve for run in arguments.runs for label, curve in [read_run(run)]}
+    curves = {label: curve for run in arguments.runs for label, curve in read_run(run).items()}
     levels = {} if arguments.kinds is None else read_levels(arguments.kinds, arguments.agents)
     import matplotlib
 
@@ -71,21 +73,26 @@ def command(arguments: Command) -> None:
     print(arguments.out)
 
 
-def read_run(run: Path) -> tuple[str, list[np.ndarray]]:
-    """Returns network and front end of a run, and of each seed seconds and share of right estimates, `(n, 2)`.
+def read_run(run: Path) -> dict[str, list[np.ndarray]]:
+    """Returns the curves of a run by label: of each seed seconds and share of right estimates, `(n, 2)`.
 
     Raises:
         ConfigError: It is no run of `train.locate`, or has no curve.
     """
     settings = read_settings(run / "config.json")
-    found = []
-    for path in sorted(run.glob(f"seed-*/{CURVE}")):
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        found.append(np.array([(row["seconds"], row["within"]) for row in rows]))
-    if not found or "config" not in settings or any(len(curve) == 0 for curve in found):
+    seeds = [
+        [json.loads(line) for line in path.read_text().splitlines()] for path in sorted(run.glob(f"seed-*/{CURVE}"))
+    ]
+    if not seeds or "config" not in settings or any(len(rows) == 0 for rows in seeds):
         raise ConfigError(f"{run}: holds no curve of train.locate")
     config = settings["config"]
-    return f"{config['network']}, {config['front']} ({len(found)} seed{'s' * (len(found) > 1)})", found
+    label = f"{config['network']}, {config['front']}"
+    count = f" ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
+    return {
+        f"{label}{further}{count}": [np.array([(row["seconds"], row[name]) for row in rows]) for rows in seeds]
+        for name, further in _CURVES.items()
+        if all(name in row for rows in seeds for row in rows)
+    }
 
 
 def read_levels(path: Path, agents: tuple[str, ...]) -> dict[str, float]:

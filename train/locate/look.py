@@ -1,6 +1,7 @@
 """Scores localisers on recorded drives, by kind: `python -m train.locate.look POLICY [POLICY ...] --out DIR`.
 
-All policies, and each with what walls tell cut out, see the same drives. A drive counts for every goal 60 to 320 m from
+All policies, and each with what walls tell cut out, see the same drives; one that takes a map also with the map, with a
+hidden start (with the map and without), and with a map of another place. A drive counts for every goal 60 to 320 m from
 its start: the score is the success of stops at goals drawn from these, but for the last step of 0.2 m.
 """
 
@@ -21,6 +22,7 @@ from subterra_jax.policies import check_fits, load
 from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.locate import memory, streams
 from subterra_jax.policies.locate.agent import Locating, nested
+from subterra_jax.policies.locate.map_strip import map_strip
 from train.config import ConfigError, at_least
 from train.locate import scores, tunnels
 from train.locate.drives import Drive
@@ -78,12 +80,22 @@ def command(arguments: Command) -> None:
     kinds = np.array([scores.kind_of(name) for name in names])[np.asarray(drives.tunnel).astype(int)]
     print(f"{arguments.drives} drives", flush=True)
     rows: dict[str, Any] = {}
+    names_of: dict[str, str] = {}
+    tunnel = np.asarray(drives.tunnel)
     for name, agent in agents.items():
         for blind in (False, True):
             label = f"cut:{name}" if blind else name
-            rows[label] = table(within(agent, drives, blind), np.asarray(drives.tunnel), kinds)
-            print(label, {kind: round(100 * cell["success"]) for kind, cell in rows[label].items()}, flush=True)
-        _write(arguments, rows)
+            rows[label], names_of[label] = table(within(agent, drives, blind), tunnel, kinds), name
+        if agent.takes_map:
+            judge = scores.make_judge(agent.network, strip=map_strip(params.tunnel))
+            shares = judge(nested(agent.tensors), drives)
+            for case in scores.WITH_MAP:
+                label = f"{case}:{name}"
+                rows[label], names_of[label] = table(np.asarray(shares[case]), tunnel, kinds), name
+        for label in rows:
+            if names_of[label] == name:
+                print(label, {kind: round(100 * cell["success"]) for kind, cell in rows[label].items()}, flush=True)
+        _write(arguments, rows, names_of)
     print(arguments.out / "look.md")
 
 
@@ -129,7 +141,7 @@ def table(share: np.ndarray, tunnel: np.ndarray, kinds: np.ndarray) -> dict[str,
     return {**found, "all": {"success": mean, "low": float(low), "high": float(high), "n": len(share)}}
 
 
-def _write(arguments: Command, rows: dict[str, Any]) -> None:
+def _write(arguments: Command, rows: dict[str, Any], names_of: dict[str, str]) -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     columns = list(next(iter(rows.values())))
     lines = ["| localiser | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
@@ -140,7 +152,7 @@ def _write(arguments: Command, rows: dict[str, Any]) -> None:
     facts = {
         "schema": SCHEMA,
         "config": {name: getattr(arguments, name) for name in names},
-        "policies": {label: read_facts(label.removeprefix("cut:"))["tensors_sha256"] for label in rows},
+        "policies": {label: read_facts(names_of[label])["tensors_sha256"] for label in rows},
         "rows": rows,
     }
     for name, text in (("look.md", "\n".join(lines)), ("look.json", json.dumps(facts, indent=1))):

@@ -11,16 +11,18 @@ from subterra_jax.host.files import replace_file
 from subterra_jax.policies.files import TENSORS
 from train.config import ConfigError
 from train.evaluate import evaluate
+from train.locate.scores import WITH_MAP
 from train.locate.session import CURVE, POLICY, SCORES
 from train.locate.tunnels import PLANAR
 from train.policies import facts_file
 from train.world import open_world
 
 MEASURED = ("subterra.kinds/1", "subterra.look/1")
-INPUTS = "odometer, own commands, start and goal; no ring length, no map, no counter of rings"
+INPUTS = "odometer, own commands, start and goal; no ring length, no counter of rings"
+NO_MAP, A_MAP = "no map", "a map if there is one: the walls in the plane of the LiDAR"
 _SEES = {PLANAR: "16 level ranges"}
 LEARNT = "where the robot is; steering, avoidance and the stop are written"
-_CUT = "cut:"
+_CASES = ("cut", "nomap", *WITH_MAP)
 
 
 def is_localiser(folder: Path) -> bool:
@@ -56,7 +58,7 @@ def release(folder: Path, out: Path, episodes: int, measured: tuple[Path, ...]) 
         "name": out.name.removesuffix(TENSORS),
         "constants_v1_sha256": st.constants_digest(version="v1"),
         "world": {"tunnel": facts["tunnels"], "lining": None, "sensor": sensor},
-        "inputs": f"{_SEES.get(sensor, f'the image of {sensor}')}, {INPUTS}",
+        "inputs": f"{_SEES.get(sensor, f'the image of {sensor}')}, {INPUTS}; {A_MAP if agent.takes_map else NO_MAP}",
         "learnt": LEARNT,
         "val": scores,
         "success_against_time": curve,
@@ -78,6 +80,12 @@ def _curve(folder: Path) -> list[list[float]]:
         raise ConfigError(f"{folder}: no readable {CURVE} in it") from error
 
 
+def _case(agent: str) -> str:
+    """Returns how a policy drove or was asked, by the prefix of its name in a table."""
+    case = agent.partition(":")[0] if ":" in agent else ""
+    return case if case in _CASES else "as it is"
+
+
 def _read(path: Path, field: str) -> Any:
     try:
         return json.loads(path.read_text())[field]
@@ -92,9 +100,7 @@ def _rows(path: Path, digest: str) -> dict[str, Any]:
     table, digests, config = _read(path, "rows"), _read(path, "policies"), _read(path, "config")
     kept = ("success", "low", "high", "contact", "median_error", "n")
     own = {
-        "cut" if agent.startswith(_CUT) else "as it is": {
-            column: {name: cell[name] for name in kept if name in cell} for column, cell in row.items()
-        }
+        _case(agent): {column: {name: cell[name] for name in kept if name in cell} for column, cell in row.items()}
         for agent, row in table.items()
         if digests.get(agent) == digest
     }

@@ -8,12 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
+from subterra_jax import constants
+from subterra_jax.policies.locate import map_filter
+from subterra_jax.policies.locate.map_strip import MapStrip
 from train.locate.drives import Drive, record_drives
-from train.locate.learner import estimate
+from train.locate.learner import Told, believe, estimate
 
 FIRST, _STEPS = 60, 1750  # m, the nearest goal; steps, 320 m and what slip adds
 _BATCH = 16
 FARTHEST = 320  # m, the farthest goal
+
+WITH_MAP = ("mapped", "hidden", "hidden_mapped", "misled")
 
 Found = dict[str, np.ndarray]
 
@@ -25,13 +30,22 @@ def record(env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = FARTHES
     return drive(key)
 
 
-def make_judge(network: str, last: int = FARTHEST) -> Callable[[Any, Drive], dict[str, Array]]:
+def make_judge(
+    network: str, last: int = FARTHEST, strip: MapStrip | None = None
+) -> Callable[[Any, Drive], dict[str, Array]]:
     """Compiles a function of weights and recorded drives.
+
+    Args:
+        network: Name of the memory.
+        last: Farthest goal, m.
+        strip: Maps of the tunnels, for a network that takes one.
 
     Returns:
         Of each drive `within` (share of goals from 60 to `last` m at which the estimate is right to 1 m), `error`
         (median, m), `claimed` (mean absolute error that it claims at the end, m), `found` (error there, m), all `(n,)`.
-        A drive that comes less than 60 m far has no goal, and `within` of NaN.
+        A drive that comes less than 60 m far has no goal, and `within` of NaN. With maps also the share of right
+        estimates with the map (`mapped`), with a hidden start and no map (`hidden`), with a hidden start and the map
+        (`hidden_mapped`), and with a map of another place (`misled`).
     """
     goals = jnp.arange(last) >= min(FIRST, last // 2) - 1
 
@@ -41,7 +55,9 @@ def make_judge(network: str, last: int = FARTHEST) -> Callable[[Any, Drive], dic
             answers, truth, valid = estimate(network, weights, drive, last)
             error, use = jnp.abs(answers.correction - truth), goals & valid
             end = jnp.maximum(jnp.sum(valid) - 1, 0)
+            mapped = {} if strip is None else with_map(weights, drive, answers, truth, use, strip)
             return {
+                **mapped,
                 "within": jnp.sum(use & (error <= 1.0)) / jnp.sum(use),
                 "error": jnp.nanmedian(jnp.where(use, error, jnp.nan)),
                 "claimed": jnp.exp(answers.log_scale[end]),
@@ -51,6 +67,29 @@ def make_judge(network: str, last: int = FARTHEST) -> Callable[[Any, Drive], dic
         return jax.lax.map(errors, drives, batch_size=_BATCH)
 
     return judge
+
+
+def with_map(weights: Any, drive: Drive, answers: Any, truth: Array, use: Array, strip: MapStrip) -> dict[str, Array]:
+    """Returns the shares of right estimates of one drive with a map, a hidden start, or a wrong map."""
+    age, zero = jnp.arange(1.0, len(truth) + 1.0), jnp.zeros(())
+    # Drawn from the start itself, so that the same drive is told the same at every score.
+    key = jax.random.key(jax.lax.bitcast_convert_type(drive.start, jnp.uint32))
+    drawn = constants.INSIDE_SIGMA * jnp.clip(jax.random.normal(key), -3.0, 3.0)
+    hidden = jnp.full((), constants.INSIDE_SIGMA)
+    other = (drive.tunnel + 1) % strip.n_bins.shape[0]
+    sure = jnp.ones((), bool)
+    cases = {
+        "mapped": Told(zero, zero, drive.tunnel, zero, sure),
+        "hidden_mapped": Told(drawn, hidden, drive.tunnel, zero, sure),
+        "misled": Told(zero, zero, other, zero, ~sure),
+    }
+    found = {"hidden": jnp.sum(use & (jnp.abs(answers.correction - truth - drawn) <= 1.0)) / jnp.sum(use)}
+    for name, told in cases.items():
+        beliefs, _ = believe(weights, drive, told, answers, strip)
+        better = jax.vmap(map_filter.corrected, (0, 0, 0, None))(beliefs, answers, age, told.sigma)
+        error = jnp.abs(better.correction - truth - told.offset)
+        found[name] = jnp.sum(use & (error <= 1.0)) / jnp.sum(use)
+    return found
 
 
 def by_kind(found: Found, tunnel: np.ndarray, names: list[str]) -> dict[str, dict[str, float]]:

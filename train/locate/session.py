@@ -31,7 +31,7 @@ from train.world import library_versions
 
 POLICY, LOG, CURVE, SCORES, CONFIG = "policy.safetensors", "log.jsonl", "curve.jsonl", "scores.json", "config.json"
 _KINDS = ("straight", "cast", "sprayed", "masonry")
-_VAL_SEED = 2**20
+VAL_SEED = 2**20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +84,11 @@ def check(arguments: Command) -> None:
     at_least(config, 1, "n_envs", "minibatch", "chunk", "epochs")
     at_least(config, 200, "n_steps")
     positive(config, "learning_rate", "max_grad_norm", "minutes")
+    for name in ("hidden", "wrong"):
+        if not 0.0 <= getattr(config, name) < 1.0:
+            raise ConfigError(f"{name} must be at least 0 and below 1, got {getattr(config, name)}")
+    if config.map and arguments.sensor != tunnels.PLANAR:
+        raise ConfigError(f"a map is of the walls in the plane of {tunnels.PLANAR}; {arguments.sensor} sees others")
     if config.n_envs % config.minibatch:
         raise ConfigError(f"n_envs = {config.n_envs} must be a multiple of minibatch = {config.minibatch}")
     at_least(arguments, 1, "drives")
@@ -107,8 +112,8 @@ def run(arguments: Command) -> None:
         SubterraError: There is no such task or tunnel, or a folder cannot be written.
     """
     check(arguments)
-    _check_folder(arguments)
-    begin = time.monotonic()
+    check_folder(arguments)
+    started = time.monotonic()
     everything = tunnels.load(
         tunnels.names_of(arguments.tunnels) + tunnels.names_of(arguments.val),
         None,
@@ -118,13 +123,29 @@ def run(arguments: Command) -> None:
     n_train = len(tunnels.names_of(arguments.tunnels))
     env, params = tunnels.enter(arguments.task, everything[:n_train], arguments.sensor)
     val_env, val_params = tunnels.enter(arguments.task, everything[n_train:], arguments.sensor)
-    print(f"{len(everything)} tunnels: {time.monotonic() - begin:.0f} s", flush=True)
-    drives = scores.record(val_env, val_params, jax.random.key(_VAL_SEED), arguments.drives)
-    session = Session(arguments, env, params, drives)
+    maps = (None, None)
+    if arguments.config.map:
+        maps = (
+            tunnels.map_of(everything[:n_train], params.tunnel),
+            tunnels.map_of(everything[n_train:], val_params.tunnel),
+        )
+    print(f"{len(everything)} tunnels: {time.monotonic() - started:.0f} s", flush=True)
+    drives = scores.record(val_env, val_params, jax.random.key(VAL_SEED), arguments.drives)
+    session = Session(arguments, env, params, drives, maps)
+    begin(session, arguments)
+    session.train()
+    finish(session, arguments, drives)
+
+
+def begin(session: "Session", arguments: Command) -> None:
+    """Throws away what the folder holds of another run, and writes the settings of this one."""
     if not session.spent:
         _clear(arguments.out)
     _write_config(arguments)  # not before a run of other settings has been refused: it would take these for its own
-    session.train()
+
+
+def finish(session: "Session", arguments: Command, drives: Any) -> None:
+    """Writes and prints the scores of all seeds."""
     for index, seed in enumerate(arguments.seeds):
         folder = arguments.out / f"seed-{seed}"
         table = scores.by_kind(session.judge(index), np.asarray(drives.tunnel), tunnels.names_of(arguments.val))
@@ -149,13 +170,15 @@ class Session:
         env: Environment to learn in.
         params: Its parameters.
         drives: Recorded drives in `val`.
+        maps: Maps of the tunnels to learn in and of those of `val`, for a network that learns to take one.
     """
 
-    def __init__(self, arguments: Command, env: Any, params: Any, drives: Any) -> None:
+    def __init__(self, arguments: Command, env: Any, params: Any, drives: Any, maps: Any = (None, None)) -> None:
         self._arguments, self._env, self._params, self._drives = arguments, env, params, drives
+        self._strip = maps[0]
         learner = LocateLearner(env, params, arguments.config)
-        self._iterate = jax.jit(jax.vmap(learner.iterate, in_axes=(0, None, None)), donate_argnums=0)
-        self._judge = scores.make_judge(arguments.config.network)
+        self._iterate = jax.jit(jax.vmap(learner.iterate, in_axes=(0, None, None, None)), donate_argnums=0)
+        self._judge = scores.make_judge(arguments.config.network, strip=maps[1])
         self.state = jax.vmap(learner.init)(jnp.asarray(arguments.seeds))
         self.spent = 0.0  # s of training, with compiling
         if arguments.resume and has_checkpoint(arguments.out):
@@ -169,42 +192,66 @@ class Session:
         """Returns the scores of a seed on the recorded drives."""
         return jax.device_get(self._judge(self.weights(index), self._drives))
 
+    def compile(self) -> None:
+        """Compiles iteration and score, which the first of each would do otherwise."""
+        left = jnp.float32(1.0)
+        self._iterate = self._iterate.lower(self.state, self._params, left, self._strip).compile()
+        self._judge = self._judge.lower(self.weights(0), self._drives).compile()
+
     def train(self) -> None:
         """Trains until the time is over: logs every iteration, scores and saves now and then."""
+        self.open()
+        while self.spent < self._budget:
+            self.turn()
+        self.close()
+
+    def open(self, budget: float | None = None) -> None:
+        """Makes the folders, and forgets what they hold of after the checkpoint that is gone on from.
+
+        Args:
+            budget: Time of the training, s; None is that of the settings.
+        """
         arguments = self._arguments
-        folders = [arguments.out / f"seed-{seed}" for seed in arguments.seeds]
-        for folder in folders:
+        self._folders = [arguments.out / f"seed-{seed}" for seed in arguments.seeds]
+        for folder in self._folders:
             folder.mkdir(parents=True, exist_ok=True)
             _forget(folder, self.spent)
-        boards = [Board(folder, self._steps()) for folder in folders] if arguments.tensorboard else []
-        budget, since, offset = 60.0 * arguments.config.minutes, time.monotonic(), self.spent
-        told, saved, compiled = self.spent, self.spent, None
-        while self.spent < budget:
-            left = (
-                1.0 if compiled is None and not offset else max(budget - self.spent, 0.0) / (budget - (compiled or 0.0))
-            )
-            before = time.monotonic()
-            self.state, terms = self._iterate(self.state, self._params, jnp.float32(min(left, 1.0)))
-            rows = jax.device_get(terms)
-            self.spent = offset + time.monotonic() - since
-            if compiled is None:
-                compiled = self.spent if not offset else 0.0
-            rate = self._per_iteration() / (time.monotonic() - before)
-            for index, folder in enumerate(folders):
-                row = {"step": self._steps(), "seconds": round(self.spent, 2), "rate": round(rate)}
-                row |= {name: float(values[index]) for name, values in rows.items()}
-                _append(folder / LOG, row)
-                if boards:
-                    boards[index].write({**row, "timing": {"steps_per_second": rate}})
-            if self.spent - told > arguments.score_every:
-                self._score(folders)
-                self.spent = told = offset + time.monotonic() - since
-            if self.spent - saved > arguments.save_every:
-                self._save()
-                self.spent = saved = offset + time.monotonic() - since
-        self._score(folders)
+        self._boards = [Board(folder, self._steps()) for folder in self._folders] if arguments.tensorboard else []
+        self._budget = 60.0 * arguments.config.minutes if budget is None else budget
+        self._compiled = 0.0 if self.spent else None
+        self._told = self._saved = self.spent
+
+    def turn(self) -> None:
+        """Takes one iteration, logs it, and scores and saves where it is time."""
+        before, offset = time.monotonic(), self.spent
+        passed = lambda: offset + time.monotonic() - before  # noqa: E731
+        left = 1.0
+        if self._compiled is not None:
+            left = max(self._budget - self.spent, 0.0) / max(self._budget - self._compiled, 1e-6)
+        self.state, terms = self._iterate(self.state, self._params, jnp.float32(min(left, 1.0)), self._strip)
+        rows = jax.device_get(terms)
+        self.spent = passed()
+        if self._compiled is None:
+            self._compiled = self.spent
+        rate = self._per_iteration() / (self.spent - offset)
+        for index, folder in enumerate(self._folders):
+            row = {"step": self._steps(), "seconds": round(self.spent, 2), "rate": round(rate)}
+            row |= {name: float(values[index]) for name, values in rows.items()}
+            _append(folder / LOG, row)
+            if self._boards:
+                self._boards[index].write({**row, "timing": {"steps_per_second": rate}})
+        if self.spent - self._told > self._arguments.score_every:
+            self._score(self._folders)
+            self.spent = self._told = passed()
+        if self.spent - self._saved > self._arguments.save_every:
+            self._save()
+            self.spent = self._saved = passed()
+
+    def close(self) -> None:
+        """Scores and saves for the last time."""
+        self._score(self._folders)
         self._save()
-        for board in boards:
+        for board in self._boards:
             board.close()
 
     def _score(self, folders: list[Path]) -> None:
@@ -213,8 +260,13 @@ class Session:
             found = self.judge(index)
             within, error = float(np.nanmean(found["within"])), float(np.nanmedian(found["error"]))
             row = {"seconds": round(self.spent, 2), "updates": int(self.state.steps[index]), "step": self._steps()}
-            _append(folder / CURVE, {**row, "within": within, "error": error})
-            print(f"{self.spent:.0f} s, {folder.name}: {row['updates']} updates, {within:.3f} within 1 m", flush=True)
+            maps = {name: float(np.nanmean(found[name])) for name in scores.WITH_MAP if name in found}
+            _append(folder / CURVE, {**row, "within": within, "error": error, **maps})
+            further = "".join(f", {name} {value:.3f}" for name, value in maps.items())
+            print(
+                f"{self.spent:.0f} s, {folder.name}: {row['updates']} updates, {within:.3f} within 1 m{further}",
+                flush=True,
+            )
 
     def _per_iteration(self) -> int:
         return self._arguments.config.n_envs * self._arguments.config.n_steps
@@ -300,7 +352,7 @@ def _check_same(arguments: Command, was: dict[str, Any] | None) -> None:
         raise ConfigError(f"{arguments.out}: was begun with another {other[0]}; train into another folder")
 
 
-def _check_folder(arguments: Command) -> None:
+def check_folder(arguments: Command) -> None:
     """Refuses a folder that holds a run, unless it is to be gone on with as what it was, or thrown away."""
     require_folder(arguments.out)
     place = arguments.out / CONFIG

@@ -15,6 +15,7 @@ from subterra_jax import constants
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import VERSION
 from subterra_jax.parts.spatial_lidar import SENSORS
+from subterra_jax.policies.locate.map_strip import MapStrip, join, walls_of
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.sources import resolve
@@ -55,6 +56,21 @@ def load(names: list[str], lining: str | None = None, cache: Path | None = None,
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
         return list(pool.map(one, names, chunksize=1))
+
+
+def map_of(made: list[Tunnel], tunnel: Tunnel) -> MapStrip:
+    """Returns the map of a tunnel or a stack, made by several processes.
+
+    Args:
+        made: Its tunnels.
+        tunnel: The tunnel or the stack.
+    """
+    workers = min(len(made), os.cpu_count() or 1)
+    if workers <= 1:
+        return join([walls_of(one) for one in made], tunnel)
+    context = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
+        return join(list(pool.map(walls_of, made, chunksize=1)), tunnel)
 
 
 def _tunnel(name: str, lining: str | None, cache: Path | None, spatial: bool = False) -> Tunnel:

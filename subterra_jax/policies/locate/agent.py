@@ -1,5 +1,6 @@
 """A learnt localiser in the written controller: it keeps to the middle and stops where it believes the goal to be.
 
+One that has learnt to take a map gets the one of the task by `with_map`, and drives without one too (`without_map`).
 Round boxes it steers by the written avoidance: what is learnt is where the robot is. A policy that has tensors of a
 steering as well steers by these everywhere; when to stop stays written.
 """
@@ -20,6 +21,7 @@ from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.locator import Locator
+from subterra_jax.policies.locate.map_strip import MapStrip, map_strip
 from subterra_jax.policies.locate.steering import PREFIX, LearntSteering, check_steering
 from subterra_jax.policies.locate.ways import TwoWays
 from subterra_jax.policies.trained import Tensors, Trained
@@ -40,6 +42,8 @@ class Locating(Trained):
         high: Largest action, m/s and rad/s.
         network: Memory behind the front end, of `memory.NETWORKS`.
         frames: Moments that its learnt steering reads; 0 where the steering is written.
+        map: The map; None has none.
+        hides_map: Take no map: `with_map` changes nothing.
         blind: Cut what the walls tell: the ablation of the learnt estimate.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
@@ -53,6 +57,8 @@ class Locating(Trained):
     high: Float[Array, "2"]
     network: str = struct.field(pytree_node=False, default="kalman")
     frames: int = struct.field(pytree_node=False, default=0)
+    map: MapStrip | None = None
+    hides_map: bool = struct.field(pytree_node=False, default=False)
     blind: bool = struct.field(pytree_node=False, default=False)
     name: str = struct.field(pytree_node=False, default=KIND)
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
@@ -73,9 +79,29 @@ class Locating(Trained):
         if (n := n_ranges(params)) % 16:
             raise PolicyError(f"{source}: needs 16 level beams or a multiple of them, {env.id} has {n}")
 
+    @property
+    def uses_map(self) -> bool:
+        """True once it has a map."""
+        return self.map is not None
+
+    @property
+    def takes_map(self) -> bool:
+        """True where it has learnt to take a map."""
+        return any(name.startswith(f"{memory.MAP}.") for name in self.tensors)
+
+    def with_map(self, params: EnvParams) -> "Locating":
+        """Returns the agent with the map of a task if it takes one; runs on the host. A way back is driven without."""
+        if not self.takes_map or self.hides_map or self.blind or params.errand != "stop":
+            return self
+        return dataclasses.replace(self, map=map_strip(params.tunnel))
+
+    def without_map(self) -> "Locating":
+        """Returns the agent with the same weights, and no map."""
+        return dataclasses.replace(self, map=None, hides_map=True, name=f"{self.name}, no map")
+
     def without_walls(self) -> "Locating":
         """Returns the agent with its learnt estimate cut out: the same weights, and nothing that the walls tell."""
-        return dataclasses.replace(self, blind=True, name=f"{self.name}, cut")
+        return dataclasses.replace(self, map=None, blind=True, name=f"{self.name}, cut")
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> Memory:
         """Begins at the believed start."""
@@ -89,7 +115,7 @@ class Locating(Trained):
 
     def _navigator(self, params: EnvParams) -> Navigator:
         mine, steering = parted(self.tensors)
-        locator = Locator(nested(mine), self.network, self.blind)
+        locator = Locator(nested(mine), self.network, self.map, self.blind)
         localiser = TwoWays(locator) if params.errand == "return" else locator
         learnt = LearntSteering(steering, self.frames) if steering else steering_of(params, CentreLine())
         return Navigator(localiser, learnt, name=self.name)
@@ -123,7 +149,7 @@ def check_tensors(agent: Locating) -> None:
     front = memory.front_of(agent.tensors)
     tensors, steering = parted(agent.tensors)
     check_steering(steering, agent.frames)
-    shapes = jax.eval_shape(lambda key: memory.init(agent.network, front, key), jax.random.key(0))
+    shapes = jax.eval_shape(lambda key: memory.init(agent.network, front, key, agent.takes_map), jax.random.key(0))
     wanted = flat(shapes)
     for name, leaf in wanted.items():
         if tensors[name].shape != leaf.shape:

@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.stations import Driven, Localiser, Station, believed_start
-from subterra_jax.policies.locate import bends, matching, memory, profiles, strips
+from subterra_jax.policies.locate import bends, map_filter, matching, memory, profiles, strips
 from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, N_ROW, Block, Estimate
+from subterra_jax.policies.locate.map_strip import MapStrip
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, REACH, WINDOW, Profiles
 from subterra_jax.policies.locate.streams import raw_rows
 
@@ -37,7 +38,9 @@ class LocatorMemory:
         raw: Sums of the scans in the parts of this metre.
         counts: Scans in each part.
         cell: Memory behind the front end.
-        estimate: Its last answer.
+        estimate: Its last answer, with what the map tells.
+        belief: Belief of the filter that takes a map; None without one.
+        passed: Correction of the metres that all beams have passed, without the map, m.
     """
 
     begin: Float[Array, ""]
@@ -53,6 +56,8 @@ class LocatorMemory:
     counts: Float[Array, "parts"]
     cell: Any
     estimate: Estimate
+    belief: map_filter.MapBelief | None
+    passed: Float[Array, ""]
 
 
 @struct.dataclass
@@ -62,18 +67,21 @@ class Locator(Localiser):
     Attributes:
         weights: As `memory.init` makes them, trained.
         network: Name of the memory.
+        map: The map; None has none.
         blind: Leave the evidence and the scans out: the ablation that shows what the walls tell.
     """
 
     weights: Any
     network: str = struct.field(pytree_node=False)
+    map: MapStrip | None = None
     blind: bool = struct.field(pytree_node=False, default=False)
 
     def begin(self, obs: Observed, params: Any) -> LocatorMemory:
         """Begins at the believed start."""
         zero = jnp.zeros(())
+        start, sigma = believed_start(obs, params)
         return LocatorMemory(
-            begin=believed_start(obs, params)[0],
+            begin=start,
             driven=zero,
             reading=obs.distance,
             steps=zero - 1.0,
@@ -86,6 +94,8 @@ class Locator(Localiser):
             counts=jnp.zeros(N_RECENT),
             cell=memory.start(self.network, self.weights),
             estimate=Estimate(zero, zero, jnp.log(jnp.full((), 0.05))),
+            belief=None if self.map is None else map_filter.start(self.weights[memory.MAP], sigma),
+            passed=zero,
         )
 
     def update(
@@ -98,22 +108,50 @@ class Locator(Localiser):
         ended = jnp.floor(at).astype(jnp.int32) > before.metres
         block, now = self._see(before, now, obs, driven, params, ended)
         cell, estimate = memory.step(self.network, self.weights, before.cell, block)
+        estimate, belief, passed = self._compare(before, now, estimate, params)
         kept = (before.cell, before.estimate, before.metres, before.read_before, before.steps_before)
+        kept += (before.belief, before.passed)
         new = (
             cell,
             estimate,
             before.metres + 1,
             before.read_before + block.read + 1.0,
             before.steps_before + block.steps,
+            belief,
+            passed,
         )
         new = jax.tree.map(lambda one, old: jnp.where(ended, one, old), new, kept)
         now = dataclasses.replace(
-            now, cell=new[0], estimate=new[1], metres=new[2], read_before=new[3], steps_before=new[4]
+            now,
+            cell=new[0],
+            estimate=new[1],
+            metres=new[2],
+            read_before=new[3],
+            steps_before=new[4],
+            belief=new[5],
+            passed=new[6],
         )
         since = at - now.metres
         station = now.begin + at + now.estimate.correction + now.estimate.share * since
         log_sigma = now.estimate.log_scale + jnp.log(_TO_SIGMA)
         return Station(station, jnp.maximum(log_sigma, jnp.log(0.01)), driven.direction), now
+
+    def _compare(
+        self, before: LocatorMemory, now: LocatorMemory, plain: Estimate, params: Any
+    ) -> tuple[Estimate, map_filter.MapBelief | None, Array]:
+        """Returns the estimate after the metre that may have ended, with the map; the belief, and what is passed."""
+        age = before.metres + 1.0
+        if self.map is None or before.belief is None:
+            return plain, before.belief, before.passed
+        passed, block = memory.passed(plain, age), before.metres - DELAY
+        weights = self.weights[memory.MAP]
+        seen = profiles.cut(now.window, BLOCK * block - map_filter.MARGIN, map_filter.N_SEEN)
+        here = self.map.of(params.tunnel)
+        ratio = map_filter.metre(weights, seen, here, now.begin, block, passed, passed - before.passed)
+        after = map_filter.advance(weights, before.belief, ratio, memory.log_rate(plain, age))
+        belief = jax.tree.map(lambda new, old: jnp.where(block >= 0, new, old), after, before.belief)
+        sigma = jnp.asarray(params.start.station_sigma, jnp.float32)
+        return map_filter.corrected(belief, plain, age, sigma), belief, passed
 
     def _see(
         self, before: LocatorMemory, now: LocatorMemory, obs: Observed, driven: Driven, params: Any, ended: Array

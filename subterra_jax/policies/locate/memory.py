@@ -11,12 +11,13 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.policies.locate import kalman, matching
+from subterra_jax.policies.locate import kalman, map_filter, matching
 from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block, Estimate, matched_inputs, raw_inputs
 from subterra_jax.policies.locate.recurrent import CELLS, HIDDEN, apply, dense
 
 Weights = dict[str, Any]
 FILTERED = "-kalman"
+MAP = "map"  # the weights that take a map
 NETWORKS = ("kalman", *CELLS, *(f"{name}{FILTERED}" for name in CELLS))
 FRONTS = ("match", "wide", "scans")
 _COMPARED = {"match": matching.SHARES, "wide": matching.WIDE_SHARES}
@@ -51,12 +52,23 @@ class Sums:
     age: Float[Array, ""]
 
 
-def init(network: str, front: str, key: PRNGKeyArray) -> Weights:
+def init(network: str, front: str, key: PRNGKeyArray, with_map: bool = False) -> Weights:
     """Returns untrained weights of a localiser.
 
+    Args:
+        network: One of `NETWORKS`.
+        front: One of `FRONTS`.
+        key: Source of randomness.
+        with_map: Add the filter that takes a map.
+
     Raises:
-        ValueError: There is no such network or front end, or a filter shall do without the front end.
+        ValueError: There is no such network or front end, a filter shall do without the front end, or a map be taken by
+            another than a network with its front end.
     """
+    if with_map:
+        if network not in CELLS or front != "match":
+            raise ValueError(f"a map is taken by {', '.join(CELLS)} with front match, not by {network} with {front}")
+        return {**init(network, front, key), MAP: map_filter.init(jax.random.fold_in(key, 2))}
     if network not in NETWORKS or front not in FRONTS:
         known = f"networks are {', '.join(NETWORKS)}; fronts are {', '.join(FRONTS)}"
         raise ValueError(f"no network {network!r} with front {front!r}; {known}")
@@ -85,6 +97,16 @@ def front_of(tensors: Any) -> str:
     shares = tensors.get("match.shares")
     wide = shares is not None and shares.shape == matching.WIDE_SHARES.shape
     return "scans" if shares is None else "wide" if wide else "match"
+
+
+def passed(estimate: Estimate, age: Array) -> Array:
+    """Returns the part of a network's correction that is of metres which all beams have passed, m."""
+    return estimate.correction - jnp.minimum(age, DELAY) * estimate.share
+
+
+def log_rate(estimate: Estimate, age: Array) -> Array:
+    """Returns the log of how fast a network says that its error grows; 0 is 3 cm after a metre."""
+    return estimate.log_scale - _log_scale(jnp.zeros(()), age)
 
 
 def start(network: str, weights: Weights) -> Any:

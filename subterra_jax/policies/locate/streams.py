@@ -9,7 +9,7 @@ from subterra_jax.policies.locate import matching, profiles
 from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, Block
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, Points, Profiles
 
-_BEFORE = 120  # bins of the profiles before the start
+BEFORE = 120  # bins of the profiles before the start
 _AFTER = 120  # bins behind the last metre
 
 
@@ -48,20 +48,23 @@ def reached(record: Record, n: int) -> Bool[Array, "n"]:
     return jnp.arange(1, n + 1) <= record.driven[-1]
 
 
+def profiles_of(record: Record, n: int) -> Profiles:
+    """Returns the profiles of `n` metres of a drive, with `BEFORE` bins before its start."""
+    where = (record.driven[:, None, None] + record.points.along) / BIN + BEFORE
+    return profiles.add_points(profiles.blank(BLOCK * n + BEFORE + _AFTER, record.points.n_sides), record.points, where)
+
+
 def _evidence(record: Record, weights: matching.Weights, n: int) -> Float[Array, "n n_shares"]:
     """Returns the evidence of the block `DELAY` metres before each metre."""
-    where = (record.driven[:, None, None] + record.points.along) / BIN + _BEFORE
-    whole = profiles.add_points(
-        profiles.blank(BLOCK * n + _BEFORE + _AFTER, record.points.n_sides), record.points, where
-    )
+    whole = profiles_of(record, n)
     features, there = matching.encode(weights, whole)
-    first = _BEFORE - matching.MARGIN - matching.LAGS  # of the first block's cut, in features
+    first = BEFORE - matching.MARGIN - matching.LAGS  # of the first block's cut, in features
 
     def one(block: Array) -> Float[Array, "n_shares"]:
         begin, width = first + BLOCK * block, BLOCK + 2 * matching.LAGS
         some = jax.lax.dynamic_slice_in_dim(features, begin, width, axis=2)
         weight = jax.lax.dynamic_slice_in_dim(there, begin, width, axis=2)
-        middle = lambda sums: jax.lax.dynamic_slice_in_dim(sums, _BEFORE + BLOCK * block, BLOCK, axis=2)  # noqa: E731
+        middle = lambda sums: jax.lax.dynamic_slice_in_dim(sums, BEFORE + BLOCK * block, BLOCK, axis=2)  # noqa: E731
         along = profiles.mean_along(Profiles(middle(whole.weight), middle(whole.out), middle(whole.along)))
         return matching.compare(weights, some, weight, along)
 
