@@ -86,3 +86,12 @@ def test_an_atlas_is_written_with_null_where_walls_tell_nothing(tmp_path, capsys
     assert set(inside) == {None}
     assert "nothing in 100 % of the cells" in capsys.readouterr().out
     assert Image.open(tmp_path / "atlas.png").size == (1100, 616)
+
+
+def test_an_agent_without_a_map_of_its_own_cannot_be_driven_without_one():
+    env, params = st.make("Subterra/StopAt-v1")
+    with pytest.raises(kinds.BenchmarkError, match="nomap:locate-transformer: has no map to go without"):
+        kinds.make_agent("nomap:locate-transformer", env, params)
+    with pytest.raises(kinds.BenchmarkError, match="nomap:fused: only a learnt localiser can be cut"):
+        kinds.make_agent("nomap:fused", env, params)
+    kinds.check(kinds.KindsConfig(agents=("nomap:locate-transformer", "cut:locate-transformer")))

@@ -87,8 +87,8 @@ def command(arguments: Command) -> None:
             label = f"cut:{name}" if blind else name
             rows[label], names_of[label] = table(within(agent, drives, blind), tunnel, kinds), name
         if agent.takes_map:
-            judge = scores.make_judge(agent.network, strip=map_strip(params.tunnel))
-            shares = judge(nested(agent.tensors), drives)
+            judge = scores.make_judge(agent.network)
+            shares = judge(nested(agent.tensors), drives, map_strip(params.tunnel))
             for case in scores.WITH_MAP:
                 label = f"{case}:{name}"
                 rows[label], names_of[label] = table(np.asarray(shares[case]), tunnel, kinds), name

@@ -30,15 +30,12 @@ def record(env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = FARTHES
     return drive(key)
 
 
-def make_judge(
-    network: str, last: int = FARTHEST, strip: MapStrip | None = None
-) -> Callable[[Any, Drive], dict[str, Array]]:
-    """Compiles a function of weights and recorded drives.
+def make_judge(network: str, last: int = FARTHEST) -> Callable[..., dict[str, Array]]:
+    """Compiles a function of weights, recorded drives and, for a network that takes one, the maps of their tunnels.
 
     Args:
         network: Name of the memory.
         last: Farthest goal, m.
-        strip: Maps of the tunnels, for a network that takes one.
 
     Returns:
         Of each drive `within` (share of goals from 60 to `last` m at which the estimate is right to 1 m), `error`
@@ -50,7 +47,7 @@ def make_judge(
     goals = jnp.arange(last) >= min(FIRST, last // 2) - 1
 
     @jax.jit
-    def judge(weights: Any, drives: Drive) -> dict[str, Array]:
+    def judge(weights: Any, drives: Drive, strip: MapStrip | None = None) -> dict[str, Array]:
         def errors(drive: Drive) -> dict[str, Array]:
             answers, truth, valid = estimate(network, weights, drive, last)
             error, use = jnp.abs(answers.correction - truth), goals & valid
@@ -77,19 +74,23 @@ def with_map(weights: Any, drive: Drive, answers: Any, truth: Array, use: Array,
     drawn = constants.INSIDE_SIGMA * jnp.clip(jax.random.normal(key), -3.0, 3.0)
     hidden = jnp.full((), constants.INSIDE_SIGMA)
     other = (drive.tunnel + 1) % strip.n_bins.shape[0]
-    sure = jnp.ones((), bool)
-    cases = {
-        "mapped": Told(zero, zero, drive.tunnel, zero, sure),
-        "hidden_mapped": Told(drawn, hidden, drive.tunnel, zero, sure),
-        "misled": Told(zero, zero, other, zero, ~sure),
-    }
-    found = {"hidden": jnp.sum(use & (jnp.abs(answers.correction - truth - drawn) <= 1.0)) / jnp.sum(use)}
-    for name, told in cases.items():
+    right = jnp.array([True, True, False])
+    cases = Told(
+        offset=jnp.stack([zero, drawn, zero]),
+        sigma=jnp.stack([zero, hidden, zero]),
+        tunnel=jnp.where(right, drive.tunnel, other),
+        shift=jnp.zeros(3),
+        right=right,
+    )
+
+    def share(told: Told) -> Array:
         beliefs, _ = believe(weights, drive, told, answers, strip)
         better = jax.vmap(map_filter.corrected, (0, 0, 0, None))(beliefs, answers, age, told.sigma)
-        error = jnp.abs(better.correction - truth - told.offset)
-        found[name] = jnp.sum(use & (error <= 1.0)) / jnp.sum(use)
-    return found
+        return jnp.sum(use & (jnp.abs(better.correction - truth - told.offset) <= 1.0)) / jnp.sum(use)
+
+    mapped, hidden_mapped, misled = jax.vmap(share)(cases)
+    alone = jnp.sum(use & (jnp.abs(answers.correction - truth - drawn) <= 1.0)) / jnp.sum(use)
+    return {"mapped": mapped, "hidden": alone, "hidden_mapped": hidden_mapped, "misled": misled}
 
 
 def by_kind(found: Found, tunnel: np.ndarray, names: list[str]) -> dict[str, dict[str, float]]:

@@ -178,7 +178,7 @@ class Session:
         self._strip = maps[0]
         learner = LocateLearner(env, params, arguments.config)
         self._iterate = jax.jit(jax.vmap(learner.iterate, in_axes=(0, None, None, None)), donate_argnums=0)
-        self._judge = scores.make_judge(arguments.config.network, strip=maps[1])
+        self._judge, self._val_strip = scores.make_judge(arguments.config.network), maps[1]
         self.state = jax.vmap(learner.init)(jnp.asarray(arguments.seeds))
         self.spent = 0.0  # s of training, with compiling
         if arguments.resume and has_checkpoint(arguments.out):
@@ -190,13 +190,13 @@ class Session:
 
     def judge(self, index: int) -> scores.Found:
         """Returns the scores of a seed on the recorded drives."""
-        return jax.device_get(self._judge(self.weights(index), self._drives))
+        return jax.device_get(self._judge(self.weights(index), self._drives, self._val_strip))
 
     def compile(self) -> None:
         """Compiles iteration and score, which the first of each would do otherwise."""
         left = jnp.float32(1.0)
         self._iterate = self._iterate.lower(self.state, self._params, left, self._strip).compile()
-        self._judge = self._judge.lower(self.weights(0), self._drives).compile()
+        self._judge = self._judge.lower(self.weights(0), self._drives, self._val_strip).compile()
 
     def train(self) -> None:
         """Trains until the time is over: logs every iteration, scores and saves now and then."""
