@@ -21,7 +21,7 @@ from scene.bore import Bore, load_bore
 from scene.errors import FitError, RecordingError, require_input
 from scene.report import drawings, sections
 from scene.report.alignment import AlignmentFit, Design, align_bore, design_of, read_design_table, turn_around
-from scene.report.clearance import Rails, bend, clearance, g1, read_gauge, read_rails
+from scene.report.clearance import CONTOURS, Rails, bend, clearance, contour, read_gauge, read_rails
 from scene.report.ifc import write_ifc
 from scene.report.landxml import read_landxml, write_landxml
 from scene.report.page import write_report
@@ -46,7 +46,7 @@ class ReportConfig:
         design: Design axis: LandXML, or CSV with CHAINAGE, EASTING, NORTHING, ELEVATION; gives the chainages.
         section: Design section: CSV of rows `left, up` about the axis, m; else `--radius`, else the bore's own median.
         radius: Design radius of a round bore, m.
-        gauge: Loading gauge: `g1`, or CSV of a closed polygon of rows `left, height over rail`, m.
+        gauge: Loading gauge: `ga`, `gb`, `gc`, or CSV of a closed polygon of rows `left, height over rail`, m.
         start: Chainage of station 0, m; that of the manifest if neither this nor a design is given.
         tolerance: Root mean square that an alignment of fewer elements may add to what many elements leave, m; if not
             given, elements are kept as long as the noise of the axis does not explain them.
@@ -57,7 +57,7 @@ class ReportConfig:
     design: Path | None = None
     section: Path | None = None
     radius: float | None = None
-    gauge: Literal["g1"] | Path = "g1"
+    gauge: Literal["ga", "gb", "gc"] | Path = "ga"
     start: float | None = None
     tolerance: float | None = None
 
@@ -76,7 +76,7 @@ def report(config: ReportConfig) -> Path:
     located = None if design is None else _locate(bore, design, config.design)
     chainage = _chainages(config, manifest, bore, design)
     section = _read_section(bore, config)
-    gauge = g1() if config.gauge == "g1" else read_gauge(Path(config.gauge))
+    gauge = contour(str(config.gauge)) if config.gauge in CONTOURS else read_gauge(Path(config.gauge))
     fit = align_bore(bore, str(manifest["name"]), origin, float(chainage[0]), config.tolerance)
     if chainage[-1] < chainage[0]:
         fit = dataclasses.replace(fit, alignment=turn_around(fit.alignment, float(chainage[-1])))
@@ -222,16 +222,23 @@ def _element_rows(fit: AlignmentFit, chainage: np.ndarray) -> tuple[list[tuple[s
     rows: tuple[list[tuple[str, ...]], list[tuple[str, ...]]] = ([], [])
     way = float(np.sign(chainage[-1] - chainage[0]))
     for number, part in enumerate((fit.plan, fit.profile)):
-        for one in part.elements:
-            ends = [_describe_bend(value) if number == 0 else f"{value:+.3%}" for value in (one.first, one.last)]
-            rows[number].append((one.kind, f"{chainage[0] + way * one.start:.2f} m", f"{one.length:.2f} m", *ends))
+        describe = _describe_bend if number == 0 else _describe_grade
+        for one, open_ in zip(part.elements, part.spread, strict=True):
+            length = f"{one.length:.2f} ± {open_.length:.2f} m"
+            ends = describe(one.first, open_.first), describe(one.last, open_.last)
+            rows[number].append((one.kind, f"{chainage[0] + way * one.start:.2f} m", length, *ends))
     return rows
 
 
-def _describe_bend(curvature: float) -> str:
+def _describe_bend(curvature: float, spread: float) -> str:
     if abs(curvature) < 1e-6:
         return "straight"
-    return f"{'left' if curvature > 0.0 else 'right'}, {abs(1.0 / curvature):.1f} m"
+    radius = abs(1.0 / curvature)
+    return f"{'left' if curvature > 0.0 else 'right'}, {radius:.1f} ± {radius**2 * spread:.1f} m"
+
+
+def _describe_grade(grade: float, spread: float) -> str:
+    return f"{grade:+.3%} ± {spread:.3%}"
 
 
 def main(words: list[str] | None = None) -> int:

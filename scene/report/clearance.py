@@ -19,12 +19,16 @@ from jaxtyping import Float
 from scene.bore import Bore
 from scene.errors import RecordingError, require_input
 
-# Upper part of the reference contour G1 of UIC 505-1, right half, distance from the middle and height over rail, m.
-# The side, 0.4 to 3.25 m, is as in the coordinates of GA, GB and GC, which share it with G1, in a public program for
-# gauges after EN 15273. The three points of the roof are from memory of the leaflet's figure, which could not be read:
-# check them against your own copy, or give a polygon of your own.
-_G1 = ((1.250, 0.400), (1.620, 0.400), (1.620, 1.170), (1.645, 1.170), (1.645, 3.250), (1.425, 3.700), (1.120, 4.010),
-       (0.525, 4.310))  # fmt: skip
+# Upper parts of the kinematic reference contours of 1435 mm track, right half from below, distance from the middle and
+# height over rail, m, of Spain's railway gauging instruction (Instrucción ferroviaria de gálibos, Orden FOM/1630/2015),
+# as two programs transcribe it with the same figures: github.com/Xema-Pastor/galibos_flet, datos_galibos.py at 057fb2a,
+# and a calculator of gauges by another hand. The order itself was not at hand: check them before you rely on them.
+_SIDE = ((1.620, 0.400), (1.620, 1.170), (1.645, 1.170))
+CONTOURS = {
+    "ga": (*_SIDE, (1.645, 3.250), (1.360, 3.880), (1.090, 4.080), (0.545, 4.350)),
+    "gb": (*_SIDE, (1.645, 3.250), (1.360, 4.110), (0.545, 4.350)),
+    "gc": (*_SIDE, (1.645, 3.550), (1.540, 4.700)),
+}
 _WIDEST = 60.0  # m; no section of a tunnel, and no gauge, is as large
 BOGIES, OVERHANG = 19.0, 3.7  # m; a passenger coach of 26.4 m
 
@@ -42,11 +46,11 @@ class Gauge:
     points: Float[np.ndarray, "k 2"]
 
 
-def g1() -> Gauge:
-    """Return the upper part of UIC G1, without allowances."""
-    right = np.array(_G1)
+def contour(name: str) -> Gauge:
+    """Return the upper part of a reference contour of `CONTOURS`, without allowances."""
+    right = np.array(CONTOURS[name])
     left = right[::-1] * [-1.0, 1.0]
-    return Gauge("UIC G1, upper part, roof from memory", np.concatenate([right, left]))
+    return Gauge(f"{name.upper()}, upper part", np.concatenate([right, left]))
 
 
 def read_gauge(path: Path) -> Gauge:

@@ -10,6 +10,10 @@ from scene.judging.page import STYLE, make_table
 
 _WORST = 12
 _APART = 5.0  # m between two worst places
+_SPREAD = (
+    "±: one standard deviation, by what the elements leave of the axis, if their number and kinds are right. A "
+    "clothoid between bends of nearly one slope has no sharp end, and its length is then as open as it says."
+)
 
 
 def write_report(
@@ -51,6 +55,7 @@ def write_report(
         if file == "alignment.png":
             for title, some in zip(("Elements in plan", "Elements in profile"), elements, strict=True):
                 parts.append(make_table(title, [("element", "begins", "length", "from", "to"), *some]))
+            parts.append(f"<p>{_SPREAD}</p>")
     files = [(file.name, _FILES.get(file.name, "")) for file in sorted(folder.iterdir())]
     parts.append(make_table("Beside this page", files))
     page = (

@@ -10,9 +10,9 @@ from scene.bore import POCKET, Bore, axis_through
 from scene.errors import RecordingError
 from scene.fitting.profile import section_angles
 from scene.report.alignment import Alignment, Piece, Vertical, align_bore, design_of, turn_around
-from scene.report.elements import correlated_noise, fit_plan, fit_profile
+from scene.report.elements import correlated_noise, find_spread, fit_plan, fit_profile
 from scene.report.landxml import read_landxml, write_landxml
-from scene.report.profiles import LEAST_ELEMENT, Profile, stepped
+from scene.report.profiles import LEAST_ELEMENT, PlanTarget, Profile, adjust, jacobian, stepped
 from scene.survey.alignment import draw_railway, lay_out, metro_elements
 
 ORIGIN = np.array([271_000.0, 2_103_000.0, -17.0])
@@ -150,6 +150,39 @@ def test_noise_is_told_from_its_correlation():
     assert alike == pytest.approx(2.0 * np.sqrt(np.pi) * 3.0, rel=0.2)  # integral of the correlation, a Gaussian
     assert correlated_noise(np.append(noise, [9.0] * 20), 0)[0] == pytest.approx(0.003, rel=0.1)
     assert correlated_noise(noise, 3000)[0] == pytest.approx(0.006, rel=0.1)
+
+
+@pytest.mark.parametrize("metres", [0.0, 2.0])
+def test_what_the_points_leave_open_is_what_fits_of_fresh_noise_differ_by(metres):
+    """White noise, and one that errs alike over some metres; one and the same railway with all of its elements told."""
+    elements, points, run = railway()
+    inner = (elements.plan > 1.0) & (elements.plan < 239.0)
+    knot = np.concatenate([[0.0], elements.plan[inner], run[-1:]])
+    value = np.interp(knot, elements.plan, elements.curvature)
+    number = {bend: k for k, bend in enumerate(dict.fromkeys(value[value != 0.0]))}
+    tie = np.array([number.get(bend, -1) for bend in value])
+    heading = np.arctan2(*(points[5] - points[0])[1::-1])
+    across = np.array([-np.sin(heading), np.cos(heading)])
+    clean = PlanTarget(points[:, :2], run, across)
+    truth = adjust(Profile(knot, value, np.array([*points[0, :2], heading])), tie, clean)
+    assert np.abs(clean.miss(truth)).max() < 1e-4
+    random, off, told = np.random.default_rng(8), [], []
+    for _ in range(30):
+        noise = random.normal(size=(len(points), 2))
+        noise = gaussian_filter1d(noise, metres, axis=0) if metres else noise
+        target = PlanTarget(points[:, :2] + 0.001 * noise / noise.std(), run, across)
+        fit = truth
+        for _ in range(3):  # a few millimetres of noise are soon linear
+            step = np.linalg.lstsq(jacobian(fit, tie, target, True), -target.miss(fit), rcond=1e-10)[0]
+            fit = stepped(fit, tie, step, True)
+        spread = find_spread(fit, tie, target)
+        off.append([*(np.diff(fit.knot) - np.diff(truth.knot)), *(fit.value - truth.value)[tie >= 0]])
+        told.append(
+            [*(one.length for one in spread), *(np.array([*(o.first for o in spread), spread[-1].last])[tie >= 0])]
+        )
+    share = np.sqrt(np.mean(np.square(off), axis=0) / np.mean(np.square(told), axis=0))
+    assert np.median(share) == pytest.approx(1.0, abs=0.2)
+    assert share == pytest.approx(1.0, abs=0.5)
 
 
 def test_a_ring_survey_is_fitted_at_its_rings_and_not_where_it_was_interpolated(bore: Bore):

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 
 import ezdxf
 import ifcopenshell
@@ -22,7 +23,7 @@ from scene.output import write_geometry
 from scene.report import drawings, sections
 from scene.report.__main__ import main
 from scene.report.alignment import align_bore, design_of
-from scene.report.clearance import Gauge, Rails, bend, clearance, g1, read_gauge, throw
+from scene.report.clearance import Gauge, Rails, bend, clearance, contour, read_gauge, throw
 from scene.report.landxml import read_landxml
 from scene.report.page import _apart
 from scene.writing.mjcf import SceneConfig
@@ -177,17 +178,20 @@ def test_a_gauge_that_is_no_polygon_is_refused(tmp_path, rows, sentence):
         read_gauge(tmp_path / "g.csv")
 
 
-def test_g1_is_a_polygon_of_its_known_size():
-    points = g1().points
-    assert np.ptp(points[:, 0]) == pytest.approx(3.29)
-    assert points[:, 1].max() == pytest.approx(4.31)
-    body = shapely.Polygon(points)
-    assert body.is_valid
-    # GA, GB and GC share its side and are wider above it.
-    assert not body.contains(shapely.Point(1.63, 0.8))
-    assert body.contains(shapely.Point(1.63, 1.2))
-    ga = [(1.62, 0.4), (1.62, 1.17), (1.645, 1.17), (1.645, 3.25), (1.36, 3.88), (1.09, 4.08), (0.545, 4.35)]
-    assert shapely.Polygon([*ga, *((-y, z) for y, z in ga[::-1])]).buffer(1e-6).contains(body)
+def test_the_contours_nest_and_have_their_known_sizes():
+    bodies = [shapely.Polygon(contour(name).points) for name in ("ga", "gb", "gc")]
+    for body, highest in zip(bodies, (4.35, 4.35, 4.70), strict=True):
+        assert body.is_valid
+        assert body.bounds == pytest.approx((-1.645, 0.4, 1.645, highest))
+        assert not body.contains(shapely.Point(1.63, 0.8))
+        assert body.contains(shapely.Point(-1.63, 1.2))
+    # GB adds the corners of semitrailers to GA, and GC those of whole lorries to GB.
+    ga, gb, gc = bodies
+    assert gb.buffer(1e-6).contains(ga)
+    assert gc.buffer(1e-6).contains(gb)
+    assert gb.contains(shapely.Point(1.35, 4.0))
+    assert not ga.contains(shapely.Point(1.35, 4.0))
+    assert gc.contains(shapely.Point(1.5, 4.6))
 
 
 def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
@@ -228,6 +232,8 @@ def test_the_folder_holds_what_surveyors_open(scene, bore: Bore, tmp_path):
     assert np.column_stack([points.x, points.y, points.z]) == pytest.approx(cloud_of(bore)[:3] + ORIGIN, abs=1e-3)
     page = (out / "report.html").read_text()
     assert "Clearance" in page
+    assert re.search(r">\d+\.\d\d ± \d+\.\d\d m<", page)  # lengths with what the points leave open
+    assert re.search(r">left, \d+\.\d ± \d+\.\d m<", page)
     assert page.count("data:image/png") == 4
     again = tmp_path / "again"
     assert main([str(scene), "--design", str(design), "--out", str(again)]) == 0
