@@ -28,6 +28,9 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 _CROWDED = 2.5e9
+_MANY_PROGRAMS = 25
+_COMPILED = "/jax/core/compile/backend_compile_duration"
+_since_looked = 0
 
 
 def pytest_collection_finish() -> None:
@@ -48,6 +51,48 @@ def bounded_memory() -> Iterator[None]:
     yield
     if _resident() > _CROWDED:
         jax.clear_caches()
+
+
+def _count_program(event: str, *_: object, **__: object) -> None:
+    """Counts programs that were compiled or read from the folder."""
+    global _since_looked
+    _since_looked += event == _COMPILED
+
+
+jax.monitoring.register_event_duration_secs_listener(_count_program)
+
+
+@pytest.fixture(autouse=True)
+def bounded_maps() -> Iterator[None]:
+    """Looks after every 25 programs or so whether memory maps run short."""
+    global _since_looked
+    yield
+    if _since_looked >= _MANY_PROGRAMS:
+        _since_looked = 0
+        forget_programs_where_maps_run_short()
+
+
+def forget_programs_where_maps_run_short() -> None:
+    """Forgets compiled programs once the process has half of the memory maps that Linux allows.
+
+    A program of XLA takes 20 to 600 of the 65,530; without any left LLVM returns nothing, and XLA ends the process by
+    a segmentation fault as it writes that to the folder.
+    """
+    if _maps() > 0.5 * _map_limit():
+        jax.clear_caches()
+        gc.collect()
+
+
+def _maps() -> int:
+    """Memory maps of this process; 0 where the system does not say."""
+    maps = Path("/proc/self/maps")
+    return maps.read_bytes().count(b"\n") if maps.exists() else 0
+
+
+def _map_limit() -> int:
+    """Memory maps that a process may have."""
+    limit = Path("/proc/sys/vm/max_map_count")
+    return int(limit.read_text()) if limit.exists() else 65_530
 
 
 def _resident() -> float:
