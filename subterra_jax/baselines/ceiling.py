@@ -9,41 +9,22 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
 
-from subterra_jax import lidar
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import commanded_cloud, log_weights, move, resample, summarise, weigh_odometer
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import FilterMemory, ParticleLocaliser, Relocaliser
 from subterra_jax.baselines.reckoning import Reckoning, reckon, unobserved_distance
-from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit
+from subterra_jax.baselines.scanmodel import ExactParams, ScanModel, exact_likelihood, fit
 from subterra_jax.baselines.stations import Driven, Station
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.parts.faults import MAX_DELAY, N_SEVERITIES
 from subterra_jax.state import EnvParams
-from subterra_jax.tunnel import at_station
 
 NAME = "ceiling"
 _LEAST_SIGMA = 0.01  # m
 _DENSE_LEAST, _DENSE_DUE = 0.02, 0.3  # shares of a cloud about a known start: below the second it is resampled
-_ECHO = 1e-3  # m below `range_max`: no echo
-
-
-@struct.dataclass
-class ExactParams:
-    """Likelihood of a scan that was cast at a particle.
-
-    Attributes:
-        pose_sigma: Standard deviation that a particle's offset and heading add to a range, m.
-        power: Exponent of the likelihood: scans share the errors of the particles.
-        lost: Share of the echoes that are lost or false, where there are faults; elsewhere a tenth of it.
-    """
-
-    pose_sigma: float = 0.02
-    power: float = 0.5
-    lost: float = 0.2
 
 
 @struct.dataclass
@@ -89,36 +70,6 @@ def with_known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reck
     share = known["severity"] / (N_SEVERITIES - 1)
     delay = jnp.clip(jnp.round(params.faults.delay * known["fault_delay"] * share), 0, MAX_DELAY).astype(jnp.int32)
     return dataclasses.replace(before, delay=delay, waiting=jnp.zeros_like(before.waiting))
-
-
-def exact_likelihood(
-    pose: TunnelPose, ranges: Float[Array, "n_beams"], params: EnvParams, exact: ExactParams
-) -> Float[Array, "n"]:
-    """Compute the log likelihood of a scan at many poses, each by casting its beams in the walls.
-
-    Args:
-        pose: Poses, each field `(n,)`.
-        ranges: The scan, m.
-        params: The task in the tunnel that the robot is in.
-        exact: Settings of the likelihood.
-    """
-    tunnel, sensor = params.tunnel, params.lidar
-
-    def cast(station: Array, lateral: Array, heading: Array) -> Array:
-        x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
-        position = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x])
-        return lidar.scan(tunnel, position, heading + jnp.arctan2(tangent_y, tangent_x), station, sensor)
-
-    expected = jax.vmap(cast)(pose.station, pose.lateral, pose.heading)
-    lost = exact.lost if "faults" in params.parts else 0.1 * exact.lost
-    lost = exact.lost if "obstacles" in params.parts else lost
-    variance = jnp.asarray(sensor.range_sigma) ** 2 + exact.pose_sigma**2
-    square = (ranges - expected) ** 2 / variance
-    normal = jnp.exp(-0.5 * square) / jnp.sqrt(2.0 * jnp.pi * variance)
-    seen = jnp.log((1.0 - lost) * normal + lost / jnp.asarray(sensor.range_max))
-    silent, empty = ranges >= sensor.range_max - _ECHO, expected >= sensor.range_max - _ECHO
-    nothing = jnp.where(empty, jnp.log1p(-0.5 * lost), jnp.log(0.5 * lost))
-    return exact.power * jnp.sum(jnp.where(silent[None], nothing, seen), axis=-1)
 
 
 def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator | Relocaliser:

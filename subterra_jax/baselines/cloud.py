@@ -172,18 +172,22 @@ def move(
     wet = jnp.where(flips, 1.0 - cloud.wet, cloud.wet)
     grip = 1.0 - params.slip_loss * wet
     distance = travelled * (1.0 + cloud.scale + cloud.wander) * grip + params.step_sigma * normal[0]
-    pose = cloud.pose
+    after = move_pose(walls, cloud.pose, distance, turned)
+    wander = jax.vmap(advance_wander, (0, None, 0, None))(cloud.wander, travelled, normal[1], params.wander)
+    return dataclasses.replace(cloud, pose=after, wander=wander, wet=wet)
+
+
+def move_pose(walls: WallMap, pose: TunnelPose, distance: Float[Array, "*n"], turned: Float[Array, ""]) -> TunnelPose:
+    """Moves poses by a distance (m) each and a turn (rad; NaN is that of the axis), along the map's curvature."""
     curvature = walls.curvature(pose.station)[2]
     turned = jnp.where(jnp.isnan(turned), curvature * distance, turned)
     middle = pose.heading + 0.5 * turned
     along = distance * jnp.cos(middle) / (1.0 - curvature * pose.lateral)
-    after = TunnelPose(
+    return TunnelPose(
         station=pose.station + along,
         lateral=pose.lateral + distance * jnp.sin(middle),
         heading=pose.heading + turned - curvature * along,
     )
-    wander = jax.vmap(advance_wander, (0, None, 0, None))(cloud.wander, travelled, normal[1], params.wander)
-    return dataclasses.replace(cloud, pose=after, wander=wander, wet=wet)
 
 
 def weigh_odometer(

@@ -3,7 +3,7 @@
 The filter finds the station by the pockets, width and curvature of the mapped walls.
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +84,17 @@ class ParticleLocaliser(Localiser):
         pose = fit_roughly(walls, pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
         return FilterMemory(new_cloud(cloud_key, pose, self.motion), begin_reckoning(obs), jnp.zeros((), jnp.int32))
 
+    def begin_anywhere(self, obs: Observed, params: EnvParams) -> FilterMemory:
+        """Spreads particles evenly along the tunnel, facing either way by turns."""
+        n, margin = self.n_particles, params.goal.margin
+        share = (jnp.arange(n) + 0.5) / n
+        heading = jnp.where(jnp.arange(n) % 2 == 0, 0.0, jnp.pi)
+        pose = TunnelPose(margin + (params.tunnel.length - 2.0 * margin) * share, jnp.zeros(n), heading)
+        walls = self.walls.pick(params.tunnel)
+        pose = fit_roughly(walls, pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
+        cloud = new_cloud(jax.random.key(self.seed), pose, self.motion)
+        return FilterMemory(cloud, begin_reckoning(obs), jnp.zeros((), jnp.int32))
+
     def update(
         self, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, FilterMemory]:
@@ -116,6 +127,13 @@ def particle_filter(params: EnvParams, n_particles: int | None = None) -> Naviga
     return Navigator(localiser, steering_of(params, CentreLine()), name="particle-filter", uses_map=True)
 
 
+class AnywhereLocaliser(Localiser, Protocol):
+    """A localiser that can begin without a start."""
+
+    def begin_anywhere(self, obs: Observed, params: EnvParams) -> Any:
+        """Returns the memory of a start that may be any place, in either direction."""
+
+
 @struct.dataclass
 class RelocaliserMemory:
     """Memory of the relocaliser.
@@ -129,7 +147,7 @@ class RelocaliserMemory:
         stopped: Whether the robot has stopped to report.
     """
 
-    filtered: FilterMemory
+    filtered: Any
     steering: Any
     command: Float[Array, "2"]
     travelled: Float[Array, ""]
@@ -141,8 +159,6 @@ class RelocaliserMemory:
 class Relocaliser(Agent):
     """Finds an unknown start: drives along the axis until the estimate has been sure for a while, then reports.
 
-    Particles begin everywhere, facing both ways.
-
     Attributes:
         filter: The filter.
         steering: The steering between the walls.
@@ -152,7 +168,7 @@ class Relocaliser(Agent):
     """
 
     uses_lidar = uses_map = True
-    filter: ParticleLocaliser
+    filter: AnywhereLocaliser
     steering: CentreLine
     sure_for: float = 30.0
     furthest: float = 0.9
@@ -165,18 +181,11 @@ class Relocaliser(Agent):
         return cls(ParticleLocaliser.of(params, n_particles), CentreLine())
 
     def begin(self, key: PRNGKeyArray, obs: Observed, params: EnvParams) -> RelocaliserMemory:
-        """Spreads particles evenly along the tunnel, facing either way by turns."""
+        """Begins with a filter that believes in every place alike, facing either way."""
         del key
-        n, margin = self.filter.n_particles, params.goal.margin
-        share = (jnp.arange(n) + 0.5) / n
-        heading = jnp.where(jnp.arange(n) % 2 == 0, 0.0, jnp.pi)
-        pose = TunnelPose(margin + (params.tunnel.length - 2.0 * margin) * share, jnp.zeros(n), heading)
-        walls, motion = self.filter.walls.pick(params.tunnel), self.filter.motion
-        pose = fit_roughly(walls, pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.filter.scan)
-        cloud = new_cloud(jax.random.key(self.filter.seed), pose, motion)
         zero = jnp.zeros(())
         return RelocaliserMemory(
-            filtered=FilterMemory(cloud, begin_reckoning(obs), jnp.zeros((), jnp.int32)),
+            filtered=self.filter.begin_anywhere(obs, params),
             steering=self.steering.begin(obs, params),
             command=jnp.zeros(2),
             travelled=zero,

@@ -13,6 +13,8 @@ from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.ceiling import NAME as BAYES
 from subterra_jax.baselines.ceiling import ceiling
 from subterra_jax.baselines.fused import FusedCount
+from subterra_jax.baselines.histogram import NAME as HISTOGRAM
+from subterra_jax.baselines.histogram import histogram_filter
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import particle_agent
 from subterra_jax.baselines.rings.grid import ring_filter
@@ -105,4 +107,5 @@ register("ring-filter", ring_filter)
 _navigator(CEILING, Truth(), CentreLine())
 register("scan-matching", scan_matching)
 register("particle-filter", particle_agent)
+register(HISTOGRAM, histogram_filter)
 register(BAYES, ceiling)

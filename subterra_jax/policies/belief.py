@@ -18,6 +18,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.histogram import Summary
 from subterra_jax.baselines.navigator import TURN_SPEED
 from subterra_jax.baselines.rings import loop as rings
 from subterra_jax.baselines.steering import CentreLine, Corridor
@@ -253,7 +254,7 @@ class Belief(Trained):
         gain = jax.lax.map(score_block, jnp.asarray(self._tape).reshape(-1, _BLOCK))
         return gain.swapaxes(0, 1).reshape(2, -1)
 
-    def _decide(self, now: BeliefMemory, best: belief_grid.Summary, obs: Observed, params: EnvParams) -> BeliefMemory:
+    def _decide(self, now: BeliefMemory, best: Summary, obs: Observed, params: EnvParams) -> BeliefMemory:
         """Decides to stop, or to turn round: at a mouth more can be seen the other way."""
         habits, turning = self.habits, now.turn.active
         sure = best.mass >= habits.sure_mass

@@ -6,27 +6,11 @@ falling stations, positions count from the far mouth. Errors of dead reckoning s
 
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
+
+from subterra_jax.baselines import histogram
 
 FORWARD = np.array([[1.0], [-1.0]], np.float32)
-
-
-@struct.dataclass
-class Summary:
-    """Most likely place of a belief.
-
-    Attributes:
-        station: Mean station of the heaviest cluster, m.
-        sigma: Standard deviation of the whole belief about `station`, m, whatever the direction.
-        mass: Share of the belief in that cluster.
-        direction: 1 where it faces growing stations, else −1.
-    """
-
-    station: Float[Array, ""]
-    sigma: Float[Array, ""]
-    mass: Float[Array, ""]
-    direction: Float[Array, ""]
 
 
 def cell_positions(n_cells: int, cell: float) -> Float[np.ndarray, "n_cells"]:
@@ -87,7 +71,7 @@ def turn_round(
 
 def summarise(
     log_mass: Float[Array, "2 n"], station: Float[Array, "2 n"], reach: Float[Array, ""], cell: float
-) -> Summary:
+) -> histogram.Summary:
     """Finds the heaviest cluster of a belief.
 
     Args:
@@ -96,22 +80,4 @@ def summarise(
         reach: Half the length of a cluster, m.
         cell: Length of a cell, m.
     """
-    mass = jnp.exp(log_mass)
-    near = _mass_within(mass, jnp.maximum(jnp.round(reach / cell), 1.0).astype(jnp.int32))
-    # All cells about a narrow peak have it within reach; the small term picks the peak itself.
-    best = jnp.argmax(near + 0.01 * mass)
-    way, at = best // mass.shape[1], best % mass.shape[1]
-    inside: Bool[Array, "2 n"] = jnp.abs(station - station[way, at]) <= reach + 0.5 * cell
-    cluster = mass * inside * (jnp.arange(2)[:, None] == way)
-    share = jnp.maximum(jnp.sum(cluster), 1e-12)
-    middle = jnp.sum(cluster * station) / share
-    sigma = jnp.sqrt(jnp.sum(mass * (station - middle) ** 2))
-    return Summary(middle, sigma, share, 1.0 - 2.0 * way)
-
-
-def _mass_within(mass: Float[Array, "2 n"], reach: Array) -> Float[Array, "2 n"]:
-    """Returns the mass within `reach` cells of each cell."""
-    n = mass.shape[1]
-    total = jnp.concatenate([jnp.zeros((2, 1)), jnp.cumsum(mass, axis=1)], axis=1)
-    index = jnp.arange(n)
-    return total[:, jnp.minimum(index + reach + 1, n)] - total[:, jnp.maximum(index - reach, 0)]
+    return histogram.summarise(jnp.exp(log_mass), station, reach, cell)

@@ -1,0 +1,289 @@
+"""A histogram filter on the map of a tunnel: every place is a cell, and each cell casts the whole scan in the walls.
+
+Cells lie on a tape of starts. A robot that began at position u of the tape and has driven a way of W is at u + W, or at
+u - W where it faces falling stations, so that driving moves no mass. A second axis holds the relative error of dead
+reckoning, which lasts: mass of a row slides by that share of each step. So sixty metres of faint relief count together,
+where a filter that forgets its scale must find it anew.
+
+Source: Burgard et al. 1996, Estimating the absolute position of a mobile robot using position probability grids.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from subterra_jax.baselines.agent import Known, Observed, range_sigma
+from subterra_jax.baselines.avoidance import steering_of
+from subterra_jax.baselines.cloud import cloud_params, move_pose
+from subterra_jax.baselines.navigator import Navigator
+from subterra_jax.baselines.particle import Relocaliser
+from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
+from subterra_jax.baselines.scanmodel import ExactParams, ScanModel, TunnelPose, exact_likelihood, fit, fit_roughly
+from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
+from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.wallmap import WallMap, wall_map
+from subterra_jax.parts.wander import WanderParams
+from subterra_jax.state import EnvParams
+
+NAME = "histogram-filter"
+CELL = 0.05  # m
+WINDOW = 25.0  # m to either side of a told start: three standard deviations of dead reckoning over 320 m
+N_SCALES, MOST_SCALE = 17, 0.04  # rows of the error of dead reckoning, from minus to plus the second
+CLUSTER = 0.8  # of the tolerance: half the length of what counts as one place
+_FLOOR = -80.0  # log of the least mass of a cell: what was ruled out once may come back
+_OUTSIDE = -30.0  # log likelihood of a scan beyond a mouth
+_LEAST_SIGMA = 0.01  # m
+
+
+@struct.dataclass
+class Summary:
+    """Most likely place of a belief.
+
+    Attributes:
+        station: Mean station of the heaviest cluster, m.
+        sigma: Standard deviation of the whole belief about `station`, m, whatever the direction.
+        mass: Share of the belief in that cluster.
+        direction: 1 where it faces growing stations, else -1.
+    """
+
+    station: Float[Array, ""]
+    sigma: Float[Array, ""]
+    mass: Float[Array, ""]
+    direction: Float[Array, ""]
+
+
+def summarise(
+    mass: Float[Array, "ways n"], station: Float[Array, "ways n"], reach: Float[Array, ""], cell: float
+) -> Summary:
+    """Finds the heaviest cluster of a belief.
+
+    Args:
+        mass: The belief, which sums to 1; the first row faces growing stations, a second one falling stations.
+        station: Stations of the cells, m.
+        reach: Half the length of a cluster, m.
+        cell: Length of a cell, m.
+    """
+    near = _mass_within(mass, jnp.maximum(jnp.round(reach / cell), 1.0).astype(jnp.int32))
+    # All cells about a narrow peak have it within reach; the small term picks the peak itself.
+    best = jnp.argmax(near + 0.01 * mass)
+    way, at = best // mass.shape[1], best % mass.shape[1]
+    inside = jnp.abs(station - station[way, at]) <= reach + 0.5 * cell
+    cluster = mass * inside * (jnp.arange(mass.shape[0])[:, None] == way)
+    share = jnp.maximum(jnp.sum(cluster), 1e-12)
+    middle = jnp.sum(cluster * station) / share
+    sigma = jnp.sqrt(jnp.sum(mass * (station - middle) ** 2))
+    return Summary(middle, sigma, share, 1.0 - 2.0 * way)
+
+
+def _mass_within(mass: Float[Array, "ways n"], reach: Array) -> Float[Array, "ways n"]:
+    """Returns the mass within `reach` cells of each cell."""
+    n = mass.shape[1]
+    total = jnp.concatenate([jnp.zeros((mass.shape[0], 1)), jnp.cumsum(mass, axis=1)], axis=1)
+    index = jnp.arange(n)
+    return total[:, jnp.minimum(index + reach + 1, n)] - total[:, jnp.maximum(index - reach, 0)]
+
+
+@struct.dataclass
+class WayNoise:
+    """Errors of a dead-reckoned way.
+
+    Attributes:
+        scale_sigma: Standard deviation of the relative error that lasts an episode, 1.
+        wander: The relative error that changes along the way.
+        step_sigma: Standard deviation of the noise of one step, m.
+    """
+
+    scale_sigma: float
+    wander: WanderParams
+    step_sigma: float
+
+
+@struct.dataclass
+class HistogramMemory:
+    """Memory of the filter.
+
+    Attributes:
+        log_mass: Log of the belief; by direction, error of dead reckoning and cell of the tape.
+        lateral: Offset to the left of the centreline at each cell, m.
+        heading: Heading against the tangent of growing station at each cell, rad.
+        origin: Station of the tape's beginning, m.
+        way: Dead-reckoned way along the axis, m; less where the robot has turned back.
+        reckoning: Dead reckoning.
+    """
+
+    log_mass: Float[Array, "ways n_scales n"]
+    lateral: Float[Array, "ways n"]
+    heading: Float[Array, "ways n"]
+    origin: Float[Array, ""]
+    way: Float[Array, ""]
+    reckoning: Reckoning
+
+
+@struct.dataclass
+class HistogramLocaliser(Localiser):
+    """Estimates the station from dead reckoning and scans, by a belief over cells.
+
+    Attributes:
+        walls: The map, for offset and heading of each cell.
+        noise: Errors of dead reckoning.
+        scan: Errors of the LiDAR, for offset and heading.
+        exact: Settings of the likelihood.
+        odometer_share: Weight of the odometer against the command.
+        n_cells: Cells of the tape.
+        cell: Length of a cell, m.
+    """
+
+    walls: WallMap
+    noise: WayNoise
+    scan: ScanModel
+    odometer_share: float
+    exact: ExactParams
+    n_cells: int = struct.field(pytree_node=False, default=0)
+    cell: float = struct.field(pytree_node=False, default=CELL)
+
+    @classmethod
+    def of(cls, params: EnvParams, exact: ExactParams | None = None, cell: float = CELL) -> "HistogramLocaliser":
+        """Makes a localiser for the map of a task, which may be a stack, and for its nominal errors; on the host."""
+        nominal = cloud_params(params)
+        span = float(np.max(np.asarray(params.tunnel.length))) if params.errand == "report" else 2.0 * WINDOW
+        return cls(
+            walls=wall_map(params.tunnel),
+            noise=WayNoise(float(nominal.scale_sigma), nominal.wander, float(nominal.step_sigma)),
+            scan=ScanModel(range_sigma=range_sigma(params)),
+            odometer_share=odometer_share(params),
+            exact=exact or ExactParams(),
+            n_cells=int(np.ceil(span / cell)),
+            cell=cell,
+        )
+
+    def begin(self, obs: Observed, params: EnvParams) -> HistogramMemory:
+        """Returns a belief about the told start, as wide as it is uncertain."""
+        start = told_start(obs, params)
+        origin = start - 0.5 * self.n_cells * self.cell
+        sigma = jnp.maximum(jnp.asarray(params.start.station_sigma, jnp.float32), 0.5 * self.cell)
+        log_mass = -0.5 * ((self._tape(origin) - start) / sigma) ** 2
+        return self._memory(log_mass[None], origin, obs, params)
+
+    def begin_anywhere(self, obs: Observed, params: EnvParams) -> HistogramMemory:
+        """Returns an even belief along the tunnel, facing either way."""
+        tape, margin = self._tape(jnp.zeros(())), jnp.asarray(params.goal.margin)
+        inside = (tape >= margin) & (tape <= params.tunnel.length - margin)
+        log_mass = jnp.where(inside, 0.0, _FLOOR)
+        return self._memory(jnp.stack([log_mass, log_mass]), jnp.zeros(()), obs, params)
+
+    def update(
+        self, memory: HistogramMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
+    ) -> tuple[Station, HistogramMemory]:
+        """Advances by dead reckoning and a scan."""
+        del known
+        walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
+        range_max = jnp.asarray(params.lidar.range_max)
+        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
+        along = distance * self._cosine(memory)
+        mass = self._slide(jnp.exp(memory.log_mass), along)
+        way = memory.way + along
+        now = dataclasses.replace(memory, way=way, reckoning=reckoning)
+        pose = move_pose(walls, self._poses(memory), distance, turn)
+        _, pose = fit(walls, dataclasses.replace(pose, station=self._stations(now)), obs.ranges, range_max, self.scan)
+        log_mass = jnp.log(mass) + self._score(pose, obs, params)[:, None, :]
+        log_mass = _normalised(log_mass)
+        now = dataclasses.replace(now, log_mass=log_mass, lateral=pose.lateral, heading=pose.heading)
+        return self._estimate(now, reckoning, params), now
+
+    def _tape(self, origin: Float[Array, ""]) -> Float[Array, " n"]:
+        """Stations of the cells before any driving, m."""
+        return origin + self.cell * (jnp.arange(self.n_cells) + 0.5)
+
+    def _stations(self, memory: HistogramMemory) -> Float[Array, "ways n"]:
+        """Stations of the cells now, m."""
+        sign = jnp.asarray((1.0, -1.0))[: memory.log_mass.shape[0], None]
+        return self._tape(memory.origin) + sign * memory.way
+
+    def _poses(self, memory: HistogramMemory) -> TunnelPose:
+        return TunnelPose(self._stations(memory), memory.lateral, memory.heading)
+
+    def _memory(
+        self, log_mass: Float[Array, "ways n"], origin: Float[Array, ""], obs: Observed, params: EnvParams
+    ) -> HistogramMemory:
+        """Returns the memory of a belief over cells: each row of errors has its share of the mass."""
+        sigma = jnp.hypot(self.noise.scale_sigma, self.noise.wander.sigma)
+        rows = -0.5 * (jnp.asarray(_scales()) / jnp.maximum(sigma, 1e-6)) ** 2
+        ways = log_mass.shape[0]
+        heading = jnp.broadcast_to(jnp.asarray((0.0, np.pi), jnp.float32)[:ways, None], log_mass.shape)
+        zero = jnp.zeros(())
+        memory = HistogramMemory(
+            log_mass=_normalised(log_mass[:, None, :] + rows[:, None]),
+            lateral=jnp.zeros_like(heading),
+            heading=heading,
+            origin=origin,
+            way=zero,
+            reckoning=begin_reckoning(obs),
+        )
+        walls, range_max = self.walls.pick(params.tunnel), jnp.asarray(params.lidar.range_max)
+        pose = fit_roughly(walls, self._poses(memory), obs.ranges, range_max, self.scan)
+        return dataclasses.replace(memory, lateral=pose.lateral, heading=pose.heading)
+
+    def _cosine(self, memory: HistogramMemory) -> Float[Array, ""]:
+        """Cosine of the angle between the robot and its first direction, by the heaviest cell; -1 after a turn."""
+        cell = jnp.sum(jnp.exp(memory.log_mass), axis=1)
+        best = jnp.argmax(cell)
+        turned = memory.heading.reshape(-1)[best] - jnp.pi * (best // cell.shape[1])
+        return jnp.cos(turned)
+
+    def _slide(self, mass: Float[Array, "ways n_scales n"], along: Float[Array, ""]) -> Float[Array, "ways n_scales n"]:
+        """Slides each row of errors by its share of a step, and spreads what the step adds to errors and way."""
+        noise, size = self.noise, jnp.abs(along)
+        change = 2.0 * noise.wander.sigma**2 / noise.wander.length * size / (_scales()[1] - _scales()[0]) ** 2
+        mass = _spread(mass, jnp.minimum(change, 0.5), axis=1)
+        sign = jnp.asarray((1.0, -1.0))[: mass.shape[0], None, None]
+        shift = sign * jnp.asarray(_scales())[:, None] * along / self.cell
+        before, after = jnp.maximum(shift, 0.0), jnp.maximum(-shift, 0.0)
+        wide = jnp.pad(mass, ((0, 0), (0, 0), (1, 1)), mode="edge")
+        mass = (1.0 - before - after) * mass + before * wide[..., :-2] + after * wide[..., 2:]
+        share = jnp.where(size > 0.0, jnp.minimum((noise.step_sigma / self.cell) ** 2, 0.5), 0.0)
+        return jnp.maximum(_spread(mass, share, axis=2), np.float32(np.exp(_FLOOR)))
+
+    def _score(self, pose: TunnelPose, obs: Observed, params: EnvParams) -> Float[Array, "ways n"]:
+        """Computes the log likelihood of a scan in every cell."""
+        flat = jax.tree.map(jnp.ravel, pose)
+        gain = exact_likelihood(flat, obs.ranges, params, self.exact).reshape(pose.station.shape)
+        return jnp.where((pose.station > 0.0) & (pose.station < params.tunnel.length), gain, gain.max() + _OUTSIDE)
+
+    def _estimate(self, memory: HistogramMemory, reckoning: Reckoning, params: EnvParams) -> Station:
+        """Returns the middle of the heaviest cluster, with what is driven and not yet observed."""
+        mass = jnp.sum(jnp.exp(memory.log_mass), axis=1)
+        reach = CLUSTER * jnp.asarray(params.goal.tolerance)
+        best = summarise(mass, self._stations(memory), reach, self.cell)
+        direction = best.direction * jnp.where(self._cosine(memory) > 0.0, 1.0, -1.0)
+        station = best.station + direction * unobserved_distance(reckoning, jnp.asarray(params.vehicle.period))
+        return Station(station, jnp.log(jnp.maximum(best.sigma, _LEAST_SIGMA)), direction)
+
+
+def _scales() -> np.ndarray:
+    """Relative errors of the rows, 1."""
+    return np.linspace(-MOST_SCALE, MOST_SCALE, N_SCALES, dtype=np.float32)
+
+
+def _spread(mass: Float[Array, "a b c"], variance: Float[Array, ""], axis: int) -> Float[Array, "a b c"]:
+    """Spreads mass over neighbours by a variance in squares of a cell, at most 0.5."""
+    pads = [(1, 1) if i == axis else (0, 0) for i in range(mass.ndim)]
+    wide = jnp.pad(mass, pads, mode="edge")
+    low, high = (jax.lax.slice_in_dim(wide, first, first + mass.shape[axis], axis=axis) for first in (0, 2))
+    return mass + 0.5 * variance * (low + high - 2.0 * mass)
+
+
+def _normalised(log_mass: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Scales a belief to a sum of 1, with no cell below the floor."""
+    return jnp.maximum(log_mass - jax.scipy.special.logsumexp(log_mass), _FLOOR)
+
+
+def histogram_filter(params: EnvParams, exact: ExactParams | None = None) -> Navigator | Relocaliser:
+    """Makes the filter with the steering and the mission of the other baselines."""
+    localiser = HistogramLocaliser.of(params, exact)
+    if params.errand == "report":
+        return Relocaliser(localiser, CentreLine(), name=NAME)
+    return Navigator(localiser, steering_of(params, CentreLine()), name=NAME, uses_map=True)
