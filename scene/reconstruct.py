@@ -14,6 +14,7 @@ from scene.cloud import Cloud
 from scene.errors import FitError, RecordingError, require_input
 from scene.fitting.assemble import bore_from_sections, describe_bore, find_fold
 from scene.fitting.centreline import CentrelineConfig, smooth_axis
+from scene.fitting.gauge import look_again
 from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
 from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
 from scene.fitting.section import Sections, fit_sections
@@ -176,7 +177,9 @@ def reconstruct(
         if kind == "recording":
             known = load_tum(trajectory) if trajectory else load_control(control) if control else None
             parts = (config.voxel, config.reading, progress, partial)
-            return _fit_recording(register_recording(detected.path, known, calibration, *parts), config, progress)
+            registered = register_recording(detected.path, known, calibration, *parts)
+            built = _fit_recording(registered, config, progress)
+            return replace(built, seen=_look_again(detected.path, registered, built, config.reading, progress))
         if kind == "cloud":
             cloud = load_cloud(detected.path, config.voxel, config.reading, progress, partial)
             return _fit_cloud(cloud, config, progress)
@@ -192,6 +195,17 @@ def _fit_recording(registered: Registered, config: ReconstructConfig, progress: 
     except FitError as error:
         doubt = registered.facts.get("pose_doubt")
         raise FitError(f"{doubt}; no bore can be fitted to them ({error})" if doubt else str(error)) from error
+
+
+def _look_again(
+    path: Path, registered: Registered, built: Reconstruction, reading: ReadingConfig, progress: Stages
+) -> SeenTrack:
+    """Return the tracks with the gauge that the recording's single returns show."""
+    if registered.located is None or all(line.rails is None for line in built.seen.lines):
+        return built.seen
+    with Recording(path, reading.topic, reading.format) as recording:
+        poses, returns = registered.located.trajectory, registered.cloud.returns
+        return look_again(recording, poses, built.origin, returns, built.bore, built.seen, progress)
 
 
 _ARBITRARY = "arbitrarily: a registered cloud tells no direction, and --reverse turns it"

@@ -1,6 +1,6 @@
 """Rails where the cloud shows them: two narrow ridges of one height, side by side all along the bore."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,8 @@ _WINDOWS = (2.0, 6.0)  # m along: so long that a bin of one holds some points
 _POINTS = 8
 _BIN = 0.02  # m across
 _LOW = (-0.10, 0.80)  # above the floor, m
-_NARROW = 9  # bins: what is broader is a sleeper, a kerb or a walkway
+# Bins: what is broader is a sleeper, a kerb or a walkway; poses a centimetre or two off broaden rails, too.
+_NARROW = (9, 13)
 _RIDGE = 0.07  # m that a rail stands over what is beside it
 _APART = (0.95, 1.80)  # of the middles of two heads, m
 _CANT = 0.16  # difference of two heads' heights, m
@@ -21,6 +22,7 @@ _DRIFT = 0.5  # m that a track's place under the axis may change by from window 
 _HEAD = 0.06  # m to each side of the middle of a head
 _HEAD_LAYER = 0.02  # above and below the most frequent height, m
 _FACE = (0.012, 0.045)  # below the top of the head, m; gauge is measured 14 to 16 mm below it
+_CLEAR_FACE = (0.016, 0.032)  # the same of single returns, clear of the rounded edge and of what lies below a head, m
 _TOP = 0.010  # above and below the top of the head, m
 _FACE_BAND = 0.015  # m between the edge of the top and the face below it
 _FACE_BLUR = 0.004  # m
@@ -41,7 +43,7 @@ class SeenRails:
     offset: Float[np.ndarray, " k"]  # Of the middle of the track to the left of the axis there, m
     cant: Float[np.ndarray, " k"]  # Height of the left head over the right one, m
     apart: float  # Distance of the middles of the heads, about, m
-    gauge: float  # Distance of the heads' inner faces, 12 to 45 mm below their tops, m; NaN where too few are seen
+    gauge: float  # Distance of the heads' inner faces below their tops, m; NaN where too few are seen
     spread: float  # Standard deviation of the gauge from piece to piece, m
     pieces: int  # Pieces of track that show a gauge
     top: float  # Median height of the heads' tops above the floor, m
@@ -68,6 +70,14 @@ def find_rails(
     `upward` is their height above the axis, which cant is measured in. Returns one entry for each track, from the
     right to the left; none where no pair is seen along half of the bore.
     """
+    found = (_find_pairs(station, lateral, height, upward, narrow) for narrow in _NARROW)
+    return max(found, key=len)  # the first of those with as many tracks
+
+
+def _find_pairs(
+    station: np.ndarray, lateral: np.ndarray, height: np.ndarray, upward: np.ndarray, narrow: int
+) -> list[SeenRails]:
+    """Finds pairs of ridges that are narrower than some bins; see `find_rails`."""
     low = (height > _LOW[0]) & (height < _LOW[1])
     station, lateral, height, upward = station[low], lateral[low], height[low], upward[low]
     if len(station) < 100:
@@ -80,7 +90,7 @@ def find_rails(
     pairs = []
     for k in range(count):
         rows = order[bounds[k] : bounds[k + 1]]
-        pairs += [(k, *pair) for pair in _pairs_of(*_ridges(lateral[rows], height[rows]))]
+        pairs += [(k, *pair) for pair in _pairs_of(*_ridges(lateral[rows], height[rows], narrow))]
     if not pairs:
         return []
     window, middle, apart, top = np.array(pairs).T
@@ -97,7 +107,7 @@ def find_rails(
         if len(index) >= _MIN_SEEN * count:
             at = (edges[index] + edges[index + 1]) / 2
             offset = median_filter(middle[alike][rows], 3, mode="nearest")
-            tracks.append(_measure(station, lateral, height, upward, at, offset, float(usual)))
+            tracks.append(_measure(station, lateral, height, upward, at, offset, float(usual), _FACE))
     tracks.sort(key=lambda track: -len(track.station))
     alone = [
         track for k, track in enumerate(tracks)
@@ -106,8 +116,25 @@ def find_rails(
     return sorted(alone, key=lambda track: float(np.median(track.offset)))
 
 
-def _ridges(lateral: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return place across and height of narrow ridges in one window, m."""
+def measure_again(
+    rails: SeenRails,
+    station: Float[np.ndarray, " n"],
+    lateral: Float[np.ndarray, " n"],
+    height: Float[np.ndarray, " n"],
+    upward: Float[np.ndarray, " n"],
+) -> SeenRails:
+    """Return rails with the gauge that single returns near them show, as they were where these show none sharply.
+
+    The returns are given as `find_rails` takes points; those from nearer than some metres had better be left out.
+    """
+    if len(station) < _FACE_RETURNS:
+        return rails
+    found = _measure(station, lateral, height, upward, rails.station, rails.offset, rails.apart, _CLEAR_FACE)
+    return replace(rails, gauge=found.gauge, spread=found.spread, pieces=found.pieces) if found.measured else rails
+
+
+def _ridges(lateral: np.ndarray, height: np.ndarray, narrow: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return place across and height of ridges in one window that are narrower than some bins, m."""
     if len(lateral) < 20:
         return np.empty(0), np.empty(0)
     first = lateral.min()
@@ -121,8 +148,8 @@ def _ridges(lateral: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.nda
     left = top[known[np.clip(place - 1, 0, len(known) - 1)]]
     right = top[known[np.clip(place, 0, len(known) - 1)]]
     top = np.where(np.isnan(top), np.minimum(left, right), top)  # behind a rail nothing is seen
-    padded = np.pad(top, _NARROW, mode="edge")
-    high = (padded - grey_opening(padded, _NARROW))[_NARROW:-_NARROW] > _RIDGE
+    padded = np.pad(top, narrow, mode="edge")
+    high = (padded - grey_opening(padded, narrow))[narrow:-narrow] > _RIDGE
     ends = np.flatnonzero(np.diff(np.concatenate([[0], high.astype(int), [0]])))
     middles = [first + (a + b) / 2 * _BIN for a, b in zip(ends[::2], ends[1::2], strict=True)]
     tops = [float(np.median(top[a:b])) for a, b in zip(ends[::2], ends[1::2], strict=True)]
@@ -167,8 +194,12 @@ def _measure(
     at: np.ndarray,
     offset: np.ndarray,
     apart: float,
+    face: tuple[float, float],
 ) -> SeenRails:
-    """Measures gauge, cant and height of one track, whose middle lies at `offset` where `at` says, m."""
+    """Measures gauge, cant and height of one track, whose middle lies at `offset` where `at` says, m.
+
+    `face` is the layer below the heads' tops that their inner faces are looked for in, m.
+    """
     for _ in range(2):
         across = lateral - np.interp(station, at, offset)
         block = np.clip(np.searchsorted((at[1:] + at[:-1]) / 2, station), 0, len(at) - 1)
@@ -186,7 +217,7 @@ def _measure(
         for side in (1, -1):
             inside = (pieces == piece) & near[side]
             below = (height - tops[side][block])[inside]
-            faces.append(_inner_edge((side * across)[inside], below))
+            faces.append(_inner_edge((side * across)[inside], below, face))
         gauges.append(sum(faces))
     gauge = np.array(gauges)[np.isfinite(gauges)]
     levels = [_block_medians(upward, block, rows, len(at)) for rows in heads.values()]
@@ -235,7 +266,7 @@ def _block_medians(value: np.ndarray, block: np.ndarray, rows: np.ndarray, count
     return result
 
 
-def _inner_edge(across: np.ndarray, above: np.ndarray) -> float:
+def _inner_edge(across: np.ndarray, above: np.ndarray, face: tuple[float, float]) -> float:
     """Distance from the track's middle where a head ends on its inner side, m.
 
     NaN where too few returns show it, or poses blur it.
@@ -247,7 +278,7 @@ def _inner_edge(across: np.ndarray, above: np.ndarray) -> float:
     if len(top) < _FACE_RETURNS:
         return np.nan
     edge = float(np.mean(top) - np.sqrt(3.0) * np.std(top))  # of what is spread evenly over a head
-    side = across[(above < -_FACE[0]) & (above > -_FACE[1])]
+    side = across[(above < -face[0]) & (above > -face[1])]
     side = side[np.abs(side - edge) < _FACE_BAND]
     if len(side) < _FACE_RETURNS or np.std(side) > _FACE_SHARP:
         return np.nan

@@ -62,7 +62,7 @@ def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
 
     On a round invert nothing is looked for but rails.
     """
-    station, lateral, upward, height = _above_floor(cloud, bore)
+    station, lateral, upward, height = above_floor(cloud.points.astype(np.float64), bore)
     lines = []
     for rails in find_rails(station, lateral, height, upward):
         # Sleepers need no better than 5 cm, and so depend on little else.
@@ -78,9 +78,9 @@ def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
     return SeenTrack(tuple(lines), sought=True)
 
 
-def _above_floor(cloud: Cloud, bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Station, lateral offset, and height above the axis and the floor of the points low in the bore, m."""
-    station, lateral, upward = bore.axis.local(cloud.points.astype(np.float64))
+def above_floor(points: Float[np.ndarray, "n 3"], bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return station, lateral offset, and height above the axis and the floor of the points low in the bore, m."""
+    station, lateral, upward = bore.axis.local(points)
     widest = float(np.median(bore.width)) / 2 - _WALL
     low = (upward < 0) & (np.abs(lateral) < widest) & (station > 0) & (station < bore.length)
     station, lateral, upward = station[low], lateral[low], upward[low]

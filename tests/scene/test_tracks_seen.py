@@ -13,8 +13,7 @@ from scene.fitting import rails as rails_seen
 from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
-from scene.fitting.trackseen import SeenTrack, find_track
-from scene.fitting.trackseen import _above_floor as above_floor
+from scene.fitting.trackseen import SeenTrack, above_floor, find_track
 from scene.judging.trackdoubt import doubt_track
 from scene.output import write_geometry
 from scene.writing.mjcf import SceneConfig
@@ -60,6 +59,11 @@ def scanned(name: str, sensor: str = "os1") -> tuple[Cloud, Bore]:
 @functools.cache
 def seen_in(name: str, sensor: str = "os1") -> SeenTrack:
     return find_track(*scanned(name, sensor))
+
+
+def low_points(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    cloud, bore = scanned(name)
+    return above_floor(cloud.points.astype(np.float64), bore)
 
 
 def f1(bore: Bore, cloud: Cloud, stations: np.ndarray) -> float:
@@ -119,7 +123,7 @@ def test_cant_is_measured():
 
 
 def test_the_gauge_of_a_canted_track_is_that_of_its_own_plane():
-    station, lateral, upward, height = above_floor(*scanned("proud"))
+    station, lateral, upward, height = low_points("proud")
     gauges = []
     for lean in np.radians([0.0, 7.0]):  # the very same track on its side, by as much as railways are canted
         across = lateral * np.cos(lean) - upward * np.sin(lean)
@@ -217,7 +221,7 @@ def test_sleepers_that_nobody_saw_are_said_to_stand_by_the_spacing():
 
 
 def test_a_gauge_between_faces_that_poses_blur_is_not_measured(monkeypatch):
-    station, lateral, upward, height = above_floor(*scanned("proud"))
+    station, lateral, upward, height = low_points("proud")
     blurred = lateral + np.random.default_rng(1).normal(0.0, 0.012, len(lateral))
     (line,) = rails_seen.find_rails(station, blurred, height, upward)
     assert not line.measured
