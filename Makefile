@@ -56,6 +56,10 @@ tunnels: $(STAMP)  ## make the packaged bores in three dimensions again; the pla
 		--provenance simulated --name subterra-351 --out build/subterra-351
 	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --reconstruct.lining.clock-angle 0.61 \
 		--out build/metro-asbuilt
+	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-universal \
+		--reconstruct.lining.kind universal --reconstruct.lining.seed 0 --out build/metro-universal
+	cp build/metro-universal/tunnel.npz subterra_jax/data/metro-universal.npz
+	cp build/metro-universal/manifest.json subterra_jax/data/metro-universal.json
 	for name in subterra-351 metro-asbuilt; do \
 		cp build/$$name/tunnel.npz subterra_jax/data/$$name-solid.npz; \
 	done

@@ -130,6 +130,8 @@ class Bore:
     stretch: Shaped[np.ndarray, " t"] = field(default_factory=lambda: np.empty(0, STRETCH))
     # Bolts that bridge two pockets across a joint, `(b,)` of `NAIL`
     nail: Shaped[np.ndarray, " b"] = field(default_factory=lambda: np.empty(0, NAIL))
+    # Ring joints by standard, where `ring_station` has the surveyed rings, m; else empty
+    ring_joint: Float[np.ndarray, " j"] = field(default_factory=lambda: np.empty(0))
 
     @property
     def length(self) -> float:

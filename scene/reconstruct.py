@@ -19,6 +19,7 @@ from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining
 from scene.fitting.rings import bore_from_rings, compare_with_design, fit_rings
 from scene.fitting.section import Sections, fit_sections
 from scene.fitting.trackseen import SeenTrack, find_track
+from scene.fitting.universal import joints_by_number
 from scene.poses.calibration import UNCALIBRATED, Calibration
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.locate import Located, locate_by_control, locate_by_odometry, locate_given
@@ -275,7 +276,9 @@ def _fit_ring_survey(path: Path, config: ReconstructConfig, progress: Stages) ->
     print(f"detected: {describe({'kind': 'ring survey', **survey.facts})}", flush=True)
     fit = fit_rings(survey)
     origin = np.floor(np.median(fit.centre, axis=0))
-    bore, provenance = add_standard_lining(bore_from_rings(fit, origin), config.lining, flat_floor=False)
+    smooth = bore_from_rings(fit, origin)
+    joints = joints_by_number(fit.names, smooth.ring_station)
+    bore, provenance = add_standard_lining(smooth, config.lining, flat_floor=False, joints=joints)
     facts = {
         "kind": "ring survey",
         **survey.facts,

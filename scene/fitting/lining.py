@@ -5,6 +5,7 @@ middle of the mouth at that depth come from it or from nothing; the rim, the sid
 """
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -15,6 +16,7 @@ from scene.cloud import Cloud
 from scene.fitting.assemble import FREE
 from scene.fitting.pockets import FLOOR_MARGIN, could_show_pockets, find_pockets
 from scene.fitting.section import Sections
+from scene.fitting.universal import place_pockets
 
 _APART = (0.25, 0.80)  # m between the middles of two pockets of a pair
 _SAME_ROW = 0.12  # m around
@@ -135,7 +137,13 @@ class LiningConfig:
 
     # Put such a lining in, but not where the survey could have shown one, or where the walls are no even section.
     by_standard: bool = True
-    ring_width: float = 1.5  # Width of a ring, m. Source: 1.5 m, Guangzhou line 21; 1.2–1.5 m in use.
+    # Rows of pockets across ring joints; or universal rings, each turned to the place of its key segment, with pockets
+    # at the joints within a ring (scene/fitting/universal.py has the sources).
+    kind: Literal["straight", "universal"] = "straight"
+    seed: int = 0  # Seed of the turns of universal rings.
+    # Width of a ring, m. Universal rings of a ring survey are as wide as their numbers tell. Source: 1.5 m, Guangzhou
+    # line 21; 1.2–1.5 m in use.
+    ring_width: float = 1.5
     # Pockets on each side of a joint, spread evenly over the crown between the lowest two. An assumption: metro rings
     # have 10 to 17 longitudinal bolts, the lowest below the track.
     pockets_per_ring: int = 8
@@ -147,9 +155,15 @@ class LiningConfig:
     # wall in a section of 5.65 m × 6.36 m. In a round one of 5.8 m that is at 0.61; at 0.70 the plane passes between
     # two rows and the lining is smooth to the robot.
     clock_angle: float = 0.70
+    # Angle below the horizontal beyond which universal rings show no pockets, rad. Ours: there a filling carries the
+    # track.
+    filled_angle: float = 0.90
     stagger: float = 0.0  # Shift of every second joint's pockets, as a share of their spacing; 0 for straight rows.
     nail_diameter: float = 0.027  # Diameter of a nail, m. Source: bolts M24 to M30.
     nail_depth: float = 0.06  # Depth of its axis behind the wall, m. An assumption: mid-pocket.
+
+
+_NO_JOINTS = np.empty(0)
 
 
 def add_lining(
@@ -169,21 +183,52 @@ def add_lining(
     return add_standard_lining(bore, config, sections.flat_floor)
 
 
-def add_standard_lining(bore: Bore, config: LiningConfig, flat_floor: bool) -> tuple[Bore, dict[str, str]]:
+def add_standard_lining(
+    bore: Bore, config: LiningConfig, flat_floor: bool, joints: Float[np.ndarray, " j"] = _NO_JOINTS
+) -> tuple[Bore, dict[str, str]]:
     """Return a smooth bore with the lining of the configuration, marked as not measured; ring stations it has are kept.
 
-    A flat floor, the lowest part of the section, gets no pockets.
+    A flat floor, the lowest part of the section, gets no pockets. `joints` are ring joints that the survey tells, m,
+    between which universal rings stand.
     """
+    if config.kind == "universal" and config.by_standard:
+        return _add_universal_lining(bore, config, flat_floor, joints)
     rings = {"rings": MEASURED} if len(bore.ring_station) else {"rings": STANDARD}
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)
-    types = bore.section_type[np.clip(np.searchsorted(bore.station, joints), 0, len(bore.station) - 1)]
-    joints = joints[types != FREE]
+    joints = joints[_is_even(bore, joints)]
     pockets = _standard_pockets(bore, joints, config, flat_floor)
     if not config.by_standard or not len(pockets):
         provenance = rings if len(bore.ring_station) else {"rings": "none"}
         return bore, {**provenance, "pockets": "none: the survey cannot show them", "nails": "none"}
     bore = replace(bore, pocket=pockets, ring_station=bore.ring_station if len(bore.ring_station) else joints)
     return _add_nails(bore, None, config, {**rings, "pockets": STANDARD})
+
+
+def _add_universal_lining(
+    bore: Bore, config: LiningConfig, flat_floor: bool, told: Float[np.ndarray, " j"]
+) -> tuple[Bore, dict[str, str]]:
+    joints = told if len(told) else np.arange(config.ring_width / 2, bore.length, config.ring_width)
+    offset = config.pocket_offset / float(bore.radius.mean())
+    station, angle = place_pockets(joints, config.seed, offset)
+    keep = _is_even(bore, station) & (np.sin(angle) > -np.sin(config.filled_angle))
+    pockets = _make_pockets(bore, station[keep], angle[keep], config, flat_floor)
+    surveyed = len(bore.ring_station) > 0
+    if not len(pockets):
+        none = {"pockets": "none: the survey cannot show them", "nails": "none"}
+        return bore, {"rings": MEASURED if surveyed else "none", **none}
+    joints = joints[_is_even(bore, joints)]
+    bore = replace(bore, pocket=pockets, ring_joint=joints if surveyed else bore.ring_joint)
+    return bore if surveyed else replace(bore, ring_station=joints), {
+        "rings": f"{MEASURED}, those between by their numbers" if len(told) else MEASURED if surveyed else STANDARD,
+        "pockets": f"{STANDARD}, turns drawn with seed {config.seed}",
+        "nails": "none: ring joints by standard have dowels",
+    }
+
+
+def _is_even(bore: Bore, station: Float[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+    """Return where the section is of a type that segments make."""
+    row = np.clip(np.searchsorted(bore.station, station), 0, len(bore.station) - 1)
+    return np.asarray(bore.section_type[row] != FREE)
 
 
 def _standard_pockets(
@@ -194,8 +239,15 @@ def _standard_pockets(
     spacing = rows[1] - rows[0] if len(rows) > 1 else 0.0
     turn = np.where(np.arange(len(joints)) % 2 == 1, config.stagger * spacing, 0.0)
     station = joints[:, None, None] + config.pocket_offset * np.array([-1.0, 1.0])[None, :, None] + 0 * rows
-    angle = np.angle(np.exp(1j * (rows[None, None] + turn[:, None, None]))) + 0 * station
-    station, angle = station.ravel(), angle.ravel()
+    angle = rows[None, None] + turn[:, None, None] + 0 * station
+    return _make_pockets(bore, station.ravel(), angle.ravel(), config, flat_floor)
+
+
+def _make_pockets(
+    bore: Bore, station: Float[np.ndarray, " p"], angle: Float[np.ndarray, " p"], config: LiningConfig, flat_floor: bool
+) -> Shaped[np.ndarray, " p"]:
+    """Return pockets at these places by growing station, but none in a mouth or a flat floor."""
+    angle = np.angle(np.exp(1j * angle))
     length, width = config.pocket_size
     keep = (station > length) & (station < bore.length - length)
     if flat_floor:

@@ -81,15 +81,16 @@ def half_widths(walls: Walls, bore: Bore) -> Float[np.ndarray, " n"]:
 
 
 def ring_pitch(bore: Bore) -> float:
-    """Return the distance from ring joint to ring joint, m; 0 where there are none.
+    """Return the distance from ring joint to ring joint, to a millimetre as on drawings, m; 0 where there are none.
 
-    A ring survey may have only some of its rings; the joints are then those that the laid nails bridge.
+    A ring survey may have only some of its rings; the joints are then those of its lining by standard, or those that
+    the laid nails bridge.
     """
-    joints = bore.ring_station
-    if not has_rings(bore):
+    joints = bore.ring_joint if len(bore.ring_joint) else bore.ring_station
+    if not len(bore.ring_joint) and not has_rings(bore):
         at = np.sort(bore.nail["station"])
         joints = at[np.diff(at, prepend=-np.inf) > _SAME_JOINT]
-    return float(np.median(np.diff(joints))) if len(joints) > 1 else 0.0
+    return round(float(np.median(np.diff(joints))), 3) if len(joints) > 1 else 0.0
 
 
 def save_tunnel(

@@ -1,6 +1,7 @@
 """Tunnel files: what is wrong with a broken one is said with its file and its field."""
 
 import hashlib
+import itertools
 
 import numpy as np
 import pytest
@@ -115,7 +116,7 @@ def test_a_digest_tells_tunnels_apart_and_is_that_of_the_file_where_there_is_one
     assert tunnel_digest("procedural:test:1") == tunnel_digest("procedural:test:1")
 
 
-def test_both_packaged_tunnels_load_by_name():
+def test_the_packaged_tunnels_load_by_name():
     assert st.load_tunnel().name == st.load_tunnel("subterra-351").name == "subterra-351"
     metro = st.load_tunnel("metro-asbuilt")
     assert metro.provenance == "measured"
@@ -133,3 +134,22 @@ def test_the_packaged_pockets_cross_the_plane_of_the_lidar_on_both_walls(name):
         recessed = away > 0.6 * depth
         rings = np.unique(np.round(wall.station[recessed] / plan.ring_pitch))
         assert len(rings) > 0.8 * plan.length / plan.ring_pitch
+
+
+def test_universal_rings_stand_in_the_plane_of_the_lidar_only_now_and_then():
+    plan = st.load_tunnel("metro-universal")
+    assert plan.provenance == "measured"
+    assert plan.ring_pitch == 1.4
+    assert plan.length == st.load_tunnel("metro-asbuilt").length
+    pocket = plan.shell.linings["pockets"].pocket
+    rings = np.unique(pocket[:, 0])
+    np.testing.assert_allclose(np.median(np.diff(rings)), 1.4, atol=1e-3)
+    assert not len(plan.shell.linings["smooth"].pocket)
+    angle = [set(np.round(pocket[pocket[:, 0] == ring, 1], 6)) for ring in rings]
+    assert not any(a & b for a, b in itertools.pairwise(angle))
+    wall = plan.lining("pockets").left
+    centre = np.stack([np.interp(wall.station, plan.station, plan.centre[:, i]) for i in (0, 1)], axis=1)
+    away = np.hypot(*(wall.vertex - centre).T) - np.interp(wall.station, plan.station, plan.half_width)
+    met = np.unique(np.round(wall.station[away > 0.06] / plan.ring_pitch))
+    assert 0.2 < len(met) / len(rings) < 0.6
+    assert len(np.unique(np.diff(met))) > 4  # at no even distance
