@@ -209,7 +209,11 @@ class LocateLearner:
         total, terms = loss(answers, truth, valid, counts)
         if told is None or strip is None:
             return total, terms
-        taught, further = jax.vmap(lambda *one: map_loss(weights, *one, strip))(drive, told, answers, truth, valid)
+
+        def one(drive: Drive, told: Told, answers: Any, truth: Array, valid: Array) -> tuple[Array, dict[str, Array]]:
+            return map_loss(weights, drive, told, answers, truth, valid, strip)
+
+        taught, further = jax.vmap(one)(drive, told, answers, truth, valid)
         terms |= {name: jnp.sum(value) / counts[0] for name, value in further.items()}
         return total + jnp.sum(taught) / counts[0], terms
 

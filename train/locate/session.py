@@ -123,7 +123,7 @@ def run(arguments: Command) -> None:
     n_train = len(tunnels.names_of(arguments.tunnels))
     env, params = tunnels.enter(arguments.task, everything[:n_train], arguments.sensor)
     val_env, val_params = tunnels.enter(arguments.task, everything[n_train:], arguments.sensor)
-    maps = (None, None)
+    maps: Any = (None, None)
     if arguments.config.map:
         maps = (
             tunnels.map_of(everything[:n_train], params.tunnel),
@@ -177,8 +177,9 @@ class Session:
         self._arguments, self._env, self._params, self._drives = arguments, env, params, drives
         self._strip = maps[0]
         learner = LocateLearner(env, params, arguments.config)
-        self._iterate = jax.jit(jax.vmap(learner.iterate, in_axes=(0, None, None, None)), donate_argnums=0)
-        self._judge, self._val_strip = scores.make_judge(arguments.config.network), maps[1]
+        self._iterate: Any = jax.jit(jax.vmap(learner.iterate, in_axes=(0, None, None, None)), donate_argnums=0)
+        self._judge: Any = scores.make_judge(arguments.config.network)
+        self._val_strip = maps[1]
         self.state = jax.vmap(learner.init)(jnp.asarray(arguments.seeds))
         self.spent = 0.0  # s of training, with compiling
         if arguments.resume and has_checkpoint(arguments.out):

@@ -109,8 +109,15 @@ class Locator(Localiser):
         block, now = self._see(before, now, obs, driven, params, ended)
         cell, estimate = memory.step(self.network, self.weights, before.cell, block)
         estimate, belief, passed = self._compare(before, now, estimate, params)
-        kept = (before.cell, before.estimate, before.metres, before.read_before, before.steps_before)
-        kept += (before.belief, before.passed)
+        kept = (
+            before.cell,
+            before.estimate,
+            before.metres,
+            before.read_before,
+            before.steps_before,
+            before.belief,
+            before.passed,
+        )
         new = (
             cell,
             estimate,
