@@ -20,7 +20,7 @@ from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
 from benchmarks.slam.board_page import as_markdown as board_markdown
 from benchmarks.slam.board_page import as_png as board_png
-from benchmarks.slam.board_page import as_table as board_table
+from benchmarks.slam.board_page import as_section as board_section
 from benchmarks.slam.board_page import split_page
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
@@ -83,7 +83,7 @@ def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | SubmissionC
             _progress.print(f"{name}: {result}")
         board = _write_board(config.out)
         if page is not None and config.page is not None:
-            write_file(config.page, board_table(board).join(page).encode())
+            write_file(config.page, board_section(board).join(page).encode())
     elif isinstance(config, SubmissionConfig):
         print("\n".join(check_submission(config)))
     else:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from benchmarks.command import BenchmarkError
 from benchmarks.results import png_bytes
+from benchmarks.slam.inertial import PROGRAMS
 
 Row = dict[str, Any]
 _DIAL = ("walls-smooth", "walls-joints", "walls-pockets", "walls-furnished", "walls-sprayed")
@@ -64,6 +65,20 @@ def as_markdown(board: dict[str, Any]) -> str:
     )
     failed = [f"- {one}" for one in _failures(board["rows"])]
     return "\n".join([as_table(board), note, "", *(["Failed:", "", *failed, ""] if failed else [])])
+
+
+def as_section(board: dict[str, Any]) -> str:
+    """Returns what stands between the marks of a page: table, the command of each row, and what did not start."""
+    versions = sorted({f"{PROGRAMS[row['program']]} {row['version']}" for row in board["rows"]
+                       if row["program"] in PROGRAMS and row.get("version")})  # fmt: skip
+    words = "--recordings SET --out POSES"
+    command = (
+        f"The command of a row, its first column being NAME: `python -m benchmarks.slam run --library NAME {words}`"
+        + (f" ({', '.join(versions)})" if versions else "")
+        + "; then `python -m benchmarks.slam score --estimate POSES --truth SET/truth`."
+    )
+    failed = [f"- {one}" for one in _failures(board["rows"])]
+    return "\n".join([as_table(board), command, "", *(["*Failed*:", "", *failed, ""] if failed else [])])
 
 
 def split_page(path: Path) -> tuple[str, str]:

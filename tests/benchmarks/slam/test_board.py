@@ -127,7 +127,9 @@ def test_runs_of_other_days_stand_on_the_board_beside_new_ones(sets, tmp_path):
     out = tmp_path / "out"
     assert command(["board", "--runs", str(path), "--out", str(out), "--page", str(page)]) == 0
     assert page.read_text().startswith("Before.\n<!-- arena -->\n| program | runs |")
-    assert page.read_text().endswith("| | | |\n<!-- end of arena -->\nBehind.\n")
+    assert "| | | |\n\nThe command of a row" in page.read_text()
+    assert "`python -m benchmarks.slam run --library NAME --recordings SET --out POSES`;" in page.read_text()
+    assert page.read_text().endswith("- other on walls-sprayed: crashed (one)\n<!-- end of arena -->\nBehind.\n")
     assert "| other | 2 | 100 | failed | 0.250 | 4 (1/1) | 50 % |" in page.read_text()
     assert json.loads((out / "board.json").read_text())["floors"][0]["gate"] == 0.002
     assert (out / "board.png").is_file()
