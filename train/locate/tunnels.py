@@ -5,6 +5,7 @@ import functools
 import multiprocessing
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.sources import resolve
 
 PLANAR = SENSORS[0]
+_EACH = 4  # planar tunnels that take as long to make as a process to begin
 
 
 def names_of(names: str) -> list[str]:
@@ -49,13 +51,11 @@ def load(names: list[str], lining: str | None = None, cache: Path | None = None,
     Raises:
         TunnelError: There is no such tunnel or lining.
     """
-    one = functools.partial(_tunnel, lining=lining, cache=cache, spatial=sensor != PLANAR)
-    workers = min(len(names), os.cpu_count() or 1)
-    if workers <= 1:
-        return [one(name) for name in names]
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
-        return list(pool.map(one, names, chunksize=1))
+    spatial = sensor != PLANAR
+    one = functools.partial(_tunnel, lining=lining, cache=cache, spatial=spatial)
+    missing = [name for name in names if not _is_kept(name, lining, cache, spatial)]
+    made = dict(zip(missing, _in_processes(one, missing, 1 if spatial else _EACH), strict=True))
+    return [made[name] if name in made else one(name) for name in names]
 
 
 def map_of(made: list[Tunnel], tunnel: Tunnel) -> MapStrip:
@@ -65,18 +65,22 @@ def map_of(made: list[Tunnel], tunnel: Tunnel) -> MapStrip:
         made: Its tunnels.
         tunnel: The tunnel or the stack.
     """
-    workers = min(len(made), os.cpu_count() or 1)
+    return join(_in_processes(walls_of, made, 2 * _EACH), tunnel)
+
+
+def _in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> list[Any]:
+    """Returns the results of a function of this module or another, by so many processes that each has `each` items."""
+    workers = min(-(-len(items) // each), os.cpu_count() or 1)
     if workers <= 1:
-        return join([walls_of(one) for one in made], tunnel)
+        return [work(item) for item in items]
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(workers, context, initializer=_on_cpu) as pool:
-        return join(list(pool.map(walls_of, made, chunksize=1)), tunnel)
+        return list(pool.map(work, items, chunksize=1))
 
 
 def _tunnel(name: str, lining: str | None, cache: Path | None, spatial: bool = False) -> Tunnel:
     """Returns a tunnel whose arrays are of the host, so that they go from one process to another."""
-    bore = "-bore" if spatial else ""
-    kept = None if cache is None else cache / f"{VERSION}-{name}-{lining}{bore}.pickle".replace("/", "_")
+    kept = _kept(name, lining, cache, spatial)
     if kept is not None and kept.is_file():
         return pickle.loads(kept.read_bytes())
     made = jax.device_get(resolve(name, lining, None, constants.RANGE_MAX, spatial))
@@ -85,6 +89,17 @@ def _tunnel(name: str, lining: str | None, cache: Path | None, spatial: bool = F
         with replace_file(kept) as fresh:
             fresh.write_bytes(pickle.dumps(made))
     return made
+
+
+def _kept(name: str, lining: str | None, cache: Path | None, spatial: bool) -> Path | None:
+    """Returns the file in which a tunnel is kept."""
+    bore = "-bore" if spatial else ""
+    return None if cache is None else cache / f"{VERSION}-{name}-{lining}{bore}.pickle".replace("/", "_")
+
+
+def _is_kept(name: str, lining: str | None, cache: Path | None, spatial: bool) -> bool:
+    kept = _kept(name, lining, cache, spatial)
+    return kept is not None and kept.is_file()
 
 
 def _on_cpu() -> None:
