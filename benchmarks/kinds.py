@@ -45,6 +45,7 @@ TUNED_ON = {
     "ring-count": _OLD,
     "ring-filter": _OLD,
     "particle-filter": f"{_OLD}; has the map, told the sizes of the errors",
+    "histogram-filter": "nothing: has the map, told the sizes of the errors",
     "scan-matching": _OLD,
     "ceiling": "nothing: has the map, told the sizes of the errors and of each episode's faults",
     "oracle": "nothing: told the truth",

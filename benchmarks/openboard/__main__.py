@@ -2,8 +2,9 @@
 
 `python -m benchmarks.openboard --tasks StopAt Return --out out/openboard`
 
-Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. `--report-only` writes
-tables and picture of the cells that are there.
+Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. All cells together are
+`cells.jsonl`. `--report-only` writes tables and picture of the cells that are there, or of those in a file `--cells`:
+`benchmarks/openboard/cells.jsonl` holds those of the docs.
 """
 
 import dataclasses
@@ -50,6 +51,7 @@ class OpenboardConfig:
         memory: Memory that driving may take at once, GB; an agent that needs more is driven in parts of the episodes.
         cache: Folder in which made tunnels are kept from run to run.
         report_only: Drive nothing.
+        cells: File of cells to report in place of those in `out`, with `report_only`.
     """
 
     out: Path
@@ -62,6 +64,7 @@ class OpenboardConfig:
     memory: float = 8.0
     cache: Path | None = None
     report_only: bool = False
+    cells: Path | None = None
 
 
 def run(config: OpenboardConfig) -> None:
@@ -76,6 +79,8 @@ def run(config: OpenboardConfig) -> None:
     if not config.memory > 0.0:
         raise BenchmarkError(f"memory must be above 0, got {config.memory}")
     require_folder(config.out)
+    if config.cells is not None and not (config.report_only and config.cells.is_file()):
+        raise BenchmarkError(f"{config.cells}: --cells takes a file, with --report-only")
     missing = [
         (task, agent)
         for task in config.tasks
@@ -84,7 +89,8 @@ def run(config: OpenboardConfig) -> None:
     ]
     if missing and not config.report_only:
         _drive(config, missing)
-    cells = report.read_cells(config.out / "cells", conditions(config))
+    cells = report.read_cells(config.cells or config.out / "cells", conditions(config))
+    write_file(config.out / "cells.jsonl", "".join(json.dumps(cell) + "\n" for cell in cells).encode())
     write_file(config.out / "openboard.md", report.as_markdown(cells).encode())
     write_file(config.out / "openboard.png", report.as_png(cells))
     print(config.out / "openboard.md")

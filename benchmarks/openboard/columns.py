@@ -23,6 +23,7 @@ AGENTS = (
     "ring-filter",
     "scan-matching",
     "particle-filter",
+    "histogram-filter",
     "ceiling",
 )
 FIRST = {"val": 100}  # index of the first tunnel: the searches of settings had those before

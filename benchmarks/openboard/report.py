@@ -23,21 +23,40 @@ TUNED_ON = {
     "ring-filter": "`subterra-351`, older family",
     "scan-matching": "`subterra-351`, older family",
     "particle-filter": "`subterra-351`, older family; has the map",
+    "histogram-filter": "nothing; has the map, told the sizes of the errors",
     CEILING: "nothing; has the map, the sizes of errors and of the episode's faults",
 }
-_COLOURS = {"ring-count": "#e09f3e", "ring-filter": "#c1121f", "scan-matching": "#8367c7", "particle-filter": "#1b4965"}
+_COLOURS = {
+    "ring-count": "#e09f3e",
+    "ring-filter": "#c1121f",
+    "scan-matching": "#8367c7",
+    "particle-filter": "#1b4965",
+    "histogram-filter": "#2a9d8f",
+}
 
 
-def read_cells(folder: Path, conditions: str) -> list[dict[str, Any]]:
-    """Read the cells of a folder that were driven under some conditions, in the order of tasks and agents.
+def read_cells(source: Path, conditions: str) -> list[dict[str, Any]]:
+    """Read the cells that were driven under some conditions, in the order of tasks and agents.
+
+    Args:
+        source: Folder with a file for each cell, or a file with a line for each.
+        conditions: Digest of the conditions.
 
     Raises:
-        BenchmarkError: There is none.
+        BenchmarkError: There is none, or a line is no cell.
     """
-    cells = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-    cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] == conditions]
+    try:
+        texts = (
+            source.read_text().splitlines()
+            if source.is_file()
+            else [file.read_text() for file in sorted(source.glob("*.json"))]
+        )
+        cells = [json.loads(text) for text in texts]
+        cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] == conditions]
+    except (ValueError, AttributeError, KeyError) as error:
+        raise BenchmarkError(f"{source}: holds something that is no cell of the board") from error
     if not cells:
-        raise BenchmarkError(f"{folder}: holds no cell of these tunnels, episodes and constants")
+        raise BenchmarkError(f"{source}: holds no cell of these tunnels, episodes and constants")
     place = lambda names, name: names.index(name) if name in names else len(names)  # noqa: E731
     return sorted(cells, key=lambda cell: (place(TASKS, cell["task"]), place(AGENTS, cell["agent"]), cell["agent"]))
 

@@ -1,7 +1,8 @@
 """The ceiling: a Bayes filter that has the exact map, the sizes of all noise, and those of the episode's faults.
 
-A particle filter whose every particle casts the whole scan in the true walls. It is no agent that anybody could send
-in: nobody is told how late the data or how slippery the rail of an episode is. Nothing else of the truth is read.
+A particle filter whose every particle casts the whole scan in the true walls; where the start may be anywhere, a
+histogram filter that does so in every cell. It is no agent that anybody could send in: nobody is told how late the data
+or how slippery the rail of an episode is. Nothing else of the truth is read.
 """
 
 import dataclasses
@@ -13,6 +14,7 @@ from flax import struct
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import commanded_cloud, log_weights, move, resample, summarise, weigh_odometer
+from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import FilterMemory, ParticleLocaliser, Relocaliser
 from subterra_jax.baselines.reckoning import Reckoning, reckon, unobserved_distance
@@ -73,24 +75,20 @@ def with_known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reck
 
 
 def ceiling(params: EnvParams, n_particles: int | None = None) -> Navigator | Relocaliser:
-    """Makes the ceiling of a task.
+    """Makes the ceiling of a task: particles about a start, and a histogram over all places where there is none.
 
     Args:
         params: The task.
-        n_particles: Number of particles; None is 512, twice that where the start is hidden or rails may be wet, and
-            4,096 where it may be anywhere.
+        n_particles: Number of particles; None is 512, twice that where the start is hidden or rails may be wet.
     """
+    if params.errand == "report":
+        # It drives as far as it may: a place that seems sure early may be one of many that look alike.
+        everywhere = HistogramLocaliser.of(params)
+        return Relocaliser(everywhere, CentreLine(), sure_for=float("inf"), name=NAME, privileged=True)
     hidden = float(params.start.station_sigma.max()) > 0.0
-    usual = 4096 if params.errand == "report" else 1024 if hidden or "faults" in params.parts else 512
-    made = ParticleLocaliser.of(params, n_particles or usual)
-    motion = made.motion
-    if params.errand != "report":
-        # A dense cloud: a likelihood that is flattened to spare its particles throws away what the walls tell. One that
-        # is spread over a tunnel has too few particles at any place for that.
-        motion = dataclasses.replace(commanded_cloud(params), least_share=_DENSE_LEAST, ess_share=_DENSE_DUE)
+    made = ParticleLocaliser.of(params, n_particles or (1024 if hidden or "faults" in params.parts else 512))
+    # A dense cloud: a likelihood that is flattened to spare its particles throws away what the walls tell.
+    motion = dataclasses.replace(commanded_cloud(params), least_share=_DENSE_LEAST, ess_share=_DENSE_DUE)
     fields = {field.name: getattr(made, field.name) for field in dataclasses.fields(made) if field.name != "privileged"}
     fields |= {"scan": ScanModel(range_sigma=range_sigma(params)), "motion": motion}
-    localiser = ExactLocaliser(**fields)
-    if params.errand == "report":
-        return Relocaliser(localiser, CentreLine(), name=NAME, privileged=True)
-    return Navigator(localiser, steering_of(params, CentreLine()), name=NAME, uses_map=True)
+    return Navigator(ExactLocaliser(**fields), steering_of(params, CentreLine()), name=NAME, uses_map=True)
