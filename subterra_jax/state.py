@@ -26,7 +26,13 @@ def as_array(value: Any, like: Any = None) -> Any:
     Args:
         value: A number or an array; anything else is returned unchanged, and so is an array of random keys.
         like: Array whose type is wanted; None makes integers int32 and everything else float32.
+
+    Raises:
+        ValueError: Integers are wanted and a Python number is none.
     """
+    wants_whole = like is not None and jnp.issubdtype(like.dtype, jnp.integer)
+    if wants_whole and isinstance(value, float) and not value.is_integer():
+        raise ValueError(f"a whole number is wanted, got {value}")
     if not isinstance(value, _NUMBERS) or jax.dtypes.issubdtype(jnp.result_type(value), jax.dtypes.extended):
         return value
     whole = jnp.issubdtype(jnp.result_type(value), jnp.integer)
@@ -88,7 +94,7 @@ class _Named:
         the new ones.
 
         Raises:
-            ValueError: There is no such field or part.
+            ValueError: There is no such field or part, or a whole number is wanted.
         """
         own = {field.name for field in dataclasses.fields(self)}  # type: ignore[arg-type]
         if unknown := set(updates) - own - set(self.parts):

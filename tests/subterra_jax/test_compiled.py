@@ -138,6 +138,14 @@ def test_replacing_params_by_python_numbers_compiles_nothing_anew():
     assert float(again.goal.tolerance) == 2.0
 
 
+@pytest.mark.parametrize("horizon", [50.5, float("nan"), float("inf")])
+def test_replacing_a_count_by_a_fraction_is_refused(horizon):
+    _, params = st.make("Subterra/TraverseShort-v0")
+    with pytest.raises(ValueError, match=f"a whole number is wanted, got {horizon}"):
+        params.replace(horizon=horizon)
+    assert int(params.replace(horizon=50.0).horizon) == 50
+
+
 def test_replacing_leaves_a_tree_of_axes_as_it_is():
     _, params = st.make("Subterra/StopAtShort-v0")
     axes = jax.tree.map(lambda _: None, params).replace(horizon=0)
