@@ -47,6 +47,10 @@ class SurveyConfig:
     # Kind of bore: the paper's D-section; the same on a real metro's alignment; one outside that class; or a place as
     # scanners meet them, from `portal` on.
     truth: TruthName = "paper"
+    # A tunnel file to survey instead, with what stands in it: `tunnel.npz` of a scene, or what
+    # `st.tunnel.save_tunnel` wrote of a tunnel of the open world.
+    truth_file: Path | None = None
+    lining: str = ""  # Lining of the tunnel file; `pockets`, or its first, if not given.
     length: float = 60.0  # Length of the bore along its centreline, m.
     seed: int = 0  # Draws the bore, the walk and all noise. The same seed gives the same bytes.
     # Draw sizes (gauge, rings, pockets ...) within building tolerance.
@@ -71,6 +75,10 @@ def check_survey(config: SurveyConfig) -> None:
         raise ValueError(f"length must be more than 10 m and at most 2000 m, got {config.length:g}")
     if config.truth == "metro" and config.length > METRO_LENGTH:
         raise ValueError(f"length must be at most {METRO_LENGTH:g} m for truth metro, got {config.length:g}")
+    if config.truth_file is None and config.lining:
+        raise ValueError("lining goes with truth-file alone")
+    if config.truth_file is not None and (config.truth != "paper" or config.tolerances):
+        raise ValueError("truth-file has its own bore: give neither truth nor tolerances beside it")
     if not 0.1 <= config.speed <= 10.0:
         raise ValueError(f"speed must lie between 0.1 and 10 m/s, got {config.speed:g}")
     if config.seed < 0:

@@ -78,6 +78,18 @@ def _copy_shape(
     return Mesh(vertices.reshape(-1, 3), every.reshape(-1, 3), parts, station.repeat(len(faces)))
 
 
+def box_mesh(
+    centre: Float[np.ndarray, "3"], half: Float[np.ndarray, "3 3"], taper: float, part: Part, station: float
+) -> Mesh:
+    """Return a box by its middle and half edges along, left and up, as rows, m.
+
+    Its length is less at the top than in the middle by the share `taper`, and more at the foot.
+    """
+    share = _CORNERS * 1.0
+    share[:, 0] *= 1.0 - taper * share[:, 2]
+    return _copy_shape(share, _BOX, centre[None], half.T[None], part, np.array([station]))
+
+
 def track_mesh(alignment: Alignment, section: Section, furniture: Furniture) -> Mesh:
     """Return sleepers, rails, pads and clips; each sleeper lies in the section of its own station."""
     if not furniture.tracks:
@@ -184,12 +196,12 @@ def station_rows(furniture: Furniture, length: float) -> Float[np.ndarray, "n"]:
     return refine_breaks(breaks[(breaks >= 0.0) & (breaks <= length)], CELL)
 
 
-def _grid_quads(index: Int[np.ndarray, "n m"]) -> Int[np.ndarray, "n-1 m-1 4"]:
+def grid_quads(index: Int[np.ndarray, "n m"]) -> Int[np.ndarray, "n-1 m-1 4"]:
     """Corners of the cells of a grid of vertices."""
     return np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]], axis=-1)
 
 
-def _split_quads(quads: Int[np.ndarray, "*q 4"]) -> Int[np.ndarray, "t 3"]:
+def split_quads(quads: Int[np.ndarray, "*q 4"]) -> Int[np.ndarray, "t 3"]:
     """Two triangles of each quad, turned so that the normals of a grid (station, girth) point into the bore."""
     quads = quads.reshape(-1, 4)
     return np.stack([quads[:, [2, 1, 0]], quads[:, [3, 2, 0]]], axis=1).reshape(-1, 3)
@@ -203,7 +215,7 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
     vertices = frames.point(nodes[..., 0], nodes[..., 1])
     n, m = nodes.shape[:2]
     index = np.arange(n * m).reshape(n, m)
-    quads = _grid_quads(index)
+    quads = grid_quads(index)
 
     part = np.full(quads.shape[:2], Part.LINING, np.uint8)
     middle = 0.5 * (rows[1:] + rows[:-1])
@@ -217,21 +229,21 @@ def surface_mesh(alignment: Alignment, section: Section, furniture: Furniture) -
         j0, jc, j1 = shape.rows[r]
         keep[i0:i1, j0:j1] = False
         out = shape.normal[jc, 0] * frames.lateral[ic] + shape.normal[jc, 1] * frames.up[ic]
-        pockets.append(_pocket_mesh(vertices[i0 : i1 + 1, j0 : j1 + 1], furniture.depth[j, r, side] * out, rows[ic]))
+        pockets.append(pocket_mesh(vertices[i0 : i1 + 1, j0 : j1 + 1], furniture.depth[j, r, side] * out, rows[ic]))
 
     station = np.broadcast_to(middle[:, None], keep.shape)
-    lining = Mesh(vertices.reshape(-1, 3), _split_quads(quads[keep]), part[keep].repeat(2), station[keep].repeat(2))
+    lining = Mesh(vertices.reshape(-1, 3), split_quads(quads[keep]), part[keep].repeat(2), station[keep].repeat(2))
     return join_meshes([lining, *pockets, _floor_mesh(vertices[:, 0], vertices[:, -1], rows)])
 
 
-def _pocket_mesh(mouth: Float[np.ndarray, "a b 3"], out: Float[np.ndarray, "3"], station: float) -> Mesh:
+def pocket_mesh(mouth: Float[np.ndarray, "a b 3"], out: Float[np.ndarray, "3"], station: float) -> Mesh:
     """Return a recess: the surface of its mouth moved by `out`, and sides parallel to `out`."""
     a, b = mouth.shape[:2]
     index = np.arange(a * b).reshape(a, b)
     rim = np.concatenate([index[0, :-1], index[:-1, -1], index[-1, :0:-1], index[:0:-1, 0]])
     ahead = np.roll(rim, -1)
     sides = np.stack([rim, ahead, ahead + a * b, rim + a * b], axis=-1)
-    faces = np.concatenate([_split_quads(_grid_quads(index)) + a * b, _split_quads(sides)])
+    faces = np.concatenate([split_quads(grid_quads(index)) + a * b, split_quads(sides)])
     vertices = np.concatenate([mouth.reshape(-1, 3), mouth.reshape(-1, 3) + out])
     return Mesh(vertices, faces, np.full(len(faces), Part.POCKET, np.uint8), np.full(len(faces), station))
 
@@ -241,6 +253,6 @@ def _floor_mesh(left: Float[np.ndarray, "n 3"], right: Float[np.ndarray, "n 3"],
     n_across = int(np.ceil(np.linalg.norm(left - right, axis=1).max() / _FLOOR_CELL)) + 1
     share = np.linspace(0.0, 1.0, n_across)[:, None]
     vertices = right[:, None] + share * (left - right)[:, None]
-    faces = _split_quads(_grid_quads(np.arange(len(rows) * n_across).reshape(len(rows), n_across)))
+    faces = split_quads(grid_quads(np.arange(len(rows) * n_across).reshape(len(rows), n_across)))
     station = (0.5 * (rows[1:] + rows[:-1])).repeat(2 * (n_across - 1))
     return Mesh(vertices.reshape(-1, 3), faces, np.full(len(faces), Part.FLOOR, np.uint8), station)

@@ -11,10 +11,12 @@ from rich.progress import Progress
 from rosbags.rosbag1 import Writer
 
 from scene.survey import messages
-from scene.survey.bore import draw_bore
+from scene.survey.bore import Bore, draw_bore
 from scene.survey.carrier import GRAVITY, Carried, Walk, draw_walk, measure_inertial, measure_prism
 from scene.survey.cast import Caster
 from scene.survey.config import LidarName, SurveyConfig
+from scene.survey.given import GivenBore, read_given
+from scene.survey.given_truth import describe_given
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep, avia, os1, vlp16
 from scene.survey.mesh import Mesh
 from scene.survey.rack import IMUS, LIDARS, calibration
@@ -103,14 +105,20 @@ _BEHIND = {"avia": 20.0}  # m of bore that a LiDAR sees behind itself, where it 
 def simulate(config: SurveyConfig, console: Console) -> str:
     """Writes the survey of `config`; returns a line that says what was written."""
     of_bore, of_walk, of_prism, of_profiles, of_sensors = np.random.SeedSequence(config.seed).spawn(5)
-    bore = draw_bore(of_bore, config.length, config.truth, config.correlation, config.tolerances)
+    bore: Bore | GivenBore
+    if config.truth_file is None:
+        bore = draw_bore(of_bore, config.length, config.truth, config.correlation, config.tolerances)
+    else:
+        bore = read_given(config.truth_file, config.lining, config.length)
+        config = replace(config, length=bore.alignment.length)
     config = replace(config, errors=replace(config.errors, strays=max(config.errors.strays, bore.strays)))
     mesh = bore.mesh()
     walk = draw_walk(np.random.default_rng(of_walk), bore, config.speed, SCAN_PERIOD)
     config.out.mkdir(parents=True, exist_ok=True)
 
     write_mesh(config.out / "truth.ply", mesh)
-    write_json(config.out / "truth.json", describe_truth(bore, config))
+    truth = describe_truth(bore, config) if isinstance(bore, Bore) else describe_given(bore, config)
+    write_json(config.out / "truth.json", truth)
     prism = measure_prism(np.random.default_rng(of_prism), walk, config.errors.prism_noise)
     write_tum(config.out / "prism.tum", *prism, None)
     parts = [f"{config.out}: {config.length:g} m"]

@@ -5,8 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Float
 
-from scene.survey.bore import Bore
-from scene.survey.carrier import CARRY_HEIGHT, Carried, rotate
+from scene.survey.carrier import CARRY_HEIGHT, Carried, Passage, rotate
 from scene.survey.cast import Caster, Hits, draw_reflectivity, draw_returns, draw_strays, mix_pixels, noise_sigma
 from scene.survey.config import SensorErrors, SurveyConfig
 from scene.survey.lidar import SCAN_PERIOD, Lidar, Sweep
@@ -92,7 +91,7 @@ def profile_stations(length: float, spacing: float) -> tuple[np.ndarray, np.ndar
     return given, np.add.outer(given[:-1], spacing * np.array(_HELD_OUT)).ravel()
 
 
-def write_profiles(config: SurveyConfig, bore: Bore, caster: Caster, seed: np.random.SeedSequence) -> int:
+def write_profiles(config: SurveyConfig, bore: Passage, caster: Caster, seed: np.random.SeedSequence) -> int:
     """Writes `cloud.ply` and `held_out.ply`; returns the number of points of the first."""
     counts = []
     stations = profile_stations(config.length, config.profiles)
@@ -108,7 +107,7 @@ def write_profiles(config: SurveyConfig, bore: Bore, caster: Caster, seed: np.ra
 
 
 def _cast_turns(
-    rng: np.random.Generator, config: SurveyConfig, bore: Bore, caster: Caster, stations: np.ndarray
+    rng: np.random.Generator, config: SurveyConfig, bore: Passage, caster: Caster, stations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points, m, and reflectivities of one turn at each station."""
     turn = np.linspace(0.0, 2.0 * np.pi, _POINTS, endpoint=False)

@@ -118,7 +118,7 @@ def _pcd_header(count: int) -> bytes:
 
 
 TRUTH_STEP = 0.25  # m between the stations of the truth
-_DEFINITIONS = {
+DEFINITIONS = {
     "frame": "survey frame, z up; sections lie in the plane of lateral (left, horizontal) and up = tangent x lateral",
     "position": "middle of the smooth section: half its width, half its height; station is arc length along it",
     "width": "largest horizontal distance between the walls in the section, roughness included, pockets excluded",
@@ -137,7 +137,8 @@ _DEFINITIONS = {
 }
 
 
-def _rounded(values: np.ndarray, digits: int = 6) -> list[Any]:
+def rounded(values: np.ndarray, digits: int = 6) -> list[Any]:
+    """Return an array as lists, rounded."""
     return np.round(np.asarray(values, float), digits).tolist()
 
 
@@ -152,25 +153,25 @@ def describe_truth(bore: Bore, config: SurveyConfig) -> dict[str, Any]:
         "provenance": "simulated",
         "section_type": bore.section_type,
         "seed": config.seed,
-        "config": {k: v for k, v in asdict(config).items() if k != "out"},
-        "definitions": _DEFINITIONS,
+        "config": {k: v for k, v in asdict(config).items() if k not in ("out", "truth_file", "lining")},
+        "definitions": DEFINITIONS,
         "length": alignment.length,
-        "station": _rounded(station),
-        "position": _rounded(frames.position),
-        "tangent": _rounded(frames.tangent, 9),
-        "width": _rounded(actual.width),
-        "height": _rounded(actual.height),
-        "width_smooth": _rounded(section.width(station) + section.aside(station)),
-        "height_smooth": _rounded(section.height(station)),
-        "middle": _rounded(actual.middle),
+        "station": rounded(station),
+        "position": rounded(frames.position),
+        "tangent": rounded(frames.tangent, 9),
+        "width": rounded(actual.width),
+        "height": rounded(actual.height),
+        "width_smooth": rounded(section.width(station) + section.aside(station)),
+        "height_smooth": rounded(section.height(station)),
+        "middle": rounded(actual.middle),
         "crossfall": section.crossfall,
-        "aside": _rounded(section.aside(station)),
+        "aside": rounded(section.aside(station)),
         "tracks": list(furniture.tracks),
         "things": [thing.describe() for thing in bore.things],
         "cutting": bore.cutting.describe() if bore.cutting else None,
-        "dark": _rounded(np.array(furniture.dark)) if furniture.dark[0] < furniture.dark[1] else None,
+        "dark": rounded(np.array(furniture.dark)) if furniture.dark[0] < furniture.dark[1] else None,
         "strays": bore.strays,
-        "rings": {"width": furniture.sizes.ring_width, "station": _rounded(furniture.joints)},
+        "rings": {"width": furniture.sizes.ring_width, "station": rounded(furniture.joints)},
         "pockets": _describe_pockets(bore),
         "nails": {"diameter": fur.NAIL_DIAMETER, "depth": fur.NAIL_DEPTH, "count": int(furniture.nails.sum())},
         "sleepers": _describe_sleepers(bore),
@@ -193,8 +194,8 @@ def _describe_pockets(bore: Bore) -> list[dict[str, Any]]:
                 out.append({
                     "ring": int(j), "row": r, "side": "left" if 2 * r < fur.N_ROWS else "right",
                     "station": round(float(station[j]), 6), "angle": round(float(np.arctan2(z, y)), 6),
-                    "above_floor": round(float(z + half[j]), 6), "position": _rounded(centre),
-                    "outward": _rounded(normal[0] * frames.lateral[j] + normal[1] * frames.up[j], 9),
+                    "above_floor": round(float(z + half[j]), 6), "position": rounded(centre),
+                    "outward": rounded(normal[0] * frames.lateral[j] + normal[1] * frames.up[j], 9),
                     "length": furniture.sizes.pocket_length, "depth": round(float(furniture.depth[j, r, side]), 6),
                     "width": round(float(np.linalg.norm(smooth[j, last] - smooth[j, first])), 6),
                     "open": not bool(furniture.filled[j, r, side]), "nail": bool(furniture.nails[j, r]),
@@ -208,8 +209,8 @@ def _describe_sleepers(bore: Bore) -> dict[str, Any]:
     frames = bore.alignment.frames(station)
     places = [frames.point(np.full_like(top, track), top) for track in tracks]
     return {
-        "station": _rounded(np.tile(station, len(tracks))),
-        "position": _rounded(np.concatenate(places) if places else np.empty((0, 3))),
+        "station": rounded(np.tile(station, len(tracks))),
+        "position": rounded(np.concatenate(places) if places else np.empty((0, 3))),
         "spacing": sizes.sleeper_spacing, "length": sizes.sleeper_length, "top_width": sizes.sleeper_top,
         "bottom_width": fur.SLEEPER_BOTTOM, "height": fur.SLEEPER_HEIGHT, "top_above_floor": bore.furniture.rise,
     }  # fmt: skip
@@ -222,7 +223,7 @@ def _describe_rails(bore: Bore, station: np.ndarray) -> dict[str, Any]:
 
     def lines(side: float) -> list[Any]:
         places = [frames.point(np.full_like(top, track + side * furniture.rail_axis), top) for track in tracks]
-        return _rounded(np.concatenate(places) if places else np.empty((0, 3)))
+        return rounded(np.concatenate(places) if places else np.empty((0, 3)))
 
     return {
         "profile": "CHN60", "gauge": furniture.sizes.gauge, "height": round(furniture.rail_height, 6),

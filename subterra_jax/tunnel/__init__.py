@@ -1,6 +1,17 @@
 """A tunnel in the plane: from a file, a plan or arrays to the pytree that every step reads."""
 
 from subterra_jax.tunnel.arrays import from_centreline, from_polylines
+from subterra_jax.tunnel.save import save_tunnel
 from subterra_jax.tunnel.tunnel import CONTACT_REACH, Foot, Tunnel, at_station, foot, node_at
 
-__all__ = ["CONTACT_REACH", "Foot", "Tunnel", "at_station", "foot", "from_centreline", "from_polylines", "node_at"]
+__all__ = [
+    "CONTACT_REACH",
+    "Foot",
+    "Tunnel",
+    "at_station",
+    "foot",
+    "from_centreline",
+    "from_polylines",
+    "node_at",
+    "save_tunnel",
+]

@@ -16,7 +16,7 @@ from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.versions import BUILD_AGAIN, other_schema
 from subterra_jax.procedural import default_lining, expand, generate
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
-from subterra_jax.tunnel.shell import N_BRICK, Shell, ShellLining
+from subterra_jax.tunnel.shell import N_BRICK, SPACING, Shell, ShellLining
 from subterra_jax.tunnel.tunnel import Tunnel, stack
 
 SCHEMA, PLANAR_SCHEMA = "subterra.tunnel/2", "subterra.tunnel/1"  # with the bore in three dimensions, and without
@@ -130,6 +130,7 @@ def read_tunnel(path: Path) -> TunnelPlan:
             for name in names
         },
         ring_pitch=ring_pitch,
+        ring_joint=fields.numbers("ring_joint", None) if "ring_joint" in fields.data else np.zeros(0),
         source=str(path),
     )
     if schema == SCHEMA:
@@ -154,12 +155,23 @@ def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
     if np.any(np.abs(rise) >= 1.0):
         raise fields.fail("shell_rise", "must be above -1 and below 1")
     unit = float(fields.numbers("shell_unit"))
-    radius = unit * fields.numbers("shell_radius", n, m).cumsum(axis=1).cumsum(axis=0)
-    section = fields.numbers("shell_section", m)
-    for name, values in (("shell_radius", radius), ("shell_section", section)):
+
+    def decode(field: str) -> np.ndarray:
+        values = unit * fields.numbers(field, n, m).cumsum(axis=1).cumsum(axis=0)
         if not np.all(values > 0.0):
-            raise fields.fail(name, "must give positive distances from the axis")
+            raise fields.fail(field, "must give positive distances from the axis")
+        return np.asarray(values)
+
+    radius = decode("shell_radius")
+    section = fields.numbers("shell_section", m)
+    if not np.all(section > 0.0):
+        raise fields.fail("shell_section", "must give positive distances from the axis")
     level = np.sqrt(1.0 - rise**2)[:, None]
+    spacing = SPACING
+    if "shell_spacing" in fields.data:  # files of scenes do not have the field
+        spacing = tuple(fields.numbers("shell_spacing", 2).tolist())
+        if min(spacing) <= 0.0:
+            raise fields.fail("shell_spacing", "must be positive")
     return Shell(
         station=plan.station,
         position=np.column_stack([plan.centre, plan.elevation + fields.numbers("shell_height", n)]),
@@ -173,9 +185,11 @@ def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
                 fields.numbers(f"shell_pocket_{name}", None, 5),
                 fields.numbers(f"shell_brick_{name}", None, N_BRICK),
                 float(fields.numbers(f"shell_seam_{name}")),
+                decode(f"shell_radius_{name}") if f"shell_radius_{name}" in fields.data else None,
             )
             for name in plan.linings
         },
+        spacing=spacing,
     )
 
 
