@@ -141,7 +141,7 @@ class BuildConfig:
 def judge_reconstruction(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgement:
     """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
     odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
-    odd += doubt_track(track, result.seen)
+    odd += doubt_track(track, result.seen, result.facts.get("pose_doubt"))
     odd += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
     if result.everything is None:
         judgement = Judgement(config.tolerance, ())

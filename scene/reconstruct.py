@@ -70,7 +70,7 @@ def register_recording(
         if isinstance(known, Trajectory):
             located = _locate_checked(recording, known, reading)
         elif isinstance(known, Control):
-            located = locate_by_control(recording, known, calibration, progress, partial)
+            located = _checked(recording, locate_by_control(recording, known, calibration, progress, partial))
         else:
             located = locate_by_odometry(recording, calibration, progress, partial)
         stage = progress.start("registering scans", recording.scan_count)
@@ -97,6 +97,12 @@ def _locate_checked(recording: Recording, given: Trajectory, reading: ReadingCon
     located = locate_given(poses)
     facts = {**located.facts, "quaternions": order, **({} if check is None else check.facts)}
     return replace(located, facts=facts)
+
+
+def _checked(recording: Recording, located: Located) -> Located:
+    """Return poses with what they make of the walls among their facts: rails hide where they blur them."""
+    check = check_poses(recording, located.trajectory)
+    return located if check is None else replace(located, facts={**located.facts, **check.facts})
 
 
 def load_cloud(path: Path, voxel: float, reading: ReadingConfig, progress: Stages, partial: Partial) -> Registered:

@@ -21,6 +21,8 @@ _FLOOR_HALF, _FLOOR_SLACK = (
     0.12,
 )  # m beside the axis, and about the nominal floor: tops of proud sleepers are above
 _EVEN, _LEAP = 10.0, 0.02  # m before and behind a place that tell its floor; m that it may be off them
+_BESIDE = (1.4, 1.9)  # m from the axis: beside the sleepers of a single track
+_SAME = 0.015  # m between the floor under the axis and beside the sleepers, further apart than which it is unknown
 _FLOOR_THICK = 0.03  # m about the lower quartile that count as floor; the flanks of sleepers are above
 
 
@@ -65,6 +67,11 @@ def measure_sizes(
     lower = np.interp(at, station, _quantiles(station, at[low], z[low], 0.25))
     low &= np.abs(z - lower) < _FLOOR_THICK
     above = _without_leaps(station, -_quantiles(station, at[low], z[low]))
+    if told.track == "single" and told.proud:  # beside what hides it, flanks of sleepers are all that is seen of a bed
+        beside = (
+            (np.abs(y) > _BESIDE[0]) & (np.abs(y) < _BESIDE[1]) & (np.abs(z + told.axis_above_floor) < _FLOOR_SLACK)
+        )
+        above = np.where(np.abs(above + _quantiles(station, at[beside], z[beside])) > _SAME, np.nan, above)
     middle = 0.5 * (sides[0] + sides[1])
     return {"axis_above_floor": above, "width": sides[0] - sides[1], "height": above + top, "middle": middle}
 

@@ -22,6 +22,9 @@ CAUSES = (
 
 _BRANCH = 3.0  # m behind the wall: less is a niche
 _BUILDING = 2000  # points
+_MOUTH = 1.2  # m behind the wall: nearer returns of a branch are those of its mouth
+_MOUTHS_APART, _MOUTH_POINTS = 1.5, 20  # m along; points
+_MUCH = 1.5  # times as long as its mouth: a branch that runs beside the bore, too
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class Removed:
     place: tuple[float, float, float]  # Median position in the input's frame, m
     nearest: float = 0.0  # How far behind the wall it begins, m
     deepest: float = 0.0  # How far behind the wall it ends, m
+    mouths: tuple[tuple[float, float], ...] = ()  # First and last stations at which a branch opens into the bore, m
 
     @property
     def warning(self) -> str:
@@ -46,20 +50,30 @@ class Removed:
         where = f"from station {self.start:.0f} to {self.end:.0f} m, near ({x:.1f}, {y:.1f}, {z:.1f}),"
         if self.cause == CAUSES[BRANCH] and self.deepest > _BRANCH:
             return (
-                f"{where} the bore opens into a branch or a room that reaches {self.deepest:.0f} m behind its wall; it "
-                "was cut at its mouth: build it from a cloud of its own"
+                f"{where} the bore opens into a branch or a room that reaches {self.deepest:.0f} m behind its wall"
+                f"{self._name_mouths()}; it was cut at its mouth: build it from a cloud of its own"
             )
         if self.cause == CAUSES[ELSEWHERE] and self.points > _BUILDING:
             return f"{where} another tunnel or building stands {self.nearest:.0f} m behind the wall; it was left out"
         return ""
 
+    def _name_mouths(self) -> str:
+        """Return where a branch opens that runs on beside the bore; empty where it opens over its length."""
+        open_over = sum(end - start for start, end in self.mouths)
+        if not self.mouths or self.end - self.start < _MUCH * open_over + _BRANCH:
+            return ""
+        told = " and ".join(f"from {start:.0f} to {end:.0f} m" for start, end in self.mouths)
+        return f", and meets it {told}, where that wall is a guess"
+
     def shifted(self, by: float) -> "Removed":
         """Return the same stretch with stations that are `by` m larger."""
-        return replace(self, start=self.start + by, end=self.end + by)
+        mouths = tuple((start + by, end + by) for start, end in self.mouths)
+        return replace(self, start=self.start + by, end=self.end + by, mouths=mouths)
 
     def reversed(self, length: float) -> "Removed":
         """Return the same stretch by stations that count from the other end of an axis of `length`, m."""
-        return replace(self, start=length - self.end, end=length - self.start)
+        mouths = tuple((length - end, length - start) for start, end in reversed(self.mouths))
+        return replace(self, start=length - self.end, end=length - self.start, mouths=mouths)
 
 
 @dataclass(frozen=True)
@@ -97,5 +111,19 @@ def list_removed(
             first, last = (float(station[part[end]]) for end in (0, -1))
             depth = (0.0, 0.0) if behind is None else np.percentile(behind[part], [1, 99])
             place = (float(x), float(y), float(z))
-            result.append(Removed(first, last, CAUSES[index], len(part), place, float(depth[0]), float(depth[1])))
+            mouths = _find_mouths(station[part], behind[part]) if behind is not None and index == BRANCH else ()
+            depths = float(depth[0]), float(depth[1])
+            result.append(Removed(first, last, CAUSES[index], len(part), place, *depths, mouths))
     return tuple(sorted(result, key=lambda part: (part.start, part.cause)))
+
+
+def _find_mouths(station: Float[np.ndarray, " n"], behind: Float[np.ndarray, " n"]) -> tuple[tuple[float, float], ...]:
+    """Return first and last stations of the stretches in which a branch comes near the wall, m.
+
+    Args:
+        station: Stations of its points in growing order, m.
+        behind: How far each is behind the wall, m.
+    """
+    near = station[behind < _MOUTH]
+    parts = np.split(near, np.flatnonzero(np.diff(near) > _MOUTHS_APART) + 1)
+    return tuple((float(part[0]), float(part[-1])) for part in parts if len(part) >= _MOUTH_POINTS)

@@ -177,7 +177,7 @@ def section_middles(
     centres = section_angles(_COARSE_ANGLES) + np.pi / _COARSE_ANGLES
     order = np.argsort(index, kind="stable")
     bounds = np.searchsorted(index[order], np.arange(len(extended.station) + 1))
-    middles = []
+    middles, shown = [], []
     count = np.diff(bounds)
     share = _FULL_SHARE if usual is None else _THIN_SHARE  # far from the last tripod a bore is thin, but goes on
     least = max(share * float(np.median(count[count > 0])), 1 if usual is None else _THIN)
@@ -191,10 +191,13 @@ def section_middles(
         rows = order[bounds[k] : bounds[k + 1]]
         medians = _bin_medians(bins[rows], radius[rows])
         if usual is not None:
-            medians = np.where(np.abs(medians - stand_in[k]) < _UNUSUAL, medians, stand_in[k])
+            usual_here = np.abs(medians - stand_in[k]) < _UNUSUAL
+            own = float(usual_here.mean())
+            medians = np.where(usual_here, medians, stand_in[k])
         seen = np.isfinite(medians)
         if seen.mean() < _MIN_SEEN:
             continue
+        shown.append(own if usual is not None else float(seen.mean()))
         around = np.interp(centres, centres[seen], medians[seen], period=2 * np.pi)
         line = fit_floor_line(lateral[rows], upward[rows])
         if line is not None:
@@ -206,7 +209,23 @@ def section_middles(
         middles.append(extended.position[k] + across * extended.lateral[k] + along * extended.up[k])
     if len(middles) < 4:
         raise FitError("no tunnel in the cloud: hardly a section shows most of its circumference")
-    return np.asarray(middles)
+    return np.asarray(middles)[_cut_begun(np.array(shown))]
+
+
+_BEGUN = 0.8  # of the directions that the next sections show
+_NEXT = 3  # sections
+
+
+def _cut_begun(shown: Float[np.ndarray, " k"]) -> slice:
+    """Return the sections without one at either end that is only begun: its middle would bend the axis.
+
+    A mouth cuts it off aslant, and of what lies before a mouth there is no crown. `shown` is the share of each
+    section's directions that show its wall.
+    """
+    if len(shown) < 4 * _NEXT:
+        return slice(None)
+    first, last = (int(ends[0] < _BEGUN * np.median(ends[1 : _NEXT + 1])) for ends in (shown, shown[::-1]))
+    return slice(first, len(shown) - last)
 
 
 def _bin_medians(bins: np.ndarray, radius: np.ndarray) -> Float[np.ndarray, " m"]:

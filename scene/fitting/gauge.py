@@ -1,5 +1,7 @@
 """The gauge from single returns: in a thinned cloud the mean of a voxel mixes the side of a head with its top."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -63,7 +65,7 @@ def look_again(
     near = np.concatenate([np.empty((0, 4)), *found])
     lines = (SeenLine(one.sleepers, measure_again(one.rails, *near.T), one.bed) if one.rails else one
              for one in seen.lines)  # fmt: skip
-    return SeenTrack(tuple(lines), seen.sought)
+    return replace(seen, lines=tuple(lines))
 
 
 def _beside_rails(

@@ -7,7 +7,8 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d, grey_opening, median_filter
 
 _WINDOWS = (2.0, 6.0)  # m along: so long that a bin of one holds some points
-_POINTS = 8
+_POINTS, _ENOUGH = 8, 4  # of a bin that are wanted, and with which rails are still told
+_LEAST = 100  # points
 _BIN = 0.02  # m across
 _LOW = (-0.10, 0.80)  # above the floor, m
 # Bins: what is broader is a sleeper, a kerb or a walkway; poses a centimetre or two off broaden rails, too.
@@ -27,6 +28,9 @@ _TOP = 0.010  # above and below the top of the head, m
 _FACE_BAND = 0.015  # m between the edge of the top and the face below it
 _FACE_BLUR = 0.004  # m
 _FACE_RETURNS = 12
+# m: spread of the returns from the top of a head, 0.021 for 73 mm and 0.024 with a carried LiDAR's noise. Where poses
+# blur it more, a face may look sharp that is a centimetre off.
+_HEAD_SHARP = 0.025
 _FACE_SHARP = 0.006  # m: spread of returns about the face; twice 15 mm of band, evenly filled, have 0.0087
 _PIECE = 8.0  # m of track of which one gauge is measured
 _LEAST_PIECES = 2
@@ -74,15 +78,28 @@ def find_rails(
     return max(found, key=len)  # the first of those with as many tracks
 
 
+def can_show_rails(
+    station: Float[np.ndarray, " n"], lateral: Float[np.ndarray, " n"], height: Float[np.ndarray, " n"]
+) -> bool:
+    """Return whether points on a floor lie close enough to tell a rail from what is beside it; see `find_rails`."""
+    low = (height > _LOW[0]) & (height < _LOW[1])
+    return bool(low.sum() >= _LEAST and _returns_a_bin(station[low], lateral[low]) * _WINDOWS[1] >= _ENOUGH)
+
+
+def _returns_a_bin(station: np.ndarray, lateral: np.ndarray) -> float:
+    """Number of points in a bin across for each metre along."""
+    return float(len(station) / max(np.ptp(station), 1.0) * _BIN / np.ptp(lateral))
+
+
 def _find_pairs(
     station: np.ndarray, lateral: np.ndarray, height: np.ndarray, upward: np.ndarray, narrow: int
 ) -> list[SeenRails]:
     """Finds pairs of ridges that are narrower than some bins; see `find_rails`."""
     low = (height > _LOW[0]) & (height < _LOW[1])
     station, lateral, height, upward = station[low], lateral[low], height[low], upward[low]
-    if len(station) < 100:
+    if len(station) < _LEAST:
         return []
-    a_metre = len(station) / max(np.ptp(station), 1.0) * _BIN / np.ptp(lateral)
+    a_metre = _returns_a_bin(station, lateral)
     count = max(int(np.ptp(station) / np.clip(_POINTS / a_metre, *_WINDOWS)), 1)
     edges = np.linspace(station.min(), station.max() + 1e-6, count + 1)
     order = np.argsort(station, kind="stable")
@@ -275,7 +292,7 @@ def _inner_edge(across: np.ndarray, above: np.ndarray, face: tuple[float, float]
     be up to a centimetre off: poses that are a little off move it outwards, while a blurred face stays where it is.
     """
     top = across[np.abs(above) < _TOP]
-    if len(top) < _FACE_RETURNS:
+    if len(top) < _FACE_RETURNS or np.std(top) > _HEAD_SHARP:
         return np.nan
     edge = float(np.mean(top) - np.sqrt(3.0) * np.std(top))  # of what is spread evenly over a head
     side = across[(above < -face[0]) & (above > -face[1])]

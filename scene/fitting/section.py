@@ -40,8 +40,10 @@ def visible_span(station: np.ndarray, angle: np.ndarray, axis: Axis) -> tuple[fl
     rows = np.flatnonzero((count > 0).mean(axis=1) > _END_COVERAGE)
     if len(rows) and len(rows) >= _DENSE * (rows[-1] - rows[0] + 1):
         first, last = grid.start + rows[0] * grid.step, grid.start + (rows[-1] + 1) * grid.step
-        inside = station[(station >= first) & (station <= last)]
-        return _trim_end(inside, first, 1), -_trim_end(-inside, -last, 1)
+        rows = (station >= first) & (station <= last)
+        inside, turn = station[rows], angle[rows]
+        start, end = _trim_end(inside, first, 1), -_trim_end(-inside, -last, 1)
+        return _trim_aslant(inside, turn, start), -_trim_aslant(-inside, turn, -end)
     # Profiles apart, and aslant to the axis where the bore flares: the first and the last one are the ends.
     rows = np.flatnonzero((uniform_filter1d((count > 0).astype(float), 3, axis=0) > 0).mean(axis=1) > _END_COVERAGE)
     if not len(rows):
@@ -66,6 +68,27 @@ def _trim_end(station: np.ndarray, end: float, behind: float) -> float:
     reach = round(behind / step)
     full = [k for k in range(len(total) - reach) if 2 * total[k] > np.median(total[k + 1 : k + 1 + reach]) > 0]
     return end - 0.5 + (full[0] if full else 0) * step
+
+
+_ASLANT = 0.10  # m between the mouth on most of the girth and its outermost rim
+_MOUTH_COLUMNS = 24
+
+
+def _trim_aslant(station: np.ndarray, angle: np.ndarray, end: float) -> float:
+    """Station where half of the directions show the wall; `end` where that is not well inside it.
+
+    An axis may meet a mouth aslant, as between rough walls, and then the rim of one side is not its end. Stations grow
+    inwards, m.
+    """
+    near = (station > end - 1.0) & (station < end + 2.0)
+    column = np.floor((angle[near] + np.pi) / (2 * np.pi) * _MOUTH_COLUMNS).astype(np.intp) % _MOUTH_COLUMNS
+    outermost = np.full(_MOUTH_COLUMNS, np.inf)
+    np.minimum.at(outermost, column, station[near])
+    seen = outermost[np.isfinite(outermost)]
+    if len(seen) < _MOUTH_COLUMNS / 2:
+        return end
+    most = float(np.median(seen))
+    return most if most > end + _ASLANT else end
 
 
 def profile_spacing(station: np.ndarray, start: float, end: float) -> float:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.fitting.evidence import steadier_than_chance
-from scene.fitting.rails import SeenRails, find_rails
+from scene.fitting.rails import SeenRails, can_show_rails, find_rails
 
 _BIN = 0.01  # m along
 _SMOOTH = 0.09  # m, box; well below a sleeper's width
@@ -55,6 +55,7 @@ class SeenTrack:
 
     lines: tuple[SeenLine, ...] = ()  # From the right to the left
     sought: bool = False  # False where the survey could not show any, as rings of points on the wall
+    thin: bool = False  # True where too few returns lie on the floor to show rails
 
 
 def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
@@ -75,7 +76,7 @@ def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
         inside = np.abs(lateral) < _BETWEEN_RAILS
         sleepers = _find_sleepers(station[inside], height[inside], bore.length, None)
         lines = [SeenLine(sleepers, None)] if sleepers is not None else []
-    return SeenTrack(tuple(lines), sought=True)
+    return SeenTrack(tuple(lines), sought=True, thin=not can_show_rails(station, lateral, height))
 
 
 def above_floor(points: Float[np.ndarray, "n 3"], bore: Bore) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

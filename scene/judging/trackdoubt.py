@@ -6,14 +6,21 @@ from scene.writing.track import Track
 
 _FEW = 0.5  # share of the sleepers seen: with fewer, their places are the spacing's
 
+_THIN = "the returns on the floor are too few to show any, or their sleepers: a track is easily missed"
 
-def doubt_track(track: Track, seen: SeenTrack) -> list[Warned]:
-    """Return what nobody saw of a track that the survey shows in part.
+
+def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) -> list[Warned]:
+    """Return what nobody saw of a track that the survey shows in part, or could not show.
 
     Args:
         track: Tracks as laid.
         seen: Tracks as the survey shows them; a ring survey can show none, and nothing is said of it.
+        pose_doubt: Sentence on poses that blur the walls; `None` where they do not.
     """
+    sought = track.config.lay == "auto" and seen.sought
+    if sought and all(line.rails is None for line in seen.lines) and (pose_doubt or seen.thin):
+        why = f"{pose_doubt}: rails blur as the walls do, and may be there" if pose_doubt else _THIN
+        return [Warned("rails", f"no rails were seen, but {why}; --track standard lays a track")]
     if track.config.lay != "auto" or not seen.sought or len(seen.lines) != len(track.lines):
         return []
     count, measured = len(track.measured), int(track.measured.sum())

@@ -1,10 +1,14 @@
 """The contract between cleaning, fitting and judging."""
 
 import numpy as np
+import pytest
 
+from scene.bore import axis_through
 from scene.cleaning.clean import CleaningConfig, clean_cloud
-from scene.cleaning.removed import BEYOND, CAUSES, INSIDE, list_removed
-from scene.fitting.centreline import CentrelineConfig
+from scene.cleaning.removed import BEYOND, BRANCH, CAUSES, INSIDE, list_removed
+from scene.cloud import Cloud
+from scene.fitting.centreline import CentrelineConfig, section_middles
+from scene.fitting.section import visible_span
 from tests.scene.clouds import curved_d_bore
 from tests.scene.test_reconstruction import thin
 
@@ -39,3 +43,45 @@ def test_stations_of_what_was_removed_follow_the_axis():
     (part,) = list_removed(cloud, cause, np.full(len(cause), 4.0), gap=1.0)
     assert (part.shifted(-1.5).start, part.shifted(-1.5).end) == (2.5, 2.5)
     assert (part.reversed(20.0).start, part.reversed(20.0).end) == (16.0, 16.0)
+
+
+def test_a_branch_that_runs_on_beside_the_bore_is_named_where_it_meets_it():
+    """Another bore 14 m behind the wall over 50 m, joined by a passage of 3 m."""
+    random = np.random.default_rng(1)
+    along = np.concatenate([random.uniform(5, 55, 4000), random.uniform(22, 25, 2000)])
+    behind = np.concatenate([random.uniform(10, 14, 4000), random.uniform(0.5, 12, 2000)])
+    cloud = Cloud(
+        np.stack([along, behind, 0 * along], axis=1).astype(np.float32), np.ones(6000), np.zeros(3), 6000, 0.04
+    )
+    (part,) = list_removed(cloud, np.full(6000, BRANCH), along, 3.0, behind)
+    assert "meets it from 22 to 25 m" in part.warning
+    assert "meets it from 122 to 125 m" in part.shifted(100.0).warning
+    assert "meets it from 35 to 38 m" in part.reversed(60.0).warning
+    passage = along > 56  # nothing of it
+    passage[4000:] = True
+    alone = list_removed(cloud, np.where(passage, BRANCH, 0), along, 3.0, behind)
+    assert "meets" not in alone[0].warning
+
+
+@pytest.mark.parametrize("lean", [0.0, 0.25])
+def test_a_mouth_that_the_axis_meets_aslant_ends_at_its_middle(lean: float):
+    """Where the axis leans from the bore by a quarter, floor and crown of a mouth lie 1.4 m apart along it."""
+    random = np.random.default_rng(3)
+    angle = random.uniform(-np.pi, np.pi, 200_000)
+    station = random.uniform(-2.0, 22.0, len(angle))
+    inside = (station > lean * 2.75 * np.sin(angle)) & (station < 20.0 + lean * 2.75 * np.sin(angle))
+    axis = axis_through(np.column_stack([np.linspace(0.0, 20.0, 21), np.zeros((21, 2))]), 1.0)
+    assert visible_span(station[inside], angle[inside], axis) == pytest.approx((0.0, 20.0), abs=0.08)
+
+
+def test_a_section_that_is_only_begun_at_a_mouth_does_not_bend_the_axis():
+    """Before the mouth at 20.5 m, floor and walls go on for a metre, pulled aside; the crown does not."""
+    random = np.random.default_rng(4)
+    angle, station = random.uniform(-np.pi, np.pi, 60_000), random.uniform(0.0, 21.5, 60_000)
+    kept = (station < 20.5) | (angle < 0.0)
+    aside = np.where(station > 20.5, 0.25, 0.0)
+    points = np.stack([station, 2.5 * np.cos(angle) + aside, 2.5 * np.sin(angle)], axis=1)[kept]
+    axis = axis_through(np.column_stack([np.linspace(0.0, 20.0, 21), np.zeros((21, 2))]), 1.0)
+    middles = section_middles(points, axis, lambda at: np.full((len(at.station), 72), 2.5))
+    assert np.abs(middles[:, 1]).max() < 0.02
+    assert middles[-1, 0] == pytest.approx(20.0, abs=1.01)

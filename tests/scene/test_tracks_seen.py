@@ -226,9 +226,45 @@ def test_a_gauge_between_faces_that_poses_blur_is_not_measured(monkeypatch):
     (line,) = rails_seen.find_rails(station, blurred, height, upward)
     assert not line.measured
     monkeypatch.setattr(rails_seen, "_FACE_SHARP", 1.0)
+    monkeypatch.setattr(rails_seen, "_HEAD_SHARP", 1.0)
     (line,) = rails_seen.find_rails(station, blurred, height, upward)
     assert line.measured  # all pieces agree
     assert line.gauge < 1.435 - 0.005
+
+
+@pytest.mark.parametrize("blur", [0.03, 0.04])
+def test_rails_that_poses_broaden_are_found_and_have_no_gauge(blur, monkeypatch):
+    station, lateral, upward, height = low_points("double")
+    blurred = lateral + np.random.default_rng(2).normal(0.0, blur, len(lateral))
+    tracks = rails_seen.find_rails(station, blurred, height, upward)
+    assert [float(np.median(one.offset)) for one in tracks] == pytest.approx([-2.1, 2.1], abs=0.02)
+    assert not any(one.measured for one in tracks)
+    monkeypatch.setattr(rails_seen, "_NARROW", (9,))
+    assert not rails_seen.find_rails(station, blurred, height, upward)
+
+
+def test_heads_too_broad_for_any_rail_show_no_gauge(monkeypatch):
+    station, lateral, upward, height = low_points("proud")
+    blurred = lateral + np.random.default_rng(2).normal(0.0, 0.03, len(lateral))
+    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    assert not line.measured
+    monkeypatch.setattr(rails_seen, "_HEAD_SHARP", 1.0)
+    (line,) = rails_seen.find_rails(station, blurred, height, upward)
+    assert line.measured  # and 25 mm narrow, in all pieces alike
+    assert line.gauge < 1.435 - 0.02
+
+
+def test_a_cloud_too_thin_to_show_rails_or_blurred_by_its_poses_says_so():
+    cloud, bore = scanned("road")
+    assert doubt_track(lay_track(bore, TrackConfig(), seen_in("road")), seen_in("road")) == []
+    few = replace(cloud, points=cloud.points[::25], weights=cloud.weights[::25])
+    thin = find_track(few, bore)
+    (warned,) = doubt_track(lay_track(bore, TrackConfig(), thin), thin)
+    assert "too few" in warned.text
+    (warned,) = doubt_track(lay_track(bore, TrackConfig(), seen_in("road")), seen_in("road"), "poses blur the walls")
+    assert "no rails were seen, but poses blur the walls" in warned.text
+    shown = seen_in("proud")
+    assert doubt_track(lay_track(scanned("proud")[1], TrackConfig(), shown), shown, "poses blur the walls") == []
 
 
 def test_three_pieces_of_which_two_agree_by_chance_make_no_gauge():
