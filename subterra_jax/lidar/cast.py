@@ -1,15 +1,19 @@
 """Casts beams against the walls, exactly.
 
 Walls come in short blocks, each in a thin box. Every beam is tested against all boxes of a window with a few products,
-and then meets the true segments of the few blocks that it enters first. Nothing about the walls is approximated; the
-cost depends neither on the tunnel's length nor, much, on its pockets.
+and then meets the true segments of the few blocks that it enters first, and of further ones as long as these do not
+decide. Nothing about the walls is approximated; the cost depends neither on the tunnel's length nor, much, on its
+pockets.
 """
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from subterra_jax.rows import vary_like
 from subterra_jax.tunnel import Tunnel
 
 NOTHING = np.int32(2**31 - 1)
@@ -26,13 +30,69 @@ def nearest(
         position: Origin of the beams, tunnel frame, m.
         direction: Their unit vectors; if their number is even, the second half must oppose the first.
     """
-    return jnp.min(hits(tunnel, candidates(tunnel, first, position, direction), position, direction), axis=-1)
+    return _search(tunnel, first, position, direction, which=False).distance
 
 
-def candidates(
-    tunnel: Tunnel, first: Int[Array, ""], position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
+class _Found(NamedTuple):
+    """Nearest walls after some rounds of a search.
+
+    Attributes:
+        distance: To the nearest wall so far along each beam, m.
+        block: The block that it is of.
+        last: Key of the farthest box looked into, as `_entries` makes it.
+        open: A nearer wall may stand in a box not yet looked into.
+    """
+
+    distance: Float[Array, "n_beams"]
+    block: Int[Array, "n_beams"]
+    last: Int[Array, "n_beams"]
+    open: Bool[Array, "n_beams"]
+
+
+def _search(
+    tunnel: Tunnel,
+    first: Int[Array, ""],
+    position: Float[Array, "2"],
+    direction: Float[Array, "n_beams 2"],
+    which: bool,
+) -> _Found:
+    """Look into boxes in the order in which each beam enters them, a few a round, until none is left before its wall.
+
+    One round is enough for nearly every scan, but not beside a row of deep recesses, whose thick boxes a beam along the
+    wall enters one after another. The blocks are found only if `which`.
+    """
+    n_beams, n_bits = direction.shape[0], (tunnel.n_scan - 1).bit_length()
+
+    def look(found: _Found) -> _Found:
+        key = _following(tunnel, first, position, direction, found.last)
+        block = first + (key & jnp.int32((1 << n_bits) - 1))
+        # A beam that enters fewer boxes gets arbitrary blocks for the rest: a hit on any wall is a hit.
+        block = jnp.minimum(block, tunnel.box.shape[1] - 1)
+        each = hits(tunnel, block, position, direction)
+        last, distance = key[:, -1], jnp.minimum(found.distance, jnp.min(each, axis=-1))
+        met = jnp.take_along_axis(block, jnp.argmin(each, axis=-1)[:, None], axis=-1)[:, 0]
+        entry = lax.bitcast_convert_type(last & jnp.int32(-(1 << n_bits)), jnp.float32)
+        met = jnp.where(distance < found.distance, met, found.block) if which else found.block
+        return _Found(distance, met, last, (last != NOTHING) & (entry <= distance))
+
+    start = _Found(
+        jnp.full(n_beams, jnp.inf, direction.dtype),
+        jnp.zeros(n_beams, jnp.int32),
+        jnp.full(n_beams, -1, jnp.int32),
+        jnp.ones(n_beams, bool),
+    )
+    start = vary_like(start, tunnel.box, first, position, direction)
+    return lax.while_loop(lambda found: jnp.any(found.open), look, start)
+
+
+def _following(
+    tunnel: Tunnel,
+    first: Int[Array, ""],
+    position: Float[Array, "2"],
+    direction: Float[Array, "n_beams 2"],
+    last: Int[Array, "n_beams"],
 ) -> Int[Array, "n_beams n_candidates"]:
-    """The blocks whose boxes each beam enters first.
+    """Return the keys of the boxes that each beam enters next after one, nearest first; `NOTHING` after the last.
 
     With m the middle of a box and e its half axis, both from the LiDAR, a line along d crosses the box if
     |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams share.
@@ -45,29 +105,26 @@ def candidates(
         first: First block of the window.
         position: Position of the LiDAR, tunnel frame, m.
         direction: Unit vectors of the beams; if their number is even, the second half must oppose the first.
-
-    Returns:
-        Block numbers, nearest box first. A beam that enters fewer boxes gets arbitrary blocks for the rest, which does
-        no harm: a hit on any wall is a hit.
+        last: Key of the box that was entered last; -1 for none.
     """
     n_beams, n_half = direction.shape[0], tunnel.n_scan // 2
     n_bits = (tunnel.n_scan - 1).bit_length()
     # Opposite beams share a line, and so everything but its sense.
-    lines = direction if n_beams % 2 else direction[: n_beams // 2]
+    n_lines = n_beams if n_beams % 2 else n_beams // 2
     box = lax.dynamic_slice_in_dim(tunnel.box, first, tunnel.n_scan, axis=1)
     number = jnp.arange(tunnel.n_scan, dtype=jnp.int32)
-    near = _entries(box[:, :n_half], number[:n_half], n_bits, position, lines)
-    far = _entries(box[:, n_half:], number[n_half:], n_bits, position, lines)
-    nearest = []
-    for sense in range(1 if n_beams % 2 else 2):
+    near = _entries(box[:, :n_half], number[:n_half], n_bits, position, direction[:n_lines])
+    far = _entries(box[:, n_half:], number[n_half:], n_bits, position, direction[:n_lines])
+    following = []
+    for sense in range(n_beams // n_lines):
         rest = jnp.minimum(near[sense], far[sense])
-        found = []
+        before, found = last[sense * n_lines : (sense + 1) * n_lines], []
         for _ in range(tunnel.n_candidates):
+            rest = jnp.where(rest > before[None], rest, NOTHING)
             found.append(jnp.min(rest, axis=0))
-            rest = jnp.where(rest > found[-1][None], rest, NOTHING)
-        nearest.append(jnp.stack(found, axis=-1))
-    block = first + (jnp.concatenate(nearest) & jnp.int32((1 << n_bits) - 1))
-    return jnp.minimum(block, tunnel.box.shape[1] - 1)
+            before = found[-1]
+        following.append(jnp.stack(found, axis=-1))
+    return jnp.concatenate(following)
 
 
 def _entries(
@@ -162,11 +219,9 @@ def met(
     tunnel: Tunnel, first: Int[Array, ""], position: Float[Array, "2"], direction: Float[Array, "n_beams 2"]
 ) -> tuple[Int[Array, "n_beams"], Int[Array, "n_beams"]]:
     """Block and first vertex of the segment that each beam meets first; any segment for a beam that meets none."""
-    block = candidates(tunnel, first, position, direction)
-    distance = _distances(tunnel, block, position, direction)
-    n_segments = distance.shape[2]
-    nearest = jnp.argmin(distance.reshape(len(direction), -1), axis=-1).astype(jnp.int32)
-    return jnp.take_along_axis(block, nearest[:, None] // n_segments, axis=1)[:, 0], nearest % n_segments
+    block = _search(tunnel, first, position, direction, which=True).block
+    distance = _distances(tunnel, block[:, None], position, direction)[:, 0]
+    return block, jnp.argmin(distance, axis=-1).astype(jnp.int32)
 
 
 def to_segment(

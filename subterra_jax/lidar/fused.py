@@ -1,8 +1,10 @@
 """The LiDAR as two fused kernels for NVIDIA GPUs.
 
-The same boxes and the same segments as in `cast`, with nothing written to memory in between but three block numbers a
+The same boxes and the same segments as in `cast`, with nothing written to memory in between but a few block numbers a
 beam: for 65,536 environments XLA moves about a gigabyte a step where this moves 25 MB. `cast` stays the reference, and
 is what runs everywhere else.
+
+Robots in different tunnels read different boxes, so a box is read as the 32 bytes of its record, in two instructions.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ _ROWS = 32
 _MOST_LINES = 8
 # Beams of one program, one after the other.
 _MOST_BEAMS = 2
+# Numbers of a record, and the places of two of them; see `Tunnel`.
+RECORD, _VERTICES, _WINDOW = 8, 6, 7
 
 
 def supported(n_beams: int) -> bool:
@@ -66,7 +70,7 @@ def scan(
     width = max(w for w in range(1, _MOST_LINES + 1) if n_lines % w == 0)
     group = max(w for w in range(1, _MOST_BEAMS + 1) if n_beams % w == 0)
     turn = jnp.asarray(np.concatenate([np.cos(bearing), np.sin(bearing)]), jnp.float32)
-    box, wall = tunnel.box.reshape(-1), tunnel.wall.reshape(-1)
+    record, wall = record_of(tunnel), tunnel.wall.reshape(-1)
     row = pl.BlockSpec((_ROWS,), lambda i, _: (i,))
     whole = pl.BlockSpec(memory_space=pl.ANY)
     warp = triton.CompilerParams(num_warps=1, num_stages=1)
@@ -78,7 +82,7 @@ def scan(
         out_shape=jax.ShapeDtypeStruct((k, n_beams, n), jnp.int32),
         compiler_params=warp,
         interpret=jax.default_backend() != "gpu",
-    )(*rows, turn, box)
+    )(*rows, turn, record)
     ranges = pl.pallas_call(
         partial(_hits_kernel, tunnel=tunnel, n_beams=n_beams, width=group),
         grid=(n // _ROWS, n_beams // group),
@@ -87,8 +91,39 @@ def scan(
         out_shape=jax.ShapeDtypeStruct((n_beams, n), jnp.float32),
         compiler_params=warp,
         interpret=jax.default_backend() != "gpu",
-    )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), box, wall)
+    )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), record, wall)
     return ranges[:, :count].T
+
+
+def record_of(tunnel: Tunnel) -> Int[Array, " n"]:
+    """Return the bits of the records of a tunnel, one after another; made of its boxes where it has none."""
+    record = tunnel.record
+    if record is None:
+        most = jnp.full(tunnel.box.shape[1], tunnel.n_scan, jnp.float32)
+        record = jnp.column_stack([tunnel.box.T, jnp.full_like(most, tunnel.wall.shape[2]), most])
+    return lax.bitcast_convert_type(jnp.asarray(record, jnp.float32), jnp.int32).reshape(-1)
+
+
+def load_box(record_ref, block):
+    """Return the six numbers of the boxes of many blocks, read by two instructions."""
+    from jax.experimental.pallas import triton
+
+    column = lax.broadcasted_iota(jnp.int32, (*block.shape, 4), 1)
+    at = RECORD * block[:, None] + column
+    halves = triton.load(record_ref.at[at]), triton.load(record_ref.at[at + 4])
+
+    def number(i):
+        bits = jnp.sum(jnp.where(column == i % 4, halves[i // 4], 0), axis=1)
+        return lax.bitcast_convert_type(bits, jnp.float32)
+
+    return [number(i) for i in range(6)]
+
+
+def load_number(record_ref, block, i, mask):
+    """Return a number of the records of many blocks, 0 where masked."""
+    from jax.experimental.pallas import triton
+
+    return lax.bitcast_convert_type(triton.load(record_ref.at[RECORD * block + i], mask=mask, other=0), jnp.float32)
 
 
 def _number_bits(tunnel: Tunnel) -> int:
@@ -111,7 +146,7 @@ def _boxes_kernel(
     y_ref,
     heading_ref,
     turn_ref,
-    box_ref,
+    record_ref,
     key_ref,
     *,
     tunnel: Tunnel,
@@ -123,23 +158,22 @@ def _boxes_kernel(
     `cast._entries` has the geometry.
     """
     from jax.experimental import pallas as pl
-    from jax.experimental.pallas import triton
 
     line = pl.program_id(1) * width
 
     @pl.when(jnp.max(wanted_ref[...]) > 0)
     def look() -> None:
-        n_blocks, n_best, n_bits = tunnel.box.shape[1], tunnel.n_candidates, _number_bits(tunnel)
+        n_best, n_bits = tunnel.n_candidates, _number_bits(tunnel)
         first, x, y, heading = first_ref[...], x_ref[...], y_ref[...], heading_ref[...]
         cos, sin = jnp.cos(heading), jnp.sin(heading)
         lines = [_direction(turn_ref, line + j, n_beams, cos, sin) for j in range(width)]
 
         def meet(number, best):
-            row = lambda i: triton.load(box_ref.at[first + number + i * n_blocks])  # noqa: E731
-            m_x, m_y, e_x, e_y, thickness = row(0) - x, row(1) - y, row(2), row(3), row(4)
+            m_x, m_y, e_x, e_y, thickness, length = load_box(record_ref, first + number)
+            m_x, m_y = m_x - x, m_y - y
             turn = m_x * e_y - m_y * e_x
             e_x, e_y = jnp.where(turn < 0.0, -e_x, e_x), jnp.where(turn < 0.0, -e_y, e_y)
-            to_face = jnp.abs(turn) - thickness * row(5)
+            to_face = jnp.abs(turn) - thickness * length
             between, to_face = to_face <= 0.0, jnp.maximum(to_face, 0.0)
             merged = []
             for d_x, d_y in lines:
@@ -155,7 +189,8 @@ def _boxes_kernel(
             return tuple(_inserted(best[i], merged[i]) for i in range(2 * width))
 
         nothing = tuple(jnp.full(first.shape, NOTHING) for _ in range(n_best))
-        best = lax.fori_loop(0, tunnel.n_scan, meet, (nothing,) * (2 * width))
+        window = jnp.max(load_number(record_ref, first, _WINDOW, None)).astype(jnp.int32)
+        best = lax.fori_loop(0, window, meet, (nothing,) * (2 * width))
         for j in range(width):
             for k in range(n_best):
                 key_ref[k, line + j, :] = best[2 * j][k]
@@ -172,13 +207,10 @@ def _inserted(best, key):
 
 
 def _hits_kernel(
-    key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, box_ref, wall_ref, range_ref,
+    key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, record_ref, wall_ref, range_ref,
     *, tunnel: Tunnel, n_beams: int, width: int,
 ):  # fmt: skip
-    """The nearest segment along one beam of many scans, in the blocks whose boxes it enters before that segment.
-
-    `cast.hits` has the geometry.
-    """
+    """The nearest segment along one beam of many scans, in the blocks whose boxes it enters before that segment."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
@@ -186,41 +218,77 @@ def _hits_kernel(
 
     @pl.when(jnp.max(wanted_ref[...]) > 0)
     def look() -> None:
-        n_blocks, n_vertices, n_bits = tunnel.box.shape[1], tunnel.wall.shape[2], _number_bits(tunnel)
+        n_blocks, n_bits = tunnel.box.shape[1], _number_bits(tunnel)
         first, x, y, heading = first_ref[...], x_ref[...], y_ref[...], heading_ref[...]
         cos, sin = jnp.cos(heading), jnp.sin(heading)
+        wanted = wanted_ref[...] > 0
 
         def beam(j, _):
-            d_x, d_y = _direction(turn_ref, first_beam + j, n_beams, cos, sin)
+            direction = _direction(turn_ref, first_beam + j, n_beams, cos, sin)
+            look_into = partial(_look_into, record_ref, wall_ref, tunnel.wall.shape[2], x, y, direction)
             nearest = jnp.full(first.shape, triton.load(limit_ref.at[jnp.int32(0)]))
             for k in range(tunnel.n_candidates):
                 key = key_ref[k, j, :]
                 entry = lax.bitcast_convert_type(key & jnp.int32(-(1 << n_bits)), jnp.float32)
                 # A box that is entered behind the hit holds no nearer one.
-                open_ = (key != NOTHING) & (entry <= nearest)
+                open_ = wanted & (key != NOTHING) & (entry <= nearest)
                 block = jnp.minimum(first + (key & jnp.int32((1 << n_bits) - 1)), n_blocks - 1)
-                load = lambda ref, index, open_=open_: triton.load(ref.at[index], mask=open_, other=0.0)  # noqa: E731
-                m_x, m_y = load(box_ref, block) - x, load(box_ref, block + n_blocks) - y
-                middle_left, middle_ahead = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
-                joint = 2e-7 * (1.0 + jnp.abs(middle_ahead))
-                start = block * (2 * n_vertices)
-
-                def vertex(i, load=load, start=start, left=middle_left, ahead=middle_ahead):
-                    x, y = load(wall_ref, start + i), load(wall_ref, start + n_vertices + i)
-                    return left + (d_x * y - d_y * x), ahead + (d_x * x + d_y * y)
-
-                def segment(i, carry, vertex=vertex, joint=joint, open_=open_):
-                    a, a_ahead, nearest = carry
-                    b, b_ahead = vertex(i)
-                    meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
-                    share = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
-                    distance = a_ahead + share * (b_ahead - a_ahead)
-                    hit = open_ & meets & (distance >= 0.0)
-                    return b, b_ahead, jnp.where(hit, jnp.minimum(nearest, distance), nearest)
-
-                end = 1 + (n_vertices - 1) * jnp.max(open_.astype(jnp.int32))
-                nearest = lax.fori_loop(1, end, segment, (*vertex(0), nearest))[2]
-            range_ref[j, :] = nearest
+                nearest = look_into(block, open_, nearest)
+            unsure = wanted & (key != NOTHING) & (entry <= nearest)
+            range_ref[j, :] = _look_everywhere(record_ref, look_into, first, unsure, x, y, direction, nearest)
             return 0
 
         lax.fori_loop(0, width, beam, 0)
+
+
+def _look_into(record_ref, wall_ref, n_vertices: int, x, y, direction, block, open_, nearest):
+    """The distance to the nearest segment of a block along beams where `open_`, if less than `nearest`.
+
+    `cast.hits` has the geometry.
+    """
+    from jax.experimental.pallas import triton
+
+    d_x, d_y = direction
+    m_x, m_y = (load_number(record_ref, block, i, open_) - at for i, at in ((0, x), (1, y)))
+    middle_left, middle_ahead = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
+    joint = 2e-7 * (1.0 + jnp.abs(middle_ahead))
+    start = block * (2 * n_vertices)
+    load = lambda i: triton.load(wall_ref.at[start + i], mask=open_, other=0.0)  # noqa: E731
+
+    def vertex(i):
+        x, y = load(i), load(n_vertices + i)
+        return middle_left + (d_x * y - d_y * x), middle_ahead + (d_x * x + d_y * y)
+
+    def segment(i, carry):
+        a, a_ahead, nearest = carry
+        b, b_ahead = vertex(i)
+        meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
+        share = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
+        distance = a_ahead + share * (b_ahead - a_ahead)
+        hit = open_ & meets & (distance >= 0.0)
+        return b, b_ahead, jnp.where(hit, jnp.minimum(nearest, distance), nearest)
+
+    end = jnp.max(load_number(record_ref, block, _VERTICES, open_)).astype(jnp.int32)
+    return lax.fori_loop(1, jnp.maximum(end, 1), segment, (*vertex(0), nearest))[2]
+
+
+def _look_everywhere(record_ref, look_into, first, unsure, x, y, direction, nearest):
+    """The same in every block of the window whose box is entered, for beams that are `unsure`.
+
+    They enter as many boxes as were kept, and meet no wall before the last of them, as beside a row of deep recesses.
+    """
+    d_x, d_y = direction
+
+    def look(number, nearest):
+        block = first + number
+        m_x, m_y, e_x, e_y, thickness, length = (load_number(record_ref, block, i, unsure) for i in range(6))
+        m_x, m_y = m_x - x, m_y - y
+        to_face = jnp.maximum(jnp.abs(m_x * e_y - m_y * e_x) - thickness * length, 0.0)
+        size = jnp.abs(d_x * e_y - d_y * e_x)
+        # Entered a little early rather than a little late.
+        open_ = unsure & (jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness)
+        open_ = open_ & (to_face * (1.0 - 1e-5) <= nearest * size + 1e-6)
+        return lax.cond(jnp.max(open_.astype(jnp.int32)) > 0, lambda: look_into(block, open_, nearest), lambda: nearest)
+
+    window = jnp.max(jnp.where(unsure, load_number(record_ref, first, _WINDOW, unsure), 0.0)).astype(jnp.int32)
+    return lax.fori_loop(0, window, look, nearest)

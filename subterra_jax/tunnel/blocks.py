@@ -147,6 +147,7 @@ class Blocks:
         half: Half the long axis of each box as a vector, m, `(n_blocks, 2)`.
         thickness: Half the thickness of each box, m, `(n_blocks,)`.
         offset: Vertices of each block from the middle of its box, m, `(n_blocks, m, 2)`; padded with the last one.
+        count: Vertices of each block without padding, `(n_blocks,)`.
         station: Station of the middle of each block, m, `(n_blocks,)`.
     """
 
@@ -154,6 +155,7 @@ class Blocks:
     half: np.ndarray
     thickness: np.ndarray
     offset: np.ndarray
+    count: np.ndarray
     station: np.ndarray
 
 
@@ -262,7 +264,7 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
     place = np.minimum(pieces.first[:, None] + np.arange(count.max()), pieces.last[:, None])
     vertex = pieces.vertex[place]
     centre, half, thickness = thin_boxes(*add_lids(vertex, count, pieces.inward))
-    return Blocks(centre, half, thickness, offset=vertex - centre[:, None, :], station=pieces.station)
+    return Blocks(centre, half, thickness, vertex - centre[:, None, :], count, pieces.station)
 
 
 def pad(blocks: Blocks, count: int) -> Blocks:
@@ -273,6 +275,7 @@ def pad(blocks: Blocks, count: int) -> Blocks:
         half=np.pad(blocks.half, ((0, missing), (0, 0))),
         thickness=np.pad(blocks.thickness, (0, missing), constant_values=PADDING_THICKNESS),
         offset=np.pad(blocks.offset, ((0, missing), (0, 0), (0, 0))),
+        count=np.pad(blocks.count, (0, missing), constant_values=1),
         station=np.pad(blocks.station, (0, missing), constant_values=np.inf),
     )
 
@@ -280,7 +283,7 @@ def pad(blocks: Blocks, count: int) -> Blocks:
 _ROWS = 128  # segments compared together: close enough to one another to share most of their blocks
 
 
-def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray, int]:
+def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Return, for each node of the station grid, the blocks within reach of a robot near that node.
 
     Args:
@@ -290,7 +293,8 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
             step along it; beyond a mouth, up to 0.5 m outside.
 
     Returns:
-        First block of each node's window `(n,)`, and the number of blocks in a window, the same for all.
+        First block of each node's window, and the number of blocks in it, both `(n,)`. As many blocks as the largest
+        window holds follow every first block.
     """
     spacing = plan.station[1] - plan.station[0]
     slack = np.full(len(plan.station), 0.6 * spacing + 0.01)
@@ -302,7 +306,8 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
     np.minimum.at(first, node, block)
     np.maximum.at(last, node, block)
     size = int(np.clip(np.max(last - first) + 1, 1, len(blocks.centre)))
-    return np.clip(first, 0, len(blocks.centre) - size), size
+    first = np.clip(first, 0, len(blocks.centre) - size)
+    return first, np.maximum(last - first + 1, 1)
 
 
 def separation(blocks: Blocks, reach: float) -> int:

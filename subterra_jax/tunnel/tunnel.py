@@ -45,8 +45,11 @@ class Tunnel:
         n_scan: Blocks in a scan window; even, and blocks half a window apart are further apart than `reach`. Every
             window, counted up to the next power of two, holds blocks of one tunnel, padding, or nothing.
         n_contact: Blocks in a contact window.
-        n_candidates: Blocks in which a beam looks for its hit, nearest first.
+        n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone.
         space: Surface and ground, a `lidar3d.space.Space`, for LiDARs in three dimensions; `None` without one.
+        record: For GPUs the numbers of each block side by side, `(n_blocks, 8)`: those of `box`, its vertices without
+            padding, and the blocks in the largest scan window that begins with it. `None` in a tunnel whose `box` was
+            replaced.
     """
 
     length: Float[Array, "*k"]
@@ -64,6 +67,7 @@ class Tunnel:
     n_contact: int = struct.field(pytree_node=False)
     n_candidates: int = struct.field(pytree_node=False)
     space: Any = None
+    record: Any = None
 
     @property
     def count(self) -> int:
@@ -118,9 +122,8 @@ class Tunnel:
             reach: Largest LiDAR range, m.
             block_length: Target length of the blocks of wall, m; affects speed alone.
             max_segments: Most wall segments in one block; affects speed alone.
-            n_candidates: Blocks in which a beam looks for its hit. A beam may graze the boxes of one or two blocks
-                without touching their walls: with 2, about one random beam in 10⁶ misses its wall; with 3, none in 10⁷.
-                `None` is 3, and 8 with furniture, beside which a beam grazes more boxes.
+            n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone. `None` is 3, and 8
+                with furniture, beside which a beam enters more boxes without touching what is in them.
 
         Raises:
             TunnelError: The plan does not have the lining, or lies so far from its origin that 32 bits blur it.
@@ -134,14 +137,16 @@ class Tunnel:
         blocks = build_blocks(plan, walls, block_length, max_segments)
         if n_candidates is None:
             n_candidates = _CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED
-        scan_first, n_scan = windows(plan, blocks, reach)
-        n_scan = 2 * max(-(-n_scan // 2), separation(blocks, reach))
+        scan_first, in_window = windows(plan, blocks, reach)
+        n_scan = 2 * max(-(-int(in_window.max()) // 2), separation(blocks, reach))
         # A slice beyond the end would start earlier than asked for.
         blocks = pad(blocks, int(scan_first.max()) + n_scan)
-        contact_first, n_contact = windows(plan, blocks, CONTACT_REACH)
+        contact_first, in_contact = windows(plan, blocks, CONTACT_REACH)
         half_length = np.linalg.norm(blocks.half, axis=1)
         grid = np.concatenate([plan.centre, plan.tangent, plan.half_width[:, None]], axis=1)
         box = np.column_stack([blocks.centre, blocks.half, blocks.thickness, half_length]).T
+        window = np.zeros(box.shape[1])
+        np.maximum.at(window, scan_first, in_window)
         real, whole = partial(_on_device, dtype=np.float32), partial(_on_device, dtype=np.int32)
         return cls(
             length=real(plan.length),
@@ -156,8 +161,9 @@ class Tunnel:
             wall=real(blocks.offset.swapaxes(1, 2)),
             reach=reach,
             n_scan=n_scan,
-            n_contact=n_contact,
+            n_contact=int(in_contact.max()),
             n_candidates=n_candidates,
+            record=real(np.column_stack([box.T, blocks.count, window])),
         )
 
 
@@ -250,7 +256,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     n_scan, n_contact = max(t.n_scan for t in tunnels), max(t.n_contact for t in tunnels)
     n_vertices = max(t.wall.shape[2] for t in tunnels)
     parts = [_pad(t, n_scan, n_contact, n_vertices) for t in tunnels]
-    n_blocks, n_nodes = np.array([box.shape[1] for box, _ in parts]), np.array([t.grid.shape[0] for t in tunnels])
+    n_blocks, n_nodes = np.array([box.shape[1] for box, _, _ in parts]), np.array([t.grid.shape[0] for t in tunnels])
     first_block, first_node = (np.concatenate([[0], np.cumsum(n)[:-1]]).astype(np.int32) for n in (n_blocks, n_nodes))
     put = jax.device_put  # `jnp.asarray` would compile a program for each new shape
     numbers = lambda name: put(np.stack([np.asarray(getattr(t, name)) for t in tunnels]))  # noqa: E731
@@ -266,18 +272,19 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         grid=put(np.concatenate([np.asarray(t.grid) for t in tunnels])),
         scan_first=shifted("scan_first"),
         contact_first=shifted("contact_first"),
-        box=put(np.concatenate([box for box, _ in parts], axis=1)),
-        wall=put(np.concatenate([wall for _, wall in parts])),
+        box=put(np.concatenate([box for box, _, _ in parts], axis=1)),
+        wall=put(np.concatenate([wall for _, wall, _ in parts])),
         reach=min(t.reach for t in tunnels),
         n_scan=n_scan,
         n_contact=n_contact,
         n_candidates=max(t.n_candidates for t in tunnels),
         space=None if tunnels[0].space is None else tunnels[0].space.join([t.space for t in tunnels]),
+        record=None if any(t.record is None for t in tunnels) else put(np.concatenate([part[2] for part in parts])),
     )
 
 
-def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return box and wall of a tunnel, padded so that none of its windows reaches beyond them."""
+def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return box, wall and record of a tunnel, padded so that none of its windows reaches beyond them."""
     box, wall = np.asarray(tunnel.box), np.asarray(tunnel.wall)
     # A beam that enters no box reads the block whose number has all bits set.
     window = 1 << (n_scan - 1).bit_length()
@@ -288,4 +295,7 @@ def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[
     fill = np.zeros((6, missing), np.float32)
     fill[:2], fill[4] = PADDING_CENTRE, PADDING_THICKNESS
     wall = np.pad(wall, ((0, 0), (0, 0), (0, n_vertices - wall.shape[2])), mode="edge")
-    return np.concatenate([box, fill], axis=1), np.pad(wall, ((0, missing), (0, 0), (0, 0)))
+    record = np.zeros((0, 8), np.float32) if tunnel.record is None else np.asarray(tunnel.record)
+    numbers = np.concatenate([fill.T, np.ones((missing, 1), np.float32), np.zeros((missing, 1), np.float32)], axis=1)
+    box, wall = np.concatenate([box, fill], axis=1), np.pad(wall, ((0, missing), (0, 0), (0, 0)))
+    return box, wall, np.concatenate([record, numbers])

@@ -64,14 +64,14 @@ def test_the_distance_to_a_segment_is_that_to_its_line_or_its_nearer_end():
 def test_windows_hold_every_block_within_reach_found_one_by_one():
     plan = procedural.plan(3, linings=("pockets",)).slice(40.0, 90.0)
     cut = blocks.build_blocks(plan, plan.lining("pockets"), 2.0, 16)
-    first, size = windows(plan, cut, 12.0)
+    first, count = windows(plan, cut, 12.0)
     apart = separation(cut, 12.0)
     vertex = cut.offset + cut.centre[:, None]
     segments = [np.hstack([v[:-1], v[1:]]) for v in vertex]
     for node in range(0, len(plan.station), 15):
         near = [i for i, s in enumerate(segments) if reference.clearance(s, plan.centre[node : node + 1])[0] < 12.0]
         assert first[node] <= min(near)
-        assert max(near) < first[node] + size
+        assert max(near) < first[node] + count[node]
     for i in range(0, len(segments) - apart, 7):
         ends = reference.clearance(np.concatenate(segments[i + apart :]), vertex[i])
         assert ends.min() > 12.0

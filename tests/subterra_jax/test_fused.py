@@ -1,5 +1,7 @@
 """The fused LiDAR, here in Pallas' interpreter; on a GPU `benchmarks.throughput` holds it against the reference."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -52,3 +54,31 @@ def test_wanted_scans_do_not_depend_on_the_unwanted_ones(plan: st.TunnelPlan) ->
     tunnel, wanted = Tunnel.from_plan(plan), np.arange(96) == 50
     some, everything = (fused_scan(tunnel, poses, mask, 16) for mask in (wanted, np.ones(96, bool)))
     np.testing.assert_array_equal(some[50], everything[50])
+
+
+def test_a_beam_along_a_row_of_deep_recesses_is_exact() -> None:
+    """Where as many boxes are entered as were sorted, the kernels look into every box of the window."""
+    plan = st.load_tunnel("open:masonry:train:0").slice(100.0, 80.0)
+    poses = reference.random_poses(plan, 64, np.random.default_rng(1))
+    ranges = fused_scan(Tunnel.from_plan(plan, n_candidates=1), poses, np.ones(64, bool), 16)
+    assert reference.agreement(plan.lining(plan.default_lining).segments, poses, ranges).n_wrong == 0
+
+
+def test_records_that_follow_the_boxes_give_the_same_ranges(plan: st.TunnelPlan) -> None:
+    poses = reference.random_poses(plan, 32, np.random.default_rng(4))
+    tunnel, wanted = Tunnel.from_plan(plan), np.ones(32, bool)
+    without = fused_scan(dataclasses.replace(tunnel, record=None), poses, wanted, 16)
+    np.testing.assert_array_equal(without, fused_scan(tunnel, poses, wanted, 16))
+
+
+def test_a_record_has_the_vertices_of_its_block_and_the_window_that_begins_there(plan: st.TunnelPlan) -> None:
+    tunnel = Tunnel.from_plan(plan)
+    record, wall = np.asarray(tunnel.record), np.asarray(tunnel.wall)
+    np.testing.assert_array_equal(record[:, :6], np.asarray(tunnel.box).T)
+    moves = np.any(wall[:, :, 1:] != wall[:, :, :-1], axis=1)
+    count = record[:, 6].astype(int)
+    assert not any(moves[i, n - 1 :].any() for i, n in enumerate(count))
+    assert np.mean(count < wall.shape[2]) > 0.1
+    first = np.unique(np.asarray(tunnel.scan_first))
+    assert np.all((record[first, 7] >= 1) & (record[first, 7] <= tunnel.n_scan))
+    assert record[np.setdiff1d(np.arange(len(record)), first), 7].max() == 0

@@ -105,6 +105,19 @@ def test_furniture_along_a_wall_is_exact(plan_of):
     check_exact(plan_of(arrays), "pockets", 20_000)
 
 
+@pytest.mark.parametrize("n_candidates", [1, 3])
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_beam_along_a_row_of_deep_recesses_is_exact(fused, n_candidates):
+    """Refuges in masonry, each in a box as thick as it is long: a beam along the wall enters up to 16 of them."""
+    plan = load_tunnel("open:masonry:train:0").slice(100.0, 120.0)
+    tunnel, params = Tunnel.from_plan(plan, n_candidates=n_candidates), lidar.LidarParams(fused=fused)
+    poses = reference.random_poses(plan, 500, np.random.default_rng(1))
+    scan = jax.jit(jax.vmap(partial(lidar.scan, params=params), (None, 0, 0, 0)))
+    ranges = np.asarray(scan(tunnel, poses.position, poses.heading, poses.station))
+    result = reference.agreement(plan.lining(plan.default_lining).segments, poses, ranges)
+    assert (result.n_wrong, result.n_ambiguous) == (0, 0)
+
+
 def test_noise_has_its_size_stays_in_range_and_spares_beams_without_a_hit():
     true = jnp.array([10.0, 30.0, 0.01, 29.99])
     noise = jax.random.normal(jax.random.key(0), (20_000, 4))
