@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import trimesh
+from jaxtyping import Float
 
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
@@ -28,6 +29,23 @@ _KEPT_UNTIL: dict[tuple[str, str], str] = {}
 
 
 @dataclass(frozen=True)
+class Near:
+    """Stretch that windows are judged on, where the rest of the tunnel is known to be unchanged.
+
+    Attributes:
+        path: Stations on the sensor's path that windows against the recording must lie between, m.
+        truth: Stations on the true axis that windows against the truth must lie between, m.
+        ends: First and last station of a profile of the whole tunnel, by the function that reads it, m.
+        box: Lowest and highest corner of a box around all surfaces of the stretch, tunnel frame, m, `(2, 3)`.
+    """
+
+    path: tuple[float, float]
+    truth: tuple[float, float]
+    ends: dict[str, tuple[float, float]]
+    box: Float[np.ndarray, "2 3"]
+
+
+@dataclass(frozen=True)
 class Case:
     """Everything that a metric may read.
 
@@ -38,6 +56,7 @@ class Case:
         truth: Truth of the generator; `None` for real data.
         seed: Seed of sampling, noise and bootstrap.
         tolerance: Factor on the tolerances inside metrics, for the sweep.
+        near: Stretch that windows are judged on; all of the tunnel where `None`.
         cache: Results of `derive` for this case.
     """
 
@@ -47,6 +66,7 @@ class Case:
     truth: Truth | None = None
     seed: int = 0
     tolerance: float = 1.0
+    near: Near | None = None
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def fresh(self) -> "Case":
@@ -104,6 +124,13 @@ def per_hold(function: Function[Result]) -> Function[Result]:
 def per_truth(function: Function[Result]) -> Function[Result]:
     """Keeps the result of a function of truth, seed and tolerance once for all candidates."""
     return _kept_in(function, lambda case: _reference_cache(case, case.truth))
+
+
+def kept_with(case: Case, reference: Hold | Truth, results: dict[Function[Any], Any]) -> dict[Any, Any]:
+    """Return what is kept of a reference, with other results of some functions of it."""
+    settings = (case.seed, case.tolerance)
+    named = {(function.__module__, function.__qualname__, *settings): value for function, value in results.items()}
+    return reference.cache | named
 
 
 def _kept_in(

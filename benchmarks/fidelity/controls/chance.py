@@ -18,6 +18,7 @@ from benchmarks.fidelity.case import Case, case_hash, release_memory
 from benchmarks.fidelity.controls.local import KINDS, draw_fault, make_ground, spoil
 from benchmarks.fidelity.files import FidelityError, read_json, write_json, write_text
 from benchmarks.fidelity.windows.judge import noticed_by, windows_hash, worst_windows
+from benchmarks.fidelity.windows.near import Nearby
 from scene.progress import Stages
 
 matplotlib.use("Agg")
@@ -45,7 +46,9 @@ def check_draw(count: int, draw: int, kinds: tuple[str, ...]) -> None:
         raise FidelityError(f"no kind of fault {unknown[0]!r}; there are {', '.join(known)}")
 
 
-def run_faults(case: Case, count: int, draw: int, kinds: tuple[str, ...], folder: Path) -> list[dict[str, Any]]:
+def run_faults(
+    case: Case, count: int, draw: int, kinds: tuple[str, ...], folder: Path, near: bool = False
+) -> list[dict[str, Any]]:
     """Draws and puts in faults; those kept from an earlier run on the same case, code and draw are not done again.
 
     Args:
@@ -54,12 +57,14 @@ def run_faults(case: Case, count: int, draw: int, kinds: tuple[str, ...], folder
         draw: Seed that draws them.
         kinds: Kinds to draw from; all where empty.
         folder: Folder that keeps `faults.json`.
+        near: Judge only the windows near each fault, and keep the first that is beyond its limit.
     """
-    key = sha256(f"{case_hash(case)} {windows_hash()} {draw} {kinds}".encode()).hexdigest()
+    key = sha256(f"{case_hash(case)} {windows_hash()} {draw} {kinds} {near}".encode()).hexdigest()
     path = folder / "faults.json"
     content = json.loads(path.read_text()) if path.exists() else {}
     rows: list[dict[str, Any]] = content["rows"][:count] if content.get("key") == key else []
     ground, before = make_ground(case.candidate), worst_windows(case)
+    nearby = Nearby(case, ground, before) if near else None
     with Stages() as progress:
         stage = progress.start("faults", count)
         if rows:
@@ -67,7 +72,12 @@ def run_faults(case: Case, count: int, draw: int, kinds: tuple[str, ...], folder
         for number in range(len(rows), count):
             rng = np.random.default_rng(np.random.SeedSequence(draw, spawn_key=(number,)))
             fault = draw_fault(rng, case.candidate.length, kinds[number % len(kinds)] if kinds else None)
-            by = noticed_by(case, spoil(ground, fault), before)
+            spoilt = spoil(ground, fault)
+            if nearby is None:
+                by = noticed_by(case, spoilt, before)
+            else:
+                first = nearby.first_beyond(spoilt, *fault.extent())
+                by = (first,) if first else ()
             rows.append({"scene": case.candidate.name, "number": number, **asdict(fault), "by": list(by)})
             write_json(path, {"schema": SCHEMA, "key": key, "rows": rows})
             release_memory()

@@ -16,6 +16,7 @@ from benchmarks.fidelity.derive.curve import Curve
 
 RAMP = 0.5  # m before and after a fault over which it grows
 LENGTHS = (3.0, 12.0)  # m, of faults that are drawn
+_SQUEEZE = 3.0  # m before and after what moves along the tunnel
 _RAIL_EDGE = 0.5  # m
 _EDGE = 1.0  # m that a drawn fault keeps from the mouths
 _CORE, _RIM = np.deg2rad(40.0), np.deg2rad(65.0)  # from the middle of a part of the section: fully moved, not moved
@@ -47,6 +48,12 @@ class Fault:
         """Return 1 along the fault, 0 beyond its ramps, smooth between."""
         beyond = np.maximum(np.maximum(self.start - station, station - self.start - self.length), 0.0)
         return _smooth(1.0 - beyond / RAMP)
+
+    def extent(self) -> tuple[float, float]:
+        """Return the stations beyond which nothing is changed, m; a mirror changes everything."""
+        wide = {"along": _SQUEEZE + abs(self.size), "sleepers": RAMP + abs(self.size) + 0.3, "missing": RAMP + 0.3}
+        reach = wide.get(self.kind, RAMP)
+        return self.start - reach, self.start + self.length + reach
 
 
 @dataclass(frozen=True)
@@ -171,8 +178,9 @@ def _move_all(axis: int) -> Callable[[Ground, Fault], Candidate]:
 
 
 def _stretch(ground: Ground, fault: Fault) -> Candidate:
-    """Moves everything along the tunnel; before and behind it is squeezed and stretched over 3 m."""
-    stations = [fault.start - 3.0, fault.start, fault.start + fault.length, fault.start + fault.length + 3.0]
+    """Moves everything along the tunnel; before and behind it is squeezed and stretched over `_SQUEEZE`."""
+    end = fault.start + fault.length
+    stations = [fault.start - _SQUEEZE, fault.start, end, end + _SQUEEZE]
 
     def shift(local: Points) -> Points:
         return _columns(local, 0, fault.size * np.interp(local[:, 0], stations, [0.0, 1.0, 1.0, 0.0]))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.fidelity.case import Case, case_hash
-from benchmarks.fidelity.controls import chance
+from benchmarks.fidelity.controls import chance, ladder
 from benchmarks.fidelity.files import FidelityError, read_json, write_json
 from benchmarks.fidelity.impostors import truth_candidate
 from benchmarks.fidelity.inputs import Inputs, complete_inputs, read_case
@@ -31,12 +31,18 @@ class FaultsConfig(Inputs):
         draw: Seed that draws them.
         kinds: Kinds to draw from; all where empty.
         join: Folders of such runs on other scenes, for one table.
+        near: Judge only the windows near each fault, and stop at the first beyond its limit.
+        ladder: Find the smallest size noticed of six kinds at random places, instead of drawing sizes.
+        places: Number of places of each kind on a ladder.
     """
 
     count: int = 200
     draw: int = 0
     kinds: tuple[str, ...] = ()
     join: tuple[Path, ...] = ()
+    near: bool = False
+    ladder: bool = False
+    places: int = 24
 
 
 def run_windows(inputs: Inputs) -> None:
@@ -123,13 +129,15 @@ def run_faults(config: FaultsConfig) -> None:
 
     Example: python -m benchmarks.fidelity faults --count 200 --scene build/tunnel --truth build/survey
     """
+    if config.ladder:
+        return _run_ladder(config)
     chance.check_draw(config.count, config.draw, config.kinds)
     earlier = [row for folder in config.join for row in chance.read_rows(folder)]
     require_folder(config.out)
     case = read_case(complete_inputs(config))
     if case.hold is None and case.truth is None:
         raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
-    rows = chance.run_faults(case, config.count, config.draw, config.kinds, config.out)
+    rows = chance.run_faults(case, config.count, config.draw, config.kinds, config.out, config.near)
     summary = chance.write_curves(config.out, rows + earlier)
     noticed = sum(bool(row["by"]) for row in rows)
     print(f"{case.candidate.name}: {noticed} of {len(rows)} faults noticed; {config.out / 'curves.csv'} over "
@@ -137,3 +145,22 @@ def run_faults(config: FaultsConfig) -> None:
     for kind in summary:
         size = "not reached" if kind["size_95"] is None else f"{kind['size_95']:.3g} {kind['unit']}"
         print(f"  {kind['kind']}: {kind['noticed']} of {kind['count']}; 95 % from {size}")
+
+
+def _run_ladder(config: FaultsConfig) -> None:
+    require_folder(config.out)
+    if config.draw < 0:
+        raise FidelityError(f"draw must not be negative, got {config.draw}")
+    case = read_case(complete_inputs(config))
+    if case.hold is None and case.truth is None:
+        raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
+    ladder.check_ladder(config.kinds, config.places, case.candidate.length)
+    rows = ladder.climb_ladders(case, config.kinds, config.places, config.draw, config.out)
+    print(
+        f"{case.candidate.name}: smallest sizes noticed at 95 % of {config.places} places; {config.out / 'ladder.csv'}"
+    )
+    for one in ladder.write_ladder(config.out, rows):
+        factor, unit = (1000.0, "mm") if one["kind"] == "gauge" else (100.0, "cm")
+        print(f"  {one['kind']} over {one['length']:g} m: {factor * one['size_95']:.2g} {unit} "
+              f"({factor * one['low']:.2g} to {factor * one['high']:.2g}); {factor * one['asked']:g} {unit} noticed at "
+              f"{one['noticed_at_asked']} of {one['places']}")  # fmt: skip

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float, Int
 
 from benchmarks.fidelity.candidate import concatenate_meshes
@@ -150,9 +151,9 @@ class Relief:
     radius: Float[np.ndarray, "n m"]
 
 
-def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], low: float, high: float) -> Relief:
-    """Casts rays from the middle of the section, in the sections' planes."""
-    station, angle = np.arange(low + FINE / 2, high, FINE), sector_angles(COLUMNS)
+def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], station: Float[np.ndarray, " n"]) -> Relief:
+    """Casts rays from the middle of the section, in the planes of the sections at some stations, m."""
+    angle = sector_angles(COLUMNS)
     position, _, left, up = curve.frames(station)
     origin = np.repeat(position + middle[0] * left + middle[1] * up, COLUMNS, axis=0)
     away = np.cos(angle)[:, None] * left[:, None] + np.sin(angle)[:, None] * up[:, None]
@@ -165,28 +166,36 @@ def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], low: 
 def bore_caster(case: Case) -> Caster:
     """Return the caster of rays into lining, bed and further bodies of the candidate, without its track."""
     one = case.candidate
-    return Caster(concatenate_meshes([part for part in (one.lining, one.bed, one.extra) if len(part.faces)]))
+    lining = one.lining if case.near is None else _inside(one.lining, case.near.box)
+    return Caster(concatenate_meshes([part for part in (lining, one.bed, one.extra) if len(part.faces)]))
+
+
+def _inside(mesh: trimesh.Trimesh, box: Float[np.ndarray, "2 3"]) -> trimesh.Trimesh:
+    """Return the faces of a mesh that have a corner in a box; vertices stay."""
+    known = ((mesh.vertices > box[0]) & (mesh.vertices < box[1])).all(axis=1)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[known[mesh.faces].any(axis=1)], process=False)
 
 
 @per_truth
 def truth_relief(case: Case) -> Relief:
     """Return the relief of the true bore about its own axis."""
     curve = truth_curve(case)
-    return cast_relief(truth_bore_caster(case), curve, (0.0, 0.0), _MOUTH, curve.length - _MOUTH)
+    stations = np.arange(_MOUTH + FINE / 2, curve.length - _MOUTH, FINE)
+    return cast_relief(truth_bore_caster(case), curve, (0.0, 0.0), stations)
 
 
 @per_case
 def relief_on_truth(case: Case) -> Relief:
     """Return the relief of the candidate about the true axis."""
-    curve = truth_curve(case)
-    return cast_relief(bore_caster(case), curve, (0.0, 0.0), _MOUTH, curve.length - _MOUTH)
+    return cast_relief(bore_caster(case), truth_curve(case), (0.0, 0.0), truth_relief(case).station)
 
 
 @per_case
 def relief_on_path(case: Case) -> Relief:
     """Return the relief of the candidate along the sensor's path."""
     frame = hold_frame(case)
-    return cast_relief(bore_caster(case), sensor_path(case), frame.middle, frame.low, frame.high)
+    stations = np.arange(frame.low + FINE / 2, frame.high, FINE)
+    return cast_relief(bore_caster(case), sensor_path(case), frame.middle, stations)
 
 
 def relief_cells(relief: Relief, values: Float[np.ndarray, "n m"] | None = None) -> Float[np.ndarray, "k s"]:
@@ -204,4 +213,5 @@ def truth_map(case: Case) -> Unrolled:
     real, judged = truth_relief(case), relief_on_truth(case)
     offset = np.where(np.isfinite(judged.radius), judged.radius - real.radius, CAP)
     offset = np.where(np.isfinite(real.radius), np.clip(offset, -CAP, CAP), np.nan)
-    return Unrolled(truth_curve(case), (0.0, 0.0), _MOUTH, relief_cells(real), relief_cells(real, offset))
+    low = float(real.station[0]) - FINE / 2
+    return Unrolled(truth_curve(case), (0.0, 0.0), low, relief_cells(real), relief_cells(real, offset))

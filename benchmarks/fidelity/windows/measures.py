@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.windows import track
@@ -153,6 +153,7 @@ def _shift(case: Case, source: Source) -> Series:
     one = unrolled(case, source)
     length = len(one.offset) * CELL
     starts = one.low + np.arange(0.0, max(length - LONG, 0.0) + 1e-6, STEP)
+    starts = starts[_near(case, source, starts, LONG)]
     found = (hold_shift if source == "recording" else truth_shift)(case, starts, LONG)
     return Series(starts, np.abs(found), ("",) * len(starts), LONG)
 
@@ -181,14 +182,30 @@ def _by_profile(
         profile = track.NOTHING if read is None else read(case)
         if not len(profile.station):
             return Series(np.empty(0), np.empty(0), (), window)
-        low, high = profile.station.min(), profile.station.max()
+        low, high = _ends(case, read, profile)
         starts = low + np.arange(0.0, max(high - low - window, 0.0) + 1e-6, STEP)
+        starts = starts[_near(case, source, starts, window)]
         order = np.argsort(profile.station, kind="stable")
         bounds = np.searchsorted(profile.station[order], [starts, starts + window])
         values = [abs(statistic(profile.value[order[a:b]])) if b - a >= least else np.nan for a, b in bounds.T]
         return Series(starts, np.asarray(values, float), ("",) * len(starts), window)
 
     return compute
+
+
+def _near(case: Case, source: Source, starts: np.ndarray, window: float) -> Bool[np.ndarray, " k"]:
+    """Return True for the windows that lie in the stretch to be judged, all where there is none."""
+    if case.near is None:
+        return np.ones(len(starts), bool)
+    low, high = case.near.path if source == "recording" else case.near.truth
+    return (starts >= low) & (starts + window <= high)
+
+
+def _ends(case: Case, read: Callable[[Case], Profile] | None, profile: Profile) -> tuple[float, float]:
+    """Return first and last station of a profile, those of the whole tunnel where a stretch of it is judged."""
+    known = {} if case.near is None else case.near.ends
+    whole = (float(profile.station.min()), float(profile.station.max()))
+    return known.get(getattr(read, "__name__", ""), whole)
 
 
 def _gauge_change(case: Case) -> Profile:
