@@ -55,6 +55,8 @@ def _outcome(recording: Recording, row: int, finished: bool) -> str:
 
 _POINTS = 300  # of a curve
 _CHART_HEIGHT = 88  # pixels: three charts below the controls fit a screen of 900
+_AXES = (uplot.Axis(size=26), uplot.Axis(space=16, size=50))  # pixels: so low, and yet two numbers or more at the side
+_PADDING = (9, 10, 0, 0)  # pixels: half a number above the curves
 _RETURN = (60, 180, 110)
 
 
@@ -135,6 +137,8 @@ def _chart(
         (_TIME, *lines),
         title=title,
         scales={"x": uplot.Scale(time=False)},
+        axes=_AXES,
+        padding=_PADDING,
         legend=uplot.Legend(show=False),
         height=_CHART_HEIGHT,
         visible=visible,

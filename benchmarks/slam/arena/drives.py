@@ -74,7 +74,9 @@ class Carrier:
 _DEGREE = np.pi / 180.0
 # A person's steps: 1.8 Hz, as in `scene.survey`. The B2 trots with 2 strides a second (`subterra_jax.b2.gait`): the
 # trunk bobs and pitches with each pair of feet, twice a stride, and rolls once. Its amplitudes, and all of the
-# trolley's, are assumptions of the size that such carriers show.
+# trolley's, are assumptions of the size that such carriers show. The released gait in MuJoCo, over sleepers at 0.8 m/s,
+# keeps to these frequencies, and bobs with the sleepers besides; its amplitudes are 3, 3 and 11 mm, 1.2° of roll, 1.0°
+# of pitch and 0.3° of yaw.
 CARRIERS: dict[MotionName, Carrier] = {
     "trolley": Carrier(
         1.5, 1.5, 0.0,
