@@ -97,9 +97,6 @@ def _following(
     With m the middle of a box and e its half axis, both from the LiDAR, a line along d crosses the box if
     |d × m| ≤ |d × e| + thickness, and does so at the distance (m × e) / (d × e), whose numerator all beams share.
 
-    Blocks half a window apart are never both within reach along one beam, so that the two halves of the window are
-    folded into one before the nearest are sought.
-
     Args:
         tunnel: The tunnel.
         first: First block of the window.
@@ -107,23 +104,19 @@ def _following(
         direction: Unit vectors of the beams; if their number is even, the second half must oppose the first.
         last: Key of the box that was entered last; -1 for none.
     """
-    n_beams, n_half = direction.shape[0], tunnel.n_scan // 2
-    n_bits = (tunnel.n_scan - 1).bit_length()
+    n_beams, n_bits = direction.shape[0], (tunnel.n_scan - 1).bit_length()
     # Opposite beams share a line, and so everything but its sense.
     n_lines = n_beams if n_beams % 2 else n_beams // 2
     box = lax.dynamic_slice_in_dim(tunnel.box, first, tunnel.n_scan, axis=1)
     number = jnp.arange(tunnel.n_scan, dtype=jnp.int32)
-    near = _entries(box[:, :n_half], number[:n_half], n_bits, position, direction[:n_lines])
-    far = _entries(box[:, n_half:], number[n_half:], n_bits, position, direction[:n_lines])
+    senses = _entries(box, number, n_bits, position, direction[:n_lines])
     following = []
     for sense in range(n_beams // n_lines):
-        rest = jnp.minimum(near[sense], far[sense])
-        before, found = last[sense * n_lines : (sense + 1) * n_lines], []
+        rest, found = senses[sense], [last[sense * n_lines : (sense + 1) * n_lines]]
         for _ in range(tunnel.n_candidates):
-            rest = jnp.where(rest > before[None], rest, NOTHING)
+            rest = jnp.where(rest > found[-1][None], rest, NOTHING)
             found.append(jnp.min(rest, axis=0))
-            before = found[-1]
-        following.append(jnp.stack(found, axis=-1))
+        following.append(jnp.stack(found[1:], axis=-1))
     return jnp.concatenate(following)
 
 

@@ -310,13 +310,6 @@ def windows(plan: TunnelPlan, blocks: Blocks, reach: float) -> tuple[np.ndarray,
     return first, np.maximum(last - first + 1, 1)
 
 
-def separation(blocks: Blocks, reach: float) -> int:
-    """Return the least n such that blocks n apart in the order are never within `reach` of one another."""
-    limit = np.full(len(blocks.centre), reach)
-    first, second = _within(blocks.centre, blocks.half, blocks.thickness, blocks, limit)
-    return int(np.max(np.abs(first - second), initial=0)) + 1
-
-
 def _within(
     middle: Float[np.ndarray, "n 2"],
     half: Float[np.ndarray, "n 2"],

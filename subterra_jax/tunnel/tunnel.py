@@ -12,7 +12,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, pad, separation, windows
+from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, pad, windows
 from subterra_jax.tunnel.plan import TunnelPlan
 
 CONTACT_REACH = 0.8
@@ -42,8 +42,8 @@ class Tunnel:
         wall: Row of x and row of y of the vertices of each block, from the middle of its box, m; the last one repeated
             as padding.
         reach: Largest range for which the scan window was made, m.
-        n_scan: Blocks in a scan window; even, and blocks half a window apart are further apart than `reach`. Every
-            window, counted up to the next power of two, holds blocks of one tunnel, padding, or nothing.
+        n_scan: Blocks in a scan window. Every window, counted up to the next power of two, holds blocks of one tunnel,
+            padding, or nothing.
         n_contact: Blocks in a contact window.
         n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone.
         space: Surface and ground, a `lidar3d.space.Space`, for LiDARs in three dimensions; `None` without one.
@@ -138,7 +138,7 @@ class Tunnel:
         if n_candidates is None:
             n_candidates = _CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED
         scan_first, in_window = windows(plan, blocks, reach)
-        n_scan = 2 * max(-(-int(in_window.max()) // 2), separation(blocks, reach))
+        n_scan = int(in_window.max())
         # A slice beyond the end would start earlier than asked for.
         blocks = pad(blocks, int(scan_first.max()) + n_scan)
         contact_first, in_contact = windows(plan, blocks, CONTACT_REACH)
@@ -230,9 +230,8 @@ def foot(tunnel: Tunnel, position: Float[Array, "2"], near: Float[Array, ""]) ->
 def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     """Join several tunnels into one `Tunnel`; `pick(i)` gives the i-th. Nodes and blocks follow one another.
 
-    Windows are as large as the largest of any tunnel. Blocks half a larger window apart are still further apart than
-    `reach`, because the blocks of each tunnel are in order of station. Behind its last block each tunnel is padded so
-    that no window, counted up to the next power of two, reaches the next tunnel.
+    Windows are as large as the largest of any tunnel. Behind its last block each tunnel is padded so that no window,
+    counted up to the next power of two, reaches the next tunnel.
 
     A stack costs memory that no longer fits a cache: 7 % of the speed for 100 tunnels and 58 % for 1,000 on an H200,
     half as much again for 100 on a CPU.
