@@ -123,7 +123,8 @@ def load_number(record_ref, block, i, mask):
     """Return a number of the records of many blocks, 0 where masked."""
     from jax.experimental.pallas import triton
 
-    return lax.bitcast_convert_type(triton.load(record_ref.at[RECORD * block + i], mask=mask, other=0), jnp.float32)
+    other = {} if mask is None else {"mask": mask, "other": 0}  # Triton takes no `other` without a mask
+    return lax.bitcast_convert_type(triton.load(record_ref.at[RECORD * block + i], **other), jnp.float32)
 
 
 def _number_bits(tunnel: Tunnel) -> int:
