@@ -42,6 +42,20 @@ def test_the_kernels_give_the_ranges_of_the_reference(plan: st.TunnelPlan, n_bea
     assert reference.agreement(plan.lining("pockets").segments, poses, ranges).n_wrong == 0
 
 
+def test_the_kernels_lower_for_a_gpu_where_there_is_none(plan: st.TunnelPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The interpreter takes what Triton refuses, such as a load with another value and no mask.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    tunnel, n = Tunnel.from_plan(plan), 32
+    rows = jnp.zeros((n, 2)), jnp.zeros(n), jnp.zeros(n, jnp.int32), jnp.ones(n, bool)
+    check = jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
+
+    def scan(tunnel, *rows):
+        return fused.scan(tunnel, *rows, jnp.float32(30.0), lidar.bearings(16))
+
+    made = jax.export.export(jax.jit(scan), platforms=["cuda"], disabled_checks=[check])(tunnel.walls, *rows)
+    assert made.mlir_module().count("triton") >= 2
+
+
 def test_the_kernels_clip_at_the_largest_range(plan: st.TunnelPlan) -> None:
     poses = reference.random_poses(plan, 32, np.random.default_rng(1))
     ranges = fused_scan(Tunnel.from_plan(plan), poses, np.ones(32, bool), 16, range_max=4.0)
