@@ -67,6 +67,8 @@ MISTAKES = {
     "train.locate.filtering StopAt-v0 --out o": "StopAt-v0: is no localiser with a network of gru, s5, transformer",
     "train.locate.filtering StopAt-v0 --out o --updates 0": "updates must be at least 1, got 0",
     "train.locate.look none.safetensors --out o": "none.safetensors: no such policy",
+    "train.locate.weigh none.safetensors --out o": "none.safetensors: no such policy",
+    "train.locate.compare --out o --minutes 0": "minutes must be positive, got 0",
     "train.locate.look StopAt-v0 --out o": "StopAt-v0: is no localiser, but Recurrent",
     "train.locate.look locate-transformer --out o --drives 0": "drives must be at least 1, got 0",
     "train.locate.steering none.safetensors --out o": "none.safetensors: no such policy",

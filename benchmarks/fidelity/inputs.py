@@ -39,16 +39,16 @@ class Inputs:
     """Files to judge and to judge by.
 
     Attributes:
-        scene: Scene folder; the packaged `subterra-351`, made under `build/` if missing, where not given.
+        scene: Scene folder; None is the packaged `subterra-351`, made under `build/`.
         recording: Held-out recording, which the builder has not read.
         trajectory: Poses of its LiDAR in the frame of the scene's input, TUM.
         truth: Folder of a simulated survey, for its truth.json and truth.ply.
-        fit_recording: The recording that the builder read, for the gap between fit and hold.
-        fit_trajectory: Poses of that recording; those of `--trajectory` where not given.
+        fit_recording: The recording that the builder read, to compare with.
+        fit_trajectory: Its poses; those of `--trajectory` where not given.
         hold: Part of a recording to score.
         seed: Seed of sampling, noise and bootstrap.
         strict: Count metrics without a reference as 0.
-        partial: Judge the part that the recording shows, where it does not show all of the tunnel.
+        partial: Judge only the part that the recording shows.
         metrics: Python file with metrics of your own, see docs/guide/extend.md.
         out: Folder for all results.
     """

@@ -31,8 +31,8 @@ class FaultsConfig(Inputs):
         draw: Seed that draws them.
         kinds: Kinds to draw from; all where empty.
         join: Folders of such runs on other scenes, for one table.
-        near: Judge only the windows near each fault, and stop at the first beyond its limit.
-        ladder: Find the smallest size noticed of six kinds at random places, instead of drawing sizes.
+        near: Judge only the windows near a fault, up to one beyond its limit.
+        ladder: Find the smallest size noticed of six kinds at random places.
         places: Number of places of each kind on a ladder.
     """
 
