@@ -17,7 +17,9 @@ from scene.survey.simulate import simulate
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> tuple[Reconstruction, float]:
     folder = tmp_path_factory.mktemp("survey")
-    simulate(SurveyConfig(folder, truth="metro", length=19.0, seed=601, tolerances=True, speed=2.0), Console(quiet=True))
+    simulate(
+        SurveyConfig(folder, truth="metro", length=19.0, seed=601, tolerances=True, speed=2.0), Console(quiet=True)
+    )
     with Stages(Console(quiet=True)) as progress:
         found = reconstruct(folder / "survey.bag", folder / "groundtruth.tum", ReconstructConfig(), progress)
     return found, json.loads((folder / "truth.json").read_text())["rails"]["gauge"]
