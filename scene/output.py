@@ -3,9 +3,7 @@
 import dataclasses
 import hashlib
 import json
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from scene.judging.sanity import doubt_bore
 from scene.judging.trackdoubt import doubt_track
 from scene.poses.trajectory import save_tum
 from scene.reconstruct import ReconstructConfig, Reconstruction
+from scene.resume import library_versions
 from scene.writing.furnished import furnish_bore, planar_segments
 from scene.writing.furniture import count_pieces
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
@@ -86,19 +85,10 @@ def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
         "schema": MANIFEST_SCHEMA,
         "files": hash_files(path.parent),
         "config": _json_value(dataclasses.asdict(config)),
-        "versions": _library_versions(),
+        "versions": library_versions(_LIBRARIES),
         **_json_value(content),
     }
     path.write_text(json.dumps(whole, indent=2, sort_keys=True) + "\n")
-
-
-def _library_versions() -> dict[str, str]:
-    """Return the versions of the libraries that are installed; formats without their library cannot have been read."""
-    found = {}
-    for name in _LIBRARIES:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
 
 
 def hash_files(folder: Path) -> dict[str, str]:

@@ -7,7 +7,8 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,9 +40,18 @@ def resume_key(record: list[dict[str, Any]], *settings: Any) -> str:
     source = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
         source.update(f"{file.relative_to(root)}\n".encode() + file.read_bytes())
-    versions = {name: version(name) for name in _LIBRARIES}
+    versions = library_versions(_LIBRARIES)
     text = json.dumps([record, settings, versions, source.hexdigest()], sort_keys=True, default=_json_value)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def library_versions(names: tuple[str, ...]) -> dict[str, str]:
+    """Return the versions of those libraries that are installed; formats without theirs cannot have been read."""
+    found = {}
+    for name in names:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
 
 
 def _files(path: Path) -> list[Path]:

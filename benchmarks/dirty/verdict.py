@@ -2,6 +2,7 @@
 
 import math
 import re
+from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.dirty.truth import Truth
@@ -21,9 +22,42 @@ _FAULT_PLACE = re.compile(r" at (-?\d+) m$")
 _STATION = r"(-?\d+(?:\.\d+)?)"
 _RANGE = re.compile(rf"from (?:station )?{_STATION} to {_STATION} m\b|\bat {_STATION} m\b")
 _GUESS = re.compile(r"(?:inside it|behind it|looks like)\b.*")
-# Causes that spoil all of a scene, so that each fault may come from them.
-_EVERYWHERE = re.compile(
-    r"--axes|--unit|--calibration|--trajectory|poses|clock|mount|quaternion|wall shows twice|grid of", re.IGNORECASE
+_AMOUNT = re.compile(r"([-+]?\d+(?:\.\d+)?) (m|cm|mm)\b")
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+_SHAPE = r"^walls |within 10 cm|^width|^height|^floor|^aside"
+_SLEEPERS = "no sleeper seen|sleeper F1"
+
+
+@dataclass(frozen=True)
+class Spoiler:
+    """A cause that a warning may name without a place, and the faults which it can explain."""
+
+    words: str  # What the warning says; a number in it is how much is off
+    faults: str  # Beginnings of the faults
+    unit: float = math.inf  # m, of that number
+    times: float = 1.0  # of it, up to which a fault may go
+
+    def explains(self, warning: str, fault: str) -> bool:
+        """Return whether a warning is of this cause, and a fault of its kind and no larger than it can make one."""
+        found = re.search(self.words, warning, re.IGNORECASE)
+        if found is None or re.search(self.faults, fault) is None:
+            return False
+        amount = _AMOUNT.search(fault)
+        if amount is None or math.isinf(self.unit):
+            return True
+        return abs(float(amount[1])) * _METRES[amount[2]] <= self.times * self.unit * float(found[1])
+
+
+_SPOILERS = (
+    Spoiler(r"is z up|z is not up", rf"{_SHAPE}|too long|span built|{_SLEEPERS}"),
+    Spoiler(r"--unit|was its unit read", rf"{_SHAPE}|too long|span built|{_SLEEPERS}|gauge"),
+    Spoiler(r"without --calibration", rf"{_SHAPE}|too long|sleeper F1"),
+    # A clock, a mount or an order that is named tells what to mend; a blur alone, how far walls may be off.
+    Spoiler(r"poses blur .*(?:are thin|order w, x, y, z)", rf"{_SHAPE}|{_SLEEPERS}|gauge"),
+    Spoiler(r"poses blur .*?(\d+) mm thick", rf"{_SHAPE}|{_SLEEPERS}|gauge", 0.001, 3.0),
+    Spoiler(r"wall shows twice, up to (\d+) cm", rf"{_SHAPE}|{_SLEEPERS}|gauge", 0.01, 2.0),
+    Spoiler(r"rounded to (\d+(?:\.\d+)?) cm", rf"{_SHAPE}|{_SLEEPERS}|gauge", 0.01, 2.0),
+    Spoiler(r"nothing measured the length", r"too long|span built"),
 )
 _WALL_WORDS = r"left wall|right wall|crown|all around|branch|opens into"
 # What a fault begins with, and the words of the warnings that are of it.
@@ -120,8 +154,8 @@ def untold_faults(row: dict[str, Any], truth: Truth | None = None) -> list[str]:
     """Return the faults of a row of which no warning speaks.
 
     A warning speaks of a fault where it names what is wrong (the floor of a floor, the track of sleepers) near its
-    place, or a cause that spoils the whole scene, such as axes or poses. One that names the trouble which the truth
-    knows, and its place, speaks of all faults there.
+    place, or a cause that can make such a fault (see `Spoiler`). One that names the trouble which the truth knows, and
+    its place, speaks of the shape there.
 
     Args:
         row: A row with faults and warnings.
@@ -131,7 +165,7 @@ def untold_faults(row: dict[str, Any], truth: Truth | None = None) -> list[str]:
     untold = []
     for fault in row["faults"]:
         place = _fault_place(fault)
-        if trouble and (math.isnan(place) or _in_trouble(place, truth)):
+        if trouble and re.search(_SHAPE, fault) and _in_trouble(place, truth):
             continue
         where = truth.trouble if math.isnan(place) and truth is not None else (place, place)
         if not any(_speaks_of(text, fault, where, row) for text in row["warnings"]):
@@ -146,9 +180,9 @@ def _names_trouble(warnings: list[str] | tuple[str, ...], truth: Truth) -> bool:
 
 
 def _in_trouble(place: float, truth: Truth | None) -> bool:
-    """Return whether a true station lies at the trouble; true where the trouble has no place."""
+    """Return whether a fault at a true station, or one without, may be of the trouble, if that has a place."""
     start, end = truth.trouble if truth is not None else (math.nan, math.nan)
-    return math.isnan(start) or start - _PLACE_SLACK <= place <= end + _PLACE_SLACK
+    return not math.isnan(start) and (math.isnan(place) or start - _PLACE_SLACK <= place <= end + _PLACE_SLACK)
 
 
 def _fault_place(fault: str) -> float:
@@ -159,10 +193,9 @@ def _fault_place(fault: str) -> float:
 
 def _speaks_of(warning: str, fault: str, where: tuple[float, float], row: dict[str, Any]) -> bool:
     """Return whether a warning is of a fault, and of its true stations where both have a place."""
-    if _EVERYWHERE.search(warning):
-        return True
     named = _GUESS.sub("", warning)  # what it looks like names floor and walls, whatever is wrong
-    if not any(words.search(named) for beginning, words in _TOLD_BY if beginning.search(fault)):
+    told = any(words.search(named) for beginning, words in _TOLD_BY if beginning.search(fault))
+    if not told and not any(cause.explains(warning, fault) for cause in _SPOILERS):
         return False
     ranges = [(float(a or c), float(b or c)) for a, b, c in _RANGE.findall(warning)]
     if math.isnan(where[0]) or not ranges:

@@ -8,16 +8,19 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import laspy
 import lazrs
 import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, LasZipVlr, WktCoordinateSystemVlr
-from pye57 import E57, ScanHeader
 from scipy.spatial.transform import Rotation
 
+from scene.errors import RecordingError
 from scene.reading.source import BATCH, UNITS, CloudSource
+
+if TYPE_CHECKING:
+    from pye57 import E57, ScanHeader
 
 DEGREES = "degrees"
 _CODES = {9001: "m", 9002: "ft", 9003: "us-ft"}
@@ -172,7 +175,16 @@ _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
 def open_e57(path: Path) -> CloudSource:
-    """Opens all scans of an E57 file, in the file's frame; raises `ValueError` for damage or missing coordinates."""
+    """Opens all scans of an E57 file, in the file's frame.
+
+    Raises:
+        RecordingError: The library that reads it, which no other format needs, is not installed.
+        ValueError: It is damaged, or has no coordinates.
+    """
+    try:
+        from pye57 import E57
+    except ImportError as error:
+        raise RecordingError(f"{path}: E57 is read by pye57, which is not installed: pip install pye57") from error
     with E57(str(path)) as file:
         scans = file.scan_count
 
@@ -187,7 +199,7 @@ def open_e57(path: Path) -> CloudSource:
     return CloudSource(f"E57, {scans} scans", chunks, np.empty((0, 3)), "m")
 
 
-def _read_e57_scan(file: E57, header: ScanHeader) -> Iterator[np.ndarray]:
+def _read_e57_scan(file: "E57", header: "ScanHeader") -> Iterator[np.ndarray]:
     fields = header.point_fields
     system = next((s for s in (_CARTESIAN, _SPHERICAL) if set(s) <= set(fields)), None)
     if system is None:
@@ -212,7 +224,7 @@ def _read_e57_scan(file: E57, header: ScanHeader) -> Iterator[np.ndarray]:
         raise ValueError(f"it ends after {read} of {count} points")
 
 
-def _e57_pose(header: ScanHeader) -> tuple[Rotation, np.ndarray]:
+def _e57_pose(header: "ScanHeader") -> tuple[Rotation, np.ndarray]:
     """Pose by the names of its nodes: the library takes them in the order of the file."""
     if not header.has_pose():
         return Rotation.identity(), np.zeros(3)

@@ -1,3 +1,7 @@
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,6 +12,7 @@ from scene.reading.source import choose_frame
 from scene.reading.tables import find_xyz, plain_name
 from tests.scene.files import CLOUDS, write_e57, write_parquet, write_text, write_xlsx
 
+ROOT = Path(__file__).parents[2]
 # No two coordinates nearer than the formats round, so that points can be put in order.
 RNG = np.random.default_rng(0)
 POINTS = np.column_stack([RNG.permutation(np.linspace(-a, a, 500, dtype=np.float32)) for a in (30, 3, 3)])
@@ -45,6 +50,16 @@ def test_each_scan_of_an_e57_is_placed_by_its_own_pose(tmp_path):
     turned = np.column_stack([100 - POINTS[:, 1], POINTS[:, 0], POINTS[:, 2] + 5])
     np.testing.assert_allclose(back, ordered(np.concatenate([POINTS, turned])), atol=2e-5)
     assert facts["format"] == "E57, 2 scans"
+
+
+def test_only_an_e57_needs_the_library_that_reads_it(tmp_path, monkeypatch):
+    path = write_e57(tmp_path / "a.e57", POINTS)
+    monkeypatch.setitem(sys.modules, "pye57", None)  # as if it were not installed
+    with pytest.raises(RecordingError, match=r"a\.e57: E57 is read by pye57, which is not installed"):
+        points_of(path)
+    lines = "import sys; sys.modules['pye57'] = None; import scene.build, scene.output"
+    done = subprocess.run([sys.executable, "-c", lines], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert not done.returncode, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig
 from scene.reading.recording import Recording
-from scene.resume import Partial, input_record, partial_folder, resume_key
+from scene.resume import Partial, input_record, library_versions, partial_folder, resume_key
 from subterra_jax.host import files
 from subterra_jax.host.errors import OutputError
 from subterra_jax.host.files import replace_folder
@@ -159,6 +159,10 @@ def test_the_key_follows_inputs_and_settings(tmp_path):
     keys = {resume_key(record, value) for record in (one, input_record([tmp_path / "b"])) for value in (0.04, 0.05)}
     assert len(keys) == 4
     assert resume_key(one, 0.04) in keys
+
+
+def test_libraries_that_are_not_installed_have_no_version():
+    assert list(library_versions(("numpy", "no-such-library"))) == ["numpy"]
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.3, 0.99])
