@@ -22,7 +22,8 @@ from subterra_jax.policies.locate.streams import Record
 from train.checkpoint import iterations
 from train.config import ConfigError
 from train.folder import RunFolderError
-from train.locate import filtering, look, release, scores, session, tunnels
+from train.locate import filtering, keeping, look, release, scores, session, tunnels
+from train.locate.command import Command, check
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner, draw_told, map_loss
 
@@ -30,7 +31,7 @@ _SMALL = LocateConfig("gru", n_envs=2, n_steps=200, minibatch=2, chunk=1)
 
 
 def _command(tmp_path, **changes):
-    return session.Command(out=tmp_path, config=dataclasses.replace(_SMALL, **changes))
+    return Command(out=tmp_path, config=dataclasses.replace(_SMALL, **changes))
 
 
 @pytest.mark.parametrize(
@@ -64,7 +65,7 @@ def test_a_map_of_the_plane_is_not_learnt_with_a_spinning_lidar(tmp_path):
 @pytest.mark.parametrize("seeds", [(), (1, 1), (-1,)])
 def test_seeds_must_differ(tmp_path, seeds):
     with pytest.raises(ConfigError, match="seeds must differ and be at least 0"):
-        session.check(dataclasses.replace(_command(tmp_path), seeds=seeds))
+        check(dataclasses.replace(_command(tmp_path), seeds=seeds))
 
 
 def test_scores_are_told_by_kind():
@@ -204,7 +205,7 @@ def test_gradients_do_not_depend_on_the_chunks():
 
 def test_a_folder_that_holds_a_run_is_neither_written_over_nor_gone_on_with_as_another(tmp_path):
     command = _command(tmp_path)
-    session._write_config(command)  # a run that was killed before its first checkpoint
+    keeping.write_config(command)  # a run that was killed before its first checkpoint
     begun = (tmp_path / "config.json").read_bytes()
     with pytest.raises(RunFolderError, match="holds a run already; --resume goes on with it, --overwrite replaces it"):
         session.run(command)
@@ -288,7 +289,7 @@ def test_a_card_takes_the_rows_of_its_own_policy(tmp_path):
 @pytest.mark.slow
 def test_a_released_localiser_is_loaded_with_its_card(tmp_path):
     task, out = "Subterra/StopAtShort-v1", tmp_path / "locate-mine.safetensors"
-    command = session.Command(out=tmp_path, task=task, tunnels="control", val="control", drives=2, config=_SMALL)
+    command = Command(out=tmp_path, task=task, tunnels="control", val="control", drives=2, config=_SMALL)
     session.run(dataclasses.replace(command, config=dataclasses.replace(_SMALL, minutes=0.01)))
     policy = tmp_path / "seed-0" / "policy.safetensors"
     digest = json.loads(policy.with_suffix(".json").read_text())["tensors_sha256"]

@@ -5,7 +5,8 @@ import sys
 import tyro
 
 from subterra_jax.host.command import parse, run_command
-from train.locate.session import Command, run
+from train.locate.command import Command
+from train.locate.session import run
 from train.options import insert_file
 
 PROG = "python -m train.locate"

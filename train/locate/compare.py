@@ -20,9 +20,11 @@ from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
 from train.config import ConfigError
 from train.locate import scores, tunnels
+from train.locate.command import Command as Training
+from train.locate.command import check
+from train.locate.keeping import CURVE, LOG, check_folder
 from train.locate.learner import LocateConfig
-from train.locate.session import CURVE, LOG, VAL_SEED, Session, begin, check, check_folder, finish
-from train.locate.session import Command as Training
+from train.locate.session import VAL_SEED, Session, begin, finish
 
 _FIRST = 2  # iterations that tell no rate
 

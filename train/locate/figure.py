@@ -17,7 +17,7 @@ import tyro
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file, require_file
 from train.config import ConfigError
-from train.locate.session import CURVE
+from train.locate.keeping import CURVE
 from train.options import read_settings
 
 _CURVES = {"within": "", "mapped": ", with map", "hidden_mapped": ", with map, hidden start"}

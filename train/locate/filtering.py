@@ -27,10 +27,10 @@ from subterra_jax.policies.locate.agent import Locating, nested
 from subterra_jax.policies.locate.blocks import Block
 from train.config import ConfigError, at_least, positive
 from train.locate import scores, tunnels
+from train.locate.command import Command as Training
 from train.locate.drives import Drive, record_drives
+from train.locate.keeping import CURVE, LOG, POLICY, SCORES, save
 from train.locate.learner import LocateConfig, count, loss
-from train.locate.session import CURVE, LOG, POLICY, SCORES, save
-from train.locate.session import Command as Training
 
 _KINDS = ("straight", "cast", "sprayed", "masonry")
 _BATCH, _VAL_SEED, _OWN_SEED = 16, 2**20, 2**21

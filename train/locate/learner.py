@@ -78,7 +78,7 @@ class TrainState:
 
 @struct.dataclass
 class Told:
-    """What a robot with a map is told.
+    """Start and map that a robot is told.
 
     Attributes:
         offset: True station of the start less that told, m.

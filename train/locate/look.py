@@ -18,12 +18,12 @@ import tyro
 
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
-from subterra_jax.policies import check_fits, load
+from subterra_jax.policies import check_fits
 from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.locate import memory, streams
 from subterra_jax.policies.locate.agent import Locating, nested
 from subterra_jax.policies.locate.map_strip import map_strip
-from train.config import ConfigError, at_least
+from train.config import at_least
 from train.locate import scores, tunnels
 from train.locate.drives import Drive
 
@@ -67,10 +67,7 @@ def command(arguments: Command) -> None:
     """
     at_least(arguments, 1, "drives")
     at_least(arguments, 0, "seed")
-    agents = {name: load(name)[0] for name in arguments.policies}
-    for name, agent in agents.items():
-        if not isinstance(agent, Locating):
-            raise ConfigError(f"{name}: is no localiser, but {type(agent).__name__}")
+    agents = {name: scores.open_localiser(name) for name in arguments.policies}
     names = tunnels.names_of(arguments.tunnels)
     found = tunnels.load(names, None, arguments.cache, arguments.sensor)
     env, params = tunnels.enter(arguments.task, found, arguments.sensor)

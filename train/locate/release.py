@@ -11,8 +11,8 @@ from subterra_jax.host.files import replace_file
 from subterra_jax.policies.files import TENSORS
 from train.config import ConfigError
 from train.evaluate import evaluate
+from train.locate.keeping import CURVE, POLICY, SCORES
 from train.locate.scores import WITH_MAP
-from train.locate.session import CURVE, POLICY, SCORES
 from train.locate.tunnels import PLANAR
 from train.policies import facts_file
 from train.world import open_world

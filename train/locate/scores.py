@@ -9,8 +9,11 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from subterra_jax import constants
+from subterra_jax.policies import load
 from subterra_jax.policies.locate import map_filter
+from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.locate.map_strip import MapStrip
+from train.config import ConfigError
 from train.locate.drives import Drive, record_drives
 from train.locate.learner import Told, believe, estimate
 
@@ -21,6 +24,19 @@ FARTHEST = 320  # m, the farthest goal
 WITH_MAP = ("mapped", "hidden", "hidden_mapped", "misled")
 
 Found = dict[str, np.ndarray]
+
+
+def open_localiser(name: str) -> Locating:
+    """Opens a policy that is a localiser: a released one, a file, or a run folder.
+
+    Raises:
+        ConfigError: It is another policy.
+        SubterraError: There is no such policy.
+    """
+    agent, _ = load(name)
+    if not isinstance(agent, Locating):
+        raise ConfigError(f"{name}: is no localiser, but {type(agent).__name__}")
+    return agent
 
 
 def record(env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = FARTHEST) -> Drive:

@@ -29,7 +29,7 @@ from subterra_jax.policies.locate.steering import N_SIGHT, PREFIX, SHARE, YAW_RA
 from train.config import ConfigError, PPOConfig, at_least, check
 from train.feedforward.learner import Learner
 from train.locate import tunnels
-from train.locate.session import POLICY
+from train.locate.keeping import POLICY
 from train.policies import facts_file, policy_tensors
 from train.session import Session
 from train.world import World, library_versions

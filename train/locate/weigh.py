@@ -21,9 +21,9 @@ from subterra_jax.baselines.fused import FusedCount
 from subterra_jax.baselines.stations import Driven
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
-from subterra_jax.policies import check_fits, load
-from subterra_jax.policies.locate.agent import Locating, nested
-from train.config import ConfigError, at_least
+from subterra_jax.policies import check_fits
+from subterra_jax.policies.locate.agent import nested
+from train.config import at_least
 from train.locate import scores, tunnels
 from train.locate.drives import Drive
 from train.locate.learner import estimate
@@ -66,9 +66,7 @@ def command(arguments: Command) -> None:
         SubterraError: There is no such policy, task or tunnel, or the policy does not fit the sensor.
     """
     at_least(arguments, 1, "drives")
-    agent, _ = load(arguments.policy)
-    if not isinstance(agent, Locating):
-        raise ConfigError(f"{arguments.policy}: is no localiser, but {type(agent).__name__}")
+    agent = scores.open_localiser(arguments.policy)
     names = tunnels.names_of(arguments.val)
     env, params = tunnels.enter(
         arguments.task, tunnels.load(names, None, arguments.cache, arguments.sensor), arguments.sensor
