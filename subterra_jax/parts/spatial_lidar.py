@@ -9,7 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.lidar3d import beams, echo, fused
+from subterra_jax.lidar3d import beams, echo
 from subterra_jax.lidar3d.casting import Met, meet, require_free
 from subterra_jax.lidar3d.echo import EchoParams
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
@@ -255,7 +255,7 @@ class SpatialLidar(Part):
         if sensor.echo.mixing:
             both = jnp.concatenate([rays, echo.rim_of(rays, uniform[:, 2], sensor.echo)])
             origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
-        limits = jnp.broadcast_to(jnp.where(sight.wanted, sensor.range_max, 0.0), len(both))
+        limits = jnp.broadcast_to(sensor.range_max, len(both))
         start = origins if sensor.sweep else origins[0]
         met = meet(sight.tunnel.space.relief, start, both, sight.station, limits.astype(jnp.float32))
         standing = sight.hits(both[:, :2])
@@ -320,8 +320,3 @@ class SpatialLidar(Part):
         x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
         place, _ = stand(tunnel, jnp.stack([x, y]), jnp.arctan2(tangent_y, tangent_x), station, sensor.mount)
         require_free(tunnel.space.relief, np.asarray(place), float(station))
-
-    def skips_unwanted(self, params: EnvParams) -> bool:
-        """Tell whether the fused kernel casts the beams; a ray of no length costs it little."""
-        del params
-        return fused.supported()

@@ -19,7 +19,7 @@ from train.recurrent.config import (
 )
 from train.recurrent.drive import make_layout
 from train.recurrent.learner import RecurrentLearner, nearer
-from train.recurrent.network import RecurrentNetworks, estimation_loss
+from train.recurrent.network import RecurrentLayout, RecurrentNetworks, estimation_loss
 
 TASK = "Subterra/StopAtShort-v0"
 CONFIG = RecurrentConfig(steps=512, n_envs=8, unroll=32, minibatches=2, epochs=1, hidden=8, bins=9)
@@ -40,6 +40,35 @@ def test_memory_begins_anew_with_every_episode_and_goes_on_between_unrolls():
     anew, _ = networks.remember(weights, features[4:], jnp.zeros((3, 8)), first[4:])
     np.testing.assert_allclose(anew[1], last[1], atol=1e-6)
     assert np.abs(anew[0] - last[0]).max() > 1e-3
+
+
+def test_in_16_bits_an_image_weighs_half_and_the_answer_and_its_gradient_stay_near():
+    full = RecurrentLayout(
+        7 + 64, 3, (0.0, -1.0), (2.0, 1.0), hidden=32, bins=9, bin_width=0.5, init_std=0.5, min_std=0.1, image=(8, 8)
+    )
+    features = jax.random.uniform(jax.random.key(0), (12, 16, full.n_features))
+    first, begun = jnp.zeros((12, 16), bool).at[5, 3].set(True), jnp.zeros((16, 32))
+    weights = RecurrentNetworks(full).init(jax.random.key(1))
+
+    def loss_of(layout):
+        networks = RecurrentNetworks(layout)
+        kept = networks.keep(features)
+
+        def loss(weights):
+            _, hidden = networks.remember(weights, kept, begun, first)
+            return jnp.mean(estimation_loss(networks.think(weights, hidden, jnp.ones(())).logits, first - 0.5, 0.5))
+
+        return kept, *jax.value_and_grad(loss)(weights)
+
+    whole, loss, gradient = loss_of(full)
+    half, near, other = loss_of(dataclasses.replace(full, half=True))
+    assert 2 * half.image.nbytes == whole.image.nbytes
+    assert half.plain.dtype == whole.plain.dtype == jnp.float32
+    assert float(near) == pytest.approx(float(loss), rel=0.01)
+    assert float(near) != float(loss)
+    one, two = (np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(t["memory"])]) for t in (gradient, other))
+    assert two.dtype == np.float32
+    assert np.linalg.norm(one - two) < 0.03 * np.linalg.norm(one)
 
 
 def test_the_value_target_of_a_truncated_step_goes_on_with_the_value_it_had():

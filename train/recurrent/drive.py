@@ -13,7 +13,7 @@ from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.policies import senses
 from train.config import ConfigError
 from train.recurrent.config import RecurrentConfig
-from train.recurrent.network import RecurrentLayout, RecurrentNetworks, Thought, Weights
+from train.recurrent.network import Kept, RecurrentLayout, RecurrentNetworks, Thought, Weights
 from train.report import Finished
 
 
@@ -55,7 +55,7 @@ class Rollout:
         truncated: The episode ended by the clock.
     """
 
-    features: Float[Array, "time env n"]
+    features: Kept
     first: Bool[Array, "time env"]
     ahead: Float[Array, "time env"]
     error: Float[Array, "time env"]
@@ -190,7 +190,7 @@ def collect(
         _, _, reward, terminated, truncated, info = stepped
         station = now.env_state.station - params.start.station
         stored = Rollout(
-            features=view.features,
+            features=networks.keep(view.features),
             first=now.first,
             ahead=view.ahead,
             error=station - view.station,
@@ -245,6 +245,7 @@ def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayo
         tracker=shown.tracker,
         boxes=shown.boxes,
         image=env.images(params).get("scan"),
+        half=config.half,
     )
 
 

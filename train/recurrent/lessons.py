@@ -14,7 +14,7 @@ from subterra_jax.episode import ask, in_tunnel, look
 from subterra_jax.policies import senses
 from subterra_jax.policies.networks import RecurrentMemory
 from train.recurrent import drive as driving
-from train.recurrent.network import RecurrentNetworks, Weights
+from train.recurrent.network import Kept, RecurrentNetworks, Weights
 from train.report import Finished
 
 
@@ -118,7 +118,7 @@ class Advised:
         advice: The teacher's action, m/s and rad/s.
     """
 
-    features: Float[Array, "time env n"]
+    features: Kept
     first: Bool[Array, "time env"]
     ahead: Float[Array, "time env"]
     error: Float[Array, "time env"]
@@ -173,7 +173,7 @@ def collect(
         action = jnp.where(now.taught[:, None], advice, own)
         stepped = env.step(key_env, state, action, params)
         station = student.env_state.station - params.start.station
-        stored = Advised(view.features, student.first, view.ahead, station - view.station, advice)
+        stored = Advised(networks.keep(view.features), student.first, view.ahead, station - view.station, advice)
         terms = {
             **driving.mean_errors(station, view, thought),
             "reward": jnp.mean(stepped[2]),

@@ -7,6 +7,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.policies import senses
@@ -35,6 +36,7 @@ class RecurrentLayout:
         tracker: Ring counter whose count it sees.
         boxes: It sees the boxes that are remembered.
         image: Rows and columns of the image that the last features are; None without one.
+        half: Image and memory are computed in 16 bits while it learns.
     """
 
     n_features: int
@@ -50,6 +52,7 @@ class RecurrentLayout:
     tracker: str = PLAIN.tracker
     boxes: bool = PLAIN.boxes
     image: tuple[int, int] | None = None
+    half: bool = False
 
     @property
     def shown(self) -> Senses:
@@ -57,40 +60,57 @@ class RecurrentLayout:
         return Senses(self.tracker, self.boxes)
 
 
+@struct.dataclass
+class Kept:
+    """Inputs of the network as a rollout keeps them, the image apart.
+
+    Attributes:
+        plain: All but the image.
+        image: Ranges over 30 m, row by row, in 16 bits if the network computes in these; None without an image.
+    """
+
+    plain: Float[Array, "*batch n"]
+    image: Float[Array, "*batch pixels"] | None
+
+
 class Memory(nn.Module):
     """A dense layer and a GRU over time; the hidden state is cleared where an episode begins.
 
-    An image among the features is first seen patch by patch, then as a whole.
+    An image is first seen patch by patch, then as a whole. With `half` all products are of bfloat16 numbers.
     """
 
     hidden: int
     image: tuple[int, int] | None = None
+    half: bool = False
 
     @nn.compact
     def __call__(
         self,
-        features: Float[Array, "time env n"],
+        kept: Kept,
         state: Float[Array, "env hidden"],
         first: Bool[Array, "time env"],
     ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
         """Returns the last hidden state, and that of every step."""
-        if self.image is not None:
-            n_pixels = self.image[0] * self.image[1]
-            tiles = senses.patches(features[..., -n_pixels:], self.image)
-            tiles = nn.swish(nn.Dense(PATCH_WIDTH, name="patch")(tiles))
-            glance = nn.swish(nn.Dense(GLANCE_WIDTH, name="glance")(tiles.reshape(*tiles.shape[:-2], -1)))
-            features = jnp.concatenate([features[..., :-n_pixels], glance], axis=-1)
-        encoded = nn.swish(nn.Dense(self.hidden)(features))
+        number = jnp.bfloat16 if self.half else kept.plain.dtype
+        features = kept.plain.astype(number)
+        if self.image is not None and kept.image is not None:
+            tiles = senses.patches(kept.image, self.image).astype(number)
+            tiles = nn.swish(nn.Dense(PATCH_WIDTH, name="patch", dtype=number)(tiles))
+            tiles = tiles.reshape(*tiles.shape[:-2], -1)
+            glance = nn.swish(nn.Dense(GLANCE_WIDTH, name="glance", dtype=number)(tiles))
+            features = jnp.concatenate([features, glance], axis=-1)
+        encoded = nn.swish(nn.Dense(self.hidden, dtype=number)(features))
         # All that does not wait for the state before is done for the whole sequence at once.
-        gates = nn.Dense(3 * self.hidden)(encoded)
-        weight = self.param("recurrent", nn.initializers.orthogonal(), (self.hidden, 3 * self.hidden))
+        gates = nn.Dense(3 * self.hidden, dtype=number)(encoded)
+        weight = self.param("recurrent", nn.initializers.orthogonal(), (self.hidden, 3 * self.hidden)).astype(number)
 
         def step(before: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
             gate, begins = now
             before = jnp.where(begins[:, None], 0.0, before)
-            given, kept = jnp.split(gate, 3, axis=-1), jnp.split(before @ weight, 3, axis=-1)
-            reset, update = nn.sigmoid(given[0] + kept[0]), nn.sigmoid(given[1] + kept[1] + 1.0)
-            fresh = jnp.tanh(given[2] + reset * kept[2])
+            own = (before.astype(number) @ weight).astype(before.dtype)
+            given, held = jnp.split(gate.astype(before.dtype), 3, axis=-1), jnp.split(own, 3, axis=-1)
+            reset, update = nn.sigmoid(given[0] + held[0]), nn.sigmoid(given[1] + held[1] + 1.0)
+            fresh = jnp.tanh(given[2] + reset * held[2])
             after = update * before + (1.0 - update) * fresh
             return after, after
 
@@ -126,7 +146,7 @@ class RecurrentNetworks:
         self.distribution = NormalTanhDistribution(n_action, min_std=layout.min_std)
         self._memory: Any
         self._estimate: Any
-        self._memory, self._estimate = Memory(layout.hidden, layout.image), nn.Dense(layout.bins)
+        self._memory, self._estimate = Memory(layout.hidden, layout.image, layout.half), nn.Dense(layout.bins)
         self._policy = MLP(
             layer_sizes=(layout.hidden, self.distribution.param_size),
             activation=jax.nn.swish,
@@ -145,7 +165,7 @@ class RecurrentNetworks:
         hidden = jnp.zeros((1, 1, layout.hidden))
         features = jnp.zeros((1, 1, layout.n_features))
         return {
-            "memory": self._memory.init(keys[0], features, hidden[0], jnp.zeros((1, 1), bool)),
+            "memory": self._memory.init(keys[0], self.keep(features), hidden[0], jnp.zeros((1, 1), bool)),
             "estimate": self._estimate.init(keys[1], hidden),
             "policy": self._policy.init(keys[2], jnp.zeros((1, layout.hidden + senses.N_AIM))),
             "critic": self._critic.init(keys[3], jnp.zeros((1, layout.n_truth))),
@@ -155,11 +175,20 @@ class RecurrentNetworks:
         """Returns a policy, the weights but the critic's, with shapes in place of arrays."""
         return without_critic(jax.eval_shape(self.init, jax.random.key(0)))
 
+    def keep(self, features: Float[Array, "*batch n"]) -> Kept:
+        """Returns the inputs as a rollout keeps them."""
+        if self.layout.image is None:
+            return Kept(features, None)
+        n_pixels = self.layout.image[0] * self.layout.image[1]
+        image = features[..., -n_pixels:]
+        return Kept(features[..., :-n_pixels], image.astype(jnp.bfloat16) if self.layout.half else image)
+
     def remember(
-        self, weights: dict[str, Weights], features: Array, state: Array, first: Array
+        self, weights: dict[str, Weights], features: Array | Kept, state: Array, first: Array
     ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
         """Returns the last hidden state, and those over time."""
-        return self._memory.apply(weights["memory"], features, state, first)
+        kept = features if isinstance(features, Kept) else self.keep(features)
+        return self._memory.apply(weights["memory"], kept, state, first)
 
     def think(
         self, weights: dict[str, Weights], hidden: Float[Array, "*batch hidden"], ahead: Float[Array, "*batch"]
