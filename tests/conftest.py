@@ -1,4 +1,4 @@
-"""How programs are compiled while the tests run: cheaply, and once for all workers of a run.
+"""Compiles programs cheaply while the tests run, and once for all workers of a run.
 
 Most of what the simulator's tests take is XLA compiling programs that run for a moment. Without LLVM's optimisations
 and fusion emitters it compiles five times as fast, and what comes out runs a third as fast. Where `XLA_FLAGS` is set,

@@ -1,4 +1,4 @@
-"""What keeps a long run of the tests alive."""
+"""Memory maps that a long run of the tests gives back in time."""
 
 import inspect
 

@@ -57,7 +57,7 @@ class Heights(Protocol):
 
 
 class Passage(Protocol):
-    """What a carrier walks along: a drawn bore, or that of a tunnel file."""
+    """The bore that a carrier walks along: a drawn one, or that of a tunnel file."""
 
     @property
     def alignment(self) -> Alignment:

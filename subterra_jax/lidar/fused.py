@@ -274,7 +274,7 @@ def _look_into(record_ref, wall_ref, n_vertices: int, x, y, direction, block, op
 
 
 def _look_everywhere(record_ref, look_into, first, unsure, x, y, direction, nearest):
-    """The same in every block of the window whose box is entered, for beams that are `unsure`.
+    """Return the nearest hit in any block of the window whose box is entered, for beams that are `unsure`.
 
     They enter as many boxes as were kept, and meet no wall before the last of them, as beside a row of deep recesses.
     """

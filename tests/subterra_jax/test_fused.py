@@ -71,7 +71,7 @@ def test_wanted_scans_do_not_depend_on_the_unwanted_ones(plan: st.TunnelPlan) ->
 
 
 def test_a_beam_along_a_row_of_deep_recesses_is_exact() -> None:
-    """Where as many boxes are entered as were sorted, the kernels look into every box of the window."""
+    """The kernels look into every box of the window where as many are entered as were sorted."""
     plan = st.load_tunnel("open:masonry:train:0").slice(100.0, 80.0)
     poses = reference.random_poses(plan, 64, np.random.default_rng(1))
     ranges = fused_scan(Tunnel.from_plan(plan, n_candidates=1), poses, np.ones(64, bool), 16)

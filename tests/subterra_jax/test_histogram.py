@@ -42,12 +42,16 @@ def moments(filter_, memory):
     return mean, np.sqrt((mass * (station - mean) ** 2).sum() / mass.sum())
 
 
+def certain(filter_):
+    """Return a filter whose heading does not wander and whose steps do not slip."""
+    wander = dataclasses.replace(filter_.noise.wander, sigma=0.0)
+    return dataclasses.replace(filter_, noise=histogram.WayNoise(0.015, wander, 0.0))
+
+
 def test_a_belief_spreads_as_the_errors_of_dead_reckoning_do(smooth):
     _, params = smooth
     filter_ = localiser(params)
-    still = dataclasses.replace(
-        filter_, noise=histogram.WayNoise(0.015, dataclasses.replace(filter_.noise.wander, sigma=0.0), 0.0)
-    )
+    still = certain(filter_)
     memory = still.begin(seen(), params)
     slide = jax.jit(still._slide)
     mass = jnp.exp(memory.log_mass)
@@ -63,9 +67,7 @@ def test_a_belief_spreads_as_the_errors_of_dead_reckoning_do(smooth):
 def test_a_row_of_errors_slides_by_its_share_of_the_way_and_back_again(smooth):
     _, params = smooth
     filter_ = localiser(params)
-    still = dataclasses.replace(
-        filter_, noise=histogram.WayNoise(0.015, dataclasses.replace(filter_.noise.wander, sigma=0.0), 0.0)
-    )
+    still = certain(filter_)
     memory = still.begin(seen(), params)
     mass = jnp.exp(memory.log_mass)
     slide = jax.jit(still._slide)

@@ -1,1 +1,1 @@
-"""What must be noticed and what must not: 36 negative controls, 7 invariances, and the runner of both."""
+"""36 negative controls, which must be noticed, 7 invariances, which must not, and the runner of both."""
