@@ -37,9 +37,13 @@ class Spoiler:
     unit: float = math.inf  # m, of that number
     times: float = 1.0  # of it, up to which a fault may go
 
+    def named(self, warning: str) -> re.Match[str] | None:
+        """Return the place in a warning where it names this cause."""
+        return re.search(self.words, warning, re.IGNORECASE)
+
     def explains(self, warning: str, fault: str) -> bool:
         """Return whether a warning is of this cause, and a fault of its kind and no larger than it can make one."""
-        found = re.search(self.words, warning, re.IGNORECASE)
+        found = self.named(warning)
         if found is None or re.search(self.faults, fault) is None:
             return False
         amount = _AMOUNT.search(fault)
@@ -50,6 +54,7 @@ class Spoiler:
 
 _SPOILERS = (
     Spoiler(r"is z up|z is not up", rf"{_SHAPE}|too long|span built|{_SLEEPERS}"),
+    Spoiler(r"floor and walls lean together by (\d+(?:\.\d+)?)°", _SHAPE, math.radians(1.0), 5.0),  # 5 m off the axis
     Spoiler(r"--unit|was its unit read", rf"{_SHAPE}|too long|span built|{_SLEEPERS}|gauge"),
     Spoiler(r"without --calibration", rf"{_SHAPE}|too long|sleeper F1"),
     # A clock, a mount or an order that is named tells what to mend; a blur alone, how far walls may be off.
@@ -193,9 +198,12 @@ def _fault_place(fault: str) -> float:
 
 def _speaks_of(warning: str, fault: str, where: tuple[float, float], row: dict[str, Any]) -> bool:
     """Return whether a warning is of a fault, and of its true stations where both have a place."""
-    named = _GUESS.sub("", warning)  # what it looks like names floor and walls, whatever is wrong
-    told = any(words.search(named) for beginning, words in _TOLD_BY if beginning.search(fault))
-    if not told and not any(cause.explains(warning, fault) for cause in _SPOILERS):
+    if any(cause.named(warning) for cause in _SPOILERS):
+        told = any(cause.explains(warning, fault) for cause in _SPOILERS)
+    else:
+        named = _GUESS.sub("", warning)  # what it looks like names floor and walls, whatever is wrong
+        told = any(words.search(named) for beginning, words in _TOLD_BY if beginning.search(fault))
+    if not told:
         return False
     ranges = [(float(a or c), float(b or c)) for a, b, c in _RANGE.findall(warning)]
     if math.isnan(where[0]) or not ranges:

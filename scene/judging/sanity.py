@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 
 from scene.bore import Bore
 from scene.judging.judge import Warned
+from scene.judging.lean import doubt_lean
 from scene.judging.shaft import doubt_shaft
 from scene.judging.words import name_sides, name_span
 
@@ -34,6 +35,7 @@ def doubt_bore(bore: Bore, facts: dict[str, Any], provenance: dict[str, str], su
         *_doubt_size(bore, str(facts.get("unit", "m"))),
         *_doubt_grade(bore, str(facts.get("axes", "xyz"))),
         *_doubt_lying(bore),
+        *doubt_lean(bore),
         *doubt_shaft(bore, str(facts.get("axes", ""))),
         *_doubt_dents(bore),
         *_doubt_poses(facts),

@@ -3,7 +3,8 @@
 The thickness of walls in sweeps put together is compared with that in single sweeps. Where it is larger, likely
 mistakes are undone one by one: another order of the quaternion, clocks apart, a mount turned. The one that makes the
 walls thin is named. Besides the median the thickest fifth counts: a mount that is off in pitch slides upright walls
-along themselves, and blurs only what of floor and crown a sensor sees.
+along themselves, and blurs only what of floor and crown a sensor sees. Where nothing explains the walls, floor and
+crown are looked at as they were seen ahead and from behind (`scene.poses.bothways`).
 """
 
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from scene.poses.bothways import Tilt, find_tilt
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import ReadPosition, Recording
@@ -45,6 +47,7 @@ class PoseCheck:
     upper_expected: float  # The same of single sweeps, m
     cause: str = ""  # The mistake that explains the difference, in words; empty where none was found
     wxyz: bool = False  # True where the quaternions are in the order w, x, y, z
+    tilt: Tilt | None = None  # Of the LiDAR along the way, where the walls show no cause
 
     @property
     def blurred(self) -> bool:
@@ -68,6 +71,11 @@ class PoseCheck:
     @property
     def words(self) -> str | None:
         """Sentence for the user; `None` where nothing is wrong."""
+        if self.tilt is not None:
+            return (
+                f"the poses blur floor and crown: seen ahead, and then from behind, they lie {self.tilt.apart:.2f} m "
+                f"apart; with the LiDAR turned by {self.tilt.words} they are thin: the extrinsic is off"
+            )
         if not self.blurred:
             return None
         likely = self.cause or "the poses, their clock or the mount of the LiDAR may be wrong"
@@ -90,7 +98,8 @@ def check_poses(recording: Recording, trajectory: Trajectory) -> PoseCheck | Non
 
     (expected, upper_expected), (given, upper) = thickness(trajectory, single=True), thickness(trajectory)
     check = PoseCheck(given, expected, upper, upper_expected)
-    return _find_cause(check, trajectory, thickness) if check.blurred else check
+    check = _find_cause(check, trajectory, thickness) if check.blurred else check
+    return check if check.cause else replace(check, tilt=find_tilt(recording, trajectory))
 
 
 def reorder(trajectory: Trajectory) -> Trajectory:

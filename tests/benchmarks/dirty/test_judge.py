@@ -168,6 +168,8 @@ _TWICE = "from 5 to 15 m the wall shows twice, up to 7 cm apart, at 60% of its p
         ("the coordinates of the cloud are rounded to 3.0 cm", ("floor +5 cm at 10 m",), ("floor +7 cm at 10 m",)),
         ("nothing measured the length: along smooth walls LiDAR odometry does not", ("0.40 m too long",),
          ("width +9 cm at 10 m", "walls 5.0 cm in the mean")),
+        ("from 0 to 18 m floor and walls lean together by 2.0°, left side up", ("height +9 cm at 4 m",),
+         ("height +40 cm at 4 m", "gauge -33 mm")),
         ("it would be 18 m wide: --unit ft makes it 5.5 m by 5.4 m", ("width +900 cm at 9 m", "30.00 m too long"),
          ("4 pockets measured that do not exist",)),
     ],
