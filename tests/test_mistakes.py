@@ -152,6 +152,8 @@ MISTAKES = {
     "benchmarks.rays --scene empty --out text.txt/x.json": "text.txt: is a file",
     "benchmarks.rays.peers --scene none": "none: is no built scene",
     "benchmarks.rays.peers --scene empty --robots 0": "robots must be at least 1",
+    "benchmarks.rays.picture --out o": "o: a picture ends in .png",
+    "benchmarks.rays.picture --out o.png --tunnel none": "none: no such tunnel file",
     "benchmarks.reproduce --jobs moon --out o": "no job 'moon'",
     "benchmarks.slam": "Expected one of {record, arena, run, board, check, score}",
     "benchmarks.slam arena": "missing: --out",

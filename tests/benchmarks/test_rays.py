@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.rays import peers, speed
+from benchmarks.rays import peers, picture, speed
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
 from benchmarks.rays.casting import Agreement
 from scene.output import write_geometry
@@ -134,3 +134,18 @@ def test_peers_cast_the_same_rays_as_the_3d_lidar(scene: Path, capsys: pytest.Ca
     assert rows[0].n_bytes < 1e6  # 24 m of 7.9 MB for 351 m
     assert peers.command(["--scene", str(scene / "nowhere")]) == 2
     assert "is no built scene" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_picture_shows_what_each_sensor_sees(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    config = picture.PictureConfig(tmp_path / "sensors.png", station=30.0)
+    azimuth, elevation, ranges = picture.look(config, "spin16x64")
+    assert azimuth.shape == elevation.shape == ranges.shape == (16, 64)
+    assert np.abs(azimuth).max() > 174.0
+    assert np.ptp(elevation) == pytest.approx(30.0, abs=0.01)
+    aside = np.abs(np.abs(azimuth) - 90.0) < 5.0
+    assert np.median(ranges[aside]) < 4.0  # the walls
+    assert np.median(ranges[8][np.abs(azimuth[8]) < 6.0]) > 10.0  # along the bore
+    picture.main(config)
+    assert capsys.readouterr().out.split() == [str(config.out)]
+    assert config.out.stat().st_size > 50_000
