@@ -11,6 +11,7 @@ import io
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
@@ -18,6 +19,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from subterra_jax.host.errors import MissingLibraryError
+from subterra_jax.policies import senses
 from train import devices
 
 try:
@@ -38,6 +40,7 @@ __all__ = [
     "clipped_objective",
     "descend",
     "discounted_returns",
+    "glance",
     "normalize",
     "run_epochs",
     "split_keys",
@@ -49,6 +52,7 @@ Statistics: TypeAlias = running_statistics.RunningStatisticsState
 # A reading that has not moved yet, such as odometry at a start, would otherwise be divided by nothing.
 _STD_MIN = 1e-3
 _LARGEST = 10.0
+_PATCH_WIDTH, _GLANCE_WIDTH = 32, 64
 
 
 @struct.dataclass
@@ -85,6 +89,22 @@ def update_statistics(statistics: Statistics, batch: Float[Array, "..."], split:
 def normalize(observation: Float[Array, "*batch obs"], statistics: Statistics) -> Float[Array, "*batch obs"]:
     """Returns the observation in standard deviations from its mean, clipped to ± 10."""
     return running_statistics.normalize(observation, statistics, max_abs_value=_LARGEST)
+
+
+def glance(
+    image: Float[Array, "*batch pixels"], shape: tuple[int, int], number: Any = jnp.float32
+) -> Float[Array, "*batch 64"]:
+    """Returns what a network sees of an image: first patch by patch, then as a whole. To be called in its `__call__`.
+
+    Args:
+        image: Ranges over 30 m, row by row.
+        shape: Rows and columns, multiples of 4.
+        number: Type that the layers compute with.
+    """
+    tiles = senses.patches(image, shape).astype(number)
+    tiles = nn.swish(nn.Dense(_PATCH_WIDTH, name="patch", dtype=number)(tiles))
+    tiles = tiles.reshape(*tiles.shape[:-2], -1)
+    return nn.swish(nn.Dense(_GLANCE_WIDTH, name="glance", dtype=number)(tiles))
 
 
 def discounted_returns(

@@ -41,6 +41,15 @@ def perceptron(
         x = activation(x)
 
 
+def glance(
+    tensors: Tensors, name: str, image: Float[Array, "*batch pixels"], shape: tuple[int, int]
+) -> Float[Array, "*batch n"]:
+    """Applies the layers `<name>.patch` and `<name>.glance` to an image of ranges, m, row by row."""
+    tiles = senses.patches(image / senses.IMAGE_RANGE, shape)
+    tiles = jax.nn.swish(dense(tensors, f"{name}.patch", tiles))
+    return jax.nn.swish(dense(tensors, f"{name}.glance", tiles.reshape(*tiles.shape[:-2], -1)))
+
+
 def squash(mean: Float[Array, "*batch n"], low: Float[Array, "n"], high: Float[Array, "n"]) -> Float[Array, "*batch n"]:
     """Maps a network's output to an action between `low` and `high`, m/s and rad/s, by a tanh."""
     return low + 0.5 * (jnp.tanh(mean) + 1.0) * (high - low)
@@ -55,6 +64,8 @@ class FeedForward(Trained):
         low: Smallest action, m/s and rad/s.
         high: Largest action, m/s and rad/s.
         frames: Number of observations in its input.
+        image: Rows and columns of the image in an observation; None without one.
+        image_at: Place of its first pixel in an observation.
         name: Name on the leaderboard.
         conditions: Conditions of its training; None: any.
     """
@@ -67,11 +78,14 @@ class FeedForward(Trained):
     frames: int = struct.field(pytree_node=False)
     name: str = struct.field(pytree_node=False, default="ppo-mlp")
     conditions: Conditions | None = struct.field(pytree_node=False, default=None)
+    image: tuple[int, int] | None = struct.field(pytree_node=False, default=None)
+    image_at: int = struct.field(pytree_node=False, default=0)
 
     @classmethod
     def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "FeedForward":
-        """Makes the agent of a layout with `frames`."""
-        return cls(**common, frames=int(layout["frames"]))
+        """Makes the agent of a layout with `frames`, and `image` and `image_at` if need be."""
+        image = tuple(layout["image"]) if layout.get("image") else None
+        return cls(**common, frames=int(layout["frames"]), image=image, image_at=int(layout.get("image_at", 0)))
 
     def try_out(self) -> None:
         """Answers a stack of observations, by shapes alone."""
@@ -103,7 +117,12 @@ class FeedForward(Trained):
     def answer(self, stack: Float[Array, "frames n_obs"]) -> Action:
         """Returns the action for a stack of observations, oldest first."""
         inputs = (stack - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
-        parameters = perceptron(self.tensors, "policy", jnp.clip(inputs, -_CLIP, _CLIP).reshape(-1), jax.nn.swish)
+        inputs, body = jnp.clip(inputs, -_CLIP, _CLIP), "policy"
+        if self.image is not None:
+            begin, end = self.image_at, self.image_at + self.image[0] * self.image[1]
+            seen = glance(self.tensors, "policy", stack[:, begin:end], self.image)
+            inputs, body = jnp.concatenate([inputs[:, :begin], inputs[:, end:], seen], axis=-1), "policy.body"
+        parameters = perceptron(self.tensors, body, inputs.reshape(-1), jax.nn.swish)
         n_action = len(self.low)
         no_estimate = jnp.array([0.0, 0.0, jnp.nan, 0.0, 0.0])
         return no_estimate.at[:n_action].set(squash(parameters[:n_action], self.low, self.high))
@@ -228,10 +247,7 @@ class Recurrent(Trained):
         """Returns the features with what the network sees of the scan."""
         if self.image is None:
             return features
-        tiles = jax.nn.swish(
-            dense(self.tensors, "memory.patch", senses.patches(obs.entries["scan"] / 30.0, self.image))
-        )
-        return jnp.concatenate([features, jax.nn.swish(dense(self.tensors, "memory.glance", tiles.reshape(-1)))])
+        return jnp.concatenate([features, glance(self.tensors, "memory", obs.entries["scan"], self.image)])
 
     def _update_hidden(self, before: Float[Array, "hidden"], features: Float[Array, "n"]) -> Float[Array, "hidden"]:
         """Returns the hidden state one step later."""

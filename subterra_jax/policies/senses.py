@@ -263,6 +263,7 @@ def _features(
 
 
 PATCH = 4  # rows and columns of a patch of an image
+IMAGE_RANGE = 30.0  # m, by which the ranges of an image are divided
 
 
 def patches(image: Float[Array, "*env n"], shape: tuple[int, int]) -> Float[Array, "*env k 32"]:

@@ -4,6 +4,7 @@ import numpy as np
 
 from train import learning
 from train.feedforward import networks
+from train.policies import make_agent
 
 LAYOUT = networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16, 16), init_std=0.5, min_std=0.01)
 
@@ -39,3 +40,23 @@ def test_every_frame_of_the_stack_reaches_policy_and_value():
 
     gradient = np.asarray(jax.grad(outputs)(jnp.ones((4, 18))))
     assert (gradient != 0.0).all()
+
+
+def test_an_image_is_seen_by_patches_and_its_release_drives_alike():
+    layout = networks.Layout(6 + 32, (0.0, -1.0), (2.0, 1.0), 2, (16, 16), 0.5, 0.01, image=(4, 8), image_at=2)
+    nets = networks.Networks(layout)
+    weights = nets.init(jax.random.key(0))
+    assert weights["policy"]["params"]["patch"]["kernel"].shape == (32, 32)
+    # The untrained policy is nearly constant.
+    last = weights["policy"]["params"]["body"]["hidden_2"]
+    last["kernel"] = jax.random.normal(jax.random.key(3), last["kernel"].shape)
+    seen = 5.0 * jax.random.uniform(jax.random.key(1), (9, 2, 38))
+    policy = networks.Policy(
+        weights["policy"], learning.update_statistics(learning.start_statistics((38,)), seen[:, 0], ())
+    )
+    agent = make_agent(nets, policy)
+    for stack in seen:
+        np.testing.assert_allclose(agent.answer(stack)[:2], nets.act(policy, stack), atol=1e-5)
+        for k in (0, 2, 33, 37):  # before, in and behind the image
+            other = nets.act(policy, stack.at[:, k].add(1.0))
+            assert np.abs(other - nets.act(policy, stack)).max() > 1e-6

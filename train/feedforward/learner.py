@@ -9,6 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 import subterra_jax as st
+from subterra_jax.policies import senses
 from train import devices, learning
 from train.config import PPOConfig, check
 from train.devices import Parts
@@ -267,7 +268,8 @@ class Learner(devices.Whole):
 
 def make_layout(env: Any, params: Any, config: PPOConfig) -> Layout:
     """Returns the layout that `config` asks for on this environment; compiles nothing."""
-    bounds = env.action_space(params)
+    bounds, image = env.action_space(params), env.images(params).get("scan")
+    patched = image is not None and not any(n % senses.PATCH for n in image)
     return Layout(
         n_observation=env.observation_size(params),
         action_low=tuple(float(bound) for bound in bounds.low),
@@ -276,4 +278,6 @@ def make_layout(env: Any, params: Any, config: PPOConfig) -> Layout:
         hidden=tuple(config.hidden),
         init_std=config.init_std,
         min_std=config.min_std,
+        image=image if patched else None,
+        image_at=env.fields(params)["scan"].start if patched else 0,
     )

@@ -4,11 +4,13 @@ import dataclasses
 import math
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from subterra_jax.policies import senses
 from train import learning
 from train.learning import MLP, NormalTanhDistribution
 
@@ -27,6 +29,8 @@ class Layout:
         hidden: Widths of the hidden layers.
         init_std: Standard deviation of the untrained policy before the tanh.
         min_std: Its floor.
+        image: Rows and columns of the image in an observation, which is seen patch by patch; None without one.
+        image_at: Place of its first pixel in an observation.
     """
 
     n_observation: int
@@ -36,6 +40,28 @@ class Layout:
     hidden: tuple[int, ...]
     init_std: float
     min_std: float
+    image: tuple[int, int] | None = None
+    image_at: int = 0
+
+
+class Seeing(nn.Module):
+    """A perceptron that sees the image of each frame at a glance, and all else as it is.
+
+    Attributes:
+        image: Rows and columns of the image.
+        body: The perceptron.
+    """
+
+    image: tuple[int, int]
+    body: nn.Module
+
+    @nn.compact
+    def __call__(
+        self, plain: Float[Array, "*batch frames n"], image: Float[Array, "*batch frames pixels"]
+    ) -> Float[Array, "*batch out"]:
+        """Returns the perceptron's answer to a stack."""
+        seen = jnp.concatenate([plain, learning.glance(image, self.image)], axis=-1)
+        return self.body(seen.reshape(*seen.shape[:-2], -1))
 
 
 @struct.dataclass
@@ -60,13 +86,15 @@ class Networks:
         self.layout = layout
         self.n_action = len(layout.action_low)
         self.distribution = NormalTanhDistribution(self.n_action, min_std=layout.min_std)
-        self._policy = MLP(
-            layer_sizes=(*layout.hidden, self.distribution.param_size),
-            activation=jax.nn.swish,
-            # A nearly constant first policy: the centre of the action range, with the spread asked for everywhere.
-            output_kernel_init=jax.nn.initializers.variance_scaling(1e-4, "fan_in", "uniform"),
+        self._policy = self._seeing(
+            MLP(
+                layer_sizes=(*layout.hidden, self.distribution.param_size),
+                activation=jax.nn.swish,
+                # A nearly constant first policy: the centre of the action range, with the spread asked for everywhere.
+                output_kernel_init=jax.nn.initializers.variance_scaling(1e-4, "fan_in", "uniform"),
+            )
         )
-        self._value = MLP(layer_sizes=(*layout.hidden, 1), activation=jax.nn.swish)
+        self._value = self._seeing(MLP(layer_sizes=(*layout.hidden, 1), activation=jax.nn.swish))
         self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
         spread = math.log(
             math.expm1(layout.init_std - layout.min_std)
@@ -76,8 +104,9 @@ class Networks:
     def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
         """Returns untrained weights, under `policy` and `value`."""
         key_policy, key_value = jax.random.split(key)
-        flat = jnp.zeros((1, self.layout.frames * self.layout.n_observation))
-        return {"policy": self._policy.init(key_policy, flat), "value": self._value.init(key_value, flat)}
+        shape = (self.layout.n_observation,)
+        seen = self._see(jnp.zeros((1, self.layout.frames, *shape)), learning.start_statistics(shape))
+        return {"policy": self._policy.init(key_policy, *seen), "value": self._value.init(key_value, *seen)}
 
     def policy_shapes(self) -> Policy:
         """Returns a policy with shapes in place of arrays."""
@@ -90,13 +119,13 @@ class Networks:
         self, weights: Weights, statistics: learning.Statistics, stack: Float[Array, "*batch frames obs"]
     ) -> Float[Array, "*batch parameters"]:
         """Returns parameters of the action distribution before the tanh: means, then spreads."""
-        return self._policy.apply(weights, self._flatten(stack, statistics)) + self._offset
+        return self._policy.apply(weights, *self._see(stack, statistics)) + self._offset
 
     def value(
         self, weights: Weights, statistics: learning.Statistics, stack: Float[Array, "*batch frames obs"]
     ) -> Float[Array, "*batch"]:
         """Estimates the return, in units of the reward scale."""
-        return self._value.apply(weights, self._flatten(stack, statistics))[..., 0]
+        return self._value.apply(weights, *self._see(stack, statistics))[..., 0]
 
     def action(self, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch action"]:
         """Returns the action in m/s and rad/s for a draw of the Gaussian."""
@@ -107,6 +136,14 @@ class Networks:
         parameters = self.parameters(policy.weights, policy.statistics, stack)
         return self.action(parameters[..., : self.n_action])
 
-    def _flatten(self, stack: Array, statistics: learning.Statistics) -> Array:
-        normalized = learning.normalize(stack, statistics)
-        return normalized.reshape(*stack.shape[:-2], -1)
+    def _seeing(self, body: MLP) -> Any:
+        return body if self.layout.image is None else Seeing(self.layout.image, body)
+
+    def _see(self, stack: Array, statistics: learning.Statistics) -> tuple[Array, ...]:
+        """Returns the inputs of the networks: numbers normalised, but an image in its own scale."""
+        normalized, layout = learning.normalize(stack, statistics), self.layout
+        if layout.image is None:
+            return (normalized.reshape(*stack.shape[:-2], -1),)
+        begin, end = layout.image_at, layout.image_at + layout.image[0] * layout.image[1]
+        plain = jnp.concatenate([normalized[..., :begin], normalized[..., end:]], axis=-1)
+        return plain, stack[..., begin:end] / senses.IMAGE_RANGE

@@ -74,7 +74,7 @@ def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning:
         return senses.look(part, params.start.station, reckoning)
     part["ranges"] = level_ring(part["scan"], params.lidar.shape)
     view = senses.look(part, params.start.station, reckoning)
-    return view.replace(features=jnp.concatenate([view.features, part["scan"] / 30.0], axis=-1))  # type: ignore[attr-defined]
+    return view.replace(features=jnp.concatenate([view.features, part["scan"] / senses.IMAGE_RANGE], axis=-1))  # type: ignore[attr-defined]
 
 
 def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Array, "env"]) -> Float[Array, "env n"]:

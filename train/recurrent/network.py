@@ -12,10 +12,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.policies import senses
 from subterra_jax.policies.senses import PLAIN, Senses
-from train.learning import MLP, NormalTanhDistribution
+from train.learning import MLP, NormalTanhDistribution, glance
 
 Weights = Any
-PATCH_WIDTH, GLANCE_WIDTH = 32, 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,11 +93,7 @@ class Memory(nn.Module):
         number = jnp.bfloat16 if self.half else kept.plain.dtype
         features = kept.plain.astype(number)
         if self.image is not None and kept.image is not None:
-            tiles = senses.patches(kept.image, self.image).astype(number)
-            tiles = nn.swish(nn.Dense(PATCH_WIDTH, name="patch", dtype=number)(tiles))
-            tiles = tiles.reshape(*tiles.shape[:-2], -1)
-            glance = nn.swish(nn.Dense(GLANCE_WIDTH, name="glance", dtype=number)(tiles))
-            features = jnp.concatenate([features, glance], axis=-1)
+            features = jnp.concatenate([features, glance(kept.image, self.image, number)], axis=-1)
         encoded = nn.swish(nn.Dense(self.hidden, dtype=number)(features))
         # All that does not wait for the state before is done for the whole sequence at once.
         gates = nn.Dense(3 * self.hidden, dtype=number)(encoded)
