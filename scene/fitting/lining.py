@@ -40,14 +40,18 @@ class SeenNails:
     depth: float  # Median depth of the nails' axes behind the wall, m
 
 
-def pair_pockets(bore: Bore) -> Int[np.ndarray, "b 2"]:
-    """Pairs pockets of one row across one joint, as indices into `bore.pocket`, each used once."""
+def pair_pockets(bore: Bore, joint: Float[np.ndarray, " r"] | None = None) -> Int[np.ndarray, "b 2"]:
+    """Pairs pockets of one row across one joint, as indices into `bore.pocket`, each used once.
+
+    `joint` holds the ring joints, m, where they are known: without, any two at the distance of a pair are one.
+    """
     pocket = bore.pocket
     if len(pocket) < 2:
         return np.empty((0, 2), np.intp)
     order = np.argsort(pocket["station"], kind="stable")
     station, angle = pocket["station"][order], pocket["angle"][order]
     across = float(np.median(bore.radius))
+    ring = np.searchsorted(np.sort(joint), station) if joint is not None else None
     free, result = np.ones(len(order), bool), []
     for k in range(len(order)):
         if not free[k]:
@@ -55,7 +59,8 @@ def pair_pockets(bore: Bore) -> Int[np.ndarray, "b 2"]:
         last = int(np.searchsorted(station, station[k] + _APART[1]))
         ahead = np.arange(k + 1, last)
         turn = np.abs(np.angle(np.exp(1j * (angle[ahead] - angle[k])))) * across
-        fit = ahead[free[ahead] & (turn < _SAME_ROW) & (station[ahead] - station[k] > _APART[0])]
+        fit = free[ahead] & (turn < _SAME_ROW) & (station[ahead] - station[k] > _APART[0])
+        fit = ahead[fit if ring is None else fit & (ring[ahead] == ring[k] + 1)]
         if len(fit):
             free[k] = free[fit[0]] = False
             result.append((order[k], order[fit[0]]))
@@ -177,7 +182,8 @@ def add_lining(
     measured, joints = find_pockets(sections)
     if len(measured):
         bore = replace(bore, pocket=measured, ring_station=joints)
-        return _add_nails(bore, cloud, config, {"rings": MEASURED, "pockets": MEASURED})
+        rings = MEASURED if len(joints) else "none: neither pockets nor steps of the wall tell the joints"
+        return _add_nails(bore, cloud, config, {"rings": rings, "pockets": MEASURED}, joints)
     if could_show_pockets(sections, config.pocket_depth):
         return bore, {"rings": NONE, "pockets": NONE, "nails": NONE}
     return add_standard_lining(bore, config, sections.flat_floor)
@@ -266,8 +272,14 @@ def _above_floor(bore: Bore, station: np.ndarray, angle: np.ndarray) -> Float[np
     return upward[row, column] - upward[row].min(axis=1)
 
 
-def _add_nails(bore: Bore, cloud: Cloud | None, config: LiningConfig, provenance: dict[str, str]) -> tuple[Bore, dict]:
-    pairs = pair_pockets(bore)
+def _add_nails(
+    bore: Bore,
+    cloud: Cloud | None,
+    config: LiningConfig,
+    provenance: dict[str, str],
+    joint: Float[np.ndarray, " r"] | None = None,
+) -> tuple[Bore, dict]:
+    pairs = pair_pockets(bore, joint)
     seen = find_nails(bore, pairs, cloud) if cloud is not None else None
     if seen is None:
         return replace(bore, nail=make_nails(bore, pairs, config.nail_depth, config.nail_diameter)), {

@@ -2,19 +2,22 @@
 
 A pocket is a hole in the returns that lie on the wall, with returns behind it. Seen along the tunnel its back is mostly
 hidden by its own edge, so that one pocket says little about its depth or size. But the pockets of a lining come from
-one mould, and all of them together say it well. They stand in rows along the bore, either side of every ring joint.
+one mould, and all of them together say it well. They stand in rows along the bore, either side of every ring joint; or
+anywhere around it, where rings are turned, but at the same places along each ring.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
-from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.ndimage import binary_dilation, maximum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
-from scene.fitting.evidence import more_than_chance, open_rims
+from scene.fitting.evidence import more_than_chance, open_rims, turned_more_than_chance
+from scene.fitting.joints import find_joints_by_steps
 from scene.fitting.section import Sections
+from scene.fitting.turned import find_ring
 from scene.fitting.unroll import Grid
 
 CLEAR = 0.32  # score of a hole that nobody doubts
@@ -127,24 +130,74 @@ _SIDE = 0.5
 _RIB = 0.02  # least wall left between two pockets, m
 _OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
 _OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
+_ALL_ROWS = 0.95  # of the clear holes at the places of rings
+_RIMS = (11, 9)  # cells about the middle of a hole that are it or its rim
+_THROUGH = 0.05  # of the pockets
+_SAME_JOINT = 0.1  # m
 _DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
     """Finds the pockets that a survey shows, of `scene.bore.POCKET`, and the ring joints between them, m.
 
-    Position is each pocket's own; length, width and depth are common to all. Holes that do not stand in rows and at a
-    pitch of rings, have no rims, or could be chance are no pockets: both results are empty then.
+    Position is each pocket's own; length, width and depth are common to all. Holes that stand neither in rows nor at
+    the same places of every ring, have no rims, or could be chance are no pockets: both results are empty then. Joints
+    of turned rings are empty where the wall shows no steps there.
     """
-    grid = sections.grid
-    nothing = np.empty(0, POCKET), np.empty(0)
     deficit = _deficit(sections)
     faint = _find_holes(deficit, sections)
-    reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / grid.columns)
-    holes = keep_rows(faint.where(faint.score > _WEAK), grid.columns, reach)
-    if len(holes.row) < _MIN_POCKETS:
+    weak = faint.where(faint.score > _WEAK)
+    reach = _ROW_WIDTH / (2 * np.pi * np.median(sections.radius) / sections.grid.columns)
+    rows = keep_rows(weak, sections.grid.columns, reach)
+    pockets, joints = _pockets_in_rows(deficit, sections, faint, rows, reach)
+    turned, pitch = _keep_turned(deficit, sections, weak)
+    if len(turned.row) and not (len(pockets) and _explains(rows, turned, sections.grid.columns)):
+        pockets, joints = _measure_pockets(deficit, sections, turned), np.empty(0)
+    if not len(pockets):
+        return pockets, np.empty(0)
+    pitch = float(np.diff(joints).mean()) if len(joints) else pitch
+    return pockets, _correct_joints(joints, _joints_by_steps(sections, weak, pockets, pitch))
+
+
+def _pockets_in_rows(
+    deficit: np.ndarray, sections: Sections, faint: Holes, rows: Holes, reach: float
+) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
+    """Return the pockets in rows, and the joints in the middle of those either side; none where it could be chance."""
+    nothing = np.empty(0, POCKET), np.empty(0)
+    if len(rows.row) < _MIN_POCKETS:
         return nothing
-    holes = add_pattern(faint, holes, grid, reach)
+    pockets = _measure_pockets(deficit, sections, add_pattern(faint, rows, sections.grid, reach))
+    if not len(pockets):
+        return nothing
+    joints = find_ring_joints(pockets["station"], sections.grid.rows * sections.grid.step)
+    radius = float(np.median(sections.radius))
+    return (pockets, joints) if more_than_chance(pockets, joints, _PITCHES, radius) else nothing
+
+
+def _keep_turned(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple[Holes, float]:
+    """Return the holes at the places that all rings share, none where that could be chance, and the pitch, m."""
+    none = holes.where(np.zeros(len(holes.row), bool))
+    clear = holes.score > CLEAR
+    if clear.sum() < _MIN_POCKETS:
+        return none, 0.0
+    length = sections.grid.rows * sections.grid.step
+    station = (_refine_positions(deficit, sections, holes)[0] + 0.5) * sections.grid.step
+    ring = find_ring(station[clear], length, _PITCHES)
+    if not turned_more_than_chance(station[clear], ring, length, _PITCHES):
+        return none, 0.0
+    return holes.where(ring.holds(station)), ring.pitch
+
+
+def _explains(rows: Holes, turned: Holes, columns: int) -> bool:
+    """Return whether rows hold nearly all clear holes that stand at the places of rings."""
+    clear = turned.where(turned.score > CLEAR)
+    in_rows = np.isin(clear.row * columns + clear.column, rows.row * columns + rows.column)
+    return bool(in_rows.mean() > _ALL_ROWS)
+
+
+def _measure_pockets(deficit: np.ndarray, sections: Sections, holes: Holes) -> Shaped[np.ndarray, " p"]:
+    """Return the pockets that holes are, of `scene.bore.POCKET`; none where their rims are open, or few are left."""
+    grid = sections.grid
     row, column = _refine_positions(deficit, sections, holes)
     station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
     slope = _slopes(sections, holes)
@@ -154,15 +207,37 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     rim = open_rims(deficit, grid, row, column, (length, width), radius)
     inside = (station > grid.start + length) & (station < grid.start + grid.rows * grid.step - length)
     if np.median(rim) > _USUAL_RIM or (inside & (rim < _OPEN_RIM)).sum() < _MIN_POCKETS:
-        return nothing
+        return np.empty(0, POCKET)
     inside &= rim < _OPEN_RIM
     pockets = np.zeros(int(inside.sum()), POCKET)
     pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
-    pockets = pockets[_drop_overlaps(pockets, radius)]
-    joints = find_ring_joints(pockets["station"], grid.rows * grid.step)
-    return (pockets, joints) if more_than_chance(pockets, joints, _PITCHES, radius) else nothing
+    return pockets[_drop_overlaps(pockets, radius)]
+
+
+def _joints_by_steps(
+    sections: Sections, holes: Holes, pockets: Shaped[np.ndarray, " p"], pitch: float
+) -> Float[np.ndarray, " r"]:
+    """Return the ring joints that steps of the wall tell, m; none where they would run through pockets."""
+    cells = np.zeros(sections.radius.shape, bool)
+    cells[holes.row, holes.column] = True
+    columns = sections.grid.columns
+    cells = binary_dilation(np.concatenate([cells] * 3, axis=1), np.ones(_RIMS))[:, columns : 2 * columns]
+    joints = find_joints_by_steps(sections, cells, pitch)
+    if not len(joints):
+        return joints
+    apart = np.abs(np.mod(pockets["station"] - joints[0] + 0.5 * pitch, pitch) - 0.5 * pitch)
+    return joints if np.mean(apart < 0.5 * pockets["length"]) < _THROUGH else np.empty(0)
+
+
+def _correct_joints(joints: Float[np.ndarray, " r"], by_steps: Float[np.ndarray, " r"]) -> Float[np.ndarray, " r"]:
+    """Return the joints by steps where those between pockets are elsewhere in the ring, m."""
+    if not len(by_steps) or not len(joints):
+        return by_steps if len(by_steps) else joints
+    pitch = float(np.diff(joints).mean())
+    apart = np.mod(joints[0] - by_steps[0] + 0.5 * pitch, pitch) - 0.5 * pitch
+    return joints if abs(apart) < _SAME_JOINT else by_steps
 
 
 def _drop_overlaps(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:
