@@ -44,26 +44,24 @@ class SurveyConfig:
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]  # Folder to write to; made if missing.
-    # Kind of bore: the paper's D-section; the same on a real metro's alignment; one outside that class; or a place as
-    # scanners meet them, from `portal` on.
+    # Kind of bore; from `portal` on places as scanners meet them.
     truth: TruthName = "paper"
-    # A tunnel file to survey instead, with what stands in it: `tunnel.npz` of a scene, or what
-    # `st.tunnel.save_tunnel` wrote of a tunnel of the open world.
+    # A tunnel file to survey instead: of a scene, or of `st.tunnel.save_tunnel`.
     truth_file: Path | None = None
     lining: str = ""  # Lining of the tunnel file; `pockets`, or its first, if not given.
     length: float = 60.0  # Length of the bore along its centreline, m.
-    seed: int = 0  # Draws the bore, the walk and all noise. The same seed gives the same bytes.
+    seed: int = 0  # Draws all that is random; the same seed gives the same bytes.
     # Draw sizes (gauge, rings, pockets ...) within building tolerance.
     tolerances: bool = False
     correlation: float = 2.0  # Correlation length of the walls of `irregular`, m.
-    # LiDARs on the rack, each with its own recording. With none, only truth and clouds are written.
+    # LiDARs, each with its own recording; with none, truth and clouds alone.
     sensors: tuple[LidarName, ...] = ("avia",)
     scan_every: int = 1  # Keep every so many scans of the VLP-16 and the OS1.
     speed: float = 1.0  # Mean walking speed, m/s.
-    point_rate: int = 240_000  # Points per second of the Avia; less than its own 240,000 thins the survey.
-    # Also write `cloud.ply` and `cloud.pcd`, the returns of the first sensor placed by the true poses.
+    point_rate: int = 240_000  # Points per second of the Avia; fewer thin the survey.
+    # Also write the first sensor's returns as `cloud.ply` and `cloud.pcd`.
     cloud: bool = False
-    # Write `cloud.ply` as thin profiles so many metres apart, and `held_out.ply` with profiles between them.
+    # Write profiles so far apart, m, as `cloud.ply`, and `held_out.ply` between.
     profiles: float = 0.0
     # Errors of the instruments. Zero, or the flag's `no-` form, switches a part off.
     errors: SensorErrors = field(default_factory=SensorErrors)
