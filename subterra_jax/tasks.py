@@ -235,11 +235,14 @@ def make(
     """
     id = find(id)
     if id == WALK or id in MISSIONS:
-        _require_planar(id, sensor, sweep)
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
-        make_walking = walking.make if id == WALK else walking.make_mission
-        return make_walking(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
+        if id == WALK:
+            _require_planar(id, sensor, sweep)
+            return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
+        if sweep:
+            overrides["lidar"] = dataclasses.replace(make_sensor(sensor), sweep=True)
+        return walking.make_mission(id, tunnel, lining, sensor=sensor, **overrides)  # type: ignore[arg-type]
     task = TASKS[id]
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
     if spatial:

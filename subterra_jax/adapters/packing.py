@@ -218,3 +218,10 @@ def observation_space(env: TunnelEnv, params: EnvParams, fields: Fields | None) 
 def as_observation(vector: np.ndarray, fields: Fields | None) -> Observation:
     """Bring vectors `(..., n_obs)` into the form of the space; the parts of a dict are views."""
     return vector if fields is None else {name: fields.shaped(name, vector[..., at]) for name, at in fields.items()}
+
+
+def as_vector(observation: Observation) -> np.ndarray:
+    """Return the vector `(n_obs,)` of one observation; the inverse of `as_observation`."""
+    if isinstance(observation, dict):
+        return np.concatenate([values.ravel() for values in observation.values()])
+    return observation

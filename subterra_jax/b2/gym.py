@@ -15,7 +15,7 @@ if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.ge
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it once, when it is imported
 
 from subterra_jax.adapters import packing
-from subterra_jax.adapters.packing import start_streams, take_key
+from subterra_jax.adapters.packing import Observation, start_streams, take_key
 from subterra_jax.adapters.views import TunnelChoice
 from subterra_jax.b2 import TRAVERSE, WALK, tasks
 from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
@@ -24,9 +24,10 @@ from subterra_jax.b2.params import WalkParams, WalkState
 from subterra_jax.b2.view import Camera
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel_env import TunnelEnv
 
 
-class SingleB2(Env[np.ndarray, np.ndarray]):
+class SingleB2(Env[Observation, np.ndarray]):
     """One B2: a pure environment with a state of its own, on the CPU.
 
     `info` is that of the pure environment: Python floats and bools, and arrays. A subclass makes `env`, `params` and
@@ -55,7 +56,9 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
 
     def _prepare(self) -> None:
         """Makes spaces and compiled functions from `env`, `params` and `walk`."""
-        self.observation_space = packing.observation_space(self.env, self.params, None)
+        mission = isinstance(self.env, TunnelEnv)
+        self._fields = packing.named_fields(self.env, self.params, flat=False) if mission else None
+        self.observation_space = packing.observation_space(self.env, self.params, self._fields)
         self.action_space = packing.action_space(self.env, self.params)
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
 
@@ -65,7 +68,7 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Begins an episode; the same seed begins the same sequence of episodes.
 
         Raises:
@@ -78,9 +81,9 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
             self._stream = start_streams([seed], self.np_random)[0]
         with jax.default_device(self._cpu):
             obs, self.state = self._reset(self._key(), self.params)
-        return np.array(obs), {}
+        return packing.as_observation(np.array(obs), self._fields), {}
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Takes one step; the action is clipped, a NaN read as 0."""
         if self.state is None:
             raise error.ResetNeeded("reset() must come before step()")
@@ -91,7 +94,13 @@ class SingleB2(Env[np.ndarray, np.ndarray]):
             obs, self.state, *rest = self._step(self._key(), self.state, action, self.params)
         obs, reward, terminated, truncated, info = jax.device_get((obs, *rest))
         plain = {name: value if np.ndim(value) else value.item() for name, value in info.items()}
-        return np.array(obs), float(reward), bool(terminated), bool(truncated), plain
+        return (
+            packing.as_observation(np.array(obs), self._fields),
+            float(reward),
+            bool(terminated),
+            bool(truncated),
+            plain,
+        )
 
     def render(self) -> np.ndarray | None:
         """Draws the last step, `(height, width, 3)` uint8; `None` without `rgb_array`.

@@ -19,7 +19,8 @@ from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.lidar import LidarParams, cast
 from subterra_jax.lidar3d import beams, casting
 from subterra_jax.lidar3d.relief import Relief
-from subterra_jax.parts import Drive, Moved, Noise, Odometer, PlanarLidar, Sight, Step, Unicycle
+from subterra_jax.lidar3d.space import into_tunnel, turned
+from subterra_jax.parts import Drive, Moved, Noise, Odometer, PlanarLidar, Sight, SpatialLidar, Step, Unicycle
 from subterra_jax.parts.odometer import OdometryState
 from subterra_jax.parts.part import Batch, Keys
 from subterra_jax.parts.unicycle import wrap
@@ -182,6 +183,44 @@ class TrunkLidar(PlanarLidar):
         return False
 
 
+@dataclasses.dataclass(frozen=True)
+class TrunkSpatialLidar(SpatialLidar):
+    """The LiDAR in three dimensions where the trunk has it, tilted as the trunk is.
+
+    Lateral place and turns of its mount count from there; the mount's height does not.
+    """
+
+    def defaults(self) -> dict[str, Any]:
+        """Return `lidar`, and `relief`: the surface that it sees; None for that of the tunnel, without sleepers."""
+        return {**super().defaults(), "relief": None}
+
+    def poses(self, own: Any, sight: Sight, params: EnvParams) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+        """Return origin (m) and direction of each beam, tunnel frame."""
+        del own
+        sensor, walk = params.lidar, sight.parts[Legs.name].walk
+        quaternion, unit = walk.body.qpos[3:7], jnp.eye(3)
+        ahead, left, up = (tuple(rotate(quaternion, unit[i])) for i in range(3))
+        _, place = lidar_place(walk, params.walk, sensor.mount.lateral)
+        directions = into_tunnel(turned((ahead, left, up), sensor.mount), sensor.directions)
+        return jnp.broadcast_to(place, (sensor.n_beams, 3)), directions
+
+    def relief(self, sight: Sight, params: EnvParams) -> Relief:
+        """Return the surface that is seen."""
+        return sight.tunnel.space.relief if params.relief is None else params.relief
+
+    def check(self, others: frozenset[str], params: EnvParams) -> None:
+        """Refuse a sweep, and what every sensor refuses.
+
+        Raises:
+            ValueError: The trunk's pose within a sweep is not known.
+        """
+        if params.lidar.sweep:
+            raise ValueError(
+                "sweep=True does not go with a robot on legs, whose trunk is known at the end of a step alone"
+            )
+        super().check(others, params)
+
+
 def _mean_motion(
     state: State, position: Float[Array, "2"], heading: Float[Array, ""], params: EnvParams
 ) -> Float[Array, "2"]:
@@ -239,6 +278,18 @@ def yaw(quaternion: Float[Array, "4"]) -> Float[Array, ""]:
     return jnp.arctan2(y, x)
 
 
+def lidar_place(
+    walk: WalkState, params: WalkParams, lateral: Float[Array, ""] | float = 0.0
+) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Return the place of the LiDAR, `lateral` m to the left of the trunk's middle: from the anchor, and in the tunnel.
+
+    In the tunnel frame float32 rounds to a tenth of a millimetre a kilometre away; from the anchor it does not.
+    """
+    x, y, z = b2.LIDAR
+    mount = walk.body.qpos[:3] + rotate(walk.body.qpos[3:7], jnp.stack([jnp.float32(x), y + lateral, jnp.float32(z)]))
+    return mount, params.track.position[walk.anchor] + mount
+
+
 def scan(
     walk: WalkState, station: Float[Array, ""], params: WalkParams, sensor: LidarParams, relief: Relief | None
 ) -> Float[Array, "n_beams"]:
@@ -258,9 +309,7 @@ def scan(
         True ranges, m, in [0, range_max]; exactly `range_max` where a beam meets nothing within it.
     """
     quaternion = walk.body.qpos[3:7]
-    # From the anchor: in the tunnel frame float32 would round to a tenth of a millimetre a kilometre away.
-    mount = walk.body.qpos[:3] + rotate(quaternion, jnp.array(b2.LIDAR))
-    origin = params.track.position[walk.anchor] + mount
+    mount, origin = lidar_place(walk, params)
     directions = jnp.asarray(beams.planar(sensor.n_beams), jnp.float32)
     if relief is not None:
         return casting.scan(relief, origin, quaternion, station, directions, sensor.range_max)

@@ -11,23 +11,24 @@ from subterra_jax.b2 import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
 from subterra_jax.b2.gait import RELEASED, GaitParams, WalkPolicy, check_fits, load_policy
-from subterra_jax.b2.mission import PERIODS, LegOdometer, Legs, TrunkLidar
+from subterra_jax.b2.mission import PERIODS, LegOdometer, Legs, TrunkLidar, TrunkSpatialLidar
 from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.params import CommandParams, RandomisationParams, SensorParams, WalkParams, WalkRewardParams
 from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
-from subterra_jax.constants import DISTANCE_BIAS_SIGMA
+from subterra_jax.constants import DISTANCE_BIAS_SIGMA, RANGE_MAX
 from subterra_jax.lidar3d.relief import Relief
-from subterra_jax.params import collect_entries, make_params
+from subterra_jax.params import check_together, collect_entries, make_params
 from subterra_jax.parts import Odometer
 from subterra_jax.parts.odometer import OdometryParams
+from subterra_jax.parts.spatial_lidar import SENSORS, SpatialParams, make_sensor
 from subterra_jax.parts.unicycle import VehicleParams
 from subterra_jax.rules import StartParams, Traverse
 from subterra_jax.state import EnvParams, as_arrays
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
-from subterra_jax.tunnel.sources import load_tunnel
+from subterra_jax.tunnel.sources import load_tunnel, resolve
 from subterra_jax.tunnel_env import TunnelEnv
 
 _MARGIN = 0.1  # to either side of the robot's envelope, m
@@ -124,6 +125,7 @@ def make_mission(
     odometer: Literal["legs", "drift"] = "legs",
     relief: Relief | None = None,
     walk: dict[str, Any] | None = None,
+    sensor: Any = SENSORS[0],
     **overrides: Any,
 ) -> tuple[TunnelEnv, EnvParams]:
     """Makes a planar task on the legs of the B2, and its params.
@@ -139,6 +141,7 @@ def make_mission(
         odometer: `legs`, the robot's own; or `drift`, the model of the planar tasks applied to its true motion.
         relief: Surface that the LiDAR sees; that of the scene, if any, if left out.
         walk: Fields of `WalkParams` to replace.
+        sensor: The LiDAR on the trunk, as for `subterra_jax.make`.
         **overrides: Fields of `EnvParams` to replace.
 
     Raises:
@@ -161,12 +164,17 @@ def make_mission(
         relief = relief or Relief.from_scene(scene, lining or "pockets")
         if engine == "mujoco":
             walker = walk_in_scene(walker, Path(scene), lining)
+    spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
+    if spatial:
+        source = tunnel if scene is None else Path(scene) / "tunnel.npz"
+        walking = dataclasses.replace(walking, tunnel=resolve(source, lining, None, RANGE_MAX, spatial=True))
+        overrides = {"lidar": sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor), **overrides}
     trained = _gait(policy, walker.observation_size(walking))
     own = {"walk": walking, "policy": trained, "relief": relief}
     env = TunnelEnv(
         id=id,
         rule=Traverse(),
-        parts=(LegOdometer() if odometer == "legs" else Odometer(), TrunkLidar()),
+        parts=(LegOdometer() if odometer == "legs" else Odometer(), TrunkSpatialLidar() if spatial else TrunkLidar()),
         motion=Legs(walker),
     )
     fields: dict[str, Any] = {
@@ -178,6 +186,7 @@ def make_mission(
         raise ValueError(f"{env.id} has no {sorted(given)} to replace; `walk=`, `policy=` and `relief=` make them")
     horizon = overrides.pop("horizon", HORIZON)
     params = make_params(env, walking.tunnel, horizon, collect_entries(env, {**fields, **own, **overrides}))
+    check_together(env, params)
     commanded, period = PERIODS * physics.period, float(jnp.asarray(params.vehicle.period))
     if abs(period - commanded) > 1e-6:
         raise ValueError(f"the B2 takes a command every {commanded:g} s, got period={period:g}")

@@ -132,11 +132,11 @@ def stand(
         p + mount.lateral * a + mount.height * b
         for p, a, b in zip((position[0], position[1], z), left, up, strict=True)
     ]
-    return jnp.stack(at), _turned((ahead, left, up), mount)
+    return jnp.stack(at), turned((ahead, left, up), mount)
 
 
-def _turned(axes: tuple[Rows, Rows, Rows], mount: Mount) -> Float[Array, "3 3"]:
-    """Return the axes of a sensor that is turned by yaw, then pitch, then roll."""
+def turned(axes: tuple[Rows, Rows, Rows], mount: Mount) -> Float[Array, "3 3"]:
+    """Return a sensor's axes ahead, left and up, as rows: the robot's, turned by yaw, then pitch, then roll."""
     ahead, left, up = axes
     ahead, left = _spin(ahead, left, mount.yaw)
     up, ahead = _spin(up, ahead, mount.pitch)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from subterra_jax.lidar3d import beams, echo
 from subterra_jax.lidar3d.casting import Met, meet, require_free
 from subterra_jax.lidar3d.echo import EchoParams
+from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.lidar3d.space import Mount, into_tunnel, stand
 from subterra_jax.parts.part import Bounds, Noise, Part, Sight, Step
 from subterra_jax.parts.unicycle import wrap
@@ -240,6 +241,11 @@ class SpatialLidar(Part):
         turned = jax.vmap(lambda a, d: into_tunnel(a, d[None])[0])(axes, sensor.directions)
         return places, turned
 
+    def relief(self, sight: Sight, params: EnvParams) -> Relief:
+        """Return the surface that is seen."""
+        del params
+        return sight.tunnel.space.relief
+
     def look(self, own: Any, sight: Sight, uniform: Any, params: EnvParams) -> tuple[Met, Array, Array]:
         """Return the nearest surfaces, the cosines of incidence, and the rays.
 
@@ -257,7 +263,7 @@ class SpatialLidar(Part):
             origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
         limits = jnp.broadcast_to(sensor.range_max, len(both))
         start = origins if sensor.sweep else origins[0]
-        met = meet(sight.tunnel.space.relief, start, both, sight.station, limits.astype(jnp.float32))
+        met = meet(self.relief(sight, params), start, both, sight.station, limits.astype(jnp.float32))
         standing = sight.hits(both[:, :2])
         nearer = standing < met.ranges
         met = met._replace(ranges=jnp.minimum(met.ranges, standing), thing=met.thing | nearer)

@@ -210,3 +210,28 @@ def test_the_robot_is_drawn_where_there_is_opengl(tmp_path):
     picture, _ = draw(DRAW, tmp_path / "picture.npy")
     assert picture.shape == (120, 160, 3)
     assert picture.std() > 10.0
+
+
+def test_a_lidar_in_three_dimensions_stands_on_the_trunk(plan):
+    env, params = st.make(ID, tunnel=plan, policy="trot", sensor="spin16x64")
+    assert env.images(params) == {"scan": (16, 64)}
+    assert env.observation_size(params) == 16 * 64 + 2
+    with pytest.raises(ValueError, match="sweep=True does not go with a robot on legs"):
+        st.make(ID, tunnel=plan, policy="trot", sensor="spin16x64", sweep=True)
+    with pytest.raises(ValueError, match="Subterra/B2Walk-v0 has the sensor 'planar16' alone"):
+        st.make("Subterra/B2Walk-v0", tunnel=plan, sensor="spin16x64")
+
+
+@pytest.mark.slow
+def test_in_gymnasium_the_image_has_its_shape_and_sees_walls_and_ground(plan):
+    made = gymnasium.make(ID, tunnel=plan, policy="trot", sensor="spin16x64")
+    obs, _ = made.reset(seed=0)
+    assert made.observation_space.contains(obs)
+    scan = obs["scan"]
+    assert scan.shape == (16, 64)
+    aside = scan[8, [16, 48]]
+    assert aside.sum() == pytest.approx(2.0 * float(np.median(plan.half_width)), abs=0.4)
+    assert scan[0, 0] < 4.0 < scan[8, 0]  # 15 degrees down it meets the ballast
+    after, *_ = made.step(np.array([0.5, 0.0], np.float32))
+    assert made.observation_space.contains(after)
+    made.close()

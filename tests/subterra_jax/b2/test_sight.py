@@ -6,12 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.core import FrozenDict
 
 from subterra_jax import lidar
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import mission
 from subterra_jax.b2.track import lay_standard_track
 from subterra_jax.lidar import LidarParams
+from subterra_jax.lidar3d import Relief, beams
+from subterra_jax.lidar3d.space import Mount
+from subterra_jax.parts import Sight, make_sensor
+from subterra_jax.state import EnvParams
 from subterra_jax.tunnel import Tunnel
 from tests.subterra_jax.tunnels import straight, tunnel_arrays
 
@@ -76,3 +81,43 @@ def test_on_its_back_nothing_is_nan(look):
     for angle in (np.pi / 2, np.pi):
         assert np.isfinite(look(leaning(angle, "x"))).all()
         assert np.isfinite(look(leaning(angle, "y"))).all()
+
+
+@pytest.fixture(scope="module")
+def in_space(world):
+    """Ranges of a LiDAR in three dimensions, and of the planar one, which sees the same surface from the same place."""
+    plan, params = world
+    relief, part = Relief.from_plan(plan, "smooth"), mission.TrunkSpatialLidar()
+
+    @jax.jit
+    def ranges(quaternion, mount):
+        body = SimpleNamespace(qpos=jnp.concatenate([jnp.array([0.0, 0.3, HEIGHT]), quaternion, jnp.zeros(12)]))
+        walk, station = SimpleNamespace(body=body, anchor=jnp.int32(ANCHOR)), params.track.station[ANCHOR]
+        sight = Sight(params.tunnel, jnp.zeros(2), jnp.zeros(()), station, {"legs": SimpleNamespace(walk=walk)})
+        parts = {"lidar": make_sensor(beams.planar(16), mount=mount), "walk": params, "relief": relief}
+        own = EnvParams(params.tunnel, jnp.int32(1), FrozenDict(parts), "cover")
+        met, _, _ = part.look((), sight, None, own)
+        return met.ranges, mission.scan(walk, station, params, SENSOR, relief)
+
+    return lambda quaternion, **mount: jax.device_get(ranges(jnp.asarray(quaternion, jnp.float32), Mount(**mount)))
+
+
+@pytest.mark.parametrize(("angle", "axis"), [(0.2, "x"), (0.15, "y"), (0.4, "z")])
+def test_in_three_dimensions_it_leans_with_the_trunk(in_space, angle, axis):
+    spatial, planar = in_space(leaning(angle, axis))
+    np.testing.assert_allclose(spatial, planar, atol=1e-3)
+    assert np.ptp(spatial) > 5.0
+
+
+def test_a_mount_is_turned_and_moved_aside_on_the_trunk(in_space):
+    level = leaning(0.0, "z")
+    straight, _ = in_space(level)
+    turned, _ = in_space(level, yaw=np.pi / 2)
+    np.testing.assert_allclose(turned, np.roll(straight, -4), atol=1e-3)
+    aside, _ = in_space(level, lateral=0.2)
+    assert aside[4] == pytest.approx(straight[4] - 0.2, abs=2e-3)
+    assert aside[12] == pytest.approx(straight[12] + 0.2, abs=2e-3)
+    down, _ = in_space(level, pitch=0.1)
+    leant, _ = in_space(leaning(0.1, "y"))
+    assert down[0] == pytest.approx(leant[0], abs=0.5)  # from a place that the leaning trunk has lowered
+    assert down[0] < 12.0
