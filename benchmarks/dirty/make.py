@@ -27,6 +27,7 @@ _progress = Console(stderr=True, highlight=False)
 
 Maker = Callable[[np.random.Generator], Cloud]
 Frame = Callable[[np.ndarray], np.ndarray]
+LidarName = Literal["avia", "vlp16", "os1"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class RecordingCase:
 
     spoil: recordings.Spoil | None  # Spoils the true poses; `None`: a prism instead of poses, without its mount
     cause: tuple[str, ...]  # Words of which a warning or refusal names at least one
+    sensor: LidarName = "avia"
 
 
 _CLOCK = ("clock", "late", "lag", "time", "offset", "thick", "blur")
@@ -110,6 +112,8 @@ ODD: dict[str, CloudCase | RecordingCase] = {
     "mine-bend": CloudCase(odd.mine_bend),
     "two-pieces": CloudCase(odd.two_pieces),
     "twin": CloudCase(odd.twin),
+    "vlp16-pitch-3deg": RecordingCase(recordings.pitched, _MOUNT, "vlp16"),
+    "vlp16-roll-2deg": RecordingCase(recordings.rolled, ("roll",), "vlp16"),
 }
 # ... and what is no tunnel, or two.
 BAD: dict[str, CloudCase | RecordingCase] = {
@@ -174,15 +178,16 @@ def _write_cloud(
 def _write_recording(
     case: RecordingCase, config: TroublesConfig, name: str, kind: str, path: Path, rng: np.random.Generator
 ) -> None:
-    survey = config.out / f"survey-{config.seed}"
-    recordings.simulate_survey(survey, config.seed)
+    end = recordings.SUFFIX[case.sensor]
+    survey = config.out / f"survey{end}-{config.seed}"
+    recordings.simulate_survey(survey, config.seed, sensors=(case.sensor,))
     if case.spoil is None:
         arguments = ["--control", f"{{folder}}/{survey.name}/prism.tum"]
     else:
-        poses = recordings.spoil_poses(survey, name, case.spoil)
+        poses = recordings.spoil_poses(survey, name, case.spoil, case.sensor)
         arguments = ["--trajectory", f"{{folder}}/{survey.name}/{poses.name}"]
-    truth = recordings.survey_truth(survey, rng)
-    more = {"source": f"{survey.name}/survey.bag", "arguments": arguments, "cause": case.cause}
+    truth = recordings.survey_truth(survey, rng, case.sensor)
+    more = {"source": f"{survey.name}/survey{end}.bag", "arguments": arguments, "cause": case.cause}
     write_truth(path, kind, {**truth, **more})
 
 
@@ -246,7 +251,7 @@ class SurveysConfig:
 
     out: Path
     truths: tuple[str, ...] = ("portal", "corridor", "works", "platform", "road", "slabtrack")
-    sensors: tuple[Literal["avia", "vlp16", "os1"], ...] = ("avia", "vlp16", "os1")
+    sensors: tuple[LidarName, ...] = ("avia", "vlp16", "os1")
     poses: tuple[Literal["given", "control"], ...] = ("given", "control")
     length: float = 40.0
     seed: int = 0
@@ -264,8 +269,8 @@ def make_surveys(config: SurveysConfig) -> None:
     for truth in config.truths:
         survey = config.out / f"survey-{truth}-{config.seed}"
         recordings.simulate_survey(survey, config.seed, truth, config.length, config.sensors)
-        fields = recordings.survey_truth(survey, np.random.default_rng(config.seed))
         for sensor in config.sensors:
+            fields = recordings.survey_truth(survey, np.random.default_rng(config.seed), sensor)
             end = recordings.SUFFIX[sensor]
             given = ["--trajectory", f"{{folder}}/{survey.name}/groundtruth{end}.tum"]
             control = ["--control", f"{{folder}}/{survey.name}/prism.tum"]

@@ -19,6 +19,7 @@ from scipy.ndimage import (
     uniform_filter1d,
 )
 
+from scene.cleaning.hanging import bridge_hanging
 from scene.fitting.gaps import fill_sides
 from scene.fitting.unroll import Grid, fill_nearest
 
@@ -96,7 +97,7 @@ def measure_tube(
         _outermost(wide, hit, window, share)
         for window, share in ((_USUAL, _MOSTLY), (_PRESENT, _PERSISTENT), (_BRIEF, _PERSISTENT))
     )
-    usual = fill_nearest(fill_sides(usual, grid.angle))
+    usual = bridge_hanging(fill_nearest(fill_sides(usual, grid.angle)), grid.angle)
     wall = _decide(usual, present, brief, wide)
     row, column, index = np.nonzero(hit)
     on = np.abs((index + 0.5) * _BIN - wall[row, column]) < _DIFFERENT

@@ -17,6 +17,8 @@ SECTORS = 36
 _SPARSE = 0.03  # of the usual number of returns of a cell: with fewer it was not seen, as stray returns are everywhere
 _MIN_AREA = 3.0  # m² of wall in one piece: a smaller one is a shadow that its neighbours tell about
 _MIN_LENGTH, _MIN_GIRTH = 1.5, 0.9  # m
+_CENTRES = -np.pi + (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
+_FLOOR = np.deg2rad(35)
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,11 @@ class Coverage:
     end: Float[np.ndarray, " r"]  # Last station, m
     seen: Bool[np.ndarray, "r c"]  # True where enough returns lie on the wall
     pieces: tuple[Unseen, ...]  # Unseen pieces of some size, the largest first
+
+    @property
+    def floor(self) -> Float[np.ndarray, " r"]:
+        """Share of the floor, 35° to each side of straight down, that was seen in each row."""
+        return self.seen[:, np.abs(_CENTRES + np.pi / 2) < _FLOOR].mean(axis=1)
 
     @property
     def share(self) -> float:
@@ -77,7 +84,7 @@ def measure_overruns(bore: Bore, returns: Returns) -> tuple[float, float]:
     """Return how far the cloud shows a lining before the first and behind the last station of a bore, at least, m."""
     overhead = (np.sin(returns.angle) > _OVERHEAD) & (np.abs(returns.outward) < _ON_LINING)
     column = np.floor((returns.angle + np.pi) / (2 * np.pi) * SECTORS).astype(np.intp) % SECTORS
-    all_columns = np.sin(-np.pi + (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS) > _OVERHEAD
+    all_columns = np.sin(_CENTRES) > _OVERHEAD
     result = []
     for beyond in (-returns.station, returns.station - bore.length):
         rows = np.flatnonzero(overhead & (beyond > 0.0) & (beyond < _BEYOND))
@@ -100,7 +107,6 @@ def _cell_areas(bore: Bore, edges: np.ndarray) -> Float[np.ndarray, "r c"]:
 
 def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple[Unseen, ...]:
     labels = _label_around(~seen)
-    centres = -np.pi + (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
     pieces = []
     for index in range(1, int(labels.max(initial=0)) + 1):
         row, column = np.nonzero(labels == index)
@@ -111,7 +117,7 @@ def _list_pieces(seen: np.ndarray, area: np.ndarray, edges: np.ndarray) -> tuple
         if size < _MIN_AREA or end - start < _MIN_LENGTH or size / (end - start) < _MIN_GIRTH:
             continue
         across = float(area[row.min() : row.max() + 1].sum())
-        pieces.append(Unseen(start, end, size, name_sides(centres[column], area[row, column]), size / across))
+        pieces.append(Unseen(start, end, size, name_sides(_CENTRES[column], area[row, column]), size / across))
     return tuple(sorted(pieces, key=lambda piece: (-piece.area, piece.start)))
 
 

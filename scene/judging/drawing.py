@@ -76,8 +76,10 @@ def draw_strips(judgement: Judgement, length: float) -> str:
     table = judgement.stations
     if table is None:
         return ""
-    rows = (("seen", "wall seen", "#2f855a"), ("inside", "inside", COLOURS[INSIDE]), ("behind", "behind", "#2f6fde"),
-            ("cut", "cut away", "#c9a227"), ("filled", "filled", "#6b7280"))  # fmt: skip
+    rows = (
+        ("seen", "wall seen", "#2f855a"), ("floor", "floor seen", "#2f855a"), ("inside", "inside", COLOURS[INSIDE]),
+        ("behind", "behind", "#2f6fde"), ("cut", "cut away", "#c9a227"), ("filled", "filled", "#6b7280"),
+    )  # fmt: skip
     parts, height = [], 24 * len(rows) + 30
     scale = (_WIDTH - 2 * _MARGIN - 40) / length
     for k, (name, title, colour) in enumerate(rows):
@@ -85,7 +87,7 @@ def draw_strips(judgement: Judgement, length: float) -> str:
         parts.append(f'<text x="{_MARGIN + 32}" y="{y + 13}" text-anchor="end">{title}</text>')
         for row in table:
             share = float(row[name])
-            strength = share if name in ("seen", "filled") else min(share / 0.3, 1.0)
+            strength = share if name in ("seen", "floor", "filled") else min(share / 0.3, 1.0)
             if strength > 0.02:
                 parts.append(
                     f'<rect x="{_MARGIN + 40 + row["start"] * scale:.1f}" y="{y}" height="18" fill="{colour}" '

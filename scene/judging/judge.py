@@ -24,8 +24,9 @@ _WINDOW = 2.0  # m of bore that one worst station stands for
 _WARN_LOCAL = 0.05  # of the returns at a place's stations: a place with fewer is listed without a warning
 _WARN_UNSEEN = 0.10  # of the girth
 STATION = np.dtype([
-    ("start", "f8"), ("end", "f8"), ("width", "f8"), ("height", "f8"), ("seen", "f8"), ("explained", "f8"),
-    ("inside", "f8"), ("behind", "f8"), ("returns", "f8"), ("cut", "f8"), ("filled", "f8"), ("confidence", "f8"),
+    ("start", "f8"), ("end", "f8"), ("width", "f8"), ("height", "f8"), ("seen", "f8"), ("floor", "f8"),
+    ("explained", "f8"), ("inside", "f8"), ("behind", "f8"), ("returns", "f8"), ("cut", "f8"), ("filled", "f8"),
+    ("confidence", "f8"),
 ])  # fmt: skip
 
 
@@ -258,7 +259,7 @@ def _tabulate(bore: Bore, returns: Returns, coverage: Coverage, cause: np.ndarra
     total = weigh(returns.in_span)
     table = np.zeros(len(middle), STATION)
     table["start"], table["end"], table["returns"] = edges[:-1], edges[1:], total
-    table["seen"] = coverage.seen.mean(axis=1)
+    table["seen"], table["floor"] = coverage.seen.mean(axis=1), coverage.floor
     for name, kind in (("explained", EXPLAINED), ("inside", INSIDE), ("behind", BEHIND)):
         table[name] = weigh(returns.kind == kind) / np.maximum(total, 1e-9)
     table["cut"] = 0.0 if cause is None else weigh((cause != KEPT) & returns.in_span) / np.maximum(total, 1e-9)

@@ -8,6 +8,7 @@ import pytest
 from scene.bore import Bore
 from scene.cleaning.removed import CAUSES
 from scene.cloud import Cloud
+from scene.judging.drawing import draw_strips
 from scene.judging.judge import DoubtError, JudgingConfig, Warned, judge_bore, require_trust
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, TrackZone, compare_returns, wall_radius
 
@@ -128,6 +129,22 @@ def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
     assert piece.sides == "left wall"
     assert [warning.code for warning in judgement.warnings] == ["unseen"]
     assert "left wall" in judgement.warnings[0].text
+
+
+def test_an_unseen_floor_is_named_and_told_station_by_station(bore):
+    station, lateral, upward = on_wall(bore)
+    hidden = (upward < -3.1) & (station > 8) & (station < 18)
+    judgement = judge_bore(
+        bore, cloud_of(about(bore, *(v[~hidden] for v in (station, lateral, upward)))), JudgingConfig()
+    )
+    assert "from 8 to 18 m hardly a return lies on the floor" in judgement.warnings[0].text
+    table = judgement.stations
+    within = (table["start"] > 8.5) & (table["end"] < 17.5)
+    assert table["floor"][within].max() == 0.0
+    assert table["floor"][(table["end"] < 7.5) | (table["start"] > 18.5)].min() == 1.0
+    strips = draw_strips(judgement, bore.length)
+    assert "floor seen" in strips
+    assert strips.count("<rect") == 2 * len(table) - int((table["floor"] == 0.0).sum())
 
 
 def test_strays_do_not_count_as_having_seen_a_wall(bore):

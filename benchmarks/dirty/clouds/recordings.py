@@ -21,6 +21,9 @@ _LINING = 0  # number of the lining among the parts of `truth.ply`
 SUFFIX = {"avia": "", "vlp16": "_vlp16", "os1": "_os1"}
 _BESIDE = np.array([-14.0, -9.0, -6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0, 9.0])  # m: from where a place may have been seen
 _CLEAR = 0.03  # m by which a ray may fall short of what it sees
+# deg, to both sides of the way and of the horizon, that each LiDAR sees; the carrier's sway is left out
+_FIELD = {"avia": (35.2, 38.6), "vlp16": (180.0, 15.0), "os1": (180.0, 22.5)}
+_ASIDE, _LAYBY, _DEEP = 0.05, 7.0, 0.05  # m: least width of a widening; shorter is a niche; how far behind the wall
 _WALL_FROM = 0.5  # m above the floor
 _MOST = 6000
 
@@ -45,8 +48,11 @@ def simulate_survey(
         raise BenchmarkError(f"{folder}: the survey failed: {done.stderr.strip().splitlines()[-1:]}")
 
 
-def survey_truth(folder: Path, rng: np.random.Generator) -> dict[str, Any]:
-    """Return the fields of the truth of a simulated survey: of the wall, what the carrier could see on the way."""
+def survey_truth(folder: Path, rng: np.random.Generator, sensor: str = "avia") -> dict[str, Any]:
+    """Return the fields of the truth of a simulated survey: of the wall, what one of its LiDARs could see on the way.
+
+    Niches are left out: a lay-by of 7 m belongs to the bore, and what is shorter is cut away, as the guide says.
+    """
     truth = json.loads((folder / "truth.json").read_text())
     axis = np.array(truth["position"])
     mesh = PlyData.read(folder / "truth.ply")
@@ -61,8 +67,9 @@ def survey_truth(folder: Path, rng: np.random.Generator) -> dict[str, Any]:
     station = np.array(truth["station"])
     above = centre[:, 2] - axis[near, 2] + half[near]
     inside = (above > _WALL_FROM) & (station[near] > 2.0) & (station[near] < truth["length"] - 3.0)
-    chosen = rng.choice(np.flatnonzero(inside), 2 * _MOST, replace=False)
-    chosen = chosen[seen_on_the_way(folder, centre[chosen])][:_MOST]
+    inside &= ~_in_niche(truth, centre, near)
+    chosen = rng.choice(np.flatnonzero(inside), min(4 * _MOST, int(inside.sum())), replace=False)
+    chosen = chosen[seen_on_the_way(folder, centre[chosen], sensor)][:_MOST]
     return {
         "axis": axis, "wall": centre[chosen], "span": np.array([2.0, truth["length"] - 3.0]),
         "ends": np.array([0.0, truth["length"]]), "axis_above_floor": half, "width": np.array(truth["width"]),
@@ -73,31 +80,55 @@ def survey_truth(folder: Path, rng: np.random.Generator) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def seen_on_the_way(folder: Path, places: np.ndarray) -> np.ndarray:
-    """Return whether a carrier on the true poses of a survey could see places on its surface, m `(p, 3)`."""
+def _in_niche(truth: dict[str, Any], places: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return which places lie in a widening to the left that is shorter than a lay-by; `near` is each one's row."""
+    station, aside = np.array(truth["station"]), np.array(truth.get("aside", np.zeros(len(truth["station"]))))
+    edges = np.diff(np.concatenate([[0], (aside > _ASIDE).astype(int), [0]]))
+    short = np.zeros(len(station), bool)
+    for first, end in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+        if station[end - 1] - station[first] < _LAYBY:
+            short[max(first - 1, 0) : end + 1] = True
+    axis, along = np.array(truth["position"]), np.array(truth["tangent"])
+    left = np.cross([0.0, 0.0, 1.0], along[near])
+    lateral = np.einsum("ij,ij->i", places - axis[near], left) / np.linalg.norm(left, axis=1)
+    return short[near] & (lateral > 0.5 * (np.array(truth["width_smooth"]) - aside)[near] + _DEEP)
+
+
+def seen_on_the_way(folder: Path, places: np.ndarray, sensor: str = "avia") -> np.ndarray:
+    """Return whether a LiDAR on the true poses of a survey could see places on its surface, m `(p, 3)`."""
     mesh = PlyData.read(folder / "truth.ply")
     vertices = np.column_stack([mesh["vertex"][k] for k in "xyz"])
     origin = np.floor(vertices[0])
     scene = EmbreeScene(robust=True)
     faces = np.vstack(mesh["face"]["vertex_indices"]).astype(np.int32)
     TriangleMesh(scene, (vertices - origin).astype(np.float32), faces)
-    poses = np.loadtxt(min(folder.glob("groundtruth*.tum")), usecols=(1, 2, 3))  # one rack: any of its LiDARs
+    poses = np.loadtxt(folder / f"groundtruth{SUFFIX[sensor]}.tum", usecols=(1, 2, 3))
     path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses, axis=0), axis=1))])
     at = path[cKDTree(poses).query(places)[1]]
     seen = np.zeros(len(places), bool)
     for ahead in _BESIDE:
-        stand = poses[np.searchsorted(path, np.clip(at + ahead, 0.0, path[-1])).clip(0, len(path) - 1)]
-        ray = places - stand
+        row = np.searchsorted(path, np.clip(at + ahead, 0.0, path[-1])).clip(0, len(path) - 1)
+        way = poses[np.searchsorted(path, path[row] + 0.5).clip(1, len(path) - 1)] - poses[
+            np.searchsorted(path, path[row] - 0.5).clip(0, len(path) - 2)]  # fmt: skip
+        ray = places - poses[row]
         far = np.linalg.norm(ray, axis=1)
-        start = (stand - origin).astype(np.float32)
+        start = (poses[row] - origin).astype(np.float32)
         reach = scene.run(start, (ray / far[:, None]).astype(np.float32), query="DISTANCE")
-        seen |= reach > far - _CLEAR
+        seen |= (reach > far - _CLEAR) & _in_field(ray, way, sensor)
     return seen
 
 
-def spoil_poses(folder: Path, name: str, spoil: Spoil) -> Path:
-    """Writes the true poses of a survey, spoilt, beside them; returns the new file."""
-    rows = [line.split() for line in (folder / "groundtruth.tum").read_text().splitlines()]
+def _in_field(ray: np.ndarray, way: np.ndarray, sensor: str) -> np.ndarray:
+    """Return which rays lie in a LiDAR's field of view; it looks along the way, level, `(p, 3)` each."""
+    turn = np.angle(np.exp(1j * (np.arctan2(ray[:, 1], ray[:, 0]) - np.arctan2(way[:, 1], way[:, 0]))))
+    rise = np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))
+    across, upright = np.radians(_FIELD[sensor])
+    return (np.abs(turn) <= across) & (np.abs(rise) <= upright)
+
+
+def spoil_poses(folder: Path, name: str, spoil: Spoil, sensor: str = "avia") -> Path:
+    """Writes the true poses of a survey's LiDAR, spoilt, beside them; returns the new file."""
+    rows = [line.split() for line in (folder / f"groundtruth{SUFFIX[sensor]}.tum").read_text().splitlines()]
     whole = np.array([int(row[0].split(".")[0]) for row in rows])
     table = np.array(rows, float)
     table[:, 0] = [int(row[0].split(".")[1]) * 1e-6 for row in rows]  # digits that float64 would lose beside the epoch
@@ -113,10 +144,19 @@ def spoil_poses(folder: Path, name: str, spoil: Spoil) -> Path:
     return path
 
 
+def _turned(rows: Rows, axis: str, angle: float) -> Rows:
+    turned = Rotation.from_quat(rows[:, 4:]) * Rotation.from_euler(axis, angle, degrees=True)
+    return np.column_stack([rows[:, :4], turned.as_quat()])
+
+
 def pitched(rows: Rows) -> Rows:
     """Return poses of a LiDAR whose mount is believed 3° off in pitch."""
-    turned = Rotation.from_quat(rows[:, 4:]) * Rotation.from_euler("y", 3.0, degrees=True)
-    return np.column_stack([rows[:, :4], turned.as_quat()])
+    return _turned(rows, "y", 3.0)
+
+
+def rolled(rows: Rows) -> Rows:
+    """Return poses of a LiDAR whose mount is believed 2° off in roll."""
+    return _turned(rows, "x", 2.0)
 
 
 def late(seconds: float) -> Spoil:

@@ -11,7 +11,7 @@ from benchmarks.dirty.__main__ import main as judge
 from benchmarks.dirty.clouds.air import Alignment, Arch, prism, surface_of
 from benchmarks.dirty.clouds.files import write_laz, write_truth
 from benchmarks.dirty.clouds.mutations import MUTATIONS, Mutant
-from benchmarks.dirty.clouds.recordings import late, pitched, scalar_first, spoil_poses
+from benchmarks.dirty.clouds.recordings import _in_field, _in_niche, late, pitched, rolled, scalar_first, spoil_poses
 from benchmarks.dirty.clouds.scanner import choose
 from benchmarks.dirty.clouds.site import bore
 from benchmarks.dirty.truth import Truth, find_cases, load_truth
@@ -98,6 +98,12 @@ def test_spoilt_poses_are_off_by_what_they_say(tmp_path: Path) -> None:
     np.testing.assert_allclose(moved.time - true.time, 0.1, atol=1e-6)
     turned = load_trajectory(spoil_poses(tmp_path, "pitch", pitched))
     np.testing.assert_allclose(np.degrees((true.attitude.inv() * turned.attitude).magnitude()), 3.0, atol=1e-6)
+    (tmp_path / "groundtruth.tum").rename(tmp_path / "groundtruth_vlp16.tum")
+    turned = load_trajectory(spoil_poses(tmp_path, "roll", rolled, "vlp16"))
+    np.testing.assert_allclose(
+        np.degrees((true.attitude.inv() * turned.attitude).as_rotvec()), [[2, 0, 0]] * 5, atol=1e-6
+    )
+    (tmp_path / "groundtruth_vlp16.tum").rename(tmp_path / "groundtruth.tum")
     rows = np.loadtxt(spoil_poses(tmp_path, "wxyz", scalar_first))
     np.testing.assert_allclose(rows[0, 4:], [np.cos(0.1), 0, 0, np.sin(0.1)], atol=1e-9)
 
@@ -167,7 +173,7 @@ def test_mutations_can_be_made_in_parts(tmp_path: Path) -> None:
 
 
 def test_cases_of_surveys_are_judged_by_the_wall_that_the_carrier_could_see(tmp_path: Path) -> None:
-    words = ["surveys", "--out", str(tmp_path), "--truths", "platform", "--length", "14", "--seed", "2"]
+    words = ["surveys", "--out", str(tmp_path), "--truths", "platform", "--length", "18", "--seed", "2"]
     assert make.main([*words, "--sensors", "vlp16", "--poses", "given", "control"]) == 0
     first, second = find_cases(tmp_path)
     assert (first.kind, second.kind) == ("vlp16-control", "vlp16-given")
@@ -178,18 +184,40 @@ def test_cases_of_surveys_are_judged_by_the_wall_that_the_carrier_could_see(tmp_
     assert (truth.track, truth.bulge) == ("single", ("aside", "width", "height"))
     # The wall behind the platform stands 3 m further out, so the middle between both walls 1.5 m.
     middle = np.broadcast_to(truth.middle, len(truth.axis))
-    assert np.median(middle[np.abs(truth.station - 7.0) < 1.5]) == pytest.approx(1.5, abs=0.1)
+    assert np.median(middle[np.abs(truth.station - 9.0) < 1.5]) == pytest.approx(1.5, abs=0.1)
     assert np.median(middle[truth.station < 3.0]) == pytest.approx(0.0, abs=0.1)
     # The platform hides the foot of the wall behind it: 1 m high from 1.75 to about 5.8 m, seen from 1.6 m.
     station = truth.station[cKDTree(truth.axis).query(truth.wall)[1]]
     tangent = np.gradient(truth.axis, truth.station, axis=0)[cKDTree(truth.axis).query(truth.wall)[1]]
     offset = truth.wall - truth.axis[cKDTree(truth.axis).query(truth.wall)[1]]
     left = np.einsum("ij,ij->i", offset, np.cross([0.0, 0.0, 1.0], tangent))
-    beside = (station > 0.45 * 14) & (station < 0.55 * 14) & (left > 4.0)
+    beside = (station > 0.45 * 18) & (station < 0.55 * 18) & (left > 4.0)
     low = offset[:, 2] + truth.axis_above_floor.mean() < 0.95
     assert beside.sum() > 50
     assert not (beside & low).any()
     assert (~beside & low).any()
+
+
+def test_a_niche_is_no_wall_and_a_lay_by_is() -> None:
+    station = np.arange(0.0, 40.1, 0.25)
+    truth = {
+        "station": station, "position": np.stack([station, 0 * station, 0 * station], axis=1),
+        "tangent": np.tile([1.0, 0.0, 0.0], (len(station), 1)),
+        "aside": np.where(np.abs(station - 10.0) < 1.0, 0.6, 0.0),
+    }  # fmt: skip
+    truth["width_smooth"] = 5.0 + truth["aside"]
+    places = np.array([[10.0, 3.1, 0.0], [11.05, 2.8, 0.0], [10.0, -2.5, 0.0], [10.0, 1.0, 2.0], [20.0, 2.6, 0.0]])
+    near = np.rint(places[:, 0] / 0.25).astype(int)
+    assert _in_niche(truth, places, near).tolist() == [True, True, False, False, False]
+    truth["aside"] = np.where(np.abs(station - 10.0) < 4.0, 0.6, 0.0)
+    assert not _in_niche(truth, places, near).any()
+
+
+def test_a_lidar_sees_what_lies_in_its_field() -> None:
+    way = np.tile([0.0, 1.0, 0.0], (4, 1))
+    ray = np.array([[0.5, 2.0, 0.1], [0.0, -2.0, 0.1], [0.0, 2.0, 1.0], [2.0, 0.1, 0.0]])  # ahead, behind, up, aside
+    assert _in_field(ray, way, "vlp16").tolist() == [True, True, False, True]
+    assert _in_field(ray, way, "avia").tolist() == [True, False, True, False]
 
 
 @pytest.mark.slow

@@ -1,0 +1,49 @@
+"""What hangs free under a ceiling all along: pipes, trays and ducts hide it in some directions, and are no wall.
+
+A wall goes on to both sides. Where a section comes nearer at once and as suddenly goes back, and what is between lies
+inside the straight line from one edge to the other, it is a thing in the bore, however long it is.
+"""
+
+import numpy as np
+from jaxtyping import Float
+
+_OVERHEAD = 0.35  # sine of the lowest direction: what stands on the floor or leans on a wall is told elsewhere
+_JUMP = 0.4  # m at both edges
+_INSIDE = 0.3  # m within the line between them
+_WIDEST = np.deg2rad(60.0)
+
+
+def bridge_hanging(
+    radius: Float[np.ndarray, "rows cols"], angle: Float[np.ndarray, " cols"]
+) -> Float[np.ndarray, "rows cols"]:
+    """Return sections with the straight line of the ceiling in place of what hangs under it, m.
+
+    Args:
+        radius: Distance of the wall from the axis, m; nowhere NaN.
+        angle: Directions from the axis, growing, rad.
+    """
+    over = np.flatnonzero(np.sin(angle) > _OVERHEAD)
+    result = radius.copy()
+    widest = int(_WIDEST / (angle[1] - angle[0]))
+    step = np.diff(radius[:, over], axis=1)
+    for row in np.flatnonzero((step < -_JUMP).any(axis=1) & (step > _JUMP).any(axis=1)):
+        section, beyond = result[row, over], 0
+        for left in np.flatnonzero(step[row] < -_JUMP):
+            if left < beyond:
+                continue
+            for right in np.flatnonzero(step[row] > _JUMP) + 1:
+                inside = np.arange(left + 1, right)
+                if not len(inside) or len(inside) > widest:
+                    continue
+                line = _line(section[left], section[right], angle[over[inside]] - angle[over[left]],
+                             angle[over[right]] - angle[over[left]])  # fmt: skip
+                if (section[inside] < line - _INSIDE).all():
+                    section[inside], beyond = line, right
+                    break
+        result[row, over] = section
+    return result
+
+
+def _line(first: float, last: float, turn: Float[np.ndarray, " k"], whole: float) -> Float[np.ndarray, " k"]:
+    """Distances to the straight line between two places, by the turn from the first one, rad."""
+    return first * last * np.sin(whole) / (first * np.sin(turn) + last * np.sin(whole - turn))
