@@ -28,6 +28,7 @@ from benchmarks.fidelity.inputs import (
     split_recording,
 )
 from benchmarks.fidelity.judge import Judgement
+from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, evaluate
 from benchmarks.fidelity.report import write_report
 from benchmarks.fidelity.tools import calibrate
@@ -225,7 +226,7 @@ def _write_report(opened: OpenCase) -> dict[str, Any]:
     controls = _kept_result(folder / "controls.json", opened.case)
     swept = _kept_result(folder / "sweep.json", opened.case)
     rows = controls["rows"] if controls else None
-    leaks = judge.find_leaks(opened.case, opened.values["base"])
+    leaks = find_leaks(opened.case, opened.values["base"])
     judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict, opened.judgement.windows)
     judgement = judge.add_outside(judgement, opened.case, folder, inputs.strict)
     return write_report(folder, opened.case, inputs, judgement, rows, swept)

@@ -21,8 +21,8 @@ from benchmarks.fidelity.references import Hold, Truth
 
 Result = TypeVar("Result")
 NOT_VALUES = (
-    "report", "figures", "controls", "tools", "__main__.py", "inputs.py", "judge.py", "scoring.py", "table.py",
-    "windows",
+    "report", "figures", "controls", "tools", "__main__.py", "inputs.py", "judge.py", "leaks.py", "scoring.py",
+    "table.py", "windows",
 )  # fmt: skip  # raw values do not depend on these; the results of controls have a key of their own
 SHARED: dict[tuple[Any, ...], Any] = {}  # results from released files, for all cases of this process
 _KEPT_UNTIL: dict[tuple[str, str], str] = {}
@@ -166,7 +166,7 @@ def code_hash() -> str:
 def controls_hash() -> str:
     """Return the SHA-256 of the code of controls and leak detector; required falls are no part of it."""
     here = Path(__file__).parent
-    return _hash_of([*(here / "controls").glob("*.py"), here / "judge.py"])
+    return _hash_of([*(here / "controls").glob("*.py"), here / "judge.py", here / "leaks.py"])
 
 
 def _hash_of(files: Iterable[Path]) -> str:

@@ -127,18 +127,20 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
         for kind, number in wanted:
             if (kind, number) in done:
                 continue
-            done[kind, number] = _climb(nearby, draw_place(kind, draw, number, case.candidate.length), number)
+            known_rungs = [row["rung"] for row in done.values() if row["kind"] == kind]
+            guess = int(np.median(known_rungs)) if known_rungs else -1
+            done[kind, number] = _climb(nearby, draw_place(kind, draw, number, case.candidate.length), number, guess)
             write_json(path, {"schema": SCHEMA, "key": key, "rows": list(done.values())})
             release_memory()
             stage.advance()
     return [done[one] for one in wanted]
 
 
-def _climb(nearby: Nearby, fault: Fault, number: int) -> dict[str, Any]:
+def _climb(nearby: Nearby, fault: Fault, number: int, guess: int = -1) -> dict[str, Any]:
     """Return a row of one place: the sizes tried and the window that noticed each, and the smallest rung noticed.
 
-    The size asked for is tried first; then the rungs above or below it are halved, as if whatever is noticed were
-    noticed at every larger size too.
+    The size asked for is tried first, then the rungs above or below it, as if whatever is noticed were noticed at every
+    larger size too.
     """
     sizes, tried = rungs(fault.kind), {}
     low, high, rung = -1, len(sizes), _BELOW  # the smallest noticed rung lies above `low`, and is `high` or below
@@ -147,9 +149,18 @@ def _climb(nearby: Nearby, fault: Fault, number: int) -> dict[str, Any]:
         by = nearby.first_beyond(spoil(nearby.ground, one), *one.extent())
         tried[rung] = by
         low, high = (low, rung) if by else (rung, high)
-        rung = (low + high) // 2
+        rung = next_rung(low, high, guess)
     return {**asdict(fault), "number": number, "scene": nearby.case.candidate.name, "rung": high,
             "tried": [{"size": float(sizes[k]), "by": by} for k, by in tried.items()]}  # fmt: skip
+
+
+def next_rung(low: int, high: int, guess: int = -1) -> int:
+    """Return the rung to try between a missed and a noticed one: the guess, its neighbour, or the middle."""
+    if low < guess < high:
+        return guess
+    if guess == high:
+        return high - 1
+    return low + 1 if guess == low and low >= 0 else (low + high) // 2
 
 
 def fit_curve(rung: np.ndarray, count: int) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from benchmarks.fidelity.controls.catalogue import (
 )
 from benchmarks.fidelity.files import read_json, write_json
 from benchmarks.fidelity.judge import Base
+from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from scene.progress import Stages
 
@@ -173,7 +174,7 @@ def run_control(bench: Bench, job: Job) -> Outcome:
             evaluated = load_controls()[job.control].evaluated
         values = bench.compute(spoiled, _evaluated_categories(evaluated), bench.base)
         recorded = None if bench.case.hold is None else bench.case.hold.hash
-        return Outcome(job, values, judge.find_leaks(spoiled, values, recorded))
+        return Outcome(job, values, find_leaks(spoiled, values, recorded))
 
 
 def without_figures(reasons: list[str]) -> set[str]:

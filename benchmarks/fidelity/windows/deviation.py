@@ -19,8 +19,10 @@ CAP = 0.5  # m; larger offsets count as this
 LEAST = 4  # returns that make a cell known
 FINE = 0.05  # m along the tunnel between rays of a relief
 COLUMNS = 216  # rays of a relief around the tunnel
+TRACK = ("sleeper", "rail", "fastening")  # parts of a candidate that are no bore
 TRACK_SIDE = np.deg2rad(50.0)  # from straight down: what lies there may be track
 _STEEPEST = np.cos(np.deg2rad(80.0))  # beams that graze more steeply say little about where a surface is
+_BORE = 0.5  # share of a cell's returns off the candidate's track from which on it shows the bore
 _MOUTH = 0.5  # m at the mouths that the truth's rays leave out
 
 
@@ -122,15 +124,23 @@ def parts_hit(case: Case) -> np.ndarray:
 
 @per_case
 def hold_map(case: Case) -> Unrolled:
-    """Return the map against the held-out returns; those on the candidate's track are left out."""
+    """Return the map against the held-out returns; those on the candidate's track are left out.
+
+    A cell that shows mostly track is not known: its other returns are those that miss an edge of the track by a hair,
+    and met far behind it.
+    """
     frame, offset = hold_frame(case), beam_offsets(case)
-    off_track = ~np.isin(parts_hit(case), ("sleeper", "rail", "fastening"))
     shape = (frame.rows, SECTORS)
+    off_track = ~np.isin(parts_hit(case), TRACK)
+    inside = frame.cell >= 0
+    count = np.bincount(frame.cell[inside], minlength=shape[0] * shape[1])
+    free = np.bincount(frame.cell[inside & off_track], minlength=shape[0] * shape[1])
+    off_track &= (free >= _BORE * count)[frame.cell]
 
     def medians(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
         return grouped_median(frame.cell[rows], values[rows], shape[0] * shape[1], LEAST).reshape(shape)
 
-    known = (frame.cell >= 0) & off_track
+    known = inside & off_track
     radius = medians(known, np.hypot(frame.local[:, 1], frame.local[:, 2]))
     return Unrolled(sensor_path(case), frame.middle, frame.low, radius, medians(known & np.isfinite(offset), offset))
 

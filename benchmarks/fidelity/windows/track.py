@@ -65,6 +65,7 @@ def _true_gauge(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return gauge_along(truth_curve(case), true_part(case, ("rail",)), rail[0], rail[1])
 
 
+@per_case
 def true_gauge_error(case: Case) -> Profile:
     """Return the gauge of the candidate less the true one, every half metre, m."""
     if not truth_railway(case).rail.shape[1] or not has_rails(case):
@@ -75,6 +76,7 @@ def true_gauge_error(case: Case) -> Profile:
     return Profile(station, gauge - np.interp(station, *real))
 
 
+@per_case
 def true_rail_offsets(case: Case) -> tuple[Profile, Profile]:
     """Return the lateral offset of the track's middle, and the height of each rail over its true one, m."""
     real = truth_railway(case)

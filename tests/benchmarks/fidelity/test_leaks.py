@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.fidelity import judge
+from benchmarks.fidelity import leaks
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.controls.damage import forge_recording, leak_hold
 from benchmarks.fidelity.registry import Value
@@ -48,37 +48,37 @@ def case() -> Case:
 
 def test_a_clean_split_has_no_leak(case: Case) -> None:
     other = tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)
-    assert judge.find_leaks(replace(case, fit=other, cache={}), GOOD, case.hold.hash) == []
+    assert leaks.find_leaks(replace(case, fit=other, cache={}), GOOD, case.hold.hash) == []
 
 
 def test_nothing_held_out_is_no_leak(case: Case) -> None:
-    assert judge.find_leaks(replace(case, hold=None), {}) == []
+    assert leaks.find_leaks(replace(case, hold=None), {}) == []
 
 
 def test_the_noise_of_the_recording_is_found(case: Case) -> None:
-    sigma = judge.plane_noise(case.hold, np.random.default_rng(0))
+    sigma = leaks.plane_noise(case.hold, np.random.default_rng(0))
     assert 0.4 * 0.02 < sigma < 1.3 * 0.02  # a beam meets the wall aslant, so less of its noise is across the plane
 
 
 def test_shared_points_are_duplicates(case: Case) -> None:
-    assert judge.duplicate_share(case.hold, case.hold) == 1.0
+    assert leaks.duplicate_share(case.hold, case.hold) == 1.0
     assert (
-        judge.duplicate_share(case.hold, tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)) == 0.0
+        leaks.duplicate_share(case.hold, tube.hold(tube.Tube(), sigma=0.02, beams=40_000, spacing=4.0, seed=1)) == 0.0
     )
 
 
 def test_mesh_samples_without_noise_are_no_recording(case: Case) -> None:
     forged = forge_recording(case, 0.0, np.random.default_rng(0))
-    assert any("scatter" in found for found in judge.find_leaks(forged, {"c2m_median": Value(0.0)}))
+    assert any("scatter" in found for found in leaks.find_leaks(forged, {"c2m_median": Value(0.0)}))
 
 
 def test_mesh_samples_with_noise_are_told_by_their_provenance(case: Case) -> None:
     forged = forge_recording(case, 0.02, np.random.default_rng(0))
-    assert any("hash is another" in found for found in judge.find_leaks(forged, GOOD, case.hold.hash))
+    assert any("hash is another" in found for found in leaks.find_leaks(forged, GOOD, case.hold.hash))
 
 
 def test_a_builder_that_read_the_held_out_recording_is_caught(case: Case) -> None:
-    found = judge.find_leaks(leak_hold(case), GOOD)
+    found = leaks.find_leaks(leak_hold(case), GOOD)
     assert any("builder read the held-out recording" in one for one in found)
     assert any("duplicates" in one for one in found)
 

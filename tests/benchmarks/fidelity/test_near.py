@@ -109,6 +109,17 @@ def test_a_ladder_finds_the_limit_and_goes_on_where_it_was(good, tmp_path, monke
     assert (tmp_path / "ladder.png").stat().st_size > 10_000
 
 
+def test_the_smallest_rung_is_found_whatever_is_guessed() -> None:
+    for smallest in range(17):
+        for guess in range(-1, 16):
+            low, high, rung, tries = -1, 16, 12, 0
+            while high - low > 1:
+                low, high, tries = (low, rung, tries + 1) if rung >= smallest else (rung, high, tries + 1)
+                rung = ladder.next_rung(low, high, guess)
+            assert high == min(smallest, 16)
+            assert tries <= (3 if smallest == guess and smallest > 0 else 7)
+
+
 def test_the_curve_of_known_thresholds_is_found_again() -> None:
     rng = np.random.default_rng(2)
     sizes = ladder.rungs("wall")

@@ -13,7 +13,7 @@ from benchmarks.fidelity.controls.local import KINDS, Fault, draw_fault, make_gr
 from benchmarks.fidelity.files import FidelityError, write_json
 from benchmarks.fidelity.registry import Value
 from benchmarks.fidelity.windows import commands
-from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, Relief
+from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, LEAST, TRACK, Relief, hold_frame, hold_map, parts_hit
 from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
 from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
 from benchmarks.fidelity.windows.shift import REACH, shift_by_window
@@ -101,6 +101,18 @@ def test_filled_pockets_lost_sleepers_and_a_cube_are_noticed(good) -> None:
     ):
         found = with_fault(good, fault)
         assert found[window].beyond, fault
+
+
+def test_a_cell_that_shows_mostly_track_says_nothing_of_the_bore(good) -> None:
+    aside = spoil(make_ground(good.candidate), Fault("track", 0.0, LENGTH, 0.008))
+    case = replace(good, candidate=aside, cache={})
+    frame, one, on_track = hold_frame(case), hold_map(case), np.isin(parts_hit(case), TRACK)
+    cells = one.offset.size
+    total, track = (np.bincount(frame.cell[rows & (frame.cell >= 0)], minlength=cells) for rows in (True, on_track))
+    mostly = track > 0.5 * total
+    assert (mostly & (total - track >= LEAST)).any()  # beams that miss the track by a hair
+    assert np.isnan(one.offset.ravel()[mostly]).all()
+    assert np.isfinite(one.offset.ravel()[(track == 0) & (total >= 4 * LEAST)]).mean() > 0.95
 
 
 def test_a_mirrored_tube_fails_where_its_sides_differ_and_a_symmetric_one_cannot_tell(good, before) -> None:
