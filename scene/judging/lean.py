@@ -54,8 +54,12 @@ def _fit_floor(across: Float[np.ndarray, " k"], upward: Float[np.ndarray, " k"])
 
 
 def _differ(angle: Float[np.ndarray, " m"], section: Float[np.ndarray, " m"], lean: float) -> float:
-    """Mean difference of a section's sides about a middle that leans from upright by some angle to the left, m."""
+    """Mean difference of a section's sides about a middle that leans from upright by some angle to the left, m.
+
+    The axis may stand beside that middle: what a step to the side explains does not count.
+    """
     left, right = (
         np.interp(np.pi / 2 + lean + sign * _SIDES, angle, section, period=2 * np.pi) for sign in (1.0, -1.0)
     )
-    return float(np.mean(np.abs(left - right)))
+    aside = np.sin(_SIDES)
+    return float(np.mean(np.abs(left - right - aside * ((left - right) @ aside) / (aside @ aside))))

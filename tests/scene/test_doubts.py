@@ -93,7 +93,9 @@ def test_a_section_on_its_side_is_noticed(bore):
     ("roll", "said"), [(0.5, None), (2.0, "by 2.0°, left side up"), (-3.0, "by 3.0°, right side up")]
 )
 def test_a_bore_that_leans_as_a_whole_is_noticed_and_its_likely_cause_is_named(bore, roll, said):
-    turned = np.interp(bore.angle - np.deg2rad(roll), bore.angle, bore.radius[0], period=2 * np.pi)
+    turn = np.exp(1j * np.deg2rad(roll))
+    outline = turn * bore.radius[0] * np.exp(1j * bore.angle) + 0.03  # the axis is not in the middle of what leans
+    turned = np.interp(bore.angle, np.angle(outline), np.abs(outline), period=2 * np.pi)
     told = codes(replace(bore, radius=np.repeat(turned[None], len(bore.station), axis=0)))
     assert (said in told["lean"] and "from 0 to 24 m" in told["lean"]) if said else told == {}
     assert not said or "roll of the LiDAR's mount" in told["lean"]

@@ -97,7 +97,7 @@ def straight(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
 
 @pytest.fixture(scope="module")
 def spun(tmp_path_factory):
-    """A straight walk of 26 m with 16 rings up to 15° off the LiDAR's plane, which see the floor 6 m off."""
+    """A straight walk of 26 m from a mouth on, with 16 rings up to 15° off level, which see the floor 6 m off."""
     up, turn = np.meshgrid(np.sin(np.deg2rad(np.arange(-15.0, 16.0, 2.0))), np.linspace(-np.pi, np.pi, 800))
     ray = np.column_stack([np.sqrt(1.0 - up.ravel() ** 2)[:, None] * np.column_stack([np.cos(turn.ravel()),
                            np.sin(turn.ravel())]), up.ravel()])  # fmt: skip
@@ -105,7 +105,8 @@ def spun(tmp_path_factory):
     for time in np.arange(26) * 1.25:
         position, attitude = straight(time + 0.1 * np.arange(len(ray)) / len(ray))
         distance = walls(position, attitude.apply(ray)) + rng.normal(0, 0.02, len(ray))
-        scans.append((100.0 + time, (distance[:, None] * ray).astype(np.float32)))
+        inside = position[:, 0] + attitude.apply(ray)[:, 0] * distance > 0.0  # the walk begins at the mouth
+        scans.append((100.0 + time, (distance[:, None] * ray)[inside].astype(np.float32)))
     with Recording(write_bag(tmp_path_factory.mktemp("spun") / "walk.bag", scans)) as opened:
         yield opened
 
