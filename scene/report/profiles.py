@@ -277,5 +277,7 @@ def knot_costs(profile: Profile, inverse: Float[np.ndarray, "p p"]) -> Float[np.
     return costs
 
 
-def _without(profile: Profile, j: int) -> Profile:
-    return replace(profile, knot=np.delete(profile.knot, j), value=np.delete(profile.value, j))
+def renumber(tie: Tie) -> Tie:
+    """Return a tie whose numbers run from 0 on without a gap."""
+    kept = np.unique(tie[tie >= 0])
+    return np.where(tie < 0, -1, np.searchsorted(kept, tie))

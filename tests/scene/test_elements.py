@@ -10,8 +10,9 @@ from scene.bore import POCKET, Bore, axis_through
 from scene.errors import RecordingError
 from scene.fitting.profile import section_angles
 from scene.report.alignment import Alignment, Piece, Vertical, align_bore, design_of, turn_around
-from scene.report.elements import correlated_noise, find_spread, fit_plan, fit_profile
+from scene.report.elements import fit_plan, fit_profile
 from scene.report.landxml import read_landxml, write_landxml
+from scene.report.noise import correlated_noise, find_spread
 from scene.report.profiles import LEAST_ELEMENT, PlanTarget, Profile, adjust, jacobian, stepped
 from scene.survey.alignment import draw_railway, lay_out, metro_elements
 
