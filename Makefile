@@ -60,6 +60,15 @@ tunnels: $(STAMP)  ## make the packaged bores in three dimensions again; the pla
 		--reconstruct.lining.kind universal --reconstruct.lining.seed 0 --out build/metro-universal
 	cp build/metro-universal/tunnel.npz subterra_jax/data/metro-universal.npz
 	cp build/metro-universal/manifest.json subterra_jax/data/metro-universal.json
+	$(BIN)/python -c "import subterra_jax as st; from subterra_jax.procedural.open_world import plan; \
+		st.tunnel.save_tunnel(plan('open:universal:test-unseen:900351', length=351.0), 'build/universal.npz')"
+	$(BIN)/python -m scene.survey --truth-file build/universal.npz --lining bare --length 351 --seed 0 --point-rate 80040 \
+		--sensors avia os1 --scan-every 40 --out build/survey-universal
+	$(BIN)/python -m scene.build build/survey-universal/survey.bag \
+		--trajectory build/survey-universal/groundtruth.tum --provenance simulated --name subterra-universal \
+		--out build/subterra-universal
+	cp build/subterra-universal/tunnel.npz subterra_jax/data/subterra-universal.npz
+	cp build/subterra-universal/manifest.json subterra_jax/data/subterra-universal.json
 	for name in subterra-351 metro-asbuilt; do \
 		cp build/$$name/tunnel.npz subterra_jax/data/$$name-solid.npz; \
 	done

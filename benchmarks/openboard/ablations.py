@@ -78,6 +78,8 @@ ROWS = (
     Row("smooth walls", lining="smooth"),
     Row("`metro-asbuilt`, pockets in the plane", "metro-asbuilt"),
     Row("`metro-asbuilt`, walls as surveyed", "metro-asbuilt", "smooth"),
+    Row("`subterra-universal`, rings turned", "subterra-universal"),
+    Row("`subterra-universal`, smooth walls", "subterra-universal", "smooth"),
     Row("`open:straight:val`, rows where they fall", "open:straight:val:0-9"),
     *(Row(f"faults, wet rail loses {loss:.1f} (assumed: 0.3)", wet_loss=loss) for loss in (0.2, 0.3, 0.4)),
 )
@@ -91,11 +93,13 @@ class AblationsConfig:
         out: Folder for `ablations.json` and `ablations.md`.
         agents: Names of agents.
         episodes: Episodes of each row; the same seeds for all.
+        only: Words of the rows to drive, such as `wet rail`; all rows if not given.
     """
 
     out: Path
     agents: tuple[str, ...] = ("fused", "ring-count", "ring-filter", "particle-filter")
     episodes: int = 200
+    only: str = ""
 
 
 def run(config: AblationsConfig) -> None:
@@ -108,9 +112,12 @@ def run(config: AblationsConfig) -> None:
     for agent in config.agents:
         if agent not in registry.names():
             raise BenchmarkError(f"no agent {agent!r}; there are {', '.join(registry.names())}")
+    wanted = [row for row in ROWS if config.only in row.words]
+    if not wanted:
+        raise BenchmarkError(f"no row with the words {config.only!r}; there are {'; '.join(row.words for row in ROWS)}")
     require_folder(config.out)
     rows: list[dict[str, Any]] = []
-    for row in ROWS:
+    for row in wanted:
         rows.append(drive(row, config))
         _progress.print(as_line(rows[-1], config.agents))
         content = {"schema": SCHEMA, "rows": rows, "facts": environment_facts(), "episodes": config.episodes,

@@ -131,6 +131,8 @@ _RIB = 0.02  # least wall left between two pockets, m
 _OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
 _OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
 _ALL_ROWS = 0.95  # of the clear holes at the places of rings
+_MATE = 0.15  # m between a hole moved on by a ring and the next
+_MIN_REPEATED = 0.5  # of them; nine tenths in rows, a third or less where every ring is turned
 _RIMS = (11, 9)  # cells about the middle of a hole that are it or its rim
 _THROUGH = 0.05  # of the pockets
 _SAME_JOINT = 0.1  # m
@@ -151,7 +153,7 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     rows = keep_rows(weak, sections.grid.columns, reach)
     pockets, joints = _pockets_in_rows(deficit, sections, faint, rows, reach)
     turned, pitch = _keep_turned(deficit, sections, weak)
-    if len(turned.row) and not (len(pockets) and _explains(rows, turned, sections.grid.columns)):
+    if len(turned.row) and not (len(pockets) and _are_rows(rows, turned, sections, pitch)):
         pockets, joints = _measure_pockets(deficit, sections, turned), np.empty(0)
     if not len(pockets):
         return pockets, np.empty(0)
@@ -188,11 +190,20 @@ def _keep_turned(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple
     return holes.where(ring.holds(station)), ring.pitch
 
 
-def _explains(rows: Holes, turned: Holes, columns: int) -> bool:
-    """Return whether rows hold nearly all clear holes that stand at the places of rings."""
+def _are_rows(rows: Holes, turned: Holes, sections: Sections, pitch: float) -> bool:
+    """Return whether rows hold nearly all clear holes that stand at the places of rings, most of them in every ring.
+
+    Turned rings put a hole on nearly every line along the bore, and seldom two on one after the other.
+    """
     clear = turned.where(turned.score > CLEAR)
+    columns, girth = sections.grid.columns, 2 * np.pi * float(np.median(sections.radius))
     in_rows = np.isin(clear.row * columns + clear.column, rows.row * columns + rows.column)
-    return bool(in_rows.mean() > _ALL_ROWS)
+    at = np.column_stack([clear.row * sections.grid.step, clear.column * girth / columns])
+    ahead = at + np.array([pitch, 0.0])
+    last = ahead[:, 0] < at[:, 0].max() + _MATE
+    tree = cKDTree(np.mod(at, [np.inf, girth]), boxsize=[2 * (at[:, 0].max() + pitch) + 1.0, girth])
+    repeated = tree.query(np.mod(ahead[last], [np.inf, girth]))[0] < _MATE
+    return bool(in_rows.mean() > _ALL_ROWS and repeated.mean() > _MIN_REPEATED)
 
 
 def _measure_pockets(deficit: np.ndarray, sections: Sections, holes: Holes) -> Shaped[np.ndarray, " p"]:

@@ -206,7 +206,7 @@ def tunnel_of(scene: Path) -> Path:
     return (scene if scene.is_dir() else scene.parent) / "tunnel.npz"
 
 
-PACKAGED = ("subterra-351", "metro-asbuilt", "metro-universal")  # the first is the default
+PACKAGED = ("subterra-351", "metro-asbuilt", "metro-universal", "subterra-universal")  # the first is the default
 # The walls of packaged tunnels stay, byte for byte, since every score depends on them. The bore in three dimensions of
 # the first two lies beside them, from the same survey built again; that of the others is in the same file.
 SOLID = "-solid.npz"
@@ -225,10 +225,10 @@ def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> Tunne
     """Read and check a `tunnel.npz`, or generate a tunnel by its name.
 
     Args:
-        path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`, `metro-universal`);
-            `control`, the bore without landmarks; `open:SPLIT:INDEX` or `open:KIND:SPLIT:INDEX`, one of the open world,
-            after `FILE.py:` where a user's file registers the kind; or `procedural:SPLIT:INDEX`, one of the older
-            family. `None` is the first packaged one.
+        path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`, `metro-universal`,
+            `subterra-universal`); `control`, the bore without landmarks; `open:SPLIT:INDEX` or
+            `open:KIND:SPLIT:INDEX`, one of the open world, after `FILE.py:` where a user's file registers
+            the kind; or `procedural:SPLIT:INDEX`, one of the older family. `None` is the first packaged one.
         solid: Give a tunnel of the open world its shell too, the bore in three dimensions; a file that has one always
             comes with it.
 

@@ -8,6 +8,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.lidar import reference
+from subterra_jax.procedural.open_world import draw
 from subterra_jax.tunnel.sources import tunnel_digest
 from tests.subterra_jax import tunnels
 
@@ -134,6 +135,19 @@ def test_the_packaged_pockets_cross_the_plane_of_the_lidar_on_both_walls(name):
         recessed = away > 0.6 * depth
         rings = np.unique(np.round(wall.station[recessed] / plan.ring_pitch))
         assert len(rings) > 0.8 * plan.length / plan.ring_pitch
+
+
+def test_the_rings_of_a_survey_turn_and_stand_as_far_apart_as_they_were_drawn():
+    plan, drawn = st.load_tunnel("subterra-universal"), draw("open:universal:test-unseen:900351", 351.0).bore
+    assert plan.provenance == "simulated"
+    assert plan.length == pytest.approx(351.0, abs=0.2)
+    assert plan.ring_pitch == pytest.approx(np.median(np.diff(drawn.rings.joint)), abs=2e-3)
+    pocket = plan.shell.linings["pockets"].pocket
+    station, angle = np.abs(pocket[:, 0, None] - drawn.pocket[:, 0]), pocket[:, 1, None] - drawn.pocket[:, 1]
+    near = np.hypot(station, drawn.section.half_width * np.abs(np.angle(np.exp(1j * angle)))) < 0.2
+    assert near.any(axis=1).mean() > 0.98  # of those found are true
+    assert near.any(axis=0).mean() > 0.95  # of the true ones are found
+    assert pocket[0, 4] == pytest.approx(drawn.pocket[0, 4], abs=0.015)
 
 
 def test_universal_rings_stand_in_the_plane_of_the_lidar_only_now_and_then():
