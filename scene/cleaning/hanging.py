@@ -38,7 +38,7 @@ def bridge_hanging(
                 line = _line(section[left], section[right], angle[over[inside]] - angle[over[left]],
                              angle[over[right]] - angle[over[left]])  # fmt: skip
                 if (section[inside] < line - _INSIDE).all():
-                    section[inside], beyond = line, right
+                    section[inside], beyond = line, int(right)
                     break
         result[row, over] = section
     return result
