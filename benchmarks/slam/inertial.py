@@ -9,17 +9,16 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from jaxtyping import Float
 
 from benchmarks.command import BenchmarkError
-from benchmarks.slam.tum import save_tum
+from benchmarks.slam.sweep_points import read_samples
+from benchmarks.slam.tum import Poses, save_tum
 
 EVALIO = ("kiss", "genz", "mad", "ct", "loam", "liosam", "dlio", "form")
 TRACKERS = ("ring-filter", "particle-filter")  # of the station alone: `trackers`
@@ -32,8 +31,6 @@ _CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "number
             "realtime": False}  # fmt: skip
 _LEAST_POSES = 2
 _SAYS = '{"poses"'  # beginning of the line in which the process reports
-
-Poses = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], float]  # times, s; LiDAR poses; run time, s
 
 
 def find_program(name: str) -> str:
@@ -122,28 +119,6 @@ def _rko(recording: Path) -> Poses:
             rows.append((1e-9 * stamp + 0.1, np.array(program.pose())))
         seconds += time.perf_counter() - started
     return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]), seconds
-
-
-def read_samples(recording: Path) -> Iterator[tuple[int, Any]]:
-    """Yields stamps, ns, with pairs of acceleration and turn rate, or arrays of points, in order of recording."""
-    from rosbags.highlevel import AnyReader
-
-    from benchmarks.slam.sweep_points import livox_points, sweep_points
-
-    facts = yaml.safe_load((recording / "calibration.yaml").read_text())
-    with AnyReader([recording / "recording"]) as reader:
-        topics = (facts["lidar"]["topic"], facts["imu"]["topic"])
-        for connection, _, raw in reader.messages([one for one in reader.connections if one.topic in topics]):
-            if connection.msgtype.endswith("CustomMsg"):
-                yield livox_points(raw)
-                continue
-            message: Any = reader.deserialize(raw, connection.msgtype)
-            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-            if connection.topic == topics[0]:
-                yield stamp, sweep_points(message)
-            else:
-                force, turn = message.linear_acceleration, message.angular_velocity
-                yield stamp, (np.array([force.x, force.y, force.z]), np.array([turn.x, turn.y, turn.z]))
 
 
 def _run(name: str, recording: Path) -> Poses:

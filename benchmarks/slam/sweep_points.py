@@ -1,8 +1,11 @@
-"""Points of a sweep from the message of any driver, with the time of each."""
+"""Sweeps and IMU samples of a recording: points from the message of any driver, with the time of each."""
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 # One layout for all: m, reflectivity or intensity as reported, ns after the header's stamp, line.
 POINT = np.dtype([
@@ -66,3 +69,23 @@ def livox_points(raw: bytes) -> tuple[int, np.ndarray]:
     for name in POINT.names or ():
         points[name] = rows[name]
     return seconds * 1_000_000_000 + rest, points
+
+
+def read_samples(recording: Path) -> Iterator[tuple[int, Any]]:
+    """Yields stamps, ns, with pairs of acceleration and turn rate, or arrays of points, in order of recording."""
+    from rosbags.highlevel import AnyReader
+
+    facts = yaml.safe_load((recording / "calibration.yaml").read_text())
+    with AnyReader([recording / "recording"]) as reader:
+        topics = (facts["lidar"]["topic"], facts["imu"]["topic"])
+        for connection, _, raw in reader.messages([one for one in reader.connections if one.topic in topics]):
+            if connection.msgtype.endswith("CustomMsg"):
+                yield livox_points(raw)
+                continue
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            if connection.topic == topics[0]:
+                yield stamp, sweep_points(message)
+            else:
+                force, turn = message.linear_acceleration, message.angular_velocity
+                yield stamp, (np.array([force.x, force.y, force.z]), np.array([turn.x, turn.y, turn.z]))

@@ -22,7 +22,8 @@ from scipy.ndimage import gaussian_filter1d
 from benchmarks.slam.arena.record import Scene
 from benchmarks.slam.arena.sets import redraw
 from benchmarks.slam.arena.wheels import SCALE, SCALE_PIECE, SCALE_SIGMA
-from benchmarks.slam.inertial import Poses, read_samples
+from benchmarks.slam.sweep_points import read_samples
+from benchmarks.slam.tum import Poses
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.survey.cast import Caster
 from scene.survey.sizes import DESIGN

@@ -8,6 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from subterra_jax.host.files import replace_file
 
+Poses = tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"], float]  # times, s; LiDAR poses; run time, s
+
 
 def save_tum(path: Path, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"]) -> None:
     """Writes poses as rows `t x y z qx qy qz qw`."""
