@@ -1,5 +1,7 @@
 """Rings that turn: pockets by their place in the ring, joints by the steps of the wall, and neither by chance."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from scene.fitting.evidence import turned_more_than_chance
 from scene.fitting.lining import add_lining, pair_pockets
 from scene.fitting.section import Sections, fit_sections
 from scene.fitting.turned import find_ring
+from scene.fitting.unroll import Grid
 from tests.scene.test_reconstruction import thin
 
 RADIUS, LENGTH, RING, FIRST = 2.75, 24.0, 1.5, 0.4
@@ -110,6 +113,16 @@ def test_holes_anywhere_in_their_rings_are_no_pockets(monkeypatch) -> None:
     assert len(found) == len(joints) == 0
     monkeypatch.setattr(pockets, "turned_more_than_chance", lambda *_: True)
     assert len(pockets.find_pockets(sections)[0]) > 0, "this cloud does not try the evidence"
+
+
+@pytest.mark.parametrize(("turned", "rows"), [(False, True), (True, False)])
+def test_rows_are_a_lining_of_their_own_where_their_pockets_come_again_in_the_next_ring(turned, rows) -> None:
+    rng = np.random.default_rng(6)
+    column = np.concatenate([rng.permutation(360)[:12] if turned else np.arange(0, 360, 30) for _ in range(30)])
+    row = np.repeat(10 + 30 * np.arange(30), 12)
+    holes = pockets.Holes(row[keep := rng.random(360) < 0.85], column[keep], np.ones(int(keep.sum())))
+    sections = SimpleNamespace(grid=Grid(0.0, 0.05, 900, 360), radius=np.full((2, 2), RADIUS))
+    assert pockets._are_rows(holes, holes, sections, 1.5) is rows
 
 
 def stations(rng: np.random.Generator, places: tuple[float, ...], keep: float, pitch: float = 1.5) -> np.ndarray:
