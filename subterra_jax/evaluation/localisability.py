@@ -53,7 +53,8 @@ class Localisability:
         station: Middles of the cells of station, m, `(n,)`.
         information: Fisher information of one scan about station (m), offset (m) and heading (rad), mean over the cell,
             `(n, 3, 3)`.
-        station_bound: Cramér–Rao bound of one scan for the station, with offset and heading unknown too, m, `(n,)`.
+        station_bound: Cramér–Rao bound of one scan for the station, with offset and heading unknown too, by the mean of
+            what the scans of the cell tell, m, `(n,)`.
         offset_bound: The same for the offset, m.
         heading_bound: The same for the heading, rad.
         drift: Standard deviation of the station that a perfect filter with the map keeps. It starts at the task's
@@ -114,13 +115,27 @@ def localisability(
     n = max(1, round(length / step))
     sigma = float(np.max(params.lidar.range_sigma))
     blurs = tuple(blur * factor for factor in WIDER)
-    means = [_cell_information(cast, length, n, one, blur, sigma) for one in blurs]
+    cells = [_cell_information(cast, length, n, one, blur, sigma) for one in blurs]
     station = (np.arange(n) + 0.5) * length / n
-    along, aside, turned = (marginal_bound(means[0], i) for i in range(3))
-    told = np.stack([marginal_bound(mean, 0) ** -2.0 for mean in means], axis=-1)
-    seen = filter_variance(station, told, params, blurs)
+    with np.errstate(divide="ignore"):
+        along, aside, turned = cells[0].told.T ** -0.5
+    seen = filter_variance(station, np.stack([cell.told[:, 0] for cell in cells], axis=-1), params, blurs)
     blind = filter_variance(station, np.zeros(n), params)
-    return Localisability(station, means[0], along, aside, turned, np.sqrt(seen), np.sqrt(blind))
+    return Localisability(station, cells[0].information, along, aside, turned, np.sqrt(seen), np.sqrt(blind))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Cells:
+    """What one scan tells in each cell, in the mean.
+
+    Attributes:
+        information: Fisher information about station, offset and heading, `(n, 3, 3)`.
+        told: Information about each of the three with the others unknown, `(n, 3)`. The mean is taken last: each scan
+            has an offset and a heading of its own, and the mean matrix would be that of one pose for all of a cell.
+    """
+
+    information: Float[np.ndarray, "n 3 3"]
+    told: Float[np.ndarray, "n 3"]
 
 
 def _cell_information(
@@ -130,8 +145,8 @@ def _cell_information(
     blur: float,
     offset: float,
     sigma: float,
-) -> Float[np.ndarray, "n 3 3"]:
-    """Mean information of one scan over each of `n` cells.
+) -> _Cells:
+    """Return the mean information of one scan over each of `n` cells.
 
     The blur of the offset and of the heading stays as it is where that of the station grows: walls tell them anywhere.
     """
@@ -141,8 +156,14 @@ def _cell_information(
     ranges = [cast(fine, aside * offset, heading * turn) for aside, heading in _POSES]
     information = scan_information(ranges, fine[1], blur, turn, sigma, offset)
     cell = np.minimum((fine / length * n).astype(int), n - 1)
-    total = np.stack([np.bincount(cell, column, n) for column in information.reshape(len(fine), 9).T], axis=-1)
-    return (total / np.bincount(cell, minlength=n)[:, None]).reshape(n, 3, 3)
+    told = np.stack([marginal_bound(information, i) ** -2.0 for i in range(3)], axis=-1)
+
+    count = np.bincount(cell, minlength=n)[:, None]
+
+    def mean(each: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(cell, column, n) for column in each.T], axis=-1) / count
+
+    return _Cells(mean(information.reshape(len(fine), 9)).reshape(n, 3, 3), mean(told))
 
 
 def scan_information(

@@ -150,6 +150,17 @@ def test_the_bound_of_one_unknown_leaves_the_others_free():
         assert marginal_bound(information, i)[0] == pytest.approx(np.linalg.inv(information[0])[i, i] ** 0.5)
 
 
+def test_a_long_cell_is_told_what_its_scans_tell_in_the_mean():
+    """The walls of the real metro narrow near its mouth: a pose for all of 5 m would be told 30 times as much."""
+    plan = st.load_tunnel("metro-asbuilt").slice(0.0, 60.0)
+    params = st.make(TASK, tunnel=plan, lining="smooth", goal=_near())[1]
+    short, long = (localisability(params, step=step) for step in (0.5, 5.0))
+    told = (short.station_bound**-2.0).reshape(-1, 10).mean(axis=1)
+    np.testing.assert_allclose(long.station_bound[2:6] ** -2.0, told[2:6], rtol=0.05)
+    one_pose = marginal_bound(long.information, 0)
+    assert np.all(one_pose[2:5] < 0.5 * long.station_bound[2:5]), "this wall does not try the order of the means"
+
+
 @pytest.mark.slow
 def test_level_beams_in_three_dimensions_tell_what_planar_ones_tell(found, params):
     plan = corridor(True).slice(20.0, 30.0)
