@@ -51,6 +51,7 @@ MISTAKES = {
     "benchmarks.openboard --out o --memory 0": "memory must be above 0, got 0",
     "benchmarks.openboard --out o --report-only": "holds no cell of these tunnels",
     "benchmarks.openboard.ablations --out o --agents nobody": "no agent 'nobody'",
+    "benchmarks.openboard.ablations --out o --only glass": "no row with the words 'glass'; there are pockets",
     "benchmarks.openboard.bound --out o --tunnels none:smooth": "none: no such tunnel file; by name there are",
     "benchmarks.openboard.search fused --out o": "no settings of 'fused' are searched for; there are scan-matching",
     "benchmarks.rays.speed nosuch": "Unrecognized options: nosuch",
