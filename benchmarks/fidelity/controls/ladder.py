@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy.optimize import minimize
+from scipy.special import ndtr
 from scipy.stats import beta, norm
 
 from benchmarks.fidelity.case import Case, case_hash, release_memory
@@ -179,7 +180,7 @@ def fit_curve(rung: np.ndarray, count: int) -> tuple[float, float]:
 
     def misfit(at: np.ndarray) -> float:
         spread = max(float(np.exp(at[1])), _LEAST_SPREAD)
-        inside = norm.cdf((high - at[0]) / spread) - norm.cdf((low - at[0]) / spread)
+        inside = ndtr((high - at[0]) / spread) - ndtr((low - at[0]) / spread)
         return float(-np.log(np.maximum(inside, 1e-12)).sum())
 
     middle = float(np.mean(np.clip((rung - 0.5) * step, 0.0, count * step)))
