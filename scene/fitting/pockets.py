@@ -154,7 +154,8 @@ def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np
     pockets, joints = _pockets_in_rows(deficit, sections, faint, rows, reach)
     turned, pitch = _keep_turned(deficit, sections, weak)
     if len(turned.row) and not (len(pockets) and _are_rows(rows, turned, sections, pitch)):
-        pockets, joints = _measure_pockets(deficit, sections, turned), np.empty(0)
+        anywhere = _measure_pockets(deficit, sections, turned)
+        pockets, joints = (anywhere, np.empty(0)) if len(anywhere) else (pockets, joints)
     if not len(pockets):
         return pockets, np.empty(0)
     pitch = float(np.diff(joints).mean()) if len(joints) else pitch
