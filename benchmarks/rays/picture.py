@@ -11,6 +11,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 import subterra_jax as st
@@ -79,15 +80,15 @@ def look(config: PictureConfig, sensor: str) -> tuple[np.ndarray, np.ndarray, np
     return azimuth.reshape(shape), elevation.reshape(shape), part["scan"].reshape(shape)
 
 
-def draw(axis: Axes, azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray) -> object:
+def draw(axis: Axes, azimuth: np.ndarray, elevation: np.ndarray, ranges: np.ndarray) -> PathCollection:
     """Draws beams as dots whose colours are ranges; returns what a colour bar needs."""
     chosen = slice(None, None, max(1, ranges.size // _DOTS)) if ranges.shape[0] == 1 else slice(None)
     size = 40.0 if ranges.size < 100 else 2.0 if ranges.size < 5_000 else 0.3
-    values = [np.ravel(one)[chosen] for one in (azimuth, elevation, ranges)]
+    x, y, far = (np.ravel(one)[chosen] for one in (azimuth, elevation, ranges))
     axis.set_facecolor("#222222")
     axis.set(xlim=(180, -180), ylim=(-45, 45) if ranges.shape[0] == 1 and ranges.size > 100 else (-25, 25))
     axis.set_xticks(np.arange(-180, 181, 45))
-    return axis.scatter(*values[:2], c=values[2], s=size, vmin=0.0, vmax=_FAR, cmap=plt.get_cmap("viridis_r"), lw=0)
+    return axis.scatter(x, y, c=far, s=size, vmin=0.0, vmax=_FAR, cmap=plt.get_cmap("viridis_r"), lw=0)
 
 
 def command(words: list[str] | None = None) -> int:

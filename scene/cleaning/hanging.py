@@ -1,4 +1,4 @@
-"""What hangs free under a ceiling all along: pipes, trays and ducts hide it in some directions, and are no wall.
+"""Pipes, trays and ducts that hang free under a ceiling all along: they hide it in some directions, and are no wall.
 
 A wall goes on to both sides. Where a section comes nearer at once and as suddenly goes back, and what is between lies
 inside the straight line from one edge to the other, it is a thing in the bore, however long it is.

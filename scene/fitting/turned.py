@@ -29,7 +29,7 @@ NEAR_PLACE = 0.10  # m along the bore
 
 @dataclass(frozen=True)
 class Ring:
-    """What all rings have in common."""
+    """Pitch and places that all rings have in common."""
 
     pitch: float  # Length of a ring, m
     place: Float[np.ndarray, " k"]  # Places of pockets, m after the stations that are multiples of the pitch

@@ -1,4 +1,4 @@
-"""What a survey does not show of a track that was laid: sleepers by standard, and gauges read off blurred rails."""
+"""Warnings of a track that was laid beyond what was seen: sleepers by standard, gauges read off blurred rails."""
 
 from scene.fitting.trackseen import SeenTrack
 from scene.judging.judge import Warned

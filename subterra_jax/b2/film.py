@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from subterra_jax.adapters.packing import as_vector
+from subterra_jax.adapters.packing import Observation, as_vector
 from subterra_jax.b2.gait import RELEASED
 from subterra_jax.b2.gym import B2Env  # first: it chooses how MuJoCo draws
 from subterra_jax.b2.view import PictureError, place
@@ -42,8 +42,9 @@ class Driver:
         self._act = jax.jit(lambda memory, obs: agent.act(key, memory, observed(mission, params, obs), params, None))
         self._memory: Any = None
 
-    def act(self, obs: np.ndarray) -> np.ndarray:
+    def act(self, seen: Observation) -> np.ndarray:
         """Return the command `[v, ω]` for an observation."""
+        obs = as_vector(seen)
         if self._memory is None:
             self._memory = self._begin(obs)
         action, self._memory = self._act(self._memory, obs)
@@ -69,7 +70,7 @@ def film(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.n
         obs, _ = env.reset(seed=seed)
         for _ in range(round(seconds / float(env.params.vehicle.period))):
             moments.clear()
-            obs, _, terminated, truncated, _ = env.step(driver.act(as_vector(obs)))
+            obs, _, terminated, truncated, _ = env.step(driver.act(obs))
             pictures += [env.camera().draw(moment) for moment in moments[-count % _EVERY :: _EVERY]]
             count += len(moments)
             if terminated or truncated:

@@ -126,7 +126,7 @@ def localisability(
 
 @dataclasses.dataclass(frozen=True)
 class _Cells:
-    """What one scan tells in each cell, in the mean.
+    """Mean of what one scan tells in each cell.
 
     Attributes:
         information: Fisher information about station, offset and heading, `(n, 3, 3)`.

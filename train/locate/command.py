@@ -1,4 +1,4 @@
-"""What a training of localisers is told: tunnels, seeds, settings; which of it a run keeps when it goes on."""
+"""Tunnels, seeds and settings that a training of localisers is told, and which of them a run keeps when it goes on."""
 
 import dataclasses
 import json

@@ -1,4 +1,4 @@
-"""What a LiDAR sees that leans with the trunk: known answers in a straight corridor."""
+"""A LiDAR that leans with the trunk: known answers in a straight corridor."""
 
 from types import SimpleNamespace
 
