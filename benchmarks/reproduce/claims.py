@@ -183,6 +183,11 @@ JOBS = {
 }  # fmt: skip
 
 _CPU, _H200 = "2 CPU cores, 2026-11-21", "one H200, 2026-11-21"
+_CPU_LATER = "2 CPU cores, 2026-11-25"
+_UNIVERSAL = (
+    "scene.build build/survey-universal/survey.bag --trajectory build/survey-universal/groundtruth.tum "
+    "--provenance simulated --name subterra-universal --out build/subterra-universal"
+)
 _H200_TODAY = "one H200, 2026-11-22"
 _OUTSIDE, _OUTSIDE_H200 = "measured from outside, 2026-11-22", "measured from outside on one H200, 2026-11-22"
 _CONTROLS = "benchmarks.fidelity controls --bold-only"
@@ -216,6 +221,7 @@ _GYM = (
 _GIVEN, _CONTROL = "simulated survey, poses given", "odometry, IMU and prism control"
 _PLANAR, _TILTED = "planar, pockets, levelled mesh", "3-D, pockets"
 _CLOUDS = "nine simulated clouds"
+_TURNED = "351 m of rings that turn"
 _SUITE, _STEP = "fidelity suite", "whole environment step"
 _LEGS, _THROUGH = "Unitree B2 on sleepers", "100 of them through"
 _SPREAD, _FIVE_SEEDS, _ONE_POLICY = "robots spread along the tunnel", "five seeds of PPO on 351 m", "family of tunnels"
@@ -232,8 +238,12 @@ CLAIMS = (
     Claim(_CONTROL, "0.02 %", 0.01, "at most", job="reconstruction", read=_survey("control", "length_error")),
     Claim(_CONTROL, "1.4 cm", 0.1, job="reconstruction", read=_survey("control", "hold_mean", 100.0)),
     Claim(_CONTROL, "6.5 min", 8.5, "at most", job="reconstruction", read=_survey("control", "seconds", 1 / 60)),
-    Claim(_SUITE, "98.0 %", 0.1, job="fidelity", read=lambda c: c["global"]),
-    Claim(_SUITE, "69.0 %", 0.2, job="fidelity", read=lambda c: c["global_null"]),
+    Claim(_TURNED, "1,692 of 1,726", 0.0, command=_UNIVERSAL, measured=_CPU_LATER),
+    Claim(_TURNED, "3.3 mm", 0.3, "at most", command=_UNIVERSAL, measured=_CPU_LATER),
+    Claim(_TURNED, "230 of 230", 0.0, command=_UNIVERSAL, measured=_CPU_LATER),
+    Claim(_TURNED, "16 mm", 2.0, "at most", command=_UNIVERSAL, measured=_CPU_LATER),
+    Claim(_SUITE, "98.2 %", 0.1, job="fidelity", read=lambda c: c["global"]),
+    Claim(_SUITE, "69.2 %", 0.2, job="fidelity", read=lambda c: c["global_null"]),
     Claim(_SUITE, "18 categories", 0.0, job="fidelity", read=lambda c: len(c["categories"])),
     Claim(_SUITE, "10 min", 10.0, "at most", command="benchmarks.fidelity run --out out/fidelity", measured=_CPU),
     Claim(_SUITE, "5.4 GiB", 0.6, "at most", command="benchmarks.fidelity run --out out/fidelity", measured=_CPU),
