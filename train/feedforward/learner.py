@@ -268,7 +268,9 @@ class Learner(devices.Whole):
 
 def make_layout(env: Any, params: Any, config: PPOConfig) -> Layout:
     """Returns the layout that `config` asks for on this environment; compiles nothing."""
-    bounds, image = env.action_space(params), env.images(params).get("scan")
+    bounds = env.action_space(params)
+    images = env.images(params) if hasattr(env, "images") else {}  # robots on legs and steering alone have none
+    image = images.get("scan")
     patched = image is not None and not any(n % senses.PATCH for n in image)
     return Layout(
         n_observation=env.observation_size(params),

@@ -40,8 +40,8 @@ class Layout:
     hidden: tuple[int, ...]
     init_std: float
     min_std: float
-    image: tuple[int, int] | None = None
-    image_at: int = 0
+    image: tuple[int, int] | None = dataclasses.field(default=None, kw_only=True)
+    image_at: int = dataclasses.field(default=0, kw_only=True)
 
 
 class Seeing(nn.Module):
