@@ -208,18 +208,6 @@ class TrunkSpatialLidar(SpatialLidar):
         """Return the surface that is seen."""
         return sight.tunnel.space.relief if params.relief is None else params.relief
 
-    def check(self, others: frozenset[str], params: EnvParams) -> None:
-        """Refuse a sweep, and what every sensor refuses.
-
-        Raises:
-            ValueError: The trunk's pose within a sweep is not known.
-        """
-        if params.lidar.sweep:
-            raise ValueError(
-                "sweep=True does not go with a robot on legs, whose trunk is known at the end of a step alone"
-            )
-        super().check(others, params)
-
 
 def _mean_motion(
     state: State, position: Float[Array, "2"], heading: Float[Array, ""], params: EnvParams

@@ -166,9 +166,13 @@ def make_mission(
             walker = walk_in_scene(walker, Path(scene), lining)
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
     if spatial:
+        made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
+        if overrides.setdefault("lidar", made).sweep:
+            raise ValueError(
+                "sweep=True does not go with a robot on legs: it knows its trunk at the end of a step alone"
+            )
         source = tunnel if scene is None else Path(scene) / "tunnel.npz"
         walking = dataclasses.replace(walking, tunnel=resolve(source, lining, None, RANGE_MAX, spatial=True))
-        overrides = {"lidar": sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor), **overrides}
     trained = _gait(policy, walker.observation_size(walking))
     own = {"walk": walking, "policy": trained, "relief": relief}
     env = TunnelEnv(

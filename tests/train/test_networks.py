@@ -45,7 +45,7 @@ def test_every_frame_of_the_stack_reaches_policy_and_value():
 def test_an_image_is_seen_by_patches_and_its_release_drives_alike():
     layout = networks.Layout(6 + 32, (0.0, -1.0), (2.0, 1.0), 2, (16, 16), 0.5, 0.01, image=(4, 8), image_at=2)
     nets = networks.Networks(layout)
-    weights = nets.init(jax.random.key(0))
+    weights = jax.jit(nets.init)(jax.random.key(0))
     assert weights["policy"]["params"]["patch"]["kernel"].shape == (32, 32)
     # The untrained policy is nearly constant.
     last = weights["policy"]["params"]["body"]["hidden_2"]
@@ -54,9 +54,10 @@ def test_an_image_is_seen_by_patches_and_its_release_drives_alike():
     policy = networks.Policy(
         weights["policy"], learning.update_statistics(learning.start_statistics((38,)), seen[:, 0], ())
     )
-    agent = make_agent(nets, policy)
+    agent, act = make_agent(nets, policy), jax.jit(nets.act)
+    answer = jax.jit(agent.answer)
     for stack in seen:
-        np.testing.assert_allclose(agent.answer(stack)[:2], nets.act(policy, stack), atol=1e-5)
+        np.testing.assert_allclose(answer(stack)[:2], act(policy, stack), atol=1e-5)
         for k in (0, 2, 33, 37):  # before, in and behind the image
-            other = nets.act(policy, stack.at[:, k].add(1.0))
-            assert np.abs(other - nets.act(policy, stack)).max() > 1e-6
+            other = act(policy, stack.at[:, k].add(1.0))
+            assert np.abs(other - act(policy, stack)).max() > 1e-6

@@ -48,7 +48,7 @@ def test_in_16_bits_an_image_weighs_half_and_the_answer_and_its_gradient_stay_ne
     )
     features = jax.random.uniform(jax.random.key(0), (12, 16, full.n_features))
     first, begun = jnp.zeros((12, 16), bool).at[5, 3].set(True), jnp.zeros((16, 32))
-    weights = RecurrentNetworks(full).init(jax.random.key(1))
+    weights = jax.jit(RecurrentNetworks(full).init)(jax.random.key(1))
 
     def loss_of(layout):
         networks = RecurrentNetworks(layout)
@@ -58,7 +58,7 @@ def test_in_16_bits_an_image_weighs_half_and_the_answer_and_its_gradient_stay_ne
             _, hidden = networks.remember(weights, kept, begun, first)
             return jnp.mean(estimation_loss(networks.think(weights, hidden, jnp.ones(())).logits, first - 0.5, 0.5))
 
-        return kept, *jax.value_and_grad(loss)(weights)
+        return kept, *jax.jit(jax.value_and_grad(loss))(weights)
 
     whole, loss, gradient = loss_of(full)
     half, near, other = loss_of(dataclasses.replace(full, half=True))
