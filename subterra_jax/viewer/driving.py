@@ -14,6 +14,7 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.cloud import Cloud
 from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.lidar3d.beams import level_ring
+from subterra_jax.lidar3d.space import into_tunnel, turned
 from subterra_jax.parts.obstacles import PITCH
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel_env import TunnelEnv
@@ -119,7 +120,7 @@ class _Rows:
             "station": state.station,
             "odometry": obs[fields["odometry"]],
             "ranges": _level_ranges(obs, fields, params),
-            "points": _points(obs, fields, params),
+            "points": _points(obs, fields, params, state),
             "command": state.command,
             "estimate": jnp.stack([station, sigma]),
             "reward": reward,
@@ -134,7 +135,7 @@ def _level_ranges(obs: Array, fields: dict[str, slice], params: EnvParams) -> Ar
     return obs[fields["ranges"]] if "ranges" in fields else level_ring(obs[fields["scan"]], params.lidar.shape)
 
 
-def _points(obs: Array, fields: dict[str, slice], params: EnvParams) -> Array:
+def _points(obs: Array, fields: dict[str, slice], params: EnvParams, state: State) -> Array:
     """Return about `_POINTS` returns of a LiDAR in three dimensions, robot's frame, m; none of a planar one."""
     if "scan" not in fields:
         return jnp.zeros((0, 3))
@@ -142,8 +143,27 @@ def _points(obs: Array, fields: dict[str, slice], params: EnvParams) -> Array:
     stride = max(1, -(-sensor.n_beams // _POINTS))
     ranges, beams = obs[fields["scan"]][::stride], sensor.directions[::stride]
     seen = (ranges > 0.0) & (ranges < sensor.range_max)
-    points = beams * ranges[:, None] + jnp.stack([0.0, sensor.mount.lateral, sensor.mount.height])
+    axes = turned(tuple(tuple(axis) for axis in jnp.eye(3)), sensor.mount)  # type: ignore[arg-type]
+    points = into_tunnel(axes, beams * ranges[:, None])
+    if "legs" in state.parts:
+        points = _from_trunk(points, state, params)
+    else:
+        points = points + jnp.stack([0.0, sensor.mount.lateral, sensor.mount.height])
     return jnp.where(seen[:, None], points, jnp.nan)
+
+
+def _from_trunk(points: Array, state: State, params: EnvParams) -> Array:
+    """Return points of a trunk's LiDAR, which leans with it, in the robot's level frame, from the ground, m."""
+    from subterra_jax.b2.kinematics import rotate
+    from subterra_jax.b2.mission import lidar_place
+
+    walk = state.legs.walk
+    mount, _ = lidar_place(walk, params.walk, params.lidar.mount.lateral)
+    leaning = jax.vmap(rotate, (None, 0))(walk.body.qpos[3:7], points) + mount - walk.body.qpos[:3]
+    cos, sin = jnp.cos(state.heading), jnp.sin(state.heading)
+    x, y, z = leaning.T
+    up = walk.body.qpos[2] + params.walk.track.protrusion
+    return jnp.stack([cos * x + sin * y, cos * y - sin * x, z + up], axis=-1)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -80,6 +80,21 @@ def test_a_b2_is_driven_and_its_legs_are_recorded():
     assert recording.station[-1] - recording.station[0] > 2.0
 
 
+@pytest.mark.slow
+def test_what_a_lidar_on_the_trunk_sees_is_shown_about_the_robot():
+    library.register_agents(())
+    plan = st.load_tunnel()
+    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/B2Traverse-v0", "pure-pursuit", 3, "spin16x64")
+    points = list(itertools.islice(parts, 2))[-1].points
+    assert points.shape[1:] == (1024, 3)
+    half = float(np.interp(2.0, plan.station, plan.half_width))
+    for row in points:
+        near = row[(np.abs(row[:, 0]) < 1.0) & (row[:, 2] > 0.4)]
+        assert np.ptp(near[:, 1]) == pytest.approx(2.0 * half, abs=0.5)  # both walls, at heights that the rings reach
+        floor = row[(np.abs(row[:, 1]) < 0.7) & (np.abs(row[:, 0]) > 2.0) & (row[:, 2] < 0.3)]
+        assert np.median(floor[:, 2]) == pytest.approx(0.0, abs=0.12)
+
+
 def _turned(wxyz, points):
     import trimesh
 
