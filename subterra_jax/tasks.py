@@ -240,9 +240,7 @@ def make(
         if id == WALK:
             _require_planar(id, sensor, sweep)
             return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
-        if sweep:
-            overrides["lidar"] = dataclasses.replace(make_sensor(sensor), sweep=True)
-        return walking.make_mission(id, tunnel, lining, sensor=sensor, **overrides)  # type: ignore[arg-type]
+        return walking.make_mission(id, tunnel, lining, sensor=sensor, sweep=sweep, **overrides)  # type: ignore[arg-type]
     task = TASKS[id]
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
     if spatial:

@@ -126,6 +126,7 @@ def make_mission(
     relief: Relief | None = None,
     walk: dict[str, Any] | None = None,
     sensor: Any = SENSORS[0],
+    sweep: bool = False,
     **overrides: Any,
 ) -> tuple[TunnelEnv, EnvParams]:
     """Makes a planar task on the legs of the B2, and its params.
@@ -142,6 +143,7 @@ def make_mission(
         relief: Surface that the LiDAR sees; that of the scene, if any, if left out.
         walk: Fields of `WalkParams` to replace.
         sensor: The LiDAR on the trunk, as for `subterra_jax.make`.
+        sweep: As for `subterra_jax.make`; refused, since the trunk's pose within a step is not kept.
         **overrides: Fields of `EnvParams` to replace.
 
     Raises:
@@ -167,10 +169,10 @@ def make_mission(
     spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
     if spatial:
         made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
-        if overrides.setdefault("lidar", made).sweep:
-            raise ValueError(
-                "sweep=True does not go with a robot on legs: it knows its trunk at the end of a step alone"
-            )
+        sweep |= overrides.setdefault("lidar", made).sweep
+    if sweep:
+        raise ValueError("sweep=True does not go with a robot on legs: it knows its trunk at the end of a step alone")
+    if spatial:
         source = tunnel if scene is None else Path(scene) / "tunnel.npz"
         walking = dataclasses.replace(walking, tunnel=resolve(source, lining, None, RANGE_MAX, spatial=True))
     trained = _gait(policy, walker.observation_size(walking))

@@ -216,8 +216,10 @@ def test_a_lidar_in_three_dimensions_stands_on_the_trunk(plan):
     env, params = st.make(ID, tunnel=plan, policy="trot", sensor="spin16x64")
     assert env.images(params) == {"scan": (16, 64)}
     assert env.observation_size(params) == 16 * 64 + 2
-    with pytest.raises(ValueError, match="sweep=True does not go with a robot on legs"):
-        st.make(ID, tunnel=plan, policy="trot", sensor="spin16x64", sweep=True)
+    swept = st.parts.make_sensor("vlp16", sweep=True)
+    for sensor, sweep in (("spin16x64", True), (swept, False), (swept, True), ("planar16", True)):
+        with pytest.raises(ValueError, match="sweep=True does not go with a robot on legs"):
+            st.make(ID, tunnel=plan, policy="trot", sensor=sensor, sweep=sweep)
     with pytest.raises(ValueError, match="Subterra/B2Walk-v0 has the sensor 'planar16' alone"):
         st.make("Subterra/B2Walk-v0", tunnel=plan, sensor="spin16x64")
 
