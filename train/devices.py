@@ -12,17 +12,18 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from train.config import ConfigError
+from train.config import ConfigError, TrainConfig
 from train.report import Report
 
 
-def compiler_options() -> dict[str, str | bool] | None:
-    """Returns compiler options under which one seed gives one result.
+def compiler_options(config: TrainConfig) -> dict[str, str | bool] | None:
+    """Returns compiler options under which one seed gives one result, where the settings ask for it.
 
     A CPU needs none. On a GPU, XLA otherwise chooses kernels by timing them, and two runs of one seed part after an
     iteration or two. Measured on an H200, the deterministic kernels cost PPO about 3 % of its speed.
     """
-    return None if jax.default_backend() == "cpu" else {"xla_gpu_deterministic_ops": True}
+    wanted = config.deterministic and jax.default_backend() != "cpu"
+    return {"xla_gpu_deterministic_ops": True} if wanted else None
 
 
 T = TypeVar("T")

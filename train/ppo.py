@@ -134,7 +134,7 @@ Watcher = Callable[[Snapshot], bool | None]
 def begin(learner: Trainable, params: Any) -> Snapshot:
     """Returns an untrained run."""
     key = learner.share(jax.random.PRNGKey(learner.config.seed))
-    state = jax.jit(learner.init, compiler_options=compiler_options())(key, learner.share(params))
+    state = jax.jit(learner.init, compiler_options=compiler_options(learner.config))(key, learner.share(params))
     return started(learner, state)
 
 
@@ -147,7 +147,6 @@ def train(
     snapshot: Snapshot | None = None,
     watch: Watcher | None = None,
     log: Log | None = None,
-    deterministic: bool = True,
 ) -> Snapshot:
     """Trains until the goal has held for long enough, or the steps are used up.
 
@@ -159,7 +158,6 @@ def train(
         snapshot: Snapshot to go on from; its state is used up. None is the beginning.
         watch: Called after every iteration; training ends early if it returns True.
         log: Called after every iteration with its line of the log, a dictionary, before `watch`.
-        deterministic: One seed is to give one result on a GPU as well.
 
     Returns:
         The last snapshot. Its `policy` is the best one, which need not be the last.
@@ -176,7 +174,7 @@ def train(
         return snapshot
     params = learner.share(params)
     began = time.perf_counter()
-    options = compiler_options() if deterministic else None
+    options = compiler_options(config)
     iterate = jax.jit(learner.iterate, donate_argnums=0).lower(snapshot.state, params).compile(options)
     compiled = time.perf_counter()
     while not finished(snapshot, config):
@@ -235,7 +233,7 @@ def train_seeds(
     Raises:
         TrainingError: The loss of a seed is no longer finite.
     """
-    first, options = learners[0], compiler_options()
+    first, options = learners[0], compiler_options(learners[0].config)
     if any(snapshot is None for snapshot in snapshots):
         keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
         states = jax.jit(over_seeds(first.init), compiler_options=options)(keys, params)

@@ -67,14 +67,13 @@ class Session:
             step = iteration * self.learner.config.steps_per_iteration
             self._sinks = self._logs.open(self.folder.path, step, dataclasses.asdict(self.learner.config))
 
-    def train(self, *, resume: bool, overwrite: bool, label: str = "", deterministic: bool = True) -> Snapshot | None:
+    def train(self, *, resume: bool, overwrite: bool, label: str = "") -> Snapshot | None:
         """Trains the run to its end, then writes the last checkpoint and the curve.
 
         Args:
             resume: Go on from the folder's checkpoint.
             overwrite: Throw away the run that the folder holds.
             label: Name of the run in the progress bar.
-            deterministic: One seed is to give one result on a GPU as well.
 
         Returns:
             The last snapshot; None after Ctrl-C, with the checkpoint saved.
@@ -101,7 +100,6 @@ class Session:
                     learner=self.learner,
                     snapshot=snapshot,
                     watch=watch,
-                    deterministic=deterministic,
                 )
             finally:
                 bar.close()

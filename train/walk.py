@@ -133,12 +133,7 @@ def _train_seed(arguments: Command, world: World, config: WalkConfig, out: Path)
     learner = WalkLearner(world.env, world.params, config, n_seen)
     alone = settings_of(dataclasses.replace(arguments, config=config))
     session = WalkSession(out, world, learner, logs=arguments.logs, command=alone)
-    last = session.train(
-        resume=arguments.resume,
-        overwrite=arguments.overwrite,
-        label=f"seed {config.seed}",
-        deterministic=config.deterministic,
-    )
+    last = session.train(resume=arguments.resume, overwrite=arguments.overwrite, label=f"seed {config.seed}")
     if last is None:
         return False
     scores = session.score(last, arguments.robots)

@@ -1,9 +1,11 @@
 import dataclasses
 
+import jax
 import pytest
 
 import subterra_jax as st
 from train.config import ConfigError, PPOConfig, check, make_config
+from train.devices import compiler_options
 
 WRONG = {
     "steps": 0,
@@ -45,3 +47,10 @@ def test_an_unknown_task_or_preset_is_refused_with_those_there_are():
 def test_steps_are_rounded_up_to_whole_iterations():
     config = dataclasses.replace(PPOConfig(), steps=1001, n_envs=10, unroll=10, minibatches=5)
     assert (config.steps_per_iteration, config.iterations, config.minibatch_envs) == (100, 11, 2)
+
+
+def test_a_gpu_adds_up_in_a_fixed_order_unless_the_settings_say_otherwise(monkeypatch):
+    assert compiler_options(PPOConfig()) is None  # a CPU always does
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert compiler_options(PPOConfig()) == {"xla_gpu_deterministic_ops": True}
+    assert compiler_options(PPOConfig(deterministic=False)) is None

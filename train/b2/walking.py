@@ -31,9 +31,7 @@ from train.world import library_versions
 class WalkConfig(PPOConfig):
     """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms.
 
-    Attributes:
-        deterministic: One seed gives one result on a GPU as well. MJX adds up by scattering, which a GPU then does one
-            after the other; two runs of one seed part otherwise.
+    On a GPU two runs of one seed part: MJX adds up by scattering, which `deterministic` has done one after the other.
     """
 
     steps: int = 150_000_000
