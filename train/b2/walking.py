@@ -4,7 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ from train.world import library_versions
 class WalkConfig(PPOConfig):
     """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms.
 
-    On a GPU two runs of one seed part: MJX adds up by scattering, which `deterministic` has done one after the other.
+    On a GPU two runs of one seed part unless `sums` are `ordered`: MJX adds up by scattering, which then takes its turn.
     """
 
     steps: int = 150_000_000
@@ -50,7 +50,7 @@ class WalkConfig(PPOConfig):
     hidden: tuple[int, ...] = (512, 256, 128)
     frames: int = 1
     checkpoint_every: int = 100
-    deterministic: bool = False
+    sums: Literal["ordered", "any"] = "any"
 
     # Pushes and commands make the rolling hundred too noisy to choose by.
     KEEPS_BEST: ClassVar[bool] = False
