@@ -31,7 +31,7 @@ from train.world import library_versions
 class WalkConfig(PPOConfig):
     """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms.
 
-    On a GPU two runs of one seed part unless `sums` are `ordered`: MJX adds up by scattering, which then takes its turn.
+    On a GPU two runs of one seed part unless `sums` are `ordered`: MJX adds up by scattering.
     """
 
     steps: int = 150_000_000
