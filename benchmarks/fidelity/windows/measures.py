@@ -35,6 +35,7 @@ PLACES = ("left wall", "left haunch", "crown", "right haunch", "right wall", "ri
 _LEAST_CELLS = 0.15  # share of a window's cells that must be known
 _LEAST_SECTOR = 6  # known cells of a window that show a sector
 _LEAST_BEAMS = 20
+_HAIR = 1e-6  # m, more than places that are one differ by rounding
 _FAINT = 0.0015  # m; where left and right of the candidate differ by less, no side can be told
 
 
@@ -186,7 +187,8 @@ def _by_profile(
         starts = low + np.arange(0.0, max(high - low - window, 0.0) + 1e-6, STEP)
         starts = starts[_near(case, source, starts, window)]
         order = np.argsort(profile.station, kind="stable")
-        bounds = np.searchsorted(profile.station[order], [starts, starts + window])
+        # Windows begin and end on places of the profile itself: the first counts and the last does not.
+        bounds = np.searchsorted(profile.station[order] + _HAIR, [starts, starts + window])
         values = [abs(statistic(profile.value[order[a:b]])) if b - a >= least else np.nan for a, b in bounds.T]
         return Series(starts, np.asarray(values, float), ("",) * len(starts), window)
 
