@@ -4,12 +4,14 @@ The same boxes and the same segments as in `cast`, with nothing written to memor
 beam: for 65,536 environments XLA moves about a gigabyte a step where this moves 25 MB. `cast` stays the reference, and
 is what runs everywhere else.
 
-Robots in different tunnels read different boxes, so a box is read as the 32 bytes of its record, in two instructions.
+Robots in different tunnels read different blocks, so a box is 16 bytes, read by one instruction, and each robot reads
+the boxes and the vertices that it needs and no further ones; see `tunnel.packed`.
 """
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.lidar.cast import NOTHING
 from subterra_jax.tunnel import Tunnel
+from subterra_jax.tunnel.packed import ALL_PAIRS, ALL_WINDOW, WINDOW_BITS, WORDS, Packed, high, low, pack
 
 # Environments of one program: one warp, one environment a thread, so that a program in which nobody looks on is short.
 _ROWS = 32
@@ -26,8 +29,8 @@ _ROWS = 32
 _MOST_LINES = 8
 # Beams of one program, one after the other.
 _MOST_BEAMS = 2
-# Numbers of a record, and the places of two of them; see `Tunnel`.
-RECORD, _VERTICES, _WINDOW = 8, 6, 7
+# Half thickness of a box that no beam enters, m.
+_NONE = -1e30
 
 
 def supported(n_beams: int) -> bool:
@@ -70,8 +73,9 @@ def scan(
     width = max(w for w in range(1, _MOST_LINES + 1) if n_lines % w == 0)
     group = max(w for w in range(1, _MOST_BEAMS + 1) if n_beams % w == 0)
     turn = jnp.asarray(np.concatenate([np.cos(bearing), np.sin(bearing)]), jnp.float32)
-    record, wall = record_of(tunnel), tunnel.wall.reshape(-1)
-    row = pl.BlockSpec((_ROWS,), lambda i, _: (i,))
+    packed = packed_blocks(tunnel)
+    box, wall = packed.box.reshape(-1), packed.wall.reshape(-1)
+    row, of_second = pl.BlockSpec((_ROWS,), lambda i, _: (i,)), pl.BlockSpec((_ROWS,), lambda _, i: (i,))
     whole = pl.BlockSpec(memory_space=pl.ANY)
     warp = triton.CompilerParams(num_warps=1, num_stages=1)
     key = pl.pallas_call(
@@ -82,49 +86,63 @@ def scan(
         out_shape=jax.ShapeDtypeStruct((k, n_beams, n), jnp.int32),
         compiler_params=warp,
         interpret=jax.default_backend() != "gpu",
-    )(*rows, turn, record)
+    )(*rows, turn, box)
     ranges = pl.pallas_call(
-        partial(_hits_kernel, tunnel=tunnel, n_beams=n_beams, width=group),
-        grid=(n // _ROWS, n_beams // group),
-        in_specs=[pl.BlockSpec((k, group, _ROWS), lambda i, j: (0, j, i))] + [row] * 5 + [whole] * 4,
-        out_specs=pl.BlockSpec((group, _ROWS), lambda i, j: (j, i)),
+        partial(_hits_kernel, tunnel=tunnel, n_numbers=packed.wall.shape[1], n_beams=n_beams, width=group),
+        # Beams of the same scans one after another: they meet the same few blocks.
+        grid=(n_beams // group, n // _ROWS),
+        in_specs=[pl.BlockSpec((k, group, _ROWS), lambda j, i: (0, j, i))] + [of_second] * 5 + [whole] * 4,
+        out_specs=pl.BlockSpec((group, _ROWS), lambda j, i: (j, i)),
         out_shape=jax.ShapeDtypeStruct((n_beams, n), jnp.float32),
         compiler_params=warp,
         interpret=jax.default_backend() != "gpu",
-    )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), record, wall)
+    )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), box, wall)
     return ranges[:, :count].T
 
 
-def record_of(tunnel: Tunnel) -> Int[Array, " n"]:
-    """Return the bits of the records of a tunnel, one after another; made of its boxes where it has none."""
-    record = tunnel.record
-    if record is None:
-        most = jnp.full(tunnel.box.shape[1], tunnel.n_scan, jnp.float32)
-        record = jnp.column_stack([tunnel.box.T, jnp.full_like(most, tunnel.wall.shape[2]), most])
-    return lax.bitcast_convert_type(jnp.asarray(record, jnp.float32), jnp.int32).reshape(-1)
+def packed_blocks(tunnel: Tunnel) -> Packed:
+    """Return the packed blocks of a tunnel; made of its boxes and walls where it has none."""
+    if tunnel.packed is not None:
+        return tunnel.packed
+    everything = jnp.full(tunnel.box.shape[1], tunnel.n_scan)
+    return pack(tunnel.box, tunnel.wall, jnp.full_like(everything, tunnel.wall.shape[2]), everything)
 
 
-def load_box(record_ref, block):
-    """Return the six numbers of the boxes of many blocks, read by two instructions."""
+def load_words(ref, start, mask=None):
+    """Return four words of each of many rows, read by one instruction; 0 where masked.
+
+    Args:
+        ref: Flat array of words.
+        start: First word of each row, a multiple of 4.
+        mask: Rows to read; `None` for all.
+    """
     from jax.experimental.pallas import triton
 
-    column = lax.broadcasted_iota(jnp.int32, (*block.shape, 4), 1)
-    at = RECORD * block[:, None] + column
-    halves = triton.load(record_ref.at[at]), triton.load(record_ref.at[at + 4])
-
-    def number(i):
-        bits = jnp.sum(jnp.where(column == i % 4, halves[i // 4], 0), axis=1)
-        return lax.bitcast_convert_type(bits, jnp.float32)
-
-    return [number(i) for i in range(6)]
+    column = lax.broadcasted_iota(jnp.int32, (*start.shape, WORDS), start.ndim)
+    # Triton takes no `other` without a mask.
+    masked: dict[str, Any] = (
+        {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
+    )
+    words = triton.load(ref.at[start[..., None] + column], **masked)
+    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(WORDS))
 
 
-def load_number(record_ref, block, i, mask):
-    """Return a number of the records of many blocks, 0 where masked."""
-    from jax.experimental.pallas import triton
+def unpack(words):
+    """Return the middle x, y, half axis x, y, half thickness (m), vertex pairs and window of boxes; see `Packed`."""
+    x, y = (lax.bitcast_convert_type(word, jnp.float32) for word in words[:2])
+    pairs, window = (words[3] >> WINDOW_BITS) & ALL_PAIRS, words[3] & ALL_WINDOW
+    return x, y, high(words[2]), low(words[2]), high(words[3]), pairs, window
 
-    other = {} if mask is None else {"mask": mask, "other": 0}  # Triton takes no `other` without a mask
-    return lax.bitcast_convert_type(triton.load(record_ref.at[RECORD * block + i], **other), jnp.float32)
+
+def all_if_full(count, full: int, everything: int):
+    """Return a count of which the largest number stands for everything."""
+    return jnp.where(count == full, jnp.int32(everything), count)
+
+
+def length_of(x, y):
+    """Return the lengths of vectors, good to 1e-6."""
+    squared = x * x + y * y
+    return squared * lax.rsqrt(squared + 1e-20)
 
 
 def _number_bits(tunnel: Tunnel) -> int:
@@ -147,7 +165,7 @@ def _boxes_kernel(
     y_ref,
     heading_ref,
     turn_ref,
-    record_ref,
+    box_ref,
     key_ref,
     *,
     tunnel: Tunnel,
@@ -169,8 +187,15 @@ def _boxes_kernel(
         cos, sin = jnp.cos(heading), jnp.sin(heading)
         lines = [_direction(turn_ref, line + j, n_beams, cos, sin) for j in range(width)]
 
-        def meet(number, best):
-            m_x, m_y, e_x, e_y, thickness, length = load_box(record_ref, first + number)
+        def load(number):
+            return load_words(box_ref, WORDS * (first + number), number < window)
+
+        def meet(number, carry):
+            best, words = carry
+            following = load(number + 1)  # while this one is worked on
+            m_x, m_y, e_x, e_y, thickness, _, _ = unpack(words)
+            thickness = jnp.where(number < window, thickness, _NONE)
+            length = length_of(e_x, e_y)
             m_x, m_y = m_x - x, m_y - y
             turn = m_x * e_y - m_y * e_x
             e_x, e_y = jnp.where(turn < 0.0, -e_x, e_x), jnp.where(turn < 0.0, -e_y, e_y)
@@ -187,11 +212,12 @@ def _boxes_kernel(
                 key = jnp.where(crosses, key, NOTHING)
                 for ahead in (facing > 0.0, facing < 0.0):
                     merged.append(jnp.where(ahead | between, key, NOTHING))
-            return tuple(_inserted(best[i], merged[i]) for i in range(2 * width))
+            return tuple(_inserted(best[i], merged[i]) for i in range(2 * width)), following
 
         nothing = tuple(jnp.full(first.shape, NOTHING) for _ in range(n_best))
-        window = jnp.max(load_number(record_ref, first, _WINDOW, None)).astype(jnp.int32)
-        best = lax.fori_loop(0, window, meet, (nothing,) * (2 * width))
+        begin = load_words(box_ref, WORDS * first)
+        window = all_if_full(unpack(begin)[-1], ALL_WINDOW, tunnel.n_scan)
+        best, _ = lax.fori_loop(0, jnp.max(window), meet, ((nothing,) * (2 * width), begin))
         for j in range(width):
             for k in range(n_best):
                 key_ref[k, line + j, :] = best[2 * j][k]
@@ -208,14 +234,14 @@ def _inserted(best, key):
 
 
 def _hits_kernel(
-    key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, record_ref, wall_ref, range_ref,
-    *, tunnel: Tunnel, n_beams: int, width: int,
+    key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, box_ref, wall_ref, range_ref,
+    *, tunnel: Tunnel, n_numbers: int, n_beams: int, width: int,
 ):  # fmt: skip
     """The nearest segment along one beam of many scans, in the blocks whose boxes it enters before that segment."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    first_beam = pl.program_id(1) * width
+    first_beam = pl.program_id(0) * width
 
     @pl.when(jnp.max(wanted_ref[...]) > 0)
     def look() -> None:
@@ -226,7 +252,7 @@ def _hits_kernel(
 
         def beam(j, _):
             direction = _direction(turn_ref, first_beam + j, n_beams, cos, sin)
-            look_into = partial(_look_into, record_ref, wall_ref, tunnel.wall.shape[2], x, y, direction)
+            look_into = partial(_look_into, box_ref, wall_ref, n_numbers, x, y, direction)
             nearest = jnp.full(first.shape, triton.load(limit_ref.at[jnp.int32(0)]))
             for k in range(tunnel.n_candidates):
                 key = key_ref[k, j, :]
@@ -236,60 +262,67 @@ def _hits_kernel(
                 block = jnp.minimum(first + (key & jnp.int32((1 << n_bits) - 1)), n_blocks - 1)
                 nearest = look_into(block, open_, nearest)
             unsure = wanted & (key != NOTHING) & (entry <= nearest)
-            range_ref[j, :] = _look_everywhere(record_ref, look_into, first, unsure, x, y, direction, nearest)
+            range_ref[j, :] = _look_everywhere(
+                box_ref, look_into, tunnel.n_scan, first, unsure, x, y, direction, nearest
+            )
             return 0
 
         lax.fori_loop(0, width, beam, 0)
 
 
-def _look_into(record_ref, wall_ref, n_vertices: int, x, y, direction, block, open_, nearest):
+def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_, nearest):
     """The distance to the nearest segment of a block along beams where `open_`, if less than `nearest`.
 
     `cast.hits` has the geometry.
     """
-    from jax.experimental.pallas import triton
-
     d_x, d_y = direction
-    m_x, m_y = (load_number(record_ref, block, i, open_) - at for i, at in ((0, x), (1, y)))
+    m_x, m_y, _, _, _, pairs, _ = unpack(load_words(box_ref, WORDS * block, open_))
+    m_x, m_y = m_x - x, m_y - y
+    pairs = jnp.where(open_, all_if_full(pairs, ALL_PAIRS, n_numbers // WORDS), 0)
     middle_left, middle_ahead = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
     joint = 2e-7 * (1.0 + jnp.abs(middle_ahead))
-    start = block * (2 * n_vertices)
-    load = lambda i: triton.load(wall_ref.at[start + i], mask=open_, other=0.0)  # noqa: E731
 
-    def vertex(i):
-        x, y = load(i), load(n_vertices + i)
-        return middle_left + (d_x * y - d_y * x), middle_ahead + (d_x * x + d_y * y)
+    def vertices(pair):
+        numbers = load_words(wall_ref, block * n_numbers + WORDS * pair, pair < pairs)
+        for x, y in (numbers[:2], numbers[2:]):
+            yield middle_left + (d_x * y - d_y * x), middle_ahead + (d_x * x + d_y * y)
 
-    def segment(i, carry):
-        a, a_ahead, nearest = carry
-        b, b_ahead = vertex(i)
+    def segment(start, end, nearest, there):
+        (a, a_ahead), (b, b_ahead) = start, end
         meets = (jnp.minimum(a, b) <= joint) & (jnp.maximum(a, b) >= -joint)
         share = jnp.clip(a / jnp.where(a == b, 1.0, a - b), 0.0, 1.0)
         distance = a_ahead + share * (b_ahead - a_ahead)
-        hit = open_ & meets & (distance >= 0.0)
-        return b, b_ahead, jnp.where(hit, jnp.minimum(nearest, distance), nearest)
+        hit = there & meets & (distance >= 0.0)
+        return jnp.where(hit, jnp.minimum(nearest, distance), nearest)
 
-    end = jnp.max(load_number(record_ref, block, _VERTICES, open_)).astype(jnp.int32)
-    return lax.fori_loop(1, jnp.maximum(end, 1), segment, (*vertex(0), nearest))[2]
+    def two_segments(pair, carry):
+        before, nearest = carry
+        one, other = vertices(pair)
+        there = pair < pairs
+        return other, segment(one, other, segment(before, one, nearest, there), there)
+
+    one, other = vertices(jnp.int32(0))
+    return lax.fori_loop(1, jnp.max(pairs), two_segments, (other, segment(one, other, nearest, pairs > 0)))[1]
 
 
-def _look_everywhere(record_ref, look_into, first, unsure, x, y, direction, nearest):
+def _look_everywhere(box_ref, look_into, n_scan: int, first, unsure, x, y, direction, nearest):
     """Return the nearest hit in any block of the window whose box is entered, for beams that are `unsure`.
 
     They enter as many boxes as were kept, and meet no wall before the last of them, as beside a row of deep recesses.
     """
     d_x, d_y = direction
+    window = all_if_full(unpack(load_words(box_ref, WORDS * first, unsure))[-1], ALL_WINDOW, n_scan)
+    window = jnp.where(unsure, window, 0)
 
     def look(number, nearest):
-        block = first + number
-        m_x, m_y, e_x, e_y, thickness, length = (load_number(record_ref, block, i, unsure) for i in range(6))
+        block, there = first + number, number < window
+        m_x, m_y, e_x, e_y, thickness, _, _ = unpack(load_words(box_ref, WORDS * block, there))
         m_x, m_y = m_x - x, m_y - y
-        to_face = jnp.maximum(jnp.abs(m_x * e_y - m_y * e_x) - thickness * length, 0.0)
+        to_face = jnp.maximum(jnp.abs(m_x * e_y - m_y * e_x) - thickness * length_of(e_x, e_y), 0.0)
         size = jnp.abs(d_x * e_y - d_y * e_x)
         # Entered a little early rather than a little late.
-        open_ = unsure & (jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness)
+        open_ = there & (jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness)
         open_ = open_ & (to_face * (1.0 - 1e-5) <= nearest * size + 1e-6)
         return lax.cond(jnp.max(open_.astype(jnp.int32)) > 0, lambda: look_into(block, open_, nearest), lambda: nearest)
 
-    window = jnp.max(jnp.where(unsure, load_number(record_ref, first, _WINDOW, unsure), 0.0)).astype(jnp.int32)
-    return lax.fori_loop(0, window, look, nearest)
+    return lax.fori_loop(0, jnp.max(window), look, nearest)

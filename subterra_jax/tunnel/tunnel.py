@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, pad, windows
+from subterra_jax.tunnel.packed import Packed, pack
 from subterra_jax.tunnel.plan import TunnelPlan
 
 CONTACT_REACH = 0.8
@@ -47,9 +48,7 @@ class Tunnel:
         n_contact: Blocks in a contact window.
         n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone.
         space: Surface and ground, a `lidar3d.space.Space`, for LiDARs in three dimensions; `None` without one.
-        record: For GPUs the numbers of each block side by side, `(n_blocks, 8)`: those of `box`, its vertices without
-            padding, and the blocks in the largest scan window that begins with it. `None` in a tunnel whose `box` was
-            replaced.
+        packed: Boxes and walls as GPUs read them, a `Packed`. `None` in a tunnel whose `box` or `wall` was replaced.
     """
 
     length: Float[Array, "*k"]
@@ -67,7 +66,7 @@ class Tunnel:
     n_contact: int = struct.field(pytree_node=False)
     n_candidates: int = struct.field(pytree_node=False)
     space: Any = None
-    record: Any = None
+    packed: Any = None
 
     @property
     def count(self) -> int:
@@ -145,6 +144,7 @@ class Tunnel:
         half_length = np.linalg.norm(blocks.half, axis=1)
         grid = np.concatenate([plan.centre, plan.tangent, plan.half_width[:, None]], axis=1)
         box = np.column_stack([blocks.centre, blocks.half, blocks.thickness, half_length]).T
+        wall = blocks.offset.swapaxes(1, 2).astype(np.float32)
         window = np.zeros(box.shape[1])
         np.maximum.at(window, scan_first, in_window)
         real, whole = partial(_on_device, dtype=np.float32), partial(_on_device, dtype=np.int32)
@@ -158,12 +158,12 @@ class Tunnel:
             scan_first=whole(scan_first),
             contact_first=whole(contact_first),
             box=real(box),
-            wall=real(blocks.offset.swapaxes(1, 2)),
+            wall=real(wall),
             reach=reach,
             n_scan=n_scan,
             n_contact=int(in_contact.max()),
             n_candidates=n_candidates,
-            record=real(np.column_stack([box.T, blocks.count, window])),
+            packed=jax.device_put(pack(box.astype(np.float32), wall, blocks.count, window)),
         )
 
 
@@ -233,8 +233,8 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     Windows are as large as the largest of any tunnel. Behind its last block each tunnel is padded so that no window,
     counted up to the next power of two, reaches the next tunnel.
 
-    A stack costs memory that no longer fits a cache: 7 % of the speed for 100 tunnels and 58 % for 1,000 on an H200,
-    half as much again for 100 on a CPU.
+    A stack costs memory that no longer fits a cache: some 40 % of the speed for 1,000 tunnels on an H100, half as much
+    again for 100 on a CPU.
 
     Args:
         tunnels: One or more single tunnels, of any length and lining.
@@ -255,7 +255,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     n_scan, n_contact = max(t.n_scan for t in tunnels), max(t.n_contact for t in tunnels)
     n_vertices = max(t.wall.shape[2] for t in tunnels)
     parts = [_pad(t, n_scan, n_contact, n_vertices) for t in tunnels]
-    n_blocks, n_nodes = np.array([box.shape[1] for box, _, _ in parts]), np.array([t.grid.shape[0] for t in tunnels])
+    n_blocks, n_nodes = np.array([box.shape[1] for box, _ in parts]), np.array([t.grid.shape[0] for t in tunnels])
     first_block, first_node = (np.concatenate([[0], np.cumsum(n)[:-1]]).astype(np.int32) for n in (n_blocks, n_nodes))
     put = jax.device_put  # `jnp.asarray` would compile a program for each new shape
     numbers = lambda name: put(np.stack([np.asarray(getattr(t, name)) for t in tunnels]))  # noqa: E731
@@ -271,19 +271,19 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         grid=put(np.concatenate([np.asarray(t.grid) for t in tunnels])),
         scan_first=shifted("scan_first"),
         contact_first=shifted("contact_first"),
-        box=put(np.concatenate([box for box, _, _ in parts], axis=1)),
-        wall=put(np.concatenate([wall for _, wall, _ in parts])),
+        box=put(np.concatenate([box for box, _ in parts], axis=1)),
+        wall=put(np.concatenate([wall for _, wall in parts])),
         reach=min(t.reach for t in tunnels),
         n_scan=n_scan,
         n_contact=n_contact,
         n_candidates=max(t.n_candidates for t in tunnels),
         space=None if tunnels[0].space is None else tunnels[0].space.join([t.space for t in tunnels]),
-        record=None if any(t.record is None for t in tunnels) else put(np.concatenate([part[2] for part in parts])),
+        packed=_join_packed(tunnels, n_blocks, n_vertices),
     )
 
 
-def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return box, wall and record of a tunnel, padded so that none of its windows reaches beyond them."""
+def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return box and wall of a tunnel, padded so that none of its windows reaches beyond them."""
     box, wall = np.asarray(tunnel.box), np.asarray(tunnel.wall)
     # A beam that enters no box reads the block whose number has all bits set.
     window = 1 << (n_scan - 1).bit_length()
@@ -291,10 +291,38 @@ def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[
         int(np.asarray(tunnel.scan_first).max()) + window, int(np.asarray(tunnel.contact_first).max()) + n_contact
     )
     missing = max(0, needed - box.shape[1])
-    fill = np.zeros((6, missing), np.float32)
-    fill[:2], fill[4] = PADDING_CENTRE, PADDING_THICKNESS
     wall = np.pad(wall, ((0, 0), (0, 0), (0, n_vertices - wall.shape[2])), mode="edge")
-    record = np.zeros((0, 8), np.float32) if tunnel.record is None else np.asarray(tunnel.record)
-    numbers = np.concatenate([fill.T, np.ones((missing, 1), np.float32), np.zeros((missing, 1), np.float32)], axis=1)
-    box, wall = np.concatenate([box, fill], axis=1), np.pad(wall, ((0, missing), (0, 0), (0, 0)))
-    return box, wall, np.concatenate([record, numbers])
+    return np.concatenate([box, _padding(missing)], axis=1), np.pad(wall, ((0, missing), (0, 0), (0, 0)))
+
+
+def _padding(count: int) -> np.ndarray:
+    """Return boxes that nothing enters."""
+    fill = np.zeros((6, count), np.float32)
+    fill[:2], fill[4] = PADDING_CENTRE, PADDING_THICKNESS
+    return fill
+
+
+def _join_packed(tunnels: Sequence[Tunnel], n_blocks: np.ndarray, n_vertices: int) -> Packed | None:
+    """Join the packed blocks of several tunnels, padded to as many blocks and vertices as the others are.
+
+    Args:
+        tunnels: The tunnels.
+        n_blocks: Blocks of each with padding.
+        n_vertices: Vertices of each block in the stack.
+    """
+    if any(t.packed is None for t in tunnels):
+        return None
+    n_numbers = 2 * (n_vertices + n_vertices % 2)
+    boxes: list[Any] = []
+    walls: list[Any] = []
+    for tunnel, total in zip(tunnels, n_blocks, strict=True):
+        box, wall = np.asarray(tunnel.packed.box), np.asarray(tunnel.packed.wall)
+        missing = int(total) - len(box)
+        nowhere = np.zeros((missing, 2, n_vertices), np.float32)
+        fill = pack(_padding(missing), nowhere, np.ones(missing), np.zeros(missing))
+        # The last vertex again, which is two numbers.
+        more = np.tile(wall[:, -2:], (1, (n_numbers - wall.shape[1]) // 2))
+        boxes += [box, fill.box]
+        walls += [np.concatenate([wall, more], axis=1), fill.wall]
+    put = jax.device_put
+    return Packed(box=put(np.concatenate(boxes)), wall=put(np.concatenate(walls)))

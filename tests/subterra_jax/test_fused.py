@@ -10,7 +10,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.lidar import fused, reference
-from subterra_jax.tunnel import Tunnel, node_at
+from subterra_jax.tunnel import Tunnel, node_at, packed
 
 
 @pytest.fixture(scope="module")
@@ -78,21 +78,54 @@ def test_a_beam_along_a_row_of_deep_recesses_is_exact() -> None:
     assert reference.agreement(plan.lining(plan.default_lining).segments, poses, ranges).n_wrong == 0
 
 
-def test_records_that_follow_the_boxes_give_the_same_ranges(plan: st.TunnelPlan) -> None:
+def test_blocks_packed_in_the_program_give_the_same_ranges(plan: st.TunnelPlan) -> None:
     poses = reference.random_poses(plan, 32, np.random.default_rng(4))
     tunnel, wanted = Tunnel.from_plan(plan), np.ones(32, bool)
-    without = fused_scan(dataclasses.replace(tunnel, record=None), poses, wanted, 16)
+    without = fused_scan(dataclasses.replace(tunnel, packed=None), poses, wanted, 16)
     np.testing.assert_array_equal(without, fused_scan(tunnel, poses, wanted, 16))
 
 
-def test_a_record_has_the_vertices_of_its_block_and_the_window_that_begins_there(plan: st.TunnelPlan) -> None:
+def unpacked(tunnel: Tunnel) -> list[np.ndarray]:
+    return [np.asarray(part) for part in fused.unpack(tuple(jnp.asarray(tunnel.packed.box).T))]
+
+
+@pytest.mark.parametrize("name", [None, "open:masonry:train:0", "open:rock:test-unseen:0"])
+def test_a_packed_box_holds_the_box_of_its_block(name: str | None) -> None:
+    plan = (st.load_tunnel(name) if name else st.load_tunnel()).slice(100.0, 80.0)
     tunnel = Tunnel.from_plan(plan)
-    record, wall = np.asarray(tunnel.record), np.asarray(tunnel.wall)
-    np.testing.assert_array_equal(record[:, :6], np.asarray(tunnel.box).T)
+    there = np.asarray(tunnel.box)[4] > 0.0
+    x, y, e_x, e_y, thickness, _, _ = (part.astype(float) for part in unpacked(tunnel))
+    np.testing.assert_array_equal(np.stack([x, y]), np.asarray(tunnel.box)[:2])
+    assert np.all(thickness[~there] == -1.0)
+    box = np.asarray(tunnel.box, np.float64)[:, there]
+    e_x, e_y, thickness = e_x[there], e_y[there], thickness[there]
+    length = np.hypot(e_x, e_y)
+    for side in (-1.0, 1.0):
+        corner_x, corner_y = box[2] - side * box[4] * box[3] / box[5], box[3] + side * box[4] * box[2] / box[5]
+        assert np.all(np.abs(corner_y * e_x - corner_x * e_y) <= thickness * length)
+        assert np.all(np.abs(corner_x * e_x + corner_y * e_y) <= (length + thickness) * length)
+    grown = thickness - box[4]
+    assert 0.0 < grown.max() < 0.01
+
+
+def test_a_packed_box_has_the_vertices_of_its_block_and_the_window_that_begins_there(plan: st.TunnelPlan) -> None:
+    tunnel = Tunnel.from_plan(plan)
+    *_, pairs, window = unpacked(tunnel)
+    wall = np.asarray(tunnel.wall)
     moves = np.any(wall[:, :, 1:] != wall[:, :, :-1], axis=1)
-    count = record[:, 6].astype(int)
-    assert not any(moves[i, n - 1 :].any() for i, n in enumerate(count))
-    assert np.mean(count < wall.shape[2]) > 0.1
+    assert not any(moves[i, 2 * n - 1 :].any() for i, n in enumerate(pairs))
+    assert np.mean(2 * pairs < wall.shape[2]) > 0.1
     first = np.unique(np.asarray(tunnel.scan_first))
-    assert np.all((record[first, 7] >= 1) & (record[first, 7] <= tunnel.n_scan))
-    assert record[np.setdiff1d(np.arange(len(record)), first), 7].max() == 0
+    assert np.all((window[first] >= 1) & (window[first] <= tunnel.n_scan))
+    assert window[np.setdiff1d(np.arange(len(window)), first)].max() == 0
+    numbers = np.asarray(tunnel.packed.wall)
+    np.testing.assert_array_equal(numbers[:, : 2 * wall.shape[2]].reshape(len(wall), -1, 2), wall.swapaxes(1, 2))
+
+
+def test_counts_that_do_not_fit_stand_for_everything(plan: st.TunnelPlan) -> None:
+    """Blocks of more than 62 vertices."""
+    poses = reference.random_poses(plan, 32, np.random.default_rng(5))
+    tunnel = Tunnel.from_plan(plan, block_length=20.0, max_segments=90)
+    assert unpacked(tunnel)[5].max() == packed.ALL_PAIRS
+    ranges = fused_scan(tunnel, poses, np.ones(32, bool), 16)
+    assert reference.agreement(plan.lining("pockets").segments, poses, ranges).n_wrong == 0
