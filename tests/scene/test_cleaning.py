@@ -101,7 +101,7 @@ def test_a_parked_vehicle_is_taken_out_and_leaves_the_floor():
     assert part.end - part.start == pytest.approx(6.0, abs=0.6), along
 
 
-@pytest.mark.parametrize("depth", [1.0, 2.5, 5.0])
+@pytest.mark.parametrize("depth", [*(pytest.param(d, marks=pytest.mark.slow) for d in (1.0, 2.5)), 5.0])
 def test_a_niche_or_a_stub_does_not_pull_the_axis_aside(depth):
     result = cleaned(turned(arch(Box((13, 0), (16, 2.5 + depth), 2.5))))
     require_axis_in_the_middle(result)

@@ -95,6 +95,7 @@ def test_fewer_elements_are_used_where_more_misfit_is_allowed():
     assert counts[1] < counts[0] < 40
 
 
+@pytest.mark.slow
 def test_a_design_comes_back_from_the_axis_of_its_tunnel_to_a_millimetre_by_default(tmp_path):
     bends = [(30.0, 0.0, 0.004), (50.0, 0.004, 0.004), (25.0, 0.004, 0.0), (20.0, 0.0, 0.0), (30.0, 0.0, -0.003),
              (40.0, -0.003, -0.003)]  # fmt: skip
@@ -121,6 +122,7 @@ def tube(axis):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_noise_that_errs_alike_over_some_metres_is_no_element():
     """As in an axis out of a smoothed cloud: from point to point it is smooth, and yet it is 3 mm of noise."""
     truth, points, run = railway()
@@ -153,7 +155,7 @@ def test_noise_is_told_from_its_correlation():
     assert correlated_noise(noise, 3000)[0] == pytest.approx(0.006, rel=0.1)
 
 
-@pytest.mark.parametrize("metres", [0.0, 2.0])
+@pytest.mark.parametrize("metres", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_what_the_points_leave_open_is_what_fits_of_fresh_noise_differ_by(metres):
     """White noise, and one that errs alike over some metres; one and the same railway with all of its elements told."""
     elements, points, run = railway()

@@ -42,16 +42,19 @@ def built(points: np.ndarray, voxel: float) -> tuple[Bore, np.ndarray]:
     return bore, foot[:, 2] - 0.01 * foot[:, 0]
 
 
+SLOW = pytest.mark.slow
+
+
 @pytest.mark.parametrize(
     ("world", "sensor"),
     [
         (World(arch(5.1, 5.5, 3.0), L, PROUD), "vlp16"),
-        (World(arch(5.1, 5.5, 3.0), L, PROUD), "os1"),
-        (World(arch(5.1, 5.5, 3.0), L, PROUD), "terrestrial"),
-        (World(arch(8.7, 6.6, 3.0), L, BALLASTED), "vlp16"),
+        pytest.param(World(arch(5.1, 5.5, 3.0), L, PROUD), "os1", marks=SLOW),
+        pytest.param(World(arch(5.1, 5.5, 3.0), L, PROUD), "terrestrial", marks=SLOW),
+        pytest.param(World(arch(8.7, 6.6, 3.0), L, BALLASTED), "vlp16", marks=SLOW),
         (World(arch(8.7, 6.6, 3.0), L, BALLASTED), "terrestrial"),
         (World(arch(9.6, 7.0, 4.0), L, [(0, L, 3.8, 4.8, 0, 0.2), (0, L, -4.8, -3.8, 0, 0.2)]), "terrestrial"),
-        (World(arch(5.5, 6.0, 3.2), L, [(0, L, 1.75, 2.75, 0, 0.9)]), "vlp16"),
+        pytest.param(World(arch(5.5, 6.0, 3.2), L, [(0, L, 1.75, 2.75, 0, 0.9)]), "vlp16", marks=SLOW),
         (World(arch(8.5, 6.0, 3.2), L, [(0, L, 1.75, 4.25, 0, 1.05)]), "terrestrial"),
         (World(DRAINED, L), "terrestrial"),
     ],
@@ -65,6 +68,7 @@ def test_floor_and_height_are_right_under_track_and_beside_walkways(world, senso
     assert np.median(bore.width) == pytest.approx(np.ptp(world.outline[:, 0]), abs=0.03)
 
 
+@pytest.mark.slow
 def test_sleepers_that_stand_out_little_do_not_lift_the_ballast(monkeypatch):
     low = [box for aside in (-2.0, 2.0) for box in railway.sleepers(SPACED, 0.06, aside)]
     points = SCANS["os1"](World(arch(8.7, 6.6, 3.0), L, low))

@@ -242,6 +242,7 @@ def start(*arguments: object, limit: int | None = None) -> subprocess.Popen:
     )
 
 
+@pytest.mark.slow
 def test_a_kill_while_writing_and_a_full_disk_leave_the_previous_output_whole(cloud_file, tmp_path):
     out = tmp_path / "scene"
     out.mkdir()

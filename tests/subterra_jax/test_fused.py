@@ -33,7 +33,7 @@ def fused_scan(tunnel: Tunnel, poses: reference.Poses, wanted: np.ndarray, n_bea
     )
 
 
-@pytest.mark.parametrize("n_beams", [2, 12, 16])
+@pytest.mark.parametrize("n_beams", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 12)), 16])
 def test_the_kernels_give_the_ranges_of_the_reference(plan: st.TunnelPlan, n_beams: int) -> None:
     poses = reference.random_poses(plan, 70, np.random.default_rng(n_beams))
     tunnel = Tunnel.from_plan(plan)

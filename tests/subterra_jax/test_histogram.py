@@ -87,6 +87,7 @@ def test_a_row_of_errors_slides_by_its_share_of_the_way_and_back_again(smooth):
     assert float(mass.sum()) == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_robot_that_faces_falling_stations_slides_the_other_way(smooth):
     _, params = smooth
     filter_ = localiser(params)

@@ -178,7 +178,7 @@ def found_by(find, relief, origin, way, station):
     return find(relief, jnp.asarray(origin), jnp.asarray(way), block, jnp.full(len(origin), 30.0))
 
 
-@pytest.mark.parametrize("name", ["bend", "things"])
+@pytest.mark.parametrize("name", [pytest.param("bend", marks=pytest.mark.slow), "things"])
 def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
     rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 72, 4)
     finds = (casting._facing_in_step, fused.find_facing)

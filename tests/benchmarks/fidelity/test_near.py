@@ -80,6 +80,7 @@ def test_a_fault_is_noticed_near_it_where_it_is_noticed_in_the_whole_tunnel(good
         assert not first or first in every
 
 
+@pytest.mark.slow
 def test_random_faults_may_be_judged_near_them(good, tmp_path) -> None:
     rows = chance.run_faults(good, 2, 3, ("rails", "wall"), tmp_path / "near", near=True)
     full = chance.run_faults(good, 2, 3, ("rails", "wall"), tmp_path / "whole")
