@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
+from subterra_jax.lidar3d.boxes import Boxes, split_boxes
+from subterra_jax.lidar3d.surface import Axis, Triangles
 
 # A ray may step this far over the face of a cell or prism without leaving what the cell lists, m.
 MARGIN = 1e-3
@@ -29,7 +30,6 @@ MOST_VERTICES, MOST_STEP = 1 << (32 - 2 * STEP_BITS), (1 << STEP_BITS) - 1
 # Unit in which a cell says how near its triangles come to the axis, m, and the most triangles of a cell.
 NEAR_UNIT, MOST_LISTED = 1e-3, (1 << 16) - 1
 _SHORTEST = 0.25  # m, of a block
-_SQUARE = 1e-6  # m, and share, by which a box may be askew
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,59 +194,6 @@ def _sort(axis: Axis, surface: Triangles, boxes: Boxes, block_length: float, n_x
     return Cells(
         blocks, low, size, unit, np.array(prism), cells, entries, first_vertex, vertices, first_box, box, top + MARGIN
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class Boxes:
-    """Boxes: middles, m, `(k, 3)`, and halves of their three edges as vectors, m, `(k, 3, 3)`."""
-
-    centre: Float[np.ndarray, "k 3"]
-    half: Float[np.ndarray, "k 3 3"]
-
-    def pick(self, which: np.ndarray) -> Boxes:
-        """Return some of the boxes."""
-        return Boxes(self.centre[which], self.half[which])
-
-    def corners(self) -> Float[np.ndarray, "k 8 3"]:
-        """Return the corners, m."""
-        return self.centre[:, None] + np.einsum("ci,kij->kcj", BOX_CORNERS, self.half)
-
-    def seen_from(self, centre: Float[np.ndarray, 3], turn: Float[np.ndarray, "3 3"]) -> Boxes:
-        """Return the boxes in another frame."""
-        return Boxes((self.centre - centre) @ turn.T, self.half @ turn.T)
-
-    def rows(self) -> Float[np.ndarray, "k 12"]:
-        """Return the boxes as `Cells.box` has them."""
-        rows = self.half / np.sum(self.half**2, axis=-1, keepdims=True)
-        return np.concatenate([rows, np.einsum("kij,kj->ki", rows, self.centre)[..., None]], axis=-1).reshape(-1, 12)
-
-
-def split_boxes(surface: Triangles) -> tuple[Triangles, Boxes]:
-    """Return a surface without the boxes in it, and these.
-
-    Boxes are runs of 12 triangles between 8 vertices as `read_scene` makes them of a scene's boxes.
-    """
-    faces, vertices, n = surface.faces, surface.vertices, len(BOX_FACES)
-    nothing = Boxes(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    if len(faces) < n:
-        return surface, nothing
-    # The first corner of such a run has the lowest number.
-    start = np.flatnonzero(
-        np.all(faces[: len(faces) - n + 1] - faces[: len(faces) - n + 1, :1] == BOX_FACES[0], axis=1)
-    )
-    base = faces[start, 0]
-    start = start[base + len(BOX_CORNERS) <= len(vertices)]
-    run = faces[start[:, None] + np.arange(n)] - faces[start, 0][:, None, None]
-    start = start[np.all(run == BOX_FACES, axis=(1, 2))]
-    corner = vertices[faces[start, 0][:, None] + np.arange(len(BOX_CORNERS))]
-    found = Boxes(corner.mean(axis=1), np.einsum("ci,kcj->kij", BOX_CORNERS, corner) / len(BOX_CORNERS))
-    size = np.sum(found.half**2, axis=-1)
-    leaning = [np.abs(np.sum(found.half[:, i] * found.half[:, (i + 1) % 3], axis=-1)) for i in range(3)]
-    true = np.abs(found.corners() - corner).max(axis=(1, 2), initial=0.0) < _SQUARE
-    true &= (size.min(axis=1, initial=np.inf) > 0.0) & (np.max(leaning, axis=0) < _SQUARE * size.max(axis=1))
-    kept = np.ones(len(faces), bool)
-    kept[(start[true][:, None] + np.arange(n)).ravel()] = False
-    return Triangles(vertices, faces[kept]), found.pick(true)
 
 
 def _parts_of_blocks(axis: Axis, parts: Float[np.ndarray, "k n 3"], blocks: Blocks) -> list[Int[np.ndarray, f]]:

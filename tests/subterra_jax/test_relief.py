@@ -5,6 +5,7 @@ import pytest
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.lidar3d import cells, relief, surface
+from subterra_jax.lidar3d.boxes import split_boxes
 from subterra_jax.lidar3d.relief import Relief
 from tests.subterra_jax import surfaces
 
@@ -63,7 +64,7 @@ def test_boxes_are_told_from_other_triangles():
     box = surface.Triangles(surface.BOX_CORNERS * [0.2, 0.3, 0.4] + [1.0, 2.0, 3.0], surface.BOX_FACES)
     leaning = surface.Triangles(box.vertices + 0.5 * box.vertices[:, [1, 2, 0]], surface.BOX_FACES)
     tube = surface.Triangles(*surfaces.tube(surfaces.axis_of(10.0), 2.0, 8, 5))
-    rest, boxes = cells.split_boxes(surface.join_surfaces([tube, box, leaning, box, tube]))
+    rest, boxes = split_boxes(surface.join_surfaces([tube, box, leaning, box, tube]))
     assert len(rest.faces) == 2 * len(tube.faces) + 12
     np.testing.assert_allclose(boxes.centre, [[1.0, 2.0, 3.0]] * 2)
     np.testing.assert_allclose(np.sort(np.abs(boxes.half).max(axis=1), axis=1), [[0.2, 0.3, 0.4]] * 2)
