@@ -183,7 +183,7 @@ JOBS = {
 }  # fmt: skip
 
 _CPU, _H200 = "2 CPU cores, 2026-11-21", "one H200, 2026-11-21"
-_CPU_LATER = "2 CPU cores, 2026-11-25"
+_CPU_LATER, _CPU_BOARD = "2 CPU cores, 2026-11-25", "2 CPU cores, 2026-11-24"
 _UNIVERSAL = (
     "scene.build build/survey-universal/survey.bag --trajectory build/survey-universal/groundtruth.tum "
     "--provenance simulated --name subterra-universal --out build/subterra-universal"
@@ -213,6 +213,7 @@ _SHORT = (
 _WALK, _B2 = "train.walk --preset gpu --out out/walk", "benchmarks.b2 --robots 8192"
 _TRAVERSE = "benchmarks.b2_traverse --robots 100 --agent B2Traverse-v0"
 _FOUR = "train.navigate --task Subterra/Traverse-v0 --preset gpu --parts 4 --out out/four"
+_BOARD = "benchmarks.openboard --tasks StopAt --splits test-unseen --out out/openboard --agents"
 _GYM = (
     'timeit -n 2000 -r 5 -s \'import gymnasium; env = gymnasium.make("subterra_jax:Subterra/Traverse-v0"); '
     "env.reset(); action = env.action_space.low; env.step(action)' 'env.step(action)'"
@@ -225,7 +226,7 @@ _TURNED = "351 m of rings that turn"
 _SUITE, _STEP = "fidelity suite", "whole environment step"
 _LEGS, _THROUGH = "Unitree B2 on sleepers", "100 of them through"
 _SPREAD, _FIVE_SEEDS, _ONE_POLICY = "robots spread along the tunnel", "five seeds of PPO on 351 m", "family of tunnels"
-_OBSTACLES, _PLACE = "T3 among boxes", "T5: report the place"
+_OBSTACLES, _PLACE, _OPEN = "T3 among boxes", "T5: report the place", "T1 of the open world"
 CLAIMS = (
     # row, text, tolerance, bound, and where the number comes from
     Claim(_GIVEN, "centreline 0.3 cm", 0.1, job="reconstruction", read=_survey("given", "lateral_rmse", 100.0)),
@@ -298,6 +299,10 @@ CLAIMS = (
     Claim(_LEGS, "falls 0.4 %", 0.6, "at most", command=_WALK, measured=_H200),
     Claim(_LEGS, "0.04 m/s", 0.01, "at most", command=_WALK, measured=_H200),
     Claim(_LEGS, "0.02 rad/s", 0.01, "at most", command=_WALK, measured=_H200),
+    Claim(_OPEN, "71 %", 5.0, command=f"{_BOARD} locate-transformer", measured=_CPU_BOARD),
+    Claim(_OPEN, "86 %", 4.0, command=f"{_BOARD} locate-spin --sensor spin16x64", measured=_CPU_BOARD),
+    Claim(_OPEN, "46 %", 5.0, command=f"{_BOARD} fused ring-count ring-filter scan-matching", measured=_CPU_BOARD),
+    Claim(_OPEN, "99 %", 1.0, command=f"{_BOARD} ceiling", measured=_CPU_BOARD),
     Claim(_LEGS, "190 s", 30.0, "at most", command=_WALK, measured=_H200),
     Claim(_LEGS, "5.5 M physics steps/s", 0.3, "at least", command=_B2, measured=_H200),
     Claim(_THROUGH, "100 arrive", 1.0, command=_TRAVERSE, measured=_H200),
@@ -321,5 +326,5 @@ SETTINGS = (
     (_CLOUDS, "within 10 cm"), (_STEP, "H200"), (_STEP, "N = 65,536"), ("planar LiDAR against embree", "within 1 cm"),
     (_FIVE_SEEDS, "90 % coverage and 100 % success of the last 100 episodes"),
     ("learnt from a teacher on a CPU", "500 listed episodes"), (_LEGS, "H200"), (_LEGS, "8,192 robots"),
-    ("PPO on 60 m", "90 % coverage and 100 % success"),
+    ("PPO on 60 m", "90 % coverage and 100 % success"), (_OPEN, "within 1 m"), (_OPEN, "300 episodes"),
 )  # fmt: skip
