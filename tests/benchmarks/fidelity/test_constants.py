@@ -10,7 +10,7 @@ from benchmarks.fidelity import judge, scoring, table
 from benchmarks.fidelity.registry import Value
 
 # Whoever changes a threshold, weight, gate, limit or row on purpose writes the new digest here, with the reason.
-DIGEST = "a845f17e01c2f08cc0e0c664ba51c98a3fcc0e063c35fa4329617f4b0f826809"
+DIGEST = "51b73302c677031478c7a7f4dcd274030972746eafffb1f9ed7e39e02030519f"
 TESTS = Path(__file__).parent
 
 

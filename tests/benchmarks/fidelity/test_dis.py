@@ -1,7 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from benchmarks.fidelity.categories.sensor import middle_range
+from benchmarks.fidelity.controls.catalogue import thin_beams
 from benchmarks.fidelity.derive.clouds import fit_planes, mean_entropy, voxel_map, voxel_wasserstein
 from tests.benchmarks.fidelity.judged import category, judged, measure, obstructed, raw
 
@@ -50,6 +54,26 @@ def test_a_local_plane_knows_its_normal_and_its_noise():
 @pytest.mark.parametrize("id", ["range_ks", "range_w1", "elevation_w1", "azimuth_profile_rmse", "awd", "c2st_auc"])
 def test_a_wider_tube_shifts_the_distribution(id):
     assert raw(id, judged(width=5.9)) > 1.5 * raw(id, judged())
+
+
+def test_the_middle_of_ranges_with_gaps_hardly_moves_with_half_of_the_beams():
+    rng = np.random.default_rng(4)
+    rings = np.repeat(4.0 * 1.2 ** np.arange(10), 100)  # m: where the rings of a scanner meet a bore
+    measured, cast = (rings + 0.03 * rng.normal(size=rings.size) for _ in range(2))
+    halves = [rng.random(rings.size) < 0.5 for _ in range(200)]
+
+    def spread(middle):
+        return np.std([middle(measured[half]) - middle(cast[half]) for half in halves])
+
+    assert middle_range(measured) == pytest.approx(np.median(rings), rel=0.05)
+    assert spread(middle_range) < 0.005
+    assert spread(middle_range) < 0.5 * spread(np.median)
+
+
+def test_half_of_the_beams_hardly_move_the_profile_over_azimuth():
+    case = judged()
+    half = replace(case, hold=thin_beams(case.hold, np.random.default_rng(5)), cache={})
+    assert raw("azimuth_profile_rmse", half) == pytest.approx(raw("azimuth_profile_rmse", case), abs=0.003)
 
 
 def test_what_is_not_recorded_is_missing():
