@@ -120,6 +120,7 @@ _SIGMA = (0.15, 1.5)  # m along, columns around
 _NEAR_WALL = 0.05  # cells further than this from the first wall are pockets or clutter
 _ON_WALL = 0.035
 _LARGE_HOLE = 4.0  # cells
+_GOES_ON = 1.0  # m that a wall goes on as it was, where it is unseen from there to the end
 _ALONG = 1.25  # m before and behind a cell that tell an edge from a pocket
 _MOSTLY, _MIN_CELLS = 0.7, 6  # share of the cells seen, and how many
 _WIDE = 6  # columns
@@ -203,7 +204,7 @@ def _first_wall(points: _Points, coarse: Grid, fine: Grid, floors: Floors | None
     wall = unroll.cell_medians(coarse, coarse.cell(points.station, points.angle), points.radius)
     if np.isfinite(wall).mean() < _MIN_COVERAGE:
         raise FitError(f"only {np.isfinite(wall).mean():.0%} of the bore's surface was seen; at least half is needed")
-    wall = fill_sides(unroll.fill_holes(wall, _LARGE_HOLE), coarse.angle)
+    wall = fill_sides(unroll.fill_holes(wall, _LARGE_HOLE), coarse.angle, round(_GOES_ON / coarse.step))
     window = (round(_MEDIAN_WINDOW[0] / coarse.step) // 2 * 2 + 1, _MEDIAN_WINDOW[1])
     along = unroll.median_smooth(unroll.fill_nearest(wall), (window[0], 1))
     wall = unroll.median_smooth(unroll.fill_nearest(wall), window)

@@ -210,12 +210,16 @@ def _warn_of_unseen(coverage: Coverage) -> list[Warned]:
     return [
         Warned(
             "unseen",
-            f"{name_span(piece.start, piece.end)} hardly a return lies on the {piece.sides} "
+            f"{name_span(piece.start, piece.end)} hardly a return lies {_on(piece.sides)} "
             f"({piece.share:.0%} of the girth, {piece.area:.0f} m²): the wall there is a guess",
             piece.start, piece.end,
         )
         for piece in coverage.pieces[:_LISTED] if piece.share > _WARN_UNSEEN
     ]  # fmt: skip
+
+
+def _on(sides: str) -> str:
+    return sides if sides == "all around" else f"on the {sides}"
 
 
 def _warn_of_places(places: tuple[Place, ...], tolerance: float) -> list[Warned]:

@@ -29,6 +29,37 @@ def test_a_gap_in_a_wall_is_closed_by_a_line_and_those_of_crown_and_floor_stay()
         np.testing.assert_allclose(filled[np.isfinite(filled)], square[np.isfinite(filled)], atol=1e-9)
 
 
+def test_a_wall_goes_on_to_an_end_as_it_was_before_and_no_further_than_told():
+    angle = -np.pi + 2 * np.pi * (np.arange(120) + 0.5) / 120
+    square = 2.0 / np.maximum(np.abs(np.cos(angle)), np.abs(np.sin(angle)))
+    walls = np.repeat(square[None], 10, axis=0)
+    gap = (angle > np.deg2rad(-60)) & (angle < np.deg2rad(50))  # from the floor, past both corners, to the ceiling
+    walls[4:, gap] = np.nan
+    line = fill_sides(walls, angle)[4:, gap]
+    assert (square[gap] - line).max() > 0.5, "the line from floor to ceiling cuts the wall off"
+    filled = fill_sides(walls, angle, 2)
+    np.testing.assert_array_equal(filled[:6], np.repeat(square[None], 6, axis=0))
+    np.testing.assert_array_equal(filled[6:, gap], line[2:])
+    np.testing.assert_array_equal(fill_sides(walls[::-1], angle, 2), filled[::-1])
+    walls[-1] = square  # seen again: no end
+    np.testing.assert_array_equal(fill_sides(walls, angle, 2)[4:9, gap], line[:5])
+
+
+def test_the_bore_keeps_its_width_where_a_scan_ends_aslant(monkeypatch):
+    points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
+    unseen = (points[:, 1] > -1.0) & (points[:, 0] > L - 0.9 - 0.2 * points[:, 1])
+    cleaned = clean_cloud(thinned(points[~unseen] + PLACE, 0.07), CleaningConfig(), CentrelineConfig())
+
+    def off() -> float:
+        return float(
+            np.abs(bore_from_sections(cleaned.axis, fit_sections(cleaned.cloud, cleaned.axis)).width - 5.5).max()
+        )
+
+    assert off() < 0.03
+    monkeypatch.setattr(section, "_GOES_ON", 0.0)
+    assert off() > 0.2
+
+
 def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypatch):
     points = ARCH.scan(railway.terrestrial(), railway.stations(L), 0.004) - PLACE
     unseen = (points[:, 1] > 2.70) & (points[:, 2] - 0.01 * points[:, 0] < 3.2)
@@ -38,7 +69,7 @@ def test_a_wall_that_nobody_saw_stands_straight_between_crown_and_floor(monkeypa
         return bore_from_sections(cleaned.axis, fit_sections(cleaned.cloud, cleaned.axis)).width[8:-8]
 
     assert np.abs(width() - 5.5).max() < 0.10
-    monkeypatch.setattr(section, "fill_sides", lambda wall, angle: wall)
+    monkeypatch.setattr(section, "fill_sides", lambda wall, angle, reach: wall)
     assert np.median(width()) > 6.0
 
 

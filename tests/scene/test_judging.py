@@ -131,6 +131,15 @@ def test_an_unseen_wall_is_named_with_its_side_and_its_stations(bore):
     assert "left wall" in judgement.warnings[0].text
 
 
+def test_a_bore_unseen_all_around_is_told_in_plain_words(bore):
+    station, lateral, upward = on_wall(bore)
+    hidden = (station > 8) & (station < 12)
+    judgement = judge_bore(
+        bore, cloud_of(about(bore, *(v[~hidden] for v in (station, lateral, upward)))), JudgingConfig()
+    )
+    assert "from 8 to 12 m hardly a return lies all around (" in judgement.warnings[0].text
+
+
 def test_an_unseen_floor_is_named_and_told_station_by_station(bore):
     station, lateral, upward = on_wall(bore)
     hidden = (upward < -3.1) & (station > 8) & (station < 18)

@@ -95,9 +95,11 @@ def straight(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
     return np.column_stack([0.8 * time, 0.05 * np.sin(3.0 * time), 1.5 + 0 * time]), Rotation.from_euler("zyx", sway)
 
 
-@pytest.fixture(scope="module")
-def spun(tmp_path_factory):
-    """A straight walk of 26 m from a mouth on, with 16 rings up to 15° off level, which see the floor 6 m off."""
+def walk(folder: Path, mouth: float) -> Path:
+    """A bag of 26 m straight on, with 16 rings up to 15° off level, which see the floor 6 m off.
+
+    What lies before the mouth, m from the start, returns nothing.
+    """
     up, turn = np.meshgrid(np.sin(np.deg2rad(np.arange(-15.0, 16.0, 2.0))), np.linspace(-np.pi, np.pi, 800))
     ray = np.column_stack([np.sqrt(1.0 - up.ravel() ** 2)[:, None] * np.column_stack([np.cos(turn.ravel()),
                            np.sin(turn.ravel())]), up.ravel()])  # fmt: skip
@@ -105,9 +107,15 @@ def spun(tmp_path_factory):
     for time in np.arange(26) * 1.25:
         position, attitude = straight(time + 0.1 * np.arange(len(ray)) / len(ray))
         distance = walls(position, attitude.apply(ray)) + rng.normal(0, 0.02, len(ray))
-        inside = position[:, 0] + attitude.apply(ray)[:, 0] * distance > 0.0  # the walk begins at the mouth
+        inside = position[:, 0] + attitude.apply(ray)[:, 0] * distance > mouth
         scans.append((100.0 + time, (distance[:, None] * ray)[inside].astype(np.float32)))
-    with Recording(write_bag(tmp_path_factory.mktemp("spun") / "walk.bag", scans)) as opened:
+    return write_bag(folder / "walk.bag", scans)
+
+
+@pytest.fixture(scope="module")
+def spun(tmp_path_factory):
+    """A straight walk of 26 m from a mouth on."""
+    with Recording(walk(tmp_path_factory.mktemp("spun"), 0.0)) as opened:
         yield opened
 
 
@@ -129,6 +137,16 @@ def test_a_pitched_mount_shows_in_the_floor_ahead_and_behind(spun, bore, turn, s
     assert [w.code for w in doubt_bore(bore, check.facts, {}, surveyed=True)] == (["poses"] if said else [])
     if said:
         assert abs(check.tilt.apart - np.sin(np.deg2rad(abs(turn[1]))) * 16.0) < 0.2  # some 8 m each way
+
+
+def test_a_pitched_mount_shows_in_a_walk_that_begins_outside(tmp_path, monkeypatch):
+    with Recording(walk(tmp_path, 10.0)) as entering:  # after 14 m it has seen nothing yet of the floor behind it
+        assert find_tilt(entering, along((0, 0, 0))) is None
+        found = find_tilt(entering, along((0, -3, 0)))
+        assert found is not None
+        assert "+3.0° in pitch" in found.words
+        monkeypatch.setattr(bothways, "_FIRST", 14)
+        assert find_tilt(entering, along((0, -3, 0))) is None, "it was taken for a LiDAR that never looks back"
 
 
 def test_a_fan_that_sees_nothing_behind_tells_no_tilt(spun, monkeypatch):
