@@ -10,9 +10,9 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
-from subterra_jax.lidar3d import beams, casting, fused, march, relay, surface
+from subterra_jax.lidar3d import beams, casting, fused, march, relay
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
-from subterra_jax.lidar3d.surface import Axis, Triangles
+from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
 
 RADIUS, LENGTH = 2.0, 60.0
@@ -193,7 +193,7 @@ def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
 @pytest.mark.parametrize("find", [casting._facing_in_step, fused.find_facing])
 def test_normals_are_those_of_the_faces_of_a_box_and_of_the_tube_behind_it(find):
     axis, middle = surfaces.axis_of(LENGTH), np.float32([20.0, 0.5, -1.0])
-    box = middle + surface.BOX_CORNERS * [0.25, 0.2, 0.3], surface.BOX_FACES
+    box = middle + BOX_CORNERS * [0.25, 0.2, 0.3], BOX_FACES
     relief = relief_of(axis, surfaces.together(surfaces.tube(axis, RADIUS, 360, 31), box))
     side = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
     origin = middle + 0.7 * np.concatenate([side, side]) + np.float32([0.013, 0.017, 0.019])
