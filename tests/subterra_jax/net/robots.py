@@ -39,7 +39,7 @@ def advanced(id, state, action, key=0):
 
 
 def observed(id, state, key=0):
-    """What all robots observe, by name."""
+    """Observations of all robots, by name."""
     env, params, *_, observe = made(id)
     flat = np.asarray(observe(state, env.draw_step(jax.random.key(key), (len(state.station),), params), params))
     return {name: flat[:, part] for name, part in env.fields(params).items()}

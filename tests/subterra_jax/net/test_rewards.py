@@ -83,7 +83,7 @@ def test_the_terms_of_eq_1_are_those_that_are_written_down():
 
 
 def reward_cases_of_t0(id):
-    """The same of T0, on the way and where nine tenths are covered."""
+    """Cases of T0: on the way, and where nine tenths are covered."""
     n, length = FEW, float(made(id)[1].tunnel.length)
     command = np.tile([1.5, 0.2], (n, 1))
     for station in (100.0, 0.9 * length):
