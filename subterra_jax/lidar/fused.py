@@ -4,14 +4,16 @@ The same boxes and the same segments as in `cast`, with nothing written to memor
 beam: for 65,536 environments XLA moves about a gigabyte a step where this moves 25 MB. `cast` stays the reference, and
 is what runs everywhere else.
 
-Robots in different tunnels read different blocks, so a box is 16 bytes, read by one instruction, and each robot reads
-the boxes and the vertices that it needs and no further ones; see `tunnel.packed`.
+Robots in different tunnels read different blocks, which a chip's cache does not hold, so time goes by waiting for
+memory. A few neighbouring threads therefore serve one robot, and read its boxes and vertices side by side; each robot
+reads those that it needs and no further ones; see `tunnel.packed`.
 """
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,12 +25,14 @@ from subterra_jax.lidar.cast import NOTHING
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.packed import ALL_PAIRS, ALL_WINDOW, WINDOW_BITS, WORDS, Packed, high, low, pack
 
-# Environments of one program: one warp, one environment a thread, so that a program in which nobody looks on is short.
-_ROWS = 32
+# Scans of one program: one warp of 32 threads, so that a program in which nobody looks on is short.
+_ROWS = 4
+# Threads that look at the boxes of one scan.
+_BOX_LANES = 8
+# Beams of one scan that meet walls at the same time, and threads of each.
+_BEAMS, _WALL_LANES = 2, 4
 # Lines whose nearest boxes fit into one thread's registers.
 _MOST_LINES = 8
-# Beams of one program, one after the other.
-_MOST_BEAMS = 2
 # Half thickness of a box that no beam enters, m.
 _NONE = -1e30
 
@@ -54,7 +58,7 @@ def scan(
         position: Positions of the LiDAR, tunnel frame, m.
         heading: Its headings, rad.
         first: First block of each window.
-        wanted: Which scans to take. Where none of 32 neighbours is wanted they cost next to nothing, and hold anything.
+        wanted: Which scans to take. Where none of 4 neighbours is wanted they cost next to nothing, and hold anything.
         range_max: Largest range, m.
         bearing: Of each beam from the heading, rad; the second half opposes the first.
 
@@ -64,40 +68,72 @@ def scan(
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    count, n_beams, k = position.shape[0], len(bearing), tunnel.n_candidates
+    interpret = jax.default_backend() != "gpu"
+    n_rows = 8 * _ROWS if interpret else _ROWS  # the interpreter takes programs one after another
+    count, n_beams, n_best = position.shape[0], len(bearing), tunnel.n_candidates
     rows = [
-        jnp.pad(row, (0, -count % _ROWS), mode="edge")
+        jnp.pad(row, (0, -count % n_rows), mode="edge")
         for row in (first, wanted.astype(jnp.int32), *position.T, heading)
     ]
     n, n_lines = rows[0].shape[0], n_beams // 2
     width = max(w for w in range(1, _MOST_LINES + 1) if n_lines % w == 0)
-    group = max(w for w in range(1, _MOST_BEAMS + 1) if n_beams % w == 0)
     turn = jnp.asarray(np.concatenate([np.cos(bearing), np.sin(bearing)]), jnp.float32)
     packed = packed_blocks(tunnel)
     box, wall = packed.box.reshape(-1), packed.wall.reshape(-1)
-    row, of_second = pl.BlockSpec((_ROWS,), lambda i, _: (i,)), pl.BlockSpec((_ROWS,), lambda _, i: (i,))
+    beams = _Beams(n_beams, n_best, tunnel.n_scan, tunnel.box.shape[1], packed.wall.shape[1], n_rows)
     whole = pl.BlockSpec(memory_space=pl.ANY)
-    warp = triton.CompilerParams(num_warps=1, num_stages=1)
-    key = pl.pallas_call(
-        partial(_boxes_kernel, tunnel=tunnel, n_beams=n_beams, width=width),
-        grid=(n // _ROWS, n_lines // width),
-        in_specs=[row] * 5 + [whole] * 2,
-        out_specs=pl.BlockSpec((k, n_beams, _ROWS), lambda i, _: (0, 0, i)),
-        out_shape=jax.ShapeDtypeStruct((k, n_beams, n), jnp.int32),
-        compiler_params=warp,
-        interpret=jax.default_backend() != "gpu",
+    call = partial(
+        pl.pallas_call,
+        out_specs=whole,
+        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+    )
+    key = call(
+        partial(_boxes_kernel, beams=beams, width=width),
+        grid=(n // n_rows, n_lines // width),
+        in_specs=[whole] * 7,
+        out_shape=jax.ShapeDtypeStruct((n * n_best * n_beams,), jnp.int32),
     )(*rows, turn, box)
-    ranges = pl.pallas_call(
-        partial(_hits_kernel, tunnel=tunnel, n_numbers=packed.wall.shape[1], n_beams=n_beams, width=group),
-        # Beams of the same scans one after another: they meet the same few blocks.
-        grid=(n_beams // group, n // _ROWS),
-        in_specs=[pl.BlockSpec((k, group, _ROWS), lambda j, i: (0, j, i))] + [of_second] * 5 + [whole] * 4,
-        out_specs=pl.BlockSpec((group, _ROWS), lambda j, i: (j, i)),
-        out_shape=jax.ShapeDtypeStruct((n_beams, n), jnp.float32),
-        compiler_params=warp,
-        interpret=jax.default_backend() != "gpu",
+    ranges = call(
+        partial(_hits_kernel, beams=beams),
+        grid=(n // n_rows,),
+        in_specs=[whole] * 10,
+        out_shape=jax.ShapeDtypeStruct((n * n_beams,), jnp.float32),
     )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), box, wall)
-    return ranges[:, :count].T
+    return ranges.reshape(n, n_beams)[:count]
+
+
+class _Beams(NamedTuple):
+    """Sizes of the arrays that both kernels read.
+
+    Attributes:
+        n: Beams of a scan.
+        n_best: Boxes of a beam that are sorted by where it enters them.
+        n_scan: Blocks in the largest window.
+        n_blocks: All blocks.
+        n_numbers: Numbers of the vertices of a block.
+        n_rows: Scans of one program.
+    """
+
+    n: int
+    n_best: int
+    n_scan: int
+    n_blocks: int
+    n_numbers: int
+    n_rows: int
+
+    @property
+    def number_bits(self) -> int:
+        """Bits that the number of a block within its window takes."""
+        return (self.n_scan - 1).bit_length()
+
+    def entry(self, key):
+        """Return the distance at which a box is entered, m, of its key."""
+        return lax.bitcast_convert_type(key & jnp.int32(-(1 << self.number_bits)), jnp.float32)
+
+    def key(self, entry, number):
+        """Return the distance at which a box is entered and its number in one sortable integer."""
+        return lax.bitcast_convert_type(entry, jnp.int32) & jnp.int32(-(1 << self.number_bits)) | number
 
 
 def packed_blocks(tunnel: Tunnel) -> Packed:
@@ -145,13 +181,15 @@ def length_of(x, y):
     return squared * lax.rsqrt(squared + 1e-20)
 
 
-def _number_bits(tunnel: Tunnel) -> int:
-    """Bits that the number of a block within its window takes."""
-    return (tunnel.n_scan - 1).bit_length()
+def _rows_of(refs, index):
+    """Return the entries of several arrays at each thread's row."""
+    from jax.experimental.pallas import triton
+
+    return tuple(triton.load(ref.at[index]) for ref in refs)
 
 
 def _direction(turn_ref, beam, n_beams: int, cos, sin):
-    """Unit vectors of one beam in many scans, from the table of bearings and the headings."""
+    """Unit vectors of a beam in many scans, from the table of bearings and the headings."""
     from jax.experimental.pallas import triton
 
     along, across = triton.load(turn_ref.at[beam]), triton.load(turn_ref.at[n_beams + beam])
@@ -159,40 +197,35 @@ def _direction(turn_ref, beam, n_beams: int, cos, sin):
 
 
 def _boxes_kernel(
-    first_ref,
-    wanted_ref,
-    x_ref,
-    y_ref,
-    heading_ref,
-    turn_ref,
-    box_ref,
-    key_ref,
-    *,
-    tunnel: Tunnel,
-    n_beams: int,
-    width: int,
+    first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, box_ref, key_ref, *, beams: _Beams, width: int
 ):
     """The first boxes along `width` lines, ahead and behind: entry distance and number in one integer, nearest first.
 
+    Each thread has every eighth box of its scan, and keeps the nearest of those; the threads of a scan then compare.
     `cast._entries` has the geometry.
     """
     from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
 
-    line = pl.program_id(1) * width
+    shape = beams.n_rows, _BOX_LANES
+    row = pl.program_id(0) * beams.n_rows + lax.broadcasted_iota(jnp.int32, shape, 0)
+    lane, line = lax.broadcasted_iota(jnp.int32, shape, 1), pl.program_id(1) * width
+    wanted = triton.load(wanted_ref.at[row])
 
-    @pl.when(jnp.max(wanted_ref[...]) > 0)
+    @pl.when(jnp.max(wanted) > 0)
     def look() -> None:
-        n_best, n_bits = tunnel.n_candidates, _number_bits(tunnel)
-        first, x, y, heading = first_ref[...], x_ref[...], y_ref[...], heading_ref[...]
+        first, x, y, heading = _rows_of((first_ref, x_ref, y_ref, heading_ref), row)
         cos, sin = jnp.cos(heading), jnp.sin(heading)
-        lines = [_direction(turn_ref, line + j, n_beams, cos, sin) for j in range(width)]
+        lines = [_direction(turn_ref, line + j, beams.n, cos, sin) for j in range(width)]
+        window = all_if_full(unpack(load_words(box_ref, WORDS * first))[-1], ALL_WINDOW, beams.n_scan)
 
         def load(number):
             return load_words(box_ref, WORDS * (first + number), number < window)
 
-        def meet(number, carry):
+        def meet(i, carry):
             best, words = carry
-            following = load(number + 1)  # while this one is worked on
+            number = lane + i * _BOX_LANES
+            following = load(number + _BOX_LANES)  # while this one is worked on
             m_x, m_y, e_x, e_y, thickness, _, _ = unpack(words)
             thickness = jnp.where(number < window, thickness, _NONE)
             length = length_of(e_x, e_y)
@@ -208,20 +241,27 @@ def _boxes_kernel(
                 crosses = jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness
                 # A reciprocal from the special function unit, good to 1e-6: less than the bits that the number takes.
                 root = lax.rsqrt(size + 1e-20)
-                key = lax.bitcast_convert_type(to_face * root * root, jnp.int32) & jnp.int32(-(1 << n_bits)) | number
-                key = jnp.where(crosses, key, NOTHING)
+                key = jnp.where(crosses, beams.key(to_face * root * root, number), NOTHING)
                 for ahead in (facing > 0.0, facing < 0.0):
                     merged.append(jnp.where(ahead | between, key, NOTHING))
             return tuple(_inserted(best[i], merged[i]) for i in range(2 * width)), following
 
-        nothing = tuple(jnp.full(first.shape, NOTHING) for _ in range(n_best))
-        begin = load_words(box_ref, WORDS * first)
-        window = all_if_full(unpack(begin)[-1], ALL_WINDOW, tunnel.n_scan)
-        best, _ = lax.fori_loop(0, jnp.max(window), meet, ((nothing,) * (2 * width), begin))
-        for j in range(width):
-            for k in range(n_best):
-                key_ref[k, line + j, :] = best[2 * j][k]
-                key_ref[k, n_beams // 2 + line + j, :] = best[2 * j + 1][k]
+        nothing = tuple(jnp.full(shape, NOTHING) for _ in range(_kept(beams.n_best)))
+        n_rounds = (jnp.max(window) + _BOX_LANES - 1) // _BOX_LANES
+        best, _ = lax.fori_loop(0, n_rounds, meet, ((nothing,) * (2 * width), load(lane)))
+        for sense in range(2):
+            first_boxes = [_first_of_all(kept, beams.n_best) for kept in best[sense::2]]
+            for k in range(beams.n_best):
+                key = jnp.zeros(shape, jnp.int32)
+                for j in range(width):
+                    key = jnp.where(lane == j, first_boxes[j][k], key)
+                beam = sense * (beams.n // 2) + line + lane
+                triton.store(key_ref.at[(row * beams.n_best + k) * beams.n + beam], key, mask=lane < width)
+
+
+def _kept(n_best: int) -> int:
+    """Boxes that each thread keeps of a beam: a few, since neighbours in the tunnel are other threads'."""
+    return min(n_best, 2 if n_best <= 3 else 3)
 
 
 def _inserted(best, key):
@@ -233,59 +273,90 @@ def _inserted(best, key):
     return tuple(kept)
 
 
+def _first_of_all(kept, n_best: int):
+    """Return the smallest keys of all threads of each scan, in order.
+
+    A thread that has given all that it kept may have had more behind the last: it gives its last again and again, so
+    that nothing behind that is taken for known.
+    """
+    smallest = []
+    for _ in range(n_best):
+        smallest.append(jnp.min(kept[0], axis=1, keepdims=True))
+        given = kept[0] == smallest[-1]
+        kept = (*(jnp.where(given, after, one) for one, after in itertools.pairwise(kept)), kept[-1])
+    return smallest
+
+
 def _hits_kernel(
     key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, box_ref, wall_ref, range_ref,
-    *, tunnel: Tunnel, n_numbers: int, n_beams: int, width: int,
+    *, beams: _Beams,
 ):  # fmt: skip
-    """The nearest segment along one beam of many scans, in the blocks whose boxes it enters before that segment."""
+    """The nearest segment along each beam of many scans, in the blocks whose boxes it enters before that segment."""
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    first_beam = pl.program_id(0) * width
+    shape = beams.n_rows, _BEAMS, _WALL_LANES
+    row = pl.program_id(0) * beams.n_rows + lax.broadcasted_iota(jnp.int32, shape, 0)
+    lane = lax.broadcasted_iota(jnp.int32, shape, 2)
+    wanted = triton.load(wanted_ref.at[row]) > 0
 
-    @pl.when(jnp.max(wanted_ref[...]) > 0)
+    @pl.when(_any(wanted))
     def look() -> None:
-        n_blocks, n_bits = tunnel.box.shape[1], _number_bits(tunnel)
-        first, x, y, heading = first_ref[...], x_ref[...], y_ref[...], heading_ref[...]
+        first, x, y, heading = _rows_of((first_ref, x_ref, y_ref, heading_ref), row)
         cos, sin = jnp.cos(heading), jnp.sin(heading)
-        wanted = wanted_ref[...] > 0
+        limit = jnp.full(shape, triton.load(limit_ref.at[jnp.int32(0)]))
 
-        def beam(j, _):
-            direction = _direction(turn_ref, first_beam + j, n_beams, cos, sin)
-            look_into = partial(_look_into, box_ref, wall_ref, n_numbers, x, y, direction)
-            nearest = jnp.full(first.shape, triton.load(limit_ref.at[jnp.int32(0)]))
-            for k in range(tunnel.n_candidates):
-                key = key_ref[k, j, :]
-                entry = lax.bitcast_convert_type(key & jnp.int32(-(1 << n_bits)), jnp.float32)
+        def some_beams(j, _):
+            beam = j * _BEAMS + lax.broadcasted_iota(jnp.int32, shape, 1)
+            direction = _direction(turn_ref, beam, beams.n, cos, sin)
+            look_into = partial(_look_into, box_ref, wall_ref, beams.n_numbers, x, y, direction)
+            nearest = limit
+            for k in range(beams.n_best):
+                key = triton.load(key_ref.at[(row * beams.n_best + k) * beams.n + beam])
                 # A box that is entered behind the hit holds no nearer one.
-                open_ = wanted & (key != NOTHING) & (entry <= nearest)
-                block = jnp.minimum(first + (key & jnp.int32((1 << n_bits) - 1)), n_blocks - 1)
-                nearest = look_into(block, open_, nearest)
-            unsure = wanted & (key != NOTHING) & (entry <= nearest)
-            range_ref[j, :] = _look_everywhere(
-                box_ref, look_into, tunnel.n_scan, first, unsure, x, y, direction, nearest
-            )
+                open_ = wanted & (key != NOTHING) & (beams.entry(key) <= nearest)
+                block = jnp.minimum(first + (key & jnp.int32((1 << beams.number_bits) - 1)), beams.n_blocks - 1)
+                together = partial(look_into, block, open_, nearest, lane, _WALL_LANES)
+                nearest = _least(lax.cond(_any(open_), together, lambda nearest=nearest: nearest))
+            unsure = wanted & (key != NOTHING) & (beams.entry(key) <= nearest)
+            everywhere = partial(_look_everywhere, box_ref, look_into, beams.n_scan, first, unsure, x, y, direction)
+            nearest = _least(lax.cond(_any(unsure), partial(everywhere, lane, nearest), lambda: nearest))
+            triton.store(range_ref.at[row * beams.n + beam], nearest)  # all threads of a beam know it
             return 0
 
-        lax.fori_loop(0, width, beam, 0)
+        lax.fori_loop(0, beams.n // _BEAMS, some_beams, 0)
 
 
-def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_, nearest):
+def _any(what):
+    """Tell whether anything holds in any thread."""
+    return jnp.max(what.astype(jnp.int32)) > 0
+
+
+def _least(distance):
+    """Return the least distance among the threads of a beam, to all of them."""
+    # As integers: a minimum of floats must look out for NaN.
+    least = jnp.min(lax.bitcast_convert_type(distance, jnp.int32), axis=2, keepdims=True)
+    return lax.bitcast_convert_type(jnp.broadcast_to(least, distance.shape), jnp.float32)
+
+
+def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_, nearest, lane, stride: int):
     """The distance to the nearest segment of a block along beams where `open_`, if less than `nearest`.
 
-    `cast.hits` has the geometry.
+    Each thread meets a vertex pair and the vertex behind it, then the pair `stride` pairs on. `cast.hits` has the
+    geometry.
     """
+    from jax.experimental.pallas import triton
+
     d_x, d_y = direction
+    n_pairs = n_numbers // WORDS
     m_x, m_y, _, _, _, pairs, _ = unpack(load_words(box_ref, WORDS * block, open_))
     m_x, m_y = m_x - x, m_y - y
-    pairs = jnp.where(open_, all_if_full(pairs, ALL_PAIRS, n_numbers // WORDS), 0)
+    pairs = jnp.where(open_, all_if_full(pairs, ALL_PAIRS, n_pairs), 0)
     middle_left, middle_ahead = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
     joint = 2e-7 * (1.0 + jnp.abs(middle_ahead))
 
-    def vertices(pair):
-        numbers = load_words(wall_ref, block * n_numbers + WORDS * pair, pair < pairs)
-        for x, y in (numbers[:2], numbers[2:]):
-            yield middle_left + (d_x * y - d_y * x), middle_ahead + (d_x * x + d_y * y)
+    def seen(x, y):
+        return middle_left + (d_x * y - d_y * x), middle_ahead + (d_x * x + d_y * y)
 
     def segment(start, end, nearest, there):
         (a, a_ahead), (b, b_ahead) = start, end
@@ -295,26 +366,30 @@ def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_,
         hit = there & meets & (distance >= 0.0)
         return jnp.where(hit, jnp.minimum(nearest, distance), nearest)
 
-    def two_segments(pair, carry):
-        before, nearest = carry
-        one, other = vertices(pair)
-        there = pair < pairs
-        return other, segment(one, other, segment(before, one, nearest, there), there)
+    def two_segments(i, nearest):
+        pair = lane + i * stride
+        there, goes_on = pair < pairs, pair + 1 < pairs
+        start = block * n_numbers + WORDS * pair
+        numbers = load_words(wall_ref, start, there)
+        behind = (triton.load(wall_ref.at[start + WORDS + j], mask=goes_on, other=0.0) for j in range(2))
+        one, other = seen(*numbers[:2]), seen(*numbers[2:])
+        return segment(other, seen(*behind), segment(one, other, nearest, there), goes_on)
 
-    one, other = vertices(jnp.int32(0))
-    return lax.fori_loop(1, jnp.max(pairs), two_segments, (other, segment(one, other, nearest, pairs > 0)))[1]
+    return lax.fori_loop(0, (jnp.max(pairs) + stride - 1) // stride, two_segments, nearest)
 
 
-def _look_everywhere(box_ref, look_into, n_scan: int, first, unsure, x, y, direction, nearest):
+def _look_everywhere(box_ref, look_into, n_scan: int, first, unsure, x, y, direction, lane, nearest):
     """Return the nearest hit in any block of the window whose box is entered, for beams that are `unsure`.
 
     They enter as many boxes as were kept, and meet no wall before the last of them, as beside a row of deep recesses.
+    Each thread has every fourth box.
     """
     d_x, d_y = direction
     window = all_if_full(unpack(load_words(box_ref, WORDS * first, unsure))[-1], ALL_WINDOW, n_scan)
     window = jnp.where(unsure, window, 0)
 
-    def look(number, nearest):
+    def look(i, nearest):
+        number = lane + i * _WALL_LANES
         block, there = first + number, number < window
         m_x, m_y, e_x, e_y, thickness, _, _ = unpack(load_words(box_ref, WORDS * block, there))
         m_x, m_y = m_x - x, m_y - y
@@ -323,6 +398,7 @@ def _look_everywhere(box_ref, look_into, n_scan: int, first, unsure, x, y, direc
         # Entered a little early rather than a little late.
         open_ = there & (jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness)
         open_ = open_ & (to_face * (1.0 - 1e-5) <= nearest * size + 1e-6)
-        return lax.cond(jnp.max(open_.astype(jnp.int32)) > 0, lambda: look_into(block, open_, nearest), lambda: nearest)
+        alone = partial(look_into, block, open_, nearest, jnp.zeros_like(lane), 1)
+        return lax.cond(_any(open_), alone, lambda: nearest)
 
-    return lax.fori_loop(0, jnp.max(window), look, nearest)
+    return lax.fori_loop(0, (jnp.max(window) + _WALL_LANES - 1) // _WALL_LANES, look, nearest)

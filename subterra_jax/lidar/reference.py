@@ -130,7 +130,7 @@ def agreement(segments: np.ndarray, poses: Poses, ranges: np.ndarray, tolerance:
     """
     n_beams = ranges.shape[1]
     error = np.abs(ranges - scan(segments, poses.position, poses.heading, n_beams))
-    off = error >= tolerance
+    off = ~(error < tolerance)  # a range that is no number is off
     rows = np.flatnonzero(off.any(axis=1))
     turned = [
         np.abs(ranges[rows] - scan(segments, poses.position[rows], poses.heading[rows], n_beams, turn=turn))
