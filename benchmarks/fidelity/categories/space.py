@@ -13,16 +13,7 @@ from benchmarks.fidelity.derive.freespace import (
     headrooms,
     infringements,
 )
-from benchmarks.fidelity.derive.ground import (
-    ROBOT_RADIUS,
-    Route,
-    blocked_metres,
-    both_grounds,
-    both_routes,
-    draw_trips,
-    feasible_trips,
-    judged_route,
-)
+from benchmarks.fidelity.derive.ground import both_grounds
 from benchmarks.fidelity.derive.plane import (
     cell_distances,
     edge_cells,
@@ -31,6 +22,15 @@ from benchmarks.fidelity.derive.plane import (
     gapless_maps,
     medial_axis,
     unknown_share,
+)
+from benchmarks.fidelity.derive.routes import (
+    ROBOT_RADIUS,
+    Route,
+    blocked_metres,
+    both_routes,
+    draw_trips,
+    feasible_trips,
+    judged_route,
 )
 from benchmarks.fidelity.derive.sections import lining_radii, sections
 from benchmarks.fidelity.derive.surface import surface_nearest
@@ -304,17 +304,21 @@ def way_clearance_error(case: Case, id: str, statistic) -> Value:
 def nav_drivable_width_mae(case: Case) -> Value:
     """Mean absolute error of the drivable width, m."""
     judged, reference = both_grounds(case)
-    width = [ground.traversable.sum(axis=1) * ground.cell for ground in (judged, reference)]
-    return estimate(mean, np.abs(width[0] - width[1]), judged.station, case.rng("nav_drivable_width_mae"))
+    error = np.abs(judged.width - reference.width)
+    return estimate(mean, error, judged.station, case.rng("nav_drivable_width_mae"))
 
 
 @metric("nav_feasible_agree", needs="reference")
 def nav_feasible_agree(case: Case) -> Value:
-    """Share of 1,000 random starts, goals and inflations that are feasible on both grounds or on neither."""
-    judged, reference = both_grounds(case)
-    trips = draw_trips(reference, case.rng("nav_feasible_agree"))
-    agree = feasible_trips(judged, trips) == feasible_trips(reference, trips)
-    return number(mean(agree.astype(float)), len(agree))
+    """Share of 1,000 random starts, goals and inflations that are feasible on both grounds or on neither.
+
+    The mean over ten lattices of cells, with 1,000 in each.
+    """
+    rng, agree = case.rng("nav_feasible_agree"), []
+    for judged, reference in zip(*(ground.lattices() for ground in both_grounds(case)), strict=True):
+        trips = draw_trips(reference, rng)
+        agree.append(feasible_trips(judged, trips) == feasible_trips(reference, trips))
+    return number(mean(np.concatenate(agree).astype(float)), sum(map(len, agree)))
 
 
 @metric("nav_blocked_diff", needs="reference")
@@ -338,11 +342,13 @@ def nav_traversable_iou(case: Case) -> Value:
 
 @metric("nav_step_p95_err", needs="reference")
 def nav_step_p95_err(case: Case) -> Value:
-    """Absolute error of the 95th percentile of the step between neighbouring cells, m."""
-    judged, reference = both_grounds(case)
-    among = np.isfinite(judged.step) & np.isfinite(reference.step)
-    steps = np.percentile([judged.step[among], reference.step[among]], 95, axis=1)
-    return number(abs(float(np.diff(steps)[0])), int(among.sum()))
+    """Absolute error of the 95th percentile of the step between neighbouring cells, m, its mean over ten lattices."""
+    steps, count = [], 0
+    for judged, reference in zip(*(ground.lattices() for ground in both_grounds(case)), strict=True):
+        among = np.isfinite(judged.step) & np.isfinite(reference.step)
+        steps.append(np.percentile([judged.step[among], reference.step[among]], 95, axis=1))
+        count += int(among.sum())
+    return number(abs(float(np.diff(np.mean(steps, axis=0))[0])), count)
 
 
 @metric("nav_footprint_margin")

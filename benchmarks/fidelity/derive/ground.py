@@ -1,16 +1,18 @@
-"""The ground that a small robot drives on, of candidate and reference, and routes over it.
+"""The ground that a small robot drives on, of candidate and reference.
 
 A step of 10 cm stops the robot. Sleepers (6 cm above the ballast) do not, rails (18 cm above the sleepers) do: it
-drives between the rails, and may drive beside them, but cannot change over.
+drives between the rails, and may drive beside them, but cannot change over. Steps are those between cells of 10 cm.
+There is a cell around every centimetre across, so that the edge of a lane moves by centimetres: in cells side by side
+a millimetre of rail more or less takes or gives a whole one.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt, label
-from skimage.graph import route_through_array
+from jaxtyping import Bool, Float
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import distance_transform_edt
 
 from benchmarks.fidelity.case import Case, per_case, per_hold, per_truth
 from benchmarks.fidelity.derive.axis import hold_curve, hold_local, lining_curve, reference_curve
@@ -25,22 +27,26 @@ STEP_MOST = 0.10  # m; a higher one stops the robot
 HEADROOM_LEAST = 0.80  # m
 MOUTH_MARGIN = 0.5  # m at either end that is left out: a track that ends a hand's breadth early is no way around a rail
 _EYE_HEIGHT = -0.5  # m above the axis: from here rays go up and down
-_ACROSS = 5  # rays across a cell, of which the highest hit counts: a rail's head is narrower than a cell
+LATTICES = 10  # of cells side by side, each a tenth of a cell farther left than the one before
+_RAYS_AT_ONCE = 200_000
 _LEVELS = (0.3, 0.7)  # m above the ground at which the robot would run into something
 
 
 @dataclass(frozen=True)
 class Ground:
-    """Ground under the robot and headroom over it.
+    """Ground under the robot and headroom over it, in cells whose middles lie closer across than a cell is wide.
 
     Attributes:
-        station: Stations of the rows, m, `(n,)`.
+        cell: Edge of a cell, m.
+        station: Stations of the rows, one cell apart, m, `(n,)`.
         left: Offsets of the columns, m, `(m,)`.
         height: Height of the ground above the axis, m; NaN where none is seen, `(n, m)`.
         headroom: Headroom above the ground, m, `(n, m)`.
-        step: Largest difference of height to the four neighbours, m; NaN beside what is not seen, `(n, m)`.
+        step: Largest difference of height to the cells before, behind and beside, m; NaN beside what is not seen,
+            `(n, m)`.
     """
 
+    cell: float
     station: Float[np.ndarray, " n"]
     left: Float[np.ndarray, " m"]
     height: Float[np.ndarray, "n m"]
@@ -48,9 +54,14 @@ class Ground:
     step: Float[np.ndarray, "n m"]
 
     @property
-    def cell(self) -> float:
-        """Edge of a cell, m."""
+    def spacing(self) -> float:
+        """Distance between two columns, m."""
         return float(self.left[1] - self.left[0])
+
+    @property
+    def width(self) -> Float[np.ndarray, " n"]:
+        """Traversable width by row, m."""
+        return self.traversable.sum(axis=1) * self.spacing
 
     @property
     def traversable(self) -> Bool[np.ndarray, "n m"]:
@@ -62,7 +73,19 @@ class Ground:
     def clearance(self) -> Float[np.ndarray, "n m"]:
         """Distance to the nearest cell that is not traversable, m; the mouths are open."""
         free = self.traversable
-        return distance_transform_edt(free, self.cell) if not free.all() else np.full(free.shape, GROUND_HALF)
+        apart = (self.cell, self.spacing)
+        return distance_transform_edt(free, apart) if not free.all() else np.full(free.shape, GROUND_HALF)
+
+    def lattices(self) -> "list[Ground]":
+        """Return the grounds of cells side by side that this one is made of."""
+        return [
+            Ground(self.cell, self.station, self.left[k::LATTICES], *(grid[:, k::LATTICES] for grid in self._grids))
+            for k in range(LATTICES)
+        ]
+
+    @property
+    def _grids(self) -> tuple[Float[np.ndarray, "n m"], ...]:
+        return self.height, self.headroom, self.step
 
 
 def ground_curve(case: Case) -> Curve:
@@ -73,8 +96,8 @@ def ground_curve(case: Case) -> Curve:
 def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " m"]]:
     """Return stations of the rows and offsets to the left of the columns, m."""
     station = curve.station[0] + MOUTH_MARGIN + cell * (np.arange(int((curve.length - 2 * MOUTH_MARGIN) / cell)) + 0.5)
-    columns = int(GROUND_HALF / cell)
-    return station, cell * np.arange(-columns, columns + 1)
+    columns = LATTICES * int(GROUND_HALF / cell)
+    return station, cell / LATTICES * np.arange(-columns, columns + 1)
 
 
 @per_case
@@ -91,35 +114,52 @@ def true_ground(case: Case) -> Ground:
 
 def _cast_ground(curve: Curve, cell: float, caster: Caster, radii: Radii) -> Ground:
     station, left = ground_axes(curve, cell)
+    rows = max(_RAYS_AT_ONCE // len(left), 1)
+    parts = [_cast_rows(curve, cell, caster, radii, station[k : k + rows], left) for k in range(0, len(station), rows)]
+    highest, lowest, barred = (np.concatenate(grids) for grids in zip(*parts, strict=True))
+    step = np.where(barred, np.inf, cell_steps(highest, LATTICES))
+    return Ground(cell, station, left, highest, lowest - highest, step)
+
+
+def _cast_rows(
+    curve: Curve,
+    cell: float,
+    caster: Caster,
+    radii: Radii,
+    station: Float[np.ndarray, " n"],
+    left: Float[np.ndarray, " m"],
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
+    """Return the highest ground and lowest roof of cells, m, and True where something upright bars one.
+
+    A ray goes down and up between every two columns; a cell has those within half its width, for a rail's head is
+    narrower than it.
+    """
     position, _, across, up = curve.frames(station)
-    fine = (left[:, None] + cell * (np.arange(_ACROSS) - _ACROSS // 2) / _ACROSS).ravel()
+    fine = cell / LATTICES * (np.arange(len(left) + LATTICES - 1) - (LATTICES - 1) / 2) + left[0]
     eye = (position[:, None] + fine[None, :, None] * across[:, None] + _EYE_HEIGHT * up[:, None]).reshape(-1, 3)
     inside = radii.depth(eye) > 0
     upward = np.repeat(up, len(fine), axis=0)
-    shape = (len(station), len(left), _ACROSS)
-    height, roof = (_ray_heights(caster, eye, sign * upward, inside, sign).reshape(shape) for sign in (-1, 1))
-    whole = inside.reshape(shape).all(axis=2)
-    highest = np.where(whole, height.max(axis=2), np.nan)
-    headroom = np.where(whole, roof.min(axis=2), np.nan) - highest
-    return Ground(
-        station,
-        left,
-        highest,
-        headroom,
-        np.where(_barred_cells(caster, curve, station, left, highest), np.inf, cell_steps(highest)),
+    height, roof = (
+        sliding_window_view(
+            _ray_heights(caster, eye, sign * upward, inside, sign).reshape(len(station), -1), LATTICES, 1
+        )
+        for sign in (-1, 1)
     )
+    highest, lowest = height.max(axis=2), roof.min(axis=2)
+    return highest, lowest, _barred_cells(caster, curve, cell, station, left, highest)
 
 
 def _barred_cells(
     caster: Caster,
     curve: Curve,
+    cell: float,
     station: Float[np.ndarray, " n"],
     left: Float[np.ndarray, " m"],
     height: Float[np.ndarray, "n m"],
 ) -> Bool[np.ndarray, "n m"]:
     """Return True for cells with an obstacle towards the next cell along or across: a wall that rays down miss."""
     position, tangent, across, up = curve.frames(station)
-    cell, known = left[1] - left[0], np.isfinite(height)
+    known = np.isfinite(height)
     barred = np.zeros(height.shape, bool)
     for above in _LEVELS:
         rise = (np.where(known, height, 0.0) + above)[..., None] * up[:, None]
@@ -143,12 +183,19 @@ def _ray_heights(
     return np.where(np.isfinite(reach), _EYE_HEIGHT + sign * reach, np.nan)
 
 
-def cell_steps(height: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
-    """Return the largest difference to the four neighbours, m; beyond the mouths the ground goes on."""
+def cell_steps(height: Float[np.ndarray, "n m"], apart: int = 1) -> Float[np.ndarray, "n m"]:
+    """Return the largest difference to the four neighbours, m; beyond the mouths the ground goes on.
+
+    Args:
+        height: Heights of cells, m, `(n, m)`.
+        apart: Columns from a cell to the one beside it.
+    """
     padded = np.pad(height, ((1, 1), (0, 0)), mode="edge")
-    padded = np.pad(padded, ((0, 0), (1, 1)), constant_values=np.nan)
-    inner = padded[1:-1, 1:-1]
-    shifted = (padded[2:, 1:-1], padded[:-2, 1:-1], padded[1:-1, 2:], padded[1:-1, :-2])
+    padded = np.pad(padded, ((0, 0), (apart, apart)), constant_values=np.nan)
+    inner = padded[1:-1, apart:-apart]
+    shifted = (
+        padded[2:, apart:-apart], padded[:-2, apart:-apart], padded[1:-1, 2 * apart :], padded[1:-1, : -2 * apart],
+    )  # fmt: skip
     return np.max([np.abs(inner - other) for other in shifted], axis=0)
 
 
@@ -194,10 +241,23 @@ def _seen_ground(case: Case) -> Ground:
 
 
 def _ground_of_points(curve: Curve, cell: float, local: Float[np.ndarray, "k 3"]) -> Ground:
+    """Return the ground of returns, about a curve, lattice by lattice."""
     station, left = ground_axes(curve, cell)
     low = local[local[:, 2] < _FLOOR_BELOW]
+    height, step = np.empty((len(station), len(left))), np.empty((len(station), len(left)))
+    for k in range(LATTICES):
+        beside = slice(k, None, LATTICES)
+        height[:, beside] = _heights_of_points(station, left[beside], cell, low)
+        step[:, beside] = cell_steps(height[:, beside])
+    return Ground(cell, station, left, height, np.where(np.isfinite(height), np.inf, np.nan), step)
+
+
+def _heights_of_points(
+    station: Float[np.ndarray, " n"], left: Float[np.ndarray, " m"], cell: float, low: Float[np.ndarray, "k 3"]
+) -> Float[np.ndarray, "n m"]:
+    """Return the heights of cells side by side, m, from returns of the ground; NaN far from any return."""
     row = np.floor((low[:, 0] - station[0]) / cell + 0.5).astype(int)
-    column = np.round(low[:, 1] / cell).astype(int) + len(left) // 2
+    column = np.round((low[:, 1] - left[0]) / cell).astype(int)
     spread = np.concatenate([row + shift for shift in _ROW_SPREAD])
     column, above = np.tile(column, len(_ROW_SPREAD)), np.tile(low[:, 2], len(_ROW_SPREAD))
     kept = (spread >= 0) & (spread < len(station)) & (column >= 0) & (column < len(left))
@@ -206,106 +266,4 @@ def _ground_of_points(curve: Curve, cell: float, local: Float[np.ndarray, "k 3"]
     wall = np.nanquantile(height, 0.5) + _WALL_ABOVE
     height = np.where(height < wall, height, np.nan)
     away, nearest = distance_transform_edt(np.isnan(height), return_indices=True)
-    height = np.where(away <= _GAP_CELLS, height[tuple(nearest)], np.nan)
-    return Ground(station, left, height, np.where(np.isfinite(height), np.inf, np.nan), cell_steps(height))
-
-
-# Routes of the robot: from mouth to mouth between the rails, and between any two places.
-
-ROBOT_RADIUS = 0.40  # m of the robot
-GAUGE_HALF = 0.70  # m; between the rails
-INFLATIONS = (0.15, 0.25, 0.35, 0.45, 0.55)  # m
-TRIPLES = 1000  # 200 let the seed move the category by a point
-_ROUTE_ENDS = 1.0  # m from a mouth within which a way begins
-_BARRED_COST = 1e6
-_EIGHT = np.ones((3, 3), int)
-
-
-@dataclass(frozen=True)
-class Route:
-    """Route of the robot over the ground.
-
-    Attributes:
-        cells: Row and column of each cell, `(k, 2)`.
-        place: Station and left of each cell, m, `(k, 2)`.
-        clearance: Distance to the nearest obstacle, m, `(k,)`.
-    """
-
-    cells: Int[np.ndarray, "k 2"]
-    place: Float[np.ndarray, "k 2"]
-    clearance: Float[np.ndarray, " k"]
-
-    @property
-    def length(self) -> float:
-        """Length along the route, m."""
-        return float(np.linalg.norm(np.diff(self.place, axis=0), axis=1).sum())
-
-
-def find_route(ground: Ground) -> Route | None:
-    """Return the route of most clearance from mouth to mouth, starting next to the axis; `None` where none exists.
-
-    A cell costs the inverse square of its clearance, and what the robot does not fit on is barred.
-    """
-    clearance = ground.clearance
-    fits = clearance >= ROBOT_RADIUS
-    start, goal = (_nearest_to_axis(ground, fits, end) for end in (0, -1))
-    if start is None or goal is None:
-        return None
-    part = label(fits, _EIGHT)[0]
-    if part[start] != part[goal]:
-        return None
-    cost = np.where(fits, 1.0 / np.maximum(clearance, 1e-3) ** 2, _BARRED_COST)
-    cells = np.asarray(route_through_array(cost, start, goal, fully_connected=True, geometric=True)[0])
-    place = np.column_stack([ground.station[cells[:, 0]], ground.left[cells[:, 1]]])
-    return Route(cells, place, clearance[tuple(cells.T)])
-
-
-def _nearest_to_axis(ground: Ground, fits: Bool[np.ndarray, "n m"], end: int) -> tuple[int, int] | None:
-    rows = range(int(_ROUTE_ENDS / ground.cell)) if end == 0 else range(-1, -1 - int(_ROUTE_ENDS / ground.cell), -1)
-    between = np.abs(ground.left) < GAUGE_HALF
-    for row in rows:
-        columns = np.flatnonzero(fits[row] & between)
-        if len(columns):
-            return row % len(fits), int(columns[np.argmin(np.abs(ground.left[columns]))])
-    return None
-
-
-@per_case
-def judged_route(case: Case) -> Route | None:
-    """Return the route on the candidate's own ground."""
-    return find_route(judged_ground(case))
-
-
-@per_case
-def both_routes(case: Case) -> tuple[Route | None, Route | None]:
-    """Return the routes on the two grounds that are compared."""
-    judged, reference = both_grounds(case)
-    return find_route(judged), find_route(reference)
-
-
-def blocked_metres(ground: Ground) -> int:
-    """Count the stretches of 1 m between the rails that the robot cannot pass."""
-    between = np.abs(ground.left) < GAUGE_HALF
-    passable = (ground.clearance[:, between] >= ROBOT_RADIUS).any(axis=1)
-    metre = ((ground.station - ground.station[0]) / 1.0).astype(int)
-    return len(np.unique(metre[~passable]))
-
-
-def feasible_trips(ground: Ground, triples: Int[np.ndarray, "t 3"]) -> Bool[np.ndarray, " t"]:
-    """Return True where a robot of each inflation gets from start to goal; cells are flat indices."""
-    clearance = ground.clearance
-    parts = [label(clearance >= inflation, _EIGHT)[0].ravel() for inflation in INFLATIONS]
-    return np.array([parts[k][a] == parts[k][b] > 0 for a, b, k in triples])
-
-
-def draw_trips(ground: Ground, rng: np.random.Generator) -> Int[np.ndarray, "t 3"]:
-    """Draws random start, goal and inflation on traversable ground.
-
-    Raises:
-        ValueError: There is none.
-    """
-    places = np.flatnonzero(ground.traversable)
-    if not len(places):
-        raise ValueError("the reference has no traversable ground")
-    ends = rng.choice(places, (TRIPLES, 2))
-    return np.column_stack([ends, rng.integers(0, len(INFLATIONS), TRIPLES)])
+    return np.where(away <= _GAP_CELLS, height[tuple(nearest)], np.nan)

@@ -6,11 +6,13 @@ import pytest
 import trimesh
 
 from benchmarks.fidelity.derive.ground import cell_steps, judged_ground
+from benchmarks.fidelity.derive.routes import judged_route
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import measure
 from tests.benchmarks.fidelity.tube import Tube
 
 TUBE = Tube(length=12.0)
+STRAIGHT = Tube(length=6.0, bend=np.inf)
 
 
 @cache
@@ -82,3 +84,44 @@ def test_the_recording_alone_shows_a_way():
     case = replace(judged(), truth=None, cache={})
     assert measure("nav_path_len_ratio", case).value == pytest.approx(1.0, abs=0.05)
     assert measure("nav_traversable_iou", case).value > 0.6
+
+
+def widened(gauge):
+    """The straight tube with another gauge, judged against the standard one."""
+    return tube.case(STRAIGHT, replace(STRAIGHT, gauge=gauge))
+
+
+def test_the_lane_between_the_rails_widens_with_the_gauge_by_centimetres_and_not_by_cells():
+    lanes, clearances = [], []
+    for gauge in (1.435, 1.445, 1.455, 1.465, 1.475):
+        ground = judged_ground(widened(gauge))
+        lanes.append(ground.traversable[:, np.abs(ground.left) < 0.75].sum(axis=1).mean() * ground.spacing)
+        clearances.append(judged_route(widened(gauge)).clearance.mean())
+    assert 0.03 <= lanes[-1] - lanes[0] <= 0.05
+    assert np.max(np.diff(lanes)) < 0.021  # a centimetre on either side: half as many lattices would give 4 cm
+    assert np.max(np.diff(clearances)) < 0.011
+
+
+@pytest.mark.parametrize("gauge", [1.440, 1.450])
+def test_what_a_wider_gauge_costs_does_not_depend_on_where_the_cells_lie(gauge):
+    shared, apart = [], []
+    for tolerance in (0.9, 0.94, 1.0, 1.03, 1.1):
+        case = replace(widened(gauge), tolerance=tolerance)
+        shared.append(measure("nav_traversable_iou", case).value)
+        apart.append(measure("nav_clearance_mean_err", case).value)
+    assert np.ptp(shared) < 0.0125  # a centimetre at four edges
+    assert np.max(apart) < 0.011
+    assert 0.98 < np.mean(shared) < 1.0
+
+
+def test_trips_are_tried_in_each_of_ten_lattices():
+    assert measure("nav_feasible_agree", judged()).n == 10_000
+
+
+def test_the_lattices_of_a_ground_are_its_columns():
+    ground = judged_ground(judged())
+    lattices = ground.lattices()
+    assert len(lattices) == 10
+    for lattice in lattices:
+        assert lattice.spacing == pytest.approx(lattice.cell) == pytest.approx(0.10)
+    assert sorted(np.concatenate([lattice.left for lattice in lattices])) == pytest.approx(list(ground.left))
