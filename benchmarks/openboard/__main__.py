@@ -3,12 +3,13 @@
 `python -m benchmarks.openboard --tasks StopAt Return --out out/openboard`
 
 Each task and agent is one file under `--out`/cells; a cell that is there is not driven again. All cells together are
-`cells.jsonl`. `--report-only` writes tables and picture of the cells that are there, or of those in a file `--cells`:
-`benchmarks/openboard/cells.jsonl` holds those of the docs.
+`cells.jsonl`. `--report-only` writes tables and picture of the cells that are there, or of those in a file `--cells`,
+also where a cell is of some of the splits only: `benchmarks/openboard/cells.jsonl` holds those of the docs.
 """
 
 import dataclasses
 import hashlib
+import itertools
 import json
 import re
 import sys
@@ -89,7 +90,7 @@ def run(config: OpenboardConfig) -> None:
     ]
     if missing and not config.report_only:
         _drive(config, missing)
-    cells = report.read_cells(config.cells or config.out / "cells", conditions(config))
+    cells = report.read_cells(config.cells or config.out / "cells", conditions_of_parts(config))
     write_file(config.out / "cells.jsonl", "".join(json.dumps(cell) + "\n" for cell in cells).encode())
     write_file(config.out / "openboard.md", report.as_markdown(cells).encode())
     write_file(config.out / "openboard.png", report.as_png(cells))
@@ -102,6 +103,12 @@ def conditions(config: OpenboardConfig) -> str:
     if config.sensor != PLANAR:
         content.append(config.sensor)
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def conditions_of_parts(config: OpenboardConfig) -> set[str]:
+    """Return the digests of all splits together and of every choice of them: a cell may be of a few splits only."""
+    choices = (some for n in range(1, len(config.splits) + 1) for some in itertools.combinations(config.splits, n))
+    return {conditions(dataclasses.replace(config, splits=some)) for some in choices}
 
 
 def cell_file(config: OpenboardConfig, task: str, agent: str) -> Path:

@@ -1,6 +1,7 @@
 """Tables and picture of the leaderboard of version 1, and which of its figures would be leaks."""
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,12 @@ _COLOURS = {
 }
 
 
-def read_cells(source: Path, conditions: str) -> list[dict[str, Any]]:
+def read_cells(source: Path, conditions: Collection[str]) -> list[dict[str, Any]]:
     """Read the cells that were driven under some conditions, in the order of tasks and agents.
 
     Args:
         source: Folder with a file for each cell, or a file with a line for each.
-        conditions: Digest of the conditions.
+        conditions: Digests of the conditions: those of all splits, and of a few of them.
 
     Raises:
         BenchmarkError: There is none, or a line is no cell.
@@ -52,7 +53,7 @@ def read_cells(source: Path, conditions: str) -> list[dict[str, Any]]:
             else [file.read_text() for file in sorted(source.glob("*.json"))]
         )
         cells = [json.loads(text) for text in texts]
-        cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] == conditions]
+        cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] in conditions]
     except (ValueError, AttributeError, KeyError) as error:
         raise BenchmarkError(f"{source}: holds something that is no cell of the board") from error
     if not cells:
@@ -88,23 +89,44 @@ def summarise(cell: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def rows_of(cells: list[dict[str, Any]], task: str) -> dict[str, dict[tuple[str, str], dict[str, Any]]]:
+    """Return for each agent of a task the rows of `summarise` by split and kind, of all splits it was driven in."""
+    rows: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}
+    for cell in cells:
+        if cell["task"] == task:
+            rows.setdefault(cell["agent"], {}).update({(r["split"], r["kind"]): r for r in summarise(cell)})
+    return rows
+
+
+def columns_of(cells: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return split and kind of all columns, those of the cell with most of them first."""
+    widest = sorted(cells, key=lambda cell: -len(cell["columns"]))
+    return list(dict.fromkeys((column["split"], column["kind"]) for cell in widest for column in cell["columns"]))
+
+
+def tasks_of(cells: list[dict[str, Any]]) -> list[str]:
+    """Return the tasks in their order."""
+    return list(dict.fromkeys(cell["task"] for cell in cells))
+
+
 def find_leaks(cells: list[dict[str, Any]]) -> list[str]:
     """Name the figures beyond a bound: a blind agent above the floor, or any agent above the ceiling.
 
     A figure is beyond where the difference is more than four standard errors of the two: a table has some hundred.
     """
-    ceiling = {cell["task"]: summarise(cell) for cell in cells if cell["agent"] == CEILING}
     found = []
-    for cell in cells:
-        for i, row in enumerate(summarise(cell)):
-            where = f"{cell['agent']}, {cell['task']}, {row['kind']} of {row['split']}"
-            if cell["agent"] in BLIND and is_above(row["success"], row["floor"], row["n"], 0):
-                found.append(f"{where}: {100 * row['success']:.0f} % is above the floor, {100 * row['floor']:.0f} %")
-            top = ceiling[cell["task"]][i] if cell["task"] in ceiling else None
-            if top is not None and is_above(row["success"], top["success"], row["n"], top["n"]):
-                found.append(
-                    f"{where}: {100 * row['success']:.0f} % is above the ceiling, {100 * top['success']:.0f} %"
-                )
+    for task in tasks_of(cells):
+        rows = rows_of(cells, task)
+        for agent, of_agent in rows.items():
+            for (split, kind), row in of_agent.items():
+                where = f"{agent}, {task}, {kind} of {split}"
+                if agent in BLIND and is_above(row["success"], row["floor"], row["n"], 0):
+                    found.append(f"{where}: {_percent(row['success'])} is above the floor, {_percent(row['floor'])}")
+                top = rows.get(CEILING, {}).get((split, kind))
+                if top is not None and is_above(row["success"], top["success"], row["n"], top["n"]):
+                    found.append(
+                        f"{where}: {_percent(row['success'])} is above the ceiling, {_percent(top['success'])}"
+                    )
     return found
 
 
@@ -119,21 +141,32 @@ def as_markdown(cells: list[dict[str, Any]]) -> str:
         "",
         "Beyond a bound: " + ("; ".join(leaks) if leaks else "nobody") + ".",
     ]
-    for split in dict.fromkeys(column["split"] for column in cells[0]["columns"]):
-        for task in dict.fromkeys(cell["task"] for cell in cells):
-            rows = {cell["agent"]: summarise(cell) for cell in cells if cell["task"] == task}
-            some = {agent: [row for row in found if row["split"] == split] for agent, found in rows.items()}
-            first = next(iter(some.values()))
-            lines += ["", f"### {task}, {split}", "", "| agent | tuned on | " + " | ".join(r["kind"] for r in first)]
-            lines[-1] += " |"
-            lines.append("|---|---|" + "---|" * len(first))
-            bounds = " | ".join(f"{100 * row['floor']:.0f}" for row in first)
+    columns = columns_of(cells)
+    for split in dict.fromkeys(split for split, _ in columns):
+        for task in tasks_of(cells):
+            rows = {
+                agent: [r for r in some.values() if r["split"] == split] for agent, some in rows_of(cells, task).items()
+            }
+            rows = {agent: some for agent, some in rows.items() if some}
+            if not rows:
+                continue
+            first = next(iter(rows.values()))
+            kinds, bounds = " | ".join(r["kind"] for r in first), " | ".join(f"{100 * r['floor']:.0f}" for r in first)
+            lines += [
+                "",
+                f"### {task}, {split}",
+                "",
+                f"| agent | tuned on | {kinds} |",
+                "|---|---|" + "---|" * len(first),
+            ]
             lines.append(f"| floor, in theory | | {bounds} |")
-            for agent, found in some.items():
-                lines.append(
-                    f"| {agent} | {TUNED_ON.get(agent, 'not known')} | " + " | ".join(map(_cell, found)) + " |"
-                )
+            for agent, some in rows.items():
+                lines.append(f"| {agent} | {TUNED_ON.get(agent, 'not known')} | " + " | ".join(map(_cell, some)) + " |")
     return "\n".join(lines) + "\n"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def _cell(row: dict[str, Any]) -> str:
@@ -144,15 +177,14 @@ def _cell(row: dict[str, Any]) -> str:
 
 def draw(cells: list[dict[str, Any]]) -> Figure:
     """Draw one panel a task: for each kind and split a bar from floor to ceiling, and a dot for each agent."""
-    tasks = list(dict.fromkeys(cell["task"] for cell in cells))
-    columns = cells[0]["columns"]
+    tasks, columns = tasks_of(cells), columns_of(cells)
     n_columns = min(3, len(tasks))
     shape = (-(-len(tasks) // n_columns), n_columns)
     figure, grid = plt.subplots(
         *shape, figsize=(1.0 + 4.6 * shape[1], 0.8 + 2.9 * shape[0]), squeeze=False, layout="constrained", sharey=True
     )
     for axes, task in zip(grid.flat, tasks, strict=False):
-        _panel(axes, task, {cell["agent"]: summarise(cell) for cell in cells if cell["task"] == task}, columns)
+        _panel(axes, task, rows_of(cells, task), columns)
     for axes in list(grid.flat)[len(tasks) :]:
         axes.axis("off")
     for axes in grid[:, 0]:
@@ -165,25 +197,28 @@ def draw(cells: list[dict[str, Any]]) -> Figure:
     return figure
 
 
-def _panel(axes: Any, task: str, rows: dict[str, list[dict[str, Any]]], columns: list[dict[str, str]]) -> None:
+def _panel(
+    axes: Any, task: str, rows: dict[str, dict[tuple[str, str], dict[str, Any]]], columns: list[tuple[str, str]]
+) -> None:
     place = np.arange(len(columns))
-    bottom = 100.0 * np.array([row["floor"] for row in next(iter(rows.values()))])
-    top = 100.0 * np.array([row["success"] for row in rows[CEILING]]) if CEILING in rows else np.full(len(place), 100.0)
+    floors = {column: row["floor"] for some in rows.values() for column, row in some.items()}
+    shares = lambda some, name, other: 100.0 * np.array([some[c][name] if c in some else other for c in columns])  # noqa: E731
+    bottom = 100.0 * np.array([floors.get(column, np.nan) for column in columns])
+    top = shares(rows.get(CEILING, {}), "success", 1.0)
     axes.bar(place, np.maximum(top - bottom, 0.0), 0.8, bottom, color="#dddddd", label="floor to ceiling")
-    for agent, found in rows.items():
-        if agent in (CEILING, *BLIND):
-            continue
-        axes.plot(
-            place, [100.0 * r["success"] for r in found], "o", ms=4.5, color=_COLOURS.get(agent, "black"), label=agent
-        )
+    for agent, some in rows.items():
+        if agent not in (CEILING, *BLIND):
+            colour = _COLOURS.get(agent, "black")
+            axes.plot(place, shares(some, "success", np.nan), "o", ms=4.5, color=colour, label=agent)
     axes.set_title(task, fontsize=10)
     axes.set_ylim(0.0, 103.0)
-    axes.set_xticks(place, [column["kind"] for column in columns], rotation=90, fontsize=7)
+    axes.set_xticks(place, [kind for _, kind in columns], rotation=90, fontsize=7)
+    splits = [split for split, _ in columns]
     for i in range(1, len(columns)):
-        if columns[i]["split"] != columns[i - 1]["split"]:
+        if splits[i] != splits[i - 1]:
             axes.axvline(i - 0.5, color="black", lw=0.8)
-    for split in dict.fromkeys(column["split"] for column in columns):
-        here = [i for i, column in enumerate(columns) if column["split"] == split]
+    for split in dict.fromkeys(splits):
+        here = [i for i, one in enumerate(splits) if one == split]
         axes.text(np.mean(here), 101.0, split, ha="center", va="top", fontsize=7)
     axes.grid(axis="y", alpha=0.3)
 

@@ -68,6 +68,28 @@ def test_a_table_and_a_picture_hold_every_agent(tmp_path):
     assert report.as_png(cells)[:4] == b"\x89PNG"
 
 
+def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():
+    wide = {**cell("fused", 0.4, n=80), "columns": [{"kind": "cast", "split": s} for s in SPLITS], "floor": [0.3] * 4}
+    narrow = {**cell("ceiling", 0.9), "columns": [{"kind": "cast", "split": "test-unseen"}]}
+    text = report.as_markdown([narrow, wide])
+    assert text.index("### StopAt, val") < text.index("### StopAt, test-unseen") < text.index("| ceiling |")
+    assert text.count("| ceiling |") == 1
+    assert report.as_png([narrow, wide])[:4] == b"\x89PNG"
+    above = report.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
+    assert above == []
+    narrow = {**narrow, "success": [0] * 40}
+    above = report.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
+    assert above == ["ring-filter, StopAt, cast of test-unseen: 100 % is above the ceiling, 0 %"]
+
+
+def test_conditions_of_parts_are_those_of_every_choice_of_splits(tmp_path):
+    config = command.OpenboardConfig(tmp_path, splits=SPLITS)
+    found = command.conditions_of_parts(config)
+    assert len(found) == 3
+    assert command.conditions(config) in found
+    assert command.conditions(command.OpenboardConfig(tmp_path, splits=("test-unseen",))) in found
+
+
 def test_a_cell_that_is_there_is_not_driven_again(tmp_path, monkeypatch, capsys):
     config = command.OpenboardConfig(tmp_path, ("StopAt",), ("fused",), ("val",), 40, 2)
     there = {**cell("fused", 0.4), "conditions": command.conditions(config)}
