@@ -1,4 +1,4 @@
-"""Learnt localisers: the front end against known walls, and the robot's metres against those of training."""
+"""Learnt localisers: their memory, the robot's metres against those of training, tensors, tasks, the way back."""
 
 import dataclasses
 from contextlib import nullcontext
@@ -13,154 +13,13 @@ import subterra_jax as st
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.stations import Driven
 from subterra_jax.baselines.steering import Corridor
-from subterra_jax.lidar3d.beams import level_ring
-from subterra_jax.parts import make_sensor
 from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
-from subterra_jax.policies.locate import bends, kalman, map_filter, matching, memory, streams, strips
+from subterra_jax.policies.locate import bends, kalman, map_filter, matching, memory, streams
 from subterra_jax.policies.locate.agent import check_tensors, flat
-from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block, Estimate
+from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block
 from subterra_jax.policies.locate.locator import Locator
-from subterra_jax.policies.locate.map_strip import MapStrip, map_strip
-from subterra_jax.policies.locate.profiles import BIN, Points
 from subterra_jax.policies.locate.ways import TwoWays
-from subterra_jax.tunnel import Tunnel
-
-_HALF, _N = 2.7, 40  # m; metres
-
-
-def _relief(station):
-    """Patches 6 cm deep at random, the same everywhere they are looked at from."""
-    edges = np.cumsum(np.random.default_rng(3).uniform(0.3, 1.5, 200)) - 20.0
-    return np.where(np.searchsorted(edges, station) % 2 == 0, 0.06, 0.0)
-
-
-def _drive(share, sigma=0.02, seed=0):
-    """A robot in the middle of a straight tunnel that drives (1 + share) times what is commanded."""
-    driven = 0.2 * np.arange(5 * _N + 2)
-    angle = np.deg2rad(22.5) * np.arange(1, 8)
-    along = np.broadcast_to(_HALF / np.tan(angle), (len(driven), 2, 7))
-    station = (1.0 + share) * driven[:, None, None] + along + np.array([0.0, 7.3])[:, None]
-    noise = sigma * np.random.default_rng(seed).standard_normal(station.shape)
-    points = Points(jnp.asarray(along), jnp.asarray(_relief(station) + noise), jnp.ones(station.shape, bool))
-    return streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + share) * driven), points)
-
-
-@pytest.mark.parametrize("share", [-0.03, 0.0, 0.02])
-def test_the_untrained_front_end_finds_the_error_of_the_command(share):
-    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, _drive(share))
-    blocks = jax.jit(lambda r: streams.metres(r, matching.init(jax.random.key(0)), _N))(record)
-    total = np.asarray(blocks.evidence)[DELAY + 10 :].sum(axis=0)
-    assert matching.SHARES[total.argmax()] == pytest.approx(share, abs=0.0045)
-    assert total.max() - total.mean() > 3.0
-
-
-def test_smooth_walls_tell_nothing():
-    record = _drive(0.02, sigma=0.0)
-    record = record.replace(points=record.points.replace(out=jnp.zeros_like(record.points.out)))
-    blocks = streams.metres(record, matching.init(jax.random.key(0)), _N)
-    assert np.ptp(np.asarray(blocks.evidence), axis=1).max() < 0.2
-
-
-def _image(station, sensor, low=-9.0, high=9.0):
-    """The image of a spinning sensor between upright walls whose relief lies between two heights, m."""
-    ray = np.asarray(sensor.directions)
-    side = np.maximum(np.abs(ray[:, 1]), 1e-6)
-    depth = np.zeros(len(ray))
-    goes_on = (_HALF / side * ray[:, 2] > low) & (_HALF / side * ray[:, 2] < high)
-    for deeper in np.linspace(0.0, 0.06, 13):  # into a patch, until its floor or its far edge
-        along = (_HALF + deeper) / side * ray[:, 0]
-        goes_on &= _relief(station + along + np.where(ray[:, 1] > 0.0, 0.0, 7.3)) > deeper - 1e-9
-        depth = np.where(goes_on, deeper, depth)
-    reach = (_HALF + depth) / side
-    return np.minimum(reach, 30.0)
-
-
-def _seen(image, sensor):
-    scan = jnp.asarray(image, jnp.float32)
-    level = level_ring(scan, sensor.shape)
-    return Observed(scan, level, distance=jnp.zeros(()), heading=jnp.zeros(()), entries={"scan": scan})
-
-
-def test_a_spinning_lidar_sees_strips_of_the_wall_at_their_heights():
-    sensor = make_sensor("spin16x64")
-    params = SimpleNamespace(lidar=sensor)
-    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
-    flat_walls = strips.sense(_seen(_image(3.0, sensor, 0.0, 0.0), sensor), walls, params)
-    points = strips.sense(_seen(_image(3.0, sensor, 0.5, 0.8), sensor), walls, params)
-    assert points.seen.shape == (2 * len(strips.HEIGHTS) * strips.RAYS, 7)
-    assert points.n_sides == strips.n_sides(sensor) == 12
-    assert np.mean(points.seen) > 0.9, "the farthest returns lie beyond reach"
-    np.testing.assert_allclose(np.where(flat_walls.seen, flat_walls.out, 0.0), 0.0, atol=1e-4)
-    out = np.asarray(points.out).reshape(len(strips.HEIGHTS), 2, strips.RAYS, 7)
-    assert np.ptp(out[strips.HEIGHTS.index(0.62)]) > 0.05, "the highest strip shows the patches"
-    for height in (0.12, -0.37, -0.62):
-        assert np.ptp(out[strips.HEIGHTS.index(height)]) < 1e-3
-    left, right = (np.asarray(points.along).reshape(len(strips.HEIGHTS), 2, strips.RAYS, 7)[:, i] for i in (0, 1))
-    there = np.asarray(points.seen).reshape(left.shape[0], 2, strips.RAYS, 7).all(axis=1)
-    np.testing.assert_allclose(left[there], right[there], atol=0.1, err_msg="of two rings as near either may be taken")
-    assert np.all(np.diff(left[0, 0]) < 0.0), "bearings go from ahead to behind"
-
-
-def test_walls_turned_by_a_heading_are_straight_again():
-    sensor, yaw = make_sensor("spin16x64"), 0.1
-    turned = np.asarray(sensor.directions) @ np.array(
-        [[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]]
-    )
-    image = np.minimum(_HALF / np.maximum(np.abs(turned[:, 1]), 1e-6), 30.0)
-    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(yaw))
-    points = strips.sense(_seen(image, sensor), walls, SimpleNamespace(lidar=sensor))
-    np.testing.assert_allclose(np.asarray(points.out)[np.asarray(points.seen)], 0.0, atol=1e-4)
-    assert np.mean(points.seen) > 0.9
-
-
-@pytest.mark.parametrize("share", [-0.02, 0.02])
-def test_strips_above_the_level_ring_tell_the_error_of_the_command(share):
-    sensor = make_sensor("spin16x64")
-    params = SimpleNamespace(lidar=sensor)
-    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
-    driven = np.float32(0.2) * np.arange(5 * 30 + 2)
-    images = np.stack([_image((1.0 + share) * d, sensor, 0.25, 9.0) for d in driven])
-    points = jax.vmap(lambda image: strips.sense(_seen(image, sensor), walls, params))(jnp.asarray(images))
-    record = streams.Record(jnp.asarray(driven), jnp.asarray((1.0 + share) * driven), points)
-    blocks = jax.jit(lambda r: streams.metres(r, matching.init(jax.random.key(0)), 30))(record)
-    total = np.asarray(blocks.evidence)[DELAY + 8 :].sum(axis=0)
-    assert matching.SHARES[total.argmax()] == pytest.approx(share, abs=0.0045)
-    level = record.replace(points=jax.tree.map(lambda leaf: leaf[:, : 4 * strips.RAYS], points))
-    blind = streams.metres(level, matching.init(jax.random.key(0)), 30)
-    assert np.ptp(np.asarray(blind.evidence), axis=1).max() < 0.2, "at the level of the sensor the wall is smooth"
-
-
-@pytest.mark.parametrize("radius", [80.0, -200.0])
-def test_a_bend_is_found_and_its_points_are_put_along_the_axis(radius):
-    angle = np.deg2rad(22.5) * np.arange(1, 8)
-    beam = np.stack([np.cos(angle), np.sin(angle)])
-    along, out, station = [], [], []
-    for side in (1.0, -1.0):
-        # Where a beam from the middle meets the circle of the wall, about a centre at (0, radius).
-        reach_wall = abs(radius - side * _HALF)
-        dot = side * beam[1] * radius
-        root = np.sqrt(dot**2 - radius**2 + reach_wall**2)
-        both = np.stack([dot - root, dot + root])
-        reach = np.where(both > 0.0, both, np.inf).min(axis=0)
-        x, y = reach * beam[0], side * reach * beam[1]
-        along.append(x)
-        out.append(side * y - _HALF)
-        station.append(radius * np.arctan2(np.sign(radius) * x, np.sign(radius) * (radius - y)))
-    points = Points(*(jnp.asarray(np.stack(rows), jnp.float32) for rows in (along, out)), jnp.ones((2, 7), bool))
-    bend = jnp.zeros(())
-    for _ in range(120):
-        bend = bends.follow(bend, points, jnp.float32(0.2))
-    assert float(bend) == pytest.approx(1.0 / radius, rel=0.05)
-    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
-    straight = bends.straighten(points, walls, bend)
-    before, after = (np.abs(np.asarray(p.along) - np.stack(station)).max() for p in (points, straight))
-    assert after < 0.015 < 0.07 < before
-    assert np.abs(np.asarray(straight.out)).max() < 0.03
-
-
-def test_a_robot_that_stands_learns_no_bend_from_a_niche():
-    points = Points(jnp.ones((2, 7)), jnp.zeros((2, 7)).at[0, :3].set(0.9), jnp.ones((2, 7), bool))
-    assert float(bends.follow(jnp.zeros(()), points, jnp.zeros(()))) == 0.0
+from tests.subterra_jax.patches import HALF, map_of_walls, patches
 
 
 def _random_blocks(n, key=1):
@@ -216,10 +75,10 @@ def _ranges(driven, share=0.01):
     """Scans of 16 beams by a robot that keeps to the middle; the ends of the tunnel are out of sight."""
     angle = 2.0 * np.pi * np.arange(16) / 16
     side = np.where(np.abs(np.sin(angle)) < 0.1, np.nan, np.abs(np.sin(angle)))
-    along = _HALF * np.cos(angle) / side
+    along = HALF * np.cos(angle) / side
     station = (1.0 + share) * driven[:, None] + along + np.where(np.sin(angle) > 0.0, 0.0, 7.3)
     noise = 0.02 * np.random.default_rng(5).standard_normal(station.shape)
-    return np.where(np.isnan(side), 30.0, (_HALF + _relief(station) + noise) / np.where(np.isnan(side), 1.0, side))
+    return np.where(np.isnan(side), 30.0, (HALF + patches(station) + noise) / np.where(np.isnan(side), 1.0, side))
 
 
 def _looked_at(ranges, driven, walls):
@@ -250,13 +109,13 @@ def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
     driven = np.cumsum((0.1 * speed).astype(np.float32))  # in 32 bits, as the robot sums
     ranges = jnp.asarray(_ranges(driven), jnp.float32)
     read = jnp.asarray(np.cumsum(0.1 * speed * 1.02 + 0.01 * rng.standard_normal(240)) + 5.0, jnp.float32)
-    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
+    walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(0.0))
     points = _looked_at(ranges, driven, walls)
     weights = memory.init(network, front, jax.random.key(4), with_map)
     n = int(driven[-1])
     record = streams.Record(jnp.asarray(driven, jnp.float32), read, points)
     whole = memory.sequence(network, weights, streams.metres(record, weights.get("match"), n))
-    strip = _strip(first=-3.0 - 0.7) if with_map else None  # told 0.7 m too far back
+    strip = map_of_walls(first=-3.0 - 0.7) if with_map else None  # told 0.7 m too far back
     if strip is not None:
         age = jnp.arange(1.0, n + 1.0)
         passed, rate = memory.passed(whole, age), memory.log_rate(whole, age)
@@ -343,7 +202,7 @@ def test_another_number_of_beams_or_another_control_period_is_named():
 
 def _way(ways, driven, direction, flagged, now, params):
     """Takes one step of 0.2 m past smooth walls."""
-    walls = Corridor(jnp.float32(_HALF), jnp.float32(_HALF), jnp.float32(0.0))
+    walls = Corridor(jnp.float32(HALF), jnp.float32(HALF), jnp.float32(0.0))
     ranges = jnp.full(16, 30.0)
     obs = Observed(ranges, ranges, distance=jnp.float32(driven), heading=jnp.zeros(()), goal=jnp.float32(63.0))
     step = Driven(jnp.float32(2.0), jnp.ones(()), jnp.float32(direction), jnp.asarray(flagged), walls)
@@ -369,72 +228,3 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
     assert stations[64] == pytest.approx(63.1, abs=0.3)
     assert stations[65] == pytest.approx(61.1, abs=1e-3), "the flag is 2 m before the goal, 0.1 m late"
     assert stations[139] == pytest.approx(stations[70] - 0.2 * 69, abs=0.4)
-
-
-def _strip(first=0.0, n_metres=160, seed=3, side=7.3):
-    """The map of two walls with the relief of `_relief`; the right one shows it `side` metres on."""
-    centre = BIN * (np.arange(10 * n_metres) + 0.5)
-    left, right = (_patches(first + centre + off, seed) for off in (0.0, side))
-    one = lambda value: jnp.full(1, value, jnp.int32)  # noqa: E731
-    return MapStrip(jnp.asarray(_HALF + np.stack([left, right]), jnp.float32), one(0), one(10 * n_metres), one(0))
-
-
-def _patches(station, seed):
-    edges = np.cumsum(np.random.default_rng(seed).uniform(0.3, 1.5, 200)) - 20.0
-    return np.where(np.searchsorted(edges, station) % 2 == 0, 0.06, 0.0)
-
-
-def _beliefs(weights, share, told, sigma, strip, passed):
-    record = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype != bool else x, _drive(share))
-    whole = streams.profiles_of(record, _N)
-    rate = jnp.full(_N, 0.0)
-    scalar = jnp.float32
-    return map_filter.sequence(
-        weights, whole, streams.BEFORE, strip.pick(0), scalar(told), scalar(sigma), jnp.asarray(passed), rate
-    )
-
-
-# The relief is met from station 0 of `_relief` on; the map begins 50 m before.
-@pytest.mark.parametrize(("offset", "share"), [(0.0, 0.0), (3.0, 0.0), (-4.2, 0.02), (2.0, -0.03)])
-def test_a_map_tells_how_far_the_start_is_off(offset, share):
-    weights = map_filter.init(jax.random.key(0))
-    passed = np.maximum(np.arange(_N) - DELAY + 1.0, 0.0) * share  # what a perfect localiser says of the metres passed
-    beliefs = _beliefs(weights, share, 50.0 - offset, 3.0, _strip(first=-50.0), passed.astype(np.float32))
-    found, sigma, believed = map_filter.place(jax.tree.map(lambda leaf: leaf[-1], beliefs))
-    assert float(found) == pytest.approx(offset, abs=0.15)
-    assert float(sigma) < 0.5
-    assert bool(believed)
-    assert float(beliefs.log_odds[-1]) > float(beliefs.log_odds[0]) + 2.0
-
-
-def test_a_map_of_another_tunnel_is_not_believed():
-    weights = map_filter.init(jax.random.key(0))
-    beliefs = _beliefs(weights, 0.0, 50.0, 0.0, _strip(first=-50.0, seed=8, side=4.1), np.zeros(_N, np.float32))
-    last = jax.tree.map(lambda leaf: leaf[-1], beliefs)
-    assert not bool(map_filter.place(last)[2])
-    plain = Estimate(jnp.float32(1.0), jnp.float32(0.02), jnp.float32(-1.0))
-    kept = map_filter.corrected(last, plain, jnp.float32(_N), jnp.float32(0.0))
-    assert float(kept.correction) == 1.0
-    assert float(kept.log_scale) == pytest.approx(-1.0)
-
-
-def test_a_strip_gives_the_walls_of_its_tunnel_and_says_where_it_ends():
-    strip = _strip(n_metres=20)
-    wall, inside = strip.pick(0).sample(jnp.float32(-1.0), 300)
-    station = -1.0 + BIN * np.arange(300)
-    np.testing.assert_array_equal(np.asarray(inside), (station > 0.049) & (station < 19.94))
-    near = np.abs(np.asarray(wall[0]) - _HALF - _patches(station, 3)) < 1e-6
-    assert np.mean(near[np.asarray(inside)]) > 0.7, "only at the edges of patches two bins are mixed"
-
-
-def test_the_strip_of_a_stack_holds_the_walls_of_each_tunnel():
-    tunnels = [st.load_tunnel("control"), st.load_tunnel("subterra-351")]
-    _, params = st.make("Subterra/StopAt-v1", tunnel=[Tunnel.from_plan(one) for one in tunnels])
-    strip = map_strip(params.tunnel)
-    for index in range(2):
-        here = strip.of(params.tunnel.pick(index))
-        wall, inside = here.sample(jnp.float32(100.0), 50)
-        alone = map_strip(Tunnel.from_plan(tunnels[index])).pick(0).sample(jnp.float32(100.0), 50)[0]
-        assert bool(inside.all())
-        np.testing.assert_allclose(wall, alone, atol=1e-6)
-    assert np.ptp(np.asarray(wall)) > 0.05, "pockets stand in the plane of subterra-351"
