@@ -27,10 +27,8 @@ from subterra_jax.tunnel.packed import ALL_PAIRS, ALL_WINDOW, WINDOW_BITS, WORDS
 
 # Scans of one program: one warp of 32 threads, so that a program in which nobody looks on is short.
 _ROWS = 4
-# Threads that look at the boxes of one scan.
-_BOX_LANES = 8
-# Beams of one scan that meet walls at the same time, and threads of each.
-_BEAMS, _WALL_LANES = 2, 4
+# Threads of one scan.
+_LANES = 8
 # Lines whose nearest boxes fit into one thread's registers.
 _MOST_LINES = 8
 # Half thickness of a box that no beam enters, m.
@@ -80,7 +78,7 @@ def scan(
     turn = jnp.asarray(np.concatenate([np.cos(bearing), np.sin(bearing)]), jnp.float32)
     packed = packed_blocks(tunnel)
     box, wall = packed.box.reshape(-1), packed.wall.reshape(-1)
-    beams = _Beams(n_beams, n_best, tunnel.n_scan, tunnel.box.shape[1], packed.wall.shape[1], n_rows)
+    beams = _Beams(n, n_beams, n_best, tunnel.n_scan, tunnel.box.shape[1], packed.wall.shape[1], n_rows)
     whole = pl.BlockSpec(memory_space=pl.ANY)
     call = partial(
         pl.pallas_call,
@@ -92,21 +90,22 @@ def scan(
         partial(_boxes_kernel, beams=beams, width=width),
         grid=(n // n_rows, n_lines // width),
         in_specs=[whole] * 7,
-        out_shape=jax.ShapeDtypeStruct((n * n_best * n_beams,), jnp.int32),
+        out_shape=jax.ShapeDtypeStruct((n * n_beams * beams.n_words,), jnp.int32),
     )(*rows, turn, box)
     ranges = call(
         partial(_hits_kernel, beams=beams),
         grid=(n // n_rows,),
         in_specs=[whole] * 10,
-        out_shape=jax.ShapeDtypeStruct((n * n_beams,), jnp.float32),
+        out_shape=jax.ShapeDtypeStruct((n_beams * n,), jnp.float32),
     )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), box, wall)
-    return ranges.reshape(n, n_beams)[:count]
+    return ranges.reshape(n_beams, n)[:, :count].T
 
 
 class _Beams(NamedTuple):
     """Sizes of the arrays that both kernels read.
 
     Attributes:
+        n_all: Scans.
         n: Beams of a scan.
         n_best: Boxes of a beam that are sorted by where it enters them.
         n_scan: Blocks in the largest window.
@@ -115,12 +114,18 @@ class _Beams(NamedTuple):
         n_rows: Scans of one program.
     """
 
+    n_all: int
     n: int
     n_best: int
     n_scan: int
     n_blocks: int
     n_numbers: int
     n_rows: int
+
+    @property
+    def n_words(self) -> int:
+        """Words of the keys of a beam, as many as are read at once or a multiple of them."""
+        return -(-self.n_best // WORDS) * WORDS
 
     @property
     def number_bits(self) -> int:
@@ -144,23 +149,42 @@ def packed_blocks(tunnel: Tunnel) -> Packed:
     return pack(tunnel.box, tunnel.wall, jnp.full_like(everything, tunnel.wall.shape[2]), everything)
 
 
-def load_words(ref, start, mask=None):
-    """Return four words of each of many rows, read by one instruction; 0 where masked.
+def load_words(ref, start, mask=None, n_words: int = WORDS):
+    """Return some words of each of many rows, read by one instruction; 0 where masked.
 
     Args:
         ref: Flat array of words.
-        start: First word of each row, a multiple of 4.
+        start: First word of each row, a multiple of their number.
         mask: Rows to read; `None` for all.
+        n_words: Words of a row, 2 or 4.
     """
     from jax.experimental.pallas import triton
 
-    column = lax.broadcasted_iota(jnp.int32, (*start.shape, WORDS), start.ndim)
+    column = lax.broadcasted_iota(jnp.int32, (*start.shape, n_words), start.ndim)
     # Triton takes no `other` without a mask.
     masked: dict[str, Any] = (
         {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
     )
     words = triton.load(ref.at[start[..., None] + column], **masked)
-    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(WORDS))
+    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(n_words))
+
+
+def store_words(ref, start, words, mask):
+    """Write up to four words of each of many rows by one instruction; the rest of the four become 0.
+
+    Args:
+        ref: Flat array of words.
+        start: First word of each row, a multiple of 4.
+        words: The words, each of all rows.
+        mask: Rows to write.
+    """
+    from jax.experimental.pallas import triton
+
+    column = lax.broadcasted_iota(jnp.int32, (*start.shape, WORDS), start.ndim)
+    value = jnp.zeros(column.shape, words[0].dtype)
+    for i, word in enumerate(words):
+        value = jnp.where(column == i, word[..., None], value)
+    triton.store(ref.at[start[..., None] + column], value, mask=jnp.broadcast_to(mask[..., None], column.shape))
 
 
 def unpack(words):
@@ -207,7 +231,7 @@ def _boxes_kernel(
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    shape = beams.n_rows, _BOX_LANES
+    shape = beams.n_rows, _LANES
     row = pl.program_id(0) * beams.n_rows + lax.broadcasted_iota(jnp.int32, shape, 0)
     lane, line = lax.broadcasted_iota(jnp.int32, shape, 1), pl.program_id(1) * width
     wanted = triton.load(wanted_ref.at[row])
@@ -224,8 +248,8 @@ def _boxes_kernel(
 
         def meet(i, carry):
             best, words = carry
-            number = lane + i * _BOX_LANES
-            following = load(number + _BOX_LANES)  # while this one is worked on
+            number = lane + i * _LANES
+            following = load(number + _LANES)  # while this one is worked on
             m_x, m_y, e_x, e_y, thickness, _, _ = unpack(words)
             thickness = jnp.where(number < window, thickness, _NONE)
             length = length_of(e_x, e_y)
@@ -247,16 +271,20 @@ def _boxes_kernel(
             return tuple(_inserted(best[i], merged[i]) for i in range(2 * width)), following
 
         nothing = tuple(jnp.full(shape, NOTHING) for _ in range(_kept(beams.n_best)))
-        n_rounds = (jnp.max(window) + _BOX_LANES - 1) // _BOX_LANES
+        n_rounds = (jnp.max(window) + _LANES - 1) // _LANES
         best, _ = lax.fori_loop(0, n_rounds, meet, ((nothing,) * (2 * width), load(lane)))
         for sense in range(2):
             first_boxes = [_first_of_all(kept, beams.n_best) for kept in best[sense::2]]
-            for k in range(beams.n_best):
-                key = jnp.zeros(shape, jnp.int32)
-                for j in range(width):
-                    key = jnp.where(lane == j, first_boxes[j][k], key)
-                beam = sense * (beams.n // 2) + line + lane
-                triton.store(key_ref.at[(row * beams.n_best + k) * beams.n + beam], key, mask=lane < width)
+            beam = sense * (beams.n // 2) + line + lane
+            for begin in range(0, beams.n_best, WORDS):
+                keys = []
+                for k in range(begin, min(begin + WORDS, beams.n_best)):
+                    # Each thread writes down one line.
+                    key = jnp.zeros(shape, jnp.int32)
+                    for j in range(width):
+                        key = jnp.where(lane == j, first_boxes[j][k], key)
+                    keys.append(key)
+                store_words(key_ref, (row * beams.n + beam) * beams.n_words + begin, keys, lane < width)
 
 
 def _kept(n_best: int) -> int:
@@ -295,9 +323,9 @@ def _hits_kernel(
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    shape = beams.n_rows, _BEAMS, _WALL_LANES
+    shape = beams.n_rows, _LANES
     row = pl.program_id(0) * beams.n_rows + lax.broadcasted_iota(jnp.int32, shape, 0)
-    lane = lax.broadcasted_iota(jnp.int32, shape, 2)
+    lane = lax.broadcasted_iota(jnp.int32, shape, 1)
     wanted = triton.load(wanted_ref.at[row]) > 0
 
     @pl.when(_any(wanted))
@@ -306,25 +334,32 @@ def _hits_kernel(
         cos, sin = jnp.cos(heading), jnp.sin(heading)
         limit = jnp.full(shape, triton.load(limit_ref.at[jnp.int32(0)]))
 
-        def some_beams(j, _):
-            beam = j * _BEAMS + lax.broadcasted_iota(jnp.int32, shape, 1)
+        def one_beam(beam, _):
             direction = _direction(turn_ref, beam, beams.n, cos, sin)
             look_into = partial(_look_into, box_ref, wall_ref, beams.n_numbers, x, y, direction)
-            nearest = limit
-            for k in range(beams.n_best):
-                key = triton.load(key_ref.at[(row * beams.n_best + k) * beams.n + beam])
+            start = (row * beams.n + beam) * beams.n_words
+            keys = [key for i in range(0, beams.n_words, WORDS) for key in load_words(key_ref, start + i)]
+
+            def enters(key, nearest):
                 # A box that is entered behind the hit holds no nearer one.
-                open_ = wanted & (key != NOTHING) & (beams.entry(key) <= nearest)
-                block = jnp.minimum(first + (key & jnp.int32((1 << beams.number_bits) - 1)), beams.n_blocks - 1)
-                together = partial(look_into, block, open_, nearest, lane, _WALL_LANES)
-                nearest = _least(lax.cond(_any(open_), together, lambda nearest=nearest: nearest))
-            unsure = wanted & (key != NOTHING) & (beams.entry(key) <= nearest)
-            everywhere = partial(_look_everywhere, box_ref, look_into, beams.n_scan, first, unsure, x, y, direction)
-            nearest = _least(lax.cond(_any(unsure), partial(everywhere, lane, nearest), lambda: nearest))
-            triton.store(range_ref.at[row * beams.n + beam], nearest)  # all threads of a beam know it
+                return wanted & (key != NOTHING) & (beams.entry(key) <= nearest)
+
+            def look_from(k: int, there, nearest):
+                """The nearest hit in a beam's boxes from the k-th on, where it enters that."""
+                if k == beams.n_best:
+                    return _look_everywhere(
+                        box_ref, look_into, beams.n_scan, first, there, x, y, direction, lane, nearest
+                    )
+                block = jnp.minimum(first + (keys[k] & jnp.int32((1 << beams.number_bits) - 1)), beams.n_blocks - 1)
+                nearest = _least(look_into(block, there, nearest, lane, _LANES))
+                further = enters(keys[min(k + 1, beams.n_best - 1)], nearest)
+                return lax.cond(_any(further), partial(look_from, k + 1, further, nearest), lambda: nearest)
+
+            nearest = look_from(0, enters(keys[0], limit), limit)
+            triton.store(range_ref.at[beam * beams.n_all + row], nearest)  # all threads of a beam know it
             return 0
 
-        lax.fori_loop(0, beams.n // _BEAMS, some_beams, 0)
+        lax.fori_loop(0, beams.n, one_beam, 0)
 
 
 def _any(what):
@@ -335,7 +370,7 @@ def _any(what):
 def _least(distance):
     """Return the least distance among the threads of a beam, to all of them."""
     # As integers: a minimum of floats must look out for NaN.
-    least = jnp.min(lax.bitcast_convert_type(distance, jnp.int32), axis=2, keepdims=True)
+    least = jnp.min(lax.bitcast_convert_type(distance, jnp.int32), axis=1, keepdims=True)
     return lax.bitcast_convert_type(jnp.broadcast_to(least, distance.shape), jnp.float32)
 
 
@@ -345,8 +380,6 @@ def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_,
     Each thread meets a vertex pair and the vertex behind it, then the pair `stride` pairs on. `cast.hits` has the
     geometry.
     """
-    from jax.experimental.pallas import triton
-
     d_x, d_y = direction
     n_pairs = n_numbers // WORDS
     m_x, m_y, _, _, _, pairs, _ = unpack(load_words(box_ref, WORDS * block, open_))
@@ -371,7 +404,7 @@ def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_,
         there, goes_on = pair < pairs, pair + 1 < pairs
         start = block * n_numbers + WORDS * pair
         numbers = load_words(wall_ref, start, there)
-        behind = (triton.load(wall_ref.at[start + WORDS + j], mask=goes_on, other=0.0) for j in range(2))
+        behind = load_words(wall_ref, start + WORDS, goes_on, 2)
         one, other = seen(*numbers[:2]), seen(*numbers[2:])
         return segment(other, seen(*behind), segment(one, other, nearest, there), goes_on)
 
@@ -382,14 +415,14 @@ def _look_everywhere(box_ref, look_into, n_scan: int, first, unsure, x, y, direc
     """Return the nearest hit in any block of the window whose box is entered, for beams that are `unsure`.
 
     They enter as many boxes as were kept, and meet no wall before the last of them, as beside a row of deep recesses.
-    Each thread has every fourth box.
+    Each thread has every eighth box.
     """
     d_x, d_y = direction
     window = all_if_full(unpack(load_words(box_ref, WORDS * first, unsure))[-1], ALL_WINDOW, n_scan)
     window = jnp.where(unsure, window, 0)
 
     def look(i, nearest):
-        number = lane + i * _WALL_LANES
+        number = lane + i * _LANES
         block, there = first + number, number < window
         m_x, m_y, e_x, e_y, thickness, _, _ = unpack(load_words(box_ref, WORDS * block, there))
         m_x, m_y = m_x - x, m_y - y
@@ -401,4 +434,4 @@ def _look_everywhere(box_ref, look_into, n_scan: int, first, unsure, x, y, direc
         alone = partial(look_into, block, open_, nearest, jnp.zeros_like(lane), 1)
         return lax.cond(_any(open_), alone, lambda: nearest)
 
-    return lax.fori_loop(0, (jnp.max(window) + _WALL_LANES - 1) // _WALL_LANES, look, nearest)
+    return _least(lax.fori_loop(0, (jnp.max(window) + _LANES - 1) // _LANES, look, nearest))
