@@ -77,8 +77,8 @@ def scan(
     width = max(w for w in range(1, _MOST_LINES + 1) if n_lines % w == 0)
     turn = jnp.asarray(np.concatenate([np.cos(bearing), np.sin(bearing)]), jnp.float32)
     packed = packed_blocks(tunnel)
-    box, wall = packed.box.reshape(-1), packed.wall.reshape(-1)
-    beams = _Beams(n, n_beams, n_best, tunnel.n_scan, tunnel.box.shape[1], packed.wall.shape[1], n_rows)
+    box, walls = packed.box.reshape(-1), (jnp.asarray(packed.start), packed.wall.reshape(-1))
+    beams = _Beams(n, n_beams, n_best, tunnel.n_scan, tunnel.box.shape[1], (tunnel.wall.shape[2] + 1) // 2, n_rows)
     whole = pl.BlockSpec(memory_space=pl.ANY)
     call = partial(
         pl.pallas_call,
@@ -95,9 +95,9 @@ def scan(
     ranges = call(
         partial(_hits_kernel, beams=beams),
         grid=(n // n_rows,),
-        in_specs=[whole] * 10,
+        in_specs=[whole] * 11,
         out_shape=jax.ShapeDtypeStruct((n_beams * n,), jnp.float32),
-    )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), box, wall)
+    )(key, *rows, turn, jnp.asarray(range_max, jnp.float32).reshape(1), box, *walls)
     return ranges.reshape(n_beams, n)[:, :count].T
 
 
@@ -110,7 +110,7 @@ class _Beams(NamedTuple):
         n_best: Boxes of a beam that are sorted by where it enters them.
         n_scan: Blocks in the largest window.
         n_blocks: All blocks.
-        n_numbers: Numbers of the vertices of a block.
+        n_pairs: Most vertex pairs of a block.
         n_rows: Scans of one program.
     """
 
@@ -119,7 +119,7 @@ class _Beams(NamedTuple):
     n_best: int
     n_scan: int
     n_blocks: int
-    n_numbers: int
+    n_pairs: int
     n_rows: int
 
     @property
@@ -145,8 +145,7 @@ def packed_blocks(tunnel: Tunnel) -> Packed:
     """Return the packed blocks of a tunnel; made of its boxes and walls where it has none."""
     if tunnel.packed is not None:
         return tunnel.packed
-    everything = jnp.full(tunnel.box.shape[1], tunnel.n_scan)
-    return pack(tunnel.box, tunnel.wall, jnp.full_like(everything, tunnel.wall.shape[2]), everything)
+    return pack(tunnel.box, tunnel.wall, None, jnp.full(tunnel.box.shape[1], tunnel.n_scan))
 
 
 def load_words(ref, start, mask=None, n_words: int = WORDS):
@@ -316,8 +315,8 @@ def _first_of_all(kept, n_best: int):
 
 
 def _hits_kernel(
-    key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, box_ref, wall_ref, range_ref,
-    *, beams: _Beams,
+    key_ref, first_ref, wanted_ref, x_ref, y_ref, heading_ref, turn_ref, limit_ref, box_ref, start_ref, wall_ref,
+    range_ref, *, beams: _Beams,
 ):  # fmt: skip
     """The nearest segment along each beam of many scans, in the blocks whose boxes it enters before that segment."""
     from jax.experimental import pallas as pl
@@ -336,7 +335,7 @@ def _hits_kernel(
 
         def one_beam(beam, _):
             direction = _direction(turn_ref, beam, beams.n, cos, sin)
-            look_into = partial(_look_into, box_ref, wall_ref, beams.n_numbers, x, y, direction)
+            look_into = partial(_look_into, box_ref, start_ref, wall_ref, beams.n_pairs, x, y, direction)
             start = (row * beams.n + beam) * beams.n_words
             keys = [key for i in range(0, beams.n_words, WORDS) for key in load_words(key_ref, start + i)]
 
@@ -374,14 +373,16 @@ def _least(distance):
     return lax.bitcast_convert_type(jnp.broadcast_to(least, distance.shape), jnp.float32)
 
 
-def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_, nearest, lane, stride: int):
+def _look_into(box_ref, start_ref, wall_ref, n_pairs: int, x, y, direction, block, open_, nearest, lane, stride: int):
     """The distance to the nearest segment of a block along beams where `open_`, if less than `nearest`.
 
     Each thread meets a vertex pair and the vertex behind it, then the pair `stride` pairs on. `cast.hits` has the
     geometry.
     """
+    from jax.experimental.pallas import triton
+
     d_x, d_y = direction
-    n_pairs = n_numbers // WORDS
+    first_pair = triton.load(start_ref.at[block], mask=open_, other=0)
     m_x, m_y, _, _, _, pairs, _ = unpack(load_words(box_ref, WORDS * block, open_))
     m_x, m_y = m_x - x, m_y - y
     pairs = jnp.where(open_, all_if_full(pairs, ALL_PAIRS, n_pairs), 0)
@@ -402,7 +403,7 @@ def _look_into(box_ref, wall_ref, n_numbers: int, x, y, direction, block, open_,
     def two_segments(i, nearest):
         pair = lane + i * stride
         there, goes_on = pair < pairs, pair + 1 < pairs
-        start = block * n_numbers + WORDS * pair
+        start = WORDS * (first_pair + pair)
         numbers = load_words(wall_ref, start, there)
         behind = load_words(wall_ref, start + WORDS, goes_on, 2)
         one, other = seen(*numbers[:2]), seen(*numbers[2:])

@@ -1,6 +1,7 @@
 """The blocks of a tunnel as NVIDIA GPUs read them: few bytes a block, in words that one instruction reads four of.
 
-Robots in a thousand tunnels read more than a chip's cache holds, and time is spent waiting for it.
+Robots in a thousand tunnels read more than a chip's cache holds, and time is spent waiting for it. So the vertices of
+all blocks follow one another without padding.
 """
 
 from typing import Any
@@ -25,12 +26,14 @@ class Packed:
         box: Words of the box around each block: the middle x and y (m, float32); half its long axis x and y (m,
             bfloat16); half its thickness (m, bfloat16), vertex pairs and blocks in the largest scan window that begins
             with it. A count with all bits set says "all there are".
-        wall: Vertices of each block as x, y, x, y, from the middle of its box, m; an even number, the last one
-            repeated as padding.
+        start: First vertex pair of each block.
+        wall: Vertex pairs of all blocks as x, y, x, y, from the middle of the block's box, m; the last vertex of a
+            block twice if their number is odd.
     """
 
     box: Int[Array, "n_blocks 4"]
-    wall: Float[Array, "n_blocks n_numbers"]
+    start: Int[Array, "n_blocks"]
+    wall: Float[Array, "n_pairs 4"]
 
 
 def pack(box: Any, wall: Any, count: Any, window: Any) -> Packed:
@@ -41,7 +44,7 @@ def pack(box: Any, wall: Any, count: Any, window: Any) -> Packed:
     Args:
         box: As in `Tunnel`.
         wall: As in `Tunnel`.
-        count: Vertices of each block without padding, `(n_blocks,)`.
+        count: Vertices of each block without padding, `(n_blocks,)`; `None` keeps the padding.
         window: Blocks in the largest scan window that begins with each block, `(n_blocks,)`; 0 where none does.
     """
     xp = np if isinstance(box, np.ndarray) else jnp
@@ -52,18 +55,29 @@ def pack(box: Any, wall: Any, count: Any, window: Any) -> Packed:
     bits = _bits(xp, thickness)
     # Towards larger numbers: cutting the last bits makes a positive number less, and a negative one more.
     up = (bits + xp.where(bits >= 0, 0xFFFF, 0).astype(np.int32)) & _HIGH
-    pairs = xp.minimum((xp.asarray(count).astype(np.int32) + 1) // 2, ALL_PAIRS)
+    wall = pair_up(xp, wall)
+    n_blocks, n_pairs = wall.shape[:2]
+    there = np.full(n_blocks, n_pairs) if count is None else (np.asarray(count).astype(np.int32) + 1) // 2
+    pairs = np.minimum(there, ALL_PAIRS)
+    kept = np.where(pairs == ALL_PAIRS, n_pairs, there)
+    start = (np.cumsum(kept) - kept).astype(np.int32)
+    wall = wall.reshape(-1, WORDS) if count is None else wall[np.arange(n_pairs) < kept[:, None]]
     window = xp.minimum(xp.asarray(window).astype(np.int32), ALL_WINDOW)
-    last = up | (pairs << WINDOW_BITS) | window
+    last = up | (pairs.astype(np.int32) << WINDOW_BITS) | window
     axis = axis_x | ((axis_y >> 16) & 0xFFFF)
     words = xp.stack([_bits(xp, middle_x), _bits(xp, middle_y), axis, last], axis=1)
-    return Packed(box=words, wall=pair_up(xp, wall))
+    return Packed(box=words, start=start, wall=wall)
+
+
+def counts(box: Any) -> tuple[Any, Any]:
+    """Return the vertex pairs and the windows of packed boxes, as `Packed.box` holds them."""
+    return (box[:, 3] >> WINDOW_BITS) & ALL_PAIRS, box[:, 3] & ALL_WINDOW
 
 
 def pair_up(xp: Any, wall: Any) -> Any:
-    """Return the vertices of each block side by side, an even number of them."""
+    """Return the vertices of each block in pairs, `(n_blocks, n_pairs, 4)`; the last one twice if they are odd."""
     wall = xp.pad(wall, ((0, 0), (0, 0), (0, wall.shape[2] % 2)), mode="edge")
-    return xp.swapaxes(wall, 1, 2).reshape(wall.shape[0], -1)
+    return xp.swapaxes(wall, 1, 2).reshape(wall.shape[0], -1, WORDS)
 
 
 def high(word: Any) -> Any:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, pad, windows
-from subterra_jax.tunnel.packed import Packed, pack
+from subterra_jax.tunnel.packed import Packed, counts, pack
 from subterra_jax.tunnel.plan import TunnelPlan
 
 CONTACT_REACH = 0.8
@@ -257,6 +257,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     parts = [_pad(t, n_scan, n_contact, n_vertices) for t in tunnels]
     n_blocks, n_nodes = np.array([box.shape[1] for box, _ in parts]), np.array([t.grid.shape[0] for t in tunnels])
     first_block, first_node = (np.concatenate([[0], np.cumsum(n)[:-1]]).astype(np.int32) for n in (n_blocks, n_nodes))
+    box, wall = np.concatenate([box for box, _ in parts], axis=1), np.concatenate([wall for _, wall in parts])
     put = jax.device_put  # `jnp.asarray` would compile a program for each new shape
     numbers = lambda name: put(np.stack([np.asarray(getattr(t, name)) for t in tunnels]))  # noqa: E731
     shifted = lambda name: put(  # noqa: E731
@@ -271,14 +272,14 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         grid=put(np.concatenate([np.asarray(t.grid) for t in tunnels])),
         scan_first=shifted("scan_first"),
         contact_first=shifted("contact_first"),
-        box=put(np.concatenate([box for box, _ in parts], axis=1)),
-        wall=put(np.concatenate([wall for _, wall in parts])),
+        box=put(box),
+        wall=put(wall),
         reach=min(t.reach for t in tunnels),
         n_scan=n_scan,
         n_contact=n_contact,
         n_candidates=max(t.n_candidates for t in tunnels),
         space=None if tunnels[0].space is None else tunnels[0].space.join([t.space for t in tunnels]),
-        packed=_join_packed(tunnels, n_blocks, n_vertices),
+        packed=_join_packed(tunnels, box, wall, n_blocks),
     )
 
 
@@ -302,27 +303,19 @@ def _padding(count: int) -> np.ndarray:
     return fill
 
 
-def _join_packed(tunnels: Sequence[Tunnel], n_blocks: np.ndarray, n_vertices: int) -> Packed | None:
-    """Join the packed blocks of several tunnels, padded to as many blocks and vertices as the others are.
+def _join_packed(tunnels: Sequence[Tunnel], box: np.ndarray, wall: np.ndarray, n_blocks: np.ndarray) -> Packed | None:
+    """Pack the blocks of a stack.
 
     Args:
         tunnels: The tunnels.
-        n_blocks: Blocks of each with padding.
-        n_vertices: Vertices of each block in the stack.
+        box: Boxes of the stack.
+        wall: Walls of the stack.
+        n_blocks: Blocks of each tunnel with padding.
     """
     if any(t.packed is None for t in tunnels):
         return None
-    n_numbers = 2 * (n_vertices + n_vertices % 2)
-    boxes: list[Any] = []
-    walls: list[Any] = []
-    for tunnel, total in zip(tunnels, n_blocks, strict=True):
-        box, wall = np.asarray(tunnel.packed.box), np.asarray(tunnel.packed.wall)
-        missing = int(total) - len(box)
-        nowhere = np.zeros((missing, 2, n_vertices), np.float32)
-        fill = pack(_padding(missing), nowhere, np.ones(missing), np.zeros(missing))
-        # The last vertex again, which is two numbers.
-        more = np.tile(wall[:, -2:], (1, (n_numbers - wall.shape[1]) // 2))
-        boxes += [box, fill.box]
-        walls += [np.concatenate([wall, more], axis=1), fill.wall]
-    put = jax.device_put
-    return Packed(box=put(np.concatenate(boxes)), wall=put(np.concatenate(walls)))
+    pairs, window = np.zeros((2, len(wall)), np.int32)
+    for tunnel, begin in zip(tunnels, np.cumsum(n_blocks) - n_blocks, strict=True):
+        own = slice(begin, begin + len(tunnel.packed.box))
+        pairs[own], window[own] = counts(np.asarray(tunnel.packed.box))
+    return jax.device_put(pack(box, wall, 2 * pairs, window))

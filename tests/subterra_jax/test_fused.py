@@ -11,6 +11,7 @@ import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.lidar import fused, reference
 from subterra_jax.tunnel import Tunnel, node_at, packed
+from subterra_jax.tunnel.tunnel import stack
 
 
 @pytest.fixture(scope="module")
@@ -118,8 +119,24 @@ def test_a_packed_box_has_the_vertices_of_its_block_and_the_window_that_begins_t
     first = np.unique(np.asarray(tunnel.scan_first))
     assert np.all((window[first] >= 1) & (window[first] <= tunnel.n_scan))
     assert window[np.setdiff1d(np.arange(len(window)), first)].max() == 0
-    numbers = np.asarray(tunnel.packed.wall)
-    np.testing.assert_array_equal(numbers[:, : 2 * wall.shape[2]].reshape(len(wall), -1, 2), wall.swapaxes(1, 2))
+    number, start = np.asarray(tunnel.packed.wall), np.asarray(tunnel.packed.start)
+    assert len(number) == pairs.sum()
+    for i in (0, len(wall) // 2, len(wall) - 1):
+        own = number[start[i] : start[i] + int(pairs[i])].reshape(-1, 2)[: wall.shape[2]]
+        np.testing.assert_array_equal(own, wall[i].T[: len(own)])
+
+
+def test_a_stack_is_packed_as_its_tunnels_are(plan: st.TunnelPlan) -> None:
+    one, other = Tunnel.from_plan(plan), Tunnel.from_plan(st.load_tunnel("open:masonry:train:0").slice(100.0, 80.0))
+    both = stack([one, other])
+    behind = both.box.shape[1] - other.packed.box.shape[0]
+    for tunnel, begin in ((one, 0), (other, int(both.scan_first[-1] - other.scan_first[-1]))):
+        own = slice(begin, begin + len(tunnel.packed.box))
+        np.testing.assert_array_equal(both.packed.box[own], tunnel.packed.box)
+        shift = int(both.packed.start[begin])
+        np.testing.assert_array_equal(both.packed.start[own] - shift, tunnel.packed.start)
+        np.testing.assert_array_equal(both.packed.wall[shift : shift + len(tunnel.packed.wall)], tunnel.packed.wall)
+    assert behind > 0
 
 
 def test_counts_that_do_not_fit_stand_for_everything(plan: st.TunnelPlan) -> None:
