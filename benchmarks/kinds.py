@@ -31,7 +31,7 @@ from subterra_jax.procedural.open_world import SPLITS, kinds_of
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import find
 from subterra_jax.tunnel import Tunnel
-from train.locate.tunnels import load
+from train.tunnels import load
 
 SCHEMA = "subterra.kinds/1"
 N_GROUPS = 10

@@ -15,10 +15,10 @@ from subterra_jax.host.versions import VERSION
 from subterra_jax.policies import TRAINED_UNDER, training_conditions
 from subterra_jax.procedural import expand
 from subterra_jax.tasks import TaskError, find
-from subterra_jax.tunnel.sources import tunnel_digest
+from train import tunnels
 from train.config import ConfigError
+from train.tunnels import PLANAR
 
-PLANAR = "planar16"
 REWARD = "reward"  # fact of a world with other weights than the task's
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
 
@@ -120,23 +120,25 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None = None, 
         TunnelError: The tunnel file is missing or wrong, or has no such lining.
     """
     task = require_task(task)
-    names = [tunnel] if tunnel is None else expand(str(tunnel))
-    plans = [st.load_tunnel(name, solid=sensor != PLANAR) for name in names]
-    lining = lining or plans[0].default_lining
+    names: list[str | Path | None] = [tunnel] if tunnel is None else [*expand(str(tunnel))]
+    several = len(names) > 1
+    plan = st.load_tunnel(names[0], solid=sensor != PLANAR and not several)
+    lining = lining or plan.default_lining
     try:
-        env, params = st.make(task, tunnel=plans if len(plans) > 1 else plans[0], lining=lining, sensor=sensor)
+        made = tunnels.load(names, lining, None, sensor, st.TASKS[task].piece) if several else plan
+        env, params = st.make(task, tunnel=made, lining=lining, sensor=sensor)
     except st.SubterraError:
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    digests = [tunnel_digest(name) for name in names]
+    digests = tunnels.digests(names)
     facts = {
         "task": task,
         "lining": lining,
-        "tunnel": plans[0].name if len(plans) == 1 else str(tunnel),
-        "tunnel_provenance": plans[0].provenance,
+        "tunnel": str(tunnel) if several else plan.name,
+        "tunnel_provenance": plan.provenance,
         "constants": st.constants_digest(env, params),
-        "tunnel_sha256": digests[0] if len(digests) == 1 else hashlib.sha256("".join(digests).encode()).hexdigest(),
+        "tunnel_sha256": hashlib.sha256("".join(digests).encode()).hexdigest() if several else digests[0],
     }
     if sensor != PLANAR:
         facts["sensor"] = sensor

@@ -31,7 +31,7 @@ from subterra_jax.evaluation.floor import floor
 from subterra_jax.evaluation.harness import fitting_batch
 from subterra_jax.host.files import require_folder
 from subterra_jax.parts.spatial_lidar import SENSORS
-from train.locate.tunnels import PLANAR, load
+from train.tunnels import PLANAR, load
 
 _progress = Console(stderr=True, highlight=False)
 

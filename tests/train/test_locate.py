@@ -19,10 +19,11 @@ from subterra_jax.policies.locate.blocks import Estimate
 from subterra_jax.policies.locate.map_strip import MapStrip, map_strip
 from subterra_jax.policies.locate.profiles import Points
 from subterra_jax.policies.locate.streams import Record
+from train import tunnels
 from train.checkpoint import iterations
 from train.config import ConfigError
 from train.folder import RunFolderError
-from train.locate import filtering, keeping, look, release, scores, session, tunnels
+from train.locate import filtering, keeping, look, release, scores, session
 from train.locate.command import Command, check
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner, draw_told, map_loss
@@ -327,9 +328,3 @@ def test_a_look_weighs_kinds_alike_and_leaves_out_drives_without_a_goal():
     assert (found["rock"]["success"], found["rock"]["n"]) == (pytest.approx(0.2), 1)
     assert found["all"]["success"] == pytest.approx((0.375 + 0.2) / 2)
     assert found["cast"]["low"] < 0.1 < 0.7 < found["cast"]["high"], "two tunnels that differ leave a wide interval"
-
-
-def test_no_tunnel_and_one_tunnel_need_no_other_process():
-    assert tunnels.load([]) == []
-    (one,) = tunnels.load(["control"], "smooth")
-    assert one.count == 1

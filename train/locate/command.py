@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import tyro
 
 from subterra_jax.policies import PolicyError
+from train import tunnels
 from train.config import ConfigError, at_least, positive
-from train.locate import tunnels
 from train.locate.learner import LocateConfig, LocateLearner
 from train.sinks import check_tensorboard
 

@@ -18,8 +18,9 @@ import tyro
 
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
+from train import tunnels
 from train.config import ConfigError
-from train.locate import scores, tunnels
+from train.locate import scores
 from train.locate.command import Command as Training
 from train.locate.command import check
 from train.locate.keeping import CURVE, LOG, check_folder

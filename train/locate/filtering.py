@@ -25,8 +25,9 @@ from subterra_jax.policies import load
 from subterra_jax.policies.locate import kalman, memory, streams
 from subterra_jax.policies.locate.agent import Locating, nested
 from subterra_jax.policies.locate.blocks import Block
+from train import tunnels
 from train.config import ConfigError, at_least, positive
-from train.locate import scores, tunnels
+from train.locate import scores
 from train.locate.command import Command as Training
 from train.locate.drives import Drive, record_drives
 from train.locate.keeping import CURVE, LOG, POLICY, SCORES, save

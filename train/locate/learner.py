@@ -17,7 +17,7 @@ from subterra_jax.policies.locate.agent import Locating, nested
 from subterra_jax.policies.locate.blocks import DELAY
 from subterra_jax.policies.locate.map_strip import MapStrip
 from train.locate.drives import Drive, record_drives
-from train.locate.tunnels import PLANAR
+from train.tunnels import PLANAR
 
 
 @dataclasses.dataclass(frozen=True)

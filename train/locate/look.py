@@ -23,8 +23,9 @@ from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.locate import memory, streams
 from subterra_jax.policies.locate.agent import Locating, nested
 from subterra_jax.policies.locate.map_strip import map_strip
+from train import tunnels
 from train.config import at_least
-from train.locate import scores, tunnels
+from train.locate import scores
 from train.locate.drives import Drive
 
 SCHEMA = "subterra.look/1"

@@ -13,8 +13,8 @@ from train.config import ConfigError
 from train.evaluate import evaluate
 from train.locate.keeping import CURVE, POLICY, SCORES
 from train.locate.scores import WITH_MAP
-from train.locate.tunnels import PLANAR
 from train.policies import facts_file
+from train.tunnels import PLANAR
 from train.world import open_world
 
 MEASURED = ("subterra.kinds/1", "subterra.look/1")

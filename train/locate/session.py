@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from subterra_jax.host.files import replace_file
+from train import tunnels
 from train.checkpoint import has_checkpoint, load_checkpoint, save_checkpoint
-from train.locate import keeping, scores, tunnels
+from train.locate import keeping, scores
 from train.locate.command import Command, check, identity
 from train.locate.learner import LocateLearner
 from train.sinks import Board

@@ -26,9 +26,9 @@ from subterra_jax.host.files import replace_file
 from subterra_jax.policies import check_fits, load
 from subterra_jax.policies.locate.agent import Locating
 from subterra_jax.policies.locate.steering import N_SIGHT, PREFIX, SHARE, YAW_RATE, sight, to_command
+from train import tunnels
 from train.config import ConfigError, PPOConfig, at_least, check
 from train.feedforward.learner import Learner
-from train.locate import tunnels
 from train.locate.keeping import POLICY
 from train.policies import facts_file, policy_tensors
 from train.session import Session

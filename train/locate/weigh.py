@@ -23,8 +23,9 @@ from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file
 from subterra_jax.policies import check_fits
 from subterra_jax.policies.locate.agent import nested
+from train import tunnels
 from train.config import at_least
-from train.locate import scores, tunnels
+from train.locate import scores
 from train.locate.drives import Drive
 from train.locate.learner import estimate
 

@@ -1,11 +1,12 @@
 """Many tunnels at once, made by several processes."""
 
 import concurrent.futures
+import dataclasses
 import functools
 import multiprocessing
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,25 @@ from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.locate.map_strip import MapStrip, join, walls_of
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnel.sources import resolve
+from subterra_jax.tunnel.sources import resolve, tunnel_digest
 
 PLANAR = SENSORS[0]
 _EACH = 4  # planar tunnels that take as long to make as a process to begin
+
+
+@dataclasses.dataclass(frozen=True)
+class Kind:
+    """What of a tunnel is made.
+
+    Attributes:
+        lining: Variant of the walls; None is the usual one.
+        spatial: Make the bore in three dimensions too.
+        piece: Start and length of the piece to cut out, m; None keeps the whole.
+    """
+
+    lining: str | None
+    spatial: bool
+    piece: tuple[float, float] | None
 
 
 def names_of(names: str) -> list[str]:
@@ -39,23 +55,35 @@ def enter(task: str, tunnels: list[Tunnel], sensor: str = PLANAR) -> tuple[Any, 
     return st.make(task, tunnel=tunnels if len(tunnels) > 1 else tunnels[0], sensor=sensor)
 
 
-def load(names: list[str], lining: str | None = None, cache: Path | None = None, sensor: str = PLANAR) -> list[Tunnel]:
+def load(
+    names: Sequence[str | Path | None],
+    lining: str | None = None,
+    cache: Path | None = None,
+    sensor: str = PLANAR,
+    piece: tuple[float, float] | None = None,
+) -> list[Tunnel]:
     """Returns the tunnels of these names.
 
     Args:
-        names: Names of single tunnels.
+        names: Names or files of single tunnels; None is the packaged one.
         lining: Variant of the walls; None is the usual one.
         cache: Folder of this command's own in which tunnels are kept from run to run; None keeps none.
         sensor: The LiDAR; one in three dimensions needs the bore.
+        piece: Start and length of the piece to cut out of each, m; None keeps the whole.
 
     Raises:
         TunnelError: There is no such tunnel or lining.
     """
-    spatial = sensor != PLANAR
-    one = functools.partial(_tunnel, lining=lining, cache=cache, spatial=spatial)
-    missing = [name for name in names if not _is_kept(name, lining, cache, spatial)]
-    made = dict(zip(missing, _in_processes(one, missing, 1 if spatial else _EACH), strict=True))
+    kind = Kind(lining, sensor != PLANAR, piece)
+    one = functools.partial(_tunnel, kind=kind, cache=cache)
+    missing = [name for name in names if not _is_kept(name, kind, cache)]
+    made = dict(zip(missing, in_processes(one, missing, 1 if kind.spatial else _EACH), strict=True))
     return [made[name] if name in made else one(name) for name in names]
+
+
+def digests(names: Sequence[str | Path | None]) -> list[str]:
+    """Returns the SHA-256 of tunnels, as `tunnel_digest` has it, made by several processes."""
+    return in_processes(tunnel_digest, list(names), _EACH)
 
 
 def map_of(made: list[Tunnel], tunnel: Tunnel) -> MapStrip:
@@ -65,10 +93,10 @@ def map_of(made: list[Tunnel], tunnel: Tunnel) -> MapStrip:
         made: Its tunnels.
         tunnel: The tunnel or the stack.
     """
-    return join(_in_processes(walls_of, made, 2 * _EACH), tunnel)
+    return join(in_processes(walls_of, made, 2 * _EACH), tunnel)
 
 
-def _in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> list[Any]:
+def in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> list[Any]:
     """Returns the results of a function of this module or another, by so many processes that each has `each` items."""
     workers = min(-(-len(items) // each), os.cpu_count() or 1)
     if workers <= 1:
@@ -78,12 +106,12 @@ def _in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> li
         return list(pool.map(work, items, chunksize=1))
 
 
-def _tunnel(name: str, lining: str | None, cache: Path | None, spatial: bool = False) -> Tunnel:
+def _tunnel(name: str | Path | None, kind: Kind, cache: Path | None) -> Tunnel:
     """Returns a tunnel whose arrays are of the host, so that they go from one process to another."""
-    kept = _kept(name, lining, cache, spatial)
+    kept = _kept(name, kind, cache)
     if kept is not None and kept.is_file():
         return pickle.loads(kept.read_bytes())
-    made = jax.device_get(resolve(name, lining, None, constants.RANGE_MAX, spatial))
+    made = jax.device_get(resolve(name, kind.lining, kind.piece, constants.RANGE_MAX, kind.spatial))
     if kept is not None:
         kept.parent.mkdir(parents=True, exist_ok=True)
         with replace_file(kept) as fresh:
@@ -91,14 +119,14 @@ def _tunnel(name: str, lining: str | None, cache: Path | None, spatial: bool = F
     return made
 
 
-def _kept(name: str, lining: str | None, cache: Path | None, spatial: bool) -> Path | None:
+def _kept(name: str | Path | None, kind: Kind, cache: Path | None) -> Path | None:
     """Returns the file in which a tunnel is kept."""
-    bore = "-bore" if spatial else ""
-    return None if cache is None else cache / f"{VERSION}-{name}-{lining}{bore}.pickle".replace("/", "_")
+    bore, piece = "-bore" if kind.spatial else "", "" if kind.piece is None else f"-{kind.piece}"
+    return None if cache is None else cache / f"{VERSION}-{name}-{kind.lining}{bore}{piece}.pickle".replace("/", "_")
 
 
-def _is_kept(name: str, lining: str | None, cache: Path | None, spatial: bool) -> bool:
-    kept = _kept(name, lining, cache, spatial)
+def _is_kept(name: str | Path | None, kind: Kind, cache: Path | None) -> bool:
+    kept = _kept(name, kind, cache)
     return kept is not None and kept.is_file()
 
 

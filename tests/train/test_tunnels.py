@@ -1,0 +1,49 @@
+"""Many tunnels at once: those of a world are the ones that a task makes of their plans."""
+
+import hashlib
+
+import jax
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.tunnel.sources import tunnel_digest
+from train import tunnels
+from train.world import open_world
+
+
+def test_no_tunnel_and_one_tunnel_need_no_other_process():
+    assert tunnels.load([]) == []
+    (one,) = tunnels.load(["control"], "smooth")
+    assert one.count == 1
+
+
+@pytest.mark.parametrize(
+    ("task", "sensor"),
+    [
+        ("StopAtShort-v0", "planar16"),  # a piece is cut out of each
+        pytest.param("StopAt-v1", "spin16x64", marks=pytest.mark.slow),  # two processes
+    ],
+)
+def test_a_world_of_several_tunnels_is_that_of_their_plans(task, sensor):
+    names = ["open:straight:train:2", "open:straight:train:3"]
+    world = open_world(f"Subterra/{task}", "open:straight:train:2-3", sensor=sensor)
+    plans = [st.load_tunnel(name, solid=sensor != "planar16") for name in names]
+    _, params = st.make(f"Subterra/{task}", tunnel=plans, lining=plans[0].default_lining, sensor=sensor)
+    assert jax.tree.structure(world.params) == jax.tree.structure(params)
+    for one, other in zip(jax.tree.leaves(world.params), jax.tree.leaves(params), strict=True):
+        np.testing.assert_array_equal(one, other)
+    digest = hashlib.sha256("".join(tunnel_digest(name) for name in names).encode()).hexdigest()
+    assert world.facts["tunnel_sha256"] == digest
+    assert world.facts["tunnel"] == "open:straight:train:2-3"
+
+
+def test_tunnels_of_another_piece_or_lining_are_kept_apart(tmp_path):
+    whole, part, bare = (
+        tunnels.load(["open:straight:train:2"], lining, tmp_path, piece=piece)[0]
+        for lining, piece in ((None, None), (None, (10.0, 90.0)), ("bare", None))
+    )
+    assert len(list(tmp_path.iterdir())) == 3
+    assert float(part.length) < 100.0 < float(whole.length) == float(bare.length)
+    again = tunnels.load(["open:straight:train:2"], None, tmp_path, piece=(10.0, 90.0))[0]
+    assert float(again.length) == float(part.length)
