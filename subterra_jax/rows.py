@@ -13,7 +13,7 @@ from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 
 
-def rowwise(single: Callable[..., jax.Array], many: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+def rowwise(single: Callable[..., Any], many: Callable[..., Any]) -> Callable[..., Any]:
     """A function that computes one row by itself and a batch of rows by a kernel.
 
     Args:
@@ -27,20 +27,24 @@ def rowwise(single: Callable[..., jax.Array], many: Callable[..., jax.Array]) ->
     one, rows = custom_vmap(single), custom_vmap(many)
 
     @one.def_vmap
-    def batch(axis_size: int, batched: Any, shared: Any, *row: Any) -> tuple[jax.Array, bool]:
+    def batch(axis_size: int, batched: Any, shared: Any, *row: Any) -> tuple[Any, Any]:
         if any(jax.tree.leaves(batched[0])):
-            return jax.vmap(single, in_axes=axes(batched))(shared, *row), True
-        return rows(shared, *spread(row, batched[1:], axis_size)), True
+            return _all_batched(jax.vmap(single, in_axes=axes(batched))(shared, *row))
+        return _all_batched(rows(shared, *spread(row, batched[1:], axis_size)))
 
     @rows.def_vmap
-    def more(axis_size: int, batched: Any, shared: Any, *row: Any) -> tuple[jax.Array, bool]:
+    def more(axis_size: int, batched: Any, shared: Any, *row: Any) -> tuple[Any, Any]:
         if any(jax.tree.leaves(batched[0])):
             apart = jax.vmap(single, in_axes=(None, *[0] * len(row)))
-            return jax.vmap(apart, in_axes=axes(batched))(shared, *row), True
+            return _all_batched(jax.vmap(apart, in_axes=axes(batched))(shared, *row))
         flat = rows(shared, *(part.reshape(-1, *part.shape[2:]) for part in spread(row, batched[1:], axis_size)))
-        return flat.reshape(axis_size, -1, *flat.shape[1:]), True
+        return _all_batched(jax.tree.map(lambda part: part.reshape(axis_size, -1, *part.shape[1:]), flat))
 
     return one
+
+
+def _all_batched(out: Any) -> tuple[Any, Any]:
+    return out, jax.tree.map(lambda _: True, out)
 
 
 def axes_of(*trees: Any) -> frozenset[str]:

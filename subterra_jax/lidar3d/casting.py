@@ -21,7 +21,7 @@ from subterra_jax.lidar3d import fused
 from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relay import march_in_relay
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
-from subterra_jax.rows import axes, spread
+from subterra_jax.rows import axes, rowwise, spread
 
 # Memory of a ray, bytes: origin, direction, block, limit, distance, entry, block again, each once more as a row.
 _BYTES = 2 * 4 * 11
@@ -112,7 +112,7 @@ def meet(
     origins: Float[Array, "n 3"] | Float[Array, "3"],
     directions: Float[Array, "n 3"],
     station: Float[Array, ""],
-    limits: Float[Array, "n"],
+    limits: Float[Array, "n"] | Float[Array, ""],
 ) -> Met:
     """Return the surfaces that rays meet. Ranges have derivatives as those of `cast`.
 
@@ -121,11 +121,12 @@ def meet(
         origins: Origins, one for each ray or one for all, tunnel frame, m, within 2 m of the station.
         directions: Unit vectors, tunnel frame; not checked.
         station: Station of the origins, m.
-        limits: Largest ranges, m.
+        limits: Largest ranges, m; one for all rays if they have one origin.
     """
-    find_blocks = block_at if origins.ndim == 1 else jax.vmap(block_at, (None, 0, None))
-    blocks = jnp.broadcast_to(find_blocks(relief, origins, jnp.asarray(station, jnp.float32)), limits.shape)
-    origins = jnp.broadcast_to(origins, directions.shape)
+    if origins.ndim == 1:
+        block = block_at(relief, origins, jnp.asarray(station, jnp.float32))
+        return Met(*_meet_from(relief.shared, origins, directions, block, limits))
+    blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, jnp.asarray(station, jnp.float32))
     return Met(*_meet(relief.shared, origins, directions, blocks, limits))
 
 
@@ -145,6 +146,28 @@ def _meet_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
     ranges, change = _ranges_and_changes(primals, tangents)
     _, normal, thing = _meet(*primals)
     return (ranges, normal, thing), (change, jnp.zeros_like(normal), np.zeros(thing.shape, jax.dtypes.float0))
+
+
+@jax.custom_jvp
+@in_32_bits()
+def _meet_from(
+    relief: Relief, origin: Array, directions: Array, block: Array, limit: Array
+) -> tuple[Array, Array, Array]:
+    """`_meet` of rays from one place."""
+    hits, normal = _find_facing_from(relief, origin, directions, block, limit)
+    return _clip(hits, origin, directions, limit), jnp.stack(normal, axis=-1), hits.entry < -1
+
+
+@_meet_from.defjvp
+@in_32_bits()
+def _meet_from_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """Return what rays meet and how the ranges change, as if each had a place of its own."""
+    relief, origin, directions, block, limit = primals
+    n = len(directions)
+    each = lambda part: jnp.broadcast_to(part, (n, *part.shape))  # noqa: E731
+    rows = relief, each(origin), directions, each(block), each(limit)
+    still = np.zeros(n, jax.dtypes.float0)
+    return _meet_and_changes(rows, (tangents[0], each(tangents[1]), tangents[2], still, each(tangents[4])))
 
 
 def _require_pattern(directions: Float[Array, "n 3"]) -> None:
@@ -367,6 +390,26 @@ def _find_facing(
 def _find_more_facing(axis_size: int, batched: Any, relief: Relief, *rows: Any) -> tuple[Any, Any]:
     """Merge a batch axis into the rays."""
     return _merged(_find_facing, _facing_in_step, axis_size, batched, relief, rows)
+
+
+def _facing_from_one(relief: Relief, origin: Array, directions: Array, block: Array, limit: Array) -> Any:
+    """Find what the rays of one scan meet, each as if it had a place of its own."""
+    n = len(directions)
+    rows = jnp.broadcast_to(origin, (n, 3)), directions, jnp.broadcast_to(block, n), jnp.broadcast_to(limit, n)
+    return _find_facing(relief, *rows)
+
+
+def _facing_from_many(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Any:
+    """Find what the rays of many scans meet."""
+    apart = jax.vmap(_facing_from_one, (None, 0, 0, 0, 0))
+    if not fused.supported() or directions.shape[1] % fused.ROWS:
+        return apart(relief, origins, directions, blocks, limits)
+    _require_memory(directions.size // 3)
+    rows = origins, directions, blocks, limits
+    return lax.platform_dependent(relief, *rows, cuda=fused.find_facing_from, default=apart)
+
+
+_find_facing_from = rowwise(_facing_from_one, in_32_bits()(_facing_from_many))
 
 
 def _find_in_step(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Hits:

@@ -14,7 +14,7 @@ from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
 
 # Rays of one program: one warp, one ray a lane.
-_ROWS = 32
+ROWS = 32
 PAIRS = ("cell", "vertex")
 
 
@@ -46,33 +46,57 @@ def find_facing(
     return Hits(*rows[:3]), rows[3:]
 
 
+def find_facing_from(
+    relief: Relief,
+    origin: Float[Array, "s 3"],
+    direction: Float[Array, "s n 3"],
+    block: Int[Array, s],
+    limit: Float[Array, s],
+) -> tuple[Hits, Point]:
+    """`find_facing` of the rays of some scans, each from one place, `n` of them a multiple of 32; results are `(s, n)`.
+
+    A scan's place is read by its programs, and not written down for each of its rays.
+    """
+    rows = _launch(relief, origin, direction, block, limit, facing=True)
+    return Hits(*rows[:3]), rows[3:]
+
+
 def _launch(relief: Relief, origin: Array, direction: Array, block: Array, limit: Array, *, facing: bool) -> Any:
-    """March rays, 32 by a program; return the rows of `Hits`, and of normals if asked."""
+    """March rays, 32 by a program; return the rows of `Hits`, and of normals if asked.
+
+    Rays have a place each, or those of a scan one, and then `direction` has a further axis.
+    """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
-    count, on_gpu = len(block), jax.default_backend() == "gpu"
-    rows = [jnp.pad(row, (0, -count % _ROWS), mode="edge") for row in (*origin.T, *direction.T, block, limit)]
-    row = pl.BlockSpec((_ROWS,), lambda i: (i,))
+    shape, on_gpu = direction.shape[:-1], jax.default_backend() == "gpu"
+    count = direction.size // 3
+    ways = [jnp.pad(row, (0, -count % ROWS), mode="edge") for row in direction.reshape(-1, 3).T]
+    row = pl.BlockSpec((ROWS,), lambda i: (i,))
     whole = pl.BlockSpec(memory_space=pl.ANY)
+    if len(shape) == 2:
+        programs = shape[1] // ROWS  # of a scan
+        places, place = [*origin.T, block, limit], pl.BlockSpec((1,), lambda i: (i // programs,))
+    else:
+        places = [jnp.pad(row, (0, -count % ROWS), mode="edge") for row in (*origin.T, block, limit)]
+        place = row
     kinds = (jnp.float32, jnp.int32, jnp.int32, *(jnp.float32,) * 3 * facing)
     out = pl.pallas_call(
         partial(_kernel, n_x=relief.n_x, on_gpu=on_gpu, facing=facing),
-        grid=(rows[0].shape[0] // _ROWS,),
-        in_specs=[row] * 8 + [whole] * len(ARRAYS),
+        grid=(ways[0].shape[0] // ROWS,),
+        in_specs=[row] * 3 + [place] * 5 + [whole] * len(ARRAYS),
         out_specs=[row] * len(kinds),
-        out_shape=[jax.ShapeDtypeStruct(rows[0].shape, kind) for kind in kinds],
+        out_shape=[jax.ShapeDtypeStruct(ways[0].shape, kind) for kind in kinds],
         compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=not on_gpu,
-    )(*rows, *(getattr(relief, name).reshape(-1) for name in ARRAYS))
-    return tuple(part[:count] for part in out)
+    )(*ways, *places, *(getattr(relief, name).reshape(-1) for name in ARRAYS))
+    return tuple(part[:count].reshape(shape) for part in out)
 
 
 def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool) -> None:
     """March 32 rays."""
     from jax.experimental.pallas import triton
 
-    *rows, block_ref, limit_ref = refs[:8]
     arrays = dict(zip(ARRAYS, refs[8 : 8 + len(ARRAYS)], strict=True))
 
     def load(name: str, index: Array, mask: Array | None = None) -> Any:
@@ -84,9 +108,10 @@ def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool) -> None:
         return tuple(jnp.sum(jnp.where(column == i, both, 0), axis=1) for i in range(2))
 
     tools = Tools(load, *((_fma, _reciprocal) if on_gpu else (lambda a, b, c: a * b + c, lambda a: 1.0 / a)))
-    ox, oy, oz, dx, dy, dz = (ref[...] for ref in rows)
+    # The place of a scan is one for all lanes.
+    dx, dy, dz, ox, oy, oz, block, limit = (jnp.broadcast_to(ref[...], (ROWS,)) for ref in refs[:8])
     origin, direction = (ox, oy, oz), (dx, dy, dz)
-    hits = march(tools, n_x, origin, direction, block_ref[...], limit_ref[...])
+    hits = march(tools, n_x, origin, direction, block, limit)
     parts = (*hits, *(normals(tools, origin, direction, hits) if facing else ()))
     for ref, part in zip(refs[8 + len(ARRAYS) :], parts, strict=True):
         ref[...] = part

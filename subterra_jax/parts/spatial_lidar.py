@@ -261,9 +261,9 @@ class SpatialLidar(Part):
         if sensor.echo.mixing:
             both = jnp.concatenate([rays, echo.rim_of(rays, uniform[:, 2], sensor.echo)])
             origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
-        limits = jnp.broadcast_to(sensor.range_max, len(both))
-        start = origins if sensor.sweep else origins[0]
-        met = meet(self.relief(sight, params), start, both, sight.station, limits.astype(jnp.float32))
+        limit = jnp.asarray(sensor.range_max, jnp.float32)
+        start, limits = (origins, jnp.broadcast_to(limit, len(both))) if sensor.sweep else (origins[0], limit)
+        met = meet(self.relief(sight, params), start, both, sight.station, limits)
         standing = sight.hits(both[:, :2])
         nearer = standing < met.ranges
         met = met._replace(ranges=jnp.minimum(met.ranges, standing), thing=met.thing | nearer)

@@ -60,7 +60,7 @@ def pack(box: Any, wall: Any, count: Any, window: Any) -> Packed:
     there = np.full(n_blocks, n_pairs) if count is None else (np.asarray(count).astype(np.int32) + 1) // 2
     pairs = np.minimum(there, ALL_PAIRS)
     kept = np.where(pairs == ALL_PAIRS, n_pairs, there)
-    start = (np.cumsum(kept) - kept).astype(np.int32)
+    start: Any = (np.cumsum(kept) - kept).astype(np.int32)
     wall = wall.reshape(-1, WORDS) if count is None else wall[np.arange(n_pairs) < kept[:, None]]
     window = xp.minimum(xp.asarray(window).astype(np.int32), ALL_WINDOW)
     last = up | (pairs.astype(np.int32) << WINDOW_BITS) | window

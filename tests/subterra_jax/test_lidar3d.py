@@ -190,6 +190,31 @@ def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
+def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
+    origin, way, station = bend_rays(surfaces.axis_of(LENGTH), 96, 5)
+    origin, station, relief = origin[::32], station[::32], reliefs["things"]
+    block, limit = jax.vmap(casting.block_at, (None, 0, 0))(relief, origin, station), jnp.full(3, 30.0)
+    hits, normal = fused.find_facing_from(relief, jnp.asarray(origin), jnp.asarray(way).reshape(3, 32, 3), block, limit)
+    each, own = found_by(fused.find_facing, relief, np.repeat(origin, 32, 0), way, np.repeat(station, 32))
+    for one, other in zip((*hits, *normal), (*each, *own), strict=True):
+        np.testing.assert_array_equal(np.ravel(one), other)
+
+
+def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(fused, "supported", lambda: True)
+    monkeypatch.setattr(casting, "device_memory", lambda: None)
+    check = jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
+
+    def ranges(relief, origin, way, station):
+        meet = jax.vmap(casting.meet, (None, 0, None, 0, None))
+        return meet(relief, origin, way, station, jnp.float32(30.0)).ranges
+
+    rows = jnp.zeros((4, 3)), jnp.asarray(beams.spinning(np.linspace(-0.2, 0.2, 2), 32)), jnp.full(4, 20.0)
+    made = jax.export.export(jax.jit(ranges), platforms=["cuda"], disabled_checks=[check])(reliefs["things"], *rows)
+    assert made.mlir_module().count("triton") == 1
+
+
 @pytest.mark.parametrize("find", [casting._facing_in_step, fused.find_facing])
 def test_normals_are_those_of_the_faces_of_a_box_and_of_the_tube_behind_it(find):
     axis, middle = surfaces.axis_of(LENGTH), np.float32([20.0, 0.5, -1.0])

@@ -68,13 +68,19 @@ class Rollout:
 
 
 def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> senses.Sight:
-    """Returns the inputs of the network for a batch of observations."""
+    """Returns the inputs of the network for a batch of observations; with an image, its features are `Kept`."""
     part = {name: observation[..., where] for name, where in env.fields(params).items()}
     if "scan" not in part:
         return senses.look(part, params.start.station, reckoning)
     part["ranges"] = level_ring(part["scan"], params.lidar.shape)
     view = senses.look(part, params.start.station, reckoning)
-    return view.replace(features=jnp.concatenate([view.features, part["scan"] / senses.IMAGE_RANGE], axis=-1))  # type: ignore[attr-defined]
+    # Side by side they would be copied, and cut apart again, at every step.
+    return view.replace(features=Kept(view.features, part["scan"] / senses.IMAGE_RANGE))  # type: ignore[attr-defined]
+
+
+def one_moment(features: Any) -> Any:
+    """Returns the inputs of a moment as a sequence of one."""
+    return jax.tree.map(lambda part: part[None], features)
 
 
 def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Array, "env"]) -> Float[Array, "env n"]:
@@ -124,7 +130,7 @@ def think(
 ) -> tuple[senses.Sight, Float[Array, "env hidden"], Thought]:
     """Returns the inputs of the network, its memory after them, and its answer."""
     view = look(env.env, params, now.observation, now.reckoning)
-    hidden, _ = networks.remember(weights, view.features[None], now.hidden, now.first[None])
+    hidden, _ = networks.remember(weights, one_moment(view.features), now.hidden, now.first[None])
     return view, hidden, networks.think(weights, hidden, view.ahead)
 
 
@@ -232,7 +238,7 @@ def make_layout(env: Any, params: Any, config: RecurrentConfig) -> RecurrentLayo
     batch = st.batch.AutoReset(env)
     shapes = jax.eval_shape(lambda obs: _shapes(env, batch, params, obs, shown), observation)
     return RecurrentLayout(
-        n_features=shapes[0].shape[-1],
+        n_features=sum(part.shape[-1] for part in jax.tree.leaves(shapes[0])),
         n_truth=shapes[1].shape[-1],
         # To stand must not lie at the end of a tanh; the environment reads a speed below 0 as 0.
         action_low=(float(bounds.low[0]) - _SLACK * float(bounds.high[0]), float(bounds.low[1])),
@@ -255,7 +261,7 @@ def senses_of(params: Any, config: RecurrentConfig) -> senses.Senses:
     return senses.Senses(config.tracker or ("careful" if among_boxes else senses.PLAIN.tracker), among_boxes)
 
 
-def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Array, Array]:
+def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Any, Array]:
     _, state = batch.reset(jax.random.key(0), params, 1)
     view = look(env, params, observation, senses.start((1,), n_ranges(params), shown))
     return view.features, truth(env, params, state, view, jnp.zeros(1))

@@ -171,7 +171,8 @@ class RecurrentLearner(devices.Whole):
         """Computes advantages and value targets; an episode cut by the clock goes on with the value it had."""
         value = self.networks.value(before.weights, rollout.truth)
         view = driving.look(self.env.env, params, after.observation, after.reckoning)
-        hidden, _ = self.networks.remember(before.weights, view.features[None], after.hidden, after.first[None])
+        seen = driving.one_moment(view.features)
+        hidden, _ = self.networks.remember(before.weights, seen, after.hidden, after.first[None])
         thought = self.networks.think(before.weights, hidden, view.ahead)
         last = self.networks.value(
             before.weights, driving.truth(self.env.env, params, after.env_state, view, thought.error)

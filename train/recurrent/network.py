@@ -170,20 +170,21 @@ class RecurrentNetworks:
         """Returns a policy, the weights but the critic's, with shapes in place of arrays."""
         return without_critic(jax.eval_shape(self.init, jax.random.key(0)))
 
-    def keep(self, features: Float[Array, "*batch n"]) -> Kept:
-        """Returns the inputs as a rollout keeps them."""
-        if self.layout.image is None:
-            return Kept(features, None)
-        n_pixels = self.layout.image[0] * self.layout.image[1]
-        image = features[..., -n_pixels:]
-        return Kept(features[..., :-n_pixels], image.astype(jnp.bfloat16) if self.layout.half else image)
+    def keep(self, features: Float[Array, "*batch n"] | Kept) -> Kept:
+        """Returns the inputs as a rollout keeps them; pixels that are not apart yet are the last."""
+        if not isinstance(features, Kept):
+            n_pixels = math.prod(self.layout.image or (0,))
+            n_plain = features.shape[-1] - n_pixels
+            features = Kept(features[..., :n_plain], features[..., n_plain:] if n_pixels else None)
+        if features.image is None or not self.layout.half:
+            return features
+        return Kept(features.plain, features.image.astype(jnp.bfloat16))
 
     def remember(
         self, weights: dict[str, Weights], features: Array | Kept, state: Array, first: Array
     ) -> tuple[Float[Array, "env hidden"], Float[Array, "time env hidden"]]:
         """Returns the last hidden state, and those over time."""
-        kept = features if isinstance(features, Kept) else self.keep(features)
-        return self._memory.apply(weights["memory"], kept, state, first)
+        return self._memory.apply(weights["memory"], self.keep(features), state, first)
 
     def think(
         self, weights: dict[str, Weights], hidden: Float[Array, "*batch hidden"], ahead: Float[Array, "*batch"]
