@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import distance_transform_edt
 
-from benchmarks.fidelity.case import Case, per_case, per_hold, per_truth
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
 from benchmarks.fidelity.derive.axis import hold_curve, hold_local, lining_curve, reference_curve
 from benchmarks.fidelity.derive.beams import synthetic_points
 from benchmarks.fidelity.derive.curve import Curve, grouped_median
@@ -100,6 +100,7 @@ def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Flo
     return station, cell / LATTICES * np.arange(-columns, columns + 1)
 
 
+@kept_until("NAV")
 @per_case
 def judged_ground(case: Case) -> Ground:
     """Return the candidate's ground, by rays."""
@@ -210,6 +211,7 @@ _WALL_FOOT = 0.3  # m above the floor where the wall's distance is taken
 _FLOOR_BELOW = -1.0  # m above the axis; returns below it are of the ground
 
 
+@kept_until("NAV")
 @per_case
 def both_grounds(case: Case) -> tuple[Ground, Ground]:
     """Return the grounds to compare: by rays against the truth, else both by the same held-out beams.
@@ -229,6 +231,7 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
     return left_out[0], left_out[1]
 
 
+@kept_until("NAV")
 @per_case
 def _observed_ground(case: Case) -> Ground:
     curve, points = reference_curve(case), synthetic_points(case)
