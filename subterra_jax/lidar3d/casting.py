@@ -93,7 +93,7 @@ def cast(
 
 
 class Met(NamedTuple):
-    """Surfaces that rays meet.
+    """Surfaces that rays meet, `n` of them or an image.
 
     Attributes:
         ranges: Distance along each ray, m; exactly the largest range where nothing is met.
@@ -101,16 +101,16 @@ class Met(NamedTuple):
         thing: A box is met, as track or furniture, and not the lining.
     """
 
-    ranges: Float[Array, "n"]
-    normal: Float[Array, "n 3"]
-    thing: Bool[Array, "n"]
+    ranges: Float[Array, "*n"]
+    normal: Float[Array, "*n 3"]
+    thing: Bool[Array, "*n"]
 
 
 @in_32_bits()
 def meet(
     relief: Relief,
     origins: Float[Array, "n 3"] | Float[Array, "3"],
-    directions: Float[Array, "n 3"],
+    directions: Float[Array, "n 3"] | Float[Array, "rows columns 3"],
     station: Float[Array, ""],
     limits: Float[Array, "n"] | Float[Array, ""],
 ) -> Met:
@@ -119,14 +119,15 @@ def meet(
     Args:
         relief: Surface of the bore, or of one picked from a stack.
         origins: Origins, one for each ray or one for all, tunnel frame, m, within 2 m of the station.
-        directions: Unit vectors, tunnel frame; not checked.
+        directions: Unit vectors, tunnel frame; not checked. Those of one origin row by row of an image, a ring a row.
         station: Station of the origins, m.
         limits: Largest ranges, m; one for all rays if they have one origin.
     """
-    if origins.ndim == 1:
+    if directions.ndim == 3:
         block = block_at(relief, origins, jnp.asarray(station, jnp.float32))
         return Met(*_meet_from(relief.shared, origins, directions, block, limits))
     blocks = jax.vmap(block_at, (None, 0, None))(relief, origins, jnp.asarray(station, jnp.float32))
+    limits = jnp.broadcast_to(limits, len(directions))
     return Met(*_meet(relief.shared, origins, directions, blocks, limits))
 
 
@@ -163,11 +164,13 @@ def _meet_from(
 def _meet_from_and_changes(primals: Any, tangents: Any) -> tuple[Any, Any]:
     """Return what rays meet and how the ranges change, as if each had a place of its own."""
     relief, origin, directions, block, limit = primals
-    n = len(directions)
+    image = directions.shape[:-1]
+    n = image[0] * image[1]
     each = lambda part: jnp.broadcast_to(part, (n, *part.shape))  # noqa: E731
-    rows = relief, each(origin), directions, each(block), each(limit)
-    still = np.zeros(n, jax.dtypes.float0)
-    return _meet_and_changes(rows, (tangents[0], each(tangents[1]), tangents[2], still, each(tangents[4])))
+    rows = relief, each(origin), directions.reshape(n, 3), each(block), each(limit)
+    turned, still = tangents[2].reshape(n, 3), np.zeros(n, jax.dtypes.float0)
+    found = _meet_and_changes(rows, (tangents[0], each(tangents[1]), turned, still, each(tangents[4])))
+    return jax.tree.map(lambda part: part.reshape(*image, *part.shape[1:]), found)
 
 
 def _require_pattern(directions: Float[Array, "n 3"]) -> None:
@@ -290,7 +293,7 @@ def _ranges(
     return _clip(_find(relief, origins, directions, blocks, limits), origins, directions, limits)
 
 
-def _clip(hits: Hits, origins: Array, directions: Array, limits: Array) -> Float[Array, "n"]:
+def _clip(hits: Hits, origins: Array, directions: Array, limits: Array) -> Float[Array, "*n"]:
     finite = jnp.isfinite(jnp.sum(origins, axis=-1) + jnp.sum(directions, axis=-1))
     return jnp.where(finite, jnp.clip(hits.distance, 0.0, limits), jnp.nan)
 
@@ -393,16 +396,17 @@ def _find_more_facing(axis_size: int, batched: Any, relief: Relief, *rows: Any) 
 
 
 def _facing_from_one(relief: Relief, origin: Array, directions: Array, block: Array, limit: Array) -> Any:
-    """Find what the rays of one scan meet, each as if it had a place of its own."""
-    n = len(directions)
-    rows = jnp.broadcast_to(origin, (n, 3)), directions, jnp.broadcast_to(block, n), jnp.broadcast_to(limit, n)
-    return _find_facing(relief, *rows)
+    """Find what the rays of an image meet, each as if it had a place of its own."""
+    image = directions.shape[:-1]
+    n = image[0] * image[1]
+    rows = jnp.broadcast_to(origin, (n, 3)), directions.reshape(n, 3), *(jnp.broadcast_to(x, n) for x in (block, limit))
+    return jax.tree.map(lambda part: part.reshape(image), _find_facing(relief, *rows))
 
 
 def _facing_from_many(relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array) -> Any:
     """Find what the rays of many scans meet."""
     apart = jax.vmap(_facing_from_one, (None, 0, 0, 0, 0))
-    if not fused.supported() or directions.shape[1] % fused.ROWS:
+    if not fused.supported() or directions.shape[1] * directions.shape[2] % fused.ROWS:
         return apart(relief, origins, directions, blocks, limits)
     _require_memory(directions.size // 3)
     rows = origins, directions, blocks, limits

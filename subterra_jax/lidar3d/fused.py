@@ -49,13 +49,14 @@ def find_facing(
 def find_facing_from(
     relief: Relief,
     origin: Float[Array, "s 3"],
-    direction: Float[Array, "s n 3"],
+    direction: Float[Array, "s rows columns 3"],
     block: Int[Array, s],
     limit: Float[Array, s],
 ) -> tuple[Hits, Point]:
-    """`find_facing` of the rays of some scans, each from one place, `n` of them a multiple of 32; results are `(s, n)`.
+    """`find_facing` of the rays of some scans, each from one place and a multiple of 32; results are images.
 
-    A scan's place is read by its programs, and not written down for each of its rays.
+    A scan's place is read by its programs, and not written down for each of its rays. They take the image column by
+    column: rays of a few azimuths go about as far, those of a whole ring do not, and a warp waits for the longest.
     """
     rows = _launch(relief, origin, direction, block, limit, facing=True)
     return Hits(*rows[:3]), rows[3:]
@@ -64,7 +65,7 @@ def find_facing_from(
 def _launch(relief: Relief, origin: Array, direction: Array, block: Array, limit: Array, *, facing: bool) -> Any:
     """March rays, 32 by a program; return the rows of `Hits`, and of normals if asked.
 
-    Rays have a place each, or those of a scan one, and then `direction` has a further axis.
+    Rays have a place each, or those of a scan one, and then `direction` has two further axes.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -74,15 +75,16 @@ def _launch(relief: Relief, origin: Array, direction: Array, block: Array, limit
     ways = [jnp.pad(row, (0, -count % ROWS), mode="edge") for row in direction.reshape(-1, 3).T]
     row = pl.BlockSpec((ROWS,), lambda i: (i,))
     whole = pl.BlockSpec(memory_space=pl.ANY)
-    if len(shape) == 2:
-        programs = shape[1] // ROWS  # of a scan
+    if len(shape) == 3:
+        programs = shape[1] * shape[2] // ROWS  # of a scan
         places, place = [*origin.T, block, limit], pl.BlockSpec((1,), lambda i: (i // programs,))
+        row, image = whole, shape[1:]
     else:
         places = [jnp.pad(row, (0, -count % ROWS), mode="edge") for row in (*origin.T, block, limit)]
-        place = row
+        place, image = row, None
     kinds = (jnp.float32, jnp.int32, jnp.int32, *(jnp.float32,) * 3 * facing)
     out = pl.pallas_call(
-        partial(_kernel, n_x=relief.n_x, on_gpu=on_gpu, facing=facing),
+        partial(_kernel, n_x=relief.n_x, on_gpu=on_gpu, facing=facing, image=image),
         grid=(ways[0].shape[0] // ROWS,),
         in_specs=[row] * 3 + [place] * 5 + [whole] * len(ARRAYS),
         out_specs=[row] * len(kinds),
@@ -93,10 +95,12 @@ def _launch(relief: Relief, origin: Array, direction: Array, block: Array, limit
     return tuple(part[:count].reshape(shape) for part in out)
 
 
-def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool) -> None:
-    """March 32 rays."""
+def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool, image: tuple[int, int] | None) -> None:
+    """March 32 rays, those of an image column by column."""
+    from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
 
+    mine = None if image is None else _rays_of(image, pl.program_id(0))
     arrays = dict(zip(ARRAYS, refs[8 : 8 + len(ARRAYS)], strict=True))
 
     def load(name: str, index: Array, mask: Array | None = None) -> Any:
@@ -109,12 +113,23 @@ def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool) -> None:
 
     tools = Tools(load, *((_fma, _reciprocal) if on_gpu else (lambda a, b, c: a * b + c, lambda a: 1.0 / a)))
     # The place of a scan is one for all lanes.
-    dx, dy, dz, ox, oy, oz, block, limit = (jnp.broadcast_to(ref[...], (ROWS,)) for ref in refs[:8])
+    dx, dy, dz = (ref[...] if mine is None else triton.load(ref.at[mine]) for ref in refs[:3])
+    ox, oy, oz, block, limit = (jnp.broadcast_to(ref[...], (ROWS,)) for ref in refs[3:8])
     origin, direction = (ox, oy, oz), (dx, dy, dz)
     hits = march(tools, n_x, origin, direction, block, limit)
     parts = (*hits, *(normals(tools, origin, direction, hits) if facing else ()))
     for ref, part in zip(refs[8 + len(ARRAYS) :], parts, strict=True):
-        ref[...] = part
+        if mine is None:
+            ref[...] = part
+        else:
+            triton.store(ref.at[mine], part)
+
+
+def _rays_of(image: tuple[int, int], program: Array) -> Int[Array, "32"]:
+    """Return the rays of a program, images of so many rows and columns being cut into 32 rays column by column."""
+    ray = program * ROWS + jax.lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
+    scan, within = ray // (image[0] * image[1]), ray % (image[0] * image[1])
+    return scan * (image[0] * image[1]) + within % image[0] * image[1] + within // image[0]
 
 
 def _fma(a: Array, b: Any, c: Any) -> Array:

@@ -261,9 +261,7 @@ class SpatialLidar(Part):
         if sensor.echo.mixing:
             both = jnp.concatenate([rays, echo.rim_of(rays, uniform[:, 2], sensor.echo)])
             origins = jnp.concatenate([origins, origins]) if sensor.sweep else origins
-        limit = jnp.asarray(sensor.range_max, jnp.float32)
-        start, limits = (origins, jnp.broadcast_to(limit, len(both))) if sensor.sweep else (origins[0], limit)
-        met = meet(self.relief(sight, params), start, both, sight.station, limits)
+        met = self._meet(origins, both, sight, params)
         standing = sight.hits(both[:, :2])
         nearer = standing < met.ranges
         met = met._replace(ranges=jnp.minimum(met.ranges, standing), thing=met.thing | nearer)
@@ -275,6 +273,15 @@ class SpatialLidar(Part):
             mixed = echo.mix(met.ranges[:n], met.ranges[n:], off, uniform[:, :2], sensor.echo)
             met = met._replace(ranges=jnp.where(met.ranges[:n] < sensor.range_max, mixed, met.ranges[:n]))
         return Met(met.ranges[:n], normal, met.thing[:n]), cosine, rays
+
+    def _meet(self, origins: Array, rays: Array, sight: Sight, params: EnvParams) -> Met:
+        """Return what rays meet; those of one place as an image, which GPUs take column by column."""
+        sensor, relief = params.lidar, self.relief(sight, params)
+        limit = jnp.asarray(sensor.range_max, jnp.float32)
+        if sensor.sweep:
+            return meet(relief, origins, rays, sight.station, limit)
+        image = meet(relief, origins[0], rays.reshape(-1, sensor.shape[1], 3), sight.station, limit)
+        return Met(*(part.reshape(len(rays), *part.shape[2:]) for part in image))
 
     def observe(self, own: Any, sight: Sight, noise: Noise, params: EnvParams) -> dict[str, Array]:
         """Return `scan`, m, and with intensities `intensity`, 0 to 255, both row by row."""

@@ -194,10 +194,12 @@ def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
     origin, way, station = bend_rays(surfaces.axis_of(LENGTH), 96, 5)
     origin, station, relief = origin[::32], station[::32], reliefs["things"]
     block, limit = jax.vmap(casting.block_at, (None, 0, 0))(relief, origin, station), jnp.full(3, 30.0)
-    hits, normal = fused.find_facing_from(relief, jnp.asarray(origin), jnp.asarray(way).reshape(3, 32, 3), block, limit)
+    hits, normal = fused.find_facing_from(
+        relief, jnp.asarray(origin), jnp.asarray(way).reshape(3, 4, 8, 3), block, limit
+    )
     each, own = found_by(fused.find_facing, relief, np.repeat(origin, 32, 0), way, np.repeat(station, 32))
     for one, other in zip((*hits, *normal), (*each, *own), strict=True):
-        np.testing.assert_array_equal(np.ravel(one), other)
+        np.testing.assert_allclose(np.ravel(one), other, rtol=1e-6, atol=1e-6)
 
 
 def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
@@ -210,7 +212,11 @@ def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monke
         meet = jax.vmap(casting.meet, (None, 0, None, 0, None))
         return meet(relief, origin, way, station, jnp.float32(30.0)).ranges
 
-    rows = jnp.zeros((4, 3)), jnp.asarray(beams.spinning(np.linspace(-0.2, 0.2, 2), 32)), jnp.full(4, 20.0)
+    rows = (
+        jnp.zeros((4, 3)),
+        jnp.asarray(beams.spinning(np.linspace(-0.2, 0.2, 2), 32)).reshape(2, 32, 3),
+        jnp.full(4, 20.0),
+    )
     made = jax.export.export(jax.jit(ranges), platforms=["cuda"], disabled_checks=[check])(reliefs["things"], *rows)
     assert made.mlir_module().count("triton") == 1
 
