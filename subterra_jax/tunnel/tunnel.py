@@ -233,7 +233,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
     Windows are as large as the largest of any tunnel. Behind its last block each tunnel is padded so that no window,
     counted up to the next power of two, reaches the next tunnel.
 
-    A stack costs memory that no longer fits a cache: some 40 % of the speed for 1,000 tunnels on an H100, half as much
+    A stack costs memory that no longer fits a cache: a fifth of the speed for 1,000 tunnels on an H100, half as much
     again for 100 on a CPU.
 
     Args:
