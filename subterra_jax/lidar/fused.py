@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax.lidar.cast import NOTHING
 from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnel.packed import ALL_PAIRS, ALL_WINDOW, WINDOW_BITS, WORDS, Packed, high, low, pack
+from subterra_jax.tunnel.packed import (
+    ALL_PAIRS,
+    ALL_WINDOW,
+    WORDS,
+    Packed,
+    all_if_full,
+    load_words,
+    pack,
+    store_words,
+    unpack,
+)
 
 # Scans of one program: one warp of 32 threads, so that a program in which nobody looks on is short.
 _ROWS = 4
@@ -146,56 +156,6 @@ def packed_blocks(tunnel: Tunnel) -> Packed:
     if tunnel.packed is not None:
         return tunnel.packed
     return pack(tunnel.box, tunnel.wall, None, jnp.full(tunnel.box.shape[1], tunnel.n_scan))
-
-
-def load_words(ref, start, mask=None, n_words: int = WORDS):
-    """Return some words of each of many rows, read by one instruction; 0 where masked.
-
-    Args:
-        ref: Flat array of words.
-        start: First word of each row, a multiple of their number.
-        mask: Rows to read; `None` for all.
-        n_words: Words of a row, 2 or 4.
-    """
-    from jax.experimental.pallas import triton
-
-    column = lax.broadcasted_iota(jnp.int32, (*start.shape, n_words), start.ndim)
-    # Triton takes no `other` without a mask.
-    masked: dict[str, Any] = (
-        {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
-    )
-    words = triton.load(ref.at[start[..., None] + column], **masked)
-    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(n_words))
-
-
-def store_words(ref, start, words, mask):
-    """Write up to four words of each of many rows by one instruction; the rest of the four become 0.
-
-    Args:
-        ref: Flat array of words.
-        start: First word of each row, a multiple of 4.
-        words: The words, each of all rows.
-        mask: Rows to write.
-    """
-    from jax.experimental.pallas import triton
-
-    column = lax.broadcasted_iota(jnp.int32, (*start.shape, WORDS), start.ndim)
-    value = jnp.zeros(column.shape, words[0].dtype)
-    for i, word in enumerate(words):
-        value = jnp.where(column == i, word[..., None], value)
-    triton.store(ref.at[start[..., None] + column], value, mask=jnp.broadcast_to(mask[..., None], column.shape))
-
-
-def unpack(words):
-    """Return the middle x, y, half axis x, y, half thickness (m), vertex pairs and window of boxes; see `Packed`."""
-    x, y = (lax.bitcast_convert_type(word, jnp.float32) for word in words[:2])
-    pairs, window = (words[3] >> WINDOW_BITS) & ALL_PAIRS, words[3] & ALL_WINDOW
-    return x, y, high(words[2]), low(words[2]), high(words[3]), pairs, window
-
-
-def all_if_full(count, full: int, everything: int):
-    """Return a count of which the largest number stands for everything."""
-    return jnp.where(count == full, jnp.int32(everything), count)
 
 
 def length_of(x, y):

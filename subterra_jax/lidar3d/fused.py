@@ -125,7 +125,7 @@ def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool, image: tuple[int, 
             triton.store(ref.at[mine], part)
 
 
-def _rays_of(image: tuple[int, int], program: Array) -> Int[Array, "32"]:
+def _rays_of(image: tuple[int, int], program: Array) -> Int[Array, ROWS]:
     """Return the rays of a program, images of so many rows and columns being cut into 32 rays column by column."""
     ray = program * ROWS + jax.lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
     scan, within = ray // (image[0] * image[1]), ray % (image[0] * image[1])

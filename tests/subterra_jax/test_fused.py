@@ -87,7 +87,7 @@ def test_blocks_packed_in_the_program_give_the_same_ranges(plan: st.TunnelPlan) 
 
 
 def unpacked(tunnel: Tunnel) -> list[np.ndarray]:
-    return [np.asarray(part) for part in fused.unpack(tuple(jnp.asarray(tunnel.packed.box).T))]
+    return [np.asarray(part) for part in packed.unpack(tuple(jnp.asarray(tunnel.packed.box).T))]
 
 
 @pytest.mark.parametrize("name", [None, "open:masonry:train:0", "open:rock:test-unseen:0"])

@@ -10,7 +10,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar, lidar3d, native
-from subterra_jax.lidar3d import beams, casting, fused, march, relay
+from subterra_jax.lidar3d import beams, casting, finding, fused, march, relay
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
@@ -181,7 +181,7 @@ def found_by(find, relief, origin, way, station):
 @pytest.mark.parametrize("name", [pytest.param("bend", marks=pytest.mark.slow), "things"])
 def test_the_fused_kernel_and_xla_meet_the_same_triangles(bend, reliefs, name):
     rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 72, 4)
-    finds = (casting._facing_in_step, fused.find_facing)
+    finds = (finding.facing_in_step, fused.find_facing)
     (xla, xla_normal), (kernel, normal) = (found_by(find, reliefs[name], *rays) for find in finds)
     np.testing.assert_array_equal(xla.entry, kernel.entry)
     np.testing.assert_allclose(xla.distance, kernel.distance, rtol=1e-6)
@@ -205,7 +205,7 @@ def test_scans_of_one_place_meet_what_rays_of_a_place_each_meet(reliefs):
 def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(fused, "supported", lambda: True)
-    monkeypatch.setattr(casting, "device_memory", lambda: None)
+    monkeypatch.setattr(finding, "device_memory", lambda: None)
     check = jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
 
     def ranges(relief, origin, way, station):
@@ -221,7 +221,7 @@ def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monke
     assert made.mlir_module().count("triton") == 1
 
 
-@pytest.mark.parametrize("find", [casting._facing_in_step, fused.find_facing])
+@pytest.mark.parametrize("find", [finding.facing_in_step, fused.find_facing])
 def test_normals_are_those_of_the_faces_of_a_box_and_of_the_tube_behind_it(find):
     axis, middle = surfaces.axis_of(LENGTH), np.float32([20.0, 0.5, -1.0])
     box = middle + BOX_CORNERS * [0.25, 0.2, 0.3], BOX_FACES
@@ -245,7 +245,7 @@ def test_machine_code_and_xla_give_the_same_ranges(bend, reliefs, name):
     from subterra_jax.native import marchcall
 
     rays = bend_rays(bend[0] if name == "bend" else surfaces.axis_of(LENGTH), 600, 5)
-    xla, code = (found_by(find, reliefs[name], *rays) for find in (casting._find_in_step, marchcall.find))
+    xla, code = (found_by(find, reliefs[name], *rays) for find in (finding.find_in_step, marchcall.find))
     np.testing.assert_allclose(np.minimum(xla.distance, 30.0), np.minimum(code.distance, 30.0), atol=2e-5)
     triangle = np.asarray(reliefs[name].entry)
     # A ray may meet one triangle in the list of either of two cells.
@@ -256,11 +256,11 @@ def test_rays_that_take_each_others_places_meet_what_they_meet_in_step(bend, rel
     rays = bend_rays(bend[0], 56, 6)
 
     def in_step(relief, origin, way, block, limit):
-        return march.march(casting._tools(relief), relief.n_x, tuple(origin.T), tuple(way.T), block, limit)
+        return march.march(finding.tools_of(relief), relief.n_x, tuple(origin.T), tuple(way.T), block, limit)
 
     whole = found_by(in_step, reliefs["bend"], *rays)
     monkeypatch.setattr(relay, "N_PLACES", 9)
-    relayed = found_by(casting._find_in_step, reliefs["bend"], *rays)
+    relayed = found_by(finding.find_in_step, reliefs["bend"], *rays)
     np.testing.assert_array_equal(whole.entry, relayed.entry)
     np.testing.assert_allclose(whole.distance, relayed.distance, rtol=1e-6)
 
@@ -356,7 +356,7 @@ def test_a_sensor_in_the_wall_is_refused(reliefs):
 
 
 def test_a_batch_that_cannot_fit_is_refused_with_what_would(reliefs, monkeypatch):
-    monkeypatch.setattr(casting, "device_memory", lambda: 1_000_000)
+    monkeypatch.setattr(finding, "device_memory", lambda: 1_000_000)
     place = jnp.zeros((100, 3)).at[:, 0].set(30.0)
     beam = jnp.asarray(beams.planar(512))
     with pytest.raises(st.SubterraError, match=r"51,200 rays .* at most [0-9,]+ at once"):

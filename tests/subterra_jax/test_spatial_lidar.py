@@ -318,6 +318,6 @@ def test_what_no_sensor_can_honour_is_one_sentence(graded, tmp_path, monkeypatch
     with pytest.raises(st.TunnelError, match=r"old\.npz: holds no heights, .*build the scene again with"):
         st.make(TASK, tunnel=old, sensor="vlp16")
     env, params = st.make(TASK, tunnel=graded, sensor="spin16x64")
-    monkeypatch.setattr("subterra_jax.lidar3d.casting.device_memory", lambda: 10**8)
+    monkeypatch.setattr("subterra_jax.lidar3d.finding.device_memory", lambda: 10**8)
     with pytest.raises(SubterraError, match=r"4,096,000 rays need 0\.36 GB and the device has 0\.1 GB: cast at most"):
         jax.eval_shape(lambda key: st.AutoReset(env).reset(key, params, 4000), jax.random.key(0))
