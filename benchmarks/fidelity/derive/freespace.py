@@ -37,6 +37,7 @@ class Carved:
     ended: Float[np.ndarray, "b 3"]
 
 
+@kept_until("F3D")
 @per_hold
 def carve_beams(case: Case) -> Carved:
     """Samples about 300 beams a metre every 15 cm, from the sensor to 20 cm before the return or 25 m."""
@@ -55,12 +56,18 @@ def carve_beams(case: Case) -> Carved:
 
 def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
     """Return passed and ended points as station, left and up about a curve, m; kept with the recording."""
-    assert case.hold is not None
-    key = ("carving.about", id(curve))
-    if key not in case.hold.cache:
+    kept = _carved_about(case)
+    if id(curve) not in kept:
         samples = carve_beams(case)
-        case.hold.cache[key] = (curve, curve.local(samples.passed), curve.local(samples.ended))
-    return case.hold.cache[key][1:]
+        kept[id(curve)] = (curve, curve.local(samples.passed), curve.local(samples.ended))
+    return kept[id(curve)][1:]
+
+
+@kept_until("F3D")
+@per_hold
+def _carved_about(case: Case) -> dict[int, tuple[Curve, Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]]:
+    """Return what `carved_about` has placed, by the curve."""
+    return {}
 
 
 # Air in voxels of (station, left, up), 20 cm, so that nothing is aligned with the world.

@@ -107,6 +107,7 @@ def judged_ground(case: Case) -> Ground:
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
 
 
+@kept_until("NAV")
 @per_truth
 def true_ground(case: Case) -> Ground:
     """Return the true ground, by rays."""
@@ -238,6 +239,7 @@ def _observed_ground(case: Case) -> Ground:
     return _ground_of_points(curve, GROUND_CELL * case.tolerance, curve.local(points[np.isfinite(points).all(axis=1)]))
 
 
+@kept_until("NAV")
 @per_hold
 def _seen_ground(case: Case) -> Ground:
     return _ground_of_points(hold_curve(case), GROUND_CELL * case.tolerance, hold_local(case))
