@@ -146,3 +146,21 @@ def test_counts_that_do_not_fit_stand_for_everything(plan: st.TunnelPlan) -> Non
     assert unpacked(tunnel)[5].max() == packed.ALL_PAIRS
     ranges = fused_scan(tunnel, poses, np.ones(32, bool), 16)
     assert reference.agreement(plan.lining("pockets").segments, poses, ranges).n_wrong == 0
+
+
+def test_nothing_behind_the_last_box_that_a_thread_kept_is_taken_for_known() -> None:
+    """A thread that gave the first two boxes of a beam may have had the third, and kept two."""
+    rng = np.random.default_rng(0)
+    keys = np.stack([rng.permutation(64) for _ in range(200)]).reshape(200, 8, 8)  # scans, threads, boxes
+    kept = tuple(jnp.asarray(np.sort(keys, axis=2)[:, :, i]) for i in range(2))
+    found = np.concatenate([np.asarray(one) for one in fused._first_of_all(kept, 3)], axis=1)
+    truth = np.sort(keys.reshape(200, 64), axis=1)[:, :3]
+    of_one_thread = np.array([len({*np.where(scan < 2)[0]}) == 1 for scan in keys])
+    assert of_one_thread.sum() > 10
+    np.testing.assert_array_equal(found[:, :2], truth[:, :2])
+    np.testing.assert_array_equal(found[:, 2], np.where(of_one_thread, truth[:, 1], truth[:, 2]))
+
+
+def test_a_range_that_is_no_number_is_wrong(plan: st.TunnelPlan) -> None:
+    poses = reference.random_poses(plan, 4, np.random.default_rng(6))
+    assert reference.agreement(plan.lining("pockets").segments, poses, np.full((4, 16), np.nan)).n_wrong == 64
