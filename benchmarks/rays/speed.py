@@ -52,6 +52,7 @@ def main(config: SpeedConfig) -> None:
     relief = lidar3d.Relief.from_scene(folder, config.lining)
     poses = random_scans(folder, load_tunnel(folder / "tunnel.npz"), config.robots, np.random.default_rng(config.seed))
     beam = beams.spinning(np.deg2rad(np.linspace(-15.0, 15.0, config.rings)), config.columns)
+    beam, n_beams = beam.reshape(config.rings, config.columns, 3), len(beam)
     scan = jax.jit(jax.vmap(lidar3d.scan, in_axes=(None, 0, 0, 0, None, None)))
     inputs = relief, *jax.device_put((poses.position, poses.orientation, poses.station)), beam, RANGE_MAX
     scan(*inputs).block_until_ready()
@@ -60,9 +61,9 @@ def main(config: SpeedConfig) -> None:
         started = time.perf_counter()
         scan(*inputs).block_until_ready()
         seconds.append(time.perf_counter() - started)
-    slow, middle, fast = (config.robots * len(beam) / np.percentile(seconds, [75, 50, 25])) / 1e6
+    slow, middle, fast = (config.robots * n_beams / np.percentile(seconds, [75, 50, 25])) / 1e6
     print(
-        f"{config.robots} robots x {len(beam)} beams: {middle:.4g} M rays/s ({slow:.4g} to {fast:.4g}), "
+        f"{config.robots} robots x {n_beams} beams: {middle:.4g} M rays/s ({slow:.4g} to {fast:.4g}), "
         f"surface {relief.n_bytes / 1e6:.1f} MB, {jax.devices()[0].device_kind}"
     )
 

@@ -334,12 +334,28 @@ def test_the_page_finds_a_pose_by_descending_on_one_scan():
     np.testing.assert_allclose(pose[3:], true_pose[3:], atol=np.deg2rad(1e-3))
 
 
+def test_an_image_of_beams_has_the_ranges_and_derivatives_of_its_beams(reliefs):
+    place, turn = jnp.array([31.0, 0.2, -0.1]), jnp.array([1.0, 0.0, 0.0, 0.0])
+    beam = jnp.asarray(beams.spinning(np.linspace(-0.3, 0.3, 4), 16), jnp.float32)
+
+    def ranges(place, beam):
+        return lidar3d.scan(reliefs["things"], place, turn, place[0], beam, 30.0)
+
+    image, flat = ranges(place, beam.reshape(4, 16, 3)), ranges(place, beam)
+    np.testing.assert_array_equal(image, np.reshape(flat, (4, 16)))
+    slopes = [jax.jacfwd(ranges)(place, pattern).reshape(64, 3) for pattern in (beam, beam.reshape(4, 16, 3))]
+    assert np.abs(slopes[0]).max() > 0.5
+    np.testing.assert_allclose(*slopes, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("pattern", "sentence"),
     [
         (np.zeros((0, 3), np.float32), "needs one or more beams"),
         (np.float32([[1, 0, 0], [np.nan, 0, 0]]), "beam 1 of the pattern is no number"),
         (np.float32([[1, 0, 0], [0, 2, 0]]), "beam 1 of the pattern is no unit vector"),
+        (np.float32([[[1, 0, 0], [0, 2, 0]]]), "beam 1 of the pattern is no unit vector"),
+        (np.ones((1, 1, 1, 3), np.float32), "needs one or more beams"),
     ],
 )
 def test_a_pattern_that_is_none_is_refused(reliefs, pattern, sentence):
