@@ -27,10 +27,9 @@ from subterra_jax.tunnel.packed import (
     ALL_PAIRS,
     ALL_WINDOW,
     WORDS,
-    Packed,
     all_if_full,
     load_words,
-    pack,
+    packed_blocks,
     store_words,
     unpack,
 )
@@ -151,13 +150,6 @@ class _Beams(NamedTuple):
         return lax.bitcast_convert_type(entry, jnp.int32) & jnp.int32(-(1 << self.number_bits)) | number
 
 
-def packed_blocks(tunnel: Tunnel) -> Packed:
-    """Return the packed blocks of a tunnel; made of its boxes and walls where it has none."""
-    if tunnel.packed is not None:
-        return tunnel.packed
-    return pack(tunnel.box, tunnel.wall, None, jnp.full(tunnel.box.shape[1], tunnel.n_scan))
-
-
 def length_of(x, y):
     """Return the lengths of vectors, good to 1e-6."""
     squared = x * x + y * y
@@ -185,7 +177,6 @@ def _boxes_kernel(
     """The first boxes along `width` lines, ahead and behind: entry distance and number in one integer, nearest first.
 
     Each thread has every eighth box of its scan, and keeps the nearest of those; the threads of a scan then compare.
-    `cast._entries` has the geometry.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -193,9 +184,8 @@ def _boxes_kernel(
     shape = beams.n_rows, _LANES
     row = pl.program_id(0) * beams.n_rows + lax.broadcasted_iota(jnp.int32, shape, 0)
     lane, line = lax.broadcasted_iota(jnp.int32, shape, 1), pl.program_id(1) * width
-    wanted = triton.load(wanted_ref.at[row])
 
-    @pl.when(jnp.max(wanted) > 0)
+    @pl.when(_any(triton.load(wanted_ref.at[row]) > 0))
     def look() -> None:
         first, x, y, heading = _rows_of((first_ref, x_ref, y_ref, heading_ref), row)
         cos, sin = jnp.cos(heading), jnp.sin(heading)
@@ -205,45 +195,55 @@ def _boxes_kernel(
         def load(number):
             return load_words(box_ref, WORDS * (first + number), number < window)
 
-        def meet(i, carry):
+        def one_box(i, carry):
             best, words = carry
             number = lane + i * _LANES
             following = load(number + _LANES)  # while this one is worked on
-            m_x, m_y, e_x, e_y, thickness, _, _ = unpack(words)
-            thickness = jnp.where(number < window, thickness, _NONE)
-            length = length_of(e_x, e_y)
-            m_x, m_y = m_x - x, m_y - y
-            turn = m_x * e_y - m_y * e_x
-            e_x, e_y = jnp.where(turn < 0.0, -e_x, e_x), jnp.where(turn < 0.0, -e_y, e_y)
-            to_face = jnp.abs(turn) - thickness * length
-            between, to_face = to_face <= 0.0, jnp.maximum(to_face, 0.0)
-            merged = []
-            for d_x, d_y in lines:
-                facing = d_x * e_y - d_y * e_x
-                size = jnp.abs(facing)
-                crosses = jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness
-                # A reciprocal from the special function unit, good to 1e-6: less than the bits that the number takes.
-                root = lax.rsqrt(size + 1e-20)
-                key = jnp.where(crosses, beams.key(to_face * root * root, number), NOTHING)
-                for ahead in (facing > 0.0, facing < 0.0):
-                    merged.append(jnp.where(ahead | between, key, NOTHING))
-            return tuple(_inserted(best[i], merged[i]) for i in range(2 * width)), following
+            keys = _entries(beams, unpack(words), number, number < window, x, y, lines)
+            return tuple(_inserted(*pair) for pair in zip(best, keys, strict=True)), following
 
         nothing = tuple(jnp.full(shape, NOTHING) for _ in range(_kept(beams.n_best)))
         n_rounds = (jnp.max(window) + _LANES - 1) // _LANES
-        best, _ = lax.fori_loop(0, n_rounds, meet, ((nothing,) * (2 * width), load(lane)))
+        best, _ = lax.fori_loop(0, n_rounds, one_box, ((nothing,) * (2 * width), load(lane)))
         for sense in range(2):
             first_boxes = [_first_of_all(kept, beams.n_best) for kept in best[sense::2]]
             beam = sense * (beams.n // 2) + line + lane
-            for begin in range(0, beams.n_best, WORDS):
-                keys = []
-                for k in range(begin, min(begin + WORDS, beams.n_best)):
-                    # Each thread writes down one line.
-                    key = jnp.zeros(shape, jnp.int32)
-                    for j in range(width):
-                        key = jnp.where(lane == j, first_boxes[j][k], key)
-                    keys.append(key)
-                store_words(key_ref, (row * beams.n + beam) * beams.n_words + begin, keys, lane < width)
+            _write_keys(key_ref, (row * beams.n + beam) * beams.n_words, first_boxes, lane)
+
+
+def _entries(beams: _Beams, box, number, there, x, y, lines):
+    """Keys of a box of each thread, ahead along each line and behind; `cast._entries` has the geometry."""
+    m_x, m_y, e_x, e_y, thickness, _, _ = box
+    thickness = jnp.where(there, thickness, _NONE)
+    length = length_of(e_x, e_y)
+    m_x, m_y = m_x - x, m_y - y
+    turn = m_x * e_y - m_y * e_x
+    e_x, e_y = jnp.where(turn < 0.0, -e_x, e_x), jnp.where(turn < 0.0, -e_y, e_y)
+    to_face = jnp.abs(turn) - thickness * length
+    between, to_face = to_face <= 0.0, jnp.maximum(to_face, 0.0)
+    keys = []
+    for d_x, d_y in lines:
+        facing = d_x * e_y - d_y * e_x
+        size = jnp.abs(facing)
+        crosses = jnp.abs(d_x * m_y - d_y * m_x) <= size + thickness
+        # A reciprocal from the special function unit, good to 1e-6: less than the bits that the number takes.
+        root = lax.rsqrt(size + 1e-20)
+        key = jnp.where(crosses, beams.key(to_face * root * root, number), NOTHING)
+        keys += [jnp.where(ahead | between, key, NOTHING) for ahead in (facing > 0.0, facing < 0.0)]
+    return keys
+
+
+def _write_keys(key_ref, start, first_boxes, lane) -> None:
+    """Write down the first boxes of some lines, each thread those of one line."""
+    n_best = len(first_boxes[0])
+    for begin in range(0, n_best, WORDS):
+        words = []
+        for k in range(begin, min(begin + WORDS, n_best)):
+            own = jnp.zeros_like(lane)
+            for j, boxes in enumerate(first_boxes):
+                own = jnp.where(lane == j, boxes[k], own)
+            words.append(own)
+        store_words(key_ref, start + begin, words, lane < len(first_boxes))
 
 
 def _kept(n_best: int) -> int:

@@ -69,6 +69,13 @@ def pack(box: Any, wall: Any, count: Any, window: Any) -> Packed:
     return Packed(box=words, start=start, wall=wall)
 
 
+def packed_blocks(tunnel: Any) -> Packed:
+    """Return the packed blocks of a tunnel; made of its boxes and walls where it has none."""
+    if tunnel.packed is not None:
+        return tunnel.packed
+    return pack(tunnel.box, tunnel.wall, None, jnp.full(tunnel.box.shape[1], tunnel.n_scan))
+
+
 def counts(box: Any) -> tuple[Any, Any]:
     """Return the vertex pairs and the windows of packed boxes, as `Packed.box` holds them."""
     return (box[:, 3] >> WINDOW_BITS) & ALL_PAIRS, box[:, 3] & ALL_WINDOW
