@@ -134,9 +134,10 @@ def as_markdown(cells: list[dict[str, Any]]) -> str:
     """Return one table for each split and task: success in %, its interval, median error at the stop in m."""
     leaks = find_leaks(cells)
     facts = cells[0]["facts"]
+    devices = ", ".join(dict.fromkeys(cell["facts"]["device"] for cell in cells))
     lines = [
         f"Version 1, constants `{facts['constants_sha256'][:12]}`, {cells[0]['tunnels']} tunnels and "
-        f"{len(cells[0]['success']) // len(cells[0]['columns'])} episodes of each kind and split; {facts['device']}.",
+        f"{len(cells[0]['success']) // len(cells[0]['columns'])} episodes of each kind and split; {devices}.",
         "Success in %, its 95 % interval, median error at the stop in m.",
         "",
         "Beyond a bound: " + ("; ".join(leaks) if leaks else "nobody") + ".",
