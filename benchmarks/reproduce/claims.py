@@ -188,13 +188,17 @@ _UNIVERSAL = (
     "scene.build build/survey-universal/survey.bag --trajectory build/survey-universal/groundtruth.tum "
     "--provenance simulated --name subterra-universal --out build/subterra-universal"
 )
-_H200_TODAY = "one H200, 2026-11-22"
+_H200_TODAY, _H100 = "one H200, 2026-11-22", "one H100 80GB, 2026-11-25"
 _OUTSIDE, _OUTSIDE_H200 = "measured from outside, 2026-11-22", "measured from outside on one H200, 2026-11-22"
 _CONTROLS = "benchmarks.fidelity controls --bold-only"
 _PEERS = "benchmarks.throughput --n 65536 --peers jaxnav --seconds 8 --poses 62500 --out out/peers"
 _LENGTHS = "benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths"
 _T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v0 --n 65536 --out out/stop"
 _MANY = "benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"
+_SPIN = (
+    "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
+    "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any --out out/spin"
+)
 _STEP_ON_CPU = "benchmarks.throughput --n 1024 --peers none"
 _FIVE = "train.navigate --task Subterra/Traverse-v0 --preset gpu --seeds 0 1 2 3 4 --out out/five"
 _FAMILY = (
@@ -265,6 +269,7 @@ CLAIMS = (
     Claim(_SPREAD, "0.05 %", 0.02, "at most", command=f"{_T1_STEP} (and the robots spread)", measured=_H200_TODAY),
     Claim(_SPREAD, "198 M", 15.0, "at least", command=f"{_T1_STEP} (and the robots spread)", measured=_H200_TODAY),
     Claim(_SPREAD, "233 M", 15.0, "at least", command=_T1_STEP, measured=_OUTSIDE_H200),
+    Claim("with a spinning LiDAR", "3.3 M", 0.3, "at least", command=_SPIN, measured=_H100),
     Claim("100 different tunnels", "202 M", 15.0, "at least", command=_MANY, measured=_H200),
     Claim("planar LiDAR against embree", "0.09 mm", 0.01, job="rays", read=_rays(_PLANAR, "p50", 1e3)),
     Claim("planar LiDAR against embree", "99.95 %", 0.01, job="rays", read=_rays(_PLANAR, "within_1cm", 100.0)),
