@@ -197,7 +197,8 @@ _T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v0 --n 65536 --out out/
 _MANY = "benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"
 _SPIN = (
     "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
-    "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any --out out/spin"
+    "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any "
+    "--out out/spin"
 )
 _STEP_ON_CPU = "benchmarks.throughput --n 1024 --peers none"
 _FIVE = "train.navigate --task Subterra/Traverse-v0 --preset gpu --seeds 0 1 2 3 4 --out out/five"
