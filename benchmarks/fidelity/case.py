@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
 
@@ -78,13 +79,16 @@ class Case:
         return replace(self, **bare, cache={})
 
     def forget(self, category: str) -> None:
-        """Drops the results that no later category needs, and the caches of the meshes.
+        """Drops the results that no category after this one needs, and the caches of the meshes.
 
-        Edges, adjacency and normals that `trimesh` keeps beside a mesh are several times the mesh.
+        A result that is asked for again later goes with the category that asked. Edges, adjacency and normals that
+        `trimesh` keeps beside a mesh are several times the mesh.
         """
+        order = list(table.categories())
+        done = order[: order.index(category) + 1] if category in order else []
         caches = [self.cache, SHARED, *(reference.cache for reference in (self.hold, self.truth) if reference)]
         for results in caches:
-            for key in [key for key in results if _KEPT_UNTIL.get(key[:2]) == category]:
+            for key in [key for key in results if _KEPT_UNTIL.get(key[:2]) in done]:
                 del results[key]
         meshes = [value for value in self.cache.values() if isinstance(value, trimesh.Trimesh)]
         for mesh in (*meshes, self.candidate.lining, self.candidate.solid):

@@ -25,6 +25,16 @@ def test_what_no_later_category_needs_is_let_go_and_comes_back_the_same() -> Non
         np.testing.assert_array_equal(found, known)
 
 
+def test_what_comes_back_after_its_category_goes_with_the_one_that_asked() -> None:
+    case = tube.case().fresh()
+    case.forget("F3D")
+    again = surface_nearest(case)
+    case.forget("CEN")
+    assert surface_nearest(case) is again
+    case.forget("SCN")
+    assert surface_nearest(case) is not again
+
+
 def test_every_mark_names_a_category() -> None:
     all_metrics()
     assert set(_KEPT_UNTIL.values()) <= set(table.categories())
