@@ -183,6 +183,7 @@ def _nearest_gap(station: np.ndarray, away: np.ndarray) -> np.ndarray:
 
 # Bodies that stand in the bore or close it.
 
+EACH = 36.0  # m, the tunnels on which the points of the controls were set: a longer one gets its share
 _WALL_THICKNESS = 0.3  # m thick
 _DEBRIS_RADIUS = 0.3  # m, radius of a piece of debris
 _PILLAR_SIZE = (0.5, 0.4)  # m along and across the tunnel
@@ -209,19 +210,18 @@ def add_bodies(candidate: Candidate, parts: list[trimesh.Trimesh]) -> Candidate:
 
 
 def block_bore(candidate: Candidate, whole: bool) -> Candidate:
-    """Puts a box of 1 m on the track in mid-tunnel, or a wall across the whole section."""
-    bore, station = candidate.bore, 0.5 * candidate.length
+    """Puts a box of 1 m on the track in the middle of every `EACH` m, or a wall across the whole section."""
+    bore, count = candidate.bore, _as_long_as(candidate)
     width, height = float(bore.width.max()), float(bore.height.max())
-    if whole:
-        return add_bodies(
-            candidate, [place_box(candidate, station, 0.0, 0.0, (_WALL_THICKNESS, width + 0.5, height + 0.5))]
-        )
     low = -0.5 * float(np.median(bore.height))
-    return add_bodies(candidate, [place_box(candidate, station, 0.0, low + 0.6, (1.0, 1.0, 1.0))])
+    up, size = (0.0, (_WALL_THICKNESS, width + 0.5, height + 0.5)) if whole else (low + 0.6, (1.0, 1.0, 1.0))
+    stations = candidate.length * (np.arange(count) + 0.5) / count
+    return add_bodies(candidate, [place_box(candidate, float(station), 0.0, up, size) for station in stations])
 
 
 def add_debris(candidate: Candidate, count: int, rng: np.random.Generator) -> Candidate:
-    """Puts pieces of debris that float into the bore."""
+    """Puts pieces of debris that float into the bore, so many to every `EACH` m."""
+    count *= _as_long_as(candidate)
     station = rng.uniform(1.0, candidate.length - 1.0, count)
     local = np.column_stack([station, rng.uniform(-1.5, 1.5, count), rng.uniform(-1.0, 1.5, count)])
     parts = []
@@ -230,6 +230,11 @@ def add_debris(candidate: Candidate, count: int, rng: np.random.Generator) -> Ca
         blob.apply_translation(middle)
         parts.append(blob)
     return add_bodies(candidate, parts)
+
+
+def _as_long_as(candidate: Candidate) -> int:
+    """Returns how many times `EACH` m a tunnel is long, at least 1."""
+    return max(1, round(candidate.length / EACH))
 
 
 def add_pillars(candidate: Candidate, spacing: float) -> Candidate:

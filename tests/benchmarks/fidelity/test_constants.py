@@ -10,7 +10,8 @@ from benchmarks.fidelity import judge, scoring, table
 from benchmarks.fidelity.registry import Value
 
 # Whoever changes a threshold, weight, gate, limit or row on purpose writes the new digest here, with the reason.
-DIGEST = "7ff3401e96dee8fe5f17e8bd590cf95fe6fdd352df6382ea5ca552ae6599b21a"
+# Last: walls, boxes and debris of N20 and N21 are so many in every 36 m, where they were so many in any tunnel.
+DIGEST = "ad1559113710eff9015d0d0b3f0c32ca1d1011d949a58f8dca2150d62e629b19"
 TESTS = Path(__file__).parent
 
 

@@ -149,6 +149,15 @@ def test_a_wall_cuts_the_air_in_two(base: Case) -> None:
     assert len(candidate(base, "N20", 2).solid.split(only_watertight=True)) == 2
 
 
+def test_what_a_control_counts_is_as_dense_in_a_long_tunnel() -> None:
+    """The points that it must cost were set on 36 m; one wall in ten times that would count a tenth."""
+    straight = {"bend": np.inf, "depth": 0.0, "track": False}
+    for length, walls in ((36.0, 1), (108.0, 3)):
+        case = tube.case(tube.Tube(length=length, **straight), beams=60)
+        assert len(candidate(case, "N21", 5).extra.split()) == 5 * walls
+        assert len(candidate(case, "N20", 1).extra.split()) == walls
+
+
 def test_debris_is_where_it_was_dropped(base: Case) -> None:
     spoilt = candidate(base, "N21", 5)
     assert len(spoilt.extra.split()) == 5
