@@ -76,9 +76,9 @@ def packed_blocks(tunnel: Any) -> Packed:
     return pack(tunnel.box, tunnel.wall, None, jnp.full(tunnel.box.shape[1], tunnel.n_scan))
 
 
-def counts(box: Any) -> tuple[Any, Any]:
-    """Return the vertex pairs and the windows of packed boxes, as `Packed.box` holds them."""
-    return (box[:, 3] >> WINDOW_BITS) & ALL_PAIRS, box[:, 3] & ALL_WINDOW
+def counts(word: Any) -> tuple[Any, Any]:
+    """Return the vertex pairs and the windows of boxes, of their last word; see `Packed`."""
+    return (word >> WINDOW_BITS) & ALL_PAIRS, word & ALL_WINDOW
 
 
 def pair_up(xp: Any, wall: Any) -> Any:
@@ -90,8 +90,7 @@ def pair_up(xp: Any, wall: Any) -> Any:
 def unpack(words):
     """Return the middle x, y, half axis x, y, half thickness (m), vertex pairs and window of boxes; see `Packed`."""
     x, y = (jax.lax.bitcast_convert_type(word, jnp.float32) for word in words[:2])
-    pairs, window = (words[3] >> WINDOW_BITS) & ALL_PAIRS, words[3] & ALL_WINDOW
-    return x, y, _high(words[2]), _low(words[2]), _high(words[3]), pairs, window
+    return x, y, _high(words[2]), _low(words[2]), _high(words[3]), *counts(words[3])
 
 
 def all_if_full(count, full: int, everything: int):

@@ -1,4 +1,4 @@
-"""What a case keeps of its computations, and when it lets them go."""
+"""A case: what it keeps of its computations, and when it lets them go."""
 
 import numpy as np
 
