@@ -23,6 +23,7 @@ from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.sources import resolve, tunnel_digest
 
 PLANAR = SENSORS[0]
+_FORM = 2  # of the arrays of a tunnel: what was kept in another is not read
 _EACH = 4  # planar tunnels that take as long to make as a process to begin
 
 
@@ -122,7 +123,11 @@ def _tunnel(name: str | Path | None, kind: Kind, cache: Path | None) -> Tunnel:
 def _kept(name: str | Path | None, kind: Kind, cache: Path | None) -> Path | None:
     """Returns the file in which a tunnel is kept."""
     bore, piece = "-bore" if kind.spatial else "", "" if kind.piece is None else f"-{kind.piece}"
-    return None if cache is None else cache / f"{VERSION}-{name}-{kind.lining}{bore}{piece}.pickle".replace("/", "_")
+    return (
+        None
+        if cache is None
+        else cache / f"{VERSION}-{_FORM}-{name}-{kind.lining}{bore}{piece}.pickle".replace("/", "_")
+    )
 
 
 def _is_kept(name: str | Path | None, kind: Kind, cache: Path | None) -> bool:

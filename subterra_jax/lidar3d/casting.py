@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d.finding import find, find_facing, find_facing_from
-from subterra_jax.lidar3d.meeting import Hits
+from subterra_jax.lidar3d.meeting import Hits, Point
 from subterra_jax.lidar3d.relief import Relief
 
 
@@ -126,13 +126,20 @@ def meet(
     return Met(*_meet(relief.shared, origins, directions, blocks, limits))
 
 
+def _surfaces(
+    found: tuple[Hits, Point], origins: Array, directions: Array, limits: Array
+) -> tuple[Array, Array, Array]:
+    """Return ranges, normals and whether a thing is met, of what was found."""
+    hits, normal = found
+    return _clip(hits, origins, directions, limits), jnp.stack(normal, axis=-1), hits.entry < -1
+
+
 @jax.custom_jvp
 @in_32_bits()
 def _meet(
     relief: Relief, origins: Array, directions: Array, blocks: Array, limits: Array
 ) -> tuple[Array, Array, Array]:
-    hits, normal = find_facing(relief, origins, directions, blocks, limits)
-    return _clip(hits, origins, directions, limits), jnp.stack(normal, axis=-1), hits.entry < -1
+    return _surfaces(find_facing(relief, origins, directions, blocks, limits), origins, directions, limits)
 
 
 @_meet.defjvp
@@ -150,8 +157,7 @@ def _meet_from(
     relief: Relief, origin: Array, directions: Array, block: Array, limit: Array
 ) -> tuple[Array, Array, Array]:
     """`_meet` of rays from one place."""
-    hits, normal = find_facing_from(relief, origin, directions, block, limit)
-    return _clip(hits, origin, directions, limit), jnp.stack(normal, axis=-1), hits.entry < -1
+    return _surfaces(find_facing_from(relief, origin, directions, block, limit), origin, directions, limit)
 
 
 @_meet_from.defjvp
