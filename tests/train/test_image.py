@@ -43,9 +43,9 @@ def test_a_student_with_an_image_learns_and_its_release_gives_the_same_action():
     seen = seen.at[1].set(seen[0]).at[1, :256].set(9.0)
     actions = []
     for flat in seen:
-        view = driving.look(env, params, flat[None], senses.start((1,), 16, learner.networks.layout.shown))
+        view, inputs = driving.look(env, params, flat[None], senses.start((1,), 16, learner.networks.layout.shown))
         hidden, _ = learner.networks.remember(
-            weights, driving.one_moment(view.features), jnp.zeros((1, config.hidden)), jnp.ones((1, 1), bool)
+            weights, driving.one_moment(inputs), jnp.zeros((1, config.hidden)), jnp.ones((1, 1), bool)
         )
         thought = learner.networks.think(weights, hidden, view.ahead)
         actions.append(np.asarray(learner.networks.action(thought.parameters[0, :2])))

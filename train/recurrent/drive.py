@@ -1,5 +1,6 @@
 """One unroll of every environment with memory, its storage, and the layout of the network it asks for."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -67,20 +68,21 @@ class Rollout:
     truncated: Bool[Array, "time env"]
 
 
-def look(env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning) -> senses.Sight:
-    """Returns the inputs of the network for a batch of observations; with an image, its features are `Kept`."""
+def look(
+    env: Any, params: Any, observation: Float[Array, "env obs"], reckoning: senses.Reckoning
+) -> tuple[senses.Sight, Kept]:
+    """Looks at a batch of observations; returns what is seen, and the inputs of the network."""
     part = {name: observation[..., where] for name, where in env.fields(params).items()}
-    if "scan" not in part:
-        return senses.look(part, params.start.station, reckoning)
-    part["ranges"] = level_ring(part["scan"], params.lidar.shape)
+    if "scan" in part:
+        part["ranges"] = level_ring(part["scan"], params.lidar.shape)
     view = senses.look(part, params.start.station, reckoning)
     # Side by side they would be copied, and cut apart again, at every step.
-    return view.replace(features=Kept(view.features, part["scan"] / senses.IMAGE_RANGE))  # type: ignore[attr-defined]
+    return view, Kept(view.features, part["scan"] / senses.IMAGE_RANGE if "scan" in part else None)
 
 
-def one_moment(features: Any) -> Any:
+def one_moment(inputs: Kept) -> Kept:
     """Returns the inputs of a moment as a sequence of one."""
-    return jax.tree.map(lambda part: part[None], features)
+    return jax.tree.map(lambda part: part[None], inputs)
 
 
 def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Array, "env"]) -> Float[Array, "env n"]:
@@ -90,7 +92,7 @@ def truth(env: Any, params: Any, state: Any, view: senses.Sight, error: Float[Ar
         env: The environment.
         params: Its params.
         state: Batched state.
-        view: The agent's inputs.
+        view: The agent's look at its observation.
         error: The agent's own estimate of true less tracked distance, m.
     """
     known = jax.vmap(env.privileged, (0, None))(state, params)
@@ -125,13 +127,28 @@ def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int, layout: Recurre
     )
 
 
-def think(
-    env: Any, params: Any, networks: RecurrentNetworks, weights: dict[str, Weights], now: Drive
-) -> tuple[senses.Sight, Float[Array, "env hidden"], Thought]:
-    """Returns the inputs of the network, its memory after them, and its answer."""
-    view = look(env.env, params, now.observation, now.reckoning)
-    hidden, _ = networks.remember(weights, one_moment(view.features), now.hidden, now.first[None])
-    return view, hidden, networks.think(weights, hidden, view.ahead)
+@dataclasses.dataclass(frozen=True)
+class ForwardPass:
+    """Forward pass of the network for one step of every environment.
+
+    Attributes:
+        view: Look at the observation.
+        inputs: Inputs of the network.
+        hidden: Memory after them.
+        thought: Outputs of the heads.
+    """
+
+    view: senses.Sight
+    inputs: Kept
+    hidden: Float[Array, "env hidden"]
+    thought: Thought
+
+
+def think(env: Any, params: Any, networks: RecurrentNetworks, weights: dict[str, Weights], now: Drive) -> ForwardPass:
+    """Runs the network on the observations to act upon next."""
+    view, inputs = look(env.env, params, now.observation, now.reckoning)
+    hidden, _ = networks.remember(weights, one_moment(inputs), now.hidden, now.first[None])
+    return ForwardPass(view, inputs, hidden, networks.think(weights, hidden, view.ahead))
 
 
 def mean_errors(station: Float[Array, "env"], view: senses.Sight, thought: Thought) -> dict[str, Float[Array, ""]]:
@@ -189,14 +206,15 @@ def collect(
 
     def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, Finished, dict[str, Array]]]:
         key_action, key_env = jax.random.split(key_now)
-        view, hidden, thought = think(env, params, networks, weights, now)
+        forward = think(env, params, networks, weights, now)
+        view, thought = forward.view, forward.thought
         raw = networks.distribution.sample_no_postprocessing(thought.parameters, key_action)
         action = networks.action(raw)
         stepped = env.step(key_env, now.env_state, action, params)
         _, _, reward, terminated, truncated, info = stepped
         station = now.env_state.station - params.start.station
         stored = Rollout(
-            features=networks.keep(view.features),
+            features=networks.keep(forward.inputs),
             first=now.first,
             ahead=view.ahead,
             error=station - view.station,
@@ -211,7 +229,7 @@ def collect(
             **mean_errors(station, view, thought),
             **{name: jnp.mean(value) for name, value in info.items() if name.startswith("reward_")},
         }
-        after, finished = follow(now, stepped, view, hidden, action)
+        after, finished = follow(now, stepped, view, forward.hidden, action)
         return after, (stored, finished, terms)
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
@@ -261,7 +279,7 @@ def senses_of(params: Any, config: RecurrentConfig) -> senses.Senses:
     return senses.Senses(config.tracker or ("careful" if among_boxes else senses.PLAIN.tracker), among_boxes)
 
 
-def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Any, Array]:
+def _shapes(env: Any, batch: Any, params: Any, observation: Array, shown: senses.Senses) -> tuple[Kept, Array]:
     _, state = batch.reset(jax.random.key(0), params, 1)
-    view = look(env, params, observation, senses.start((1,), n_ranges(params), shown))
-    return view.features, truth(env, params, state, view, jnp.zeros(1))
+    view, inputs = look(env, params, observation, senses.start((1,), n_ranges(params), shown))
+    return inputs, truth(env, params, state, view, jnp.zeros(1))

@@ -170,13 +170,9 @@ class RecurrentLearner(devices.Whole):
     ) -> Lesson:
         """Computes advantages and value targets; an episode cut by the clock goes on with the value it had."""
         value = self.networks.value(before.weights, rollout.truth)
-        view = driving.look(self.env.env, params, after.observation, after.reckoning)
-        seen = driving.one_moment(view.features)
-        hidden, _ = self.networks.remember(before.weights, seen, after.hidden, after.first[None])
-        thought = self.networks.think(before.weights, hidden, view.ahead)
-        last = self.networks.value(
-            before.weights, driving.truth(self.env.env, params, after.env_state, view, thought.error)
-        )
+        forward = driving.think(self.env, params, self.networks, before.weights, after)
+        truth = driving.truth(self.env.env, params, after.env_state, forward.view, forward.thought.error)
+        last = self.networks.value(before.weights, truth)
         advantage = learning.advantages(
             rollout.reward / scale,
             value,

@@ -164,7 +164,8 @@ def collect(
     def step(now: Classroom, key_now: PRNGKeyArray) -> tuple[Classroom, tuple[Advised, Finished, dict[str, Array]]]:
         key_teacher, key_env, key_who = jax.random.split(key_now, 3)
         student, state = now.student, now.student.env_state
-        view, hidden, thought = driving.think(env, params, networks, weights, student)
+        forward = driving.think(env, params, networks, weights, student)
+        view, thought = forward.view, forward.thought
         advice, memory = advise(
             env.env, agent, key_teacher, now.teacher, student.observation, state, student.first, params
         )
@@ -173,13 +174,13 @@ def collect(
         action = jnp.where(now.taught[:, None], advice, own)
         stepped = env.step(key_env, state, action, params)
         station = student.env_state.station - params.start.station
-        stored = Advised(networks.keep(view.features), student.first, view.ahead, station - view.station, advice)
+        stored = Advised(networks.keep(forward.inputs), student.first, view.ahead, station - view.station, advice)
         terms = {
             **driving.mean_errors(station, view, thought),
             "reward": jnp.mean(stepped[2]),
             "taught": jnp.mean(now.taught),
         }
-        following, finished = driving.follow(student, stepped, view, hidden, action)
+        following, finished = driving.follow(student, stepped, view, forward.hidden, action)
         done = following.first
         finished = dataclasses.replace(finished, done=done & ~now.taught)
         again = jax.random.uniform(key_who, done.shape) < taught
