@@ -233,33 +233,39 @@ def train_seeds(
     Raises:
         TrainingError: The loss of a seed is no longer finite.
     """
-    first, options = learners[0], compiler_options(learners[0].config)
-    if any(snapshot is None for snapshot in snapshots):
-        keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
-        states = jax.jit(over_seeds(first.init), compiler_options=options)(keys, params)
-        untrained = _apart(states, len(learners))
-        now = [s or started(learner, state) for s, learner, state in zip(snapshots, learners, untrained, strict=True)]
-    else:
-        now = [snapshot for snapshot in snapshots if snapshot is not None]
+    now, first = _begin_missing(learners, params, snapshots), learners[0]
     states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
     if all(map(_done, now, learners)):
         return now
     began = time.perf_counter()
-    iterate = jax.jit(over_seeds(first.iterate), donate_argnums=0).lower(states, params).compile(options)
+    program = jax.jit(over_seeds(first.iterate), donate_argnums=0).lower(states, params)
+    iterate = program.compile(compiler_options(first.config))
     compiled = time.perf_counter()
     while not all(map(_done, now, learners)) and not stop():
         before = time.perf_counter()
         states, reports = iterate(states, params)
-        told = fetch_all(reports, len(learners))
+        fetched = fetch_all(reports, len(learners))
         timed = timing(began, compiled, before, first.config.steps_per_iteration * len(learners))
         parts = _apart((states, reports.policy), len(learners))
-        for k, (learner, (state, policy), (ended, metrics)) in enumerate(zip(learners, parts, told, strict=True)):
-            if not _done(now[k], learner):
-                now[k] = advance(now[k], state, policy, ended, metrics, learner.config)
-                now[k].record["timing"] = timed
-                if watch is not None:
-                    watch(k, now[k])
+        for k, (learner, (state, policy), (ended, metrics)) in enumerate(zip(learners, parts, fetched, strict=True)):
+            if _done(now[k], learner):
+                continue
+            now[k] = advance(now[k], state, policy, ended, metrics, learner.config)
+            now[k].record["timing"] = timed
+            if watch is not None:
+                watch(k, now[k])
     return now
+
+
+def _begin_missing(learners: list[Trainable], params: Any, snapshots: list[Snapshot | None]) -> list[Snapshot]:
+    """Returns the snapshots, an untrained one in place of each that is None."""
+    known = [snapshot for snapshot in snapshots if snapshot is not None]
+    if len(known) == len(snapshots):
+        return known
+    keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
+    init = jax.jit(over_seeds(learners[0].init), compiler_options=compiler_options(learners[0].config))
+    untrained = _apart(init(keys, params), len(learners))
+    return [s or started(learner, state) for s, learner, state in zip(snapshots, learners, untrained, strict=True)]
 
 
 def _done(snapshot: Snapshot, learner: Trainable) -> bool:
