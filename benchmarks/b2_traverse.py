@@ -8,7 +8,7 @@ import json
 import math
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -110,7 +110,7 @@ def command(arguments: Command) -> None:
         engine=arguments.engine,
         odometer=arguments.odometer,
         goal_coverage=arguments.coverage,
-        vehicle=tasks.VEHICLE.replace(speed_max=arguments.speed),  # type: ignore[attr-defined]
+        vehicle=replace(tasks.VEHICLE, speed_max=arguments.speed),
     )
     agent, started = load_driver(arguments.agent, env, params), time.perf_counter()
     walks = transfer.walk_robots(env, params, agent, arguments.robots, arguments.seed, show_progress)

@@ -81,7 +81,7 @@ _SHORT = (0.0, c.SHORT_LENGTH + c.GOAL_MARGIN)
 _RETURN = StartParams(station=c.RETURN_START)
 _OFFSET = StartParams(station=c.OFFSET_START, station_sigma=c.OFFSET_SIGMA)
 _NEAR = GoalParams(low=c.SHORT_GOAL_LOW, high=c.SHORT_GOAL_HIGH, tolerance=c.SHORT_TOLERANCE)
-_NEAR_OFFSET = _NEAR.replace(low=c.SHORT_OFFSET_GOAL_LOW)  # type: ignore[attr-defined]
+_NEAR_OFFSET = dataclasses.replace(_NEAR, low=c.SHORT_OFFSET_GOAL_LOW)
 _NEAR_REPORT = GoalParams(tolerance=c.SHORT_TOLERANCE, travel_max=c.SHORT_TRAVEL_MAX)
 _AMONG_BOXES, _FAULTED = (*SLIPPING, Obstacles()), (*SLIPPING, Faults())
 
@@ -113,7 +113,7 @@ VERSIONS = ("v0", "v1")
 def _version_1() -> dict[str, Task]:
     """Tasks told honestly: start and goal inside, fault sizes drawn, and each with a hidden start as well."""
     goal = GoalParams(low=c.INSIDE_LOW, high=c.INSIDE_HIGH, margin=c.INSIDE_MARGIN)
-    near = goal.replace(low=c.INSIDE_SHORT_LOW, high=c.INSIDE_SHORT_HIGH, tolerance=c.SHORT_TOLERANCE)  # type: ignore[attr-defined]
+    near = dataclasses.replace(goal, low=c.INSIDE_SHORT_LOW, high=c.INSIDE_SHORT_HIGH, tolerance=c.SHORT_TOLERANCE)
     report = GoalParams(margin=c.RELOCALISE_MARGIN, travel_max=c.RELOCALISE_TRAVEL)
     rows = {
         "StopAt": Task(StopInside(), c.HORIZON_STOP, None, SLIPPING, _drifting(goal=goal)),

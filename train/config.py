@@ -153,11 +153,11 @@ _PRESETS: dict[str, PPOConfig] = {
 # What differs from that by task. T1 to T5 are here for comparison: without memory nobody passes the blind bound, and
 # coverage does not say who has learnt them.
 _GOAL = {"stop_coverage": 2.0}
-_TASKS: dict[str, dict[str, dict[str, float | int]]] = {
+_TASKS: dict[str, dict[str, dict[str, Any]]] = {
     "Subterra/Traverse-v0": {"cpu": {"steps": 4_000_000, "stop_patience": 60}, "gpu": {}},
     "Subterra/TraverseShort-v0": {"cpu": {}, "gpu": {"steps": 30_000_000}},
 }
-_OTHERS: dict[str, dict[str, float | int]] = {
+_OTHERS: dict[str, dict[str, Any]] = {
     "cpu": {**_GOAL, "steps": 4_000_000},
     "gpu": {**_GOAL, "steps": 130_000_000, "discount": 0.99},
 }
@@ -179,7 +179,7 @@ def make_config(task: str, preset: str = "cpu") -> PPOConfig:
     except TaskError as error:
         raise ConfigError(str(error)) from error
     different = _TASKS[task][preset] if task in _TASKS else _OTHERS[preset]
-    return dataclasses.replace(_PRESETS[preset], **different)  # type: ignore[arg-type]
+    return dataclasses.replace(_PRESETS[preset], **different)
 
 
 def known_preset(preset: str) -> None:

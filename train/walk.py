@@ -78,8 +78,9 @@ def _read_words(arguments: list[str]) -> Command:
     early.add_argument("--preset", default=None)
     named, _ = early.parse_known_args(arguments)
     preset = named.preset or ("cpu" if jax.default_backend() == "cpu" else "gpu")
-    on_cpu = {"robots": 64} if preset == "cpu" else {}
-    default = Command(out=tyro.MISSING, preset=preset, config=make_walk_config(preset), **on_cpu)  # type: ignore[arg-type]
+    default = Command(out=tyro.MISSING, preset=preset, config=make_walk_config(preset))
+    if preset == "cpu":
+        default = dataclasses.replace(default, robots=64)
     default = with_weights(default, WalkRewardParams())
     return tyro.cli(type(default), args=arguments, default=default, prog="python -m train.walk", description=__doc__)
 

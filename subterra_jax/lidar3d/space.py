@@ -147,9 +147,10 @@ def turned(axes: tuple[Rows, Rows, Rows], mount: Mount) -> Float[Array, "3 3"]:
 def _spin(first: Rows, second: Rows, angle: Any) -> tuple[Rows, Rows]:
     """Turn two axes of a right-handed frame about the third."""
     cos, sin = jnp.cos(angle), jnp.sin(angle)
+    (ax, ay, az), (bx, by, bz) = first, second
     return (
-        tuple(cos * a + sin * b for a, b in zip(first, second, strict=True)),  # type: ignore[return-value]
-        tuple(cos * b - sin * a for a, b in zip(first, second, strict=True)),
+        (cos * ax + sin * bx, cos * ay + sin * by, cos * az + sin * bz),
+        (cos * bx - sin * ax, cos * by - sin * ay, cos * bz - sin * az),
     )
 
 

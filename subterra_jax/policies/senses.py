@@ -191,7 +191,9 @@ def look(parts: Parts, begin: Float[Array, ""] | float, now: Reckoning) -> Sight
         near = boxes.look(near, parts["ranges"], now.action, now.begun < 0.5, back > now.back)
         distance = distance * boxes.cosine(near)
     track = counter.advance(now.rings, parts["ranges"], distance, 1.0 - 2.0 * back, pitch)
-    after = now.replace(rings=track, reading=reading, flag=flag, flagged_at=flagged_at, back=back, boxes=near)  # type: ignore[attr-defined]
+    after = dataclasses.replace(
+        now, rings=track, reading=reading, flag=flag, flagged_at=flagged_at, back=back, boxes=near
+    )
     ahead = jnp.where(flag > 0.5, 0.0, goal) - track.station
     return Sight(_features(parts["ranges"], heading, ahead, pitch, after), track.station, ahead, after)
 
@@ -224,7 +226,7 @@ def replace_action(before: Reckoning, after: Reckoning, action: Float[Array, "*e
         action: Action that was taken instead, m/s and rad/s.
     """
     step = PERIOD * jnp.maximum(action[..., 0], 0.0)
-    return after.replace(commanded=before.commanded + step, step=step, action=action)  # type: ignore[attr-defined]
+    return dataclasses.replace(after, commanded=before.commanded + step, step=step, action=action)
 
 
 def _features(

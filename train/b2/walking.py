@@ -56,7 +56,7 @@ class WalkConfig(PPOConfig):
     KEEPS_BEST: ClassVar[bool] = False
 
 
-_PRESETS: dict[str, dict[str, int | tuple[int, ...]]] = {
+_PRESETS: dict[str, dict[str, Any]] = {
     "gpu": {},
     # Shows that it learns, not how well: a hundredth of the steps.
     "cpu": {"steps": 2_000_000, "n_envs": 256, "minibatches": 8, "hidden": (128, 128), "checkpoint_every": 20},
@@ -70,7 +70,7 @@ def make_walk_config(preset: str) -> WalkConfig:
         ConfigError: There is no preset of that name.
     """
     known_preset(preset)
-    return WalkConfig(**_PRESETS[preset])  # type: ignore[arg-type]
+    return WalkConfig(**_PRESETS[preset])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -58,7 +58,7 @@ class BeliefConfig(TrainConfig):
     KEEPS_BEST: ClassVar[bool] = False
 
 
-_PRESETS: dict[str, dict[str, int]] = {
+_PRESETS: dict[str, dict[str, Any]] = {
     "gpu": {},
     "cpu": {"steps": 400_000, "n_envs": 16, "unroll": 64, "epochs": 2, "minibatches": 2, "ways": 63},
 }
@@ -71,7 +71,7 @@ def make_belief_config(preset: str) -> BeliefConfig:
         ConfigError: There is no preset of that name.
     """
     known_preset(preset)
-    return BeliefConfig(**_PRESETS[preset])  # type: ignore[arg-type]
+    return BeliefConfig(**_PRESETS[preset])
 
 
 def check_belief(config: BeliefConfig) -> BeliefConfig:

@@ -1,7 +1,7 @@
 """Settings of a policy with memory: learnt by reward, or from a teacher."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from subterra_jax.policies.senses import TRACKERS
 from train.config import (
@@ -58,7 +58,7 @@ class RecurrentConfig(TrainConfig):
     KEEPS_BEST: ClassVar[bool] = False
 
 
-_PRESETS: dict[str, dict[str, float | int]] = {
+_PRESETS: dict[str, dict[str, Any]] = {
     "gpu": {},
     "cpu": {"steps": 30_000_000, "n_envs": 512, "hidden": 96, "minibatches": 8, "checkpoint_every": 10},
 }
@@ -77,7 +77,7 @@ def make_recurrent_config(task: str, preset: str = "gpu") -> RecurrentConfig:
     """
     known_preset(preset)
     steps = {"steps": _STEPS[task]} if preset == "gpu" and task in _STEPS else {}
-    return RecurrentConfig(**{**_PRESETS[preset], **steps})  # type: ignore[arg-type]
+    return RecurrentConfig(**{**_PRESETS[preset], **steps})
 
 
 def check_recurrent(config: RecurrentConfig) -> RecurrentConfig:
@@ -116,7 +116,7 @@ class DistillConfig(RecurrentConfig):
     imitation_weight: float = 1.0
 
 
-_DISTILL_PRESETS: dict[str, dict[str, float | int]] = {
+_DISTILL_PRESETS: dict[str, dict[str, Any]] = {
     "gpu": {},
     "cpu": {"steps": 10_000_000, "n_envs": 256, "hidden": 96, "minibatches": 8},
 }
@@ -130,7 +130,7 @@ def make_distill_config(task: str, preset: str = "gpu") -> DistillConfig:
     """
     known_preset(preset)
     del task
-    return DistillConfig(**_DISTILL_PRESETS[preset])  # type: ignore[arg-type]
+    return DistillConfig(**_DISTILL_PRESETS[preset])
 
 
 def check_distill(config: DistillConfig) -> DistillConfig:

@@ -201,7 +201,8 @@ def _choose_pair(
     best_distance = jnp.take_along_axis(distance, at[..., None], axis=-2)[..., 0, :]
     best_slope = jnp.clip(jnp.take_along_axis(slope, at, axis=-1)[..., 0], -2.0 * _STEEP, 2.0 * _STEEP)
     distance = jnp.where(other[..., None], best_distance, walls.distance)
-    return walls.replace(distance=distance, slope=jnp.where(other, best_slope, walls.slope)), other  # type: ignore[attr-defined]
+    slope = jnp.where(other, best_slope, walls.slope)
+    return dataclasses.replace(walls, distance=distance, slope=slope), other
 
 
 def _bell(value: Array) -> Array:
