@@ -89,6 +89,30 @@ def read_tunnel(path: Path) -> TunnelPlan:
     fields = _Fields(path)
     if (schema := fields.text("schema")) not in (SCHEMA, PLANAR_SCHEMA):
         raise TunnelError(f"{path}: {other_schema(schema, SCHEMA, BUILD_AGAIN)}")
+    axis = _read_axis(fields)
+    # Older files do not have the field.
+    ring_pitch = float(fields.numbers("ring_pitch")) if "ring_pitch" in fields.data else 0.0
+    if ring_pitch < 0.0:
+        raise fields.fail("ring_pitch", f"must not be negative, is {ring_pitch}")
+    linings = _read_linings(fields)
+    plan = TunnelPlan(
+        name=fields.text("name"),
+        provenance=fields.text("provenance"),
+        **axis,
+        lidar_height=float(fields.numbers("lidar_height")),
+        linings=linings,
+        ring_pitch=ring_pitch,
+        ring_joint=fields.numbers("ring_joint", None) if "ring_joint" in fields.data else np.zeros(0),
+        source=str(path),
+    )
+    if schema == SCHEMA:
+        plan = dataclasses.replace(plan, shell=_read_shell(fields, plan))
+    _check_sides(fields, plan)
+    return plan
+
+
+def _read_axis(fields: _Fields) -> dict[str, Any]:
+    """Read what a plan knows at each station: the centreline and the width around it."""
     station = fields.numbers("station", None)
     n = len(station)
     if n < 2:
@@ -105,43 +129,39 @@ def read_tunnel(path: Path) -> TunnelPlan:
     half_width = fields.numbers("half_width", n)
     if np.any(half_width <= 0.0):
         raise fields.fail("half_width", "must be positive")
-    # Older files do not have the field.
-    ring_pitch = float(fields.numbers("ring_pitch")) if "ring_pitch" in fields.data else 0.0
-    if ring_pitch < 0.0:
-        raise fields.fail("ring_pitch", f"must not be negative, is {ring_pitch}")
+    elevation = fields.numbers("elevation", n)
+    return {
+        "station": station,
+        "centre": centre,
+        "tangent": tangent,
+        "elevation": elevation,
+        "half_width": half_width,
+    }
+
+
+def _read_linings(fields: _Fields) -> dict[str, Lining]:
+    """Read every lining variant by its name."""
     names: Any = fields.data.get("lining")
     if names is None:
         raise fields.fail("lining", "is missing")
     if names.ndim != 1 or names.dtype.kind != "U" or len(names) == 0:
         raise fields.fail("lining", f"must be a list of names, is {names.dtype} of shape {names.shape}")
-    plan = TunnelPlan(
-        name=fields.text("name"),
-        provenance=fields.text("provenance"),
-        station=station,
-        centre=centre,
-        tangent=tangent,
-        elevation=fields.numbers("elevation", n),
-        half_width=half_width,
-        lidar_height=float(fields.numbers("lidar_height")),
-        linings={
-            str(name): Lining(
-                fields.wall("left", name), fields.wall("right", name), fields.numbers(f"furniture_{name}", None, 4)
-            )
-            for name in names
-        },
-        ring_pitch=ring_pitch,
-        ring_joint=fields.numbers("ring_joint", None) if "ring_joint" in fields.data else np.zeros(0),
-        source=str(path),
-    )
-    if schema == SCHEMA:
-        plan = dataclasses.replace(plan, shell=_read_shell(fields, plan))
+    return {
+        str(name): Lining(
+            fields.wall("left", name), fields.wall("right", name), fields.numbers(f"furniture_{name}", None, 4)
+        )
+        for name in names
+    }
+
+
+def _check_sides(fields: _Fields, plan: TunnelPlan) -> None:
+    """Refuse a wall that lies to the other side of the centreline."""
     for name, lining in plan.linings.items():
         for side, wall, sign in (("left", lining.left, 1.0), ("right", lining.right, -1.0)):
             if np.median(sign * _lateral(plan, wall)) <= 0.0:
                 raise fields.fail(
                     f"{side}_{name}", f"lies to the other side of the centreline: {side} means its {side}"
                 )
-    return plan
 
 
 def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
@@ -167,11 +187,7 @@ def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
     if not np.all(section > 0.0):
         raise fields.fail("shell_section", "must give positive distances from the axis")
     level = np.sqrt(1.0 - rise**2)[:, None]
-    spacing = SPACING
-    if "shell_spacing" in fields.data:  # files of scenes do not have the field
-        spacing = tuple(fields.numbers("shell_spacing", 2).tolist())
-        if min(spacing) <= 0.0:
-            raise fields.fail("shell_spacing", "must be positive")
+    spacing = _read_spacing(fields)
     return Shell(
         station=plan.station,
         position=np.column_stack([plan.centre, plan.elevation + fields.numbers("shell_height", n)]),
@@ -191,6 +207,16 @@ def _read_shell(fields: _Fields, plan: TunnelPlan) -> Shell:
         },
         spacing=spacing,
     )
+
+
+def _read_spacing(fields: _Fields) -> tuple[float, float]:
+    """Read the spacing of the shell's vertices, m; files of scenes do not have the field."""
+    if "shell_spacing" not in fields.data:
+        return SPACING
+    along, around = fields.numbers("shell_spacing", 2).tolist()
+    if min(along, around) <= 0.0:
+        raise fields.fail("shell_spacing", "must be positive")
+    return along, around
 
 
 def _lateral(plan: TunnelPlan, wall: Wall) -> np.ndarray:
@@ -301,9 +327,8 @@ def resolve(
     if isinstance(tunnel, TunnelPlan):
         plan = tunnel
     elif GENERATED.fullmatch(str(tunnel)):
-        plan = generate(
-            str(tunnel), (lining or default_lining(str(tunnel)),), spatial
-        )  # no more than is needed is made
+        # No more than is needed is made.
+        plan = generate(str(tunnel), (lining or default_lining(str(tunnel)),), spatial)
     else:
         plan = load_tunnel(tunnel)
     if piece is not None:
