@@ -199,35 +199,14 @@ def _bare_plan(
             f"the corridor is narrower than the robot: half_width is {width.min():.2f} m at index "
             f"{int(np.argmin(width))}, the robot's radius {ROBOT_RADIUS} m"
         )
-    step = np.diff(vertex, axis=0)
-    size = np.linalg.norm(step, axis=1)
-    if np.any(size < 1e-6):
-        raise TunnelError(f"centreline repeats the vertex at index {int(np.argmax(size < 1e-6))}")
-    back = np.sum(step[1:] * step[:-1], axis=1) <= 0.0
-    if np.any(back):
-        corner = int(np.argmax(back)) + 1
-        raise TunnelError(f"centreline doubles back at index {corner}, or has a corner of 90 degrees there")
-    at = np.concatenate([[0.0], np.cumsum(size)])
+    at = _distances_along(vertex)
     station = np.linspace(0.0, at[-1], max(2, round(at[-1] / _SPACING) + 1))
 
     def along(values: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(station, at, column) for column in values.T], axis=-1)
 
     centre = along(vertex)
-    if tangent is None:
-        directions = np.gradient(centre, axis=0)
-    else:
-        given = _numbers("tangent", tangent, (None, 2))
-        if len(given) != n:
-            raise TunnelError(f"tangent has {len(given)} values, the centreline {n} vertices")
-        if np.any(np.abs(np.linalg.norm(given, axis=1) - 1.0) > 1e-3):
-            raise TunnelError("tangent must hold unit vectors")
-        against = np.minimum(np.sum(given[:-1] * step, axis=1), np.sum(given[1:] * step, axis=1)) <= 0.0
-        if np.any(against):
-            raise TunnelError(
-                f"tangent is flipped at index {int(np.argmax(against))}: it points against the centreline"
-            )
-        directions = along(given)
+    directions = np.gradient(centre, axis=0) if tangent is None else along(_unit_tangent(tangent, vertex))
     return TunnelPlan(
         name=name,
         provenance="simulated",
@@ -240,6 +219,32 @@ def _bare_plan(
         linings={},
         ring_pitch=float(_numbers("ring_pitch", ring_pitch, ())),
     )
+
+
+def _distances_along(vertex: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    """Return the distance of each vertex along a centreline, m, which may not repeat a vertex or double back."""
+    step = np.diff(vertex, axis=0)
+    size = np.linalg.norm(step, axis=1)
+    if np.any(size < 1e-6):
+        raise TunnelError(f"centreline repeats the vertex at index {int(np.argmax(size < 1e-6))}")
+    back = np.sum(step[1:] * step[:-1], axis=1) <= 0.0
+    if np.any(back):
+        corner = int(np.argmax(back)) + 1
+        raise TunnelError(f"centreline doubles back at index {corner}, or has a corner of 90 degrees there")
+    return np.concatenate([[0.0], np.cumsum(size)])
+
+
+def _unit_tangent(tangent: ArrayLike, vertex: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+    """Return the unit tangent at each vertex, refused where it points against the centreline."""
+    given, step = _numbers("tangent", tangent, (None, 2)), np.diff(vertex, axis=0)
+    if len(given) != len(vertex):
+        raise TunnelError(f"tangent has {len(given)} values, the centreline {len(vertex)} vertices")
+    if np.any(np.abs(np.linalg.norm(given, axis=1) - 1.0) > 1e-3):
+        raise TunnelError("tangent must hold unit vectors")
+    against = np.minimum(np.sum(given[:-1] * step, axis=1), np.sum(given[1:] * step, axis=1)) <= 0.0
+    if np.any(against):
+        raise TunnelError(f"tangent is flipped at index {int(np.argmax(against))}: it points against the centreline")
+    return given
 
 
 def _offset_lining(plan: TunnelPlan, distances: dict[float, tuple[np.ndarray, np.ndarray]]) -> Lining:
