@@ -26,22 +26,36 @@ def bridge_hanging(
     result = radius.copy()
     widest = int(_WIDEST / (angle[1] - angle[0]))
     step = np.diff(radius[:, over], axis=1)
-    for row in np.flatnonzero((step < -_JUMP).any(axis=1) & (step > _JUMP).any(axis=1)):
-        section, beyond = result[row, over], 0
-        for left in np.flatnonzero(step[row] < -_JUMP):
-            if left < beyond:
-                continue
-            for right in np.flatnonzero(step[row] > _JUMP) + 1:
-                inside = np.arange(left + 1, right)
-                if not len(inside) or len(inside) > widest:
-                    continue
-                line = _line(section[left], section[right], angle[over[inside]] - angle[over[left]],
-                             angle[over[right]] - angle[over[left]])  # fmt: skip
-                if (section[inside] < line - _INSIDE).all():
-                    section[inside], beyond = line, int(right)
-                    break
-        result[row, over] = section
+    nearer, farther = step < -_JUMP, step > _JUMP
+    for row in np.flatnonzero(nearer.any(axis=1) & farther.any(axis=1)):
+        lefts, rights = np.flatnonzero(nearer[row]), np.flatnonzero(farther[row]) + 1
+        result[row, over] = _bridge_section(radius[row, over], angle[over], lefts, rights, widest)
     return result
+
+
+def _bridge_section(
+    section: Float[np.ndarray, " k"], angle: Float[np.ndarray, " k"], lefts: np.ndarray, rights: np.ndarray, widest: int
+) -> Float[np.ndarray, " k"]:
+    """Return the overhead part of a section with a line over each thing that hangs in it.
+
+    Args:
+        section: Distances from the axis, m.
+        angle: Their directions, rad.
+        lefts: Places before a jump towards the axis, growing.
+        rights: Places after a jump away from it, growing.
+        widest: Most places that a thing covers.
+    """
+    section, beyond = section.copy(), 0
+    for left in lefts:
+        if left < beyond:
+            continue  # inside the thing before
+        for right in rights[(rights > left + 1) & (rights <= left + 1 + widest)]:
+            inside = np.arange(left + 1, right)
+            line = _line(section[left], section[right], angle[inside] - angle[left], angle[right] - angle[left])
+            if (section[inside] < line - _INSIDE).all():
+                section[inside], beyond = line, int(right)
+                break
+    return section
 
 
 def _line(first: float, last: float, turn: Float[np.ndarray, " k"], whole: float) -> Float[np.ndarray, " k"]:
