@@ -290,7 +290,7 @@ def _facts(grids: Occupied) -> dict[str, Any]:
     whole = np.zeros(len(grids.station), int)
     return {
         "iou": iou(grids.real, grids.first),
-        "iou_of_two_draws": iou(grids.second, grids.first),
+        "iou_of_two_draws": iou(grids.points[2] > 0, grids.first),
         "f1_one_voxel": float(tolerant_f1(grids, whole)[0]),
         "voxels_scene": int(grids.first.sum()),
         "voxels_cloud": int(grids.real.sum()),

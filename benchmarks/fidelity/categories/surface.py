@@ -17,6 +17,7 @@ from benchmarks.fidelity.derive.distances import (
     occupied_voxels,
     phantom_cells,
     shell_voxels,
+    told_together,
     tolerant_f1,
 )
 from benchmarks.fidelity.registry import Statistic, Value, estimate, family, metric, missing, number, percentile, rms
@@ -176,17 +177,17 @@ def vox_iou_20cm(case: Case) -> Value:
 
 @metric("vox_iou_norm", needs="hold")
 def vox_iou_norm(case: Case) -> Value:
-    """`vox_iou_20cm` over the value that two noisy draws of the candidate reach."""
-    grids = occupied_voxels(case)
-    return number(iou(grids.real, grids.first) / max(iou(grids.first, grids.second), 1e-12), int(grids.real.sum()))
+    """Intersection over union of voxels told together, over the value that two noisy draws of the candidate reach."""
+    real, first, second = occupied_voxels(case).points
+    return number(iou(*told_together(real, first)) / max(iou(*told_together(first, second)), 1e-12), int(real.sum()))
 
 
-@family("hold", {"vox_precision": "first", "vox_recall": "real"})
-def voxel_share(case: Case, id: str, side: str) -> Value:
-    """Share of the voxels of one side (`first` the candidate, `real` the held-out cloud) that the other has too."""
-    grids = occupied_voxels(case)
-    own = getattr(grids, side).sum()
-    return number(float((grids.real & grids.first).sum() / max(own, 1)), int(own))
+@family("hold", {"vox_precision": 1, "vox_recall": 0})
+def voxel_share(case: Case, id: str, side: int) -> Value:
+    """Share of the voxels of one side (1 the candidate, 0 the held-out cloud) that the other has too."""
+    both = told_together(*occupied_voxels(case).points[:2])
+    own = both[side].sum()
+    return number(float((both[0] & both[1]).sum() / max(own, 1)), int(own))
 
 
 @metric("vox_f1_tol1", needs="hold")
@@ -234,8 +235,8 @@ def _mouth_slices(case: Case) -> np.ndarray:
 @family("hold", {"vox_proj_iou_xy": 2, "vox_proj_iou_xz": 1, "vox_proj_iou_yz": 0})
 def projected_iou(case: Case, id: str, axis: int) -> Value:
     """Intersection over union seen along an axis: 0 the tunnel, 1 from the side, 2 from above."""
-    grids = occupied_voxels(case)
-    return number(iou(*(np.asarray(grid.any(axis=axis)) for grid in (grids.real, grids.first))), int(grids.real.sum()))
+    real, first = (grid.sum(axis=axis) for grid in occupied_voxels(case).points[:2])
+    return number(iou(*told_together(real, first)), int(real.sum()))
 
 
 @metric("vox_chainage_min_f1", needs="hold")

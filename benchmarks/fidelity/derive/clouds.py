@@ -12,6 +12,9 @@ from benchmarks.fidelity.derive.mesh import first_hits, weld_offset, welded_lini
 from benchmarks.fidelity.derive.surface import cell_numbers
 
 NEIGHBOURS = 24
+_FEW_PER_SCAN = 2000  # points of each scan in the cloud of `smooth_normals`: half of the beams leave more
+_SUPPORT = 64  # points of a plane there
+_PLANES_AT_ONCE = 20_000
 _MOST_PER_SCAN = 1500  # points of each scan at most
 _MOST_PLANES = 240_000
 _ENTROPY_RADIUS = 0.3  # m
@@ -40,15 +43,26 @@ class Planes:
 def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> Planes:
     """Fits a plane through the `NEIGHBOURS` nearest points of a cloud, by principal axes."""
     count = min(NEIGHBOURS, len(cloud))
-    around = cloud[tree.query(query, count)[1]]
-    middle = around.mean(axis=1)
-    away = around - middle[:, None]
-    spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away) / count)
+    middle, spread, axes = _principal_axes(cloud, tree, query, count)
     freed = np.sqrt(count / max(count - 3, 1))
-    spread = np.sqrt(np.maximum(spread, 0.0))
     residual = np.abs(np.einsum("ni,ni->n", query - middle, axes[:, :, 0])) * freed
     planarity = (spread[:, 1] - spread[:, 0]) / np.maximum(spread[:, 2], 1e-9)
     return Planes(query, axes[:, :, 0], residual, spread[:, 0] * freed, planarity)
+
+
+def _principal_axes(
+    cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.ndarray, "n 3"], count: int
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    """Return middle, standard deviations (growing) and axes of the points of a cloud that are nearest to each query."""
+    parts = []
+    for start in range(0, max(len(query), 1), _PLANES_AT_ONCE):
+        around = cloud[tree.query(query[start : start + _PLANES_AT_ONCE], count)[1]]
+        middle = around.mean(axis=1)
+        away = around - middle[:, None]
+        spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", away, away) / count)
+        parts.append((middle, np.sqrt(np.maximum(spread, 0.0)), axes))
+    middles, spreads, all_axes = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return middles, spreads, all_axes
 
 
 @per_hold
@@ -57,10 +71,14 @@ def plane_rows(case: Case) -> Int[np.ndarray, " k"]:
     scan = returns(case).scan
     starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
     ends = np.append(starts[1:], len(scan))
-    each = int(np.clip(_MOST_PLANES // len(starts), 50, _MOST_PER_SCAN))
+    each = _planes_per_scan(len(starts))
     return np.concatenate([
         np.linspace(a, b - 1, min(b - a, each)).astype(int) for a, b in zip(starts, ends, strict=True)
     ])  # fmt: skip
+
+
+def _planes_per_scan(scans: int) -> int:
+    return int(np.clip(_MOST_PLANES // scans, 50, _MOST_PER_SCAN))
 
 
 @per_hold
@@ -92,6 +110,35 @@ def synthetic_planes(case: Case) -> Planes:
     for column, values in zip(full, vars(planes).values(), strict=True):
         column[there] = values
     return Planes(*full)
+
+
+# Normals of a cloud that is as dense whatever the sensor.
+
+
+@per_hold
+def few_rows(case: Case) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " q"]]:
+    """Return the numbers of `_FEW_PER_SCAN` returns of each scan, drawn at random, and of those that get a normal."""
+    scan = returns(case).scan
+    order = np.lexsort((case.rng("few returns of each scan").random(len(scan)), scan))
+    place = np.arange(len(scan)) - np.searchsorted(scan[order], scan[order])
+    count = _planes_per_scan(len(np.unique(scan)))
+    return np.sort(order[place < _FEW_PER_SCAN]), np.sort(order[place < min(count, _FEW_PER_SCAN)])
+
+
+def smooth_normals(case: Case, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "q 3"]:
+    """Return normals at the second `few_rows` of points on the returned beams; NaN where a beam has no point.
+
+    Planes through a number of nearest points grow with the gaps between them, and the noise of the ranges turns the
+    normals of small planes farther. So every scan gives the cloud as many points, and planes are wide.
+    """
+    cloud, query = (points[rows] for rows in few_rows(case))
+    cloud = cloud[np.isfinite(cloud[:, 0])]
+    there = np.isfinite(query[:, 0])
+    normal = np.full((len(query), 3), np.nan)
+    if there.any():
+        tree = cKDTree(cloud, balanced_tree=False)
+        normal[there] = _principal_axes(cloud, tree, query[there], min(_SUPPORT, len(cloud)))[2][:, :, 0]
+    return normal
 
 
 def mean_entropy(tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> float:

@@ -10,7 +10,14 @@ from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.case import Case, per_case, per_hold
 from benchmarks.fidelity.derive.beams import returns, sensor_path, synthetic_points
-from benchmarks.fidelity.derive.clouds import Planes, plane_rows, real_planes, synthetic_planes
+from benchmarks.fidelity.derive.clouds import (
+    Planes,
+    few_rows,
+    plane_rows,
+    real_planes,
+    smooth_normals,
+    synthetic_planes,
+)
 
 _FEWEST_POINTS = 20  # points of a scan
 _EIGEN_FLOOR = 1e-6  # of an eigenvalue; less than the noise of any normal
@@ -40,27 +47,25 @@ class ScanInformation:
 @per_hold
 def real_information(case: Case) -> ScanInformation:
     """Return the information of the held-out scans."""
-    return _information(case, real_planes(case))
+    return _information(case, returns(case).points)
 
 
 @per_case
 def synthetic_information(case: Case) -> ScanInformation:
     """Return the information of the same scans taken in the candidate."""
-    return _information(case, synthetic_planes(case))
+    return _information(case, synthetic_points(case))
 
 
-def _information(case: Case, planes: Planes) -> ScanInformation:
-    """Return Hessians of point-to-plane registration about the sensor, from normals by local planes."""
-    real, pick = returns(case), plane_rows(case)
+def _information(case: Case, points: Float[np.ndarray, "n 3"]) -> ScanInformation:
+    """Return Hessians of point-to-plane registration about the sensor, of points on the returned beams."""
+    real, pick, normal = returns(case), few_rows(case)[1], smooth_normals(case, points)
+    arm = points[pick] - real.origin[pick]
     scan = real.scan[pick]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
     bounds = np.append(starts, len(scan))
     station = sensor_path(case).local(real.origin[pick[starts]])[:, 0]
     axis = sensor_path(case).frames(station)[1]
-    rows = [
-        _scan_information(planes.point[a:b] - real.origin[pick[a:b]], planes.normal[a:b], axis[k])
-        for k, (a, b) in enumerate(itertools.pairwise(bounds))
-    ]
+    rows = [_scan_information(arm[a:b], normal[a:b], axis[k]) for k, (a, b) in enumerate(itertools.pairwise(bounds))]
     columns = [np.asarray(column) for column in zip(*rows, strict=True)]
     return ScanInformation(station, *columns)
 

@@ -4,7 +4,7 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -263,25 +263,33 @@ _FREE_LENGTH = 1.5  # m of a beam before its return that are known to be free
 _BEAM_STEP = 0.1  # m between samples along it
 _AROUND_PATH = 12.0  # m from the path; what lies farther is no tunnel
 _FREE_RAYS = 150_000
+_FEWEST_TOGETHER = 4  # points of two clouds in a cell that counts in any case
 
 
 @dataclass(frozen=True)
 class Occupied:
-    """Occupied voxels on one grid, axes station, left, up, `(i, j, k)` each.
+    """Points by voxel on one grid, axes station, left, up.
 
     Attributes:
-        real: Voxels with a held-out point.
-        first: Voxels with a point of the first noisy draw in the candidate.
-        second: Voxels of the second draw, which differs from the first in noise alone.
-        known: Voxels that held-out beams show, or that hold one of the surfaces.
+        points: Number of held-out points and of those of two noisy draws in the candidate, which differ in noise alone,
+            `(3, i, j, k)`.
+        known: Voxels that held-out beams show, or that hold one of the surfaces, `(i, j, k)`.
         station: Station of the middle of each slice, m, `(i,)`.
     """
 
-    real: Bool[np.ndarray, "i j k"]
-    first: Bool[np.ndarray, "i j k"]
-    second: Bool[np.ndarray, "i j k"]
+    points: Shaped[np.ndarray, "3 i j k"]
     known: Bool[np.ndarray, "i j k"]
     station: Float[np.ndarray, " i"]
+
+    @property
+    def real(self) -> Bool[np.ndarray, "i j k"]:
+        """True for voxels with a held-out point."""
+        return self.points[0] > 0
+
+    @property
+    def first(self) -> Bool[np.ndarray, "i j k"]:
+        """True for voxels with a point of the first draw."""
+        return self.points[1] > 0
 
 
 @kept_until("OCC")
@@ -290,14 +298,15 @@ def occupied_voxels(case: Case) -> Occupied:
     """Return the voxels of held-out and synthetic points, and the known voxels near them."""
     edge = VOXEL_EDGE * case.tolerance
     real = returns(case)
-    clouds = [_voxel_indices(real.local, edge)]
+    clouds = [_count_points(real.local, edge)]
     for draw in ("first", "second"):
-        clouds.append(_voxel_indices(local_at(case, noisy_ranges(case, draw)), edge))
-    both = np.concatenate(clouds[:2])
+        clouds.append(_count_points(local_at(case, noisy_ranges(case, draw)), edge))
+    both = np.concatenate([index for index, _ in clouds[:2]])
     low, high = both.min(axis=0) - SHELL_VOXELS - 1, both.max(axis=0) + SHELL_VOXELS + 2
-    grids = [_fill_grid(cloud, low, high) for cloud in (*clouds, free_voxels(case))]
-    station = (np.arange(low[0], high[0]) + 0.5) * edge
-    return Occupied(grids[0], grids[1], grids[2], grids[0] | grids[1] | grids[3], station)
+    points = np.stack([_fill_grid(index, count, low, high) for index, count in clouds])
+    free = free_voxels(case)
+    known = (points[0] > 0) | (points[1] > 0) | (_fill_grid(free, np.ones(len(free), np.int32), low, high) > 0)
+    return Occupied(points, known, (np.arange(low[0], high[0]) + 0.5) * edge)
 
 
 @per_hold
@@ -308,17 +317,37 @@ def free_voxels(case: Case) -> Int[np.ndarray, "n 3"]:
     edge = VOXEL_EDGE * case.tolerance
     before = np.arange(edge, _FREE_LENGTH, _BEAM_STEP)
     steps = (real.local[pick] - back * real.heading[pick] for back in before)
-    return np.unique(np.concatenate([_voxel_indices(step, edge) for step in steps]), axis=0)
+    return np.unique(np.concatenate([_count_points(step, edge)[0] for step in steps]), axis=0)
 
 
-def dilate(grid: Bool[np.ndarray, "i j k"], by: int = 1) -> Bool[np.ndarray, "i j k"]:
+def dilate(grid: Bool[np.ndarray, "..."], by: int = 1) -> Bool[np.ndarray, "..."]:
     """Grows a grid by whole voxels in every direction."""
     return ndimage.maximum_filter(grid.astype(np.uint8), 2 * by + 1, mode="constant").astype(bool)
 
 
+def told_cells(a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]) -> Bool[np.ndarray, "..."]:
+    """Return the cells that tell two clouds apart, from the number of points of each.
+
+    Whether a surface that just cuts a cell has a point there is a matter of how many beams there are, and no point of
+    the other cloud says little. So a cell with few points of both counts only where the other cloud has none beside it.
+    """
+    alone = ((a > 0) & ~dilate(b > 0)) | ((b > 0) & ~dilate(a > 0))
+    return alone | (a + b >= _FEWEST_TOGETHER)
+
+
+def told_together(
+    a: Int[np.ndarray, "..."], b: Int[np.ndarray, "..."]
+) -> tuple[Bool[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
+    """Return where either cloud has a point, among the cells that tell them apart."""
+    told = told_cells(a, b)
+    return (a > 0) & told, (b > 0) & told
+
+
 def shell_voxels(grids: Occupied) -> Bool[np.ndarray, "i j k"]:
-    """Return the known voxels within `SHELL_VOXELS` of either surface."""
-    return grids.known & dilate(grids.real | grids.first, SHELL_VOXELS)
+    """Return the known voxels within `SHELL_VOXELS` of either surface that are free in both or tell them apart."""
+    real, first = grids.points[:2]
+    told = (real + first == 0) | told_cells(real, first)
+    return grids.known & told & dilate(grids.real | grids.first, SHELL_VOXELS)
 
 
 def iou(a: Bool[np.ndarray, "..."], b: Bool[np.ndarray, "..."]) -> float:
@@ -343,13 +372,17 @@ def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarr
     return 2.0 * precision * recall / np.maximum(precision + recall, 1e-12)
 
 
-def _voxel_indices(local: Float[np.ndarray, "n 3"], edge: float) -> Int[np.ndarray, "n 3"]:
+def _count_points(local: Float[np.ndarray, "n 3"], edge: float) -> tuple[Int[np.ndarray, "v 3"], Int[np.ndarray, " v"]]:
+    """Return the voxels with a point near the path, and the number of their points."""
     near = local[(np.abs(local[:, 1:]) < _AROUND_PATH).all(axis=1)]
-    return np.floor(near[np.unique(cell_numbers(near, edge), return_index=True)[1]] / edge).astype(np.int64)
+    _, first, count = np.unique(cell_numbers(near, edge), return_index=True, return_counts=True)
+    return np.floor(near[first] / edge).astype(np.int64), count
 
 
-def _fill_grid(index: Int[np.ndarray, "n 3"], low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]) -> np.ndarray:
-    grid = np.zeros(tuple(high - low), bool)
+def _fill_grid(
+    index: Int[np.ndarray, "v 3"], count: Int[np.ndarray, " v"], low: Int[np.ndarray, "3"], high: Int[np.ndarray, "3"]
+) -> Int[np.ndarray, "i j k"]:
+    grid = np.zeros(tuple(high - low), np.int32)
     inside = ((index >= low) & (index < high)).all(axis=1)
-    grid[tuple((index[inside] - low).T)] = True
+    grid[tuple((index[inside] - low).T)] = count[inside]
     return grid

@@ -13,13 +13,7 @@ from benchmarks.fidelity.tools import calibrate
 from benchmarks.fidelity.tools.calibrate import Survey
 
 ROWS = calibrate.draft_table()
-RESTLESS = {
-    "deg_profile_corr",
-    "lin_depth_map_ncc",
-    "vox_proj_iou_xy",
-    "vox_proj_iou_xz",
-    "vox_recall",
-}  # what half of the beams moves from the floor
+RESTLESS = {"deg_profile_corr", "lin_depth_map_ncc"}  # what half of the beams moves from the floor
 
 
 def at(share: float, **single: float) -> dict[str, Value]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.controls.catalogue import thin_beams
 from benchmarks.fidelity.derive.degeneracy import localised_stations, real_alias, real_information
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import category, judged, raw
@@ -72,3 +73,10 @@ def test_a_planar_scan_is_lost_between_smooth_walls_and_found_between_pilasters(
     pilasters = _planar(tmp_path / "pockets.npz", stepped, "pockets")
     assert localised_stations(pilasters).mean() > 0.5
     assert raw("deg_planar_axial_info", pilasters) == localised_stations(pilasters).mean()
+
+
+def test_half_of_the_beams_are_as_informed():
+    whole = tube.case(sigma=0.03, beams=8000)
+    half = replace(whole, hold=thin_beams(whole.hold, np.random.default_rng(7)), cache={})
+    full, thin = (np.median(real_information(case).axial) for case in (whole, half))
+    assert thin == pytest.approx(full, rel=0.1)

@@ -66,5 +66,5 @@ def test_seen_from_the_side_voxels_of_one_surface_and_of_both_are_told_apart():
     real, scene = np.zeros((4, 2, 1), bool), np.zeros((4, 2, 1), bool)
     real[[0, 1], [0, 1], 0] = True
     scene[[0, 2], [1, 1], 0] = True  # in slice 0 on the other side: one pixel from the side all the same
-    classes = classify_side_view(Occupied(real, scene, scene, real | scene, np.arange(4.0)))
+    classes = classify_side_view(Occupied(np.stack([real, scene, scene]), real | scene, np.arange(4.0)))
     np.testing.assert_array_equal(classes[:, 0], [0.0, 2.0, 1.0, np.nan])
