@@ -36,9 +36,10 @@ def find_leaks(case: Case, values: dict[str, Value], recorded: str | None = None
 
 def duplicate_share(hold: Hold, fit: Hold) -> float:
     """Return the share of held-out points with an exact duplicate among those of the fit."""
-    known = {row.tobytes() for row in np.round(fit.points, 6) + 0.0}
-    rows = np.round(hold.points, 6) + 0.0
-    return float(np.mean([row.tobytes() in known for row in rows])) if len(rows) else 0.0
+    rows, known = (np.round(recording.points, 6) + 0.0 for recording in (hold, fit))
+    alike = rows[np.isin(rows[:, 0], known[:, 0])]  # few: a set of all points takes 0.3 GiB
+    others = {row.tobytes() for row in known[np.isin(known[:, 0], alike[:, 0])]}
+    return sum(row.tobytes() in others for row in alike) / max(len(rows), 1)
 
 
 def noise_leaks(case: Case, values: dict[str, Value]) -> list[str]:

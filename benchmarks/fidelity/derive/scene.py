@@ -20,7 +20,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import Track, concatenate_meshes, geom_mesh, track_of
+from benchmarks.fidelity.candidate import Track, concatenate_meshes, geom_mesh, load_model, track_of
 from benchmarks.fidelity.case import SHARED, Case, per_case
 from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.derive.mesh import face_parts
@@ -98,7 +98,7 @@ def scene_model(case: Case) -> mujoco.MjModel:
     Raises:
         ValueError: MuJoCo refuses it.
     """
-    return mujoco.MjModel.from_xml_path(str(case.candidate.scene))
+    return load_model(case.candidate.scene)
 
 
 @per_release("scene")

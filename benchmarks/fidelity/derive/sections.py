@@ -65,7 +65,7 @@ def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
     return trimesh.Trimesh(truth.surface.vertices, truth.surface.faces[kept], process=False)
 
 
-@kept_until("F2D")
+@kept_until("SEC")
 @per_truth
 def truth_bore_caster(case: Case) -> Caster:
     """Return the caster of rays into the true bore: lining with joints and pockets, floor; no track."""
