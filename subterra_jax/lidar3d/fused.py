@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from subterra_jax.lidar.nvidia import fma, reciprocal
 from subterra_jax.lidar3d.march import march
 from subterra_jax.lidar3d.meeting import Hits, Point, Tools, normals
 from subterra_jax.lidar3d.relief import ARRAYS, Relief
@@ -111,7 +112,7 @@ def _kernel(*refs: Any, n_x: int, on_gpu: bool, facing: bool, image: tuple[int, 
         both = triton.load(arrays[name].at[2 * index[:, None] + column])
         return tuple(jnp.sum(jnp.where(column == i, both, 0), axis=1) for i in range(2))
 
-    tools = Tools(load, *((_fma, _reciprocal) if on_gpu else (lambda a, b, c: a * b + c, lambda a: 1.0 / a)))
+    tools = Tools(load, *((fma, reciprocal) if on_gpu else (lambda a, b, c: a * b + c, lambda a: 1.0 / a)))
     # The place of a scan is one for all lanes.
     dx, dy, dz = (ref[...] if mine is None else triton.load(ref.at[mine]) for ref in refs[:3])
     ox, oy, oz, block, limit = (jnp.broadcast_to(ref[...], (ROWS,)) for ref in refs[3:8])
@@ -130,25 +131,3 @@ def _rays_of(image: tuple[int, int], program: Array) -> Int[Array, ROWS]:
     ray = program * ROWS + jax.lax.broadcasted_iota(jnp.int32, (ROWS,), 0)
     scan, within = ray // (image[0] * image[1]), ray % (image[0] * image[1])
     return scan * (image[0] * image[1]) + within % image[0] * image[1] + within // image[0]
-
-
-def _fma(a: Array, b: Any, c: Any) -> Array:
-    """Return a · b + c by one instruction: XLA keeps Triton from joining the two."""
-    return _instruction("fma.rn.f32 $0, $1, $2, $3;", "=f,f,f,f", a, b, c)
-
-
-def _reciprocal(a: Array) -> Array:
-    """Return 1 / a, off by a last bit at most, and 0 for what is not a normal number."""
-    return _instruction("rcp.approx.ftz.f32 $0, $1;", "=f,f", a)
-
-
-def _instruction(text: str, constraints: str, *numbers: Any) -> Array:
-    from jax.experimental.pallas import triton
-
-    shape = jnp.broadcast_shapes(*(jnp.shape(number) for number in numbers))
-    arguments = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), shape) for number in numbers]
-    out = jax.ShapeDtypeStruct(shape, jnp.float32)
-    (result,) = triton.elementwise_inline_asm(
-        text, args=arguments, constraints=constraints, pack=1, result_shape_dtypes=[out]
-    )
-    return result

@@ -98,44 +98,6 @@ def all_if_full(count, full: int, everything: int):
     return jnp.where(count == full, jnp.int32(everything), count)
 
 
-def load_words(ref, start, mask=None, n_words: int = WORDS):
-    """Return some words of each of many rows, read by one instruction; 0 where masked.
-
-    Args:
-        ref: Flat array of words.
-        start: First word of each row, a multiple of their number.
-        mask: Rows to read; `None` for all.
-        n_words: Words of a row, 2 or 4.
-    """
-    from jax.experimental.pallas import triton
-
-    column = jax.lax.broadcasted_iota(jnp.int32, (*start.shape, n_words), start.ndim)
-    # Triton takes no `other` without a mask.
-    masked: dict[str, Any] = (
-        {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
-    )
-    words = triton.load(ref.at[start[..., None] + column], **masked)
-    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(n_words))
-
-
-def store_words(ref, start, words, mask):
-    """Write up to four words of each of many rows by one instruction; the rest of the four become 0.
-
-    Args:
-        ref: Flat array of words.
-        start: First word of each row, a multiple of 4.
-        words: The words, each of all rows.
-        mask: Rows to write.
-    """
-    from jax.experimental.pallas import triton
-
-    column = jax.lax.broadcasted_iota(jnp.int32, (*start.shape, WORDS), start.ndim)
-    value = jnp.zeros(column.shape, words[0].dtype)
-    for i, word in enumerate(words):
-        value = jnp.where(column == i, word[..., None], value)
-    triton.store(ref.at[start[..., None] + column], value, mask=jnp.broadcast_to(mask[..., None], column.shape))
-
-
 def _high(word: Any) -> Any:
     """Return the number in the upper half of a word."""
     return jax.lax.bitcast_convert_type(word & _HIGH, jnp.float32)

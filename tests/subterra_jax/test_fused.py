@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar
-from subterra_jax.lidar import fused, reference
+from subterra_jax.lidar import boxes, fused, reference
 from subterra_jax.tunnel import Tunnel, node_at, packed
 from subterra_jax.tunnel.tunnel import stack
 
@@ -151,7 +151,7 @@ def test_nothing_behind_the_last_box_that_a_thread_kept_is_taken_for_known() -> 
     rng = np.random.default_rng(0)
     keys = np.stack([rng.permutation(64) for _ in range(200)]).reshape(200, 8, 8)  # scans, threads, boxes
     kept = tuple(jnp.asarray(np.sort(keys, axis=2)[:, :, i]) for i in range(2))
-    found = np.concatenate([np.asarray(one) for one in fused._first_of_all(kept, 3)], axis=1)
+    found = np.concatenate([np.asarray(one) for one in boxes._first_of_all(kept, 3)], axis=1)
     truth = np.sort(keys.reshape(200, 64), axis=1)[:, :3]
     of_one_thread = np.array([len({*np.where(scan < 2)[0]}) == 1 for scan in keys])
     assert of_one_thread.sum() > 10

@@ -1,0 +1,85 @@
+"""Single instructions of NVIDIA GPUs, for kernels written in Pallas.
+
+Outside of a kernel, and in Pallas' interpreter where it lacks them, plain arithmetic stands in for them.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+_MOST = 4  # words that one instruction reads or writes
+
+
+def load_words(ref, start, mask=None, n_words: int = _MOST):
+    """Return some words of each of many rows, read by one instruction; 0 where masked.
+
+    Args:
+        ref: Flat array of words.
+        start: First word of each row, a multiple of their number.
+        mask: Rows to read; `None` for all.
+        n_words: Words of a row, 2 or 4.
+    """
+    from jax.experimental.pallas import triton
+
+    column = jax.lax.broadcasted_iota(jnp.int32, (*start.shape, n_words), start.ndim)
+    # Triton takes no `other` without a mask.
+    masked: dict[str, Any] = (
+        {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
+    )
+    words = triton.load(ref.at[start[..., None] + column], **masked)
+    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(n_words))
+
+
+def store_words(ref, start, words, mask):
+    """Write up to four words of each of many rows by one instruction; the rest of the four become 0.
+
+    Args:
+        ref: Flat array of words.
+        start: First word of each row, a multiple of 4.
+        words: The words, each of all rows.
+        mask: Rows to write.
+    """
+    from jax.experimental.pallas import triton
+
+    column = jax.lax.broadcasted_iota(jnp.int32, (*start.shape, _MOST), start.ndim)
+    value = jnp.zeros(column.shape, words[0].dtype)
+    for i, word in enumerate(words):
+        value = jnp.where(column == i, word[..., None], value)
+    triton.store(ref.at[start[..., None] + column], value, mask=jnp.broadcast_to(mask[..., None], column.shape))
+
+
+def any_thread(what: Array) -> Array:
+    """Tell whether something holds in any thread of a program."""
+    return most(what.astype(jnp.int32)) > 0
+
+
+def most(number: Array) -> Array:
+    """Return the largest of the whole numbers of all threads of a program."""
+    # In one row, for which a warp has an instruction; by rows and columns it takes five exchanges.
+    return jnp.max(number.reshape(-1))
+
+
+def fma(a: Array, b: Any, c: Any) -> Array:
+    """Return a · b + c by one instruction: XLA keeps Triton from joining the two."""
+    return _instruction("fma.rn.f32 $0, $1, $2, $3;", "=f,f,f,f", a, b, c)
+
+
+def reciprocal(a: Array) -> Array:
+    """Return 1 / a, off by a last bit at most; of what is not a normal number 0, or infinity."""
+    if jax.default_backend() != "gpu":
+        return 1.0 / a
+    return _instruction("rcp.approx.ftz.f32 $0, $1;", "=f,f", a)
+
+
+def _instruction(text: str, constraints: str, *numbers: Any) -> Array:
+    from jax.experimental.pallas import triton
+
+    shape = jnp.broadcast_shapes(*(jnp.shape(number) for number in numbers))
+    arguments = [jnp.broadcast_to(jnp.asarray(number, jnp.float32), shape) for number in numbers]
+    out = jax.ShapeDtypeStruct(shape, jnp.float32)
+    (result,) = triton.elementwise_inline_asm(
+        text, args=arguments, constraints=constraints, pack=1, result_shape_dtypes=[out]
+    )
+    return result
