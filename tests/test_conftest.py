@@ -1,12 +1,18 @@
-"""Memory maps that a long run of the tests gives back in time."""
+"""Memory and memory maps that a long run of the tests gives back in time."""
 
 import inspect
+import platform
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 from tests import conftest
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.skipif(conftest._maps() == 0, reason="this system does not count memory maps")
@@ -37,3 +43,17 @@ def test_the_watch_looks_after_some_programs(monkeypatch):
         with pytest.raises(StopIteration):
             next(turn)
         assert len(looks) == expected
+
+
+@pytest.mark.skipif(conftest.resident() == 0 or platform.libc_ver()[0] != "glibc", reason="the system keeps memory")
+def test_memory_is_given_back_so_that_files_after_a_large_one_keep_their_programs():
+    code = "\n".join([
+        "from tests import conftest",
+        "blocks = [bytearray(1000) for _ in range(300_000)]",
+        "last = bytearray(1000)",  # what lies behind it would go back to the system by itself
+        "del blocks",
+        "before = conftest.resident()",
+        "conftest.forget_programs()",
+        "assert conftest.resident() < before - 0.2e9, (before, conftest.resident())",
+    ])  # fmt: skip
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
