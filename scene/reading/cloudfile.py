@@ -11,7 +11,7 @@ from scene.cloud import Cloud, VoxelMean
 from scene.errors import RecordingError
 from scene.progress import Stage
 from scene.reading.formats import Format, ReadingConfig, detect
-from scene.reading.source import CloudSource, choose_frame, needs_local_points, refuse_damage
+from scene.reading.source import CloudSource, Frame, choose_frame, needs_local_points, refuse_damage
 from scene.reading.tables import parse_columns
 from scene.resume import Partial
 
@@ -37,48 +37,70 @@ def read_cloud(
     detected = detect(path, config.format)
     if detected.format.kind != "cloud":
         raise RecordingError(f"{path}: is no registered cloud")
-    partial = partial or Partial(None)
-    thinned, read, skip, step = VoxelMean(voxel), 0, 0, None
-    if (known := partial.load("cloud")) is not None:
-        thinned, (read, skip) = VoxelMean.restored(voxel, known), (int(n) for n in known["read"])
     with refuse_damage(path, f"a readable {detected.format.label} cloud", RecordingError):
         source: CloudSource = _open_cloud(path, detected.format, config.columns)
-        local = next(source.chunks(), None) if config.unit is None and needs_local_points(source) else None
-        whole = source.sample if len(source.sample) or local is None else local
-        try:
-            frame = choose_frame(whole, source.unit, config.unit, config.axes, local)
-        except ValueError as error:
-            raise RecordingError(f"{path}: {error}") from error
+        frame = _frame_of(path, source, config)
+        thinned, read, rounding = _thin(source, frame, voxel, stage, partial or Partial(None))
+    _refuse_unusable(path, thinned, read, rounding, frame.unit)
+    rounded = {"rounded_to": rounding} if rounding >= _COARSE else {}
+    facts = {**rounded, "kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
+    return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
+
+
+def _frame_of(path: Path, source: CloudSource, config: ReadingConfig) -> Frame:
+    """Chooses unit and axes of a cloud; raises `RecordingError` for a flag or declaration that is none."""
+    local = next(source.chunks(), None) if config.unit is None and needs_local_points(source) else None
+    whole = source.sample if len(source.sample) or local is None else local
+    try:
+        return choose_frame(whole, source.unit, config.unit, config.axes, local)
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def _thin(
+    source: CloudSource, frame: Frame, voxel: float, stage: Stage | None, partial: Partial
+) -> tuple[VoxelMean, int, float]:
+    """Thins a cloud chunk by chunk, from where an earlier build stopped.
+
+    Returns:
+        The thinned cloud, the number of points read, and the coarsest rounding of the first chunk's coordinates, m; 0
+        where none was read now.
+    """
+    thinned, read, skip, rounding = VoxelMean(voxel), 0, 0, None
+    if (known := partial.load("cloud")) is not None:
+        thinned, (read, skip) = VoxelMean.restored(voxel, known), (int(n) for n in known["read"])
+    if stage is not None:
+        stage.expect(source.count)
+        if skip:
+            stage.resume(read)
+    # Chunks that an earlier build had thinned are decoded again, which most formats cannot do without.
+    for index, chunk in enumerate(itertools.islice(source.chunks(), skip, None), skip + 1):
+        read += len(chunk)
+        thinned.add(placed := frame.apply(chunk))
+        rounding = max(measure_rounding(placed)) if rounding is None else rounding
         if stage is not None:
-            stage.expect(source.count)
-            if skip:
-                stage.resume(read)
-        # Chunks that an earlier build had thinned are decoded again, which most formats cannot do without.
-        for index, chunk in enumerate(itertools.islice(source.chunks(), skip, None), skip + 1):
-            read += len(chunk)
-            thinned.add(placed := frame.apply(chunk))
-            step = measure_rounding(placed) if step is None else step
-            if stage is not None:
-                stage.advance(len(chunk))
-            if partial.due():
-                partial.save("cloud", read=np.array([read, index]), **thinned.arrays())
+            stage.advance(len(chunk))
+        if partial.due():
+            partial.save("cloud", read=np.array([read, index]), **thinned.arrays())
+    return thinned, read, rounding or 0.0
+
+
+def _refuse_unusable(path: Path, thinned: VoxelMean, read: int, rounding: float, unit: str) -> None:
+    """Raises `RecordingError` for a cloud without points, larger than any tunnel, or rounded until no wall shows."""
     if not read:
         raise RecordingError(f"{path}: holds no points")
     if not thinned.finite:
         raise RecordingError(f"{path}: none of its {read} points is finite")
     if thinned.returns < (1 - _MOST_OUTSIDE) * thinned.finite:
         raise RecordingError(
-            f"{path}: most of its points lie further apart than any tunnel is long (unit {frame.unit}); "
+            f"{path}: most of its points lie further apart than any tunnel is long (unit {unit}); "
             "is the unit mm? --unit says so"
         )
-    if step is not None and max(step) >= _HOPELESS:
+    if rounding >= _HOPELESS:
         raise RecordingError(
-            f"{path}: its coordinates are rounded to {max(step):.2g} m, so no wall can be seen: 32-bit numbers far "
+            f"{path}: its coordinates are rounded to {rounding:.2g} m, so no wall can be seen: 32-bit numbers far "
             "from the origin do so; export it with an offset, in 64 bits or with more digits"
         )
-    rounded = {"rounded_to": max(step)} if step is not None and max(step) >= _COARSE else {}
-    facts = {**rounded, "kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
-    return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
 
 
 def measure_rounding(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, float]:
