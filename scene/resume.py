@@ -119,12 +119,10 @@ class Partial:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             key_file = self.folder / "key"
             known = key_file.read_text() if key_file.is_file() else None
+            if known is not None and known != key and not self.fresh:
+                print("a partial result of another input, configuration or version was discarded", flush=True)
             if known != key or self.fresh:
-                if known is not None and not self.fresh:
-                    print("a partial result of another input, configuration or version was discarded", flush=True)
-                for entry in self.folder.iterdir():
-                    if entry.name != "lock":
-                        entry.unlink()
+                _clear(self.folder)
                 (self.folder / "key.tmp").write_text(key)
                 (self.folder / "key.tmp").replace(key_file)
             self._open = True
@@ -188,3 +186,10 @@ class Partial:
 def partial_folder(out: Path) -> Path:
     """Return the folder for the partial results of a build that writes `out`."""
     return out.with_name(f".{out.name}.resume")
+
+
+def _clear(folder: Path) -> None:
+    """Removes everything in the folder but the lock."""
+    for entry in folder.iterdir():
+        if entry.name != "lock":
+            entry.unlink()
