@@ -198,14 +198,11 @@ def write_sdf(folder: Path, parts: list[Part], facts: dict[str, Any]) -> None:
         mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
         file = folder / "meshes" / f"{part.name}.obj"
         file.write_text(trimesh.exchange.obj.export_obj(mesh, include_normals=False, digits=6))
-        for kind in ("visual", "collision"):
-            one = ET.SubElement(link, kind, name=f"{part.name}_{kind}")
-            geometry = ET.SubElement(ET.SubElement(one, "geometry"), "mesh")
-            ET.SubElement(geometry, "uri").text = f"model://{name}/meshes/{part.name}.obj"
-            if kind == "visual":
-                look = ET.SubElement(one, "material")
-                for light in ("ambient", "diffuse"):
-                    ET.SubElement(look, light).text = " ".join(f"{value:.4g}" for value in part.colour)
+        uri = f"model://{name}/meshes/{part.name}.obj"
+        look = ET.SubElement(_add_shape(link, part, "visual", uri), "material")
+        for light in ("ambient", "diffuse"):
+            ET.SubElement(look, light).text = " ".join(f"{value:.4g}" for value in part.colour)
+        _add_shape(link, part, "collision", uri)
     config = ET.Element("model")
     for key, text in (("name", name), ("version", "1.0"), ("description", json.dumps(facts))):
         ET.SubElement(config, key).text = text
@@ -213,6 +210,14 @@ def write_sdf(folder: Path, parts: list[Part], facts: dict[str, Any]) -> None:
     for name, element in (("model.sdf", root), ("model.config", config)):
         ET.indent(element)
         (folder / name).write_bytes(ET.tostring(element, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _add_shape(link: ET.Element, part: Part, kind: str, uri: str) -> ET.Element:
+    """Add a mesh to a link as `visual` or `collision`; returns its element."""
+    shape = ET.SubElement(link, kind, name=f"{part.name}_{kind}")
+    geometry = ET.SubElement(ET.SubElement(shape, "geometry"), "mesh")
+    ET.SubElement(geometry, "uri").text = uri
+    return shape
 
 
 def export(config: ExportConfig) -> Path:
