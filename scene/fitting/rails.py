@@ -228,15 +228,8 @@ def _measure(
     offset = gaussian_filter1d(offset, 1.0, mode="nearest")
     across = lateral - np.interp(station, at, offset)
     pieces = np.clip((station - at[0]) / _PIECE, 0, max(int(np.ptp(at) / _PIECE) - 1, 0)).astype(np.intp)
-    gauges = []
-    for piece in range(int(pieces.max()) + 1):
-        faces = []
-        for side in (1, -1):
-            inside = (pieces == piece) & near[side]
-            below = (height - tops[side][block])[inside]
-            faces.append(_inner_edge((side * across)[inside], below, face))
-        gauges.append(sum(faces))
-    gauge = np.array(gauges)[np.isfinite(gauges)]
+    below = {side: height - tops[side][block] for side in near}
+    gauge = _gauges(across, below, near, pieces, face)
     levels = [_block_medians(upward, block, rows, len(at)) for rows in heads.values()]
     cant = levels[0] - levels[1]
     known = np.isfinite(cant)
@@ -249,6 +242,30 @@ def _measure(
         _robust_spread(gauge), len(gauge),
         float(np.nanmedian(np.concatenate(list(tops.values())))),
     )  # fmt: skip
+
+
+def _gauges(
+    across: np.ndarray,
+    below: dict[int, np.ndarray],
+    near: dict[int, np.ndarray],
+    pieces: np.ndarray,
+    face: tuple[float, float],
+) -> Float[np.ndarray, " k"]:
+    """Measures the gauge of each piece of track that shows both inner faces, m.
+
+    Args:
+        across: Distance of each return to the left of the track's middle, m.
+        below: For each side, height above the head's top, m.
+        near: For each side, the returns near its rail.
+        pieces: Piece of track that each return lies in.
+        face: Layer below the heads' tops that shows their inner faces, m.
+    """
+    gauges = np.zeros(int(pieces.max()) + 1)
+    for piece in range(len(gauges)):
+        for side, rows in near.items():
+            inside = rows & (pieces == piece)
+            gauges[piece] += _inner_edge((side * across)[inside], below[side][inside], face)
+    return gauges[np.isfinite(gauges)]
 
 
 def _robust_spread(values: np.ndarray) -> float:
