@@ -47,27 +47,37 @@ def wall_panels(bore: Bore, bed: Float[np.ndarray, " n"], openings: list[Opening
     """Return boxes within about a centimetre of the smooth wall, but not below the bed or in openings."""
     surface, (n, m) = bore.surface(), bore.radius.shape
     above = surface[..., 2] - bed[:, None]
-    outline = bore.radius.mean(axis=0)[:, None] * np.column_stack([np.cos(bore.angle), np.sin(bore.angle)])
     floor = above.mean(axis=0) < _ON_BED
     start = int(np.flatnonzero(floor)[len(np.flatnonzero(floor)) // 2]) if floor.any() else 0
     turn = (start + np.arange(m + 1)) % m
+    cuts = {0, n - 1} | {row for opening in openings for row in opening.rows}
+    stretches = [stretch for r0, r1 in pairwise(sorted(cuts)) for stretch in _stretches(bore.station, r0, r1)]
+    panels: list[Panel] = []
+    for around in pairwise(_breaks_around(bore, floor, turn)):
+        if floor[turn[around[0] : around[1] + 1]].mean() > 0.5:
+            continue
+        for first, last in stretches:
+            for low, high in _columns_left(openings, (first, last), around, turn):
+                columns = turn[low : high + 1]
+                _divide_patch(surface[first : last + 1][:, columns], above[first : last + 1][:, columns], panels)
+    return panels
+
+
+def _breaks_around(bore: Bore, floor: np.ndarray, turn: np.ndarray) -> list[int]:
+    """Return the places in `turn` at which the mean section bends, or meets the bed; the first and the last too."""
+    outline = bore.radius.mean(axis=0)[:, None] * np.column_stack([np.cos(bore.angle), np.sin(bore.angle)])
     vertices = np.asarray(LineString(outline[turn]).simplify(_PATCH_TOLERANCE).coords)
-    breaks = {int(np.argmin(np.linalg.norm(outline[turn[:-1]] - point, axis=1))) for point in vertices} | {0, m}
+    breaks = {int(np.argmin(np.linalg.norm(outline[turn[:-1]] - point, axis=1))) for point in vertices}
     edge = np.flatnonzero(np.diff(floor[turn].astype(int)))
     breaks |= {int(k) + int(floor[turn[k]]) for k in edge}
-    panels: list[Panel] = []
-    for c0, c1 in pairwise(sorted(breaks)):
-        if floor[turn[c0 : c1 + 1]].mean() > 0.5:
-            continue
-        cuts = {0, n - 1} | {row for opening in openings for row in opening.rows}
-        for r0, r1 in pairwise(sorted(cuts)):
-            pieces = max(int(np.ceil((bore.station[r1] - bore.station[r0]) / _STRETCH - 1e-6)), 1)
-            rows = np.rint(np.linspace(r0, r1, pieces + 1)).astype(int).tolist()
-            for first, last in pairwise(sorted(set(rows))):
-                for low, high in _columns_left(openings, (first, last), (c0, c1), turn):
-                    columns = turn[low : high + 1]
-                    _divide_patch(surface[first : last + 1][:, columns], above[first : last + 1][:, columns], panels)
-    return panels
+    return sorted(breaks | {0, len(turn) - 1})
+
+
+def _stretches(station: np.ndarray, start: int, end: int) -> list[tuple[int, int]]:
+    """Return the first and last rows of even stretches between two rows, of about `_STRETCH` each."""
+    pieces = max(int(np.ceil((station[end] - station[start]) / _STRETCH - 1e-6)), 1)
+    rows = np.rint(np.linspace(start, end, pieces + 1)).astype(int).tolist()
+    return list(pairwise(sorted(set(rows))))
 
 
 def _columns_left(
