@@ -168,10 +168,42 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
         shown = {"detected": result.facts, "removed": removed}
         raise DoubtError(str(error), render_page(name, bore, judgement, shown)) from error
     count, furnished = write_geometry(folder, name, config.provenance, bore, track, config.scene)
-    content = {
+    content = _describe_scene(name, result, track, config.provenance, count, furnished)
+    content |= {"judgement": judgement.facts, "removed": removed}
+    write_stations(folder / "stations.csv", judgement)
+    (folder / "build.html").write_text(render_page(name, bore, judgement, content), encoding="utf-8")
+    write_manifest(folder / "manifest.json", content, config)
+    if result.cloud is not None:
+        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+    if result.odometry is not None:
+        save_tum(result.odometry, folder / "odometry.tum")
+    for scene in SCENES:
+        try:
+            mujoco.MjModel.from_xml_path(str(folder / scene))
+        except ValueError as error:
+            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
+    return judgement
+
+
+def _describe_scene(
+    name: str, result: Reconstruction, track: Track, provenance: str, count: dict[str, int], furnished: dict[str, str]
+) -> dict[str, Any]:
+    """Return the entries of the manifest that say what the scene is and where each part comes from.
+
+    Args:
+        name: Name of the scene.
+        result: The reconstruction.
+        track: The track laid in it.
+        provenance: Provenance of the input.
+        count: Number of things of each kind that were written.
+        furnished: Provenance of the furniture, by kind.
+    """
+    bore = result.bore
+    assets = {**track_provenance(track, result.seen), **result.provenance}
+    return {
         "name": name,
         "inputs": result.inputs,
-        "input_provenance": config.provenance,
+        "input_provenance": provenance,
         "frame": {"origin": result.origin, "up": "z", "length_unit": "m"},
         "seeds": {},
         "detected": result.facts,
@@ -189,29 +221,11 @@ def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: 
         },
         "track": describe_track(track, result.seen),
         "provenance": {
-            "bore": config.provenance,
+            "bore": provenance,
             **furnished,
-            **{
-                asset: kind.replace("measured", config.provenance)
-                for asset, kind in {**track_provenance(track, result.seen), **result.provenance}.items()
-            },
+            **{asset: kind.replace("measured", provenance) for asset, kind in assets.items()},
         },
     }
-    content["judgement"] = judgement.facts
-    content["removed"] = removed
-    write_stations(folder / "stations.csv", judgement)
-    (folder / "build.html").write_text(render_page(name, bore, judgement, content), encoding="utf-8")
-    write_manifest(folder / "manifest.json", content, config)
-    if result.cloud is not None:
-        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
-    if result.odometry is not None:
-        save_tum(result.odometry, folder / "odometry.tum")
-    for scene in SCENES:
-        try:
-            mujoco.MjModel.from_xml_path(str(folder / scene))
-        except ValueError as error:
-            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
-    return judgement
 
 
 def write_stations(path: Path, judgement: Judgement) -> None:
