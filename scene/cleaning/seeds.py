@@ -11,6 +11,8 @@ from jaxtyping import Float
 from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.spatial import cKDTree
 
+from scene.cloud import occupied_cells
+
 _TILE = 6.0  # m between places tried
 _MOST = 60  # places
 _REACH = 10.0  # m around a place whose returns tell the direction
@@ -45,8 +47,7 @@ def frame_of(direction: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"],
 
 def find_seeds(points: Float[np.ndarray, "n 3"]) -> list[Seed]:
     """Return places inside bores, the likeliest first; a bore may have many, an open place has none well enclosed."""
-    tile = np.unique(np.floor(points[:, :2] / _TILE).astype(np.int64), axis=0)
-    middles = (tile + 0.5) * _TILE
+    middles = (occupied_cells(points[:, :2], _TILE) + 0.5) * _TILE
     tree = cKDTree(points[:, :2])
     count = np.array([len(rows) for rows in tree.query_ball_point(middles, _TILE)])
     middles = middles[count > 0.3 * np.median(count)]
@@ -106,14 +107,15 @@ def sweep_direction(near: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
 
     def cells(heading: float, slope: float) -> int:
         direction = np.array([np.cos(heading), np.sin(heading), slope])
-        left, up = frame_of(direction / np.linalg.norm(direction))
-        key = np.floor(centred @ left / _CELL).astype(np.int64) * 100_003 + np.floor(centred @ up / _CELL).astype(
-            np.int64
+        row, column = (
+            np.floor(centred @ vector / _CELL).astype(np.int64)
+            for vector in frame_of(direction / np.linalg.norm(direction))
         )
-        return len(np.unique(key))
+        taken = np.zeros((np.ptp(row) + 1, np.ptp(column) + 1), bool)
+        taken[row - row.min(), column - column.min()] = True
+        return int(np.count_nonzero(taken))
 
-    tried = [(cells(turn, slope), turn, slope) for turn in np.pi * np.arange(_HEADINGS) / _HEADINGS for slope in (0.0,)]
-    best = min(tried)
+    best = min((cells(turn, 0.0), turn, 0.0) for turn in np.pi * np.arange(_HEADINGS) / _HEADINGS)
     best = min((cells(best[1], slope), best[1], float(slope)) for slope in _SLOPES)
     step = np.pi / _HEADINGS / 2
     for _ in range(3):

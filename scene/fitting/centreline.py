@@ -15,9 +15,10 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from scene.bore import Axis, axis_through
+from scene.cloud import occupied_cells
 from scene.errors import FitError
 from scene.fitting.branches import require_no_fold, require_one_bore
-from scene.fitting.floor import fit_floor_line, floor_radius
+from scene.fitting.floorline import fit_floor_line, floor_radius
 from scene.fitting.profile import measure_section, section_angles
 
 SKELETON_VOXEL = 0.5
@@ -38,8 +39,7 @@ def surface_skeleton(
     Raises `FitError` for a cloud shorter than `min_length`, m, without two ends, or with a branch or a room. `origin`
     is that of the points' frame in the input's, m, for the message.
     """
-    cells = np.unique(np.floor(points / SKELETON_VOXEL).astype(np.int64), axis=0)
-    nodes = (cells + 0.5) * SKELETON_VOXEL
+    nodes = (occupied_cells(points, SKELETON_VOXEL) + 0.5) * SKELETON_VOXEL
     extent = 2 * float(np.linalg.norm(nodes[:, :2] - nodes[:, :2].mean(axis=0), axis=1).max())
     if extent < min_length:
         raise FitError(f"the tunnel is at most {extent:.1f} m long; at least {min_length:g} m are needed")
