@@ -32,11 +32,12 @@ def written(tmp_path_factory):
     return out / "policy.safetensors"
 
 
-def test_full_speed_and_standing_can_be_chosen_and_nothing_beyond():
+def test_full_speed_can_be_chosen_and_standing_cannot_since_it_would_end_the_episode():
     shares = jnp.array([-0.5, 0.0, 0.5, 0.96, 1.0])
     speeds = jax.vmap(lambda share: to_command(jnp.stack([share, 0.7]), jnp.float32(2.0))[0])(shares)
-    np.testing.assert_allclose(speeds, [0.0, 0.0, 1.05, 2.0, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(speeds, [0.4, 0.4, 1.05, 2.0, 2.0], rtol=1e-6)
     assert float(to_command(jnp.array([0.3, 0.7]), jnp.float32(2.0))[1]) == pytest.approx(0.7)
+    assert float(to_command(jnp.array([0.3, 0.7]), jnp.float32(0.0))[0]) == 0.0, "the mission alone says when to stop"
 
 
 def test_of_a_finer_lidar_it_sees_the_beams_of_sixteen():
@@ -93,6 +94,20 @@ def test_a_policy_localises_as_before_and_steers_as_it_learnt(written, task):
         assert np.abs(commands[0] - one).max() > 1e-3
 
 
+def test_a_learnt_steering_goes_beside_another_localiser_and_nothing_is_trained(written, tmp_path):
+    command = steering.Command("locate-obstructed", tmp_path / "both", steering=str(written))
+    steering.run(command)
+    agent, facts = policies.load(tmp_path / "both" / "policy.safetensors")
+    theirs, localiser = policies.load(written), policies.load("locate-obstructed")
+    assert facts["steering"] == {**theirs[1]["steering"], "localiser": localiser[1]["tensors_sha256"]}
+    expected = {n: t for n, t in theirs[0].tensors.items() if n.startswith(PREFIX)} | dict(localiser[0].tensors)
+    assert agent.tensors.keys() == expected.keys()
+    for name, tensor in agent.tensors.items():
+        np.testing.assert_array_equal(tensor, expected[name])
+    with pytest.raises(ConfigError, match="exists already"):
+        steering.run(command)
+
+
 def _drive(agent, env, params, n=4):
     draws, noise = env.draw_reset(jax.random.key(0), (), params), env.draw_step(jax.random.key(1), (), params)
     state = env.begin(draws, params)
@@ -122,6 +137,7 @@ def test_mistakes_are_told_before_anything_is_written(tmp_path):
     for localiser, more, sentence in (
         ("StopAt-v0", {}, "StopAt-v0: is no localiser"),
         ("locate-transformer", {"task": "Subterra/Return-v1"}, "asks to return"),
+        ("locate-transformer", {"steering": "locate-map"}, "locate-map: has no steering that was learnt"),
     ):
         with pytest.raises(ConfigError, match=sentence):
             steering.run(steering.Command(localiser, out, tunnels="subterra-351", config=_SMALL, **more))

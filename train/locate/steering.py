@@ -22,9 +22,9 @@ from jaxtyping import Array, Float
 from subterra_jax.baselines.agent import observed
 from subterra_jax.env import Box
 from subterra_jax.host.command import parse, run_command
-from subterra_jax.host.files import replace_file
+from subterra_jax.host.files import replace_file, require_folder
 from subterra_jax.policies import check_fits, load
-from subterra_jax.policies.locate.agent import Locating
+from subterra_jax.policies.locate.agent import Locating, parted
 from subterra_jax.policies.locate.steering import N_SIGHT, PREFIX, SHARE, YAW_RATE, sight, to_command
 from train import tunnels
 from train.config import ConfigError, PPOConfig, at_least, check
@@ -121,6 +121,7 @@ class Command:
     Attributes:
         localiser: Localiser that the policy stops by, by name or file; it is not trained here.
         out: Run folder, with the policy beside its checkpoints.
+        steering: Policy whose learnt steering is put beside the localiser, by name or file; nothing is trained then.
         task: Task with a goal ahead.
         tunnels: Tunnels to learn in.
         cache: Folder in which made tunnels are kept from run to run.
@@ -131,6 +132,7 @@ class Command:
 
     localiser: tyro.conf.Positional[str]
     out: Path
+    steering: str | None = None
     task: str = "Subterra/Obstructed-v1"
     tunnels: str = ",".join(f"open:{kind}:train:0-15" for kind in _KINDS)
     cache: Path | None = None
@@ -156,14 +158,28 @@ def run(arguments: Command) -> None:
     """Trains, and writes the policy.
 
     Raises:
-        ConfigError: A setting is wrong, or `localiser` is none.
+        ConfigError: A setting is wrong, `localiser` is none, or `steering` has none that was learnt.
         SubterraError: There is no such policy, task or tunnel, or the folder cannot be written.
     """
-    config = check(arguments.config)
-    at_least(config, 1, "frames")
     agent, facts = load(arguments.localiser)
     if not isinstance(agent, Locating):
         raise ConfigError(f"{arguments.localiser}: is no localiser, but {type(agent).__name__}")
+    if arguments.steering is None:
+        facts, tensors, steered = learn(arguments, agent, facts)
+    else:
+        if (arguments.out / POLICY).exists() and not arguments.overwrite:
+            raise ConfigError(f"{arguments.out / POLICY}: exists already; choose another --out, or say --overwrite")
+        tensors, steered = borrow(arguments.steering)
+    save(arguments.out / POLICY, agent, facts, tensors, steered)
+    print(arguments.out / POLICY)
+
+
+def learn(
+    arguments: Command, agent: Locating, facts: dict[str, Any]
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Returns the facts of the localiser under this task, the tensors of a steering that was trained, and its facts."""
+    config = check(arguments.config)
+    at_least(config, 1, "frames")
     names = tunnels.names_of(arguments.tunnels)
     env, params = tunnels.enter(arguments.task, tunnels.load(names, None, arguments.cache))
     if env.rule.errand != "stop":
@@ -173,37 +189,51 @@ def run(arguments: Command) -> None:
     steered = SteeringEnv(env)
     world = World(env.id, steered, params, {"task": env.id, "tunnel": arguments.tunnels, "lining": None})
     learner = Learner(steered, params, config)
-    session = Session(arguments.out, world, learner)
-    last = session.train(resume=arguments.resume, overwrite=arguments.overwrite)
+    last = Session(arguments.out, world, learner).train(resume=arguments.resume, overwrite=arguments.overwrite)
     if last is None:
         sys.exit(130)
-    facts = {**facts, **world.trained_under}
-    save(arguments.out / POLICY, agent, facts, policy_tensors(learner.networks, last.policy), arguments)
-    print(arguments.out / POLICY)
+    told = {"task": arguments.task, "tunnels": arguments.tunnels, "config": dataclasses.asdict(config)}
+    return {**facts, **world.trained_under}, policy_tensors(learner.networks, last.policy), told
 
 
-def save(path: Path, agent: Locating, facts: dict[str, Any], steering: dict[str, Any], arguments: Command) -> None:
-    """Writes a policy of a localiser's tensors and a steering's, and its facts."""
-    named = {name: np.asarray(tensor, np.float32) for name, tensor in agent.tensors.items()}
-    named = {name: tensor for name, tensor in named.items() if not name.startswith(PREFIX)}
-    named |= {PREFIX + name: np.asarray(tensor, np.float32) for name, tensor in steering.items()}
+def borrow(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Returns the tensors of the steering that a policy has learnt, and its facts.
+
+    Raises:
+        ConfigError: It has learnt none.
+        PolicyError: There is no such policy.
+    """
+    other, facts = load(name)
+    tensors = parted(other.tensors)[1] if isinstance(other, Locating) else {}
+    if not tensors:
+        raise ConfigError(f"{name}: has no steering that was learnt")
+    return tensors, facts["steering"]
+
+
+def save(path: Path, agent: Locating, facts: dict[str, Any], steering: dict[str, Any], steered: dict[str, Any]) -> None:
+    """Writes a policy of a localiser's tensors and a steering's, and its facts.
+
+    Args:
+        path: The tensors' file; the facts go beside it.
+        agent: The localiser.
+        facts: Its facts.
+        steering: Tensors of the steering.
+        steered: What the steering was trained on: task, tunnels and settings.
+    """
+    named = {PREFIX + name: np.asarray(tensor, np.float32) for name, tensor in steering.items()}
+    named |= {name: np.asarray(tensor, np.float32) for name, tensor in parted(agent.tensors)[0].items()}
     content = safetensors.numpy.save(dict(sorted(named.items())))
-    steered = {
-        "task": arguments.task,
-        "tunnels": arguments.tunnels,
-        "config": dataclasses.asdict(arguments.config),
-        "localiser": facts["tensors_sha256"],
-    }
     whole = {
         **{name: value for name, value in facts.items() if name not in _OF_THE_WRITTEN},
         "name": f"{facts['name']}-steering",
-        "task": arguments.task,
+        "task": steered["task"],
         "learnt": _LEARNT,
-        "layout": {**facts["layout"], "frames": arguments.config.frames},
+        "layout": {**facts["layout"], "frames": steered["config"]["frames"]},
         "tensors_sha256": hashlib.sha256(content).hexdigest(),
-        "steering": steered,
+        "steering": {**steered, "localiser": facts["tensors_sha256"]},
         "versions": library_versions(),
     }
+    require_folder(path.parent).mkdir(parents=True, exist_ok=True)
     for place, data in ((path, content), (facts_file(path), f"{json.dumps(whole, indent=1)}\n".encode())):
         with replace_file(place) as fresh:
             fresh.write_bytes(data)

@@ -1,7 +1,8 @@
 """A steering that was learnt by reward: it reads ranges and its own last commands, and no rule of avoidance.
 
 The mission says how fast to go at most, as to every steering: the largest speed, and less where the goal is believed
-near. The network chooses the share of that speed and the yaw rate.
+near. The network chooses the share of that speed, a fifth of it at least, and the yaw rate: to stand still is to stop,
+which is the mission's to say.
 """
 
 from typing import Any
@@ -20,6 +21,8 @@ PREFIX = "steering."
 N_BEAMS = 16
 N_SIGHT = N_BEAMS + 2  # numbers of one moment
 SHARE, YAW_RATE = (0.0, 1.0), 1.5  # bounds of what the network chooses; rad/s to either side
+# Least share: before a box the released network would stand now and then, and who stands still has stopped.
+_LEAST = 0.2
 _FULL = 1.05  # a tanh never reaches its end: the full speed lies a little below it
 _CLIP = 10.0  # standard deviations
 
@@ -44,7 +47,7 @@ def sight(ranges: Float[Array, "n_beams"], command: Float[Array, "2"]) -> Float[
 
 def to_command(action: Float[Array, "2"], speed: Float[Array, ""]) -> Float[Array, "2"]:
     """Returns speed (m/s) and yaw rate (rad/s) of a choice of the network."""
-    return jnp.stack([speed * jnp.clip(_FULL * action[0], *SHARE), action[1]])
+    return jnp.stack([speed * jnp.clip(_FULL * action[0], _LEAST, SHARE[1]), action[1]])
 
 
 @struct.dataclass
