@@ -170,6 +170,93 @@ def leap(frame, f, y, z, dy, dz):
 
 @compiled
 @no_type_check
+def turn_into(frame, f, x, y, z):
+    """Return a vector in a block's frame."""
+    return (
+        frame[f + 3] * x + frame[f + 4] * y + frame[f + 5] * z,
+        frame[f + 6] * x + frame[f + 7] * y + frame[f + 8] * z,
+        frame[f + 9] * x + frame[f + 10] * y + frame[f + 11] * z,
+    )
+
+
+@compiled
+@no_type_check
+def step_wedge(wedge, onward):
+    """Return the number of the wedge beside one."""
+    if onward:
+        return 0 if wedge + 1 == N_WEDGES else wedge + 1
+    return N_WEDGES - 1 if wedge == 0 else wedge - 1
+
+
+@compiled
+@no_type_check
+def march_block(frame, f, link, here, cell, entry, vertex, n_x, px, py, pz, dx, dy, dz, stop):
+    """March a ray through the cells of one block.
+
+    Args:
+        frame: Frames of the relief's blocks; `link`, `cell`, `entry` and `vertex` are the relief's as well.
+        f: First number of this block's frame.
+        link: Links of the blocks.
+        here: This block.
+        cell: Cells.
+        entry: Entries.
+        vertex: Vertices.
+        n_x: Cells of a block along the axis.
+        px: Place along the axis at which the march begins, block's frame, m.
+        py: Place to the left, m.
+        pz: Place upwards, m.
+        dx: Direction along the axis.
+        dy: Direction to the left.
+        dz: Direction upwards.
+        stop: Largest distance of interest, m; below 0 no cell is looked at.
+
+    Returns:
+        Distance to the first triangle, m, `inf` where there is none; and its entry, -1 where there is none.
+    """
+    low, per_cell, along, across = frame[f + 20], frame[f + 21], frame[f + 22], frame[f + 23]
+    pitch = _ONE / per_cell
+    across *= _FINE
+    ux, uy, uz, vx, vy, vz = px * along + _MIDDLE, py * across, pz * across, dx * along, dy * across, dz * across
+    first_vertex, first_cell = np.int64(link[N_LINK * here + 2]), np.int64(link[N_LINK * here + 3])
+    forward, onward = dx > _ZERO, py * dz - pz * dy > _ZERO
+    slope = _ONE / (_F(1e-9) if abs(dx) < _F(1e-9) else dx)
+    x = int(min(max(np.floor((px - low) * per_cell), _ZERO), _F(n_x - 1)))
+    wedge = wedge_at(py, pz)
+    place, best, chosen = _ZERO, _FAR, -1
+    inside = stop >= _ZERO
+    while inside:
+        edge = x + (1 if forward else 0)
+        leave_x = _FAR if edge <= 0 or edge >= n_x else (low + _F(edge) * pitch - px) * slope
+        y0, z0 = wedge_edge(wedge)
+        y1, z1 = wedge_edge(step_wedge(wedge, True))
+        y, z = (y1, z1) if onward else (y0, z0)
+        speed = y * dz - z * dy
+        leave_wedge = _FAR
+        if (speed if onward else -speed) > _TINY:
+            leave_wedge = -(y * pz - z * py) / speed
+        away = max(min(leave_x, leave_wedge), place)
+        y, z = y0 + y1, z0 + z1
+        deeper = y * dy + z * dz
+        depth = y * py + z * pz + deeper * (min(away, stop) if deeper > _ZERO else place)
+        number = 2 * (first_cell + x * N_WEDGES + wedge)
+        word = np.uint32(cell[number + 1])
+        if depth + _MARGIN >= _F(word & np.uint32(0xFFFF)) * _UNIT:
+            best, chosen = meet(
+                vertex, entry, np.int64(cell[number]), np.int64(word >> np.uint32(16)), first_vertex,
+                ux, uy, uz, vx, vy, vz, best, chosen,
+            )  # fmt: skip
+        if not (away < stop and best > away):
+            inside = False
+        elif leave_x <= leave_wedge:
+            x += 1 if forward else -1
+        else:
+            wedge = step_wedge(wedge, onward)
+        place = away
+    return best, chosen
+
+
+@compiled
+@no_type_check
 def march_rows(
     begin, end, origin, direction, block, limit, frame, link, cell, entry, vertex, box, n_x, distance, found, home
 ):
@@ -199,18 +286,11 @@ def march_rows(
         going = farthest >= _ZERO
         while going:
             f = here * N_FRAME
-            gx, gy, gz = (
-                origin[3 * ray] - frame[f],
-                origin[3 * ray + 1] - frame[f + 1],
+            ox, oy, oz = turn_into(
+                frame, f, origin[3 * ray] - frame[f], origin[3 * ray + 1] - frame[f + 1],
                 origin[3 * ray + 2] - frame[f + 2],
-            )
-            hx, hy, hz = direction[3 * ray], direction[3 * ray + 1], direction[3 * ray + 2]
-            ox = frame[f + 3] * gx + frame[f + 4] * gy + frame[f + 5] * gz
-            oy = frame[f + 6] * gx + frame[f + 7] * gy + frame[f + 8] * gz
-            oz = frame[f + 9] * gx + frame[f + 10] * gy + frame[f + 11] * gz
-            dx = frame[f + 3] * hx + frame[f + 4] * hy + frame[f + 5] * hz
-            dy = frame[f + 6] * hx + frame[f + 7] * hy + frame[f + 8] * hz
-            dz = frame[f + 9] * hx + frame[f + 10] * hy + frame[f + 11] * hz
+            )  # fmt: skip
+            dx, dy, dz = turn_into(frame, f, direction[3 * ray], direction[3 * ray + 1], direction[3 * ray + 2])
             back = leaving(frame, f + 12, ox, oy, oz, dx, dy, dz, -_ONE)
             front = leaving(frame, f + 16, ox, oy, oz, dx, dy, dz, _ONE)
             leave, following = (front, link[N_LINK * here + 1]) if front <= back else (back, link[N_LINK * here])
@@ -225,57 +305,10 @@ def march_rows(
                 )  # fmt: skip
                 if reached + nearest < hit:
                     hit, which, at_home = reached + nearest, -2 - number, here
-            stop = min(min(leave, farthest), hit) - start
-            low, per_cell, along, across = frame[f + 20], frame[f + 21], frame[f + 22], frame[f + 23]
-            pitch = _ONE / per_cell
-            across *= _FINE
-            ux, uy, uz, vx, vy, vz = (
-                px * along + _MIDDLE,
-                py * across,
-                pz * across,
-                dx * along,
-                dy * across,
-                dz * across,
-            )
-            first_vertex, first_cell = np.int64(link[N_LINK * here + 2]), np.int64(link[N_LINK * here + 3])
-            forward, onward = dx > _ZERO, py * dz - pz * dy > _ZERO
-            slope = _ONE / (_F(1e-9) if abs(dx) < _F(1e-9) else dx)
-            x = int(min(max(np.floor((px - low) * per_cell), _ZERO), _F(n_x - 1)))
-            wedge = wedge_at(py, pz)
-            place, best, chosen = _ZERO, _FAR, -1
-            inside = stop >= _ZERO
-            while inside:
-                edge = x + (1 if forward else 0)
-                leave_x = _FAR if edge <= 0 or edge >= n_x else (low + _F(edge) * pitch - px) * slope
-                y0, z0 = wedge_edge(wedge)
-                y1, z1 = wedge_edge(0 if wedge + 1 == N_WEDGES else wedge + 1)
-                y, z = (y1, z1) if onward else (y0, z0)
-                speed = y * dz - z * dy
-                leave_wedge = _FAR
-                if (speed if onward else -speed) > _TINY:
-                    leave_wedge = -(y * pz - z * py) / speed
-                away = max(min(leave_x, leave_wedge), place)
-                y, z = y0 + y1, z0 + z1
-                deeper = y * dy + z * dz
-                depth = y * py + z * pz + deeper * (min(away, stop) if deeper > _ZERO else place)
-                number = 2 * (first_cell + x * N_WEDGES + wedge)
-                word = np.uint32(cell[number + 1])
-                if depth + _MARGIN >= _F(word & np.uint32(0xFFFF)) * _UNIT:
-                    best, chosen = meet(
-                        vertex, entry, np.int64(cell[number]), np.int64(word >> np.uint32(16)), first_vertex,
-                        ux, uy, uz, vx, vy, vz, best, chosen,
-                    )  # fmt: skip
-                if not (away < stop and best > away):
-                    inside = False
-                elif leave_x <= leave_wedge:
-                    x += 1 if forward else -1
-                else:
-                    wedge += 1 if onward else -1
-                    if wedge == N_WEDGES:
-                        wedge = 0
-                    elif wedge < 0:
-                        wedge = N_WEDGES - 1
-                place = away
+            best, chosen = march_block(
+                frame, f, link, here, cell, entry, vertex, n_x, px, py, pz, dx, dy, dz,
+                min(min(leave, farthest), hit) - start,
+            )  # fmt: skip
             if start + best < hit:
                 hit, which, at_home = start + best, chosen, here
             going = leave < min(farthest, hit) and following >= 0
