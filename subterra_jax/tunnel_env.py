@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from subterra_jax.actions import COMMAND, ESTIMATE, REPORT, action_bounds, check_action, read_report
 from subterra_jax.compiled import compiled
 from subterra_jax.env import Box, Info, Stepped
 from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, Sight, Step, Unicycle
@@ -22,7 +23,6 @@ from subterra_jax.rules import Rule, Traverse, Verdict
 from subterra_jax.state import EnvParams, State, make_alike
 from subterra_jax.tunnel import Tunnel, at_station, foot
 
-ESTIMATE, REPORT = 4, 5  # numbers in an action that holds an estimate, and in one that reports
 _NOTHING = Noise()
 
 
@@ -163,7 +163,7 @@ class TunnelEnv:
         Raises:
             ValueError: The action has another shape, seen when the step is traced.
         """
-        action = self._checked(action).astype(state.command.dtype)
+        action = check_action(action, self.action_size, self.id).astype(state.command.dtype)
         tunnel = params.tunnel.pick(state.tunnel)
         command = self.motion.obey(action, state, params)
         drive = Drive(command, command)
@@ -183,7 +183,7 @@ class TunnelEnv:
             command=command,
             drive=moved.drive,
             moved=jnp.abs(moved.drive.motion[0]) * jnp.asarray(params.vehicle.period),
-            report=self._report(action, params),
+            report=read_report(action, params),
             after={self.motion.name: moved.own},
         )
         step = self._advance_parts(step, noise, params)
@@ -237,7 +237,7 @@ class TunnelEnv:
     @property
     def action_size(self) -> int:
         """Count of numbers in one action."""
-        return REPORT if self.rule.reports else ESTIMATE if self.estimates else 2
+        return REPORT if self.rule.reports else ESTIMATE if self.estimates else COMMAND
 
     def observation_size(self, params: EnvParams) -> int:
         """Count the numbers of one observation."""
@@ -259,11 +259,7 @@ class TunnelEnv:
 
     def action_space(self, params: EnvParams) -> Box:
         """Return the bounds of an action; `step` clips to them."""
-        speed, yaw_rate = (np.max(np.asarray(v)) for v in (params.vehicle.speed_max, params.vehicle.yaw_rate_max))
-        length = np.max(np.asarray(params.tunnel.length))
-        low, high = [0.0, -yaw_rate, 0.0, -5.0, -1.0], [speed, yaw_rate, length, 5.0, 1.0]
-        n = self.action_size
-        return Box(np.array(low[:n], np.float32), np.array(high[:n], np.float32))
+        return action_bounds(self.action_size, params)
 
     def privileged(self, state: State, params: EnvParams) -> dict[str, Float[Array, ""]]:
         """Return what only a teacher or a critic may know; no observation holds any of it.
@@ -360,23 +356,12 @@ class TunnelEnv:
 
         return dataclasses.replace(sight, hits=hits, spoil=spoil)
 
-    def _report(self, action: Float[Array, n_action], params: EnvParams) -> Float[Array, 3]:
-        """Estimate, log of its standard deviation and direction in an action: clipped; 0 for a NaN and where absent."""
-        size = self.action_size
-        if size == 2:
-            return jnp.zeros(3, action.dtype)
-        length = jnp.max(jnp.asarray(params.tunnel.length)).astype(action.dtype)
-        low = jnp.array([0.0, -5.0, -1.0], action.dtype)
-        high = jnp.concatenate([length[None], jnp.array([5.0, 1.0], action.dtype)])
-        given = jnp.concatenate([action[2:size], jnp.zeros(REPORT - size, action.dtype)])
-        return jnp.clip(jnp.where(jnp.isnan(given), 0.0, given), low, high)
-
     def _info(
         self, step: Step, moved: Moved, verdict: Verdict, clear: Float[Array, ""], contact: Bool[Array, ""]
     ) -> Info:
         """Entries of `info`: those of rule, motion, estimate, environment and parts, in this order."""
         info = {**verdict.terms, **verdict.info, **moved.info}
-        if self.action_size > 2:
+        if self.action_size > COMMAND:
             info["estimate_error"] = step.report[0] - step.place.station
             info["estimate_log_sigma"] = step.report[1]
         info |= {
@@ -391,15 +376,6 @@ class TunnelEnv:
         for part in self.parts:
             info |= part.info(step.before.parts[part.name])
         return info
-
-    def _checked(self, action: Any) -> Array:
-        """An action as an array, refused where it has another shape than it must have."""
-        action = jnp.asarray(action)
-        if action.shape != (self.action_size,):
-            raise ValueError(
-                f"an action of {self.id} has {self.action_size} numbers, got an array of shape {action.shape}"
-            )
-        return action
 
 
 def _slices(sizes: Mapping[str, int]) -> dict[str, slice]:
