@@ -69,7 +69,7 @@ def randomize(
     for name, leaf in leaves.items():
         own_key = jax.random.fold_in(key, zlib.crc32(name.encode()))
         drawn = _draw(own_key, leaf.dtype, (n_envs, *leaf.shape), *bounds[name], isinstance(ranges[name], LogUniform))
-        params, axes = _replaced(params, name.split("."), drawn), _replaced(axes, name.split("."), 0)
+        params, axes = _replace_part(params, name.split("."), drawn), _replace_part(axes, name.split("."), 0)
     return params, axes
 
 
@@ -149,8 +149,8 @@ def _draw(
     return jax.random.uniform(key, shape, dtype, low, high)
 
 
-def _replaced(node: Any, path: list[str], value: Any) -> Any:
+def _replace_part(node: Any, path: list[str], value: Any) -> Any:
     """A tree of dataclasses with one part exchanged."""
     if len(path) > 1:
-        value = _replaced(getattr(node, path[0]), path[1:], value)
+        value = _replace_part(getattr(node, path[0]), path[1:], value)
     return node.replace(**{path[0]: value})

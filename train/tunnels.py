@@ -109,7 +109,7 @@ def in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> lis
 
 def _tunnel(name: str | Path | None, kind: Kind, cache: Path | None) -> Tunnel:
     """Returns a tunnel whose arrays are of the host, so that they go from one process to another."""
-    kept = _kept(name, kind, cache)
+    kept = _cache_file(name, kind, cache)
     if kept is not None and kept.is_file():
         return pickle.loads(kept.read_bytes())
     made = jax.device_get(resolve(name, kind.lining, kind.piece, constants.RANGE_MAX, kind.spatial))
@@ -120,7 +120,7 @@ def _tunnel(name: str | Path | None, kind: Kind, cache: Path | None) -> Tunnel:
     return made
 
 
-def _kept(name: str | Path | None, kind: Kind, cache: Path | None) -> Path | None:
+def _cache_file(name: str | Path | None, kind: Kind, cache: Path | None) -> Path | None:
     """Returns the file in which a tunnel is kept."""
     bore, piece = "-bore" if kind.spatial else "", "" if kind.piece is None else f"-{kind.piece}"
     return (
@@ -131,7 +131,7 @@ def _kept(name: str | Path | None, kind: Kind, cache: Path | None) -> Path | Non
 
 
 def _is_kept(name: str | Path | None, kind: Kind, cache: Path | None) -> bool:
-    kept = _kept(name, kind, cache)
+    kept = _cache_file(name, kind, cache)
     return kept is not None and kept.is_file()
 
 

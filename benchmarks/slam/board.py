@@ -123,7 +123,7 @@ def make_board(config: BoardConfig) -> Iterator[tuple[str, str]]:
         futures = {pool.submit(_run, one, config.limit): one for one in order}
         for future in as_completed(futures):
             one = futures[future]
-            yield f"{one.place.parent.name} {one.folder.name} {one.program}", _said(future.result())
+            yield f"{one.place.parent.name} {one.folder.name} {one.program}", _describe_result(future.result())
     rows = [_labels(one) | read_case(one) for one in cases]
     floors = []
     for floor in _find_floors(config):
@@ -156,7 +156,7 @@ def _run(case: Case, limit: float) -> dict[str, Any]:
     return result
 
 
-def _said(result: dict[str, Any]) -> str:
+def _describe_result(result: dict[str, Any]) -> str:
     return f"failed: {result['failed']}" if "failed" in result else f"{result.get('seconds', 0.0):.0f} s"
 
 

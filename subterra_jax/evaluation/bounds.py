@@ -30,9 +30,9 @@ def stop_bounds(params: EnvParams) -> dict[str, float]:
     distance = low + (high - low) * (np.arange(_GOALS) + 0.5) / _GOALS - float(params.start.station)
     slip, odometry, metre = params.slip, params.odometry, _noise_of_a_metre(params)
     variances = {
-        "command": (slip.gain_sigma * distance) ** 2 + _wandered(distance, slip.wander),
-        "odometry": (odometry.distance_bias_sigma * distance) ** 2 + _wandered(distance, odometry.wander),
-        "fused": _fused(distance, params),
+        "command": (slip.gain_sigma * distance) ** 2 + _wander_variance(distance, slip.wander),
+        "odometry": (odometry.distance_bias_sigma * distance) ** 2 + _wander_variance(distance, odometry.wander),
+        "fused": _fused_variance(distance, params),
     }
     variances["odometry"] = variances["odometry"] + metre * distance
     tolerance, start = float(params.goal.tolerance), float(params.start.station_sigma) ** 2
@@ -50,7 +50,7 @@ def _noise_of_a_metre(params: EnvParams) -> float:
     return float(params.odometry.distance_sigma) ** 2 / step
 
 
-def _wandered(distance: Float[np.ndarray, " n"], wander: WanderParams | None) -> Float[np.ndarray, " n"]:
+def _wander_variance(distance: Float[np.ndarray, " n"], wander: WanderParams | None) -> Float[np.ndarray, " n"]:
     """Variance of the integral of a wandering error, m²."""
     if wander is None:
         return np.zeros_like(distance)
@@ -58,7 +58,7 @@ def _wandered(distance: Float[np.ndarray, " n"], wander: WanderParams | None) ->
     return 2.0 * sigma**2 * length * (distance + length * np.expm1(-distance / length))
 
 
-def _fused(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
+def _fused_variance(distance: Float[np.ndarray, " n"], params: EnvParams) -> Float[np.ndarray, " n"]:
     """Variance of the true distance given commands and readings, m²: a Kalman filter's, which needs no data."""
     n = math.ceil(distance.max() / _STRETCH)
     variance = _station_variance(np.zeros((n, 1)), params, 0.0)

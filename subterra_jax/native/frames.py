@@ -180,7 +180,7 @@ def _call_at(typing: Any, address: Any, argument: Any) -> Any:
     return signature(types.intp, types.intp, types.intp), emit
 
 
-def _named(name: str) -> Callable[[Callable[..., Any]], Any]:
+def _compile_as(name: str) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function under a name of its own.
 
     Numba numbers the functions of one name anew in every process. Code that two processes have put on disk is linked
@@ -242,7 +242,7 @@ def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
         name: Name of the helpers' code; must be unique.
     """
 
-    @_named(name)
+    @_compile_as(name)
     @no_type_check
     def take_chunks(job):
         frame, rows = read64(job + _FRAME), read64(job + _ROWS)
@@ -254,13 +254,13 @@ def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
             work(frame, begin, end)
             _fetch_add(job + _DONE, end - begin)
 
-    @_named(name)
+    @_compile_as(name)
     @no_type_check
     def leave(job):
         if _fetch_add(job + _HOLDERS, -1) == 1:
             _release(job)
 
-    @_named(name)
+    @_compile_as(name)
     @no_type_check
     def help_once(job):
         take_chunks(job)
@@ -268,7 +268,7 @@ def run_on_all_threads(work: Callable[..., None], chunk: int, name: str) -> Any:
 
     helper = _as_c_function(help_once, name)
 
-    @_named(name)
+    @_compile_as(name)
     @no_type_check
     def run(frame, rows):
         api = read64(frame + _API)

@@ -275,12 +275,12 @@ def generate(name: str, linings: tuple[str, ...] | None = None, solid: bool = Fa
         UserCodeError: The user's file cannot be run.
     """
     if name == "control":
-        _known(name, linings, ("smooth",))
+        _choose_variants(name, linings, ("smooth",))
         return control()
     if match := _OPEN.fullmatch(name):
         if match[1]:
             load_module(match[1])
-        return open_world.plan(match[2], variants=_known(name, linings, open_world.VARIANTS), solid=solid)
+        return open_world.plan(match[2], variants=_choose_variants(name, linings, open_world.VARIANTS), solid=solid)
     match = _NAME.fullmatch(name)
     if match is None:
         raise TunnelError(
@@ -288,12 +288,12 @@ def generate(name: str, linings: tuple[str, ...] | None = None, solid: bool = Fa
             f"procedural:SPLIT:INDEX, as in procedural:test:7"
         )
     try:
-        return plan(seed_of(match[1], int(match[2])), name=name, linings=_known(name, linings, LININGS))
+        return plan(seed_of(match[1], int(match[2])), name=name, linings=_choose_variants(name, linings, LININGS))
     except ValueError as error:
         raise TunnelError(f"no tunnel {name!r}: {error}") from error
 
 
-def _known(name: str, wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:
+def _choose_variants(name: str, wanted: tuple[str, ...] | None, there: tuple[str, ...]) -> tuple[str, ...]:
     """Return the wanted variants of a family.
 
     Raises:

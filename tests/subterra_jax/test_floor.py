@@ -39,7 +39,7 @@ def test_commands_alone_drift_by_their_slip():
 
 def test_the_way_out_agrees_with_the_bound_of_version_0():
     params = task("StopAt")
-    np.testing.assert_allclose(way_out_variance(DISTANCE, params), bounds._fused(DISTANCE, params), rtol=0.02)
+    np.testing.assert_allclose(way_out_variance(DISTANCE, params), bounds._fused_variance(DISTANCE, params), rtol=0.02)
 
 
 def test_a_way_back_cancels_what_lasts_and_a_flag_tells_a_hidden_start_in_part():

@@ -132,7 +132,7 @@ def test_information_falls_with_the_square_of_the_noise(params, found):
 def test_a_filter_without_scans_keeps_the_drift_of_the_closed_form_and_scans_pull_it_in(params):
     station = np.arange(2.0, 79.0)
     blind = bounds.filter_variance(station, np.zeros(len(station)), params[True])
-    np.testing.assert_allclose(blind, bounds._fused(station, params[True]), rtol=1e-6)
+    np.testing.assert_allclose(blind, bounds._fused_variance(station, params[True]), rtol=1e-6)
     # One scan of 10 cm a step, and nearly nothing else to go by: sigma² / n.
     steps = [bounds.filter_variance(station, np.full(len(station), told), params[True]) for told in (1.0, 100.0)]
     assert np.all(steps[1][5:] < steps[0][5:])

@@ -69,7 +69,7 @@ def test_a_teacher_who_is_not_obeyed_remembers_what_was_done_and_has_not_arrived
     np.testing.assert_allclose(advice[:, 0], 0.0, atol=1e-6)
     assert after.mission.stopped.all()
     done = jnp.array([[1.5, 0.1], [0.7, -0.2]])
-    told = lessons.driven(memory, after, done)
+    told = lessons.correct_memory(memory, after, done)
     np.testing.assert_array_equal(told.command, done)
     assert not told.mission.stopped.any()
 

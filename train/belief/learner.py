@@ -216,7 +216,7 @@ class BeliefLearner(devices.Whole):
         )
         metrics = {**jax.tree.map(jnp.mean, losses), "temper": jnp.exp(weights["temper"])}
         after = TrainState(weights, moments, drive, key, state.iteration + 1)
-        told = _told(jax.tree.map(lambda x: x[0].reshape(-1), found), config.unroll)
+        told = _as_episodes(jax.tree.map(lambda x: x[0].reshape(-1), found), config.unroll)
         return after, report(told, metrics, self.policy_of(state))
 
     def _loss(
@@ -269,7 +269,7 @@ class BeliefLearner(devices.Whole):
         return jax.vmap(scan)(stretch.ranges, stretch.walls, ways.station), ways.wrong
 
 
-def _told(found: dict[str, Array], unroll: int) -> Finished:
+def _as_episodes(found: dict[str, Array], unroll: int) -> Finished:
     """Logs lessons as episodes: a success where the true way won, the log of the belief in it as return."""
     won, log_belief = found["won"], found["log_belief"]
     last = jnp.broadcast_to((jnp.arange(unroll) == unroll - 1)[:, None], (unroll, len(won)))

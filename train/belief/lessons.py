@@ -72,7 +72,7 @@ class Ways:
 def begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int) -> Drive:
     """Starts an episode in every environment."""
     observation, state = env.reset(key, params, n_envs)
-    walls = jax.vmap(lambda seen: CentreLine().begin(_seen(env, params, seen), params))(observation)
+    walls = jax.vmap(lambda seen: CentreLine().begin(_observe(env, params, seen), params))(observation)
     return Drive(state, observation, walls, jnp.zeros((n_envs, 2)), jnp.ones(n_envs, bool))
 
 
@@ -80,7 +80,7 @@ def collect(env: Any, params: Any, drive: Drive, key: PRNGKeyArray, n_steps: int
     """Drives on along the axis at full speed; a robot that comes to an end begins anew somewhere else."""
 
     def look(walls: Corridor, seen: Array, command: Array, first: Array) -> Corridor:
-        obs = _seen(env, params, seen)
+        obs = _observe(env, params, seen)
         fresh, tracked = CentreLine().begin(obs, params), CentreLine().look(walls, obs, command, params)
         return jax.tree.map(lambda new, old: jnp.where(first, new, old), fresh, tracked)
 
@@ -153,5 +153,5 @@ def ways(
     )
 
 
-def _seen(env: Any, params: Any, observation: Float[Array, "obs"]) -> Observed:
+def _observe(env: Any, params: Any, observation: Float[Array, "obs"]) -> Observed:
     return observed(env.env, params, observation)

@@ -86,7 +86,7 @@ class Networks:
         self.layout = layout
         self.n_action = len(layout.action_low)
         self.distribution = NormalTanhDistribution(self.n_action, min_std=layout.min_std)
-        self._policy = self._seeing(
+        self._policy = self._with_sight(
             MLP(
                 layer_sizes=(*layout.hidden, self.distribution.param_size),
                 activation=jax.nn.swish,
@@ -94,7 +94,7 @@ class Networks:
                 output_kernel_init=jax.nn.initializers.variance_scaling(1e-4, "fan_in", "uniform"),
             )
         )
-        self._value = self._seeing(MLP(layer_sizes=(*layout.hidden, 1), activation=jax.nn.swish))
+        self._value = self._with_sight(MLP(layer_sizes=(*layout.hidden, 1), activation=jax.nn.swish))
         self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
         spread = math.log(
             math.expm1(layout.init_std - layout.min_std)
@@ -136,7 +136,7 @@ class Networks:
         parameters = self.parameters(policy.weights, policy.statistics, stack)
         return self.action(parameters[..., : self.n_action])
 
-    def _seeing(self, body: MLP) -> Any:
+    def _with_sight(self, body: MLP) -> Any:
         return body if self.layout.image is None else Seeing(self.layout.image, body)
 
     def _see(self, stack: Array, statistics: learning.Statistics) -> tuple[Array, ...]:

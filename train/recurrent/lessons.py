@@ -62,7 +62,7 @@ def advise(
     return jax.vmap(one)(jax.random.split(key, len(first)), memory, observation, state, first)
 
 
-def driven(before: Any, after: Any, action: Float[Array, "env 2"]) -> Any:
+def correct_memory(before: Any, after: Any, action: Float[Array, "env 2"]) -> Any:
     """Corrects a teacher's memory of a step by the action that was taken, which need not be the one it advised.
 
     Args:
@@ -184,7 +184,7 @@ def collect(
         done = following.first
         finished = dataclasses.replace(finished, done=done & ~now.taught)
         again = jax.random.uniform(key_who, done.shape) < taught
-        after = Classroom(following, driven(now.teacher, memory, action), jnp.where(done, again, now.taught))
+        after = Classroom(following, correct_memory(now.teacher, memory, action), jnp.where(done, again, now.taught))
         return after, (stored, finished, terms)
 
     after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))

@@ -57,7 +57,7 @@ def take_window(rng: np.random.Generator, whole: Mutant, oblique: bool = False) 
     return Mutant(whole.points[kept], replace(truth, wall=wall, span=(low, high), ends=(np.nan, np.nan)))
 
 
-def _moved(whole: Mutant, move: Callable[[np.ndarray], np.ndarray], sizes: bool = True) -> Mutant:
+def _move(whole: Mutant, move: Callable[[np.ndarray], np.ndarray], sizes: bool = True) -> Mutant:
     truth = replace(whole.truth, axis=move(whole.truth.axis), wall=move(whole.truth.wall))
     if not sizes:
         nothing = np.full(len(truth.axis), np.nan)
@@ -75,7 +75,7 @@ def rotate(rng: np.random.Generator, whole: Mutant) -> Mutant:
     piece = take_window(rng, whole)
     turn = Rotation.from_euler("ZYX", [rng.uniform(-np.pi, np.pi), *rng.uniform(-_LEAN, _LEAN, 2)])
     centre = piece.points.mean(axis=0)
-    return _moved(piece, lambda points: turn.apply(points - centre) + centre, sizes=False)
+    return _move(piece, lambda points: turn.apply(points - centre) + centre, sizes=False)
 
 
 def thin_out(rng: np.random.Generator, whole: Mutant) -> Mutant:
@@ -95,7 +95,7 @@ def stray(rng: np.random.Generator, whole: Mutant) -> Mutant:
 
 def mirror(rng: np.random.Generator, whole: Mutant) -> Mutant:
     """Return a piece with left and right exchanged."""
-    moved = _moved(take_window(rng, whole), lambda points: points * (-1.0, 1.0, 1.0))
+    moved = _move(take_window(rng, whole), lambda points: points * (-1.0, 1.0, 1.0))
     return replace(moved, truth=replace(moved.truth, middle=-np.asarray(moved.truth.middle)))
 
 

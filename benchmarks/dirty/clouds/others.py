@@ -15,8 +15,8 @@ from benchmarks.dirty.clouds.troubles import Cloud, finish
 _SECOND = tuple(f"{one} {what}" for one in ("two", "second", "another", "other") for what in ("tunnel", "bore"))
 
 
-def _refused(rng: np.random.Generator, air: Manifold, tripods: list, sky: Mask, cause: tuple[str, ...]) -> Cloud:
-    """A cloud without a bore, and the truth that it is none."""
+def _no_bore(rng: np.random.Generator, air: Manifold, tripods: list, sky: Mask, cause: tuple[str, ...]) -> Cloud:
+    """Return a cloud without a bore, and the truth that it is none."""
     alignment = Alignment(rng.uniform(-np.pi, np.pi), offset=tuple(rng.uniform(500.0, 900.0, 3)))
     site = Site(alignment, Arch(), 20.0, air, np.array(tripods, float), sky)
     nothing: dict[str, Any] = {"expect": "refused", "cause": cause, "span": np.array([0.0, 20.0]), "width": np.nan}
@@ -30,7 +30,7 @@ def _inside(local: Float[np.ndarray, "p 3"]) -> np.ndarray:
 
 def room(rng: np.random.Generator) -> Cloud:
     """Return a room of 12 × 10 × 4 m."""
-    return _refused(rng, box((0, -5, 0), (12, 5, 4)), [(4, 0, 1.7), (8, 1, 1.7)], _inside, ("room",))
+    return _no_bore(rng, box((0, -5, 0), (12, 5, 4)), [(4, 0, 1.7), (8, 1, 1.7)], _inside, ("room",))
 
 
 def street(rng: np.random.Generator) -> Cloud:
@@ -41,7 +41,7 @@ def street(rng: np.random.Generator) -> Cloud:
         return (local[:, 2] > 11.99) | (local[:, 0] < 0.01) | (local[:, 0] > 79.99)
 
     words = ("street", "no roof", "roof", "crown", "ceiling", "sky", "open above", "overhead")
-    return _refused(rng, box((0, -7, 0), (80, 7, 12)), stands, sky, words)
+    return _no_bore(rng, box((0, -7, 0), (80, 7, 12)), stands, sky, words)
 
 
 def plane(rng: np.random.Generator) -> Cloud:
@@ -51,13 +51,13 @@ def plane(rng: np.random.Generator) -> Cloud:
         return local[:, 2] > 1e-3
 
     stands = [(s, left, HEIGHT) for s in (10, 30, 50) for left in (-10.0, 10.0)]
-    return _refused(rng, box((0, -20, 0), (60, 20, 9)), stands, sky, ("plane", "surface", "flat", "ground", "no walls"))
+    return _no_bore(rng, box((0, -20, 0), (60, 20, 9)), stands, sky, ("plane", "surface", "flat", "ground", "no walls"))
 
 
 def shaft(rng: np.random.Generator) -> Cloud:
     """Return a vertical shaft of 6 m, 30 m deep."""
     tube = Manifold.cylinder(30.0, 3.0, circular_segments=96)
-    return _refused(rng, tube, [(0, 0, z) for z in range(3, 30, 5)], _inside, ("shaft", "vertical", "steep", "grade"))
+    return _no_bore(rng, tube, [(0, 0, z) for z in range(3, 30, 5)], _inside, ("shaft", "vertical", "steep", "grade"))
 
 
 def two_tunnels(rng: np.random.Generator) -> Cloud:
