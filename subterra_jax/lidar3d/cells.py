@@ -159,41 +159,58 @@ def _sort(axis: Axis, surface: Triangles, boxes: Boxes, block_length: float, n_x
     local = [_compact(surface, faces, blocks, k) for k, faces in enumerate(chosen)]
     extent = np.abs(np.concatenate([np.ones((1, 3)), *(points for points, _ in local)])).max(axis=0)
     unit = np.array([extent[0], extent[1:].max()]) * (1.0 + 1e-6) / [(1 << X_BITS - 1) - 1, (1 << YZ_BITS - 1) - 1]
-    prism: list[np.ndarray] = []
-    cell: list[np.ndarray] = []
-    entry: list[np.ndarray] = []
-    vertex: list[np.ndarray] = []
-    n_entries = 0
-    first_vertex = np.zeros(len(local), np.int64)
-    for k, (points, faces) in enumerate(local):
-        corner = points[faces]
-        points, faces = _number_vertices(_pack_points(points, unit), faces)
-        if len(points) > MOST_VERTICES:
-            raise _TooDense
-        which, count, near, order = _list(corner, -half, size, n_x)
-        first_vertex[k] = first_vertex[k - 1] + len(vertex[-1]) if k else 0
-        prism.append(_empty_prism(corner[..., 1:]))
-        packed = np.zeros((n_x * N_WEDGES, 2), np.int64)
-        packed[:, 0] = n_entries
-        packed[which, 0] = n_entries + np.cumsum(count) - count
-        if len(count) and count.max() > MOST_LISTED:
-            raise _TooDense
-        packed[which, 1] = (count << 16) | np.clip(near / NEAR_UNIT, 0, (1 << 16) - 1).astype(np.int64)
-        step = faces[:, 1:] - faces[:, :1]
-        code = (faces[:, 0] << 2 * STEP_BITS) | (step[:, 0] << STEP_BITS) | step[:, 1]
-        cell.append(packed)
-        entry.append(code[order])
-        vertex.append(points)
-        n_entries += len(order)
+    parts, n_entries = [], 0
+    for points, faces in local:
+        parts.append(_pack_block(points, faces, unit, -half, size, n_x, n_entries))
+        n_entries += len(parts[-1][1])
     low = np.full(len(local), -half)
+    cell, entry, vertex = zip(*parts, strict=True)
+    first_vertex = np.cumsum([0, *(len(words) for words in vertex[:-1])])
     cells, entries, vertices = (np.concatenate(part).astype(np.uint32).view(np.int32) for part in (cell, entry, vertex))
+    prism = np.array([_empty_prism(points[faces][..., 1:]) for points, faces in local])
     first_box = np.cumsum([0, *(len(parts) for parts in chosen_boxes)])
     placed = [boxes.pick(parts).seen_from(blocks.centre[k], blocks.turn[k]) for k, parts in enumerate(chosen_boxes)]
     top = np.array([float(part.corners()[..., 2].max(initial=-1e6)) for part in placed])
     box = np.concatenate([part.rows() for part in placed])
-    return Cells(
-        blocks, low, size, unit, np.array(prism), cells, entries, first_vertex, vertices, first_box, box, top + MARGIN
-    )
+    return Cells(blocks, low, size, unit, prism, cells, entries, first_vertex, vertices, first_box, box, top + MARGIN)
+
+
+def _pack_block(
+    points: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    unit: Float[np.ndarray, 2],
+    low: float,
+    size: float,
+    n_x: int,
+    n_before: int,
+) -> tuple[Int[np.ndarray, "c 2"], Int[np.ndarray, e], Int[np.ndarray, "w 2"]]:
+    """Return cells, entries and vertices of one block, as `Cells` has them.
+
+    Args:
+        points: Vertices in the block's frame, m.
+        faces: Triangles, by their vertices.
+        unit: Units of the coordinates along and across the axis, m.
+        low: Coordinate along the axis at which the first cell begins, m.
+        size: Length of a cell along the axis, m.
+        n_x: Cells along the axis.
+        n_before: Entries of the blocks before.
+
+    Raises:
+        _TooDense: The block has more vertices, or one of its cells more triangles, than its integers can number.
+    """
+    vertex, numbered = _number_vertices(_pack_points(points, unit), faces)
+    if len(vertex) > MOST_VERTICES:
+        raise _TooDense
+    which, count, near, order = _list(points[faces], low, size, n_x)
+    if len(count) and count.max() > MOST_LISTED:
+        raise _TooDense
+    cell = np.zeros((n_x * N_WEDGES, 2), np.int64)
+    cell[:, 0] = n_before
+    cell[which, 0] = n_before + np.cumsum(count) - count
+    cell[which, 1] = (count << 16) | np.clip(near / NEAR_UNIT, 0, (1 << 16) - 1).astype(np.int64)
+    step = numbered[:, 1:] - numbered[:, :1]
+    code = (numbered[:, 0] << 2 * STEP_BITS) | (step[:, 0] << STEP_BITS) | step[:, 1]
+    return cell, code[order], vertex
 
 
 def _parts_of_blocks(axis: Axis, parts: Float[np.ndarray, "k n 3"], blocks: Blocks) -> list[Int[np.ndarray, f]]:
