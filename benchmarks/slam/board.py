@@ -82,18 +82,7 @@ def plan_board(config: BoardConfig) -> list[Case]:
         BenchmarkError: A program is unknown or not installed, a set holds no recordings or no truth, a bag that is
             to be run on is damaged, two sets have one name, or there is nothing to score.
     """
-    require_least(config, jobs=1)
-    if not config.programs or not (config.sets or config.runs):
-        raise BenchmarkError("sets and programs must name at least one")
-    if not config.sets and config.runs is not None and not config.runs.is_file():
-        raise BenchmarkError(f"{config.runs}: no such file, and no sets to run on")
-    if len({folder.name for folder in config.sets}) < len(config.sets):
-        raise BenchmarkError("sets must differ in the last part of their names")
-    for name in config.programs:
-        if name not in (*PROGRAMS, WHEELS):
-            raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *PROGRAMS])}")
-        if name != WHEELS and config.run:
-            find_program(name)
+    _check_board(config)
     cases = []
     for folder in config.sets:
         for name, bag in recordings_in(folder):
@@ -107,6 +96,22 @@ def plan_board(config: BoardConfig) -> list[Case]:
     if config.sets and all(one.program == WHEELS for one in cases) and any(name != WHEELS for name in config.programs):
         raise BenchmarkError(f"{config.out}: holds no poses of {', '.join(config.programs)} to score")
     return cases
+
+
+def _check_board(config: BoardConfig) -> None:
+    """Refuses settings that make no board, before a recording is opened."""
+    require_least(config, jobs=1)
+    if not config.programs or not (config.sets or config.runs):
+        raise BenchmarkError("sets and programs must name at least one")
+    if not config.sets and config.runs is not None and not config.runs.is_file():
+        raise BenchmarkError(f"{config.runs}: no such file, and no sets to run on")
+    if len({folder.name for folder in config.sets}) < len(config.sets):
+        raise BenchmarkError("sets must differ in the last part of their names")
+    for name in config.programs:
+        if name not in (*PROGRAMS, WHEELS):
+            raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *PROGRAMS])}")
+        if name != WHEELS and config.run:
+            find_program(name)
 
 
 def make_board(config: BoardConfig) -> Iterator[tuple[str, str]]:
