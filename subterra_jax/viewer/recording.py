@@ -162,15 +162,20 @@ def load(path: Path) -> Recording:
     texts: dict[str, Any] = {name: str(_field(path, fields, name, (), "U")) for name in _TEXTS}
     numbers: dict[str, Any] = {name: float(_field(path, fields, name, (), "fiub")) for name in _NUMBERS}
     series: dict[str, Any] = {name: _field(path, fields, name, shape, "f") for name, shape in _SHAPES.items()}
+    _check_values(path, series, numbers["period"])
+    return Recording(**texts, **numbers, **series)
+
+
+def _check_values(path: Path, series: dict[str, Any], period: float) -> None:
+    """Refuse series of unlike length or that are not finite, and a period that is none."""
     sizes = {len(values) for name, values in series.items() if name != "boxes"}
     if len(sizes) != 1 or 0 in sizes:
         raise EpisodeFileError(f"{path}: its series must have one length of at least 1, have {sorted(sizes)}")
     for name in ("position", "heading", "station", "odometry", "reward", "coverage"):
         if not np.isfinite(series[name]).all():
             raise EpisodeFileError(f"{path}: field {name!r} has a value that is not finite")
-    if not (np.isfinite(numbers["period"]) and numbers["period"] > 0.0):
-        raise EpisodeFileError(f"{path}: field 'period' must be positive, is {numbers['period']}")
-    return Recording(**texts, **numbers, **series)
+    if not (np.isfinite(period) and period > 0.0):
+        raise EpisodeFileError(f"{path}: field 'period' must be positive, is {period}")
 
 
 def _field(path: Path, fields: dict[str, Any], name: str, shape: tuple[str | int, ...], kinds: str) -> Any:
