@@ -57,7 +57,7 @@ def cache_programs(folder: str | Path | None = None) -> Path:
     one task take about 1 MB.
 
     Args:
-        folder: Where to keep them. None is `JAX_COMPILATION_CACHE_DIR` if it is set, else a folder for this kind of
+        folder: Folder to keep them in. None is `JAX_COMPILATION_CACHE_DIR` if it is set, else a folder for this kind of
             processor under `~/.cache/subterra`, or `XDG_CACHE_HOME`.
 
     Returns:

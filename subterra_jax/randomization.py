@@ -50,7 +50,7 @@ def randomize(
         params: What all environments share but for the named numbers.
         ranges: By dotted name of a number in `params`: least and largest value, drawn uniformly, or `LogUniform`. Whole
             numbers are drawn with both ends included.
-        n_envs: How many environments.
+        n_envs: Number of environments.
 
     Returns:
         The params with `(n_envs, ...)` where a name was given, and the same tree with 0 there and None elsewhere, for

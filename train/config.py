@@ -54,7 +54,7 @@ class TrainConfig:
         minibatches: Minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments.
         init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
         min_std: Floor of that standard deviation.
-        learning_rate: Of Adam, at the start and at most.
+        learning_rate: Learning rate of Adam, at the start and at most.
         max_grad_norm: Gradients are scaled down to this norm.
         discount: Per control period.
         gae_lambda: Mix of one-step and n-step advantages.

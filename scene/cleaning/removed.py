@@ -122,7 +122,7 @@ def _find_mouths(station: Float[np.ndarray, " n"], behind: Float[np.ndarray, " n
 
     Args:
         station: Stations of its points in growing order, m.
-        behind: How far each is behind the wall, m.
+        behind: Distance of each behind the wall, m.
     """
     near = station[behind < _MOUTH]
     parts = np.split(near, np.flatnonzero(np.diff(near) > _MOUTHS_APART) + 1)

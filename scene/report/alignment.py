@@ -22,7 +22,7 @@ class Piece:
     """One element in plan with its place, as LandXML holds it.
 
     Attributes:
-        start: Where it begins, x and y, m.
+        start: Its beginning, x and y, m.
         heading: Direction there, anticlockwise from x, rad.
         length: Length, m.
         first: Curvature at its beginning, 1/m, to the left positive.

@@ -63,7 +63,7 @@ def likely_noise(
     Args:
         residual: Distances of the points from the fit, m.
         station: Their stations, m.
-        hat: What the fit makes of a change of the points.
+        hat: Change of the fit for a change of the points.
     """
     n = len(residual)
     left = np.eye(n) - hat

@@ -37,8 +37,8 @@ class Surroundings:
 
     Attributes:
         corridor: The walls.
-        along: How far ahead along the axis each hit lies, m.
-        across: How far left of the middle between the walls, m.
+        along: Distance ahead along the axis at which each hit lies, m.
+        across: Distance to the left of the middle between the walls, m.
         newest: Row of the newest hits.
         lane: Lane to take, m left of the middle.
     """

@@ -55,12 +55,12 @@ class Localisability:
             `(n, 3, 3)`.
         station_bound: Cramér–Rao bound of one scan for the station, with offset and heading unknown too, by the mean of
             what the scans of the cell tell, m, `(n,)`.
-        offset_bound: The same for the offset, m.
-        heading_bound: The same for the heading, rad.
+        offset_bound: Bound of the offset, m.
+        heading_bound: Bound of the heading, rad.
         drift: Standard deviation of the station that a perfect filter with the map keeps. It starts at the task's
             start, drives to the far mouth at full speed, and has commands, odometry and every scan, m, `(n,)`. A scan
             tells it as much as it tells a filter as uncertain, of at least `blur` and at most 16 times that.
-        blind_drift: The same without scans, m, `(n,)`.
+        blind_drift: Drift without scans, m, `(n,)`.
     """
 
     station: Float[np.ndarray, " n"]

@@ -25,7 +25,7 @@ class Records:
 
     Attributes:
         seed: Seed of the episode.
-        tunnel: Which tunnel of a stack.
+        tunnel: Number of the tunnel in a stack.
         severity: Severity of the faults.
         group: Stratum of the bootstrap.
         success: Whether the task was achieved.

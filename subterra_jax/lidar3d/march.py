@@ -77,7 +77,7 @@ class Way(NamedTuple):
         leave: Distance at which the ray leaves the block, m.
         following: Block behind or ahead that it enters then; -1 at a mouth.
         hits: First triangles or boxes met so far, those in earlier blocks and the boxes of this one.
-        low: Where the first cell begins along the axis, m.
+        low: Coordinate along the axis at which the first cell begins, m.
         per_cell: Cells a metre.
         along: Units of a vertex along the axis, 1/m.
         across: Units of a vertex across the axis, 1/m.

@@ -125,7 +125,7 @@ def hold(before: Any, after: Any, held: list[Any]) -> Any:
     Args:
         before: The odometer before the step.
         after: The odometer that has counted.
-        held: What each part says of `holds_odometer`; a plain False costs nothing.
+        held: Answer of each part to `holds_odometer`; a plain False costs nothing.
     """
     for holds in held:
         if holds is not False:

@@ -22,7 +22,7 @@ class Boxes:
         start: Station where each begins, m, `(k,)`.
         end: Station where it ends, m.
         side: 1 at the left wall, -1 at the right.
-        out: How far it stands out of the wall; negative for how deep a niche is, m.
+        out: Height out of the wall, m; below 0 it is the depth of a niche.
         face: Lateral of its inner face without its sign, m; of a niche, of its mouth.
         low: Lower end above the floor, m.
         high: Upper end above the floor, m.

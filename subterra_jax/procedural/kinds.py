@@ -296,7 +296,7 @@ class FixtureRanges:
         spacing: Distance from one to the next on one side, m; drawn once a tunnel.
         jitter: Standard deviation of each one's place, over the spacing, 1.
         length: Length along the tunnel, m.
-        depth: How far it stands out of the wall; negative for how deep a niche is, m.
+        depth: Height out of the wall, m; below 0 it is the depth of a niche.
         low: Lower end above the floor, m.
         high: Upper end above the floor, m.
         sides: Number of sides it stands on: 1, or 2 with the sides staggered by half a spacing.

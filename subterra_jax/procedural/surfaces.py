@@ -165,7 +165,7 @@ class Patches:
     Attributes:
         station: Their begins and ends, m, `(p, 2)`.
         girth: Their edges around the section, m, `(p, 2)`.
-        relief_of: How far the wall lies outside the section there, m, `(p,)`.
+        relief_of: Distance of the wall outside the section there, m, `(p,)`.
     """
 
     station: Float[np.ndarray, "p 2"]

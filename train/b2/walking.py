@@ -147,7 +147,7 @@ def walker(
         act: Observations to actions.
         n_robots: Number of robots.
         n_steps: Control periods.
-        seed: Of everything that is drawn.
+        seed: Seed of all draws.
 
     Returns:
         A function of params, whose result has every step's `velocity` and `asked` `(step, robot, 3)`, and `fall`,

@@ -126,7 +126,7 @@ def ways(
         key: Source of the draws.
         station: True station at each time, m.
         forward: 1 where the robot faces growing stations, else −1.
-        length: Of the tunnel, m.
+        length: Length of the tunnel, m.
         pitch: Between rings, m; 0 where there are none.
         n: Number of other ways.
         least_apart: Nearer ways than this are no mistake, m.

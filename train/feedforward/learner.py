@@ -44,7 +44,7 @@ class Lesson:
     Attributes:
         first_stack: Frame stack at the first step, from which the others are rebuilt.
         rollout: As stored.
-        advantage: Of every action, in units of the reward scale.
+        advantage: Advantage of every action, in units of the reward scale.
         target: For the value function, in the same units.
     """
 

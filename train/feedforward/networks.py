@@ -69,7 +69,7 @@ class Policy:
     """Weights and statistics that acting needs.
 
     Attributes:
-        weights: Of the policy network.
+        weights: Weights of the policy network.
         statistics: Normalisation of one observation.
     """
 

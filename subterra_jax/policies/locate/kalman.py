@@ -73,7 +73,7 @@ def advance(weights: Weights, now: Filter, block: Block, measured: Any = None) -
     """Takes in one metre.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         now: The filter.
         block: The metre.
         measured: Error of the command `DELAY` metres ago, m per m, and its variance; None: by the block's evidence.

@@ -96,7 +96,7 @@ def map_features(weights: Weights, strip: MapStrip, start: Float[Array, ""], n: 
     """Returns what beams would see along a stretch of the map.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         strip: The map of one tunnel.
         start: Station of the first bin, m.
         n: Number of bins.
@@ -142,11 +142,11 @@ def agreement(
     """Returns the log likelihood ratio, map against no map, of each of `SHIFTS` by one block.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         seen: Features of the block.
         mapped: Features of the map about where the block is believed to be, rounded down to a bin.
         along: Mean distance ahead at which each beam saw the block, m.
-        part: What was rounded off, in bins.
+        part: Rest after rounding, in bins.
         error: Error of the command in the block, m per m: what was seen ahead lies further on by that.
     """
     moved = jnp.clip(part - (error / BIN) * (0.5 + along), 1.0 - SLACK, SLACK - 1.0)
@@ -171,10 +171,10 @@ def advance(weights: Weights, now: MapBelief, ratio: Float[Array, "n_shifts"], l
     """Takes in one metre.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         now: The belief.
-        ratio: Of `agreement`.
-        log_rate: How fast the localiser says that its error grows, of `memory`.
+        ratio: Ratio of `agreement`.
+        log_rate: Log of the rate at which the localiser says that its error grows, of `memory`.
     """
     variance = jnp.exp(weights["log_widen"] + 2.0 * weights["widen_by"] * log_rate) / CELL**2
     variance = jnp.clip(variance, 1e-3, 0.9)
@@ -242,7 +242,7 @@ def metre(
     """Returns the agreement of one block, as the robot goes.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         profiles: `N_SEEN` bins about the block.
         strip: The map of the tunnel.
         told: Station told as the start, m.
@@ -272,14 +272,14 @@ def sequence(
     """Returns the beliefs after all metres of a drive: the fields have the metres as first axis.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         whole: Profiles of the drive.
         before: Bins of them before the start; at least `MARGIN`.
         strip: The map of the tunnel.
         told: Station told as the start, m.
         sigma: Its standard deviation, m.
         passed: Correction at the end of the block `DELAY` metres before each metre, by the localiser alone, m.
-        log_rate: How fast the localiser says that its error grows, at each metre.
+        log_rate: Log of the rate at which the localiser says that its error grows, at each metre.
     """
     n = passed.shape[0]
     seen = seen_features(weights, whole)

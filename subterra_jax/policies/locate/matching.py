@@ -103,7 +103,7 @@ def evidence(weights: Weights, profiles: Profiles) -> Float[Array, "n_shares"]:
     """Returns the log likelihood, up to a constant, of each of `shares` by one block.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         profiles: `N_CUT` bins about the block.
     """
     features, there = encode(weights, profiles)
@@ -121,7 +121,7 @@ def compare(
     """Compares the pairs of beams on either side.
 
     Args:
-        weights: Of `init`, trained.
+        weights: Trained weights, as `init` makes them.
         features: Features of `BLOCK + 2 LAGS` bins about the block.
         there: Weights of the features.
         along: Mean distance ahead at which each beam saw the block, m.
