@@ -153,11 +153,7 @@ def make_mission(
         RobotError: The tunnel is narrower than the robot.
         PolicyError: There is no such gait, or it does not fit the robot.
     """
-    for name, value, known in (("task", id, MISSIONS), ("engine", engine, ENGINES)):
-        if value not in known:
-            raise ValueError(f"no {name} {value!r}; there are {', '.join(known)}")
-    if odometer not in ("legs", "drift"):
-        raise ValueError(f"odometer must be 'legs' or 'drift', got {odometer!r}")
+    _check_choices(id, engine, odometer)
     # No pushes on the way.
     parts = {"randomisation": RandomisationParams(push=0.0), "sensor": SensorParams(), **(walk or {})}
     physics = MujocoPhysics() if engine == "mujoco" else Physics()
@@ -193,10 +189,23 @@ def make_mission(
     horizon = overrides.pop("horizon", HORIZON)
     params = make_params(env, walking.tunnel, horizon, collect_entries(env, {**fields, **own, **overrides}))
     check_together(env, params)
-    commanded, period = PERIODS * physics.period, float(jnp.asarray(params.vehicle.period))
+    _check_period(params, PERIODS * physics.period)
+    return env, params
+
+
+def _check_choices(id: str, engine: str, odometer: str) -> None:
+    for name, value, known in (("task", id, MISSIONS), ("engine", engine, ENGINES)):
+        if value not in known:
+            raise ValueError(f"no {name} {value!r}; there are {', '.join(known)}")
+    if odometer not in ("legs", "drift"):
+        raise ValueError(f"odometer must be 'legs' or 'drift', got {odometer!r}")
+
+
+def _check_period(params: EnvParams, commanded: float) -> None:
+    """Refuse a control period other than that of the commands, s."""
+    period = float(jnp.asarray(params.vehicle.period))
     if abs(period - commanded) > 1e-6:
         raise ValueError(f"the B2 takes a command every {commanded:g} s, got period={period:g}")
-    return env, params
 
 
 def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:
