@@ -3,7 +3,7 @@ import pytest
 import trimesh
 from pypcd4 import PointCloud
 
-from scene.cloud import VoxelMean
+from scene.cloud import VoxelMean, occupied_cells
 from scene.errors import RecordingError
 from scene.reading.cloudfile import read_cloud
 
@@ -68,3 +68,11 @@ def test_an_empty_cloud_is_refused(tmp_path):
     )
     with pytest.raises(RecordingError, match=r"e\.ply: holds no points"):
         read_cloud(tmp_path / "e.ply", 0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_occupied_cells_are_the_different_rows_in_order(count):
+    points = np.random.default_rng(0).normal(0.0, 1.5, (count, 3))
+    cells = occupied_cells(points, 0.5)
+    np.testing.assert_array_equal(cells, np.unique(np.floor(points / 0.5).astype(np.int64), axis=0))
+    assert len(cells) < max(count, 2)
