@@ -250,7 +250,7 @@ CLAIMS = (
     Claim(_TURNED, "230 of 230", 0.0, command=_UNIVERSAL, measured=_CPU_LATER),
     Claim(_TURNED, "16 mm", 2.0, "at most", command=_UNIVERSAL, measured=_CPU_LATER),
     Claim(_SUITE, "98.0 %", 0.1, job="fidelity", read=lambda c: c["global"]),
-    Claim(_SUITE, "69.0 %", 0.2, job="fidelity", read=lambda c: c["global_null"]),
+    Claim(_SUITE, "69.4 %", 0.2, job="fidelity", read=lambda c: c["global_null"]),
     Claim(_SUITE, "18 categories", 0.0, job="fidelity", read=lambda c: len(c["categories"])),
     Claim(_SUITE, "9.6 min", 10.0, "at most", command=_JUDGED, measured=_CPU_LATER),
     Claim(_SUITE, "5.4 GiB", 0.2, "at most", command=_JUDGED, measured=_CPU_LATER),
