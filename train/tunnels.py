@@ -29,7 +29,7 @@ _EACH = 4  # planar tunnels that take as long to make as a process to begin
 
 @dataclasses.dataclass(frozen=True)
 class Kind:
-    """What of a tunnel is made.
+    """Lining, bore and piece of a tunnel to make.
 
     Attributes:
         lining: Variant of the walls; None is the usual one.

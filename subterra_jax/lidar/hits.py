@@ -49,14 +49,14 @@ def hits_kernel(
             direction = direction_of(turn_ref, beam, beams.n, cos, sin)
 
             def look_from(k: int, there, nearest):
-                """The nearest hit in a beam's boxes from the k-th on, where it enters that."""
+                """Return the nearest hit in the boxes from the k-th on, where the beam enters that."""
                 if k == beams.n_best:
                     return _look_everywhere(walls, beams.n_scan, first, there, direction, lane, nearest)
                 block = walls.block(boxes.block(keys[k]), there)
                 return look_on(k, walls.nearest(block, direction, nearest, lane, LANES))
 
             def look_on(k: int, distance):
-                """The same from the one behind the k-th on, with the distances that the threads of a beam found."""
+                """Return the nearest hit, also of the boxes behind the k-th, after what the threads found."""
                 nearest = _least(distance)
                 further = boxes.enters(keys[min(k + 1, beams.n_best - 1)], nearest)
                 return lax.cond(any_thread(further), partial(look_from, k + 1, further, nearest), lambda: nearest)
