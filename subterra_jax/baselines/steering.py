@@ -1,5 +1,6 @@
-"""Finds the walls in a scan and steers along them: a centre-line controller, pure pursuit, and heading hold."""
+"""Finds the walls in a scan and steers along them: centre line, pure pursuit, heading hold, and a limit of speed."""
 
+import dataclasses
 from typing import Any, Protocol
 
 import jax.numpy as jnp
@@ -246,3 +247,61 @@ class HeadingHold(Steering):
     def turn_round(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
         """Holds the opposite heading from now on."""
         return jnp.stack([memory[0], wrap(memory[1] + jnp.pi)])
+
+
+@struct.dataclass
+class PaceMemory:
+    """Memory of `PacedSteering`.
+
+    Attributes:
+        steering: Memory of the steering.
+        driven: Distance commanded, m.
+    """
+
+    steering: Any
+    driven: Float[Array, ""]
+
+    @property
+    def corridor(self) -> Any:
+        """The walls, which a localiser asks for."""
+        return getattr(self.steering, "corridor", self.steering)
+
+
+@struct.dataclass
+class PacedSteering(Steering):
+    """A steering that drives no faster towards a goal than its robot can see: a slow one has more scans of each metre.
+
+    Attributes:
+        steering: The steering itself.
+        cruise: Largest speed, m/s.
+        slow: Largest speed over the first distance, m/s.
+        learning: That first distance, m; 0 is none.
+    """
+
+    steering: Steering
+    cruise: float
+    slow: float = 0.0
+    learning: float = 0.0
+
+    def begin(self, obs: Observed, params: EnvParams) -> PaceMemory:
+        """Returns the memory at the start."""
+        return PaceMemory(self.steering.begin(obs, params), jnp.zeros(()))
+
+    def look(self, memory: PaceMemory, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> PaceMemory:
+        """Updates the memory of the steering by an observation."""
+        steering = self.steering.look(memory.steering, obs, command, params)
+        return PaceMemory(steering, memory.driven + command[0] * params.vehicle.period)
+
+    def cosine(self, memory: PaceMemory) -> Float[Array, ""]:
+        """Returns the cosine of the angle to the axis."""
+        return self.steering.cosine(memory.steering)
+
+    def steer(self, memory: PaceMemory, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
+        """Returns the command of the steering at the limited speed."""
+        if params.errand != "cover":
+            speed = jnp.minimum(speed, jnp.where(memory.driven < self.learning, self.slow, self.cruise))
+        return self.steering.steer(memory.steering, speed, params)
+
+    def turn_round(self, memory: PaceMemory) -> PaceMemory:
+        """Returns the memory after a turn by half a circle."""
+        return dataclasses.replace(memory, steering=self.steering.turn_round(memory.steering))

@@ -10,8 +10,7 @@ from subterra_jax.baselines.reckoning import StepDistances
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.rings import grid as ringgrid
 from subterra_jax.baselines.rings import loop as rings
-from subterra_jax.baselines.rings.grid import PacedSteering, PaceMemory
-from subterra_jax.baselines.steering import HeadingHold
+from subterra_jax.baselines.steering import HeadingHold, PacedSteering, PaceMemory
 from subterra_jax.evaluation import evaluate, listed_episodes
 from tests.subterra_jax.ringscans import N_BEAMS, PITCH, scans
 
@@ -130,7 +129,7 @@ def test_the_agent_drives_slowly_where_it_learns_and_faster_where_it_counts():
     params = st.make("Subterra/FaultedShort-v0")[1]
     steering = make_agent("ring-filter", params).steering
     assert isinstance(steering, PacedSteering)
-    blind = PacedSteering(HeadingHold())
+    blind = PacedSteering(HeadingHold(), steering.cruise, steering.slow, steering.learning)
 
     @jax.jit
     def speed(driven, wanted):

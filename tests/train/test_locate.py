@@ -13,6 +13,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import policies
+from subterra_jax.baselines.agent import observed
 from subterra_jax.policies.locate import map_filter, memory
 from subterra_jax.policies.locate.agent import flat
 from subterra_jax.policies.locate.blocks import Estimate
@@ -50,6 +51,8 @@ def _command(tmp_path, **changes):
         ({"map": True, "network": "kalman"}, "a map is taken by gru, s5, transformer with front match"),
         ({"map": True, "front": "wide"}, "a map is taken by gru, s5, transformer with front match"),
         ({"wrong": 1.0}, "wrong must be at least 0 and below 1"),
+        ({"speed": 0.0}, "speed must be above 0 and at most 2.0 m/s, got 0.0"),
+        ({"speed": 2.5}, "speed must be above 0 and at most 2.0 m/s, got 2.5"),
     ],
 )
 def test_settings_that_cannot_be_trained_with_are_refused_by_name(tmp_path, changes, sentence):
@@ -67,6 +70,40 @@ def test_a_map_of_the_plane_is_not_learnt_with_a_spinning_lidar(tmp_path):
 def test_seeds_must_differ(tmp_path, seeds):
     with pytest.raises(ConfigError, match="seeds must differ and be at least 0"):
         check(dataclasses.replace(_command(tmp_path), seeds=seeds))
+
+
+def test_a_slow_robot_takes_more_steps_for_each_metre_and_its_policy_drives_as_slowly():
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="control")
+    drive = scores.record(env, params, jax.random.key(0), 2, last=32, speed=0.5)
+    steps = np.diff(np.asarray(drive.record.driven), axis=1)
+    assert steps.shape[1] == scores.steps_of(params, 0.5, 32) - 1 == 4 * scores.steps_of(params, None, 32) - 1
+    assert steps.max() == pytest.approx(0.05, abs=1e-3)
+    assert np.median(steps) > 0.045
+    layout = {"network": "kalman", "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
+    weights = flat(memory.init("kalman", "match", jax.random.key(0)))
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="control", estimates=True)
+    for speed, expected in ((None, 2.0), (0.5, 0.5)):
+        told = layout if speed is None else {**layout, "speed": speed}
+        agent = policies.from_tensors("locate", told, weights, "one")
+        assert agent.speed == speed
+        assert _fastest(agent, env, params) == pytest.approx(expected, abs=1e-3)
+
+
+def _fastest(agent, env, params):
+    """Returns the largest speed that an agent commands in its first 20 steps, m/s."""
+    key = jax.random.key(1)
+    state = env.begin(env.draw_reset(key, (), params), params)
+
+    def step(carry, t):
+        state, mind = carry
+        noise = env.draw_step(jax.random.fold_in(key, t), (), params)
+        seen = observed(env, params, env.observe(state, noise, params))
+        action, mind = agent.act(key, mind, seen, params, None)
+        return (env.advance(state, action[: env.action_size], noise, params)[0], mind), action[0]
+
+    first = observed(env, params, env.observe(state, env.draw_step(key, (), params), params))
+    mind = agent.begin(key, first, params)
+    return float(jax.jit(lambda carry: jax.lax.scan(step, carry, jnp.arange(20)))((state, mind))[1].max())
 
 
 def test_scores_are_told_by_kind():
@@ -224,11 +261,10 @@ def test_a_folder_that_holds_a_run_is_neither_written_over_nor_gone_on_with_as_a
 @pytest.mark.slow
 def test_a_run_writes_policies_that_load_and_goes_on_as_what_it_was(tmp_path, monkeypatch):
     settings = {"tunnels": "control", "val": "control", "task": "Subterra/StopAtShort-v1", "drives": 2, "seeds": (3, 4)}
-    command = dataclasses.replace(_command(tmp_path, minutes=0.01), **settings)
+    command = dataclasses.replace(_command(tmp_path, minutes=0.01, speed=1.5), **settings)
     session.run(command)
     folder = tmp_path / "seed-3"
-    policy = st.load_policy(str(folder / "policy.safetensors"))
-    assert policy is not None
+    assert policies.load(folder / "policy.safetensors")[0].speed == 1.5
     first = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
     assert len(first) == 1
     assert json.loads((folder / "scores.json").read_text())["seed"] == 3

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from subterra_jax.constants import SPEED_MAX
 from subterra_jax.policies import PolicyError
 from train import tunnels
 from train.config import ConfigError, at_least, positive
@@ -71,6 +72,8 @@ def check(arguments: Command) -> None:
             raise ConfigError(f"{name} must be at least 0 and below 1, got {getattr(config, name)}")
     if config.map and arguments.sensor != tunnels.PLANAR:
         raise ConfigError(f"a map is of the walls in the plane of {tunnels.PLANAR}; {arguments.sensor} sees others")
+    if config.speed is not None and not 0.0 < config.speed <= SPEED_MAX:
+        raise ConfigError(f"speed must be above 0 and at most {SPEED_MAX} m/s, got {config.speed}")
     if config.n_envs % config.minibatch:
         raise ConfigError(f"n_envs = {config.n_envs} must be a multiple of minibatch = {config.minibatch}")
     at_least(arguments, 1, "drives")

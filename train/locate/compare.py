@@ -81,7 +81,10 @@ def run(arguments: Command) -> None:
     made = tunnels.load(names + val, None, arguments.cache)
     env, params = tunnels.enter(arguments.task, made[: len(names)])
     drives = scores.record(
-        *tunnels.enter(arguments.task, made[len(names) :]), jax.random.key(VAL_SEED), arguments.drives
+        *tunnels.enter(arguments.task, made[len(names) :]),
+        jax.random.key(VAL_SEED),
+        arguments.drives,
+        speed=arguments.config.speed,
     )
     sessions = {network: Session(one, env, params, drives) for network, one in runs.items()}
     print(f"{len(made)} tunnels: {time.monotonic() - started:.0f} s", flush=True)

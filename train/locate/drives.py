@@ -41,7 +41,13 @@ class Drive:
 
 
 def record_drives(
-    env: Any, params: Any, key: PRNGKeyArray, n_envs: int, n_steps: int, from_mouth: bool = False
+    env: Any,
+    params: Any,
+    key: PRNGKeyArray,
+    n_envs: int,
+    n_steps: int,
+    from_mouth: bool = False,
+    speed: float | None = None,
 ) -> Drive:
     """Drives `n_envs` robots for `n_steps` steps; a robot that meets the end stands there.
 
@@ -52,10 +58,11 @@ def record_drives(
         n_envs: Number of robots.
         n_steps: Number of steps.
         from_mouth: All start at the mouth and drive at full speed, as an agent does.
+        speed: The full speed, m/s; None is that of the vehicle.
     """
     keys = jax.random.split(key, 4)
     draws = env.draw_reset(keys[0], (n_envs,), params)
-    speed_max = params.vehicle.speed_max
+    speed_max = params.vehicle.speed_max if speed is None else speed
     room = speed_max * params.vehicle.period * n_steps * 1.1 + 20.0
 
     def begin(draws: Any, key: PRNGKeyArray) -> Any:
@@ -89,8 +96,8 @@ def record_drives(
         share = jnp.where(from_mouth, 1.0, jax.vmap(lambda p: _speed(p, t))(pace))
         end = jax.vmap(lambda s: params.tunnel.pick(s.tunnel).length)(state) - 5.0
         over = over | (state.station > end)
-        speed = jnp.where(over, 0.0, share * speed_max)
-        command = jax.vmap(lambda s, w, v: s.steer(w, v, params))(steering, walls, speed)
+        wanted = jnp.where(over, 0.0, share * speed_max)
+        command = jax.vmap(lambda s, w, v: s.steer(w, v, params))(steering, walls, wanted)
         command = jnp.where(over[:, None], 0.0, command)
         noise = env.draw_step(jax.random.fold_in(keys[3], t + 1), (n_envs,), params)
         action = jnp.pad(command, ((0, 0), (0, env.action_size - 2)))

@@ -106,7 +106,7 @@ def command(arguments: Command) -> None:
         n, seed = (
             (arguments.drives, _OWN_SEED + arguments.seed) if split == "train" else (arguments.val_drives, _VAL_SEED)
         )
-        drives = record(env, params, seed, n, split == "val")
+        drives = record(env, params, seed, n, split == "val", agent.speed)
         rows[split] = look(network, weights, drives)
         val_tunnel = np.asarray(drives.tunnel)
         print(f"{split}: {n} drives", flush=True)
@@ -134,10 +134,10 @@ def command(arguments: Command) -> None:
         print(kind, *(f"{word} {table[kind]['within']:.3f}" for word, table in (("without", before), ("with", after))))
 
 
-def record(env: Any, params: Any, seed: int, n: int, plain: bool) -> Drive:
-    """Drives `n` robots; `plain` as an agent does, otherwise at speeds that vary, from anywhere."""
-    steps = 1750
-    drive = jax.jit(lambda key: record_drives(env, params, key, min(n, 64), steps, from_mouth=plain))
+def record(env: Any, params: Any, seed: int, n: int, plain: bool, speed: float | None) -> Drive:
+    """Drives `n` robots; `plain` as an agent does, otherwise at speeds that vary up to `speed`, from anywhere."""
+    steps = scores.steps_of(params, speed)
+    drive = jax.jit(lambda key: record_drives(env, params, key, min(n, 64), steps, from_mouth=plain, speed=speed))
     parts = [drive(jax.random.fold_in(jax.random.key(seed), i)) for i in range(-(-n // 64))]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:n], *parts)
 

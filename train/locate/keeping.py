@@ -33,11 +33,13 @@ def save(path: Path, weights: Any, updates: int, seed: int, env: Any, params: An
     named = {name: np.asarray(leaf, np.float32) for name, leaf in flat(jax.device_get(weights)).items()}
     content = safetensors.numpy.save(dict(sorted(named.items())))
     bounds = env.action_space(params)
-    layout = {
+    layout: dict[str, Any] = {
         "network": arguments.config.network,
         "action_low": [float(x) for x in bounds.low[:2]],
         "action_high": [float(x) for x in bounds.high[:2]],
     }
+    if arguments.config.speed is not None:
+        layout["speed"] = arguments.config.speed
     facts = {
         "schema": SCHEMA,
         "name": f"locate-{arguments.config.network}",

@@ -36,6 +36,8 @@ class LocateConfig:
         learning_rate: Of Adam, at most; it rises over the first steps and falls with the time that is left.
         max_grad_norm: Norm to which gradients are clipped.
         minutes: Time of the training, with compiling.
+        speed: Full speed of the drives, m/s, and of the policy; None is that of the vehicle. A slow robot sees
+            each metre more often, and takes more steps for it.
         begin_from: Localiser whose weights all seeds begin with, by name or file; it may be of another LiDAR, and have
             learnt without a map.
         map: Learn to take a map as well. What it does without one is learnt on the same drives.
@@ -53,6 +55,7 @@ class LocateConfig:
     learning_rate: float = 2e-3
     max_grad_norm: float = 1.0
     minutes: float = 20.0
+    speed: float | None = None
     begin_from: str | None = None
     map: bool = False
     hidden: float = 0.5
@@ -113,9 +116,9 @@ class LocateLearner:
 
     def __init__(self, env: Any, params: Any, config: LocateConfig) -> None:
         self.env, self.config = env, config
-        period = float(params.vehicle.period) * float(params.vehicle.speed_max)
+        speed = float(params.vehicle.speed_max if config.speed is None else config.speed)
         self.chunk = math.gcd(config.minibatch, config.chunk)
-        self.n_metres = int(config.n_steps * period)
+        self.n_metres = int(config.n_steps * float(params.vehicle.period) * speed)
         self.optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(b2=0.99))
         self.given = None if config.begin_from is None else begun(config, strips.n_sides(params.lidar))
 
@@ -155,7 +158,7 @@ class LocateLearner:
         """
         config = self.config
         key, key_drive, key_order = jax.random.split(state.key, 3)
-        drive = record_drives(self.env, params, key_drive, config.n_envs, config.n_steps)
+        drive = record_drives(self.env, params, key_drive, config.n_envs, config.n_steps, speed=config.speed)
         told = draw_told(jax.random.fold_in(key_drive, 1), drive, params, config) if config.map else None
         n_batches = config.n_envs // config.minibatch
 

@@ -44,7 +44,7 @@ class Command:
         task: Task that is driven.
         sensor: The LiDAR, by name.
         tunnels: Tunnels; a choice may be made on `val` alone.
-        drives: Drives, spread over the tunnels.
+        drives: Drives, spread over the tunnels; localisers of one speed see the same.
         seed: Added to the seed of the drives.
         cache: Folder in which made tunnels are kept from run to run.
     """
@@ -74,13 +74,16 @@ def command(arguments: Command) -> None:
     env, params = tunnels.enter(arguments.task, found, arguments.sensor)
     for name, agent in agents.items():
         check_fits(agent, env, params, name)
-    drives = scores.record(env, params, jax.random.key(_SEED + arguments.seed), arguments.drives)
-    kinds = np.array([scores.kind_of(name) for name in names])[np.asarray(drives.tunnel).astype(int)]
+    key = jax.random.key(_SEED + arguments.seed)
+    speeds = {agent.speed for agent in agents.values()}
+    recorded = {speed: scores.record(env, params, key, arguments.drives, speed=speed) for speed in speeds}
     print(f"{arguments.drives} drives", flush=True)
     rows: dict[str, Any] = {}
     names_of: dict[str, str] = {}
-    tunnel = np.asarray(drives.tunnel)
     for name, agent in agents.items():
+        drives = recorded[agent.speed]
+        tunnel = np.asarray(drives.tunnel)
+        kinds = np.array([scores.kind_of(one) for one in names])[tunnel.astype(int)]
         for blind in (False, True):
             label = f"cut:{name}" if blind else name
             rows[label], names_of[label] = table(within(agent, drives, blind), tunnel, kinds), name

@@ -17,7 +17,8 @@ from train.config import ConfigError
 from train.locate.drives import Drive, record_drives
 from train.locate.learner import Told, believe, estimate
 
-FIRST, _STEPS = 60, 1750  # m, the nearest goal; steps, 320 m and what slip adds
+FIRST = 60  # m, the nearest goal
+_WAY = 350.0  # m, commanded: the farthest goal and what slip adds
 _BATCH = 16
 FARTHEST = 320  # m, the farthest goal
 
@@ -39,11 +40,17 @@ def open_localiser(name: str) -> Locating:
     return agent
 
 
-def record(env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = FARTHEST) -> Drive:
-    """Drives `n` robots from where the task starts, at full speed, for `last` m."""
-    steps = int(np.ceil(_STEPS * last / FARTHEST))
-    drive = jax.jit(lambda key: record_drives(env, params, key, n, steps, from_mouth=True))
+def record(env: Any, params: Any, key: PRNGKeyArray, n: int, last: int = FARTHEST, speed: float | None = None) -> Drive:
+    """Drives `n` robots from where the task starts for `last` m, at `speed`, m/s, or the vehicle's."""
+    steps = steps_of(params, speed, last)
+    drive = jax.jit(lambda key: record_drives(env, params, key, n, steps, from_mouth=True, speed=speed))
     return drive(key)
+
+
+def steps_of(params: Any, speed: float | None, last: int = FARTHEST) -> int:
+    """Returns the steps that `last` m and what slip adds take at `speed`, m/s; None is the vehicle's."""
+    each = float(params.vehicle.period) * float(params.vehicle.speed_max if speed is None else speed)
+    return int(np.ceil(_WAY / each * last / FARTHEST - 1e-6))
 
 
 def make_judge(network: str, last: int = FARTHEST) -> Callable[..., dict[str, Array]]:

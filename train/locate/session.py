@@ -48,7 +48,9 @@ def run(arguments: Command) -> None:
             tunnels.map_of(everything[n_train:], val_params.tunnel),
         )
     print(f"{len(everything)} tunnels: {time.monotonic() - started:.0f} s", flush=True)
-    drives = scores.record(val_env, val_params, jax.random.key(VAL_SEED), arguments.drives)
+    drives = scores.record(
+        val_env, val_params, jax.random.key(VAL_SEED), arguments.drives, speed=arguments.config.speed
+    )
     session = Session(arguments, env, params, drives, maps)
     begin(session, arguments)
     session.train()

@@ -73,7 +73,7 @@ def command(arguments: Command) -> None:
         arguments.task, tunnels.load(names, None, arguments.cache, arguments.sensor), arguments.sensor
     )
     check_fits(agent, env, params, arguments.policy)
-    drives = scores.record(env, params, jax.random.key(_SEED), arguments.drives)
+    drives = scores.record(env, params, jax.random.key(_SEED), arguments.drives, speed=agent.speed)
     weights = nested(agent.tensors)
     found = jax.jit(lambda d: jax.lax.map(lambda one: both(agent.network, weights, one, params), d, batch_size=16))
     rows = weigh(jax.device_get(found(drives)))

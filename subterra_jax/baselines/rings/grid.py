@@ -14,7 +14,6 @@ Measured: `docs/measurements.md`.
 
 import dataclasses
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +36,7 @@ from subterra_jax.baselines.rings import bank
 from subterra_jax.baselines.rings.loop import RingMemory, begin_memory
 from subterra_jax.baselines.rings.walls import Bumps, Walls, begin_walls, track_walls
 from subterra_jax.baselines.stations import Driven, Localiser, Station, fault_sizes
-from subterra_jax.baselines.steering import CentreLine, Steering
+from subterra_jax.baselines.steering import CentreLine, PacedSteering
 from subterra_jax.parts.faults import FaultParams
 from subterra_jax.state import EnvParams
 
@@ -270,60 +269,7 @@ class RingFilter(Localiser):
         return estimate, dataclasses.replace(memory, track=track, reckoning=reckoning)
 
 
-@struct.dataclass
-class PaceMemory:
-    """Memory of `PacedSteering`.
-
-    Attributes:
-        steering: Memory of the steering.
-        driven: Distance commanded, m.
-    """
-
-    steering: Any
-    driven: Float[Array, ""]
-
-
-@struct.dataclass
-class PacedSteering(Steering):
-    """A steering that drives slowly past the first rings, and no faster than they can be counted, towards a goal.
-
-    Attributes:
-        steering: The steering itself.
-        cruise: Largest speed, m/s.
-        slow: Largest speed over the first distance, m/s.
-        learning: That first distance, m.
-    """
-
-    steering: Steering
-    cruise: float = _CRUISE
-    slow: float = _SLOW
-    learning: float = _LEARNING
-
-    def begin(self, obs: Observed, params: EnvParams) -> PaceMemory:
-        """Return the memory at the start."""
-        return PaceMemory(self.steering.begin(obs, params), jnp.zeros(()))
-
-    def look(self, memory: PaceMemory, obs: Observed, command: Float[Array, "2"], params: EnvParams) -> PaceMemory:
-        """Updates the memory of the steering by an observation."""
-        steering = self.steering.look(memory.steering, obs, command, params)
-        return PaceMemory(steering, memory.driven + command[0] * params.vehicle.period)
-
-    def cosine(self, memory: PaceMemory) -> Float[Array, ""]:
-        """Return the cosine of the angle to the axis."""
-        return self.steering.cosine(memory.steering)
-
-    def steer(self, memory: PaceMemory, speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Return the command of the steering at the limited speed."""
-        if params.errand != "cover":
-            speed = jnp.minimum(speed, jnp.where(memory.driven < self.learning, self.slow, self.cruise))
-        return self.steering.steer(memory.steering, speed, params)
-
-    def turn_round(self, memory: PaceMemory) -> PaceMemory:
-        """Return the memory after a turn by half a circle."""
-        return dataclasses.replace(memory, steering=self.steering.turn_round(memory.steering))
-
-
 def ring_filter(params: EnvParams) -> Navigator:
     """Makes the agent of a task."""
-    steering = PacedSteering(steering_of(params, CentreLine()))
+    steering = PacedSteering(steering_of(params, CentreLine()), _CRUISE, _SLOW, _LEARNING)
     return Navigator(RingFilter(wet="faults" in params.parts), steering, name="ring-filter")

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from subterra_jax.baselines.agent import Action, Known, Observed, n_ranges
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.navigator import Memory, Navigator
-from subterra_jax.baselines.steering import CentreLine
+from subterra_jax.baselines.steering import CentreLine, PacedSteering, Steering
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.locator import Locator
@@ -42,6 +42,7 @@ class Locating(Trained):
         high: Largest action, m/s and rad/s.
         network: Memory behind the front end, of `memory.NETWORKS`.
         frames: Moments that its learnt steering reads; 0 where the steering is written.
+        speed: Speed at which it drives at most, m/s; None is that of the vehicle.
         map: The map; None has none.
         hides_map: Take no map: `with_map` changes nothing.
         blind: Cut what the walls tell: the ablation of the learnt estimate.
@@ -57,6 +58,7 @@ class Locating(Trained):
     high: Float[Array, "2"]
     network: str = struct.field(pytree_node=False, default="kalman")
     frames: int = struct.field(pytree_node=False, default=0)
+    speed: float | None = struct.field(pytree_node=False, default=None)
     map: MapStrip | None = None
     hides_map: bool = struct.field(pytree_node=False, default=False)
     blind: bool = struct.field(pytree_node=False, default=False)
@@ -65,8 +67,14 @@ class Locating(Trained):
 
     @classmethod
     def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Locating":
-        """Makes the agent of a layout with `network`, and `frames` if its steering is learnt."""
-        return cls(**common, network=str(layout["network"]), frames=int(layout.get("frames", 0)))
+        """Makes the agent of a layout with `network`, `frames` if its steering is learnt, and `speed` if it has one."""
+        speed = layout.get("speed")
+        return cls(
+            **common,
+            network=str(layout["network"]),
+            frames=int(layout.get("frames", 0)),
+            speed=None if speed is None else float(speed),
+        )
 
     def try_out(self) -> None:
         """Compares names and shapes of the tensors with the network's."""
@@ -117,8 +125,10 @@ class Locating(Trained):
         mine, steering = parted(self.tensors)
         locator = Locator(nested(mine), self.network, self.map, self.blind)
         localiser = TwoWays(locator) if params.errand == "return" else locator
-        learnt = LearntSteering(steering, self.frames) if steering else steering_of(params, CentreLine())
-        return Navigator(localiser, learnt, name=self.name)
+        steered: Steering = LearntSteering(steering, self.frames) if steering else steering_of(params, CentreLine())
+        if self.speed is not None:
+            steered = PacedSteering(steered, self.speed)
+        return Navigator(localiser, steered, name=self.name)
 
 
 def parted(tensors: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
