@@ -24,7 +24,7 @@ from train import tunnels
 from train.checkpoint import iterations
 from train.config import ConfigError
 from train.folder import RunFolderError
-from train.locate import filtering, keeping, look, release, scores, session
+from train.locate import figure, filtering, keeping, look, release, scores, session
 from train.locate.command import Command, check
 from train.locate.drives import Drive
 from train.locate.learner import LocateConfig, LocateLearner, draw_told, map_loss
@@ -364,3 +364,26 @@ def test_a_look_weighs_kinds_alike_and_leaves_out_drives_without_a_goal():
     assert (found["rock"]["success"], found["rock"]["n"]) == (pytest.approx(0.2), 1)
     assert found["all"]["success"] == pytest.approx((0.375 + 0.2) / 2)
     assert found["cast"]["low"] < 0.1 < 0.7 < found["cast"]["high"], "two tunnels that differ leave a wide interval"
+
+
+def test_the_figure_takes_localisers_and_whole_drivers(tmp_path):
+    seed = tmp_path / "locate" / "seed-0"
+    seed.mkdir(parents=True)
+    rows = [{"seconds": 10.0 * i, "within": 0.2 * i} for i in range(3)]
+    (seed / "curve.jsonl").write_text("\n".join(map(json.dumps, rows)))
+    (tmp_path / "locate" / "config.json").write_text('{"config": {"network": "s5", "front": "match"}}')
+    driver = tmp_path / "driver"
+    driver.mkdir()
+    lines = [{"episodes": 60 * i, "success_mean_100": 0.1 * i, "timing": {"seconds": 5.0 * i}} for i in range(4)]
+    (driver / "log.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    (driver / "config.json").write_text('{"config": {"teacher": "oracle"}}')
+    (label,) = figure.read_run(tmp_path / "locate")
+    assert label == "s5, match (1 seed)"
+    ((label, (curve,)),) = figure.read_run(driver).items()
+    assert "taught by oracle" in label
+    np.testing.assert_allclose(curve, [(10.0, 0.2), (15.0, 0.3)])
+    figure.command(figure.Command((tmp_path / "locate", driver), tmp_path / "curve.png"))
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
+    (driver / "log.jsonl").write_text(json.dumps(lines[1]))
+    with pytest.raises(ConfigError, match="holds no hundred episodes"):
+        figure.read_run(driver)

@@ -1,8 +1,9 @@
 """Draws success against wall time: `python -m train.locate.figure RUN [RUN ...] --out curve.png`.
 
 Of each run the share of goals in `val` at which the estimate is right to 1 m, as it trains; of one that takes a map
-also with the map, and with the map where the start is hidden. Agents of a table of `benchmarks.kinds` on `val` are
-level lines.
+also with the map, and with the map where the start is hidden. Of a run of `train.navigate` with a memory, dotted, the
+success of the last hundred episodes of its training: in other tunnels, and easier at first. Agents of a table of
+`benchmarks.kinds` on `val` are level lines.
 """
 
 import dataclasses
@@ -17,10 +18,11 @@ import tyro
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import replace_file, require_file
 from train.config import ConfigError
-from train.locate.keeping import CURVE
+from train.locate.keeping import CURVE, LOG
 from train.options import read_settings
 
 _CURVES = {"within": "", "mapped": ", with map", "hidden_mapped": ", with map, hidden start"}
+_DRIVEN = "GRU that drives"
 _STYLES = ("-", "--", "-.", ":")
 
 
@@ -29,7 +31,7 @@ class Command:
     """Draws success against wall time.
 
     Attributes:
-        runs: Folders of `train.locate`.
+        runs: Folders of `train.locate` or `train.navigate`.
         out: File of the figure, `.png`.
         kinds: `kinds.json` of `benchmarks.kinds` on `val`, for level lines.
         agents: Agents of that table to draw; all if left out.
@@ -60,7 +62,8 @@ def command(arguments: Command) -> None:
     figure, axes = plt.subplots(figsize=(8.0, 4.5), layout="constrained")
     for index, (label, seeds) in enumerate(curves.items()):
         for number, curve in enumerate(seeds):
-            axes.plot(curve[:, 0], 100.0 * curve[:, 1], color=f"C{index}", lw=1.5, label=label if number == 0 else None)
+            style: dict[str, Any] = {"ls": ":" if label.startswith(_DRIVEN) else "-", "color": f"C{index}", "lw": 1.5}
+            axes.plot(curve[:, 0], 100.0 * curve[:, 1], **style, label=label if number == 0 else None)
     for index, (agent, level) in enumerate(levels.items()):
         axes.axhline(100.0 * level, color="0.4", ls=_STYLES[index % len(_STYLES)], lw=1.0, label=f"{agent} (written)")
     axes.set(xlabel="training, s (compiling included)", ylabel="right to 1 m, % of goals in val", ylim=(0.0, 100.0))
@@ -77,9 +80,11 @@ def read_run(run: Path) -> dict[str, list[np.ndarray]]:
     """Returns the curves of a run by label: of each seed seconds and share of right estimates, `(n, 2)`.
 
     Raises:
-        ConfigError: It is no run of `train.locate`, or has no curve.
+        ConfigError: It is no run of `train.locate` or `train.navigate`, or has no curve.
     """
     settings = read_settings(run / "config.json")
+    if (run / LOG).is_file():
+        return {_name_of(settings.get("config", {})): [_read_driven(run)]}
     seeds = [
         [json.loads(line) for line in path.read_text().splitlines()] for path in sorted(run.glob(f"seed-*/{CURVE}"))
     ]
@@ -93,6 +98,25 @@ def read_run(run: Path) -> dict[str, list[np.ndarray]]:
         for name, further in _CURVES.items()
         if all(name in row for rows in seeds for row in rows)
     }
+
+
+def _name_of(config: dict[str, Any]) -> str:
+    """Returns the label of a run of `train.navigate`."""
+    taught = config.get("teacher")
+    return f"{_DRIVEN}, {'PPO by reward' if taught is None else f'taught by {taught}'} (1 seed, its training episodes)"
+
+
+def _read_driven(run: Path) -> np.ndarray:
+    """Returns seconds and success of the last hundred episodes of training, `(n, 2)`, once there are a hundred.
+
+    Raises:
+        ConfigError: There is no such line.
+    """
+    rows = [json.loads(line) for line in (run / LOG).read_text().splitlines()]
+    curve = [(row["timing"]["seconds"], row["success_mean_100"]) for row in rows if row.get("episodes", 0) >= 100]
+    if not curve:
+        raise ConfigError(f"{run}: holds no hundred episodes of train.navigate")
+    return np.array(curve)
 
 
 def read_levels(path: Path, agents: tuple[str, ...]) -> dict[str, float]:
