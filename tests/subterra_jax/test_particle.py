@@ -201,3 +201,11 @@ def test_the_ceiling_takes_likelihoods_whole_about_a_start_and_drives_as_far_as_
     made = ceiling(params)
     assert made.filter.n_cells * made.filter.cell >= float(params.tunnel.length)
     assert made.sure_for == float("inf")
+
+
+def test_the_ceiling_takes_more_particles_where_fewer_get_lost():
+    counts = {
+        name: ceiling(st.make(f"Subterra/{name}-v1")[1]).localiser.n_particles
+        for name in ("StopAt", "Faulted", "Obstructed", "StopAtOffset")
+    }
+    assert counts["StopAt"] < counts["Faulted"] < counts["Obstructed"] == counts["StopAtOffset"]
