@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from subterra_jax.lidar import nvidia
 from subterra_jax.lidar.boxes import MOST_LINES, ROWS, Beams, boxes_kernel
 from subterra_jax.lidar.hits import hits_kernel
 from subterra_jax.tunnel import Tunnel
@@ -26,7 +27,7 @@ from subterra_jax.tunnel.packed import packed_blocks
 
 def supported(n_beams: int) -> bool:
     """Tell whether the kernels can run: on an NVIDIA GPU, with an even number of beams (opposite ones share a line)."""
-    return n_beams % 2 == 0 and jax.default_backend() == "gpu" and "nvidia" in jax.devices()[0].device_kind.lower()
+    return n_beams % 2 == 0 and nvidia.present()
 
 
 def scan(

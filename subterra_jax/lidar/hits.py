@@ -38,7 +38,7 @@ def hits_kernel(
         cos, sin = jnp.cos(heading), jnp.sin(heading)
         limit = jnp.full(shape, triton.load(limit_ref.at[jnp.int32(0)]))
         boxes = _Entered(beams, key_ref, row, first, wanted)
-        walls = _Walls(box_ref, start_ref, wall_ref, beams.n_pairs, x, y)
+        walls = Walls(box_ref, start_ref, wall_ref, beams.n_pairs, x, y)
 
         def first_block(keys):
             return walls.block(boxes.block(keys[0]), boxes.enters(keys[0], limit))
@@ -103,7 +103,7 @@ class _Entered(NamedTuple):
         return self.wanted & (key != NOTHING) & (self.beams.entry(key) <= nearest)
 
 
-class _Walls(NamedTuple):
+class Walls(NamedTuple):
     """The blocks of wall, as each thread sees them from its robot.
 
     Attributes:
@@ -134,7 +134,7 @@ class _Walls(NamedTuple):
 
     def corners(self, block, pair):
         """Return a vertex pair of each thread's block and the vertex behind it, from the middle of the block, m."""
-        pairs, start = self._pairs(block), WORDS * (block[WORDS] + pair)
+        pairs, start = self.pairs(block), WORDS * (block[WORDS] + pair)
         behind = load_words(self.wall_ref, start + WORDS, pair + 1 < pairs, 2)
         return load_words(self.wall_ref, start, pair < pairs) + behind
 
@@ -152,7 +152,7 @@ class _Walls(NamedTuple):
             stride: Pairs from one to the next of a thread.
             corners: The first ones, if they have been read.
         """
-        (m_x, m_y, *_), pairs, (d_x, d_y) = unpack(block[:WORDS]), self._pairs(block), direction
+        (m_x, m_y, *_), pairs, (d_x, d_y) = unpack(block[:WORDS]), self.pairs(block), direction
         m_x, m_y = m_x - self.x, m_y - self.y
         middle_left, middle_ahead = d_x * m_y - d_y * m_x, d_x * m_x + d_y * m_y
         joint = 2e-7 * (1.0 + jnp.abs(middle_ahead))
@@ -182,13 +182,13 @@ class _Walls(NamedTuple):
         rounds = (most(pairs) + stride - 1) // stride
         return lax.fori_loop(1, rounds, later, two_segments(lane, corners, nearest))
 
-    def _pairs(self, block):
+    def pairs(self, block):
         """Return the vertex pairs of each thread's block; none where it was not read."""
         pairs = all_if_full(counts(block[WORDS - 1])[0], ALL_PAIRS, self.n_pairs)
         return jnp.where(block[WORDS - 1] == 0, 0, pairs)
 
 
-def _look_everywhere(walls: _Walls, n_scan: int, first, unsure, direction, lane, nearest):
+def _look_everywhere(walls: Walls, n_scan: int, first, unsure, direction, lane, nearest):
     """Return the nearest hit in any block of the window whose box is entered, for beams that are `unsure`.
 
     They enter as many boxes as were kept, and meet no wall before the last of them, as beside a row of deep recesses.

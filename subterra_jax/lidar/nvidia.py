@@ -12,6 +12,11 @@ from jaxtyping import Array
 _MOST = 4  # words that one instruction reads or writes
 
 
+def present() -> bool:
+    """Tell whether this process computes on an NVIDIA GPU."""
+    return jax.default_backend() == "gpu" and "nvidia" in jax.devices()[0].device_kind.lower()
+
+
 def load_words(ref, start, mask=None, n_words: int = _MOST):
     """Return some words of each of many rows, read by one instruction; 0 where masked.
 
@@ -29,7 +34,9 @@ def load_words(ref, start, mask=None, n_words: int = _MOST):
         {} if mask is None else {"mask": jnp.broadcast_to(mask[..., None], column.shape), "other": 0}
     )
     words = triton.load(ref.at[start[..., None] + column], **masked)
-    return tuple(jnp.sum(jnp.where(column == i, words, jnp.zeros_like(words)), axis=-1) for i in range(n_words))
+    zero = jnp.zeros_like(words)
+    # Where JAX has 64 bits, it would sum words in as many.
+    return tuple(jnp.sum(jnp.where(column == i, words, zero), axis=-1, dtype=words.dtype) for i in range(n_words))
 
 
 def store_words(ref, start, words, mask):

@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants, native
+from subterra_jax.parts import fused_gap
 from subterra_jax.parts.part import Drive, Motion, Moved
 from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.state import EnvParams, State
@@ -89,8 +90,9 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
         Distance, m; exact up to 0.8 m, and exactly that where the truth is beyond.
     """
     first = tunnel.contact_first[node_at(tunnel, station)]
-    # The kernel knows 32 bits.
-    return _measured_gap(native.supported() and position.dtype == jnp.float32, tunnel.walls, position, first)
+    # The kernels know 32 bits.
+    by_kernel = (native.supported() or fused_gap.supported()) and position.dtype == jnp.float32
+    return _measured_gap(by_kernel, tunnel.walls, position, first)
 
 
 def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> Float[Array, ""]:
@@ -115,14 +117,20 @@ def _nearest_points(
 
 def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
     """Compute `clearance` of many points in one tunnel."""
-    from subterra_jax.native import calls  # numba is optional
+    kernels = {}
+    if fused_gap.supported():
+        kernels["cuda"] = _by(fused_gap.clearance)
+    if native.supported():
+        from subterra_jax.native import calls  # numba is optional
 
+        kernels["cpu"] = _by(calls.clearance)
     by_xla: Callable[..., Array] = jax.vmap(_gap, in_axes=(None, 0, 0))
+    return lax.platform_dependent(tunnel, position, first, **kernels, default=by_xla)
 
-    def by_kernel(tunnel: Tunnel, position: Array, first: Array) -> Array:
-        return vary_like(calls.clearance(tunnel, position, first), position, first)
 
-    return lax.platform_dependent(tunnel, position, first, cpu=by_kernel, default=by_xla)
+def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
+    """A kernel whose distances vary like the points."""
+    return lambda tunnel, position, first: vary_like(kernel(tunnel, position, first), position, first)
 
 
 _gap_by_kernel = rowwise(_gap, _gap_rows)
