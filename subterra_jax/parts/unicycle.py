@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants, native
+from subterra_jax.lidar import nvidia
 from subterra_jax.parts import fused_gap
 from subterra_jax.parts.part import Drive, Motion, Moved
 from subterra_jax.rows import rowwise, slope_along, vary_like
@@ -91,7 +92,7 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
     """
     first = tunnel.contact_first[node_at(tunnel, station)]
     # The kernels know 32 bits.
-    by_kernel = (native.supported() or fused_gap.supported()) and position.dtype == jnp.float32
+    by_kernel = (native.supported() or nvidia.present()) and position.dtype == jnp.float32
     return _measured_gap(by_kernel, tunnel.walls, position, first)
 
 
@@ -118,7 +119,7 @@ def _nearest_points(
 def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
     """Compute `clearance` of many points in one tunnel."""
     kernels = {}
-    if fused_gap.supported():
+    if nvidia.present():
         kernels["cuda"] = _by(fused_gap.clearance)
     if native.supported():
         from subterra_jax.native import calls  # numba is optional
