@@ -196,6 +196,8 @@ _PEERS = "benchmarks.throughput --n 65536 --peers jaxnav --seconds 8 --poses 625
 _LENGTHS = "benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths"
 _T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v0 --n 65536 --out out/stop"
 _MANY = "benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"
+_OPEN_STEP = "T1 of version 1 in 1,020 tunnels"
+_OPEN_MANY = "benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-999 --n 65536 (60 tunnels by a script)"
 _SPIN = (
     "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
     "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any "
@@ -273,6 +275,8 @@ CLAIMS = (
     Claim(_SPREAD, "233 M", 15.0, "at least", command=_T1_STEP, measured=_OUTSIDE_H200),
     Claim("with a spinning LiDAR", "3.3 M", 0.3, "at least", command=_SPIN, measured=_H100),
     Claim("100 different tunnels", "202 M", 15.0, "at least", command=_MANY, measured=_H200),
+    Claim(_OPEN_STEP, "164 M", 12.0, "at least", command=_OPEN_MANY, measured="one H200, 2026-11-26"),
+    Claim(_OPEN_STEP, "145 M", 12.0, "at least", command=_OPEN_MANY, measured="one H100, 2026-11-25"),
     Claim("planar LiDAR against embree", "0.09 mm", 0.01, job="rays", read=_rays(_PLANAR, "p50", 1e3)),
     Claim("planar LiDAR against embree", "99.95 %", 0.01, job="rays", read=_rays(_PLANAR, "within_1cm", 100.0)),
     Claim("planar LiDAR against embree", "2 µm", 1.0, "at most", job="rays", read=_rays(_TILTED, "p50", 1e6)),
@@ -333,5 +337,6 @@ SETTINGS = (
     (_CLOUDS, "within 10 cm"), (_STEP, "H200"), (_STEP, "N = 65,536"), ("planar LiDAR against embree", "within 1 cm"),
     (_FIVE_SEEDS, "90 % coverage and 100 % success of the last 100 episodes"),
     ("learnt from a teacher on a CPU", "500 listed episodes"), (_LEGS, "H200"), (_LEGS, "8,192 robots"),
-    ("PPO on 60 m", "90 % coverage and 100 % success"), (_OPEN, "within 1 m"), (_OPEN, "300 episodes"),
+    ("PPO on 60 m", "90 % coverage and 100 % success"), (_OPEN_STEP, "60 different tunnels, 17 copies of each"),
+    (_OPEN_STEP, "one H100"), ("float64 brute force", "320,000 rays in 60 tunnels, on an H200"), (_OPEN, "within 1 m"), (_OPEN, "300 episodes"),
 )  # fmt: skip
