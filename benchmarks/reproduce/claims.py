@@ -197,7 +197,11 @@ _LENGTHS = "benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths
 _T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v0 --n 65536 --out out/stop"
 _MANY = "benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"
 _OPEN_STEP = "T1 of version 1 in 1,020 tunnels"
-_OPEN_MANY = "benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-999 --n 65536 (60 tunnels by a script)"
+_OPEN_MANY = (
+    "benchmarks.throughput --task Subterra/StopAt-v1 --n 65536 --copies 17 --tunnel open:straight:train:0-9,"
+    "open:cast:train:0-9,open:sprayed:train:0-9,open:masonry:train:0-9,open:universal:test-unseen:0-9,"
+    "open:rock:test-unseen:0-9"
+)
 _SPIN = (
     "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
     "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any "
@@ -338,5 +342,6 @@ SETTINGS = (
     (_FIVE_SEEDS, "90 % coverage and 100 % success of the last 100 episodes"),
     ("learnt from a teacher on a CPU", "500 listed episodes"), (_LEGS, "H200"), (_LEGS, "8,192 robots"),
     ("PPO on 60 m", "90 % coverage and 100 % success"), (_OPEN_STEP, "60 different tunnels, 17 copies of each"),
-    (_OPEN_STEP, "one H100"), ("float64 brute force", "320,000 rays in 60 tunnels, on an H200"), (_OPEN, "within 1 m"), (_OPEN, "300 episodes"),
+    (_OPEN_STEP, "one H100"), ("float64 brute force", "320,000 rays in 60 tunnels, on an H200"),
+    (_OPEN, "within 1 m"), (_OPEN, "300 episodes"),
 )  # fmt: skip

@@ -1,24 +1,36 @@
 """Speed of the batched environment and of its peers, measured together with the exactness of its LiDAR.
 
 `python -m benchmarks.throughput --n 1024 4096 --lengths 351 3510 --linings smooth pockets furnished --out out/speed`
+`python -m benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-999 --n 65536`
 """
 
 import sys
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 import subterra_jax as st
-from benchmarks.command import run_main
+from benchmarks.command import BenchmarkError, run_main
 from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
-from benchmarks.throughput.measure import arithmetic_floor, environment_loop, floor_loop, measure_exactness
+from benchmarks.throughput.measure import (
+    arithmetic_floor,
+    environment_loop,
+    floor_loop,
+    measure_exactness,
+    measure_exactness_of_many,
+)
 from benchmarks.throughput.peers import Route, find_peers, measure_peer
 from benchmarks.throughput.timing import Timing, measure
 from benchmarks.throughput.variants import measure_lengths, measure_linings
 from subterra_jax.host.files import require_folder
+from train import tunnels
 
-_progress = Console(stderr=True, highlight=False)
+_WHOLE = "Subterra/Traverse-v0"  # whose piece is the whole tunnel
+_COMPARED = 8  # tunnels of several in which the LiDAR is compared
+_progress = Console(stderr=True, highlight=False, emoji=False)
 
 
 def run(config: ThroughputConfig) -> report.Result:
@@ -30,39 +42,87 @@ def run(config: ThroughputConfig) -> report.Result:
         FloatingPointError: An observation or a reward is not finite.
     """
     check(config)
+    if config.out is not None:
+        require_folder(config.out)
+    names = [config.tunnel] if config.tunnel is None else tunnels.names_of(config.tunnel)
+    return run_one(config) if len(names) * config.copies == 1 else run_many(config, names)
+
+
+def run_one(config: ThroughputConfig) -> report.Result:
+    """Measures in one tunnel, beside the peers that are installed, and as the tunnel gets longer or rougher."""
     peers = find_peers(config.peers)
     tunnel = config.scene / "tunnel.npz" if config.scene is not None and config.tunnel is None else config.tunnel
     plan = st.load_tunnel(tunnel)
-    env, params = st.make(config.task, plan, config.lining)
+    lining = config.lining or plan.default_lining
+    env, params = st.make(config.task, plan, lining)
     # The comparison with the reference and the paper's route use the whole tunnel, whichever piece the task uses.
-    whole = st.make("Subterra/Traverse-v0", plan, config.lining)[1]
-    for lining in config.linings:
-        plan.lining(lining)
-    if config.out is not None:
-        require_folder(config.out)
-    timing = Timing(config.steps, config.repeats, config.seconds, config.seed)
-    segments = len(plan.lining(config.lining).segments)
-    facts = {"name": plan.name, "length": plan.length, "lining": config.lining, "segments": segments}
-    result = report.Result(config, environment_facts(), facts, params.lidar.n_beams)
-    result.arithmetic = arithmetic_floor(result.environment["device"], result.n_beams)
+    whole = st.make(_WHOLE, plan, lining)[1]
+    for name in config.linings:
+        plan.lining(name)
+    segments = len(plan.lining(lining).segments)
+    facts = {"name": plan.name, "length": plan.length, "lining": lining, "segments": segments}
+    result, timing = _begin(config, facts, params)
     if config.poses:
         _progress.print(f"exactness: {config.poses:,} poses")
-        result.exactness = measure_exactness(plan, config.lining, whole, config.poses, config.seed)
-    for n_envs in config.sizes():
-        _progress.print(f"subterra: {n_envs:,} environments")
-        loop = environment_loop(env, params, n_envs)
-        result.speeds.append(measure(loop, n_envs, timing))
-        result.floor.append(measure(floor_loop(loop), n_envs, timing))
-    route = Route(plan, config.lining, whole, config.scene)
+        result.exactness = measure_exactness(plan, lining, whole, config.poses, config.seed)
+    _measure_speeds(result, env, params, timing)
+    route = Route(plan, lining, whole, config.scene)
     for name, peer in peers.items():
         result.peers.append(measure_peer(name, peer, config.sizes(), route, timing, _progress.print))
     if config.lengths:
         _progress.print("lengths")
-        result.lengths = measure_lengths(plan, config, timing)
+        result.lengths = measure_lengths(plan, lining, config, timing)
     if config.linings:
         _progress.print("linings")
         result.linings = measure_linings(plan, config, timing)
     return result
+
+
+def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
+    """Measures in several tunnels at once, one drawn each episode; the LiDAR is compared in the first few of them.
+
+    Raises:
+        BenchmarkError: Something is asked for that takes one tunnel.
+    """
+    for option in ("scene", "lengths", "linings"):
+        if getattr(config, option):
+            raise BenchmarkError(f"--{option} takes one tunnel, and {config.tunnel or 'the packaged one'} is several")
+    if set(config.peers) - {"auto", "none"}:
+        raise BenchmarkError(f"--peers are measured beside one tunnel, and {config.tunnel} is several")
+    _progress.print(f"{len(names)} tunnels")
+    made = tunnels.load(names, config.lining)
+    env, params = st.make(config.task, tunnel=made * config.copies)
+    lengths = np.broadcast_to(np.asarray(params.tunnel.length), (params.tunnel.count,))
+    facts = {
+        "name": config.tunnel or "packaged",
+        "tunnels": params.tunnel.count,
+        "length": float(lengths.mean()),
+        "lining": config.lining or "the usual one of each",
+    }
+    result, timing = _begin(config, facts, params)
+    if config.poses:
+        some = names[:_COMPARED]
+        _progress.print(f"exactness: {config.poses:,} poses in the first {len(some)}")
+        whole = st.make(_WHOLE, tunnel=made[: len(some)])[1]
+        result.exactness = measure_exactness_of_many(some, config.lining, whole, config.poses, config.seed)
+    _measure_speeds(result, env, params, timing)
+    return result
+
+
+def _begin(config: ThroughputConfig, facts: dict[str, Any], params: Any) -> tuple[report.Result, Timing]:
+    """Returns the results with nothing measured yet, and how it is timed."""
+    result = report.Result(config, environment_facts(), facts, params.lidar.n_beams)
+    result.arithmetic = arithmetic_floor(result.environment["device"], result.n_beams)
+    return result, Timing(config.steps, config.repeats, config.seconds, config.seed)
+
+
+def _measure_speeds(result: report.Result, env: Any, params: Any, timing: Timing) -> None:
+    """Measures each batch size, and the least that a loop of that size does."""
+    for n_envs in result.config.sizes():
+        _progress.print(f"subterra: {n_envs:,} environments")
+        loop = environment_loop(env, params, n_envs)
+        result.speeds.append(measure(loop, n_envs, timing))
+        result.floor.append(measure(floor_loop(loop), n_envs, timing))
 
 
 def run_and_report(config: ThroughputConfig) -> int:
@@ -73,7 +133,7 @@ def run_and_report(config: ThroughputConfig) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     # In a file or a pipe tables are not wrapped; a terminal knows its own width.
-    report.show(result, Console(highlight=False, width=None if sys.stdout.isatty() else 120))
+    report.show(result, Console(highlight=False, emoji=False, width=None if sys.stdout.isatty() else 120))
     if config.out is not None:
         write_file(config.out / "throughput.json", report.as_json(result).encode())
         write_file(config.out / "throughput.png", report.as_png(result))

@@ -25,10 +25,12 @@ class ThroughputConfig:
         n: Batch sizes to measure; 1 to 262,144 if not given, on a CPU to 4,096.
         peers: Other environments to measure: `auto` (all installed), `none`, or names, which must be installed.
         task: Task id.
-        tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given.
+        tunnel: Tunnel file, or the name of a packaged one; the packaged default if not given. Several names, as
+            `open:cast:train:0-9` or with commas between: each episode draws one of them.
+        copies: Copies of each tunnel, in memory of their own.
         scene: Scene folder for the paper's route, with its own `tunnel.npz` unless `tunnel` is given. Without it,
             MuJoCo gets the tunnel's walls, extruded.
-        lining: Variant of the walls.
+        lining: Variant of the walls; the tunnel's usual one if not given.
         lengths: Tunnel lengths to compare, m; a tunnel too short is continued by mirrored copies.
         linings: Variants of the walls to compare.
         study_n: Batch size of those comparisons; 65,536 if not given, on a CPU 1,024.
@@ -44,8 +46,9 @@ class ThroughputConfig:
     peers: tuple[PeerChoice, ...] = ("auto",)
     task: str = "Subterra/Traverse-v0"
     tunnel: str | None = None
+    copies: int = 1
     scene: Path | None = None
-    lining: str = "pockets"
+    lining: str | None = None
     lengths: tuple[float, ...] = ()
     linings: tuple[str, ...] = ()
     study_n: int | None = None
@@ -75,7 +78,7 @@ def check(config: ThroughputConfig) -> None:
     Raises:
         BenchmarkError: An option is out of range; the message names it with its value.
     """
-    for name, least in (("steps", 1), ("repeats", 1), ("poses", 0), ("seed", 0)):
+    for name, least in (("copies", 1), ("steps", 1), ("repeats", 1), ("poses", 0), ("seed", 0)):
         if getattr(config, name) < least:
             raise BenchmarkError(f"--{name} must be at least {least}, got {getattr(config, name)}")
     for size in (*config.n, config.study_size()):

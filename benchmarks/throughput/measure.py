@@ -112,3 +112,29 @@ def measure_exactness(
         for rows in np.array_split(np.arange(n_poses), max(1, n_poses // _BATCH))
     ]
     return reference.agreement(plan.lining(lining).segments, poses, np.concatenate(ranges))
+
+
+def measure_exactness_of_many(
+    names: list[str], lining: str | None, params: st.EnvParams, n_poses: int, seed: int
+) -> reference.Agreement:
+    """Compares the LiDAR in several tunnels that are in memory together, each as `measure_exactness` does.
+
+    Args:
+        names: Names of the tunnels.
+        lining: Variant of their walls; None is the usual one of each.
+        params: Params of an environment made of these tunnels, in this order.
+        n_poses: Random poses, spread over the tunnels.
+        seed: Seed for the poses.
+    """
+    found = []
+    for index, name in enumerate(names):
+        plan, here = st.load_tunnel(name), params.replace(tunnel=params.tunnel.pick(index))
+        found.append(
+            measure_exactness(plan, lining or plan.default_lining, here, -(-n_poses // len(names)), seed + index)
+        )
+    return reference.Agreement(
+        n_rays=sum(each.n_rays for each in found),
+        max_error=max(each.max_error for each in found),
+        n_ambiguous=sum(each.n_ambiguous for each in found),
+        n_wrong=sum(each.n_wrong for each in found),
+    )

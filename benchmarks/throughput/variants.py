@@ -35,15 +35,15 @@ class Variant:
     exactness: Agreement | None
 
 
-def measure_lengths(plan: st.TunnelPlan, config: ThroughputConfig, timing: Timing) -> list[Variant]:
+def measure_lengths(plan: st.TunnelPlan, lining: str, config: ThroughputConfig, timing: Timing) -> list[Variant]:
     """Measures a step by length of tunnel; every call starts with robots spread along the tunnel."""
-    bare = replace(plan, linings={config.lining: plan.lining(config.lining)})  # other linings take long to cut
+    bare = replace(plan, linings={lining: plan.lining(lining)})  # other linings take long to cut
     plans = [extend_tunnel(bare, length) for length in config.lengths]
-    made = [st.make(_TASK, each, config.lining) for each in plans]
+    made = [st.make(_TASK, each, lining) for each in plans]
     loops = [spread_loop(env, params, config.study_size()) for env, params in made]
     speeds = measure_in_turn(loops, config.study_size(), timing, restart=True)
-    gates = [_gate(each, config.lining, params, config) for each, (_, params) in zip(plans, made, strict=True)]
-    sizes = [len(each.lining(config.lining).segments) for each in plans]
+    gates = [_gate(each, lining, params, config) for each, (_, params) in zip(plans, made, strict=True)]
+    sizes = [len(each.lining(lining).segments) for each in plans]
     return _variants([f"{length:g} m" for length in config.lengths], sizes, speeds, gates)
 
 

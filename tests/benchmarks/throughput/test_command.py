@@ -65,6 +65,26 @@ def test_a_mistake_is_one_sentence_and_status_2(monkeypatch, capsys, arguments, 
     assert named in line
 
 
+def test_several_tunnels_are_measured_together_and_compared_one_by_one(tmp_path, monkeypatch, capsys):
+    quick = ("--n", "4", "--steps", "1", "--repeats", "1", "--poses", "20")
+    several = ("--task", "Subterra/StopAtShort-v1", "--tunnel", "open:cast:train:0-1", "--copies", "2")
+    assert run_here(monkeypatch, *quick, *several, "--out", str(tmp_path)) == 0
+    result = json.loads((tmp_path / "throughput.json").read_text())
+    assert result["tunnel"]["tunnels"] == 4
+    assert result["exactness"]["n_rays"] == 320
+    assert result["exactness"]["n_wrong"] == 0
+    assert ":train:" in capsys.readouterr().out, "a part of the name was taken for a picture"
+    true_scan = measure.lidar.scan
+    monkeypatch.setattr(measure.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
+    assert run_here(monkeypatch, *quick, *several) == 1
+
+
+@pytest.mark.parametrize("option", [("--lengths", "60"), ("--linings", "built"), ("--peers", "mujoco")])
+def test_what_takes_one_tunnel_is_refused_in_several(monkeypatch, capsys, option):
+    assert run_here(monkeypatch, "--n", "2", "--tunnel", "open:cast:train:0-1", *option) == 2
+    assert f"error: {option[0]}" in capsys.readouterr().err
+
+
 def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "gymnax", None)
     assert run_here(monkeypatch, "--peers", "gymnax") == 2
