@@ -61,18 +61,9 @@ def record_drives(
         speed: The full speed, m/s; None is that of the vehicle.
     """
     keys = jax.random.split(key, 4)
-    draws = env.draw_reset(keys[0], (n_envs,), params)
     speed_max = params.vehicle.speed_max if speed is None else speed
     room = speed_max * params.vehicle.period * n_steps * 1.1 + 20.0
-
-    def begin(draws: Any, key: PRNGKeyArray) -> Any:
-        state = env.begin(draws, params)
-        uniform = jax.random.uniform(key, (2,))
-        anywhere = uniform[1] * jnp.maximum(params.tunnel.pick(state.tunnel).length - room, 0.0)
-        station = jnp.where((uniform[0] < _AT_MOUTH) | from_mouth, jnp.nan, anywhere)
-        return env.begin({**draws, "choice": Choice(station=station)}, params)
-
-    state = jax.vmap(begin)(draws, jax.random.split(keys[1], n_envs))
+    state = _starts(env, params, keys, n_envs, room, from_mouth)
     pace = jax.vmap(_pace)(jax.random.split(keys[2], n_envs))
 
     def look(state: Any, noise: Any) -> Any:
@@ -110,6 +101,20 @@ def record_drives(
     (state, *_), (record, station) = jax.lax.scan(step, carry, jnp.arange(n_steps))
     record = jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), record)
     return Drive(record, jnp.swapaxes(station, 0, 1) - start[:, None], start, state.tunnel)
+
+
+def _starts(env: Any, params: Any, keys: Array, n: int, room: Any, from_mouth: bool) -> Any:
+    """Returns states to drive from: some where the task starts, the others anywhere with `room` m before them."""
+    draws = env.draw_reset(keys[0], (n,), params)
+
+    def begin(draws: Any, key: PRNGKeyArray) -> Any:
+        state = env.begin(draws, params)
+        uniform = jax.random.uniform(key, (2,))
+        anywhere = uniform[1] * jnp.maximum(params.tunnel.pick(state.tunnel).length - room, 0.0)
+        station = jnp.where((uniform[0] < _AT_MOUTH) | from_mouth, jnp.nan, anywhere)
+        return env.begin({**draws, "choice": Choice(station=station)}, params)
+
+    return jax.vmap(begin)(draws, jax.random.split(keys[1], n))
 
 
 def _steerings(steering: Any, key: PRNGKeyArray, n: int, speed_max: Any, as_it_is: bool) -> Any:
