@@ -14,6 +14,7 @@ from subterra_jax.lidar3d import beams, casting, finding, fused, march, relay
 from subterra_jax.lidar3d.relief import Relief, stack_reliefs
 from subterra_jax.lidar3d.surface import BOX_CORNERS, BOX_FACES, Axis, Triangles
 from tests.subterra_jax import surfaces
+from tests.subterra_jax.lowering import for_nvidia
 
 RADIUS, LENGTH = 2.0, 60.0
 N_SCANS, N_BEAMS = 32, 16
@@ -206,7 +207,6 @@ def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monke
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(fused, "supported", lambda: True)
     monkeypatch.setattr(finding, "device_memory", lambda: None)
-    check = jax.export.DisabledSafetyCheck.custom_call("__gpu$xla.gpu.triton")
 
     def ranges(relief, origin, way, station):
         meet = jax.vmap(casting.meet, (None, 0, None, 0, None))
@@ -217,8 +217,7 @@ def test_the_kernel_for_scans_lowers_for_a_gpu_and_serves_a_batch(reliefs, monke
         jnp.asarray(beams.spinning(np.linspace(-0.2, 0.2, 2), 32)).reshape(2, 32, 3),
         jnp.full(4, 20.0),
     )
-    made = jax.export.export(jax.jit(ranges), platforms=["cuda"], disabled_checks=[check])(reliefs["things"], *rows)
-    assert made.mlir_module().count("triton") == 1
+    assert for_nvidia(ranges, reliefs["things"], *rows).count("triton") == 1
 
 
 @pytest.mark.parametrize("find", [finding.facing_in_step, fused.find_facing])
