@@ -84,11 +84,10 @@ def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
     Raises:
         BenchmarkError: Something is asked for that takes one tunnel.
     """
-    for option in ("scene", "lengths", "linings"):
-        if getattr(config, option):
-            raise BenchmarkError(f"--{option} takes one tunnel, and {config.tunnel or 'the packaged one'} is several")
-    if set(config.peers) - {"auto", "none"}:
-        raise BenchmarkError(f"--peers are measured beside one tunnel, and {config.tunnel} is several")
+    peers = set(config.peers) - {"auto", "none"}
+    asked: dict[str, Any] = {"scene": config.scene, "lengths": config.lengths, "linings": config.linings, "peers": peers}
+    for option in (name for name, value in asked.items() if value):
+        raise BenchmarkError(f"--{option} takes one tunnel, and there are {len(names) * config.copies}")
     _progress.print(f"{len(names)} tunnels")
     made = tunnels.load(names, config.lining)
     env, params = st.make(config.task, tunnel=made * config.copies)

@@ -105,23 +105,42 @@ def boxes_kernel(
         lines = [direction_of(turn_ref, line + j, beams.n, cos, sin) for j in range(width)]
         window = all_if_full(unpack(load_words(box_ref, WORDS * first))[-1], ALL_WINDOW, beams.n_scan)
 
-        def load(number):
-            return load_words(box_ref, WORDS * (first + number), number < window)
-
-        def one_box(i, carry):
-            best, words = carry
-            number = lane + i * LANES
-            following = load(number + LANES)  # while this one is worked on
+        def one_box(number, words, best):
             keys = _entries(beams, unpack(words), number, number < window, x, y, lines)
-            return tuple(_inserted(*pair) for pair in zip(best, keys, strict=True)), following
+            return tuple(_inserted(*pair) for pair in zip(best, keys, strict=True))
 
         nothing = tuple(jnp.full(shape, NOTHING) for _ in range(_kept(beams.n_best)))
         n_rounds = (most(window) + LANES - 1) // LANES
-        best, _ = lax.fori_loop(0, n_rounds, one_box, ((nothing,) * (2 * width), load(lane)))
+        best = over_boxes(box_ref, first, window, n_rounds, lane, one_box, (nothing,) * (2 * width))
         for sense in range(2):
             first_boxes = [_first_of_all(kept, beams.n_best) for kept in best[sense::2]]
             beam = sense * (beams.n // 2) + line + lane
             _write_keys(key_ref, (row * beams.n + beam) * beams.n_words, first_boxes, lane)
+
+
+def over_boxes(box_ref, first, window, n_rounds, lane, one_box, start):
+    """Return what comes of all boxes of a window; each thread has every eighth of them.
+
+    Args:
+        box_ref: Words of the boxes.
+        first: First block of each thread's window.
+        window: Blocks of the window.
+        n_rounds: Rounds of a box a thread that the longest window takes.
+        lane: First box of each thread.
+        one_box: What a box makes of its number, its words (zeros beyond the window) and what came of those before it.
+        start: What is there before the first.
+    """
+
+    def load(number):
+        return load_words(box_ref, WORDS * (first + number), number < window)
+
+    def one_round(i, carry):
+        found, words = carry
+        number = lane + i * LANES
+        following = load(number + LANES)  # while this one is worked on
+        return one_box(number, words, found), following
+
+    return lax.fori_loop(0, n_rounds, one_round, (start, load(lane)))[0]
 
 
 def _entries(beams: Beams, box, number, there, x, y, lines):

@@ -13,17 +13,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from subterra_jax.lidar.boxes import length_of
+from subterra_jax.lidar.boxes import LANES, ROWS, length_of, over_boxes
+from subterra_jax.lidar.cast import NOTHING
 from subterra_jax.lidar.hits import Walls
 from subterra_jax.lidar.nvidia import any_thread, load_words, most
 from subterra_jax.tunnel import CONTACT_REACH, Tunnel
 from subterra_jax.tunnel.packed import WORDS, packed_blocks, unpack
 
-# Points of one program, a warp of 32 threads, and threads of one point. Two points of 16 threads are 2 % slower (H200).
-ROWS, LANES = 4, 8
 # Distance from a box up to which its walls are looked at, m: the reach, and more than rounding.
 _NEAR = CONTACT_REACH + 1e-3
-_NOTHING = 2**31 - 1
 
 
 def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
@@ -86,19 +84,13 @@ def gap_kernel(
     x, y = load_words(position_ref, 2 * row, n_words=2)
     walls = Walls(box_ref, start_ref, wall_ref, n_pairs, x, y)
 
-    def load(number):
-        return load_words(box_ref, WORDS * (first + number), number < n_contact)
-
-    def one_box(i, carry):
-        squared, words = carry
-        number = lane + i * LANES
-        following = load(number + LANES)  # while this one is worked on
+    def one_box(number, words, squared):
         near = (number < n_contact) & _is_near(words, x, y)
         look = partial(_look, walls, first, number, near, lane, squared)
-        return lax.cond(any_thread(near), look, lambda: squared), following
+        return lax.cond(any_thread(near), look, lambda: squared)
 
     n_rounds = -(-n_contact // LANES)
-    squared, _ = lax.fori_loop(0, n_rounds, one_box, (jnp.full(shape, jnp.inf, jnp.float32), load(lane)))
+    squared = over_boxes(box_ref, first, n_contact, n_rounds, lane, one_box, jnp.full(shape, jnp.inf, jnp.float32))
     gap = jnp.minimum(jnp.sqrt(jnp.min(squared, axis=1, keepdims=True)), CONTACT_REACH)
     triton.store(gap_ref.at[row], jnp.broadcast_to(gap, shape))
 
@@ -127,12 +119,12 @@ def _look(walls: Walls, first, number, near, lane, squared):
 
     def after(last):
         """Return the near block of each point that comes after one."""
-        least = jnp.min(jnp.where(near & (number > last), number, _NOTHING), axis=1, keepdims=True)
+        least = jnp.min(jnp.where(near & (number > last), number, NOTHING), axis=1, keepdims=True)
         return jnp.broadcast_to(least, number.shape)
 
     def one_block(_, carry):
         squared, current = carry
-        there = current != _NOTHING
+        there = current != NOTHING
         block = walls.block(first + jnp.where(there, current, 0), there)
         return _measure(walls, block, lane, squared), after(current)
 
