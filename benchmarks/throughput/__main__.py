@@ -84,8 +84,8 @@ def run_many(config: ThroughputConfig, names: list[Any]) -> report.Result:
     Raises:
         BenchmarkError: Something is asked for that takes one tunnel.
     """
-    peers = set(config.peers) - {"auto", "none"}
-    asked: dict[str, Any] = {"scene": config.scene, "lengths": config.lengths, "linings": config.linings, "peers": peers}
+    asked: dict[str, Any] = {name: getattr(config, name) for name in ("scene", "lengths", "linings")}
+    asked["peers"] = set(config.peers) - {"auto", "none"}
     for option in (name for name, value in asked.items() if value):
         raise BenchmarkError(f"--{option} takes one tunnel, and there are {len(names) * config.copies}")
     _progress.print(f"{len(names)} tunnels")
