@@ -14,11 +14,12 @@ from flax import struct
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import commanded_cloud, log_weights, move, resample, summarise, weigh_odometer
+from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import FilterMemory, ParticleLocaliser, Relocaliser
 from subterra_jax.baselines.reckoning import Reckoning, reckon, unobserved_distance
-from subterra_jax.baselines.scanmodel import ExactParams, ScanModel, exact_likelihood, fit
+from subterra_jax.baselines.scanmodel import ScanModel, fit
 from subterra_jax.baselines.stations import Driven, Station
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.parts.faults import MAX_DELAY, N_SEVERITIES
@@ -60,7 +61,7 @@ class ExactLocaliser(ParticleLocaliser):
         cloud = move(move_key, told, walls, distance, turn, motion)
         _, pose = fit(walls, cloud.pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
         cloud = dataclasses.replace(cloud, pose=pose)
-        cloud = log_weights(cloud, heard + exact_likelihood(pose, obs.ranges, params, self.exact), motion)
+        cloud = log_weights(cloud, heard + exact_likelihood(walls, pose, obs.ranges, params, self.exact), motion)
         summary = summarise(cloud, motion)
         station = summary.station + unobserved_distance(reckoning, period) * jnp.cos(summary.heading)
         direction = jnp.where(jnp.cos(summary.heading) > 0.0, 1.0, -1.0)

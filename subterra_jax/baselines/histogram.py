@@ -19,10 +19,11 @@ from jaxtyping import Array, Float
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
 from subterra_jax.baselines.cloud import cloud_params, move_pose
+from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import Relocaliser
 from subterra_jax.baselines.reckoning import Reckoning, begin_reckoning, odometer_share, reckon, unobserved_distance
-from subterra_jax.baselines.scanmodel import ExactParams, ScanModel, TunnelPose, exact_likelihood, fit, fit_roughly
+from subterra_jax.baselines.scanmodel import ScanModel, TunnelPose, fit, fit_roughly
 from subterra_jax.baselines.stations import Driven, Localiser, Station, told_start
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.baselines.wallmap import WallMap, wall_map
@@ -189,7 +190,7 @@ class HistogramLocaliser(Localiser):
         now = dataclasses.replace(memory, way=way, reckoning=reckoning)
         pose = move_pose(walls, self._poses(memory), distance, turn)
         _, pose = fit(walls, dataclasses.replace(pose, station=self._stations(now)), obs.ranges, range_max, self.scan)
-        log_mass = jnp.log(mass) + self._score(pose, obs, params)[:, None, :]
+        log_mass = jnp.log(mass) + self._score(walls, pose, obs, params)[:, None, :]
         log_mass = _normalised(log_mass)
         now = dataclasses.replace(now, log_mass=log_mass, lateral=pose.lateral, heading=pose.heading)
         return self._estimate(now, reckoning, params), now
@@ -247,10 +248,10 @@ class HistogramLocaliser(Localiser):
         share = jnp.where(size > 0.0, jnp.minimum((noise.step_sigma / self.cell) ** 2, 0.5), 0.0)
         return jnp.maximum(_spread(mass, share, axis=2), np.float32(np.exp(_FLOOR)))
 
-    def _score(self, pose: TunnelPose, obs: Observed, params: EnvParams) -> Float[Array, "ways n"]:
+    def _score(self, walls: WallMap, pose: TunnelPose, obs: Observed, params: EnvParams) -> Float[Array, "ways n"]:
         """Computes the log likelihood of a scan in every cell."""
         flat = jax.tree.map(jnp.ravel, pose)
-        gain = exact_likelihood(flat, obs.ranges, params, self.exact).reshape(pose.station.shape)
+        gain = exact_likelihood(walls, flat, obs.ranges, params, self.exact).reshape(pose.station.shape)
         return jnp.where((pose.station > 0.0) & (pose.station < params.tunnel.length), gain, gain.max() + _OUTSIDE)
 
     def _estimate(self, memory: HistogramMemory, reckoning: Reckoning, params: EnvParams) -> Station:

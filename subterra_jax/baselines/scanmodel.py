@@ -1,24 +1,18 @@
 """Likelihood of a LiDAR scan at many poses in a mapped tunnel.
 
-`fit` compares the end of each beam with the mapped wall at its station, and casts no ray; `exact_likelihood` casts the
-whole scan in the walls at each pose.
+`fit` compares the end of each beam with the mapped wall at its station, and casts no ray; `exactscan` does.
 """
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float
 
-from subterra_jax import lidar
 from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.lidar import bearings
-from subterra_jax.state import EnvParams
-from subterra_jax.tunnel import at_station
 
-_ECHO = 1e-3  # m below `range_max`: no echo
 _SIDEWAYS = 0.3  # sine from which on a beam looks at a wall, not along it
 _ROUGH_INFLATIONS = (10.0, 6.0, 3.0, 1.5, 1.0)
 
@@ -156,7 +150,8 @@ def fit(
     square = residual * residual / variance
     # Cauchy's weight: a large residual pulls little, but enough for a lost pose to come back.
     weight = jnp.where(useful, 1.0 / (variance * (1.0 + square / 6.0)), 0.0)
-    shift, turn = least_squares_step(residual, ends.along, weight, model, inflation)
+    sigma = inflation * model.lateral_sigma, inflation * model.heading_sigma
+    shift, turn = least_squares_step(residual, ends.along, weight, sigma)
     residual = residual + shift + ends.along * turn
     each = _log_mixture(residual * residual / variance, variance, model)
     # An echo from beyond a mouth, or no echo from a wall, is unlikely.
@@ -182,13 +177,15 @@ def least_squares_step(
     residual: Float[Array, "n_beams *n"],
     along: Float[Array, "n_beams *n"],
     weight: Float[Array, "n_beams *n"],
-    model: ScanModel,
-    inflation: float = 1.0,
+    sigma: tuple[float, float],
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """Computes the shift (m) and turn (rad) that minimise the weighted squares of `residual + shift + along * turn`."""
-    a = jnp.sum(weight, axis=0) + (inflation * model.lateral_sigma) ** -2
+    """Computes the shift (m) and turn (rad) that minimise the weighted squares of `residual + shift + along * turn`.
+
+    `sigma` are their standard deviations before: they are drawn towards 0 by them.
+    """
+    a = jnp.sum(weight, axis=0) + sigma[0] ** -2
     b = jnp.sum(weight * along, axis=0)
-    c = jnp.sum(weight * along * along, axis=0) + (inflation * model.heading_sigma) ** -2
+    c = jnp.sum(weight * along * along, axis=0) + sigma[1] ** -2
     p, q = jnp.sum(weight * residual, axis=0), jnp.sum(weight * along * residual, axis=0)
     # The sum of two positive definite parts cannot vanish.
     determinant = a * c - b * b
@@ -206,48 +203,3 @@ def _log_mixture(
     """Log density of a residual, of which `square` is the square over the variance."""
     normal = (1.0 - model.outlier_share) * jnp.exp(-0.5 * square) / jnp.sqrt(2.0 * jnp.pi * variance)
     return jnp.log(normal + _outlier_density(model))
-
-
-@struct.dataclass
-class ExactParams:
-    """Likelihood of a scan that was cast at a particle.
-
-    Attributes:
-        pose_sigma: Standard deviation that a particle's offset and heading add to a range, m.
-        power: Exponent of the likelihood: scans share the errors of the particles.
-        lost: Share of the echoes that are lost or false, where there are faults; elsewhere a tenth of it.
-    """
-
-    pose_sigma: float = 0.02
-    power: float = 0.5
-    lost: float = 0.2
-
-
-def exact_likelihood(
-    pose: TunnelPose, ranges: Float[Array, "n_beams"], params: EnvParams, exact: ExactParams
-) -> Float[Array, "n"]:
-    """Compute the log likelihood of a scan at many poses, each by casting its beams in the walls.
-
-    Args:
-        pose: Poses, each field `(n,)`.
-        ranges: The scan, m.
-        params: The task in the tunnel that the robot is in.
-        exact: Settings of the likelihood.
-    """
-    tunnel, sensor = params.tunnel, params.lidar
-
-    def cast(station: Array, lateral: Array, heading: Array) -> Array:
-        x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
-        position = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x])
-        return lidar.scan(tunnel, position, heading + jnp.arctan2(tangent_y, tangent_x), station, sensor)
-
-    expected = jax.vmap(cast)(pose.station, pose.lateral, pose.heading)
-    lost = exact.lost if "faults" in params.parts else 0.1 * exact.lost
-    lost = exact.lost if "obstacles" in params.parts else lost
-    variance = jnp.asarray(sensor.range_sigma) ** 2 + exact.pose_sigma**2
-    square = (ranges - expected) ** 2 / variance
-    normal = jnp.exp(-0.5 * square) / jnp.sqrt(2.0 * jnp.pi * variance)
-    seen = jnp.log((1.0 - lost) * normal + lost / jnp.asarray(sensor.range_max))
-    silent, empty = ranges >= sensor.range_max - _ECHO, expected >= sensor.range_max - _ECHO
-    nothing = jnp.where(empty, jnp.log1p(-0.5 * lost), jnp.log(0.5 * lost))
-    return exact.power * jnp.sum(jnp.where(silent[None], nothing, seen), axis=-1)

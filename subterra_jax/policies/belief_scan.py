@@ -119,5 +119,5 @@ def _fit_residuals(
         left_over = residual + shift + ends.along * turn
         # Cauchy's weight, as in the particle filter: a pocket that is missing has little influence.
         weight = jnp.where(useful, 1.0 / (variance * (1.0 + left_over * left_over / (6.0 * variance))), 0.0)
-        shift, turn = least_squares_step(residual, ends.along, weight, _PRIOR)
+        shift, turn = least_squares_step(residual, ends.along, weight, (_PRIOR.lateral_sigma, _PRIOR.heading_sigma))
     return side * (residual + shift + ends.along * turn)
