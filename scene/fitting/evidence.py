@@ -2,6 +2,9 @@
 
 What stands out between two rails is a row of sleepers only where its gaps are alike: rubble leaves gaps of any size.
 
+A hole by itself is a pocket where it looks like the clear ones: the cells about it lack as much of the wall, and have
+returns behind it as often. A pocket mortared flush, or a wall that is thin by chance, does not.
+
 Strays, shadows of pillars and a wall that was fitted too far in all make holes with returns behind them. A shadow has
 no rim: the wall beside it is missing as well. Strays leave most places of a row empty, and their pitch is the best of
 the many that were tried.
@@ -9,21 +12,30 @@ the many that were tried.
 Pockets of turned rings fill no rows. They need a pitch that all clear holes of the wall agree on, each place of the
 bore counted once whatever stands around it, few holes elsewhere, and most rings.
 
-Source: Rayleigh's test of uniformity, `P(|mean wave| > c) = exp(-p c²)` for p phases, over the independent pitches;
-Buccheri's over the first harmonics; binomial test for gaps.
+Source: the ratio of likelihoods (Neyman and Pearson 1933); Rayleigh's test of uniformity, `P(|mean wave| > c) =
+exp(-p c²)` for p phases, over the independent pitches; Buccheri's over the first harmonics; binomial test for gaps.
 """
 
 import numpy as np
 from jaxtyping import Float, Shaped
-from scipy.ndimage import uniform_filter
-from scipy.special import bdtrc
+from scipy.ndimage import binary_dilation, uniform_filter
+from scipy.special import bdtrc, expit, logit, logsumexp
 from scipy.stats import chi2
 
+from scene.fitting.mould import CLEAR, MODES, Holes, patches
+from scene.fitting.section import Sections
 from scene.fitting.turned import N_HARMONICS, NEAR_PLACE, Ring, agreement, one_a_bin
 from scene.fitting.unroll import Grid
 
 _BEYOND_RIM = 2  # cells beyond the edge of a hole in which the wall must stand again
-_MODES = ("nearest", "wrap")
+_BEHIND = 0.055  # m, four to five standard deviations of a wall: a return further out lies behind it
+_EXPECTED = (31, 21)  # cells of 5 cm × 1° over which the wall is alike
+_LEAST_BEHIND = 1 / (_EXPECTED[0] * _EXPECTED[1])  # share of the wall's cells with a return behind: one among them
+_MOUTH = (9, 7)  # cells about the middle of a hole that are no wall
+_PRIOR = 1.0  # points on the wall, or holes, that a cell of the looks starts with as wall
+_SHIFTS = [(row, column) for row in (-1, 0, 1) for column in (-1, 0, 1)]
+_SAME_PLACE = 0.05  # m along the rings
+_ROUNDS = 8  # after which the odds hardly change
 _CHANCE = 1e-4  # probability that random stations have a pitch as clear as the one found
 _MIN_FILLED = 0.2  # of the places that rows and joints make; a true lining fills most, a staggered one half
 _MIN_IN_PLACE = 0.5  # of the clear holes beyond those that chance puts there
@@ -51,7 +63,7 @@ def open_rims(
         size: Length and width of a hole, m.
         radius: Distance of the wall from the axis, m.
     """
-    smooth = uniform_filter(deficit, (3, 3), mode=_MODES)
+    smooth = uniform_filter(deficit, (3, 3), mode=MODES)
     reach = (size[0] / 2 / grid.step, size[1] / 2 / (2 * np.pi * radius / grid.columns))
     sides = []
     for along, around in ((-1, 0), (1, 0), (0, -1), (0, 1)):
@@ -59,6 +71,92 @@ def open_rims(
         beside = np.rint(column + around * (reach[1] + _BEYOND_RIM)).astype(np.intp)
         sides.append(smooth[np.clip(at, 0, grid.rows - 1), beside % grid.columns])
     return np.mean(sides, axis=0)
+
+
+def pocket_over_wall(sections: Sections, holes: Holes, size: tuple[float, float]) -> Float[np.ndarray, " p"]:
+    """Return how much likelier the returns about each hole are with a pocket there than with wall, as a logarithm.
+
+    A cell has points on the wall by Poisson's law, of the mean that the wall around has, or of the share of it that
+    clear holes leave; and has returns behind the wall as often as the wall around or, more, as clear holes do. The
+    middle may be a cell off, each way as likely. Without clear holes the result is 0 throughout.
+
+    Args:
+        sections: The wall, and what was measured of it.
+        holes: Holes, with the middle of each.
+        size: Length along and width around of the pockets, m: with a cell of rim, the cells that tell.
+
+    Cells are taken as independent.
+    """
+    points, chance = _wall_around(sections, holes)
+    fields = sections.support, points, (sections.deepest > _BEHIND).astype(float), chance
+    across = 2 * np.pi * float(np.median(sections.radius)) / sections.grid.columns
+    reach = round(0.5 * size[0] / sections.grid.step) + 1, round(0.5 * size[1] / across) + 1
+    left, hollow = _looks_of(holes.where(holes.score > CLEAR), fields, reach)
+    ratios = []
+    for row, column in _SHIFTS:
+        at = Holes(holes.row + row, holes.column + column, holes.score)
+        found, expected, behind, by_chance = (patches(field, at, *reach) for field in fields)
+        on_wall = found * np.log(left) + expected * (1 - left)
+        share = 1 - (1 - hollow) * (1 - by_chance)
+        beyond = behind * np.log(share / by_chance) + (1 - behind) * np.log((1 - share) / (1 - by_chance))
+        ratios.append((on_wall + beyond).sum(axis=(1, 2)))
+    return np.asarray(logsumexp(ratios, axis=0) - np.log(len(ratios)))
+
+
+def _wall_around(
+    sections: Sections, holes: Holes
+) -> tuple[Float[np.ndarray, "rows cols"], Float[np.ndarray, "rows cols"]]:
+    """Points on the wall that each cell would have without a hole, and the chance of a return behind it."""
+    columns = sections.grid.columns
+    cells = np.zeros(sections.radius.shape, bool)
+    cells[np.clip(holes.row, 0, len(cells) - 1), holes.column % columns] = True
+    cells = binary_dilation(np.concatenate([cells] * 3, axis=1), np.ones(_MOUTH))[:, columns : 2 * columns]
+    wall = (~cells).astype(float)
+    share = np.maximum(uniform_filter(wall, _EXPECTED, mode=MODES), _LEAST_BEHIND)
+    seen = (sections.deepest > _BEHIND) * wall
+    points = uniform_filter(sections.support * wall, _EXPECTED, mode=MODES) / share
+    behind = uniform_filter(seen, _EXPECTED, mode=MODES) / share
+    return np.maximum(points, 0.0), np.clip(behind, _LEAST_BEHIND, 0.5)
+
+
+def _looks_of(
+    clear: Holes, fields: tuple[np.ndarray, ...], reach: tuple[int, int]
+) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
+    """Share of the wall's points that clear holes leave in each cell, and the chance that they show one behind it.
+
+    `fields` are points on the wall, those without a hole, whether one lies behind, and the chance of it without a hole.
+    """
+    found, expected, behind, by_chance = (patches(field, clear, *reach).sum(axis=0) for field in fields)
+    left = (found + _PRIOR) / (expected + _PRIOR)
+    wall = (by_chance + _PRIOR * _LEAST_BEHIND) / (len(clear.row) + _PRIOR)
+    share = (behind + _PRIOR * wall) / (len(clear.row) + _PRIOR)
+    return left, np.clip((share - wall) / (1 - wall), 0.0, None)
+
+
+def odds_by_place(
+    ratio: Float[np.ndarray, " p"], station: Float[np.ndarray, " p"], pitch: float
+) -> Float[np.ndarray, " p"]:
+    """Return the odds that each hole is a pocket, as a logarithm, with what holes at the same place in the rings are.
+
+    A hole's odds before its own returns count are those of all holes within 5 cm along the rings, half a pocket and
+    half a wall beside them; they are found together with the odds of those (expectation and maximisation).
+
+    Args:
+        ratio: How much likelier the returns about each hole are with a pocket there, as a logarithm.
+        station: Stations of the holes, m.
+        pitch: Length of a ring, m.
+    """
+    place = np.mod(station, pitch)
+    order = np.argsort(place)
+    around = np.concatenate([place[order] - pitch, place[order], place[order] + pitch])
+    first = np.searchsorted(around, place - _SAME_PLACE)
+    after = np.searchsorted(around, place + _SAME_PLACE, side="right")
+    odds = ratio
+    for _ in range(_ROUNDS):
+        total = np.concatenate([[0.0], np.cumsum(np.tile(expit(odds)[order], 3))])
+        share = (total[after] - total[first] + 0.5) / (after - first + 1.0)
+        odds = ratio + logit(share)
+    return odds
 
 
 def more_than_chance(

@@ -6,39 +6,33 @@ one mould, and all of them together say it well. They stand in rows along the bo
 anywhere around it, where rings are turned, but at the same places along each ring.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Shaped
 from scipy.ndimage import binary_dilation, maximum_filter, uniform_filter
 from scipy.spatial import cKDTree
 
 from scene.bore import POCKET
-from scene.fitting.evidence import more_than_chance, open_rims, turned_more_than_chance
+from scene.fitting.evidence import more_than_chance, odds_by_place, open_rims, pocket_over_wall, turned_more_than_chance
 from scene.fitting.joints import find_joints_by_steps
+from scene.fitting.mould import (
+    CLEAR,
+    MIN_DEPTH,
+    MODES,
+    Holes,
+    common_depth,
+    common_size,
+    refine_positions,
+    slopes,
+)
 from scene.fitting.section import Sections
 from scene.fitting.turned import find_ring
 from scene.fitting.unroll import Grid
 
-CLEAR = 0.32  # score of a hole that nobody doubts
 _ROW_SHARE = 0.3  # of the fullest row, and of the places in a row
 _PITCHES = (0.9, 2.1)  # widths of rings in use, m
 _MIN_COHERENCE = 0.4
 _NEAR_PLACE = 0.12  # m along the bore
 _PLACES = 0.05  # m, step in which places in a ring are counted
-
-
-@dataclass(frozen=True)
-class Holes:
-    """Holes of the unrolled wall: cell and how clear each is."""
-
-    row: Int[np.ndarray, " p"]
-    column: Int[np.ndarray, " p"]
-    score: Float[np.ndarray, " p"]
-
-    def where(self, keep: Bool[np.ndarray, " p"]) -> "Holes":
-        """Return the holes for which `keep` is true."""
-        return Holes(self.row[keep], self.column[keep], self.score[keep])
 
 
 def keep_rows(holes: Holes, columns: int, reach: float) -> Holes:
@@ -112,23 +106,18 @@ def find_ring_joints(station: Float[np.ndarray, " p"], length: float) -> Float[n
     return np.arange(phase, length, pitch[best])
 
 
-_MODES = ("nearest", "wrap")
 _HOLE = (4, 3)  # cells of 5 cm × 1°
 _AROUND = (16, 13)
 _EXPECTED = (31, 21)
 _PEAK_WINDOW = (7, 7)
 _WEAK, _FAINT = 0.22, 0.12
 _MIN_EXPECTED = 0.2  # points a cell; with fewer on the wall a hole says nothing
-_MIN_DEPTH = 0.06
 FLOOR_MARGIN = 0.45  # m above the floor
 _ROW_WIDTH = 0.15  # m
-_PROFILE = 0.30  # half window for the common size, m
 _MIN_POCKETS = 6
 _MIN_SEEN = 0.6  # of the wall
 _NOISE_SHARE = 0.25  # of the depth
-_SIDE = 0.5
-_RIB = 0.02  # least wall left between two pockets, m
-_OVERSHOOT = 0.7  # of the wall's spread: how far the deepest of a few returns lies beyond the surface, measured
+_RIB = 0.02  # least wall left between two pockets, and before a mouth, m
 _OPEN_RIM, _USUAL_RIM = 0.35, 0.15  # share of the wall missing around one hole that is no pocket, and around the usual
 _ALL_ROWS = 0.95  # of the clear holes at the places of rings
 _MATE = 0.15  # m between a hole moved on by a ring and the next
@@ -136,7 +125,6 @@ _MIN_REPEATED = 0.5  # of them; nine tenths in rows, a third or less where every
 _RIMS = (11, 9)  # cells about the middle of a hole that are it or its rim
 _THROUGH = 0.05  # of the pockets
 _SAME_JOINT = 0.1  # m
-_DEEP_SHARE = 0.75  # quantile over pockets of their deepest return
 
 
 def find_pockets(sections: Sections) -> tuple[Shaped[np.ndarray, " p"], Float[np.ndarray, " r"]]:
@@ -184,7 +172,7 @@ def _keep_turned(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple
     if clear.sum() < _MIN_POCKETS:
         return none, 0.0
     length = sections.grid.rows * sections.grid.step
-    station = (_refine_positions(deficit, sections, holes)[0] + 0.5) * sections.grid.step
+    station = (refine_positions(deficit, sections, holes)[0] + 0.5) * sections.grid.step
     ring = find_ring(station[clear], length, _PITCHES)
     if not turned_more_than_chance(station[clear], ring, length, _PITCHES):
         return none, 0.0
@@ -207,17 +195,33 @@ def _are_rows(rows: Holes, turned: Holes, sections: Sections, pitch: float) -> b
     return bool(in_rows.mean() > _ALL_ROWS and repeated.mean() > _MIN_REPEATED)
 
 
+def _keep_likely(deficit: np.ndarray, sections: Sections, holes: Holes) -> tuple[Holes, Float[np.ndarray, " k"]]:
+    """Return the holes that are likelier pockets like the clear ones than wall, and the odds of it, as a logarithm."""
+    grid, clear = sections.grid, holes.score > CLEAR
+    row, column = refine_positions(deficit, sections, holes)
+    middle = Holes(np.rint(row).astype(np.intp), np.rint(column).astype(np.intp), holes.score)
+    odds = pocket_over_wall(sections, middle, common_size(deficit, sections, holes, slopes(sections, holes)))
+    if clear.any():
+        station = (row + 0.5) * grid.step
+        odds = odds_by_place(odds, station, find_ring(station[clear], grid.rows * grid.step, _PITCHES).pitch)
+    return holes.where(odds >= 0.0), odds[odds >= 0.0]
+
+
 def _measure_pockets(deficit: np.ndarray, sections: Sections, holes: Holes) -> Shaped[np.ndarray, " p"]:
     """Return the pockets that holes are, of `scene.bore.POCKET`; none where their rims are open, or few are left."""
+    holes, odds = _keep_likely(deficit, sections, holes)
+    if len(holes.row) < _MIN_POCKETS:
+        return np.empty(0, POCKET)
     grid = sections.grid
-    row, column = _refine_positions(deficit, sections, holes)
+    row, column = refine_positions(deficit, sections, holes)
     station, angle = grid.start + (row + 0.5) * grid.step, -np.pi + (column + 0.5) * 2 * np.pi / grid.columns
-    slope = _slopes(sections, holes)
-    length, width = _common_size(deficit, sections, holes, slope)
-    depth = _common_depth(sections, holes, slope)
+    slope = slopes(sections, holes)
+    length, width = common_size(deficit, sections, holes, slope)
+    depth = common_depth(sections, holes, slope)
     radius = float(np.median(sections.radius))
     rim = open_rims(deficit, grid, row, column, (length, width), radius)
-    inside = (station > grid.start + length) & (station < grid.start + grid.rows * grid.step - length)
+    end = 0.5 * length + _RIB
+    inside = (station > grid.start + end) & (station < grid.start + grid.rows * grid.step - end)
     if np.median(rim) > _USUAL_RIM or (inside & (rim < _OPEN_RIM)).sum() < _MIN_POCKETS:
         return np.empty(0, POCKET)
     inside &= rim < _OPEN_RIM
@@ -225,7 +229,7 @@ def _measure_pockets(deficit: np.ndarray, sections: Sections, holes: Holes) -> S
     pockets["station"], pockets["angle"] = (station - grid.start)[inside], angle[inside]
     pockets["length"], pockets["width"], pockets["depth"] = length, width, depth
     pockets["confidence"], pockets["measured"] = np.clip(holes.score[inside] / CLEAR, 0, 1), True
-    return pockets[_drop_overlaps(pockets, radius)]
+    return pockets[_drop_overlaps(pockets, odds[inside], radius)]
 
 
 def _joints_by_steps(
@@ -252,20 +256,25 @@ def _correct_joints(joints: Float[np.ndarray, " r"], by_steps: Float[np.ndarray,
     return joints if abs(apart) < _SAME_JOINT else by_steps
 
 
-def _drop_overlaps(pockets: Shaped[np.ndarray, " p"], radius: float) -> Bool[np.ndarray, " p"]:
-    """Pockets to keep so that none overlap in a bore of a radius, m; of two that do, the fainter goes."""
+def _drop_overlaps(
+    pockets: Shaped[np.ndarray, " p"], odds: Float[np.ndarray, " p"], radius: float
+) -> Bool[np.ndarray, " p"]:
+    """Pockets to keep so that none overlap in a bore of a radius, m; of two that do, the one likelier wall goes.
+
+    `odds` are those of each to be a pocket, as a logarithm.
+    """
     length, width = float(pockets["length"][0]) + _RIB, float(pockets["width"][0]) + _RIB
     place = np.column_stack([pockets["station"] / length, pockets["angle"] * radius / width])
     keep = np.ones(len(pockets), bool)
     for i, j in sorted(cKDTree(place).query_pairs(1.0, p=np.inf)):
         if keep[i] and keep[j]:
-            keep[i if pockets["confidence"][i] < pockets["confidence"][j] else j] = False
+            keep[i if odds[i] < odds[j] else j] = False
     return keep
 
 
 def could_show_pockets(sections: Sections, depth: float) -> bool:
     """Return whether pockets of a depth, m, would be found in this cloud, were there any."""
-    near = uniform_filter(sections.support, _EXPECTED, mode=_MODES)[~_near_floor(sections)]
+    near = uniform_filter(sections.support, _EXPECTED, mode=MODES)[~_near_floor(sections)]
     seen = float(np.mean(near > _MIN_EXPECTED)) if near.size else 0.0
     noise = float(np.median(sections.spread))
     return sections.spacing == 0.0 and seen > _MIN_SEEN and noise < _NOISE_SHARE * depth
@@ -273,7 +282,7 @@ def could_show_pockets(sections: Sections, depth: float) -> bool:
 
 def _deficit(sections: Sections) -> Float[np.ndarray, "rows cols"]:
     """Share of the wall's returns that each cell lacks against those around it: 0 none, 1 all."""
-    expected = uniform_filter(sections.support, _EXPECTED, mode=_MODES)
+    expected = uniform_filter(sections.support, _EXPECTED, mode=MODES)
     share = sections.support / np.maximum(expected, 1e-9)
     deficit = np.where(expected > _MIN_EXPECTED, np.clip(1 - share, -1, 1), 0.0)
     return np.where(_near_floor(sections), 0.0, deficit)
@@ -289,76 +298,8 @@ def _near_floor(sections: Sections) -> np.ndarray:
 
 
 def _find_holes(deficit: np.ndarray, sections: Sections) -> Holes:
-    score = uniform_filter(deficit, _HOLE, mode=_MODES) - uniform_filter(deficit, _AROUND, mode=_MODES)
-    behind = maximum_filter(sections.deepest, (9, 5), mode=_MODES)
-    peak = (score == maximum_filter(score, _PEAK_WINDOW, mode=_MODES)) & (score > _FAINT) & (behind > _MIN_DEPTH)
+    score = uniform_filter(deficit, _HOLE, mode=MODES) - uniform_filter(deficit, _AROUND, mode=MODES)
+    behind = maximum_filter(sections.deepest, (9, 5), mode=MODES)
+    peak = (score == maximum_filter(score, _PEAK_WINDOW, mode=MODES)) & (score > _FAINT) & (behind > MIN_DEPTH)
     row, column = np.nonzero(peak)
     return Holes(row, column, score[row, column])
-
-
-def _patches(field: np.ndarray, holes: Holes, rows: int, columns: int) -> Float[np.ndarray, "p r c"]:
-    """Return the field around each hole; beyond the ends the last row holds, around it wraps."""
-    at_row = np.clip(holes.row[:, None] + np.arange(-rows, rows + 1), 0, field.shape[0] - 1)
-    at_column = (holes.column[:, None] + np.arange(-columns, columns + 1)) % field.shape[1]
-    return field[at_row[:, :, None], at_column[:, None, :]]
-
-
-def _refine_positions(
-    deficit: np.ndarray, sections: Sections, holes: Holes
-) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
-    """Row and column of each hole's centre of gravity, in cells.
-
-    The side that faces the scanner is seen through the mouth and blurs that rim, so that the hole alone would lie
-    4 cm off; being the rim, it counts half.
-    """
-    missing = np.maximum(_patches(deficit, holes, 4, 3), 0.0) ** 2
-    side = _patches((sections.deepest > _MIN_DEPTH).astype(float), holes, 4, 3)
-    patch = missing + _SIDE * side
-    mass = np.maximum(patch.sum(axis=(1, 2)), 1e-9)
-    row = holes.row + (patch.sum(axis=2) @ np.arange(-4, 5)) / mass
-    column = holes.column + (patch.sum(axis=1) @ np.arange(-3, 4)) / mass
-    return row, column
-
-
-def _slopes(sections: Sections, holes: Holes) -> Float[np.ndarray, " p"]:
-    """Cosine between the wall's normal and the radius at each hole; cells on an oblique wall are longer."""
-    around = 2 * np.pi / sections.grid.columns
-    wall = sections.radius
-    before, after = (wall[holes.row, (holes.column + step) % wall.shape[1]] for step in (-3, 3))
-    lean = (after - before) / (6 * around) / wall[holes.row, holes.column]
-    return 1 / np.sqrt(1 + lean**2)
-
-
-def _common_size(deficit: np.ndarray, sections: Sections, holes: Holes, slope: np.ndarray) -> tuple[float, float]:
-    """Length and width of the mould, m, from the mean hole, along and around.
-
-    A voxel that the rim crosses still holds a wall point, so the hole in the thinned cloud is one voxel short each way.
-    """
-    grid = sections.grid
-    across = sections.radius[holes.row, holes.column] * 2 * np.pi / grid.columns / slope  # m a column
-    rows, columns = int(_PROFILE / grid.step), int(_PROFILE / np.median(across))
-    mean = _patches(deficit, holes, rows, columns).mean(axis=0)
-    mean = mean - np.median(mean)
-    core = mean[rows - 3 : rows + 4, columns - 3 : columns + 4]
-    along, around = core.sum(axis=1), core.sum(axis=0)
-    length = _spread(along) * grid.step
-    width = _spread(around) * float(np.median(across))
-    return float(np.clip(length + sections.voxel, 0.05, 0.5)), float(np.clip(width + sections.voxel, 0.05, 0.5))
-
-
-def _spread(profile: Float[np.ndarray, " k"]) -> float:
-    """Width, in cells, of the box with the profile's second moment, less that of one cell."""
-    weight = np.maximum(profile, 0.0)
-    at = np.arange(len(profile)) - len(profile) // 2
-    mass = weight.sum()
-    if mass <= 0:
-        return 1.0
-    centre = (weight @ at) / mass
-    variance = (weight @ (at - centre) ** 2) / mass
-    return float(np.sqrt(max(12 * variance - 1.0, 1.0)))
-
-
-def _common_depth(sections: Sections, holes: Holes, slope: np.ndarray) -> float:
-    """Depth of the mould, m, from the pockets whose backs are seen, less the noise of the deepest return."""
-    deepest = _patches(sections.deepest, holes, 4, 2).max(axis=(1, 2)) * slope
-    return float(np.quantile(deepest, _DEEP_SHARE) - _OVERSHOOT * np.median(sections.spread))
