@@ -127,7 +127,7 @@ def describe(row: dict[str, Any]) -> str:
     if found is None:
         return f"{words}; the bound is nowhere below {TIGHT} m"
     share = 100.0 * float(np.mean(bound < TIGHT))
-    return f"{words}; ratio {found:.2f} where the bound is below {TIGHT} m ({share:.0f} % of the way)"
+    return f"{words}; ratio {found:.2f} where the bound is below {TIGHT} m ({share:.1f} % of the way)"
 
 
 def draw(rows: list[dict[str, Any]]) -> Figure:
@@ -140,7 +140,8 @@ def draw(rows: list[dict[str, Any]]) -> Figure:
         axes.set_yscale("log")
         axes.set_ylabel("m")
         found = ratio(row)
-        axes.set_title(f"{row['tunnel']}" + ("" if found is None else f": error over bound {found:.2f}"), fontsize=9)
+        words = "" if found is None else f": error over bound {found:.2f} where that is below {TIGHT} m"
+        axes.set_title(row["tunnel"] + words, fontsize=9)
         axes.grid(alpha=0.25)
     grid[0, 0].legend(fontsize=8)
     grid[-1, 0].set_xlabel("station, m")

@@ -212,7 +212,7 @@ def _panel(
             colour = _COLOURS.get(agent, "black")
             axes.plot(place, shares(some, "success", np.nan), "o", ms=4.5, color=colour, label=agent)
     axes.set_title(task, fontsize=10)
-    axes.set_ylim(0.0, 103.0)
+    axes.set_ylim(0.0, 112.0)  # room for the names of the splits
     axes.set_xticks(place, [kind for _, kind in columns], rotation=90, fontsize=7)
     splits = [split for split, _ in columns]
     for i in range(1, len(columns)):
@@ -220,7 +220,7 @@ def _panel(
             axes.axvline(i - 0.5, color="black", lw=0.8)
     for split in dict.fromkeys(splits):
         here = [i for i, one in enumerate(splits) if one == split]
-        axes.text(np.mean(here), 101.0, split, ha="center", va="top", fontsize=7)
+        axes.text(np.mean(here), 103.0, split, ha="center", va="bottom", fontsize=7)
     axes.grid(axis="y", alpha=0.3)
 
 

@@ -39,7 +39,9 @@ WIDER = (1.0, 2.0, 4.0, 8.0, 16.0)  # blurs for the drift, in units of the first
 LEAST_SLOPE = (
     0.005  # 1: a range that changes by less than 5 mm a metre of station says more of the map than of the wall
 )
-_TURN = 0.02  # blur of the heading, rad, for each metre of `blur` over 0.05 m
+# Blur of the heading, rad: about what scans tell of it. With 20 mrad a beam of 20 m ends half a metre aside, where the
+# wall of a bend has another slope, and the heading no longer explains what a shift does.
+_TURN = 0.003
 _REACH = 4  # standard deviations to which the blur is carried
 _BATCH = 2048  # poses cast at once
 _POSES = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # offset and heading, in units of their blur
@@ -148,13 +150,13 @@ def _cell_information(
 ) -> _Cells:
     """Return the mean information of one scan over each of `n` cells.
 
-    The blur of the offset and of the heading stays as it is where that of the station grows: walls tell them anywhere.
+    The blur of the offset stays as it is where that of the station grows, and that of the heading is always the same:
+    walls tell them anywhere.
     """
     spacing = 0.5 * min(blur, length / n)
     fine = np.linspace(0.0, length, round(length / spacing) + 1)
-    turn = _TURN * offset / BLUR
-    ranges = [cast(fine, aside * offset, heading * turn) for aside, heading in _POSES]
-    information = scan_information(ranges, fine[1], blur, turn, sigma, offset)
+    ranges = [cast(fine, aside * offset, heading * _TURN) for aside, heading in _POSES]
+    information = scan_information(ranges, fine[1], blur, _TURN, sigma, offset)
     cell = np.minimum((fine / length * n).astype(int), n - 1)
     told = np.stack([marginal_bound(information, i) ** -2.0 for i in range(3)], axis=-1)
 

@@ -2,15 +2,17 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import subterra_jax as st
 from subterra_jax.evaluation import bounds
 from subterra_jax.evaluation.localisability import Solid, localisability, marginal_bound, scan_information
-from subterra_jax.lidar import reference
+from subterra_jax.lidar import reference, scan
 from subterra_jax.lidar3d import Relief, beams
-from subterra_jax.tunnel import from_centreline
+from subterra_jax.tunnel import at_station, from_centreline
 
 SIGMA, BLUR, TURN, STEP = 0.05, 0.05, 0.02, 0.025
 TASK = "Subterra/StopAt-v0"
@@ -206,3 +208,38 @@ def test_the_drift_of_a_perfect_filter_takes_each_scan_as_blurred_as_the_filter_
     naive = np.sqrt(bounds.filter_variance(lost.station, lost.station_bound**-2.0, hidden))
     at = np.searchsorted(lost.station, 33.0)
     assert lost.drift[at] > naive[at]
+
+
+def test_in_a_bend_a_scan_tells_as_much_as_another_place_differs_once_offset_and_heading_are_fitted():
+    _, params = st.make("Subterra/StopAt-v0", tunnel="metro-asbuilt", lining="smooth")
+    station, shift = np.arange(100.0, 132.0, 0.5, dtype=np.float32), 0.8
+
+    @jax.jit
+    def cast(at, offset, heading):
+        def one(at, offset, heading):
+            x, y, ahead, aside, _ = at_station(params.tunnel, at)
+            place = jnp.stack([x - offset * aside, y + offset * ahead])
+            return scan(params.tunnel, place, jnp.arctan2(aside, ahead) + heading, at, params.lidar)
+
+        return jax.vmap(one)(at, offset, heading)
+
+    offset, heading = np.zeros_like(station), np.zeros_like(station)
+    here = np.asarray(cast(station, offset, heading), np.float64)
+    least = np.full(len(station), np.inf)
+    for _ in range(4):
+        there = lambda o, h: np.asarray(cast(station + shift, np.float32(o), np.float32(h)), np.float64)  # noqa: E731
+        other = there(offset, heading)
+        seen = (here < 29.9) & (other < 29.9)
+        rest = np.where(seen, other - here, 0.0)
+        least = np.minimum(least, (rest**2).sum(axis=1) / SIGMA**2)
+        slopes = [
+            np.where(seen, (there(offset + a, heading + b) - there(offset - a, heading - b)) / (2.0 * (a + b)), 0.0)
+            for a, b in ((1e-3, 0.0), (0.0, 3e-4))
+        ]
+        for i, jacobian in enumerate(np.stack(slopes, axis=-1)):
+            weight = 1.0 / (1.0 + (rest[i] / (3.0 * SIGMA)) ** 2)
+            step = np.linalg.lstsq(jacobian * weight[:, None] ** 0.5, -rest[i] * weight**0.5, rcond=None)[0]
+            offset[i], heading[i] = offset[i] + step[0], heading[i] + step[1]
+    differs = float(np.mean(least) ** -0.5 * shift)
+    cells = localisability(params, step=5.0, blur=0.4).station_bound[20:26]
+    assert float(np.mean(cells**-2.0) ** -0.5) == pytest.approx(differs, rel=0.15)

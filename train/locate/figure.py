@@ -59,17 +59,18 @@ def command(arguments: Command) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(8.0, 4.5), layout="constrained")
+    figure, axes = plt.subplots(figsize=(8.0, 5.6), layout="constrained")
     for index, (label, seeds) in enumerate(curves.items()):
         for number, curve in enumerate(seeds):
             style: dict[str, Any] = {"ls": ":" if label.startswith(_DRIVEN) else "-", "color": f"C{index}", "lw": 1.5}
             axes.plot(curve[:, 0], 100.0 * curve[:, 1], **style, label=label if number == 0 else None)
     for index, (agent, level) in enumerate(levels.items()):
         axes.axhline(100.0 * level, color="0.4", ls=_STYLES[index % len(_STYLES)], lw=1.0, label=f"{agent} (written)")
-    axes.set(xlabel="training, s (compiling included)", ylabel="right to 1 m, % of goals in val", ylim=(0.0, 100.0))
+    axes.set_xlabel("training, s (compiling too, but for runs of train.locate.compare)")
+    axes.set(ylabel="right to 1 m, % of goals in val", ylim=(0.0, 100.0))
     axes.set_xlim(left=0.0)
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure.legend(fontsize=8, loc="outside lower center", ncols=2)
     with replace_file(arguments.out) as fresh:
         figure.savefig(fresh, dpi=110, format="png")
     plt.close(figure)
@@ -91,7 +92,8 @@ def read_run(run: Path) -> dict[str, list[np.ndarray]]:
     if not seeds or "config" not in settings or any(len(rows) == 0 for rows in seeds):
         raise ConfigError(f"{run}: holds no curve of train.locate")
     config = settings["config"]
-    label = f"{config['network']}, {config['front']}"
+    begun = config.get("begin_from")
+    label = f"{config['network']}, {config['front']}" + (f", begun from {Path(begun).stem}" if begun else "")
     count = f" ({len(seeds)} seed{'s' * (len(seeds) > 1)})"
     return {
         f"{label}{further}{count}": [np.array([(row["seconds"], row[name]) for row in rows]) for rows in seeds]
