@@ -78,14 +78,12 @@ def pocket_over_wall(sections: Sections, holes: Holes, size: tuple[float, float]
 
     A cell has points on the wall by Poisson's law, of the mean that the wall around has, or of the share of it that
     clear holes leave; and has returns behind the wall as often as the wall around or, more, as clear holes do. The
-    middle may be a cell off, each way as likely. Without clear holes the result is 0 throughout.
+    middle may be a cell off, each way as likely. Cells are taken as independent. Without clear holes the result is 0.
 
     Args:
         sections: The wall, and what was measured of it.
         holes: Holes, with the middle of each.
         size: Length along and width around of the pockets, m: with a cell of rim, the cells that tell.
-
-    Cells are taken as independent.
     """
     points, chance = _wall_around(sections, holes)
     fields = sections.support, points, (sections.deepest > _BEHIND).astype(float), chance
