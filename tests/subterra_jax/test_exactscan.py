@@ -74,15 +74,25 @@ def test_it_is_the_least_over_offset_and_heading_that_an_optimiser_finds(place, 
     assert -best - 0.25 < found < -best + 1e-3
 
 
-def test_a_box_before_a_wall_costs_no_more_than_a_lost_echo(place):
-    _, params = place
+def test_a_box_before_a_wall_costs_what_a_false_echo_does_in_place_of_a_true_one(place):
     ranges = scan_at(place, 0.3, 0.2)
     boxed = ranges.at[3:5].set(1.5)
     lost = gain(place, ranges, 0.3, 0.2) - gain(place, boxed, 0.3, 0.2)
-    most = EXACT.power * 2 * np.log(float(params.lidar.range_max) / (0.1 * EXACT.lost) / 0.05)
-    assert 0.0 < lost < most
+    beams = cast_beams(*place_at(place, 0.3, 0.2), EXACT)
+    true = np.abs(beams.slant[3:5, 0]) / np.sqrt(2.0 * np.pi * beams.variance[3:5, 0])
+    # One echo in fifty is false, anywhere within 30 m as likely; the root of it counts.
+    assert lost == pytest.approx(0.5 * np.sum(np.log(true / (0.02 / 30.0))), abs=0.3)
     # The other beams hold the pose: a station told by them alone is not pulled off.
     assert gain(place, boxed, 0.3, 0.2) > gain(place, boxed, 0.3 + 5 * OFF[0], 0.2 + 5 * OFF[1]) + 2.0
+
+
+def test_a_beam_ends_as_unsure_as_its_range_is_and_as_the_tangent_leaves_its_wall(place):
+    beams = cast_beams(*place_at(place, 0.0, 0.0), EXACT)
+    across, sigma = np.asarray(beams.expected[:, 0] * beams.slant[:, 0]), np.sqrt(np.asarray(beams.variance[:, 0]))
+    square, ahead = 4, 1  # at 90 and 22.5 degrees
+    assert sigma[square] == pytest.approx(np.hypot(0.05, 0.005 + 0.001 * WIDTH), rel=0.02)
+    assert sigma[ahead] == pytest.approx(np.hypot(0.05 * 0.383, 0.005 + 0.001 * beams.expected[ahead, 0]), rel=0.06)
+    assert across[square] == pytest.approx(WIDTH, abs=0.02)
 
 
 def test_the_wall_that_a_slanting_beam_meets_runs_as_the_bend_does(place):
