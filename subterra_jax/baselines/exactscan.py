@@ -16,7 +16,7 @@ from subterra_jax import lidar
 from subterra_jax.baselines.scanmodel import TunnelPose, least_squares_step
 from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.state import EnvParams
-from subterra_jax.tunnel import at_station
+from subterra_jax.tunnel import beside
 
 _ECHO = 1e-3  # m below `range_max`: no echo
 _GRAZING = 0.02  # sine of the least angle between a beam and its wall
@@ -97,9 +97,8 @@ def cast_beams(walls: WallMap, pose: TunnelPose, params: EnvParams, exact: Exact
     tunnel, sensor = params.tunnel, params.lidar
 
     def cast(station: Array, lateral: Array, heading: Array) -> Array:
-        x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
-        position = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x])
-        return lidar.scan(tunnel, position, heading + jnp.arctan2(tangent_y, tangent_x), station, sensor)
+        position, ahead = beside(tunnel, station, lateral)
+        return lidar.scan(tunnel, position, heading + ahead, station, sensor)
 
     expected = jax.vmap(cast)(pose.station, pose.lateral, pose.heading).T
     bearing = pose.heading + jnp.asarray(np.float32(lidar.bearings(expected.shape[0])))[:, None]

@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from subterra_jax import lidar, lidar3d
 from subterra_jax.evaluation.bounds import filter_variance
 from subterra_jax.state import EnvParams
-from subterra_jax.tunnel import Tunnel, at_station
+from subterra_jax.tunnel import Tunnel, beside
 from subterra_jax.tunnel.plan import TunnelPlan
 
 BLUR = 0.05  # m
@@ -253,9 +253,8 @@ def _caster(take: Cast, tunnel: Tunnel) -> Callable[[np.ndarray, float, float], 
     @jax.jit
     def many(stations: Array, offset: Array, turn: Array) -> Array:
         def one(s: Array) -> Array:
-            x, y, tangent_x, tangent_y, _ = at_station(tunnel, s)
-            position = jnp.stack([x - offset * tangent_y, y + offset * tangent_x])
-            return take(position, jnp.arctan2(tangent_y, tangent_x) + turn, s)
+            position, ahead = beside(tunnel, s, offset)
+            return take(position, ahead + turn, s)
 
         return jax.vmap(one)(stations)
 

@@ -206,6 +206,15 @@ def at_station(tunnel: Tunnel, station: Float[Array, ""]) -> Float[Array, "5"]:
     return lower + share * (upper - lower)
 
 
+def beside(
+    tunnel: Tunnel, station: Float[Array, ""], lateral: Float[Array, ""]
+) -> tuple[Float[Array, "2"], Float[Array, ""]]:
+    """Return the point that lies `lateral` m to the left of the centreline at a station, m, and its heading there."""
+    x, y, tangent_x, tangent_y, _ = at_station(tunnel, station)
+    position = jnp.stack([x - lateral * tangent_y, y + lateral * tangent_x])
+    return position, jnp.arctan2(tangent_y, tangent_x)
+
+
 def foot(tunnel: Tunnel, position: Float[Array, "2"], near: Float[Array, ""]) -> Foot:
     """Return the foot of the perpendicular from a point to the centreline, searched near a known station.
 

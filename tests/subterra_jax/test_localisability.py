@@ -3,7 +3,6 @@
 import dataclasses
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +11,7 @@ from subterra_jax.evaluation import bounds
 from subterra_jax.evaluation.localisability import Solid, localisability, marginal_bound, scan_information
 from subterra_jax.lidar import reference, scan
 from subterra_jax.lidar3d import Relief, beams
-from subterra_jax.tunnel import at_station, from_centreline
+from subterra_jax.tunnel import beside, from_centreline
 
 SIGMA, BLUR, TURN, STEP = 0.05, 0.05, 0.02, 0.025
 TASK = "Subterra/StopAt-v0"
@@ -217,9 +216,8 @@ def test_in_a_bend_a_scan_tells_as_much_as_another_place_differs_once_offset_and
     @jax.jit
     def cast(at, offset, heading):
         def one(at, offset, heading):
-            x, y, ahead, aside, _ = at_station(params.tunnel, at)
-            place = jnp.stack([x - offset * aside, y + offset * ahead])
-            return scan(params.tunnel, place, jnp.arctan2(aside, ahead) + heading, at, params.lidar)
+            place, ahead = beside(params.tunnel, at, offset)
+            return scan(params.tunnel, place, ahead + heading, at, params.lidar)
 
         return jax.vmap(one)(at, offset, heading)
 
