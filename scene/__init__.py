@@ -5,4 +5,3 @@ from subterra_jax.host.command import require_libraries
 require_libraries(
     "scene", "recordings", "tyro", "rich", "rosbags", "small_gicp", "laspy", "shapely", "manifold3d", "embreex", "rtree"
 )
-require_libraries("scene.compare", "survey", "py4dgeo", "matplotlib")

@@ -155,7 +155,7 @@ def write_usd(path: Path, parts: list[Part], facts: dict[str, Any]) -> None:
     try:
         from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
     except ModuleNotFoundError as error:
-        raise RecordingError("USD needs pxr, which is not installed: pip install 'subterra-jax[survey]'") from error
+        raise RecordingError("USD needs pxr, which is not installed: pip install 'subterra-jax[export]'") from error
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)

@@ -97,11 +97,6 @@ MISTAKES = {
     "train.release none --out o.safetensors": "none: no such folder",
     "train.release empty --out o.txt": "o.txt: must end in .safetensors",
     "train.release empty --out text.txt/o.safetensors": "text.txt: is a file",
-    "scene.report": "missing: SCENE",
-    "scene.report empty --out o": "empty: not a scene folder",
-    "scene.report empty --out text.txt": "text.txt: is a file",
-    "scene.compare empty empty --out o": "empty: not a scene folder",
-    "scene.compare empty empty --out text.txt": "text.txt: is a file",
     "scene.export empty --to glb": "empty: not a scene folder",
     "scene.export empty --to moon": "'moon'",
     "scene.export tunnel --to urdf --out text.txt": "text.txt: must end in .urdf",
@@ -334,7 +329,7 @@ def test_a_library_that_is_missing_is_named_with_what_brings_it(library, words, 
 LATE = """
 from subterra_jax.host.command import require_libraries
 def main():
-    require_libraries("late", "survey", "no_such_library")
+    require_libraries("late", "export", "no_such_library")
     print("went on")
 if __name__ == "__main__":
     main()
@@ -352,7 +347,7 @@ def test_a_library_asked_for_within_main_ends_the_command_alone(words, status, d
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == status, done.stderr
-    assert ("no_such_library is not installed: pip install -e '.[survey]'" in done.stderr) == (status == 2)
+    assert ("no_such_library is not installed: pip install -e '.[export]'" in done.stderr) == (status == 2)
     assert done.stdout == ("" if status else "went on\n")
 
 

@@ -8,15 +8,29 @@ import numpy as np
 import pytest
 import trimesh
 
+from scene.bore import Bore
 from scene.export import main
-from tests.scene.test_report import ORIGIN, scene  # noqa: F401 (a fixture)
+from scene.output import write_geometry
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import TrackConfig, lay_track
 
 GROUPS = np.array([1, 1, 0, 0, 0, 0], np.uint8)
 N = 10_000  # rays
+ORIGIN = np.array([271_000.0, 2_103_000.0, -17.0])
 
 
 @pytest.fixture(scope="module")
-def rays(scene):  # noqa: F811
+def scene(bore: Bore, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("built") / "arc"
+    (folder / "meshes").mkdir(parents=True)
+    write_geometry(folder, "arc", "simulated", bore, lay_track(bore, TrackConfig()), SceneConfig())
+    manifest = {"name": "arc", "input_provenance": "simulated", "frame": {"origin": ORIGIN.tolist()}}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rays(scene):
     """Origins in the bore, directions all around, and the distances that MuJoCo finds."""
     model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
     data = mujoco.MjData(model)
@@ -90,14 +104,14 @@ def load_sdf(path) -> trimesh.Trimesh:
     ("to", "name", "load"),
     [("glb", "arc.glb", load_glb), ("usd", "arc.usdc", load_usd), ("sdf", "arc", load_sdf)],
 )
-def test_rays_meet_the_export_where_they_meet_the_mjcf(scene, rays, tmp_path, to, name, load):  # noqa: F811
+def test_rays_meet_the_export_where_they_meet_the_mjcf(scene, rays, tmp_path, to, name, load):
     out = tmp_path / name
     assert main([str(scene), "--to", to, "--out", str(out), "--licence", "CC0"]) == 0
     origins, headings, wanted = rays
     agree(first_hits(load(out), origins, headings), wanted)
 
 
-def test_mistakes_end_in_a_sentence(scene, tmp_path, capsys):  # noqa: F811
+def test_mistakes_end_in_a_sentence(scene, tmp_path, capsys):
     assert main([str(tmp_path), "--to", "glb"]) == 2
     assert "not a scene folder" in capsys.readouterr().err
     assert main([str(scene), "--to", "usd", "--out", str(tmp_path / "a.glb")]) == 2
