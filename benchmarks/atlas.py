@@ -49,7 +49,7 @@ class AtlasConfig:
     tunnel: Annotated[str, tyro.conf.Positional]
     linings: tuple[str, ...] = ()
     sensors: tuple[str, ...] = ("planar",)
-    task: str = "Subterra/StopAt-v0"
+    task: str = "Subterra/StopAt-v1"
     step: float = 0.5
     out: Path | None = None
 

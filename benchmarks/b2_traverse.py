@@ -29,7 +29,7 @@ from train.policies import open_agent
 class Command:
     """Lets B2s traverse a tunnel.
 
-    Example: python -m benchmarks.b2_traverse --robots 100 --agent B2Traverse-v0 --engine mujoco
+    Example: python -m benchmarks.b2_traverse --robots 100 --agent B2Traverse-v1 --engine mujoco
 
     Attributes:
         robots: Number of robots.

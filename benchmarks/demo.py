@@ -17,7 +17,7 @@ from benchmarks.truth import Truth, compare, load_truth, start_placement
 from scene.survey.config import SurveyConfig, check_survey
 from subterra_jax.host.files import require_folder
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 
 
 @dataclass(frozen=True)

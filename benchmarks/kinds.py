@@ -72,7 +72,7 @@ class KindsConfig:
         out: Folder for `kinds.json` and `kinds.md`; `None` prints the table only.
     """
 
-    task: str = "Subterra/StopAt-v0"
+    task: str = "Subterra/StopAt-v1"
     split: str = "val"
     agents: tuple[str, ...] = AGENTS
     episodes: int = 100

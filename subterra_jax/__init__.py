@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from subterra_jax.policies import load_policy
     from subterra_jax.randomization import LogUniform, randomize
     from subterra_jax.state import EnvParams, State
-    from subterra_jax.tasks import TASKS, constants_digest, make, register
+    from subterra_jax.tasks import TASKS, constants_digest, list_tasks, make, register
     from subterra_jax.tunnel import Tunnel
     from subterra_jax.tunnel.plan import TunnelPlan
     from subterra_jax.tunnel.sources import load_tunnel
@@ -43,6 +43,7 @@ __all__ = [
     "batch",
     "cache_programs",
     "constants_digest",
+    "list_tasks",
     "load_policy",
     "load_tunnel",
     "localisability",
@@ -65,6 +66,7 @@ _HOMES = {
     "Env": "env",
     "cache_programs": "compiled",
     "constants_digest": "tasks",
+    "list_tasks": "tasks",
     "register": "tasks",
     "EnvParams": "state",
     "LogUniform": "randomization",

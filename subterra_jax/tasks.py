@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import importlib.util
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,28 +13,17 @@ import numpy as np
 
 from subterra_jax import constants as c
 from subterra_jax.adapters import register_tasks
-from subterra_jax.b2 import MISSIONS, WALK
+from subterra_jax.digest import digest, task_figures
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_module
-from subterra_jax.host.versions import no_task
+from subterra_jax.host.task_ids import BENCHMARK, MISSIONS, PLANAR, WALK, full_id, no_task
 from subterra_jax.params import check_length, check_robot, check_together, collect_entries, make_params
-from subterra_jax.parts import DrawnFaults, Faults, Imu, Obstacles, ObstaclesAhead, Odometer, Part, PlanarLidar, Slip
+from subterra_jax.parts import Faults, Imu, Obstacles, Odometer, Part, PlanarLidar, Slip
 from subterra_jax.parts.odometer import OdometryParams
 from subterra_jax.parts.spatial_lidar import SENSORS, SpatialLidar, SpatialParams, make_sensor
 from subterra_jax.parts.wander import WanderParams
 from subterra_jax.procedural import open_world
-from subterra_jax.rules import (
-    GoalParams,
-    Relocalise,
-    RelocaliseInside,
-    Rule,
-    StartParams,
-    StopAt,
-    StopInside,
-    Traverse,
-    TurnBack,
-    TurnBackInside,
-)
+from subterra_jax.rules import GoalParams, Relocalise, Rule, StartParams, StopAt, Traverse, TurnBack
 from subterra_jax.rules.rule import ERRANDS
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel.sources import Source, resolve
@@ -76,63 +63,24 @@ def _drifting(**params: Any) -> dict[str, Any]:
     return {"odometry": OdometryParams(wander=wander, backward_bias_sigma=c.BACKWARD_BIAS_SIGMA), **params}
 
 
-# A goal of 60 m needs some tunnel behind it; a return needs some behind the start.
-_SHORT = (0.0, c.SHORT_LENGTH + c.GOAL_MARGIN)
-_RETURN = StartParams(station=c.RETURN_START)
-_OFFSET = StartParams(station=c.OFFSET_START, station_sigma=c.OFFSET_SIGMA)
 _NEAR = GoalParams(low=c.SHORT_GOAL_LOW, high=c.SHORT_GOAL_HIGH, tolerance=c.SHORT_TOLERANCE)
-_NEAR_OFFSET = dataclasses.replace(_NEAR, low=c.SHORT_OFFSET_GOAL_LOW)
-_NEAR_REPORT = GoalParams(tolerance=c.SHORT_TOLERANCE, travel_max=c.SHORT_TRAVEL_MAX)
-_AMONG_BOXES, _FAULTED = (*SLIPPING, Obstacles()), (*SLIPPING, Faults())
+_REPORT = GoalParams(margin=c.RELOCALISE_MARGIN, travel_max=c.RELOCALISE_TRAVEL)
 
 TASKS: dict[str, Task] = {
-    "Subterra/Traverse-v0": Task(Traverse(), c.HORIZON_TRAVERSE),
-    "Subterra/TraverseShort-v0": Task(Traverse(), c.HORIZON_TRAVERSE_SHORT, (0.0, c.SHORT_LENGTH)),
-    "Subterra/StopAt-v0": Task(StopAt(), c.HORIZON_STOP, None, SLIPPING, _drifting()),
-    "Subterra/StopAtShort-v0": Task(StopAt(), c.HORIZON_STOP_SHORT, _SHORT, SLIPPING, _drifting(goal=_NEAR)),
-    "Subterra/StopAtOffset-v0": Task(StopAt(), c.HORIZON_STOP, None, SLIPPING, _drifting(start=_OFFSET)),
-    "Subterra/StopAtOffsetShort-v0": Task(
-        StopAt(), c.HORIZON_STOP_SHORT, _SHORT, SLIPPING, _drifting(start=_OFFSET, goal=_NEAR_OFFSET)
-    ),
-    "Subterra/Return-v0": Task(TurnBack(), c.HORIZON_RETURN, None, SLIPPING, _drifting(start=_RETURN)),
-    "Subterra/ReturnShort-v0": Task(
-        TurnBack(), c.HORIZON_RETURN_SHORT, _SHORT, SLIPPING, _drifting(start=_RETURN, goal=_NEAR)
-    ),
-    "Subterra/Obstructed-v0": Task(StopAt(), c.HORIZON_STOP, None, _AMONG_BOXES, _drifting()),
-    "Subterra/ObstructedShort-v0": Task(StopAt(), c.HORIZON_STOP_SHORT, _SHORT, _AMONG_BOXES, _drifting(goal=_NEAR)),
-    "Subterra/Faulted-v0": Task(StopAt(), c.HORIZON_STOP, None, _FAULTED, _drifting()),
-    "Subterra/FaultedShort-v0": Task(StopAt(), c.HORIZON_STOP_SHORT, _SHORT, _FAULTED, _drifting(goal=_NEAR)),
-    "Subterra/Relocalise-v0": Task(Relocalise(), c.HORIZON_RELOCALISE, None, SLIPPING, _drifting()),
-    "Subterra/RelocaliseShort-v0": Task(
-        Relocalise(), c.HORIZON_RELOCALISE_SHORT, _SHORT, SLIPPING, _drifting(goal=_NEAR_REPORT)
-    ),
+    "Subterra/Traverse-v1": Task(Traverse(), c.HORIZON_TRAVERSE),
+    "Subterra/TraverseShort-v1": Task(Traverse(), c.HORIZON_TRAVERSE_SHORT, (0.0, c.SHORT_LENGTH)),
+    "Subterra/StopAt-v1": Task(StopAt(), c.HORIZON_STOP, None, SLIPPING, _drifting()),
+    "Subterra/StopAtShort-v1": Task(StopAt(), c.HORIZON_STOP_SHORT, None, SLIPPING, _drifting(goal=_NEAR)),
+    "Subterra/Return-v1": Task(TurnBack(), c.HORIZON_RETURN, None, SLIPPING, _drifting()),
+    "Subterra/Obstructed-v1": Task(StopAt(), c.HORIZON_STOP, None, (*SLIPPING, Obstacles()), _drifting()),
+    "Subterra/Faulted-v1": Task(StopAt(), c.HORIZON_STOP, None, (*SLIPPING, Faults()), _drifting()),
+    "Subterra/Relocalise-v1": Task(Relocalise(), c.HORIZON_RELOCALISE, None, SLIPPING, _drifting(goal=_REPORT)),
 }
-VERSIONS = ("v0", "v1")
 
 
-def _version_1() -> dict[str, Task]:
-    """Tasks told honestly: start and goal inside, fault sizes drawn, and each with a hidden start as well."""
-    goal = GoalParams(low=c.INSIDE_LOW, high=c.INSIDE_HIGH, margin=c.INSIDE_MARGIN)
-    near = dataclasses.replace(goal, low=c.INSIDE_SHORT_LOW, high=c.INSIDE_SHORT_HIGH, tolerance=c.SHORT_TOLERANCE)
-    report = GoalParams(margin=c.RELOCALISE_MARGIN, travel_max=c.RELOCALISE_TRAVEL)
-    rows = {
-        "StopAt": Task(StopInside(), c.HORIZON_STOP, None, SLIPPING, _drifting(goal=goal)),
-        "Return": Task(TurnBackInside(), c.HORIZON_RETURN, None, SLIPPING, _drifting(goal=goal)),
-        "Obstructed": Task(StopInside(), c.HORIZON_STOP, None, (*SLIPPING, ObstaclesAhead()), _drifting(goal=goal)),
-        "Faulted": Task(StopInside(), c.HORIZON_STOP, None, (*SLIPPING, DrawnFaults()), _drifting(goal=goal)),
-    }
-    hidden = StartParams(station_sigma=c.INSIDE_SIGMA)
-    offset = {
-        f"{name}Offset": dataclasses.replace(row, params={**row.params, "start": hidden}) for name, row in rows.items()
-    }
-    rows |= offset
-    rows["StopAtShort"] = Task(StopInside(), c.HORIZON_STOP_SHORT, None, SLIPPING, _drifting(goal=near))
-    rows["Relocalise"] = Task(RelocaliseInside(), c.HORIZON_RELOCALISE, None, SLIPPING, _drifting(goal=report))
-    return {f"Subterra/{name}-v1": row for name, row in rows.items()}
-
-
-TASKS |= _version_1()
-BUILT_IN = tuple(TASKS)
+def list_tasks() -> tuple[str, ...]:
+    """Return the ids that `make` takes: the ten of the benchmark, then those that were registered."""
+    return tuple(dict.fromkeys((*BENCHMARK, *TASKS)))
 
 
 def register(
@@ -147,7 +95,7 @@ def register(
     """Add a task, here and in Gymnasium. Adding it again under the same id replaces it.
 
     Args:
-        id: Gymnasium id, `Namespace/Name-v0`.
+        id: Gymnasium id, `Namespace/Name-v1`.
         rule: Rule of the task.
         horizon: Steps after which an episode is truncated.
         piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
@@ -157,11 +105,11 @@ def register(
     Raises:
         ValueError: The id belongs to the benchmark, has another form, or the rule's errand is unknown.
     """
-    if id in BUILT_IN or id in (WALK, *MISSIONS):
+    if id in BENCHMARK:
         raise ValueError(f"{id} is a task of the benchmark; register yours under another id")
     namespace, _, rest = id.partition("/")
     if not (namespace and "-v" in rest and rest.rpartition("-v")[2].isdigit()):
-        raise ValueError(f"a task's id must read Namespace/Name-v0, got {id!r}")
+        raise ValueError(f"a task's id must read Namespace/Name-v1, got {id!r}")
     if not isinstance(rule, Rule):
         raise ValueError(f"{id}: rule must be a subterra_jax.rules.Rule, got {type(rule).__name__}")
     if rule.errand not in ERRANDS:
@@ -176,21 +124,19 @@ def find(id: str, short: bool = False) -> str:
 
     Args:
         id: The id.
-        short: Take `StopAt` for `Subterra/StopAt-v0`, as command lines do.
+        short: Take `StopAt` for `Subterra/StopAt-v1`, as command lines do.
 
     Raises:
         TaskError: There is no such task.
         UserCodeError: The module cannot be run.
     """
     if not isinstance(id, str):
-        raise TaskError(f"a task is named by its id, as Subterra/StopAt-v0, got {id!r}")
+        raise TaskError(f"a task is named by its id, as Subterra/StopAt-v1, got {id!r}")
     source, _, name = id.rpartition(":")
     if source:
         load_module(source)
-    known = (*TASKS, WALK, *MISSIONS)
-    if short and name not in known and f"Subterra/{name}-v0" in known:
-        return f"Subterra/{name}-v0"
-    if name not in known:
+    name = full_id(name) if short else name
+    if name not in (known := list_tasks()):
         raise TaskError(no_task(name, known))
     return name
 
@@ -203,13 +149,14 @@ def make(
     parts: Sequence[Part] = (),
     sensor: Any = SENSORS[0],
     sweep: bool = False,
+    hidden_start: bool = False,
     **overrides: Any,
 ) -> tuple[Any, Any]:
     """Make an environment and its params.
 
     Args:
-        id: A key of `TASKS`; `MODULE:ID` or `FILE.py:ID` for a task of one's own; or `Subterra/B2Walk-v0` or
-            `Subterra/B2Traverse-v0`, whose further arguments are those of `subterra_jax.b2.tasks.make` and
+        id: A key of `TASKS`; `MODULE:ID` or `FILE.py:ID` for a task of one's own; or `Subterra/B2Walk-v1` or
+            `Subterra/B2Traverse-v1`, whose further arguments are those of `subterra_jax.b2.tasks.make` and
             `subterra_jax.b2.tasks.make_mission`.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
@@ -222,6 +169,8 @@ def make(
         sensor: The LiDAR: `planar16`, the paper's; `spin16x64`, `vlp16`, `os1-64`, `avia` or unit vectors `(n, 3)`, in
             three dimensions, whose `scan` takes the place of `ranges`; or what `parts.make_sensor` returns.
         sweep: Cast each beam of a LiDAR in three dimensions from the pose at its own time.
+        hidden_start: The true start is off the reported one by a normal number of 3 m, cut off at three of them; for
+            the tasks that report a start: `StopAt`, `StopAtShort`, `Return`, `Obstructed` and `Faulted`.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
             `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
@@ -234,6 +183,8 @@ def make(
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
     id = find(id)
+    if hidden_start:
+        overrides = {"start": _hidden_start(id, overrides), **overrides}
     if id == WALK or id in MISSIONS:
         from subterra_jax.b2 import tasks as walking  # MuJoCo is loaded only where physics is meant
 
@@ -264,6 +215,16 @@ def make(
     return env, params
 
 
+def _hidden_start(id: str, overrides: Mapping[str, Any]) -> StartParams:
+    """Return the start of a task whose true station is not the reported one."""
+    if id not in TASKS or not isinstance(TASKS[id].rule, StopAt):
+        able = ", ".join(name for name, task in TASKS.items() if isinstance(task.rule, StopAt))
+        raise ValueError(f"{id} reports no start that could be hidden; these do: {able}")
+    if "start" in overrides:
+        raise ValueError("hidden_start and start exclude each other: start.station_sigma hides it too")
+    return StartParams(station_sigma=c.HIDDEN_START_SIGMA)
+
+
 def _checked_horizon(horizon: Any) -> Any:
     """Refuse a horizon that is no whole number of steps; what is traced has no value yet and is taken."""
     if isinstance(horizon, jax.core.Tracer):
@@ -282,46 +243,25 @@ def _require_planar(id: str, sensor: Any, sweep: bool) -> None:
         raise ValueError(f"{SENSORS[0]!r} measures a scan at one moment: sweep=True needs a LiDAR in three dimensions")
 
 
-def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None, version: str = "v0") -> str:
+def constants_digest(env: TunnelEnv | None = None, params: EnvParams | None = None) -> str:
     """SHA-256 of the numbers that define the benchmark, or one task of it, whatever the tunnel.
 
     Args:
-        env: An environment; None for all tasks of a version of the benchmark with their default params.
+        env: An environment; None for all planar tasks with their default params, and the open world's kinds and splits.
         params: Its params.
-        version: One of `VERSIONS`. That of `v1` is of the open world's kinds and splits too.
     """
     if env is None or params is None:
-        return _benchmark_digest(version)
-    return _digest(_figures(env, params))
+        return _benchmark_digest()
+    return digest(task_figures(env, params))
 
 
 @functools.cache
-def _benchmark_digest(version: str) -> str:
-    figures: dict[str, Any] = {
-        id: _figures(*_without_tunnel(id, TASKS[id])) for id in BUILT_IN if id.endswith(f"-{version}")
-    }
-    if version != VERSIONS[0]:
-        figures["world"] = open_world.figures()
-    return _digest(figures)
+def _benchmark_digest() -> str:
+    figures: dict[str, Any] = {id: task_figures(*_without_tunnel(id, TASKS[id])) for id in PLANAR}
+    return digest({**figures, "world": open_world.figures(), "hidden_start": c.HIDDEN_START_SIGMA})
 
 
 def _without_tunnel(id: str, task: Task) -> tuple[TunnelEnv, EnvParams]:
     """Environment and params of a task in no tunnel."""
     env = TunnelEnv(id=id, rule=task.rule, parts=task.parts)
     return env, make_params(env, (), task.horizon, collect_entries(env, task.params))
-
-
-def _figures(env: TunnelEnv, params: EnvParams) -> dict[str, Any]:
-    """The numbers of a task, and the names of what they belong to."""
-    leaves = jax.tree_util.tree_flatten_with_path({"horizon": params.horizon, **params.parts})[0]
-    numbers = {jax.tree_util.keystr(path): np.round(np.asarray(leaf, np.float64), 9).tolist() for path, leaf in leaves}
-    return {
-        "rule": type(env.rule).__name__,
-        "parts": [part.name for part in (env.motion, *env.parts)],
-        "beams": params.lidar.n_beams,
-        "numbers": numbers,
-    }
-
-
-def _digest(content: Any) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -15,7 +15,6 @@ from subterra_jax.actions import COMMAND, ESTIMATE, REPORT, action_bounds, check
 from subterra_jax.compiled import compiled
 from subterra_jax.env import Box, Info, Stepped
 from subterra_jax.parts import Drive, Motion, Moved, Noise, Odometer, Part, PlanarLidar, Sight, Step, Unicycle
-from subterra_jax.parts.odometer import hold
 from subterra_jax.parts.part import Batch, Bounds
 from subterra_jax.parts.unicycle import clearance, in_contact, wrap
 from subterra_jax.rows import vary_like
@@ -327,12 +326,8 @@ class TunnelEnv:
 
     def _advance_parts(self, step: Step, noise: Mapping[str, Any], params: EnvParams) -> Step:
         """Advance every part in turn; each sees the states of those before it."""
-        before = step.before
-        held = [part.holds_odometer(before.parts[part.name]) for part in self.parts]
         for part in self.parts:
-            own = part.advance(before.parts[part.name], step, noise.get(part.name, _NOTHING), params)
-            if part.name == Odometer.name:
-                own = hold(before.parts[part.name], own, held)
+            own = part.advance(step.before.parts[part.name], step, noise.get(part.name, _NOTHING), params)
             step = dataclasses.replace(step, after={**step.after, part.name: own})
         return step
 

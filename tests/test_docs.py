@@ -61,7 +61,7 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     settings = YAML.search((ROOT / "docs" / "guide" / "train.md").read_text())
     assert settings is not None
     (tmp_path / "mine.yaml").write_text(settings[1])
-    run = {"schema": "subterra.run/1", "command": {"task": "Subterra/TraverseShort-v0", "config": {"hidden": [64, 64]}}}
+    run = {"schema": "subterra.run/1", "command": {"task": "Subterra/TraverseShort-v1", "config": {"hidden": [64, 64]}}}
     (tmp_path / "out" / "short").mkdir(parents=True)
     (tmp_path / "out" / "short" / "config.json").write_text(json.dumps(run))
     run = {"schema": "subterra.locate/1", "command": {"drives": 64, "config": {"network": "gru"}}}

@@ -14,6 +14,7 @@ import subterra_jax as st
 from subterra_jax import tasks
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import evaluate, listed_episodes
+from subterra_jax.host import task_ids
 from subterra_jax.host.loading import load_file
 from subterra_jax.parts import Part
 from subterra_jax.procedural import kinds, open_world
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.door
 
 PAGE = Path(__file__).parents[1] / "docs" / "guide" / "extend.md"
 FILES = dict(re.findall(r"`(\w+\.py)`:?\s*\n\s*```python\n(.*?)```", PAGE.read_text(), re.DOTALL))
-TASK = "keep_left.py:Mine/KeepLeft-v0"
+TASK = "keep_left.py:Mine/KeepLeft-v1"
 
 
 def forget() -> None:
@@ -45,14 +46,14 @@ def desk(tmp_path, monkeypatch):
     forget()
     yield tmp_path
     forget()
-    for added in set(tasks.TASKS) - set(tasks.BUILT_IN):
+    for added in set(tasks.TASKS) - set(task_ids.PLANAR):
         del tasks.TASKS[added]
 
 
 def test_a_sensor_from_outside_is_observed_with_its_noise_and_its_bias(desk):
     gyro = load_file(desk / "gyro.py")
     env, params = st.make(
-        "Subterra/StopAt-v0", parts=[gyro.Gyro()], gyro=gyro.GyroParams(sigma=0.02, bias_sigma=0.05), tunnel="control"
+        "Subterra/StopAt-v1", parts=[gyro.Gyro()], gyro=gyro.GyroParams(sigma=0.02, bias_sigma=0.05), tunnel="control"
     )
     where = env.fields(params)["yaw_rate"]
     assert where.stop == env.observation_size(params)
@@ -77,8 +78,8 @@ def test_a_sensor_from_outside_is_observed_with_its_noise_and_its_bias(desk):
 
 def test_a_sensor_from_outside_leaves_the_other_entries_as_they_are(desk):
     gyro = load_file(desk / "gyro.py")
-    plain, params = st.make("Subterra/ObstructedShort-v0")
-    richer, more = st.make("Subterra/ObstructedShort-v0", parts=[gyro.Gyro()])
+    plain, params = st.make("Subterra/Obstructed-v1")
+    richer, more = st.make("Subterra/Obstructed-v1", parts=[gyro.Gyro()])
     _, one = plain.reset(jax.random.key(3), params)
     _, other = richer.reset(jax.random.key(3), more)
     np.testing.assert_array_equal(one.position, other.position)
@@ -88,7 +89,7 @@ def test_a_sensor_from_outside_leaves_the_other_entries_as_they_are(desk):
 
 def test_its_params_are_randomised_like_those_of_the_package(desk):
     gyro = load_file(desk / "gyro.py")
-    env, params = st.make("Subterra/Traverse-v0", parts=[gyro.Gyro()])
+    env, params = st.make("Subterra/Traverse-v1", parts=[gyro.Gyro()])
     mixed, axes = st.randomize(jax.random.key(0), params, {"gyro.sigma": (0.1, 0.2)}, 8)
     obs, _ = st.AutoReset(env, params_axes=axes).reset(jax.random.key(1), mixed, 8)
     assert obs.shape == (8, 19)
@@ -98,7 +99,7 @@ def test_its_params_are_randomised_like_those_of_the_package(desk):
 def test_gymnasium_makes_tasks_with_a_sensor_from_outside(desk):
     gymnasium = pytest.importorskip("gymnasium")
     gyro = load_file(desk / "gyro.py")
-    env = gymnasium.make("subterra_jax:Subterra/TraverseShort-v0", parts=(gyro.Gyro(),))
+    env = gymnasium.make("subterra_jax:Subterra/TraverseShort-v1", parts=(gyro.Gyro(),))
     assert set(env.observation_space.spaces) == {"ranges", "odometry", "yaw_rate"}
     assert env.reset(seed=0)[0]["yaw_rate"].shape == (1,)
 
@@ -117,9 +118,9 @@ def test_a_task_from_outside_is_evaluated_on_listed_episodes(desk):
 
 def test_a_task_from_outside_works_with_gymnasium_and_stable_baselines(desk):
     gymnasium = pytest.importorskip("gymnasium")
-    env = gymnasium.make("keep_left:Mine/KeepLeft-v0")
+    env = gymnasium.make("keep_left:Mine/KeepLeft-v1")
     assert env.reset(seed=0)[0]["gap"] == 2.0
-    several = gymnasium.make_vec("Mine/KeepLeft-v0", num_envs=3)
+    several = gymnasium.make_vec("Mine/KeepLeft-v1", num_envs=3)
     assert several.reset(seed=0)[0]["gap"].shape == (3, 1)
     pytest.importorskip("stable_baselines3")
     from subterra_jax.adapters.sb3 import SubterraVecEnv
@@ -140,7 +141,7 @@ def test_leaderboard_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
     assert "KeepLeft" in (desk / "board" / "leaderboard.md").read_text()
     assert recorder(["--task", TASK, "--agent", "dead-reckoning", "--steps", "20", "--out", "episode"]) == 0
     plan = st.load_tunnel().slice(0.0, 60.0)
-    *_, episode = library.drive_episode(plan, "0", "t", "smooth", "Mine/KeepLeft-v0", "dead-reckoning", 0)
+    *_, episode = library.drive_episode(plan, "0", "t", "smooth", "Mine/KeepLeft-v1", "dead-reckoning", 0)
     assert episode.coverage[-1] >= 0.9
 
 
@@ -243,17 +244,17 @@ class Formless(Traverse):
     ],
 )
 def test_parts_that_do_not_go_together_are_refused_in_one_sentence(rule, parts, message, monkeypatch):
-    monkeypatch.setitem(tasks.TASKS, "Mine/Bad-v0", tasks.Task(rule, 10, (0.0, 60.0), parts))
+    monkeypatch.setitem(tasks.TASKS, "Mine/Bad-v1", tasks.Task(rule, 10, (0.0, 60.0), parts))
     with pytest.raises(ValueError, match=message) as refused:
-        st.make("Mine/Bad-v0")
+        st.make("Mine/Bad-v1")
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
     ("id", "rule", "message"),
     [
-        ("Subterra/Traverse-v0", StopAt(), "is a task of the benchmark"),
-        ("Traverse", StopAt(), "must read Namespace/Name-v0"),
+        ("Subterra/Traverse-v1", StopAt(), "is a task of the benchmark"),
+        ("Traverse", StopAt(), "must read Namespace/Name-v1"),
     ],
 )
 def test_a_registration_that_cannot_be_is_refused(id, rule, message):
@@ -269,7 +270,7 @@ def test_a_rule_without_a_verdict_cannot_be_made():
 
 
 def test_spaces_have_samples_and_know_what_they_contain():
-    env, params = st.make("Subterra/StopAt-v0", estimates=True)
+    env, params = st.make("Subterra/StopAt-v1", estimates=True)
     for space in (env.action_space(params), env.observation_space(params)):
         draws = jax.vmap(space.sample)(jax.random.split(jax.random.key(0), 64))
         assert draws.shape == (64, *space.shape)
@@ -282,7 +283,7 @@ def test_spaces_have_samples_and_know_what_they_contain():
 
 @pytest.mark.parametrize(("shape", "batched"), [((1,), False), ((3,), False), ((7,), False), ((8, 1), True)])
 def test_an_action_of_another_shape_is_refused_in_one_sentence(shape, batched):
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     if batched:
         batch = st.AutoReset(env)
         _, state = batch.reset(jax.random.key(0), params, 8)
@@ -290,6 +291,6 @@ def test_an_action_of_another_shape_is_refused_in_one_sentence(shape, batched):
     else:
         _, state = env.reset(jax.random.key(0), params)
     with pytest.raises(
-        ValueError, match=r"an action of Subterra/TraverseShort-v0 has 2 numbers, got an array of shape"
+        ValueError, match=r"an action of Subterra/TraverseShort-v1 has 2 numbers, got an array of shape"
     ):
         env.step(jax.random.key(1), state, jnp.zeros(shape), params)

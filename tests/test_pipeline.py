@@ -31,7 +31,7 @@ def scene(tmp_path_factory):
 
 def device_scans(plan: st.TunnelPlan, poses: reference.Poses, lining: str) -> np.ndarray:
     """What the environment observes, without noise, from each pose."""
-    env, params = st.make("Subterra/Traverse-v0", tunnel=plan, lining=lining)
+    env, params = st.make("Subterra/Traverse-v1", tunnel=plan, lining=lining)
     _, state = env.reset(jax.random.key(0), params)
 
     def scan(position, heading, station):
@@ -67,7 +67,7 @@ def test_the_environments_lidar_sees_what_mujoco_sees_in_the_scene(scene, lining
 
 
 def test_an_episode_runs_on_a_scene_just_built(scene):
-    env, params = st.make("Subterra/Traverse-v0", tunnel=scene / "tunnel.npz")
+    env, params = st.make("Subterra/Traverse-v1", tunnel=scene / "tunnel.npz")
     obs, state = env.reset(jax.random.key(0), params)
     step = jax.jit(env.step)
     for k in range(20):
@@ -81,7 +81,7 @@ def test_an_episode_runs_on_a_scene_just_built(scene):
 def test_an_episode_runs_between_furniture(scene):
     plan = st.load_tunnel(scene / "tunnel.npz")
     assert len(plan.lining("furnished").furniture) > 0
-    env, params = st.make("Subterra/Traverse-v0", tunnel=plan, lining="furnished")
+    env, params = st.make("Subterra/Traverse-v1", tunnel=plan, lining="furnished")
     _, state = env.reset(jax.random.key(0), params)
     step = jax.jit(env.step)
     for k in range(20):
@@ -106,7 +106,7 @@ def test_the_environment_runs_in_a_window_of_the_real_metro(tmp_path):
     build(metro_rings(tmp_path / "survey", 400, 700), tmp_path / "metro", config=bare)
     window = st.load_tunnel(tmp_path / "metro" / "tunnel.npz").slice(30.0, 351.0)
     assert window.length == pytest.approx(351.0, abs=0.3)
-    env, params = st.make("Subterra/Traverse-v0", tunnel=window, lining="smooth")
+    env, params = st.make("Subterra/Traverse-v1", tunnel=window, lining="smooth")
     keys = jax.random.split(jax.random.key(0), 8)
     obs, _ = jax.vmap(env.reset, (0, None))(keys, params)
     assert np.isfinite(np.asarray(obs)).all()

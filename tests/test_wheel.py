@@ -16,10 +16,10 @@ warnings.simplefilter("error", UserWarning)
 import subterra_jax as st
 import jax
 from subterra_jax import policies
-env, params = st.make("Subterra/TraverseShort-v0")
+env, params = st.make("Subterra/TraverseShort-v1")
 obs, state = env.reset(jax.random.key(0), params)
 obs, state, *_ = env.step(jax.random.key(1), state, env.action_space(params).high, params)
-agent, facts = policies.load("TraverseShort-v0")
+agent, facts = policies.load("TraverseShort-v1")
 print(obs.shape, agent.name, facts["task"])
 """
 

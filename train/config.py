@@ -154,8 +154,8 @@ _PRESETS: dict[str, PPOConfig] = {
 # coverage does not say who has learnt them.
 _GOAL = {"stop_coverage": 2.0}
 _TASKS: dict[str, dict[str, dict[str, Any]]] = {
-    "Subterra/Traverse-v0": {"cpu": {"steps": 4_000_000, "stop_patience": 60}, "gpu": {}},
-    "Subterra/TraverseShort-v0": {"cpu": {}, "gpu": {"steps": 30_000_000}},
+    "Subterra/Traverse-v1": {"cpu": {"steps": 4_000_000, "stop_patience": 60}, "gpu": {}},
+    "Subterra/TraverseShort-v1": {"cpu": {}, "gpu": {"steps": 30_000_000}},
 }
 _OTHERS: dict[str, dict[str, Any]] = {
     "cpu": {**_GOAL, "steps": 4_000_000},
@@ -167,7 +167,7 @@ def make_config(task: str, preset: str = "cpu") -> PPOConfig:
     """Returns the settings that are known to learn a task on one kind of machine.
 
     Args:
-        task: Task id, `Subterra/TraverseShort-v0` say.
+        task: Task id, `Subterra/TraverseShort-v1` say.
         preset: `cpu` or `gpu`.
 
     Raises:

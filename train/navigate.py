@@ -1,4 +1,4 @@
-"""Trains a navigation policy: `python -m train.navigate --task Subterra/TraverseShort-v0 --out DIR`.
+"""Trains a navigation policy: `python -m train.navigate --task Subterra/TraverseShort-v1 --out DIR`.
 
 `--memory gru` trains one that remembers where it is, for the tasks that end with a stop at a goal, and `--teacher
 oracle` lets it learn from one that knows. `--seeds 0 1 2 3 4` trains several at once, each into its own folder.
@@ -34,11 +34,11 @@ from train.sinks import Logs
 from train.snapshot import Snapshot
 from train.world import World, open_world, require_task, task_reward, with_reward
 
-_DEFAULT_TASK = "Subterra/TraverseShort-v0"
+_DEFAULT_TASK = "Subterra/TraverseShort-v1"
 _MEMORIES = ("none", "gru", "map")
 _DESCRIPTION = """Trains a navigation policy; defaults follow from `--task`, `--memory`, `--teacher` and `--preset`.
 
-python -m train.navigate --task Subterra/StopAtShort-v0 --memory gru --teacher oracle --out out/stop"""
+python -m train.navigate --task Subterra/StopAtShort-v1 --memory gru --teacher oracle --out out/stop"""
 
 
 @dataclasses.dataclass(frozen=True)

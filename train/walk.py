@@ -13,10 +13,11 @@ from typing import Annotated
 import jax
 import tyro
 
-from subterra_jax.b2 import WALK, tasks
+from subterra_jax.b2 import tasks
 from subterra_jax.b2.params import WalkRewardParams
 from subterra_jax.host.command import EXIT_INTERRUPTED, parse, run_command
 from subterra_jax.host.files import require_file
+from subterra_jax.host.task_ids import WALK
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
 from train.b2.walking import WalkConfig, WalkLearner, WalkSession, make_walk_config

@@ -35,7 +35,7 @@ class LeaderboardConfig:
     """Settings of a leaderboard.
 
     Attributes:
-        tasks: Task ids, as `Subterra/StopAt-v0`, `StopAt` or `FILE.py:ID`; all tasks if not given.
+        tasks: Task ids, as `Subterra/StopAt-v1`, `StopAt` or `FILE.py:ID`; all tasks if not given.
         agents: Agents: a baseline; `policy:NAME`, `policy:FILE` or `policy:RUN-FOLDER`; `released-policy`, the one
             released for the task; `module:Class` or `FILE.py:Class`. All baselines and `released-policy` if not given.
         load: Python files to run first; they register tasks or agents of your own.

@@ -175,7 +175,7 @@ def _success(row: dict[str, Any] | None) -> str:
 
 
 def _short(task: str) -> str:
-    return task.removeprefix("Subterra/").removesuffix("-v0")
+    return task.removeprefix("Subterra/").removesuffix("-v1")
 
 
 def _table(lines: list[list[str]]) -> str:
@@ -207,7 +207,7 @@ def read_markdown(path: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
         for task, cell in zip(tasks, cells, strict=True):
             if numbers := re.fullmatch(r"([\d.]+) \((\d+)-(\d+)\)", cell):
                 success, low, high = (float(number) / 100.0 for number in numbers.groups())
-                row = {"task": f"Subterra/{task}-v0", "world": world[1], "agent": agent, "success": success}
+                row = {"task": f"Subterra/{task}-v1", "world": world[1], "agent": agent, "success": success}
                 rows.append({**row, "success_low": low, "success_high": high})
     return rows, {"episodes": int(episodes[1])}
 

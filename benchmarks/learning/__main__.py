@@ -38,7 +38,7 @@ class Command:
     """
 
     out: Path
-    task: str = "Subterra/TraverseShort-v0"
+    task: str = "Subterra/TraverseShort-v1"
     tunnel: str | None = None
     steps: int = 1_000_000
     our_steps: int = 1_500_000

@@ -99,7 +99,7 @@ def run(config: OpenboardConfig) -> None:
 
 def conditions(config: OpenboardConfig) -> str:
     """Return a digest of what a cell depends on: constants, world, tunnels, episodes and LiDAR."""
-    content = [st.constants_digest(version="v1"), config.splits, config.episodes, config.tunnels, board.FIRST]
+    content = [st.constants_digest(), config.splits, config.episodes, config.tunnels, board.FIRST]
     if config.sensor != PLANAR:
         content.append(config.sensor)
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
@@ -126,12 +126,13 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
     names = board.tunnel_names(columns, config.tunnels)
     started = time.monotonic()
     made = load(names, cache=config.cache, sensor=config.sensor)
-    tunnel = st.make(f"Subterra/{missing[0][0]}-v1", tunnel=made, sensor=config.sensor)[1].tunnel
+    tunnel = st.make(board.task_of(missing[0][0])[0], tunnel=made, sensor=config.sensor)[1].tunnel
     _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
     floors: dict[str, list[float]] = {}
     for task, agent in missing:
         started = time.monotonic()
-        env, params = st.make(f"Subterra/{task}-v1", tunnel=tunnel, estimates=True, sensor=config.sensor)
+        id, hidden = board.task_of(task)
+        env, params = st.make(id, tunnel=tunnel, estimates=True, sensor=config.sensor, hidden_start=hidden)
         if task not in floors:
             floors[task] = [floor(params, index) for index in range(len(names))]
         episodes = board.draw_episodes(task, columns, config.tunnels, config.episodes)
@@ -152,7 +153,7 @@ def _drive(config: OpenboardConfig, missing: list[tuple[str, str]]) -> None:
             "goal_error": [None if np.isnan(e) else round(float(e), 3) for e in records.goal_error],
             "floor": [round(value, 4) for value in floors[task]],
             "seconds": round(seconds, 1),
-            "facts": {**environment_facts(), "constants_sha256": st.constants_digest(version="v1")},
+            "facts": {**environment_facts(), "constants_sha256": st.constants_digest()},
         }
         write_file(cell_file(config, task, agent), (json.dumps(content) + "\n").encode())
         _progress.print(f"{task}, {agent}: {100 * records.success.mean():.1f} % ({seconds:.0f} s)")

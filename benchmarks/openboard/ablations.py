@@ -24,8 +24,8 @@ from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.evaluation.floor import floor
 from subterra_jax.evaluation.records import grouped, interval
 from subterra_jax.host.files import require_folder
-from subterra_jax.parts import DrawnFaults
-from subterra_jax.parts.drawn_faults import SIZES, DrawnFaultState
+from subterra_jax.parts import Faults
+from subterra_jax.parts.faults import SIZES, FaultState
 from subterra_jax.rules import ToldParams
 
 SCHEMA = "subterra.ablations/1"
@@ -35,7 +35,7 @@ _progress = Console(stderr=True, highlight=False)
 
 
 @dataclasses.dataclass(frozen=True)
-class WetRail(DrawnFaults):
+class WetRail(Faults):
     """Faults whose loss on wet rail is chosen, while agents assume the middle of its range.
 
     Attributes:
@@ -44,8 +44,8 @@ class WetRail(DrawnFaults):
 
     factor: float = 1.0
 
-    def begin(self, draw: Any, state: Any, params: Any) -> DrawnFaultState:
-        """Begin as `DrawnFaults`, the loss apart."""
+    def begin(self, draw: Any, state: Any, params: Any) -> FaultState:
+        """Begin as `Faults`, the loss apart."""
         begun = super().begin(draw, state, params)
         return dataclasses.replace(begun, scale=begun.scale.at[_WET].set(jnp.float32(self.factor)))
 
@@ -121,7 +121,7 @@ def run(config: AblationsConfig) -> None:
         rows.append(drive(row, config))
         _progress.print(as_line(rows[-1], config.agents))
         content = {"schema": SCHEMA, "rows": rows, "facts": environment_facts(), "episodes": config.episodes,
-                   "constants_sha256": st.constants_digest(version="v1")}  # fmt: skip
+                   "constants_sha256": st.constants_digest()}  # fmt: skip
         write_file(config.out / "ablations.json", (json.dumps(content, indent=1) + "\n").encode())
     head = "| what is changed | floor | " + " | ".join(config.agents) + " |\n|---|---|" + "---|" * len(config.agents)
     text = "\n".join([head, *(as_line(row, config.agents) for row in rows)]) + "\n"
@@ -137,7 +137,7 @@ def drive(row: Row, config: AblationsConfig) -> dict[str, Any]:
     )
     if row.wet_loss is not None:
         factor = row.wet_loss / float(params.faults.wet_loss)
-        parts = tuple(WetRail(factor=factor) if isinstance(part, DrawnFaults) else part for part in env.parts)
+        parts = tuple(WetRail(factor=factor) if isinstance(part, Faults) else part for part in env.parts)
         env = dataclasses.replace(env, parts=parts)
     n = config.episodes
     index = np.arange(n, dtype=np.int32)

@@ -30,6 +30,7 @@ SCHEMA = "subterra.bound/1"
 TIGHT = 0.3  # m; the bound and the error are compared where the bound is below
 _CELL = 5.0  # m of station over which errors are gathered
 _MOUTH = 35.0  # m next to a mouth that are left out: the mouth itself is seen
+_MARGIN = 4.0  # m from each mouth to start and goal
 _CHUNK = 200
 _progress = Console(stderr=True, highlight=False)
 
@@ -79,9 +80,9 @@ def compare(name: str, config: BoundConfig) -> dict[str, Any]:
     """Return stations (m), bound (m) and root of the mean squared error of the filter (m) along a tunnel."""
     source, _, lining = name.rpartition(":")
     plan = st.load_tunnel(tunnel_of(Path(source)) if Path(source).is_dir() else source)
-    end = plan.length - 5.0
-    goal = GoalParams(low=end, high=end, margin=4.0)
-    env, params = st.make("Subterra/StopAt-v0", plan, lining, estimates=True, goal=goal, horizon=20_000)
+    way = plan.length - 2.0 * _MARGIN
+    goal = GoalParams(low=way, high=way, margin=_MARGIN)
+    env, params = st.make("Subterra/StopAt-v1", plan, lining, estimates=True, goal=goal, horizon=20_000)
     found = localisability(params, step=_CELL)
     driver = Driver(env, keep=_keep)
     seeds = config.seed + np.arange(config.episodes)

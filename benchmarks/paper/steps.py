@@ -10,7 +10,7 @@ from pathlib import Path
 from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.files import file_hash, write_json
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 SEEDS = (0, 1, 2, 3, 4)
 SURVEY_FILES = ("survey.bag", "groundtruth.tum", "survey_os1.bag", "groundtruth_os1.tum")
 SCENE_FILES = ("scene.xml", "bore.npz", "tunnel.npz", "cloud.ply", "manifest.json")

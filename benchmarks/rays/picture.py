@@ -19,7 +19,7 @@ from benchmarks.command import BenchmarkError, require_least, run_main
 from benchmarks.results import png_bytes, write_file
 from subterra_jax.parts.spatial_lidar import SENSORS
 
-_TASK = "Subterra/TraverseShort-v0"
+_TASK = "Subterra/TraverseShort-v1"
 _FAR = 12.0  # m, where the colours end
 _DOTS = 4_000  # beams of a sensor without rows that are drawn
 

@@ -150,7 +150,7 @@ def _success(agent: str, task: str) -> Callable[[Any], float]:
     return lambda content: (
         100.0
         * next(
-            row["success"] for row in content["scores"] if (row["agent"], row["task"]) == (agent, f"Subterra/{task}-v0")
+            row["success"] for row in content["scores"] if (row["agent"], row["task"]) == (agent, f"Subterra/{task}-v1")
         )
     )
 
@@ -164,7 +164,7 @@ _FIDELITY = (
     "benchmarks.fidelity run --scene {out}/scene --recording {out}/survey/survey_os1.bag "
     "--trajectory {out}/survey/groundtruth_os1.tum --truth {out}/survey --out {out}/report"
 )
-_LEARN = "train.navigate --task Subterra/TraverseShort-v0 --preset cpu --seeds 0 1 2 3 4 --overwrite --out {out}"
+_LEARN = "train.navigate --task Subterra/TraverseShort-v1 --preset cpu --seeds 0 1 2 3 4 --overwrite --out {out}"
 _METRO, _DIRTY = "{shared}/data/metro_asbuilt", "{shared}/data/dirty_clouds"
 JOBS = {
     job.name: job
@@ -195,8 +195,8 @@ _OUTSIDE, _OUTSIDE_H200 = "measured from outside, 2026-11-22", "measured from ou
 _JUDGED, _CONTROLS = "benchmarks.fidelity run --out out/fidelity", "benchmarks.fidelity controls --bold-only"
 _PEERS = "benchmarks.throughput --n 65536 --peers jaxnav --seconds 8 --poses 62500 --out out/peers"
 _LENGTHS = "benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths"
-_T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v0 --n 65536 --out out/stop"
-_MANY = "benchmarks.throughput --task Subterra/StopAt-v0 --tunnel procedural:train:0-99 --n 65536"
+_T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v1 --n 65536 --out out/stop"
+_MANY = "benchmarks.throughput --task Subterra/StopAt-v1 --tunnel procedural:train:0-99 --n 65536"
 _OPEN_STEP = "T1 of version 1 in 1,020 tunnels"
 _OPEN_MANY = (
     "benchmarks.throughput --task Subterra/StopAt-v1 --n 65536 --copies 17 --tunnel open:straight:train:0-9,"
@@ -204,14 +204,14 @@ _OPEN_MANY = (
     "open:rock:test-unseen:0-9"
 )
 _SPIN = (
-    "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
+    "train.navigate --task Subterra/StopAt-v1 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
     "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any "
     "--out out/spin"
 )
 _STEP_ON_CPU = "benchmarks.throughput --n 1024 --peers none"
-_FIVE = "train.navigate --task Subterra/Traverse-v0 --preset gpu --seeds 0 1 2 3 4 --out out/five"
+_FIVE = "train.navigate --task Subterra/Traverse-v1 --preset gpu --seeds 0 1 2 3 4 --out out/five"
 _FAMILY = (
-    "train.navigate --task Subterra/StopAt-v0 --memory gru --teacher oracle --tunnel procedural:train:0-255 "
+    "train.navigate --task Subterra/StopAt-v1 --memory gru --teacher oracle --tunnel procedural:train:0-255 "
     "--steps 150000000 --out out/family"
 )
 _RELEASED = "benchmarks.leaderboard --agents released-policy --tasks"
@@ -220,15 +220,15 @@ _SMOOTH_RETURN = f"{_RELEASED} Return --linings smooth --out out/smooth"
 _AT_THE_METRO = f"{_RELEASED} Obstructed Faulted Relocalise --tunnels metro-asbuilt --out out/metro"
 _UNSEEN = f"{_RELEASED} Obstructed Faulted --tunnels procedural:test:0-63 --out out/unseen"
 _SHORT = (
-    "train.navigate --task Subterra/StopAtShort-v0 --memory gru --teacher oracle --preset cpu "
+    "train.navigate --task Subterra/StopAtShort-v1 --memory gru --teacher oracle --preset cpu "
     "--evaluation-episodes 500 --out out/short"
 )
 _WALK, _B2 = "train.walk --preset gpu --out out/walk", "benchmarks.b2 --robots 8192"
-_TRAVERSE = "benchmarks.b2_traverse --robots 100 --agent B2Traverse-v0"
-_FOUR = "train.navigate --task Subterra/Traverse-v0 --preset gpu --parts 4 --out out/four"
+_TRAVERSE = "benchmarks.b2_traverse --robots 100 --agent B2Traverse-v1"
+_FOUR = "train.navigate --task Subterra/Traverse-v1 --preset gpu --parts 4 --out out/four"
 _BOARD = "benchmarks.openboard --tasks StopAt --splits test-unseen --out out/openboard --agents"
 _GYM = (
-    'timeit -n 2000 -r 5 -s \'import gymnasium; env = gymnasium.make("subterra_jax:Subterra/Traverse-v0"); '
+    'timeit -n 2000 -r 5 -s \'import gymnasium; env = gymnasium.make("subterra_jax:Subterra/Traverse-v1"); '
     "env.reset(); action = env.action_space.low; env.step(action)' 'env.step(action)'"
 )
 

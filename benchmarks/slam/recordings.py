@@ -18,7 +18,7 @@ from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
 from scene.reading.scans import parse_pointcloud2
 from subterra_jax.evaluation.episodes import N_LISTED
-from subterra_jax.host.versions import no_task
+from subterra_jax.host.task_ids import no_task
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.recorder.config import check_config, open_world
 from subterra_jax.tasks import TASKS
@@ -76,8 +76,8 @@ def plan_set(config: SetConfig) -> list[tuple[str, RecorderConfig]]:
         raise BenchmarkError(f"secret must not be negative, got {config.secret}")
     plan = []
     for task in config.tasks:
-        short = task.removeprefix("Subterra/").removesuffix("-v0")
-        if f"Subterra/{short}-v0" not in TASKS:
+        short = task.removeprefix("Subterra/").removesuffix("-v1")
+        if f"Subterra/{short}-v1" not in TASKS:
             raise BenchmarkError(no_task(task, TASKS))
         for lining in config.linings:
             for episode in range(config.episodes):

@@ -28,7 +28,7 @@ from benchmarks.throughput.variants import measure_lengths, measure_linings
 from subterra_jax.host.files import require_folder
 from train import tunnels
 
-_WHOLE = "Subterra/Traverse-v0"  # whose piece is the whole tunnel
+_WHOLE = "Subterra/Traverse-v1"  # whose piece is the whole tunnel
 _COMPARED = 8  # tunnels of several in which the LiDAR is compared
 _progress = Console(stderr=True, highlight=False, emoji=False)
 

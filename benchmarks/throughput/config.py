@@ -44,7 +44,7 @@ class ThroughputConfig:
 
     n: tuple[int, ...] = ()
     peers: tuple[PeerChoice, ...] = ("auto",)
-    task: str = "Subterra/Traverse-v0"
+    task: str = "Subterra/Traverse-v1"
     tunnel: str | None = None
     copies: int = 1
     scene: Path | None = None

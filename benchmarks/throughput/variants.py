@@ -13,7 +13,7 @@ from benchmarks.throughput.timing import Speed, Timing, measure_in_turn
 from subterra_jax.lidar.reference import Agreement
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 
-_TASK = "Subterra/Traverse-v0"  # whose piece is the whole tunnel
+_TASK = "Subterra/Traverse-v1"  # whose piece is the whole tunnel
 
 
 @dataclass(frozen=True)

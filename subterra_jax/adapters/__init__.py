@@ -5,50 +5,15 @@ Each file needs its own library, and none is imported before its first use.
 
 from collections.abc import Sequence
 
-from subterra_jax.b2 import MISSIONS, WALK
+from subterra_jax.host.task_ids import MISSIONS, PLANAR, WALK
 
-# The keys of `subterra_jax.tasks.TASKS`, which loads jax; importing the package registers them and must not.
-PLANAR_TASKS = tuple(
-    f"Subterra/{name}-v0"
-    for name in (
-        "Traverse",
-        "TraverseShort",
-        "StopAt",
-        "StopAtShort",
-        "StopAtOffset",
-        "StopAtOffsetShort",
-        "Return",
-        "ReturnShort",
-        "Obstructed",
-        "ObstructedShort",
-        "Faulted",
-        "FaultedShort",
-        "Relocalise",
-        "RelocaliseShort",
-    )
-)
-PLANAR_TASKS += tuple(
-    f"Subterra/{name}-v1"
-    for name in (
-        "StopAt",
-        "Return",
-        "Obstructed",
-        "Faulted",
-        "StopAtOffset",
-        "ReturnOffset",
-        "ObstructedOffset",
-        "FaultedOffset",
-        "StopAtShort",
-        "Relocalise",
-    )
-)
 _SINGLE = "subterra_jax.adapters.single:SubterraEnv"
 _VECTOR = "subterra_jax.adapters.vector:SubterraVectorEnv"
 # MuJoCo is loaded only where one of these is made.
 _ON_LEGS = dict.fromkeys(MISSIONS, "subterra_jax.b2.gym:B2Env") | {WALK: "subterra_jax.b2.gym:B2WalkEnv"}
 
 
-def register_tasks(tasks: Sequence[str] = PLANAR_TASKS) -> None:
+def register_tasks(tasks: Sequence[str] = PLANAR) -> None:
     """Make planar tasks, and those on legs, known to Gymnasium under their ids; doing so again changes nothing."""
     from gymnasium.envs import registration  # optional
 

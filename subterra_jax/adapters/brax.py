@@ -45,7 +45,7 @@ class SubterraBraxEnv(Env):
         **options: As for `subterra_jax.make`.
     """
 
-    def __init__(self, task: str = "Subterra/Traverse-v0", params: EnvParams | None = None, **options: Any):
+    def __init__(self, task: str = "Subterra/Traverse-v1", params: EnvParams | None = None, **options: Any):
         self.env, made = make(task, **options)
         self.params = made if params is None else params
 

@@ -25,7 +25,7 @@ class GoalConditioned(gymnasium.Wrapper[GoalObservation, np.ndarray, Any, np.nda
     `achieved_goal` is the believed start and the dead-reckoned distance, m, `(1,)`. Reward is 1 for a stop within the
     tolerance of the goal and else 0, so that it can be computed for another goal.
 
-        env = GoalConditioned(gymnasium.make("subterra_jax:Subterra/StopAtShort-v0"))
+        env = GoalConditioned(gymnasium.make("subterra_jax:Subterra/StopAtShort-v1"))
         SAC("MultiInputPolicy", env, replay_buffer_class=HerReplayBuffer, replay_buffer_kwargs={"copy_info_dict": True})
 
     Args:

@@ -51,7 +51,7 @@ class SubterraGymnax:
         **options: As for `subterra_jax.make`.
     """
 
-    def __init__(self, task: str = "Subterra/Traverse-v0", **options: Any):
+    def __init__(self, task: str = "Subterra/Traverse-v1", **options: Any):
         self.env: TunnelEnv
         self.env, params = make(task, **options)
         self._params = GymnaxParams(params.tunnel, params.horizon, params.parts, params.errand)

@@ -83,7 +83,7 @@ class SubterraVecEnv(VecEnv):
         **options: As for `SubterraEnv`.
     """
 
-    def __init__(self, num_envs: int, task: str = "Subterra/Traverse-v0", flat: bool = False, **options: Any):
+    def __init__(self, num_envs: int, task: str = "Subterra/Traverse-v1", flat: bool = False, **options: Any):
         self._envs = SubterraVectorEnv(num_envs, AutoresetMode.SAME_STEP, task, flat=flat, **options)
         self._rows = [EnvRow(self._envs, index) for index in range(num_envs)]
         self._action = np.zeros((0,), np.float32)

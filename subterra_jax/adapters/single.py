@@ -164,7 +164,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
 
     def __init__(
         self,
-        task: str = "Subterra/Traverse-v0",
+        task: str = "Subterra/Traverse-v1",
         tunnel: Source | Sequence[Source] = None,
         lining: str | None = None,
         flat: bool = False,

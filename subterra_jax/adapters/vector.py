@@ -87,7 +87,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self,
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        task: str = "Subterra/Traverse-v0",
+        task: str = "Subterra/Traverse-v1",
         tunnel: Source | Sequence[Source] = None,
         lining: str | None = None,
         flat: bool = False,

@@ -4,8 +4,3 @@ constants ─► model ─┐
 track ──────────────┴► physics (MJX) or engine (MuJoCo in C) ─► walk (50 Hz) ─► mission (5 Hz)
 kinematics ─► gait ───────────────────────────────────────────────┘
 """
-
-# Task ids. Importing them does not load MuJoCo.
-WALK = "Subterra/B2Walk-v0"
-TRAVERSE = "Subterra/B2Traverse-v0"
-MISSIONS = (TRAVERSE,)  # planar tasks, done on a learnt gait

@@ -23,7 +23,7 @@ from subterra_jax.policies.trained import Tensors
 
 _OFFSET = np.array([0.0, 0.5, 0.5, 0.0], np.float32)  # of each leg's clock: diagonal legs together
 _WEIGHT = b2.TOTAL_MASS * b2.GRAVITY
-RELEASED = "B2Walk-v0"
+RELEASED = "B2Walk-v1"
 _CLIP = 10.0  # largest normalised observation, standard deviations
 
 

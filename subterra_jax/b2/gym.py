@@ -1,4 +1,4 @@
-"""Gymnasium: one B2 in MuJoCo's own engine, as `Subterra/B2Traverse-v0` and `Subterra/B2Walk-v0`."""
+"""Gymnasium: one B2 in MuJoCo's own engine, as `Subterra/B2Traverse-v1` and `Subterra/B2Walk-v1`."""
 
 import os
 import sys
@@ -17,12 +17,13 @@ if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.ge
 from subterra_jax.adapters import packing
 from subterra_jax.adapters.packing import Observation, start_streams, take_key
 from subterra_jax.adapters.views import TunnelChoice
-from subterra_jax.b2 import TRAVERSE, WALK, tasks
+from subterra_jax.b2 import tasks
 from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
 from subterra_jax.b2.gait import RELEASED, WalkPolicy
 from subterra_jax.b2.params import WalkParams, WalkState
 from subterra_jax.b2.view import Camera
 from subterra_jax.b2.walk import WalkEnv
+from subterra_jax.host.task_ids import B2_TRAVERSE, WALK
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -163,7 +164,7 @@ class B2Env(SingleB2):
 
     def __init__(
         self,
-        task: str = TRAVERSE,
+        task: str = B2_TRAVERSE,
         tunnel: TunnelPlan | str | Path | None = None,
         lining: str | None = None,
         *,

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import jax.numpy as jnp
 import numpy as np
 
-from subterra_jax.b2 import MISSIONS, TRAVERSE, WALK
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.engine import MujocoPhysics, walk_in_scene
 from subterra_jax.b2.gait import RELEASED, GaitParams, WalkPolicy, check_fits, load_policy
@@ -18,6 +17,7 @@ from subterra_jax.b2.physics import Physics
 from subterra_jax.b2.track import Track, lay_standard_track, read_scene_track
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.constants import DISTANCE_BIAS_SIGMA, RANGE_MAX
+from subterra_jax.host.task_ids import B2_TRAVERSE, MISSIONS, WALK
 from subterra_jax.lidar3d.relief import Relief
 from subterra_jax.params import check_together, collect_entries, make_params
 from subterra_jax.parts import Odometer
@@ -57,7 +57,7 @@ def make(
     """Makes the walking environment and its params.
 
     Args:
-        id: `Subterra/B2Walk-v0`.
+        id: `Subterra/B2Walk-v1`.
         tunnel: A tunnel file, a name as for `load_tunnel`, or a plan; None is the packaged tunnel. Sleepers are laid
             by standard.
         lining: Variant of the walls; None is `pockets`, or the first where a tunnel has none.
@@ -115,7 +115,7 @@ def _load_track(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None
 
 
 def make_mission(
-    id: str = TRAVERSE,
+    id: str = B2_TRAVERSE,
     tunnel: TunnelPlan | str | Path | None = None,
     lining: str | None = None,
     *,

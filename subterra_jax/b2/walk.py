@@ -41,7 +41,7 @@ class WalkEnv:
         privileged: Whether the observation ends with the truth for a critic.
     """
 
-    id: str = "Subterra/B2Walk-v0"
+    id: str = "Subterra/B2Walk-v1"
     physics: Physics = dataclasses.field(default_factory=Physics)
     driven: bool = False
     privileged: bool = False

@@ -19,15 +19,16 @@ def stop_bounds(params: EnvParams) -> dict[str, float]:
     """Expected success of a stop at the goal, 0 to 1, from commands, from odometry, and from the best of both.
 
     Args:
-        params: A task with slip and a goal; goals are drawn uniformly between its bounds.
+        params: A task with slip and a goal, whose distance is drawn uniformly between its bounds.
 
     Returns:
         `command`, `odometry` and `fused`, to the first order in the errors. `fused` is the most that anybody can have
         who knows the task's priors and sees no walls.
     """
-    low = float(params.goal.low)
-    high = max(low, min(float(params.goal.high), float(np.min(params.tunnel.length)) - float(params.goal.margin)))
-    distance = low + (high - low) * (np.arange(_GOALS) + 0.5) / _GOALS - float(params.start.station)
+    room = float(np.min(params.tunnel.length)) - 2.0 * float(params.goal.margin)
+    high = min(float(params.goal.high), room)
+    low = min(float(params.goal.low), high)
+    distance = low + (high - low) * (np.arange(_GOALS) + 0.5) / _GOALS
     slip, odometry, metre = params.slip, params.odometry, _noise_of_a_metre(params)
     variances = {
         "command": (slip.gain_sigma * distance) ** 2 + _wander_variance(distance, slip.wander),

@@ -8,14 +8,13 @@ from importlib import resources
 
 import numpy as np
 
-from subterra_jax.b2 import MISSIONS
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS
 from subterra_jax.tunnel_env import TunnelEnv
 
 SCHEMA = "subterra.evaluation/1"
-SHA256 = "4ec196147f6aa4d6f4b3c656cf6d169295718eff9c50046f31743f6de138baa2"
+SHA256 = "1c7d30cd26d502c01e24f291fbe7d130d32b5b570780fa749787296d3b0bd58f"
 N_LISTED = 500
 N_GROUPS = 10
 
@@ -53,7 +52,7 @@ def listed_seeds(task: str) -> np.ndarray:
     listed = _listed()
     if task in listed:
         return np.asarray(listed[task], np.uint32)
-    if task not in TASKS and task not in MISSIONS:
+    if task not in TASKS:
         raise EvaluationError(f"no task {task!r}; there are {', '.join(TASKS)}")
     return draw_seeds(task)
 
@@ -101,11 +100,3 @@ def draw_seeds(task: str) -> np.ndarray:
     digest = hashlib.sha256(f"{SCHEMA} {task}".encode()).digest()
     generator = np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))
     return (2**30 + generator.choice(2**30, N_LISTED, replace=False, shuffle=True)).astype(np.uint32)
-
-
-def draw_list(tasks: tuple[str, ...]) -> bytes:
-    """Write the list as its file holds it."""
-    lines = ",\n".join(
-        f" {json.dumps(task)}: {json.dumps(draw_seeds(task).tolist(), separators=(',', ':'))}" for task in tasks
-    )
-    return f'{{"schema": "{SCHEMA}", "tasks": {{\n{lines}\n}}}}\n'.encode()

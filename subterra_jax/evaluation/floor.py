@@ -1,4 +1,4 @@
-"""The floor of a task of version 1: the most that anybody can expect who never localises by the walls.
+"""The floor of a task: the most that anybody can expect who never localises by the walls.
 
 Such an agent has commands, odometry, the flag and what it is told, and knows the sizes of every error and, under
 faults, the episode's severity; no start and no goal lies in sight of a mouth. float64 on the host, sharing no code with
@@ -23,7 +23,7 @@ def floor(params: EnvParams, index: int = 0) -> float:
     """Compute the largest expected success without a look at the walls, 0 to 1, to the first order in the errors.
 
     Args:
-        params: A task of version 1.
+        params: A task with a goal.
         index: Number of the tunnel in a stack.
     """
     length = float(np.broadcast_to(np.asarray(params.tunnel.length), params.tunnel.count)[index])

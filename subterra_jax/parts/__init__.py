@@ -1,9 +1,8 @@
 """The parts of an environment, one file each; `part.py` is their contract."""
 
-from subterra_jax.parts.drawn_faults import DrawnFaultParams, DrawnFaults
-from subterra_jax.parts.faults import Faults
+from subterra_jax.parts.faults import FaultParams, Faults
 from subterra_jax.parts.imu import Imu, ImuParams
-from subterra_jax.parts.obstacles import Obstacles, ObstaclesAhead
+from subterra_jax.parts.obstacles import Obstacles
 from subterra_jax.parts.odometer import Odometer
 from subterra_jax.parts.part import Drive, Motion, Moved, Noise, Part, Sight, Step
 from subterra_jax.parts.planar_lidar import PlanarLidar
@@ -12,9 +11,8 @@ from subterra_jax.parts.spatial_lidar import SpatialLidar, SpatialParams, make_s
 from subterra_jax.parts.unicycle import Unicycle
 
 __all__ = [
-    "DrawnFaultParams",
-    "DrawnFaults",
     "Drive",
+    "FaultParams",
     "Faults",
     "Imu",
     "ImuParams",
@@ -22,7 +20,6 @@ __all__ = [
     "Moved",
     "Noise",
     "Obstacles",
-    "ObstaclesAhead",
     "Odometer",
     "Part",
     "PlanarLidar",

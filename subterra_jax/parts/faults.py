@@ -1,4 +1,7 @@
-"""Faults that come and go: beams that drop out, dust, an odometer that freezes, stale data, wet rails."""
+"""Faults that come and go: beams that drop out, dust, an odometer that freezes, stale data, wet rails.
+
+Their sizes are drawn for each episode and never told, and no exact zero gives them away.
+"""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -13,17 +16,21 @@ from subterra_jax import constants
 from subterra_jax.parts.hashing import uniform
 from subterra_jax.parts.odometer import OdometryState
 from subterra_jax.parts.part import Batch, Drive, Keys, Noise, Part, Sight, Step
+from subterra_jax.parts.unicycle import wrap
 from subterra_jax.state import EnvParams, State
 
 N_SEVERITIES = 5
 MAX_DELAY = 4  # steps
 PATCH = constants.WET_PATCH  # m of rail that are wet or dry as a whole
 _WET = 17  # number of the draw that makes a patch wet
+SIZES = ("dropout_share", "dropout_steps", "dust_rate", "freeze_steps", "delay", "wet_share", "wet_loss")
 
 
 @struct.dataclass
 class FaultParams:
     """Faults at severity 4. There are none at severity 0, and proportionally fewer in between.
+
+    Those of `SIZES` are middles of the ranges that the sizes of an episode are drawn from; the ranges are public.
 
     Attributes:
         severity_low: Least severity of an episode, 0 to 4.
@@ -37,6 +44,9 @@ class FaultParams:
         delay: Age of the observation, steps; at most 4.
         wet_share: Share of the 10 m patches of rail that are wet.
         wet_loss: Share of the speed lost on wet rail, while the wheels turn as before.
+        spread: Each of `SIZES` is drawn evenly between 1 - spread and 1 + spread times its middle, by itself.
+        origin_distance: Standard deviation of the odometer's distance at the start, m.
+        origin_heading: Standard deviation of its heading there, rad.
     """
 
     severity_low: int = constants.SEVERITY_LOW
@@ -50,6 +60,9 @@ class FaultParams:
     delay: float = constants.DELAY
     wet_share: float = constants.WET_SHARE
     wet_loss: float = constants.WET_LOSS
+    spread: float = constants.FAULT_SPREAD
+    origin_distance: float = constants.ORIGIN_DISTANCE_SIGMA
+    origin_heading: float = constants.ORIGIN_HEADING_SIGMA
 
 
 @struct.dataclass
@@ -65,6 +78,8 @@ class FaultState:
         dropout_first: First beam of that sector.
         dropout_count: Beams of that sector.
         freeze_left: Steps until the odometer counts again.
+        scale: Factors on the middles of `SIZES`, 1.
+        origin: Readings of the odometer at the start, m and rad.
     """
 
     severity: Float[Array, ""]
@@ -74,6 +89,8 @@ class FaultState:
     dropout_first: Float[Array, ""]
     dropout_count: Float[Array, ""]
     freeze_left: Float[Array, ""]
+    scale: Float[Array, "7"]
+    origin: Float[Array, "2"]
 
 
 def sight(
@@ -88,21 +105,10 @@ def n_step_noise(n_beams: int) -> int:
     return 5 + n_beams
 
 
-def start_faults(
-    draw: Float[Array, ""], seed: UInt32[Array, ""], seen: Float[Array, "6"], params: FaultParams
-) -> FaultState:
-    """Begin an episode without faults; `draw` is uniform in [0, 1) and gives the severity."""
+def draw_severity(draw: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
+    """Draw the severity of an episode; `draw` is uniform in [0, 1)."""
     low, high = (jnp.asarray(bound).astype(draw.dtype) for bound in (params.severity_low, params.severity_high))
-    zero = jnp.zeros_like(draw)
-    return FaultState(
-        severity=jnp.minimum(low + jnp.floor(draw * (high - low + 1)), high),
-        seed=seed,
-        seen=jnp.broadcast_to(seen, (MAX_DELAY + 1, 6)),
-        dropout_left=zero,
-        dropout_first=zero,
-        dropout_count=zero,
-        freeze_left=zero,
-    )
+    return jnp.minimum(low + jnp.floor(draw * (high - low + 1)), high)
 
 
 def grip(state: FaultState, station: Float[Array, ""], params: FaultParams) -> Float[Array, ""]:
@@ -177,43 +183,69 @@ def _again(draw: Float[Array, "*n"], rate: Float[Array, ""]) -> Float[Array, "*n
 
 @dataclasses.dataclass(frozen=True)
 class Faults(Part):
-    """Lost beams, dust, a frozen odometer, late observations and wet rail, all of one severity."""
+    """Lost beams, dust, a frozen odometer, late observations and wet rail, all of one severity.
+
+    A frozen odometer goes on with its noise, as does one of a standing robot, and late observations begin with readings
+    from before the start: neither shows as an exact zero.
+    """
 
     name: ClassVar[str] = "faults"
-    streams: ClassVar[tuple[int, ...]] = (6, 7)
+    streams: ClassVar[tuple[int, ...]] = (6, 7, 8, 9)
 
     def defaults(self) -> dict[str, Any]:
         """Return `faults`."""
         return {"faults": FaultParams()}
 
     def draw_reset(self, key: Keys, batch: Batch, params: EnvParams) -> tuple[Array, ...]:
-        """Draw random bits `(*batch, 2)`, of which the second word counts, and a uniform number `(*batch,)`."""
+        """Draw what an episode needs.
+
+        Returns:
+            Random bits `(*batch, 2)`, of which the second word counts; uniform numbers for the severity `(*batch,)` and
+            the sizes `(*batch, 7)`; and normal ones for what was read before the start, `(*batch, 5, 2)`.
+        """
         del params
-        return jax.random.bits(key[0], (*batch, 2), jnp.uint32), jax.random.uniform(key[1], batch, jnp.float32)
+        return (
+            jax.random.bits(key[0], (*batch, 2), jnp.uint32),
+            jax.random.uniform(key[1], batch, jnp.float32),
+            jax.random.uniform(key[2], (*batch, len(SIZES)), jnp.float32),
+            jax.random.normal(key[3], (*batch, MAX_DELAY + 1, 2), jnp.float32),
+        )
 
     def uniforms(self, params: EnvParams) -> int:
         """Count the numbers of a step."""
         return n_step_noise(params.lidar.n_beams)
 
     def begin(self, draw: tuple[Array, ...], state: State, params: EnvParams) -> FaultState:
-        """Begin an episode without faults."""
-        seen = sight(state.position, state.heading, state.station, state.odometry)
-        return start_faults(draw[1], draw[0][1], seen, params.faults)
+        """Begin an episode without faults; the robot has stood still until now."""
+        faults, odometry = params.faults, params.odometry
+        noise = jnp.stack([jnp.asarray(odometry.distance_sigma), jnp.asarray(odometry.heading_sigma)])
+        past = noise * jnp.cumsum(draw[3][:-1], axis=0)
+        origin = jnp.stack([jnp.asarray(faults.origin_distance), jnp.asarray(faults.origin_heading)]) * draw[3][-1]
+        now = sight(state.position, state.heading, state.station, state.odometry)
+        zero = jnp.zeros_like(draw[1])
+        return FaultState(
+            severity=draw_severity(draw[1], faults),
+            seed=draw[0][1],
+            seen=jnp.broadcast_to(now, (MAX_DELAY + 1, 6)).at[1:, 4:].add(-past),
+            dropout_left=zero,
+            dropout_first=zero,
+            dropout_count=zero,
+            freeze_left=zero,
+            scale=1.0 + faults.spread * (2.0 * draw[2] - 1.0),
+            origin=origin,
+        )
 
-    def sizes(self, own: Any, params: EnvParams) -> FaultParams:
+    def sizes(self, own: FaultState, params: EnvParams) -> FaultParams:
         """Return the sizes of the faults of an episode at severity 4."""
-        del own
-        return params.faults
+        middle: Any = params.faults
+        sizes: FaultParams = middle.replace(**{n: getattr(middle, n) * own.scale[i] for i, n in enumerate(SIZES)})
+        return sizes
 
     def drive(self, own: FaultState, drive: Drive, state: State, params: EnvParams) -> Drive:
-        """Take speed from the robot on wet rail, and none from its wheels."""
-        wheels = drive.wheels
+        """Take speed from the robot on wet rail, and none from its wheels; those of a frozen odometer seem to stand."""
         share = grip(own, state.station, self.sizes(own, params))
-        return Drive(wheels, jnp.stack([drive.motion[0] * share, drive.motion[1]]))
-
-    def holds_odometer(self, own: FaultState) -> Bool[Array, ""]:
-        """Freeze the odometer."""
-        return frozen(own)
+        motion = jnp.stack([drive.motion[0] * share, drive.motion[1]])
+        return Drive(jnp.where(frozen(own), 0.0, drive.wheels), motion)
 
     def advance(self, own: FaultState, step: Step, noise: Noise, params: EnvParams) -> FaultState:
         """Remember the step, and let faults end or begin."""
@@ -221,9 +253,11 @@ class Faults(Part):
         return advance_faults(own, seen, noise.uniform, params.lidar.n_beams, self.sizes(own, params))
 
     def look_from(self, own: FaultState, sight: Sight, params: EnvParams) -> Sight:
-        """Show an earlier moment."""
+        """Show an earlier moment, by an odometer that did not begin at 0."""
         seen = observed(own, self.sizes(own, params))
-        reading = dataclasses.replace(sight.parts["odometry"], distance=seen[4], heading=seen[5])
+        reading = dataclasses.replace(
+            sight.parts["odometry"], distance=seen[4] + own.origin[0], heading=wrap(seen[5] + own.origin[1])
+        )
         parts = {**sight.parts, "odometry": reading}
         return dataclasses.replace(sight, position=seen[:2], heading=seen[2], station=seen[3], parts=parts)
 
@@ -232,8 +266,8 @@ class Faults(Part):
         return spoil(ranges, own, noise.uniform, jnp.asarray(params.lidar.range_max), self.sizes(own, params))
 
     def privileged(self, own: FaultState) -> dict[str, Array]:
-        """Return the severity."""
-        return {"severity": own.severity}
+        """Return the severity, and the factors on the middles of the sizes that a bound may know."""
+        return {"severity": own.severity, **{f"fault_{name}": own.scale[i] for i, name in enumerate(SIZES)}}
 
     def info(self, own: FaultState) -> dict[str, Array]:
         """Return the severity."""

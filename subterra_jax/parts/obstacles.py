@@ -29,7 +29,7 @@ class ObstacleParams:
         size_min: Least side of a box, m.
         size_max: Largest side of a box, m.
         gap: Free width left on one side of each box, m.
-        first: No obstacle stands before this station, m.
+        first: No obstacle stands before this distance from the start, m.
         trolley_length: Length of the trolley, along the tunnel, m.
         trolley_width: Its width, m.
     """
@@ -53,7 +53,7 @@ def boxes_near(
         reach: Distance back to the first slot, m.
         n: Number of slots.
         tunnel: The tunnel they stand in.
-        params: Their sizes.
+        params: Their sizes; `first` is a station here, m.
     """
     slot = jnp.floor((station - reach) / PITCH).astype(jnp.int32) + jnp.arange(n, dtype=jnp.int32)
     return boxes_in(seed, slot, tunnel, params)
@@ -95,9 +95,22 @@ def clearance(
     return distance_to(boxes_near(seed, station, 3.0, _N_NEAR, tunnel, params), position)
 
 
+@struct.dataclass
+class ObstacleState:
+    """Boxes of an episode.
+
+    Attributes:
+        seed: Seed of the boxes.
+        start: Station of the start, m.
+    """
+
+    seed: UInt32[Array, ""]
+    start: Float[Array, ""]
+
+
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Part):
-    """Boxes that stand in the way; its state is the seed of the episode's boxes."""
+    """Boxes that stand in the way, ahead of a start that may lie anywhere."""
 
     name: ClassVar[str] = "obstacles"
     streams: ClassVar[tuple[int, ...]] = (6,)
@@ -111,65 +124,30 @@ class Obstacles(Part):
         del params
         return jax.random.bits(key, (*batch, 2), jnp.uint32)
 
-    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> UInt32[Array, ""]:
-        """Return the seed."""
-        del state, params
-        return draw[0]
+    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> ObstacleState:
+        """Return the seed, and where the boxes begin."""
+        del params
+        return ObstacleState(draw[0], state.station)
 
-    def clearance(self, own: Array, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Array:
+    def clearance(
+        self, own: ObstacleState, position: Array, station: Array, tunnel: Tunnel, params: EnvParams
+    ) -> Array:
         """Measure the distance to the nearest box, m."""
-        return clearance(own, station, position, tunnel, params.obstacles)
+        return clearance(own.seed, station, position, tunnel, _ahead(own, params))
 
     def hits(
-        self, own: Array, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
+        self, own: ObstacleState, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
     ) -> Float[Array, "n_beams"]:
         """Measure where beams meet boxes, m."""
-        boxes = boxes_near(own, sight.station, REACH, N_SLOTS, sight.tunnel, params.obstacles)
+        boxes = boxes_near(own.seed, sight.station, REACH, N_SLOTS, sight.tunnel, _ahead(own, params))
         return distance_along(boxes, sight.position, directions)
 
-    def boxes(self, own: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
+    def boxes(self, own: ObstacleState, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
         """Return the boxes within a LiDAR's reach."""
-        return [boxes_near(own, station, REACH, N_SLOTS, tunnel, params.obstacles)]
+        return [boxes_near(own.seed, station, REACH, N_SLOTS, tunnel, _ahead(own, params))]
 
 
-@struct.dataclass
-class ClearStartState:
-    """Boxes of an episode that begins inside.
-
-    Attributes:
-        seed: Seed of the boxes.
-        start: Station of the start, m.
-    """
-
-    seed: UInt32[Array, ""]
-    start: Float[Array, ""]
-
-
-@dataclasses.dataclass(frozen=True)
-class ObstaclesAhead(Obstacles):
-    """Boxes ahead of a start that may lie anywhere: `obstacles.first` is a distance from the start."""
-
-    def begin(self, draw: UInt32[Array, "2"], state: State, params: EnvParams) -> Any:
-        """Return the seed, and where the boxes begin."""
-        return ClearStartState(draw[0], state.station)
-
-    def clearance(self, own: Any, position: Array, station: Array, tunnel: Tunnel, params: EnvParams) -> Array:
-        """Measure the distance to the nearest box, m."""
-        return super().clearance(own.seed, position, station, tunnel, self._ahead(own, params))
-
-    def hits(
-        self, own: Any, sight: Sight, directions: Float[Array, "n_beams 2"], params: EnvParams
-    ) -> Float[Array, "n_beams"]:
-        """Measure where beams meet boxes, m."""
-        return super().hits(own.seed, sight, directions, self._ahead(own, params))
-
-    def boxes(self, own: Any, station: Array, tunnel: Tunnel, params: EnvParams) -> list[Boxes]:
-        """Return the boxes within a LiDAR's reach."""
-        return super().boxes(own.seed, station, tunnel, self._ahead(own, params))
-
-    def _ahead(self, own: ClearStartState, params: EnvParams) -> EnvParams:
-        """Params of the boxes of an episode."""
-        sizes = params.obstacles
-        return dataclasses.replace(
-            params, parts=params.parts.copy({"obstacles": sizes.replace(first=sizes.first + own.start)})
-        )
+def _ahead(own: ObstacleState, params: EnvParams) -> ObstacleParams:
+    """Params of an episode's boxes, whose first station is counted from the mouth."""
+    sizes: ObstacleParams = params.obstacles
+    return sizes.replace(first=sizes.first + own.start)  # type: ignore[attr-defined]

@@ -119,24 +119,6 @@ def advance_odometry(
     )
 
 
-def hold(before: Any, after: Any, held: list[Any]) -> Any:
-    """Return the odometer after a step; while a part holds it, its readings stay and its errors go on.
-
-    Args:
-        before: The odometer before the step.
-        after: The odometer that has counted.
-        held: Answer of each part to `holds_odometer`; a plain False costs nothing.
-    """
-    for holds in held:
-        if holds is not False:
-            after = dataclasses.replace(
-                after,
-                distance=jnp.where(holds, before.distance, after.distance),
-                heading=jnp.where(holds, before.heading, after.heading),
-            )
-    return after
-
-
 @dataclasses.dataclass(frozen=True)
 class Odometer(Part):
     """Distance and heading counted from the wheels."""

@@ -200,11 +200,6 @@ class Part(abc.ABC):
         del own, position, station, tunnel, params
         return np.inf
 
-    def holds_odometer(self, own: Any) -> Any:
-        """Tell whether the odometer does not count in this step."""
-        del own
-        return False
-
     def advance(self, own: Any, step: Step, noise: Noise, params: EnvParams) -> Any:
         """Return the part's state after a step."""
         del step, noise, params

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines.agent import shown
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.episode import ask, in_tunnel, look
+from subterra_jax.host.task_ids import MISSIONS
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.files import GAIT, PolicyError, read_facts
 from subterra_jax.policies.loading import load
@@ -211,7 +211,7 @@ def load_policy(source: Any, env: TunnelEnv | None = None, params: EnvParams | N
     """Loads a policy as a function of observation and memory, whatever it is made of.
 
     Args:
-        source: Name of a released policy, as `StopAt-v0`; a `.safetensors` file; a run folder of `train`; a baseline by
+        source: Name of a released policy, as `StopAt-v1`; a `.safetensors` file; a run folder of `train`; a baseline by
             name, as `ring-count`; `module:Class` or `FILE.py:Class`; or an agent.
         env: The environment to drive in. None is the task that the policy was trained on, in the packaged tunnel.
         params: Its params. Sizes and noises are what the policy believes of its robot.

@@ -17,7 +17,17 @@ from subterra_jax.host.errors import TunnelError
 from subterra_jax.procedural.bore import Bore, draw_bore
 from subterra_jax.procedural.cut import Cut, cut_lining, plane_walls
 from subterra_jax.procedural.geometry import Alignment, ProceduralConfig, draw_alignment, wander
-from subterra_jax.procedural.kinds import KINDS, LENGTH, all_kinds, kind_number
+from subterra_jax.procedural.kinds import (
+    BENCHES,
+    FIXTURES,
+    KINDS,
+    LENGTH,
+    MOUNT_HEIGHT,
+    MOUNT_LATERAL,
+    MOUNT_TILT,
+    all_kinds,
+    kind_number,
+)
 from subterra_jax.procedural.solid import make_shell
 from subterra_jax.tunnel.plan import TunnelPlan
 
@@ -54,13 +64,25 @@ def levels_of(kind: str, split: str) -> tuple[str, ...]:
 
 
 def figures() -> dict[str, Any]:
-    """Return every number that defines the open world, as plain values: kinds, splits, alignments, grades."""
+    """Return every number that defines the open world, as plain values; the tests list every key."""
     return {
         "kinds": {name: dataclasses.asdict(kind) for name, kind in KINDS.items()},
+        "order": list(KINDS),
+        "fixtures": {name: dataclasses.asdict(ranges) for name, ranges in FIXTURES.items()},
+        "benches": BENCHES,
+        "mount": (MOUNT_HEIGHT, MOUNT_LATERAL, MOUNT_TILT),
         "length": LENGTH,
         "splits": SPLITS,
         "held_out": HELD_OUT,
-        "line": dataclasses.asdict(LINE),
+        "line": {
+            "radius": LINE.radius,
+            "straight": LINE.straight,
+            "arc": LINE.arc,
+            "transition": LINE.transition,
+            "turn": LINE.turn,
+            "reverse_share": LINE.reverse_share,
+            "grid_step": LINE.grid_step,
+        },
         "grade": (GRADE_SD, GRADE_MOST, GRADE_WAVE),
         "share": _HALF,
     }

@@ -38,7 +38,7 @@ class RecorderConfig:
 
     Attributes:
         out: Folder to make; `recording/` and `truth/` go into it.
-        task: Task id, as `Subterra/StopAt-v0` or `StopAt`.
+        task: Task id, as `Subterra/StopAt-v1` or `StopAt`.
         agent: Driver, as on the leaderboard: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`,
             `module:Class` or `FILE.py:Class`.
         policy: Policy that drives instead: a `.safetensors` file, a run folder, or the name of a released one.
@@ -59,7 +59,7 @@ class RecorderConfig:
     """
 
     out: Path
-    task: str = "Subterra/StopAt-v0"
+    task: str = "Subterra/StopAt-v1"
     agent: str = "dead-reckoning"
     policy: str | None = None
     seed: int = 0

@@ -1,9 +1,8 @@
 """The rules of the tasks, one file each: params, start, verdict, reward; `rule.py` is their contract."""
 
-from subterra_jax.rules.inside import RelocaliseInside, StopInside, ToldParams, TurnBackInside
 from subterra_jax.rules.relocalise import Relocalise
 from subterra_jax.rules.rule import Choice, Rule, Start, StartParams, Verdict
-from subterra_jax.rules.stop import GoalParams, GoalRewardParams, StopAt
+from subterra_jax.rules.stop import GoalParams, GoalRewardParams, StopAt, ToldParams
 from subterra_jax.rules.traverse import RewardParams, Traverse
 from subterra_jax.rules.turn_back import TurnBack
 
@@ -12,16 +11,13 @@ __all__ = [
     "GoalParams",
     "GoalRewardParams",
     "Relocalise",
-    "RelocaliseInside",
     "RewardParams",
     "Rule",
     "Start",
     "StartParams",
     "StopAt",
-    "StopInside",
     "ToldParams",
     "Traverse",
     "TurnBack",
-    "TurnBackInside",
     "Verdict",
 ]

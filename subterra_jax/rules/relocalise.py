@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.parts.part import Bounds, Step
 from subterra_jax.rules.rule import Choice, Rule, Start, Verdict, spread
-from subterra_jax.rules.stop import GoalState, StopAt, count_still, goal_terms
+from subterra_jax.rules.stop import GoalRule, GoalState, count_still, goal_terms
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
@@ -27,15 +27,18 @@ class RelocaliseState(GoalState):
 
 
 @dataclasses.dataclass(frozen=True)
-class Relocalise(StopAt):
-    """Success is a right report at the stop: the one in the action of the step that makes it a stop."""
+class Relocalise(GoalRule):
+    """Success is a right report at the stop: the one in the action of the step that makes it a stop.
 
+    No mouth comes into sight within the travel that is allowed.
+    """
+
+    key: ClassVar[str] = "relocalise"
     errand: ClassVar[str] = "report"
-    chooses_goal: ClassVar[bool] = False
     reports: ClassVar[bool] = True
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
-        """Start anywhere but at the ends, facing either way."""
+        """Start anywhere but within `goal.margin` of a mouth, facing either way."""
         room = jnp.maximum(tunnel.length - 2.0 * params.goal.margin, 0.0)
         station = params.goal.margin + room * draw[1][1]
         backwards = (draw[1][2] < 0.5).astype(station.dtype)
@@ -85,3 +88,7 @@ class Relocalise(StopAt):
         """Return NaN: how far one has to drive depends on what there is to be seen."""
         del state, tunnel, params
         return jnp.full((), jnp.nan, jnp.float32)
+
+    def least_length(self, params: EnvParams) -> float:
+        """Return a metre and a margin at either end, m."""
+        return float(1.0 + 2.0 * np.max(params.goal.margin))

@@ -96,6 +96,8 @@ class Rule(abc.ABC):
     Its state is the entry `goal` of `State.parts`, its params are entries of `EnvParams.parts`.
 
     Attributes:
+        key: Name of the rule in the digest of the constants, where a rename of the class leaves it; by default the
+            class's name.
         errand: What agents are asked to do: `cover` (drive on), `stop` (at the observed `goal`), `return` (to the start
             once the observed `flag` is raised) or `report` (stop and say where).
         reports: The action holds an estimate that counts.
@@ -105,12 +107,18 @@ class Rule(abc.ABC):
         streams: Numbers of its random streams at a reset, one key each.
     """
 
+    key: ClassVar[str]
     errand: ClassVar[str] = "cover"
     reports: ClassVar[bool] = False
     chooses_goal: ClassVar[bool] = False
     covers: ClassVar[bool] = False
     needs: ClassVar[tuple[str, ...]] = ()
     streams: ClassVar[tuple[int, ...]] = (0,)
+
+    def __init_subclass__(cls, **options: Any):
+        super().__init_subclass__(**options)
+        if "key" not in cls.__dict__:
+            cls.key = cls.__name__
 
     def defaults(self) -> dict[str, Any]:
         """Entries of `EnvParams` that the rule reads, by name, with their default values; `start` at least."""

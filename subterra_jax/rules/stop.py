@@ -21,9 +21,9 @@ class GoalParams:
     """Goals, and what counts as having reached one.
 
     Attributes:
-        low: Least station of a goal, m.
-        high: Largest station of a goal, m.
-        margin: Least distance of goals, and of starts anywhere, from the ends of the tunnel, m; it comes before `low`.
+        low: Least distance of a goal from the start, m.
+        high: Largest distance of a goal from the start, m.
+        margin: Least distance of starts and goals from both mouths, m.
         tolerance: Largest error of success, m.
         still_speed: Speed below which a robot stands, m/s.
         still_yaw: Yaw rate from which it does not stand, rad/s: to turn on the spot is not to stop.
@@ -69,6 +69,17 @@ class GoalRewardParams:
 
 
 @struct.dataclass
+class ToldParams:
+    """Errors of what an agent is told.
+
+    Attributes:
+        pitch_error: Relative error of the ring length told against that of the tunnel's drawings, 1; for ablations.
+    """
+
+    pitch_error: float = 0.0
+
+
+@struct.dataclass
 class GoalState:
     """Goal of one episode.
 
@@ -81,12 +92,22 @@ class GoalState:
     still: Int[Array, ""]
 
 
-@dataclasses.dataclass(frozen=True)
-class StopAt(Rule):
-    """Success is a stop within the tolerance of the goal; any stop ends the episode."""
+@struct.dataclass
+class StopState(GoalState):
+    """Goal of one episode, and what is told.
 
-    errand: ClassVar[str] = "stop"
-    chooses_goal: ClassVar[bool] = True
+    Attributes:
+        told: Station of the start as it is told, m.
+        pitch: Ring length as it is told, m; 0 where there are no rings.
+    """
+
+    told: Float[Array, ""]
+    pitch: Float[Array, ""]
+
+
+class GoalRule(Rule):
+    """What the rules that end with a stop share."""
+
     streams: ClassVar[tuple[int, ...]] = (0, 4, 5)
 
     def defaults(self) -> dict[str, Any]:
@@ -101,27 +122,57 @@ class StopAt(Rule):
             jax.random.normal(key[2], batch, jnp.float32),
         )
 
+    def privileged(self, state: State) -> dict[str, Array]:
+        """Return the way to the goal, m, and how long the robot has stood, as a share of a stop."""
+        return {"to_goal": state.goal.station - state.station, "still": state.goal.still}
+
+    def tolerance(self, params: EnvParams) -> Any:
+        """Return the tolerance of the goal, m."""
+        return params.goal.tolerance
+
+
+@dataclasses.dataclass(frozen=True)
+class StopAt(GoalRule):
+    """Success is a stop within the tolerance of the goal; any stop ends the episode.
+
+    The episode starts further than `goal.margin` from both mouths, with a goal ahead. The believed start is observed as
+    `start`; the true one is off by a normal number of `start.station_sigma`, cut off at three of them.
+    """
+
+    key: ClassVar[str] = "stop"
+    errand: ClassVar[str] = "stop"
+    chooses_goal: ClassVar[bool] = True
+
+    def defaults(self) -> dict[str, Any]:
+        """Add `told`."""
+        return {**super().defaults(), "told": ToldParams()}
+
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
-        """Start near the mouth, facing forward, with a goal ahead."""
-        goal = GoalState(draw_goal(draw[1][0], tunnel, params.goal), jnp.zeros((), jnp.int32))
+        """Draw the distance, then the start in the room that is left, then how far the true start is off."""
+        told, goal = draw_stations(draw[1], tunnel, params.goal)
         offset = params.start.station_sigma * jnp.clip(draw[2], -3.0, 3.0)
-        # Not outside of the mouth.
-        return Start(jnp.maximum(params.start.station + offset, 0.0), **spread(draw[0], params), own=goal)
+        pitch = tunnel.ring_pitch * (1.0 + params.told.pitch_error)
+        own = StopState(goal, jnp.zeros((), jnp.int32), told, pitch)
+        return Start(told + offset, **spread(draw[0], params), own=own)
 
     def place(self, start: Start, choice: Choice) -> Start:
-        """Return a start with a chosen place and goal."""
+        """Return a start with a chosen place, which is told as it is, and goal; a drawn goal keeps its distance."""
+        own = start.own
+        told = chosen(choice.station, own.told)
+        goal = chosen(choice.goal, own.station + told - own.told)
         start = super().place(start, choice)
-        own = dataclasses.replace(start.own, station=chosen(choice.goal, start.own.station))
-        return dataclasses.replace(start, own=own)
+        return dataclasses.replace(start, own=dataclasses.replace(own, station=goal, told=told))
 
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Station of the goal (m), and distance between rings of the lining (m; 0 where there are none)."""
+        """Station of the goal, nominal ring length (0 where there are no rings), and the believed start, m."""
         del params
-        return {"goal": (0.0, np.inf), "ring_pitch": (0.0, np.inf)}
+        return {"goal": (0.0, np.inf), "ring_pitch": (0.0, np.inf), "start": (0.0, np.inf)}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
         """Return the numbers that `space` names."""
-        return {"goal": state.goal.station, "ring_pitch": tunnel.ring_pitch}
+        del tunnel
+        own = state.goal
+        return {"goal": own.station, "ring_pitch": own.pitch, "start": own.told}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
         """Judge a stop by its distance from the goal."""
@@ -136,29 +187,32 @@ class StopAt(Rule):
         after = dataclasses.replace(goal, still=still)
         return Verdict(success, stopped, terms, after, {"goal_error": error, "stopped": stopped})
 
-    def privileged(self, state: State) -> dict[str, Array]:
-        """Return the way to the goal, m, and how long the robot has stood, as a share of a stop."""
-        return {"to_goal": state.goal.station - state.station, "still": state.goal.still}
-
-    def tolerance(self, params: EnvParams) -> Any:
-        """Return the tolerance of the goal, m."""
-        return params.goal.tolerance
-
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:
         """Return the distance to the goal, m."""
         del tunnel, params
         return jnp.abs(state.goal.station - state.station)
 
     def least_length(self, params: EnvParams) -> float:
-        """Return the nearest goal and the margin behind it, m."""
-        return float(np.max(params.goal.low) + np.max(params.goal.margin))
+        """Return the nearest goal and a margin at either end, m."""
+        return float(np.max(params.goal.low) + 2.0 * np.max(params.goal.margin))
 
 
-def draw_goal(draw: Float[Array, ""], tunnel: Tunnel, goal: GoalParams) -> Float[Array, ""]:
-    """Draw a station between the bounds, m, as far as the tunnel has them; `draw` is uniform in [0, 1)."""
-    high = jnp.maximum(jnp.minimum(goal.high, tunnel.length - goal.margin), goal.margin)
+def draw_stations(
+    draw: Float[Array, "3"], tunnel: Tunnel, goal: GoalParams
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Draw the stations of start and goal, m, as far apart as the tunnel has room for.
+
+    Args:
+        draw: Uniform numbers in [0, 1): of the distance, and of the start.
+        tunnel: The tunnel.
+        goal: Bounds of the distance, and the least distance from a mouth.
+    """
+    room = jnp.maximum(tunnel.length - 2.0 * goal.margin, 0.0)
+    high = jnp.minimum(goal.high, room)
     low = jnp.minimum(goal.low, high)
-    return low + (high - low) * draw
+    distance = low + (high - low) * draw[0]
+    start = goal.margin + (room - distance) * draw[1]
+    return start, start + distance
 
 
 def count_still(step: Step, goal: GoalParams) -> tuple[Int[Array, ""], Bool[Array, ""]]:

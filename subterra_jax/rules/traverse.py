@@ -35,6 +35,7 @@ class RewardParams:
 class Traverse(Rule):
     """Success is coverage."""
 
+    key: ClassVar[str] = "traverse"
     covers: ClassVar[bool] = True
 
     def defaults(self) -> dict[str, Any]:

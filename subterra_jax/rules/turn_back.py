@@ -1,4 +1,4 @@
-"""T2: drive to the goal, turn round, and stop where the episode began."""
+"""T2: drive to the goal, turn round, and stop where the episode was told to begin."""
 
 import dataclasses
 from typing import ClassVar
@@ -8,65 +8,64 @@ from flax import struct
 from jaxtyping import Array, Float
 
 from subterra_jax.parts.part import Bounds, Step
-from subterra_jax.rules.rule import Choice, Start, Verdict
-from subterra_jax.rules.stop import GoalState, StopAt, count_still, goal_terms
+from subterra_jax.rules.rule import Start, Verdict
+from subterra_jax.rules.stop import StopAt, StopState, count_still, goal_terms
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tunnel import Tunnel
 
 
 @struct.dataclass
-class ReturnState(GoalState):
-    """Goal of one episode, and the way back from it.
+class ReturnState(StopState):
+    """Goal of one episode, and whether the robot is on its way back, which ends at the station told as the start.
 
     Attributes:
-        start: True station of the start, m.
         flag: 1 once the goal has been reached, else 0.
     """
 
-    start: Float[Array, ""]
     flag: Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
 class TurnBack(StopAt):
-    """Success is a stop within the tolerance of the start, after the flag at the goal was raised."""
+    """Success is a stop at the station told as the start, after the flag at the goal was raised."""
 
+    key: ClassVar[str] = "return"
     errand: ClassVar[str] = "return"
 
     def start(self, draw: tuple[Array, Array, Array], tunnel: Tunnel, params: EnvParams) -> Start:
         """Start as for `StopAt`, the flag down."""
         start = super().start(draw, tunnel, params)
-        goal = ReturnState(start.own.station, start.own.still, start.station, jnp.zeros_like(start.station))
+        own = start.own
+        goal = ReturnState(own.station, own.still, told=own.told, pitch=own.pitch, flag=jnp.zeros_like(own.told))
         return dataclasses.replace(start, own=goal)
 
-    def place(self, start: Start, choice: Choice) -> Start:
-        """Return a start with a chosen place, which is where the way back ends, and goal."""
-        start = super().place(start, choice)
-        return dataclasses.replace(start, own=dataclasses.replace(start.own, start=start.station))
-
     def space(self, params: EnvParams) -> dict[str, Bounds]:
-        """Add the flag to the entries of `StopAt`: 1 once the goal has been reached."""
-        return {**super().space(params), "flag": (0.0, 1.0)}
+        """Add the flag, before the believed start: 1 once the goal has been reached."""
+        entries = super().space(params)
+        start = entries.pop("start")
+        return {**entries, "flag": (0.0, 1.0), "start": start}
 
     def observe(self, state: State, tunnel: Tunnel) -> dict[str, Array]:
         """Return the numbers that `space` names."""
-        return {**super().observe(state, tunnel), "flag": state.goal.flag}
+        entries = super().observe(state, tunnel)
+        start = entries.pop("start")
+        return {**entries, "flag": state.goal.flag, "start": start}
 
     def judge(self, step: Step, params: EnvParams) -> Verdict:
         """Judge the flag, then the stop."""
         goal = step.before.goal
         still, stopped = count_still(step, params.goal)
-        station, back = step.place.station, jnp.abs(step.place.station - goal.start)
+        station, back = step.place.station, jnp.abs(step.place.station - goal.told)
         reached = jnp.abs(station - goal.station) <= params.goal.flag_reach
         flag = jnp.where(reached, 1.0, goal.flag)
         success = stopped & (flag > 0.5) & (back <= params.goal.tolerance)
-        to_go = _to_go(station, goal.station, goal.start, flag)
-        nearer = _to_go(step.before.station, goal.station, goal.start, goal.flag) - to_go
+        to_go = _to_go(station, goal.station, goal.told, flag)
+        nearer = _to_go(step.before.station, goal.station, goal.told, goal.flag) - to_go
         terms = goal_terms(
             step, params, success=success, stopped=stopped, failed=step.contact, error=to_go, nearer=nearer
         )
         after = dataclasses.replace(goal, still=still, flag=flag)
-        info = {"goal_error": station - goal.start, "stopped": stopped, "flag": flag > 0.5}
+        info = {"goal_error": station - goal.told, "stopped": stopped, "flag": flag > 0.5}
         return Verdict(success, stopped, terms, after, info)
 
     def shortest_way(self, state: State, tunnel: Tunnel, params: EnvParams) -> Float[Array, ""]:

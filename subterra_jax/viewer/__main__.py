@@ -28,7 +28,7 @@ def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
     add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build: its lining, track and tunnel")
     add("--tunnel", action="append", default=[], metavar="NAME|FILE", help="offer another tunnel; may be repeated")
     add("--lining", default=default.lining, metavar="NAME", help="pockets (default), smooth or furnished")
-    add("--task", default=default.task, metavar="ID", help="first task, as StopAt or Subterra/StopAt-v0 (the default)")
+    add("--task", default=default.task, metavar="ID", help="first task, as StopAt or Subterra/StopAt-v1 (the default)")
     add("--sensor", default=default.sensor, metavar="NAME", help="planar16 (default), spin16x64, vlp16, os1-64 or avia")
     drivers = "first driver: a baseline, policy:NAME|FILE|RUN-FOLDER, module:Class or FILE.py:Class"
     add("--driver", default=default.agent, metavar="NAME", help=drivers)

@@ -26,7 +26,7 @@ class ViewerConfig:
     Attributes:
         scene: Scene folder with the lining, track and tunnel to show; `None`: no scene.
         tunnels: Further tunnel files, or names as for `load_tunnel`.
-        task: Id of the first task, as `Subterra/StopAt-v0` or `StopAt`.
+        task: Id of the first task, as `Subterra/StopAt-v1` or `StopAt`.
         agent: First driver: a baseline, `policy:NAME`, `policy:FILE`, `policy:RUN-FOLDER`, `module:Class` or
             `FILE.py:Class`.
         policies: Trained policies, `.safetensors` files or run folders, offered beside the baselines.
@@ -41,7 +41,7 @@ class ViewerConfig:
 
     scene: Path | None = None
     tunnels: tuple[str, ...] = ()
-    task: str = "Subterra/StopAt-v0"
+    task: str = "Subterra/StopAt-v1"
     agent: str = "dead-reckoning"
     policies: tuple[Path, ...] = field(default=())
     lining: str = "pockets"

@@ -10,10 +10,10 @@ import numpy as np
 
 import subterra_jax as st
 from subterra_jax import policies, tasks
-from subterra_jax.b2 import MISSIONS
 from subterra_jax.baselines import registry
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_object
+from subterra_jax.host.task_ids import MISSIONS
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.opening import FORMS, call_factory, names_code, policy_source
 from subterra_jax.tunnel.plan import TunnelPlan

@@ -16,7 +16,7 @@ from subterra_jax.viewer.scene import ESTIMATE, ODOMETRY, TRUTH
 
 def status_text(recording: Recording, row: int, *, finished: bool, note: str = "") -> str:
     """Return task, driver, tunnel and state at a row, as Markdown; `note` is a caveat about the picture."""
-    task = recording.task.removeprefix("Subterra/").removesuffix("-v0")
+    task = recording.task.removeprefix("Subterra/").removesuffix("-v1")
     lines = [
         f"**{task}** · {recording.agent} · seed {int(recording.seed)}  ",
         f"{recording.tunnel}, {recording.lining}, {recording.length:.0f} m  ",

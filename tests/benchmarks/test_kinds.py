@@ -41,7 +41,7 @@ def test_further_tunnels_are_columns_of_their_own_and_severities_are_spread_over
 def test_the_floor_is_that_of_each_columns_tunnels():
     config = kinds.KindsConfig(tunnels=0, further=("subterra-351", "control"))
     tunnels = [Tunnel.from_plan(plan, plan.default_lining) for plan in map(st.load_tunnel, config.further)]
-    _, params = st.make("Subterra/StopAtOffset-v1", tunnel=tunnels)
+    _, params = st.make("Subterra/StopAt-v1", tunnel=tunnels, hidden_start=True)
     low = kinds.floors(params, config, 2)
     assert low == pytest.approx([floor(params, 0), floor(params, 1)], abs=1e-3)
     assert 0.1 < low[0] < 0.3

@@ -36,8 +36,8 @@ def test_table_figure_and_file_say_the_same(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--task", "Subterra/Nowhere-v0"), "no task 'Subterra/Nowhere-v0'"),
-        (("--task", "Subterra/StopAt-v0"), "task Subterra/StopAt-v0 is not one of coverage"),
+        (("--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
+        (("--task", "Subterra/StopAt-v1"), "task Subterra/StopAt-v1 is not one of coverage"),
         (("--steps", "0"), "steps must be at least 1, got 0"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
     ],

@@ -39,7 +39,7 @@ def test_violations_are_counted_by_name():
 @pytest.mark.slow
 def test_random_and_extreme_actions_leave_nothing_outside_of_its_space():
     # Faults have the most parts; the other tasks and ten million steps are for the command.
-    env, params = st.make("Subterra/FaultedShort-v0", estimates=True)
+    env, params = st.make("Subterra/Faulted-v1", estimates=True)
     assert soak.soak(env, params, 300, 60_000, seed=0) == {}
 
 

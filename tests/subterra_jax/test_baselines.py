@@ -19,7 +19,7 @@ from subterra_jax.parts.wander import WanderParams
 
 @pytest.fixture(scope="module")
 def params():
-    return st.make("Subterra/ReturnShort-v0")[1]
+    return st.make("Subterra/Return-v1", tunnel="subterra-351")[1]
 
 
 def between_walls(left: float, right: float, angle: float) -> np.ndarray:
@@ -142,7 +142,7 @@ def test_where_a_corner_is_near_it_turns_steeper_to_its_lane_than_where_the_way_
 
 
 def test_who_knows_the_truth_comes_back_always():
-    env, params = st.make("Subterra/ReturnShort-v0")
+    env, params = st.make("Subterra/Return-v1", tunnel="subterra-351")
     records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env, params, 50))
     assert records.success.all()
     assert (np.abs(records.goal_error) < 0.05).all()
@@ -153,14 +153,14 @@ def test_who_knows_the_truth_comes_back_always():
     ("task", "least"), [("Return", 1.0), ("Obstructed", 0.97), ("Faulted", 0.99), ("Relocalise", 1.0)]
 )
 def test_over_the_whole_list_knowing_the_truth_is_all_that_is_missing(task, least):
-    env, params = st.make(f"Subterra/{task}-v0")
+    env, params = st.make(f"Subterra/{task}-v1", tunnel="subterra-351")
     records = evaluate(env, params, make_agent("oracle", params), listed_episodes(env, params))
     assert records.success.mean() >= least
 
 
 @pytest.mark.slow
 def test_dead_reckoning_knows_how_well_it_knows():
-    env, params = st.make("Subterra/StopAt-v0")
+    env, params = st.make("Subterra/StopAt-v1", tunnel="subterra-351")
     for name in ("command-integrator", "dead-reckoning", "fused"):
         records = evaluate(env, params, make_agent(name, params), listed_episodes(env, params))
         assert 0.85 < records.nees.mean() < 1.15, name

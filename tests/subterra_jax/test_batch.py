@@ -12,7 +12,7 @@ import subterra_jax as st
 from subterra_jax import lidar
 from subterra_jax.lidar import LidarParams
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 N, FEW = 128, 8  # every other size is another program
 
 

@@ -15,7 +15,7 @@ from subterra_jax.policies.belief import Belief, Habits
 from subterra_jax.policies.belief_scan import N_FEATURES
 from tests.subterra_jax import tunnels
 
-TASK = "Subterra/Relocalise-v0"
+TASK = "Subterra/Relocalise-v1"
 LENGTH, POCKET = 70.0, 40.0
 CELL, N = 0.1, 512
 TAPE = jnp.asarray(grid.cell_positions(N, CELL))
@@ -113,8 +113,8 @@ def test_without_a_map_it_refuses_to_begin(world):
 
 
 def test_other_tasks_refuse_it():
-    with pytest.raises(policies.PolicyError, match="which Subterra/StopAt-v0 does not ask for"):
-        policies.check_fits(untrained(), *st.make("Subterra/StopAt-v0"), "mine")
+    with pytest.raises(policies.PolicyError, match="which Subterra/StopAt-v1 does not ask for"):
+        policies.check_fits(untrained(), *st.make("Subterra/StopAt-v1"), "mine")
 
 
 def at(way: int, place: float) -> jax.Array:

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.door
 
 @pytest.fixture(scope="module")
 def short() -> tuple[Any, Any, Any]:
-    env, params = st.make("Subterra/StopAtShort-v0")
+    env, params = st.make("Subterra/StopAtShort-v1")
     return env, params, env.reset(jax.random.key(0), params)[1]
 
 
@@ -35,7 +35,7 @@ def test_the_methods_run_in_shards_as_alone():
     code = """
 import jax, jax.numpy as jnp, numpy as np, subterra_jax as st
 from jax.sharding import Mesh, PartitionSpec as P
-env, params = st.make("Subterra/FaultedShort-v0")
+env, params = st.make("Subterra/Faulted-v1")
 batch = st.AutoReset(env)
 def go(keys, params):
     obs, state = batch.reset(keys[0], params, 4)
@@ -122,7 +122,7 @@ def count_compilations(function: Any) -> tuple[Any, Any]:
 
 
 def test_replacing_params_by_python_numbers_compiles_nothing_anew():
-    env, params = st.make("Subterra/StopAtShort-v0")
+    env, params = st.make("Subterra/StopAtShort-v1")
     step, counts = count_compilations(lambda state, params: env.step(jax.random.key(1), state, jnp.ones(2), params))
     _, state = env.reset(jax.random.key(0), params)
     step(state, params)
@@ -140,14 +140,14 @@ def test_replacing_params_by_python_numbers_compiles_nothing_anew():
 
 @pytest.mark.parametrize("horizon", [50.5, float("nan"), float("inf")])
 def test_replacing_a_count_by_a_fraction_is_refused(horizon):
-    _, params = st.make("Subterra/TraverseShort-v0")
+    _, params = st.make("Subterra/TraverseShort-v1")
     with pytest.raises(ValueError, match=f"a whole number is wanted, got {horizon}"):
         params.replace(horizon=horizon)
     assert int(params.replace(horizon=50.0).horizon) == 50
 
 
 def test_replacing_leaves_a_tree_of_axes_as_it_is():
-    _, params = st.make("Subterra/StopAtShort-v0")
+    _, params = st.make("Subterra/StopAtShort-v1")
     axes = jax.tree.map(lambda _: None, params).replace(horizon=0)
     assert axes.horizon == 0
     assert isinstance(axes.horizon, int)
@@ -196,7 +196,7 @@ def test_a_rollout_compiles_once_for_a_policy_and_reads_its_weights_each_time(sh
 
 def test_a_second_env_compiles_nothing(short):
     env, params, state = short
-    again, others = st.make("Subterra/StopAtShort-v0")
+    again, others = st.make("Subterra/StopAtShort-v1")
     env.step(jax.random.key(1), state, jnp.ones(2), params)
 
     def use():
@@ -221,17 +221,17 @@ def test_a_rule_that_cannot_be_hashed_runs_all_the_same(short):
 
 def test_gymnasium_traces_and_compiles_an_environment_once(short, monkeypatch):
     gymnasium = pytest.importorskip("gymnasium")
-    first = gymnasium.make("Subterra/TraverseShort-v0")
+    first = gymnasium.make("Subterra/TraverseShort-v1")
     obs, _ = first.reset(seed=0)
 
     def second():
-        again, _ = gymnasium.make("Subterra/TraverseShort-v0").reset(seed=0)
+        again, _ = gymnasium.make("Subterra/TraverseShort-v1").reset(seed=0)
         np.testing.assert_array_equal(obs, again)
 
     assert count(COMPILES, second) == 0
     casts, cast = [], lidar.scan
     monkeypatch.setattr(lidar, "scan", lambda *args: casts.append(1) or cast(*args))
-    other = gymnasium.make("Subterra/TraverseShort-v0", horizon=3, lidar=LidarParams(n_beams=5))
+    other = gymnasium.make("Subterra/TraverseShort-v1", horizon=3, lidar=LidarParams(n_beams=5))
     assert len(casts) == 2  # by reset and by step
     other.reset(seed=0)
     assert [other.step(np.float32([0.0, 0.0]))[3] for _ in range(3)] == [False, False, True]
@@ -243,7 +243,7 @@ def test_programs_are_kept_on_disk_only_where_it_is_asked_for(tmp_path: Path):
         "before = jax.config.jax_compilation_cache_dir\n"
         "jax.jit(lambda x: x + 1)(1)\n"
         "print(before, st.cache_programs())\n"
-        "env, params = st.make('Subterra/TraverseShort-v0')\n"
+        "env, params = st.make('Subterra/TraverseShort-v1')\n"
         "env.reset(jax.random.key(0), params)"
     )
     places = {"XDG_CACHE_HOME": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}

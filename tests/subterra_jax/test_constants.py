@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import tasks
+from subterra_jax import digest, tasks
+from subterra_jax.digest import task_figures
+from subterra_jax.host.task_ids import PLANAR
 from subterra_jax.procedural import open_world
+from subterra_jax.rules import StartParams
 
 Value = float | int | list[float] | None
 
@@ -70,18 +73,11 @@ WITH_GOAL: dict[str, Value] = {
     "reward.time": 0.002,
     "reward.lateral": 0.01,
     "reward.jerk": 0.003,
-    "goal.margin": 5.0,
     "goal.still_speed": 0.05,
     "goal.still_yaw": 0.5,
     "goal.still_steps": 10,
 }
 LONG: dict[str, Value] = {"goal.tolerance": 1.0}
-SHORT: dict[str, Value] = {"goal.tolerance": 0.25}
-LONG_GOALS: dict[str, Value] = {**LONG, "goal.low": 60.0, "goal.high": 320.0}
-SHORT_GOALS: dict[str, Value] = {**SHORT, "goal.low": 10.0, "goal.high": 60.0}
-AT_MOUTH: dict[str, Value] = {"start.station": 0.0, "start.station_sigma": 0.0}
-HIDDEN_START: dict[str, Value] = {"start.station": 9.0, "start.station_sigma": 3.0}
-RETURN: dict[str, Value] = {"start.station": 5.0, "start.station_sigma": 0.0, "goal.flag_reach": 2.0}
 CLEAR: dict[str, Value] = {"obstacles": None, "faults": None}
 BOXES: dict[str, Value] = {
     "obstacles.size_min": 0.3,
@@ -96,14 +92,17 @@ FAULTS: dict[str, Value] = {
     "faults.severity_low": 0,
     "faults.severity_high": 4,
     "faults.dropout_rate": 0.02,
-    "faults.dropout_share": 0.75,
+    "faults.dropout_share": 0.5,
     "faults.dropout_steps": 40.0,
     "faults.dust_rate": 0.15,
     "faults.freeze_rate": 0.01,
     "faults.freeze_steps": 30.0,
-    "faults.delay": 4.0,
+    "faults.delay": 2.4,
     "faults.wet_share": 0.3,
     "faults.wet_loss": 0.3,
+    "faults.spread": 2.0 / 3.0,
+    "faults.origin_distance": 0.05,
+    "faults.origin_heading": 0.005,
     "obstacles": None,
 }
 WALKING_MISSION: dict[str, Value] = {
@@ -159,7 +158,7 @@ WALKING: dict[str, Value] = {
     "fall_height": 0.25,
     "fall_tilt": 1.0,
 }
-INSIDE: dict[str, Value] = {
+STOP: dict[str, Value] = {
     **WITH_GOAL,
     **LONG,
     "goal.margin": 40.0,
@@ -169,53 +168,21 @@ INSIDE: dict[str, Value] = {
     "start.station_sigma": 0.0,
     "told.pitch_error": 0.0,
 }
-HIDDEN: dict[str, Value] = {"start.station_sigma": 3.0}
-DRAWN_FAULTS: dict[str, Value] = {
-    **FAULTS,
-    "faults.dropout_share": 0.5,
-    "faults.delay": 2.4,
-    "faults.spread": 2.0 / 3.0,
-    "faults.origin_distance": 0.05,
-    "faults.origin_heading": 0.005,
-}
 TABLE: dict[str, dict[str, Value]] = {
-    "Subterra/Traverse-v0": {**TRAVERSE, "horizon": 3000},
-    "Subterra/TraverseShort-v0": {**TRAVERSE, "horizon": 600},
-    "Subterra/StopAt-v0": {**WITH_GOAL, **LONG_GOALS, **AT_MOUTH, **CLEAR, "horizon": 4000},
-    "Subterra/StopAtShort-v0": {**WITH_GOAL, **SHORT_GOALS, **AT_MOUTH, **CLEAR, "horizon": 1000},
-    "Subterra/StopAtOffset-v0": {**WITH_GOAL, **LONG_GOALS, **HIDDEN_START, **CLEAR, "horizon": 4000},
-    "Subterra/StopAtOffsetShort-v0": {
-        **WITH_GOAL,
-        **SHORT_GOALS,
-        "goal.low": 20.0,
-        **HIDDEN_START,
-        **CLEAR,
-        "horizon": 1000,
-    },
-    "Subterra/Return-v0": {**WITH_GOAL, **LONG_GOALS, **RETURN, **CLEAR, "horizon": 8000},
-    "Subterra/ReturnShort-v0": {**WITH_GOAL, **SHORT_GOALS, **RETURN, **CLEAR, "horizon": 2000},
-    "Subterra/Obstructed-v0": {**WITH_GOAL, **LONG_GOALS, **AT_MOUTH, **BOXES, "horizon": 4000},
-    "Subterra/ObstructedShort-v0": {**WITH_GOAL, **SHORT_GOALS, **AT_MOUTH, **BOXES, "horizon": 1000},
-    "Subterra/Faulted-v0": {**WITH_GOAL, **LONG_GOALS, **AT_MOUTH, **FAULTS, "horizon": 4000},
-    "Subterra/FaultedShort-v0": {**WITH_GOAL, **SHORT_GOALS, **AT_MOUTH, **FAULTS, "horizon": 1000},
-    "Subterra/Relocalise-v0": {**WITH_GOAL, **LONG, **CLEAR, "goal.travel_max": 120.0, "horizon": 2000},
-    "Subterra/RelocaliseShort-v0": {**WITH_GOAL, **SHORT, **CLEAR, "goal.travel_max": 40.0, "horizon": 1000},
-    "Subterra/StopAt-v1": {**INSIDE, **CLEAR, "horizon": 4000},
-    "Subterra/Return-v1": {**INSIDE, **CLEAR, "horizon": 8000},
-    "Subterra/Obstructed-v1": {**INSIDE, **BOXES, "horizon": 4000},
-    "Subterra/Faulted-v1": {**INSIDE, **DRAWN_FAULTS, "horizon": 4000},
-    "Subterra/StopAtOffset-v1": {**INSIDE, **CLEAR, **HIDDEN, "horizon": 4000},
-    "Subterra/ReturnOffset-v1": {**INSIDE, **CLEAR, **HIDDEN, "horizon": 8000},
-    "Subterra/ObstructedOffset-v1": {**INSIDE, **BOXES, **HIDDEN, "horizon": 4000},
-    "Subterra/FaultedOffset-v1": {**INSIDE, **DRAWN_FAULTS, **HIDDEN, "horizon": 4000},
+    "Subterra/Traverse-v1": {**TRAVERSE, "horizon": 3000},
+    "Subterra/TraverseShort-v1": {**TRAVERSE, "horizon": 600},
+    "Subterra/StopAt-v1": {**STOP, **CLEAR, "horizon": 4000},
     "Subterra/StopAtShort-v1": {
-        **INSIDE,
+        **STOP,
         **CLEAR,
         "goal.low": 10.0,
         "goal.high": 60.0,
         "goal.tolerance": 0.25,
         "horizon": 1000,
     },
+    "Subterra/Return-v1": {**STOP, **CLEAR, "horizon": 8000},
+    "Subterra/Obstructed-v1": {**STOP, **BOXES, "horizon": 4000},
+    "Subterra/Faulted-v1": {**STOP, **FAULTS, "horizon": 4000},
     "Subterra/Relocalise-v1": {
         **WITH_GOAL,
         **LONG,
@@ -224,16 +191,20 @@ TABLE: dict[str, dict[str, Value]] = {
         "goal.travel_max": 60.0,
         "horizon": 2000,
     },
-    "Subterra/B2Traverse-v0": WALKING_MISSION,
-    "Subterra/B2Walk-v0": WALKING,
+    "Subterra/B2Traverse-v1": WALKING_MISSION,
+    "Subterra/B2Walk-v1": WALKING,
 }
-# m: the whole packaged tunnel, or its first metres.
-LENGTHS = {"Subterra/TraverseShort-v0": 60.0} | {
-    name: 65.0 for name in TABLE if "Short-v0" in name and "Trav" not in name
-}
-SHA256 = "c60f594132b7d16b611d10e51dc1adaafe8f00aac06ae8af253f8f70766bb891"
-VERSION_1_SHA256 = "10843af873f83497ba645cf3d882f05ea2b9973a6571829b014f71f05ee68ace"
-BENCHMARK_SHA256 = "83b420fe7ff1f64a0aee373733478697f68eade60d249f8c3393ff29f9b263bb"
+# Keys of the digest that `TABLE` does not list: a task has the number, and its rule does not read it.
+UNREAD = {
+    "Subterra/Traverse-v1": {"start.station_sigma"},
+    "Subterra/TraverseShort-v1": {"start.station_sigma"},
+    "Subterra/Relocalise-v1": {"start.station", "start.station_sigma", "goal.low", "goal.high", "goal.flag_reach"},
+} | {f"Subterra/{name}-v1": {"start.station", "goal.travel_max"} for name in
+     ("StopAt", "StopAtShort", "Return", "Obstructed", "Faulted")}  # fmt: skip
+RULES = {"Traverse": "traverse", "TraverseShort": "traverse", "Return": "return", "Relocalise": "relocalise"}
+HIDDEN_START_SIGMA = 3.0
+SHA256 = "db85e8274d85053d0795117aa89d5dd0d9bde6ba68ae6ecbc7ab49b49acc5021"
+BENCHMARK_SHA256 = "f396508d37329b3bfdfd0b11ad7e8da59c47b80d67d6efb177b004999848e6fa"
 
 
 def canonical(table: dict[str, dict[str, Value]]) -> str:
@@ -257,7 +228,8 @@ def halved(node: Any, path: list[str]) -> Any:
 
 
 def test_the_table_lists_every_task():
-    assert set(TABLE) - {"Subterra/B2Traverse-v0", "Subterra/B2Walk-v0"} == set(st.TASKS)
+    assert set(TABLE) == set(st.list_tasks())
+    assert len(TABLE) == 10
 
 
 def test_the_table_itself_is_the_one_that_was_agreed_on():
@@ -280,47 +252,65 @@ def test_a_task_has_the_constants_of_the_table(id):
     assert not wrong, f"{id}: constant: (in the code, in the table): {wrong}"
 
 
+@pytest.mark.parametrize("id", PLANAR)
+def test_the_keys_of_the_digest_are_these_whatever_classes_are_called(id):
+    found = task_figures(*st.make(id, tunnel="control"))
+    name = id.removeprefix("Subterra/").removesuffix("-v1")
+    listed = {key for key, value in TABLE[id].items() if value is not None}
+    assert set(found["numbers"]) == listed - {"lidar.n_beams"} | UNREAD[id]
+    assert found["rule"] == RULES.get(name, "stop")
+    own = {"Obstructed": ["obstacles"], "Faulted": ["faults"]}.get(name, [])
+    slip = [] if name.startswith("Traverse") else ["slip"]
+    assert found["parts"] == ["vehicle", "odometry", "lidar", *slip, *own]
+
+
+def test_a_renamed_field_keeps_its_key(monkeypatch):
+    env, params = st.make("Subterra/StopAt-v1", tunnel="control")
+    monkeypatch.setattr(digest, "RENAMED", {"goal.low": "goal.least", "slip": "skid"})
+    found = task_figures(env, params)
+    assert {"goal.least", "skid.gain_sigma"} <= set(found["numbers"])
+    assert "goal.low" not in found["numbers"]
+    assert "skid" in found["parts"]
+
+
 def test_the_digest_of_the_benchmark_is_the_one_that_results_are_comparable_under():
     assert st.constants_digest() == BENCHMARK_SHA256
-    assert st.constants_digest(version="v1") == VERSION_1_SHA256
+
+
+def test_a_hidden_start_is_off_by_the_agreed_length_and_nothing_else_changes():
+    for id in PLANAR:
+        if TABLE[id].get("told.pitch_error") is None:
+            with pytest.raises(ValueError, match=f"{id} reports no start that could be hidden; these do: .*StopAt-v1"):
+                st.make(id, tunnel="control", hidden_start=True)
+            continue
+        plain, hidden = (task_figures(*st.make(id, "control", hidden_start=wish))["numbers"] for wish in (False, True))
+        assert hidden == {**plain, "start.station_sigma": HIDDEN_START_SIGMA}
+    with pytest.raises(ValueError, match="hidden_start and start exclude each other"):
+        st.make("Subterra/StopAt-v1", "control", hidden_start=True, start=StartParams(lateral=0.1))
 
 
 def test_half_of_a_number_of_the_open_world_is_another_digest(monkeypatch):
-    for name, value in (("LENGTH", (150.0, 3000.0)), ("HELD_OUT", {}), ("GRADE_SD", 0.005), ("_HALF", 0.25)):
+    for name, value in (("LENGTH", (150.0, 3000.0)), ("HELD_OUT", {}), ("GRADE_SD", 0.005), ("_HALF", 0.25),
+                        ("MOUNT_TILT", 0.01)):  # fmt: skip
         with monkeypatch.context() as patched:
             patched.setattr(open_world, name, value)
             tasks._benchmark_digest.cache_clear()
-            assert st.constants_digest(version="v1") != VERSION_1_SHA256, name
-            assert st.constants_digest() == BENCHMARK_SHA256, "version 0 has no open world in it"
+            assert st.constants_digest() != BENCHMARK_SHA256, name
     tasks._benchmark_digest.cache_clear()
 
 
-@pytest.mark.parametrize(
-    "id",
-    [
-        "Subterra/Traverse-v0",
-        "Subterra/StopAtOffsetShort-v0",
-        "Subterra/Return-v0",
-        "Subterra/Obstructed-v0",
-        "Subterra/Faulted-v0",
-        "Subterra/Relocalise-v0",
-        "Subterra/FaultedOffset-v1",
-        "Subterra/Obstructed-v1",
-        "Subterra/Relocalise-v1",
-    ],
-)
+@pytest.mark.parametrize("id", [f"Subterra/{name}-v1" for name in ("Traverse", "Obstructed", "Faulted", "Relocalise")])
 def test_half_of_any_constant_is_another_digest(id):
-    env, params = st.make(id)
-    digest = st.constants_digest(env, params)
-    assert st.constants_digest(*st.make(id, tunnel=params.tunnel)) == digest
+    env, params = st.make(id, tunnel="subterra-351")
+    before = st.constants_digest(env, params)
+    assert st.constants_digest(*st.make(id, tunnel=params.tunnel)) == before
     for name, value in TABLE[id].items():
         if not value or name == "vehicle.radius":  # half a radius is refused
             continue
         field, *path = name.split(".")
         changed = halved(getattr(params, field), path)
-        assert st.constants_digest(*st.make(id, tunnel=params.tunnel, **{field: changed})) != digest, name
+        assert st.constants_digest(*st.make(id, tunnel=params.tunnel, **{field: changed})) != before, name
 
 
-@pytest.mark.parametrize("id", sorted(LENGTHS))
-def test_a_short_task_happens_in_the_first_metres_of_the_tunnel(id):
-    assert float(st.make(id)[1].tunnel.length) == pytest.approx(LENGTHS[id])
+def test_a_short_traverse_happens_in_the_first_metres_of_the_tunnel():
+    assert float(st.make("Subterra/TraverseShort-v1")[1].tunnel.length) == pytest.approx(60.0)

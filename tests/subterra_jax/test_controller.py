@@ -17,7 +17,7 @@ def centre_line(key, obs):
 
 
 def test_a_pd_controller_on_the_lidar_always_reaches_the_goal_of_the_short_task():
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     batch = st.AutoReset(env)
     obs, state = jax.jit(lambda key: batch.reset(key, params, 100))(jax.random.key(0))
     run = jax.jit(lambda key, obs, state: st.rollout(batch, centre_line, key, obs, state, params, 330)[2])

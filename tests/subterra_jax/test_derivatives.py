@@ -63,7 +63,7 @@ def test_the_clearance_changes_towards_the_nearest_wall(corridor):
 
 @pytest.mark.slow
 def test_a_standing_robot_and_one_inside_a_box_have_no_nan_in_their_derivatives():
-    env, params = st.make("Subterra/ObstructedShort-v0", estimates=True)
+    env, params = st.make("Subterra/Obstructed-v1", estimates=True)
     _, state = env.reset(jax.random.key(0), params)
 
     def total(action, position):
@@ -148,9 +148,9 @@ def relative_errors(task: str, n: int, n_steps: int) -> tuple[np.ndarray, np.nda
 @pytest.mark.parametrize(
     ("task", "n", "n_steps"),
     [
-        pytest.param("Subterra/StopAt-v0", 100, 3),
+        pytest.param("Subterra/StopAt-v1", 100, 3),
         *(
-            pytest.param(f"Subterra/{task}-v0", n, n_steps, marks=pytest.mark.slow)
+            pytest.param(f"Subterra/{task}-v1", n, n_steps, marks=pytest.mark.slow)
             for task in ("Traverse", "StopAt", "Obstructed")
             for n, n_steps in ((2000, 1), (10_000, 20))
         ),

@@ -18,10 +18,10 @@ from subterra_jax.rules import StartParams
 INFO = {"coverage", "station", "lateral", "half_width", "clearance", "contact", "success"}
 # Between them they have every part that a task can have.
 COVERING = {
-    "Traverse": ("Subterra/TraverseShort-v0", {}),
-    "Return": ("Subterra/ReturnShort-v0", {}),
-    "Relocalise": ("Subterra/RelocaliseShort-v0", {}),
-    "Faulted and obstructed": ("Subterra/FaultedShort-v0", {"obstacles": ObstacleParams()}),
+    "Traverse": ("Subterra/TraverseShort-v1", {}),
+    "Return": ("Subterra/Return-v1", {}),
+    "Relocalise": ("Subterra/Relocalise-v1", {}),
+    "Faulted and obstructed": ("Subterra/Faulted-v1", {"obstacles": ObstacleParams()}),
 }
 FORWARD = jnp.array([2.0, 0.0])
 
@@ -44,7 +44,7 @@ def leaves_equal(a, b, **tolerance):
 
 
 @pytest.mark.parametrize("estimates", [False, True])
-@pytest.mark.parametrize("id", sorted(id for id in st.TASKS if id.endswith("-v0")))
+@pytest.mark.parametrize("id", sorted(id for id in st.TASKS))
 def test_every_task_gives_what_the_contract_says(id, estimates):
     env, params = st.make(id, estimates=estimates)
     n_obs = env.observation_size(params)
@@ -62,7 +62,7 @@ def test_every_task_gives_what_the_contract_says(id, estimates):
     assert described[0] == described[1]
 
 
-@pytest.mark.parametrize("id", sorted(id for id in st.TASKS if id.endswith("-v0")))
+@pytest.mark.parametrize("id", sorted(id for id in st.TASKS))
 def test_the_parts_of_an_observation_are_named_and_bounded(id):
     env, params = st.make(id)
     parts = list(env.fields(params).values())
@@ -120,7 +120,7 @@ def test_two_resets_differ_in_pose_and_in_odometry_bias(task):
 
 
 def test_episodes_start_at_the_mouth_within_their_bounds():
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     reset = jax.jit(jax.vmap(env.reset, (0, None)))
     _, state = reset(jax.random.split(jax.random.key(0), 500), params)
     assert (np.asarray(state.station) == 0.0).all()
@@ -148,7 +148,7 @@ LEAVES = ("horizon", "goal_coverage", "lidar.range_sigma", "vehicle.speed_max", 
 
 @pytest.mark.parametrize("leaves", [LEAVES, *(pytest.param((leaf,), marks=pytest.mark.slow) for leaf in LEAVES)])
 def test_params_may_be_batched(leaves):
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
 
     def read(leaf):
         part, _, name = leaf.rpartition(".")
@@ -175,7 +175,7 @@ def test_params_may_be_batched(leaves):
 
 
 def test_an_episode_is_truncated_at_the_horizon_and_that_is_not_termination():
-    env, params = st.make("Subterra/TraverseShort-v0", horizon=5)
+    env, params = st.make("Subterra/TraverseShort-v1", horizon=5)
     _, state = jax.jit(env.reset)(jax.random.key(0), params)
     step = jax.jit(env.step)
     for k in range(5):
@@ -186,7 +186,7 @@ def test_an_episode_is_truncated_at_the_horizon_and_that_is_not_termination():
 
 
 def test_ninety_percent_coverage_is_success_and_ends_the_episode_once():
-    env, params = st.make("Subterra/TraverseShort-v0", start=StartParams(station=53.0, lateral=0.0, heading=0.0))
+    env, params = st.make("Subterra/TraverseShort-v1", start=StartParams(station=53.0, lateral=0.0, heading=0.0))
     _, state = jax.jit(env.reset)(jax.random.key(0), params)
     step, ends = jax.jit(env.step), []
     for k in range(8):
@@ -200,7 +200,7 @@ def test_ninety_percent_coverage_is_success_and_ends_the_episode_once():
 
 
 def test_touching_a_wall_terminates_without_success():
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     _, state = jax.jit(env.reset)(jax.random.key(0), params)
     step = jax.jit(env.step)
     for k in range(100):
@@ -227,13 +227,13 @@ def test_actions_that_are_not_numbers_leave_everything_finite(task, bad):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"id": "Subterra/Nowhere-v0"}, "no task 'Subterra/Nowhere-v0'"),
+        ({"id": "Subterra/Nowhere-v1"}, "no task 'Subterra/Nowhere-v1'"),
         ({"speed": 3.0}, "no field"),
         ({"lidar": LidarParams(n_beams=0)}, "n_beams must be at least 1, got 0"),
         ({"vehicle": VehicleParams(radius=1.5)}, "radius must be in"),
         ({"vehicle": VehicleParams(speed_max=5.0)}, "must leave 0.2 m"),
         ({"lining": "velvet"}, "no lining 'velvet'"),
-        ({"id": 5}, "a task is named by its id, as Subterra/StopAt-v0, got 5"),
+        ({"id": 5}, "a task is named by its id, as Subterra/StopAt-v1, got 5"),
         ({"tunnel": 5}, "a tunnel is a name, a file, a plan, a Tunnel or a list of these, got 5"),
         ({"parts": [LidarParams()]}, "parts must hold subterra_jax.parts.Part alone, got LidarParams"),
         ({"horizon": 0}, "horizon must be a whole number of steps, at least 1, got 0"),
@@ -245,29 +245,29 @@ def test_actions_that_are_not_numbers_leave_everything_finite(task, bad):
 def test_a_mistake_is_refused_with_its_value(arguments, message, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checker would come first
     with pytest.raises((ValueError, st.TunnelError), match=message):
-        st.make(**{"id": "Subterra/TraverseShort-v0", **arguments})
+        st.make(**{"id": "Subterra/TraverseShort-v1", **arguments})
 
 
 def test_a_ready_tunnel_is_taken_as_it_is_but_not_beyond_its_reach():
     plan = st.load_tunnel().slice(100.0, 80.0)
     tunnel = st.Tunnel.from_plan(plan, "smooth")
-    _, params = st.make("Subterra/TraverseShort-v0", tunnel=tunnel)
+    _, params = st.make("Subterra/TraverseShort-v1", tunnel=tunnel)
     assert float(params.tunnel.length) == pytest.approx(80.0)
     with pytest.raises(ValueError, match="ranges up to 30"):
-        st.make("Subterra/TraverseShort-v0", tunnel=tunnel, lidar=LidarParams(range_max=50.0))
+        st.make("Subterra/TraverseShort-v1", tunnel=tunnel, lidar=LidarParams(range_max=50.0))
 
 
 def test_the_short_task_is_the_first_60_metres():
-    assert float(st.make("Subterra/TraverseShort-v0")[1].tunnel.length) == pytest.approx(60.0)
-    assert float(st.make("Subterra/TraverseShort-v0", odometry=OdometryParams())[1].horizon) == 600
-    assert float(st.make("Subterra/Traverse-v0")[1].horizon) == 3000
+    assert float(st.make("Subterra/TraverseShort-v1")[1].tunnel.length) == pytest.approx(60.0)
+    assert float(st.make("Subterra/TraverseShort-v1", odometry=OdometryParams())[1].horizon) == 600
+    assert float(st.make("Subterra/Traverse-v1")[1].horizon) == 3000
 
 
 @pytest.mark.door
 @pytest.mark.parametrize(("estimates", "size"), [(False, 2), (True, 4)])
 def test_an_action_of_another_shape_is_refused_in_one_sentence(estimates, size, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' own checker would come first
-    env, params = st.make("Subterra/StopAtShort-v0", estimates=estimates)
+    env, params = st.make("Subterra/StopAtShort-v1", estimates=estimates)
     batch = st.AutoReset(env)
     _, one = jax.eval_shape(env.reset, jax.random.key(0), params)
     _, many = jax.eval_shape(lambda: batch.reset(jax.random.key(0), params, 5))
@@ -284,7 +284,7 @@ def test_an_action_of_another_shape_is_refused_in_one_sentence(estimates, size, 
 @pytest.mark.parametrize("count", [0, -1, 2.5, "4", None])
 def test_a_batch_of_no_size_and_a_rollout_of_no_length_are_refused(count, monkeypatch):
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     batch, key = st.AutoReset(env), jax.random.key(0)
     with pytest.raises(ValueError, match=f"n_envs must be a whole number, at least 1, got {count!r}"):
         batch.reset(key, params, count)

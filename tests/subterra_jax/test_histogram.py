@@ -22,7 +22,7 @@ CELL, START = 0.1, 30.0
 def smooth(plan_of):
     """A straight tunnel without relief: the walls tell nothing of the station."""
     arrays = tunnels.tunnel_arrays(tunnels.straight(90.0), half_width=2.8)
-    return st.make("Subterra/StopAt-v0", tunnel=plan_of(arrays), lining="smooth", estimates=True)
+    return st.make("Subterra/StopAt-v1", tunnel=plan_of(arrays), lining="smooth", estimates=True)
 
 
 def localiser(params) -> HistogramLocaliser:
@@ -99,7 +99,7 @@ def test_a_robot_that_faces_falling_stations_slides_the_other_way(smooth):
 
 
 def test_it_stops_within_centimetres_where_dead_reckoning_misses():
-    env, params = st.make("Subterra/StopAtShort-v0", tunnel="subterra-351", estimates=True)
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", estimates=True)
     episodes = listed_episodes(env, params, 4)
     coarse = dataclasses.replace(
         open_agent(histogram.NAME, env, params), localiser=HistogramLocaliser.of(params, cell=CELL)
@@ -111,6 +111,6 @@ def test_it_stops_within_centimetres_where_dead_reckoning_misses():
 
 @pytest.mark.slow
 def test_it_finds_out_where_it_is():
-    env, params = st.make("Subterra/RelocaliseShort-v0", tunnel="subterra-351", estimates=True)
+    env, params = st.make("Subterra/Relocalise-v1", tunnel="subterra-351", estimates=True)
     records = evaluate(env, params, open_agent(histogram.NAME, env, params), listed_episodes(env, params, 4), 4)
     assert records.success.all()

@@ -6,11 +6,12 @@ import pkgutil
 
 import pytest
 import tyro
+from gymnasium.envs import registration
 
 import subterra_jax as st
 from scene.build import command as build_command
 from scene.survey.config import SurveyConfig
-from subterra_jax.adapters import PLANAR_TASKS
+from subterra_jax.host import task_ids
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.errors import OutputError, SubterraError
 from subterra_jax.host.files import replace_file
@@ -172,4 +173,5 @@ def test_what_the_package_offers_can_be_pickled():
 
 
 def test_gymnasium_knows_every_planar_task():
-    assert set(PLANAR_TASKS) == set(st.TASKS)
+    assert set(task_ids.PLANAR) == set(st.TASKS)
+    assert set(st.list_tasks()) <= set(registration.registry)

@@ -1,4 +1,4 @@
-"""Tasks of version 1: where they begin, what they tell, and that nothing gives a fault or the start away."""
+"""Tasks with a goal: where they begin, what they tell, and that nothing gives a fault or the start away."""
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,9 @@ def begin(id, n=N, **overrides):
     return env, params, states(params)
 
 
-@pytest.mark.parametrize("name", ["StopAt", "ReturnOffset"])
-def test_no_mouth_is_in_sight_of_a_start_or_a_goal(name):
-    _, params, state = begin(f"Subterra/{name}-v1")
+@pytest.mark.parametrize(("name", "hidden"), [("StopAt", False), ("Return", True)])
+def test_no_mouth_is_in_sight_of_a_start_or_a_goal(name, hidden):
+    _, params, state = begin(f"Subterra/{name}-v1", hidden_start=hidden)
     length = float(params.tunnel.length)
     for station in (state.station, state.goal.station):
         assert float(station.min()) > SEES
@@ -49,7 +49,7 @@ def test_no_mouth_comes_into_sight_within_the_travel_of_a_relocalisation():
 
 def test_a_hidden_start_is_off_by_three_metres_and_a_known_one_by_nothing():
     _, _, known = begin("Subterra/StopAt-v1")
-    _, _, hidden = begin("Subterra/StopAtOffset-v1")
+    _, _, hidden = begin("Subterra/StopAt-v1", hidden_start=True)
     np.testing.assert_allclose(known.station, known.goal.told, rtol=1e-6)
     off = np.asarray(hidden.station - hidden.goal.told)
     assert off.std() == pytest.approx(2.97, rel=0.06)  # cut off at three standard deviations
@@ -58,7 +58,7 @@ def test_a_hidden_start_is_off_by_three_metres_and_a_known_one_by_nothing():
 
 
 def test_the_believed_start_is_observed_and_the_true_one_is_not():
-    env, params = st.make("Subterra/ReturnOffset-v1", tunnel="control")
+    env, params = st.make("Subterra/Return-v1", tunnel="control", hidden_start=True)
     flat, state = env.reset(jax.random.key(0), params)
     obs = observed(env, params, flat)
     assert float(obs.start) == float(state.goal.told)
@@ -68,7 +68,7 @@ def test_the_believed_start_is_observed_and_the_true_one_is_not():
 
 
 def test_the_way_back_ends_at_the_station_that_was_told():
-    env, params = st.make("Subterra/ReturnOffset-v1", tunnel="control")
+    env, params = st.make("Subterra/Return-v1", tunnel="control", hidden_start=True)
     _, state = env.reset(jax.random.key(0), params)
     raised = {**state.parts, "goal": state.goal.replace(flag=jnp.ones(()), still=jnp.full((), 99, jnp.int32))}
     stands = lambda where: env.step(  # noqa: E731
@@ -78,7 +78,7 @@ def test_the_way_back_ends_at_the_station_that_was_told():
 
 
 def test_a_chosen_start_is_told_and_keeps_the_distance_of_the_goal():
-    env, params = st.make("Subterra/StopAtOffset-v1", tunnel="control")
+    env, params = st.make("Subterra/StopAt-v1", tunnel="control", hidden_start=True)
     draws = env.draw_reset(jax.random.key(0), (), params)
     drawn, placed = env.begin(draws, params), env.begin({**draws, "choice": Choice(station=50.0)}, params)
     assert float(placed.station) == float(placed.goal.told) == 50.0

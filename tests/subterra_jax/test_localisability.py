@@ -14,7 +14,7 @@ from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.tunnel import beside, from_centreline
 
 SIGMA, BLUR, TURN, STEP = 0.05, 0.05, 0.02, 0.025
-TASK = "Subterra/StopAt-v0"
+TASK = "Subterra/StopAt-v1"
 
 
 def corridor(pockets: bool, bend: float = 0.0) -> st.TunnelPlan:
@@ -165,8 +165,8 @@ def test_a_long_cell_is_told_what_its_scans_tell_in_the_mean():
 @pytest.mark.slow
 def test_level_beams_in_three_dimensions_tell_what_planar_ones_tell(found, params):
     plan = corridor(True).slice(20.0, 30.0)
-    planar = localisability(st.make("Subterra/StopAtShort-v0", tunnel=dataclasses.replace(plan), goal=_near())[1])
-    env_params = st.make("Subterra/StopAtShort-v0", tunnel=plan, goal=_near())[1]
+    planar = localisability(st.make("Subterra/StopAtShort-v1", tunnel=dataclasses.replace(plan), goal=_near())[1])
+    env_params = st.make("Subterra/StopAtShort-v1", tunnel=plan, goal=_near())[1]
     solid = localisability(env_params, solid=Solid(Relief.from_plan(plan), plan, beams.planar(16)))
     np.testing.assert_allclose(solid.information[10:50, 0, 0], planar.information[10:50, 0, 0], rtol=0.05)
 
@@ -210,7 +210,7 @@ def test_the_drift_of_a_perfect_filter_takes_each_scan_as_blurred_as_the_filter_
 
 
 def test_in_a_bend_a_scan_tells_as_much_as_another_place_differs_once_offset_and_heading_are_fitted():
-    _, params = st.make("Subterra/StopAt-v0", tunnel="metro-asbuilt", lining="smooth")
+    _, params = st.make("Subterra/StopAt-v1", tunnel="metro-asbuilt", lining="smooth")
     station, shift = np.arange(100.0, 132.0, 0.5, dtype=np.float32), 0.8
 
     @jax.jit

@@ -174,11 +174,11 @@ def _trained(env, params):
     ("task", "sensor", "sentence"),
     [
         ("Relocalise-v1", None, "one: a localiser on its way to a goal, without a map; .* asks to report"),
-        ("Traverse-v0", None, "asks to cover"),
+        ("Traverse-v1", None, "asks to cover"),
         pytest.param("StopAt-v1", "spin16x64", "trained with 16 beams, .* has 1024", marks=pytest.mark.slow),
         ("Return-v1", None, None),
         ("Faulted-v1", None, None),
-        ("ObstructedOffset-v1", None, None),
+        ("Obstructed-v1", None, None),
     ],
 )
 def test_a_localiser_drives_where_it_can_and_is_refused_in_a_sentence_elsewhere(task, sensor, sentence):

@@ -175,7 +175,7 @@ def test_a_handler_never_claims_an_interface_it_does_not_know(theirs, answer):
 @pytest.mark.slow
 def test_code_kept_by_one_process_serves_another_and_no_other_version(tmp_path):
     program = (
-        "import jax, subterra_jax as st; env, params = st.make('Subterra/TraverseShort-v0'); b = st.AutoReset(env);"
+        "import jax, subterra_jax as st; env, params = st.make('Subterra/TraverseShort-v1'); b = st.AutoReset(env);"
         "obs, _ = jax.jit(b.reset, static_argnums=2)(jax.random.key(0), params, 64); print(float(obs.sum()))"
     )
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "JAX_PLATFORMS": "cpu"}
@@ -208,7 +208,7 @@ def test_kernels_that_two_processes_compiled_run_in_a_third(tmp_path):
     scan = """
 import jax
 import subterra_jax as st
-env, params = st.make("Subterra/TraverseShort-v0")
+env, params = st.make("Subterra/TraverseShort-v1")
 print(float(st.AutoReset(env).reset(jax.random.key(0), params, 512)[0].sum()))
 """
     march = """

@@ -29,7 +29,7 @@ def square(x=5.0, y=0.0, turn=0.0):
 
 @pytest.fixture(scope="module")
 def tunnel():
-    return Tunnel.from_plan(st.load_tunnel(), "pockets")
+    return Tunnel.from_plan(st.load_tunnel("subterra-351"), "pockets")
 
 
 @pytest.mark.parametrize(
@@ -46,19 +46,21 @@ def test_a_beam_from_inside_a_box_meets_it_at_once():
 
 
 def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
-    env, params = st.make("Subterra/Obstructed-v0", lidar=st.lidar.LidarParams(range_sigma=0.0))
-    plan = st.load_tunnel()
+    env, params = st.make("Subterra/Obstructed-v1", "subterra-351", lidar=st.lidar.LidarParams(range_sigma=0.0))
+    plan = st.load_tunnel("subterra-351")
     poses = reference.random_poses(plan, 60, np.random.default_rng(0))
     walls = plan.lining("pockets").segments
     _, state = jax.jit(env.reset)(jax.random.key(3), params)
     slots = jnp.arange(int(plan.length / obstacles.PITCH) + 1)
-    boxes = obstacles.boxes_in(state.obstacles, slots, params.tunnel, params.obstacles)
+    own, sizes = state.obstacles, params.obstacles
+    sizes = sizes.replace(first=sizes.first + own.start)
+    boxes = obstacles.boxes_in(own.seed, slots, params.tunnel, sizes)
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
     everything = np.concatenate([walls, sides])
     free = reference.clearance(sides, poses.position) > 0.3
     inside = np.asarray(
         jax.vmap(obstacles.clearance, (None, 0, 0, None, None))(
-            state.obstacles, poses.station, poses.position, params.tunnel, params.obstacles
+            own.seed, poses.station, poses.position, params.tunnel, sizes
         )
     )
     keep = free & (inside > 0.0)
@@ -80,7 +82,7 @@ def test_there_is_always_a_way_past(tunnel):
     seeds = jax.random.bits(jax.random.key(0), (200,))
     boxes = jax.vmap(obstacles.boxes_in, (0, None, None, None))(seeds, slots, tunnel, PARAMS)
     corners = np.asarray(jax.vmap(segments)(boxes))[..., :2]
-    plan = st.load_tunnel()
+    plan = st.load_tunnel("subterra-351")
     free, trolleys = [], 0
     for box, half in zip(corners.reshape(-1, 4, 2), np.asarray(boxes.half).reshape(-1, 2), strict=True):
         if np.abs(box).max() > 1e5:
@@ -103,7 +105,7 @@ def test_the_clearance_is_the_distance_to_the_nearest_side(tunnel):
     slots = jnp.arange(1, 20)
     boxes = obstacles.boxes_in(jnp.uint32(5), slots, tunnel, PARAMS)
     sides = np.asarray(segments(boxes), np.float64).reshape(-1, 4)
-    plan, compared = st.load_tunnel(), 0
+    plan, compared = st.load_tunnel("subterra-351"), 0
     clearance = jax.jit(obstacles.clearance)
     for node in range(40, 1000, 9):
         position = plan.centre[node].astype(np.float32)

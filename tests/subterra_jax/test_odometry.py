@@ -8,7 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.parts import odometer as odometry
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 N, T = 4000, 50
 
 

@@ -78,19 +78,19 @@ def test_a_split_has_its_kinds_in_turn_and_a_range_of_names_is_their_list():
 )
 def test_a_tunnel_that_is_not_there_is_refused_in_one_sentence(name, said):
     with pytest.raises(st.TunnelError, match=said) as error:
-        st.make("Subterra/StopAt-v0", tunnel=name)
+        st.make("Subterra/StopAt-v1", tunnel=name)
     assert "\n" not in str(error.value)
 
 
 def test_a_kind_says_what_it_has_where_pockets_are_asked_of_sprayed_concrete():
     with pytest.raises(st.TunnelError, match="'open:sprayed:val:2' has no lining 'pockets'; it has built, bare"):
-        st.make("Subterra/StopAt-v0", tunnel="open:sprayed:val:2", lining="pockets")
+        st.make("Subterra/StopAt-v1", tunnel="open:sprayed:val:2", lining="pockets")
 
 
 def test_a_task_longer_than_its_tunnel_is_refused_with_both_lengths():
     short = plan(name_of("cast"), solid=False, length=40.0)
     with pytest.raises(ValueError, match=r"needs a tunnel of 65 m, this one has 40\.0 m"):
-        st.make("Subterra/StopAt-v0", tunnel=short)
+        st.make("Subterra/StopAt-v1", tunnel=short)
 
 
 @pytest.mark.parametrize("kind", ["straight", "universal"])
@@ -111,7 +111,7 @@ def test_the_nominal_ring_length_is_told_and_the_built_one_is_a_little_longer(ki
     tunnel = plan(name_of(kind), solid=False, length=120.0)
     rings = draw(name_of(kind), 120.0).bore.rings
     np.testing.assert_array_equal(tunnel.ring_joint, rings.joint)
-    told = st.make("Subterra/StopAtShort-v0", tunnel=tunnel)[1].tunnel.ring_pitch  # the entry of the observation
+    told = st.make("Subterra/StopAtShort-v1", tunnel=tunnel)[1].tunnel.ring_pitch  # the entry of the observation
     assert float(told) == pytest.approx(rings.nominal, abs=1e-6)
     cut = tunnel.slice(50.0, 30.0)
     np.testing.assert_allclose(cut.ring_joint, rings.joint[(rings.joint >= 50) & (rings.joint <= 80)] - 50.0)
@@ -272,7 +272,7 @@ def test_the_plan_of_every_kind_is_the_cut_of_its_shell(kind, variant):
 
 def hostile(names: list[str], n_envs: int, n_steps: int) -> None:
     """Commands from NaN to infinity in tunnels of all kinds, started anew where an episode ends."""
-    env, params = st.make("Subterra/StopAtShort-v0", tunnel=[plan(name, solid=False, length=90.0) for name in names])
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel=[plan(name, solid=False, length=90.0) for name in names])
     batch = st.AutoReset(env)
     values = jnp.array([-jnp.inf, -1e30, -3.0, -0.0, 1e-30, 0.7, 5.0, 1e30, jnp.inf, jnp.nan])
 

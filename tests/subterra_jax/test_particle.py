@@ -71,7 +71,7 @@ def test_the_age_of_what_is_observed_shows_when_the_robot_sets_off():
 
 
 def test_the_odometer_weighs_as_much_as_its_nominal_errors_allow():
-    _, params = st.make("Subterra/StopAtShort-v0")
+    _, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351")
     # Variances: odometer 0.02² + 0.01², plant 0.02² + 0.02².
     assert reckoning.odometer_share(params) == pytest.approx(8.0 / 13.0, rel=1e-5)
 
@@ -126,7 +126,7 @@ def test_a_cloud_speaks_for_its_heaviest_cluster_and_admits_the_other():
 @pytest.fixture(scope="module")
 def pockets():
     """The short stop between pockets, cut to 400 steps, and the filter's records of a few episodes."""
-    env, params = st.make("Subterra/StopAtShort-v0", horizon=400)
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", horizon=400)
     episodes = listed_episodes(env, params, 12)
     return env, params, episodes, evaluate(env, params, particle_filter(params, 128), episodes)
 
@@ -151,7 +151,7 @@ def test_the_filter_is_deterministic(pockets):
 
 @pytest.mark.slow
 def test_between_smooth_walls_of_one_curvature_the_filter_is_no_better_than_dead_reckoning():
-    env, params = st.make("Subterra/StopAt-v0", tunnel="control", lining="smooth")
+    env, params = st.make("Subterra/StopAt-v1", tunnel="control", lining="smooth")
     episodes = listed_episodes(env, params, 100)
     filtered = evaluate(env, params, particle_filter(params), episodes)
     fused = evaluate(env, params, make_agent("fused", params), episodes)
@@ -162,7 +162,7 @@ def test_between_smooth_walls_of_one_curvature_the_filter_is_no_better_than_dead
 
 @pytest.mark.slow
 def test_relocalisation_finds_place_and_direction():
-    env, params = st.make("Subterra/Relocalise-v0")
+    env, params = st.make("Subterra/Relocalise-v1", tunnel="subterra-351")
     found = evaluate(env, params, make_agent("particle-filter", params), listed_episodes(env, params, 20))
     assert found.success.mean() >= 0.7
 
@@ -204,11 +204,11 @@ def test_the_ceiling_takes_likelihoods_whole_about_a_start_and_drives_as_far_as_
 
 
 def test_the_ceiling_spares_its_particles_where_the_start_is_hidden():
-    tasks = ("StopAt", "Faulted", "Obstructed", "StopAtOffset", "FaultedOffset")
-    made = {name: ceiling(st.make(f"Subterra/{name}-v1")[1]).localiser for name in tasks}
-    assert {name: one.n_particles for name, one in made.items()} == {
-        "StopAt": 512, "Faulted": 1024, "Obstructed": 512, "StopAtOffset": 1024, "FaultedOffset": 2048
-    }  # fmt: skip
-    least = {name: one.motion.least_share for name, one in made.items()}
-    assert max(least[name] for name in ("StopAt", "Faulted", "Obstructed", "FaultedOffset")) < 0.1
-    assert least["StopAtOffset"] > 0.3
+    cases = [(name, False) for name in ("StopAt", "Faulted", "Obstructed")] + [("StopAt", True), ("Faulted", True)]
+    made = [
+        ceiling(st.make(f"Subterra/{name}-v1", "control", hidden_start=hidden)[1]).localiser for name, hidden in cases
+    ]
+    assert [one.n_particles for one in made] == [512, 1024, 512, 1024, 2048]
+    least = [one.motion.least_share for one in made]
+    assert max(least[i] for i in (0, 1, 2, 4)) < 0.1
+    assert least[3] > 0.3

@@ -77,7 +77,7 @@ def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
     assert choice.plan(0).name == "metro-asbuilt"
     assert choice.plan(1).length == pytest.approx(60.0)
     assert TunnelChoice("procedural:test:0-2").plan(1).name == st.load_tunnel("procedural:test:1").name
-    ready = st.make("Subterra/TraverseShort-v0")[1].tunnel
+    ready = st.make("Subterra/TraverseShort-v1")[1].tunnel
     with pytest.raises(ValueError, match="holds no heights"):
         TunnelChoice(ready).plan(0)
 
@@ -93,7 +93,7 @@ DRAW = """
 import sys
 import gymnasium
 import numpy as np
-env = gymnasium.make("subterra_jax:Subterra/StopAt-v0", tunnel="control", render_mode="rgb_array", view="mujoco")
+env = gymnasium.make("subterra_jax:Subterra/StopAt-v1", tunnel="control", render_mode="rgb_array", view="mujoco")
 env.reset(seed=0, options={"start": 100.0})
 try:
     np.save(sys.argv[1], env.render())

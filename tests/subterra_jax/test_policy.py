@@ -26,9 +26,9 @@ from tests.subterra_jax.probes import PROBES
 
 pytestmark = pytest.mark.door
 
-TASK, DRIVEN = "Subterra/StopAtShort-v0", "Subterra/TraverseShort-v0"
-SHORT = "TraverseShort-v0"
-FEW = ("random", "StopAtShort-v0")
+TASK, DRIVEN = "Subterra/StopAtShort-v1", "Subterra/TraverseShort-v1"
+SHORT = "TraverseShort-v1"
+FEW = ("random", "fused")
 LONG = tuple(
     pytest.param(name, marks=pytest.mark.slow) for name in ("oracle", "ring-count", "ring-filter", "particle-filter")
 )
@@ -54,7 +54,7 @@ class Slow:
 
 @pytest.fixture(scope="module")
 def world():
-    return st.make(TASK)
+    return st.make(TASK, tunnel="subterra-351")
 
 
 @pytest.fixture
@@ -163,19 +163,19 @@ def test_a_rollout_gives_a_policy_its_memory_and_begins_it_anew_with_each_episod
 
 
 def test_a_policy_knows_its_own_task_and_a_gait_is_a_policy_too():
-    policy = st.load_policy("TraverseShort-v0")
-    assert policy.env.id == "Subterra/TraverseShort-v0"
+    policy = st.load_policy("TraverseShort-v1")
+    assert policy.env.id == "Subterra/TraverseShort-v1"
     obs, _ = policy.env.reset(jax.random.key(0), policy.params)
     action, _ = policy(obs, policy.initial_memory())
     assert policy.env.action_space(policy.params).contains(action)
-    gait = st.load_policy("B2Walk-v0")
+    gait = st.load_policy("B2Walk-v1")
     action, memory = gait(jnp.zeros((5, 56)), gait.initial_memory(n_envs=5))
     assert action.shape == (5, 12)
     assert gait.restart(memory, jnp.ones(5, bool)) == ()
     np.testing.assert_allclose(jax.jit(gait)(jnp.zeros((5, 56)), memory)[0], action, atol=1e-6)
 
 
-@pytest.mark.parametrize("source", ["TraverseShort-v0", "dead-reckoning"])
+@pytest.mark.parametrize("source", ["TraverseShort-v1", "dead-reckoning"])
 def test_a_policy_itself_can_be_compiled(source):
     """It holds arrays and dicts of arrays, which have no hash; `jax.jit` asks for one."""
     policy = st.load_policy(source, *st.make(DRIVEN))
@@ -227,10 +227,8 @@ def test_leaderboard_recorder_and_viewer_drive_with_each_of_them(places):
         ("empty", TASK, PolicyError, r"empty: holds no policy.safetensors; release it again"),
         ("nobody", None, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
         ("ring-count", None, PolicyError, r"ring-count: drives any task, so name one"),
-        ("StopAt-v0", "Subterra/TraverseShort-v0", PolicyError, r"StopAt-v0: a policy that drives to a goal"),
-        ("TraverseShort-v0", TASK, PolicyError, r"TraverseShort-v0: made for observations of 18 numbers"),
-        ("StopAt-v0", "Subterra/ReturnShort-v0", PolicyError, r"has learnt Subterra/StopAt-v0 \(to stop\)"),
-        ("B2Walk-v0", TASK, PolicyError, r"made for observations of 56 numbers, the B2 gives 20"),
+        ("TraverseShort-v1", TASK, PolicyError, r"TraverseShort-v1: made for observations of 18 numbers"),
+        ("B2Walk-v1", TASK, PolicyError, r"made for observations of 56 numbers, the B2 gives 21"),
         ("pathlib:Path", TASK, AgentError, r"agent 'pathlib:Path' has no uses_lidar"),
     ],
 )
@@ -238,25 +236,25 @@ def test_what_cannot_drive_here_is_refused_in_one_sentence(source, task, error, 
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=message) as refused:
-        load_policy(source, *(st.make(task) if task else ()))
+        load_policy(source, *(st.make(task, "subterra-351") if task else ()))
     assert "\n" not in str(refused.value)
 
 
 def test_a_call_that_lacks_something_is_refused_in_one_sentence(world):
     env, params = world
     policy = load_policy("fused", env, params)
-    with pytest.raises(PolicyError, match=r"fused: Subterra/StopAtShort-v0 has 20 numbers, got .* \(18,"):
+    with pytest.raises(PolicyError, match=r"fused: Subterra/StopAtShort-v1 has 21 numbers, got .* \(18,"):
         policy(jnp.zeros(18), policy.initial_memory())
     for wrong in (None, ()):
         with pytest.raises(PolicyError, match=r"fused: the first memory is policy.initial_memory\(\), got a"):
-            policy(jnp.zeros(20), wrong)
+            policy(jnp.zeros(21), wrong)
     oracle = load_policy("oracle", env, params)
     with pytest.raises(PolicyError, match=r"oracle: is told the truth, so call it as policy\(obs, memory, state\)"):
-        oracle(jnp.zeros(20), oracle.initial_memory())
+        oracle(jnp.zeros(21), oracle.initial_memory())
     several = st.make(TASK, tunnel=["subterra-351", "control"], lining="smooth")
     policy = load_policy("fused", *several)
     with pytest.raises(PolicyError, match=r"drives in 2 tunnels, so call it as policy\(obs, memory, state\)"):
-        policy(jnp.zeros(20), policy.initial_memory())
+        policy(jnp.zeros(21), policy.initial_memory())
     with pytest.raises(PolicyError, match="belong together"):
         load_policy("fused", env)
 
@@ -264,7 +262,7 @@ def test_a_call_that_lacks_something_is_refused_in_one_sentence(world):
 @pytest.mark.parametrize("name", PROBES)
 def test_the_function_gives_an_agent_what_it_declares_and_no_more(name):
     agent, speed = PROBES[name]
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     policy = load_policy(dataclasses.replace(agent), env, params)
     obs, state = env.reset(jax.random.key(0), params)
     action, _ = policy(obs, policy.initial_memory(), state)
@@ -274,16 +272,14 @@ def test_the_function_gives_an_agent_what_it_declares_and_no_more(name):
 @pytest.mark.parametrize(
     ("name", "task", "message"),
     [
-        ("TraverseShort-v0", TASK, "ppo-mlp|TraverseShort-v0: made for observations of 18 numbers"),
-        ("StopAt-v0", "Subterra/Return-v0", r"StopAt-v0: has learnt Subterra/StopAt-v0 \(to stop\)"),
-        ("Relocalise-v0", "Subterra/StopAt-v0", "Relocalise-v0: a policy that finds out where it is"),
+        ("TraverseShort-v1", TASK, "ppo-mlp|TraverseShort-v1: made for observations of 18 numbers"),
     ],
 )
 def test_an_evaluation_refuses_the_policy_of_another_task_in_one_sentence(name, task, message):
     agent, _ = policies.load(name)
     one = np.zeros(1, np.int32)
     with pytest.raises(PolicyError, match=message) as refused:
-        evaluate(*st.make(task), agent, Episodes(np.zeros(1, np.uint32), one, one, one))
+        evaluate(*st.make(task, "subterra-351"), agent, Episodes(np.zeros(1, np.uint32), one, one, one))
     assert "\n" not in str(refused.value)
 
 

@@ -10,7 +10,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.randomization import LogUniform, randomize
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 RANGES = {"lidar.range_sigma": (0.0, 0.1), "vehicle.speed_max": (1.0, 2.0), "lidar.range_max": (10.0, 30.0)}
 
 

@@ -8,7 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.rules.traverse import RewardParams, reward_terms
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 
 
 def terms(**changes):

@@ -126,7 +126,7 @@ def test_who_begins_anew_is_as_at_the_start_and_who_does_not_is_as_before(tracke
 
 
 def test_the_agent_drives_slowly_where_it_learns_and_faster_where_it_counts():
-    params = st.make("Subterra/FaultedShort-v0")[1]
+    params = st.make("Subterra/Faulted-v1")[1]
     steering = make_agent("ring-filter", params).steering
     assert isinstance(steering, PacedSteering)
     blind = PacedSteering(HeadingHold(), steering.cruise, steering.slow, steering.learning)
@@ -141,7 +141,7 @@ def test_the_agent_drives_slowly_where_it_learns_and_faster_where_it_counts():
 
 @pytest.mark.slow
 def test_most_goals_are_found_under_faults_without_a_map():
-    env, params = st.make("Subterra/Faulted-v0", estimates=True)
+    env, params = st.make("Subterra/Faulted-v1", estimates=True)
     agent = make_agent("ring-filter", params)
     assert not agent.uses_map
     records = evaluate(env, params, agent, listed_episodes(env, params, 25), 25)

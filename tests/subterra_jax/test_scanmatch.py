@@ -105,7 +105,7 @@ def test_a_bin_that_stands_for_another_place_begins_anew(straight):
 
 @pytest.mark.slow
 def test_scan_matching_beats_dead_reckoning_between_pockets():
-    env, params = st.make("Subterra/StopAt-v0")
+    env, params = st.make("Subterra/StopAt-v1")
     episodes = listed_episodes(env, params, 50)
     found = evaluate(env, params, scan_matching(params), episodes)
     blind = evaluate(env, params, make_agent("fused", params), episodes)

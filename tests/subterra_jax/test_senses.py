@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import policies
 from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.avoidance import Avoidance
 from subterra_jax.policies import boxes, senses
@@ -63,25 +62,8 @@ def remembered(drive):
     return jax.device_get(jax.jit(lambda *seen: jax.lax.scan(step, boxes.start((2,), 16), seen)[1])(*seen))
 
 
-def test_a_policy_of_before_there_was_a_choice_acts_as_when_it_was_released():
-    agent, facts = policies.load("StopAtShort-v0")
-    assert "tracker" not in facts["layout"]
-    assert agent.shown == senses.PLAIN
-    station = np.cumsum(np.full(60, 0.19))
-    ranges = jnp.asarray(scans(station, np.ones(60), np.random.default_rng(5)))
-
-    def step(memory, seen):
-        action, memory = agent.answer(memory, observation(*seen), jnp.float32(0.0))
-        return memory, action
-
-    read = jnp.asarray(1.01 * station, jnp.float32)
-    actions = jax.jit(lambda *seen: jax.lax.scan(step, agent.blank(), seen))(ranges, read)[1]
-    # Written down before the senses could be chosen, at commit 80f2ea8.
-    np.testing.assert_allclose(actions[-1], [-0.2448480, -0.0038254, 11.8343363, -2.1679378, 1.0], atol=2e-4)
-
-
 def test_the_sense_of_boxes_is_what_avoidance_remembers(drive, remembered):
-    _, params = st.make("Subterra/ObstructedShort-v0")
+    _, params = st.make("Subterra/Obstructed-v1", "subterra-351")
 
     def step(now, seen):
         after = AVOID.look(now, observation(seen[0]), seen[1], params)

@@ -15,7 +15,7 @@ from subterra_jax.parts import make_sensor
 from subterra_jax.parts.spatial_lidar import SENSORS, Sweeping, along_arc
 from tests.subterra_jax import tunnels
 
-TASK, GRADE, HALF = "Subterra/TraverseShort-v0", 0.05, 2.8
+TASK, GRADE, HALF = "Subterra/TraverseShort-v1", 0.05, 2.8
 EXACT = {"sigma": 0.0, "sigma_per_metre": 0.0, "sigma_slant": 0.0, "losing": False}
 
 
@@ -304,7 +304,7 @@ def test_what_no_sensor_can_honour_is_one_sentence(graded, tmp_path, monkeypatch
     with pytest.raises(ValueError, match="'planar16' measures a scan at one moment"):
         st.make(TASK, tunnel=graded, sweep=True)
     with pytest.raises(ValueError, match="sweep=True does not go with the part 'faults'"):
-        st.make("Subterra/FaultedShort-v0", tunnel=graded, sensor=ahead, sweep=True)
+        st.make("Subterra/Faulted-v1", tunnel=graded, sensor=ahead, sweep=True)
     for mount in (Mount(height=-0.5), Mount(height=7.0), Mount(lateral=3.5)):
         with pytest.raises(SubterraError, match="is inside the wall, or in a thing"):
             st.make(TASK, tunnel=graded, sensor=exact(ahead, mount=mount))

@@ -14,9 +14,12 @@ import subterra_jax as st
 from scene.bore import load_bore
 from scene.errors import RecordingError as SceneError
 from subterra_jax import policies
-from subterra_jax.host.versions import VERSION, no_task, other_schema
+from subterra_jax.host.errors import SubterraError
+from subterra_jax.host.task_ids import no_task
+from subterra_jax.host.versions import VERSION, other_schema
 from subterra_jax.lidar3d.surface import read_axis
-from subterra_jax.policies.files import PolicyError
+from subterra_jax.policies.files import PolicyError, read
+from subterra_jax.tasks import TaskError, find
 from subterra_jax.viewer.config import ViewerError
 from subterra_jax.viewer.recording import load as load_episode
 from subterra_jax.viewer.recording import save as save_episode
@@ -100,7 +103,7 @@ def test_an_archive_that_was_cut_short_is_no_bore_and_no_tunnel(tmp_path):
 @pytest.mark.parametrize(("number", "says"), [(0, "older .* `python -m train.release`"), (2, "newer .* --upgrade")])
 def test_a_policy_of_another_version_says_what_to_do(tmp_path, number, says):
     for ending in (".safetensors", ".json"):
-        shutil.copy(packaged("policies") / f"TraverseShort-v0{ending}", tmp_path / f"mine{ending}")
+        shutil.copy(packaged("policies") / f"TraverseShort-v1{ending}", tmp_path / f"mine{ending}")
     facts = json.loads((tmp_path / "mine.json").read_text())
     (tmp_path / "mine.json").write_text(json.dumps({**facts, "schema": f"subterra.policy/{number}"}))
     with pytest.raises(PolicyError, match=says):
@@ -126,21 +129,53 @@ def test_an_episode_of_another_version_says_what_to_do(tmp_path):
             load_episode(other(tmp_path / "now.npz", tmp_path / "other.npz", f"{name}/{told}"))
 
 
-def test_an_id_of_another_version_names_the_one_there_is():
-    known = ("Subterra/StopAt-v0", "Subterra/Return-v0")
-    both = (*known, "Subterra/StopAt-v1")
-    assert "has Subterra/StopAt-v0 and Subterra/StopAt-v1; results" in no_task("Subterra/StopAt-v7", both)
-    assert no_task("StopAt-v1", both) == "no task 'StopAt-v1': its id is Subterra/StopAt-v1"
-    assert no_task("StopAt", both) == "no task 'StopAt': its id is Subterra/StopAt-v0"
-    assert no_task("Subterra/StopAt-v1", known).endswith(
-        "has Subterra/StopAt-v0; results of two versions do not compare"
-    )
-    assert no_task("StopAt-v3", known) == no_task("Subterra/StopAt-v1", known).replace(
-        "Subterra/StopAt-v1", "StopAt-v3"
-    )
-    assert no_task("Return", known) == "no task 'Return': its id is Subterra/Return-v0"
-    assert no_task("Fly", known) == "no task 'Fly'; there are Subterra/StopAt-v0, Subterra/Return-v0"
-    with pytest.raises(ValueError, match="has Subterra/B2Traverse-v0"):
-        st.make("Subterra/B2Traverse-v1")
+@pytest.mark.parametrize(
+    ("gone", "now"),
+    [
+        ("Subterra/StopAt-v0", "Subterra/StopAt-v1"),
+        ("Subterra/Traverse-v0", "Subterra/Traverse-v1"),
+        ("Subterra/B2Walk-v0", "Subterra/B2Walk-v1"),
+        ("Subterra/B2Traverse-v0", "Subterra/B2Traverse-v1"),
+        ("FaultedShort-v0", "Subterra/Faulted-v1"),
+        ("Subterra/StopAtOffsetShort-v0", "Subterra/StopAtShort-v1 with hidden_start=True"),
+        ("Subterra/ReturnOffset-v1", "Subterra/Return-v1 with hidden_start=True"),
+    ],
+)
+def test_a_task_that_is_gone_names_its_successor_in_one_sentence(gone, now):
+    says = f"no task {gone!r}: version 1 is the benchmark; use {now}"
+    for refuse in (lambda: st.make(gone), lambda: find(gone, short=True)):
+        with pytest.raises(TaskError) as error:
+            refuse()
+        assert str(error.value) == says
+    policy = gone.removeprefix("Subterra/")
+    for source in (policy, f"policy:{policy}"):
+        with pytest.raises(SubterraError, match=f"version 1 is the benchmark; its task is {now}$"):
+            st.load_policy(source, *st.make("Subterra/StopAt-v1", tunnel="control"))
+
+
+def test_gymnasium_names_the_successor_of_a_task_that_is_gone():
+    for id in ("Subterra/StopAt-v0", "Subterra/B2Traverse-v0"):
+        with pytest.raises(gymnasium.error.DeprecatedEnv, match=id.replace("-v0", "-v1")):
+            gymnasium.make(f"subterra_jax:{id}")
+    with pytest.raises(gymnasium.error.NameNotFound, match="Did you mean"):
+        gymnasium.make("subterra_jax:Subterra/StopAtOffset-v0")
+
+
+def test_a_policy_file_of_a_task_that_is_gone_names_the_successor(tmp_path):
+    for ending in (".safetensors", ".json"):
+        shutil.copy(packaged("policies") / f"TraverseShort-v1{ending}", tmp_path / f"mine{ending}")
+    facts = tmp_path / "mine.json"
+    facts.write_text(facts.read_text().replace("TraverseShort-v1", "TraverseShort-v0"))
+    with pytest.raises(PolicyError) as error:
+        read(tmp_path / "mine.safetensors")
+    assert str(error.value).endswith("trained for Subterra/TraverseShort-v0, which is gone; train for "
+                                     "Subterra/TraverseShort-v1")  # fmt: skip
+
+
+def test_an_id_that_never_was_lists_those_there_are():
+    known = ("Subterra/StopAt-v1", "Subterra/Return-v1")
+    for id in ("StopAt-v1", "StopAt", "StopAt-v7"):
+        assert no_task(id, known) == f"no task {id!r}: its id is Subterra/StopAt-v1"
+    assert no_task("Fly", known) == "no task 'Fly'; there are Subterra/StopAt-v1, Subterra/Return-v1"
     with pytest.raises(gymnasium.error.VersionNotFound, match="StopAt"):
         gymnasium.make("subterra_jax:Subterra/StopAt-v7")

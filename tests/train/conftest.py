@@ -14,7 +14,7 @@ CHECKED = ("train.learning", "train.feedforward.rollout", "train.feedforward.net
 with install_import_hook(CHECKED, f"{checking.__name__}.check_functions"):
     from train import navigate
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 SMALL = ("--n-envs=64", "--unroll=64", "--minibatches=4", "--hidden", "32", "32")
 
 

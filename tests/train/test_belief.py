@@ -21,7 +21,7 @@ from train.belief.learner import (
 from train.config import ConfigError
 from train.policies import make_agent
 
-TASK = "Subterra/RelocaliseShort-v0"
+TASK = "Subterra/Relocalise-v1"
 CONFIG = make_belief_config("cpu")
 LENGTH, PITCH = 300.0, 1.5
 STATION = jnp.linspace(80.0, 92.0, 61)
@@ -69,8 +69,8 @@ def test_half_of_the_ways_face_the_other_way_and_begin_anywhere():
 
 
 def test_it_is_refused_where_one_knows_where_one_is():
-    with pytest.raises(ConfigError, match="which Subterra/StopAtShort-v0 does not"):
-        BeliefLearner(*st.make("Subterra/StopAtShort-v0"), CONFIG)
+    with pytest.raises(ConfigError, match="which Subterra/StopAtShort-v1 does not"):
+        BeliefLearner(*st.make("Subterra/StopAtShort-v1"), CONFIG)
 
 
 @pytest.mark.parametrize(("name", "value"), [("ways", 0), ("least_apart", 0.0), ("hidden", ()), ("minibatches", 3)])

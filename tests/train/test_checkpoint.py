@@ -16,7 +16,7 @@ from train.ppo import begin
 from train.world import open_world
 
 LAYOUT = networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16,), init_std=0.5, min_std=0.01)
-FACTS = {"layout": LAYOUT.__dict__, "task": "Subterra/TraverseShort-v0"}
+FACTS = {"layout": LAYOUT.__dict__, "task": "Subterra/TraverseShort-v1"}
 
 
 def policy_of(seed):
@@ -37,7 +37,7 @@ def test_a_policy_read_back_acts_the_same_to_the_bit(saved):
     again, restored, facts = policies.load_policy(saved)
     stack = jnp.asarray(np.random.default_rng(0).normal(0.0, 9.0, (64, 4, 18)), jnp.float32)
     np.testing.assert_array_equal(again.act(restored, stack), nets.act(policy, stack))
-    assert facts["task"] == "Subterra/TraverseShort-v0"
+    assert facts["task"] == "Subterra/TraverseShort-v1"
 
 
 def test_a_checkpoint_can_be_named_by_its_run_its_folder_or_itself(saved):
@@ -118,7 +118,7 @@ def test_a_file_of_another_schema_is_refused_by_field(saved):
 
 
 def test_a_resumed_run_knows_for_how_long_the_goal_has_held(tunnel, tmp_path):
-    world = open_world("Subterra/TraverseShort-v0", tunnel)
+    world = open_world("Subterra/TraverseShort-v1", tunnel)
     learner = Learner(world.env, world.params, PPOConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
     run = folder.RunFolder(tmp_path / "run", world, learner)
     run.start()

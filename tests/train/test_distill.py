@@ -17,7 +17,7 @@ from train.recurrent import lessons
 from train.recurrent.config import DistillConfig, check_distill, make_distill_config
 from train.recurrent.distill import DistillLearner
 
-TASK = "Subterra/StopAtShort-v0"
+TASK = "Subterra/StopAtShort-v1"
 CONFIG = DistillConfig(steps=512, n_envs=4, unroll=32, minibatches=2, hidden=8, bins=9)
 SMALL = (
     "--n-envs=16",
@@ -91,10 +91,10 @@ def test_every_task_has_a_preset_that_makes_sense(preset):
     [
         (("--teacher", "oracle"), "teacher = oracle teaches a policy with memory; give --memory gru as well"),
         (("--memory", "gru", "--teacher", "nobody", "--task", TASK), "teacher = nobody is no baseline"),
-        (("--memory", "gru", "--teacher", "oracle", "--task", "Subterra/Relocalise-v0"), "does not ask for"),
-        (("--memory", "gru", "--teacher", "TraverseShort-v0", "--task", TASK), "observations of 18 numbers"),
+        (("--memory", "gru", "--teacher", "oracle", "--task", "Subterra/Relocalise-v1"), "does not ask for"),
+        (("--memory", "gru", "--teacher", "TraverseShort-v1", "--task", TASK), "observations of 18 numbers"),
         (("--memory", "gru", "--teacher", "oracle", "--task", TASK, "--minibatches", "7"), "minibatches = 7"),
-        (("--memory", "gru", "--task", "Subterra/Nowhere-v0"), "no task 'Subterra/Nowhere-v0'"),
+        (("--memory", "gru", "--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
         (("--memory", "lstm"), "unknown memory 'lstm'; there are none, gru"),
     ],
 )

@@ -13,7 +13,7 @@ from train.b2 import embodied
 from train.config import ConfigError, Legs
 from train.navigate import read_command
 
-SHORT = "Subterra/TraverseShort-v0"
+SHORT = "Subterra/TraverseShort-v1"
 NO_TRIAL = Legs(robots=0)
 
 
@@ -44,7 +44,7 @@ def test_the_scout_is_who_drives_unless_told_otherwise():
 @pytest.mark.parametrize(
     ("task", "tunnel", "legs", "error", "said"),
     [
-        ("Subterra/StopAt-v0", None, NO_TRIAL, ConfigError, "does not do 'Subterra/StopAt-v0'"),
+        ("Subterra/StopAt-v1", None, NO_TRIAL, ConfigError, "does not do 'Subterra/StopAt-v1'"),
         (SHORT, None, Legs(gait="nobody"), PolicyError, "nobody: no such policy"),
         (SHORT, None, Legs(robots=-1), ConfigError, "robots must not be negative, got -1"),
         (SHORT, "procedural:train:0-1", NO_TRIAL, ConfigError, "the B2 walks one"),

@@ -67,12 +67,12 @@ def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--task", "Subterra/Nowhere-v0"), "no task 'Subterra/Nowhere-v0'"),
+        (("--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
         (("--lining", "velvet"), "no lining 'velvet'"),
         (("--episodes", "0"), "episodes must be at least 1, got 0"),
         (("--episodes", "501"), "episodes must be at most 500"),
-        (("--task", "Subterra/StopAt-v0"), "made for observations of 18 numbers, Subterra/StopAt-v0 has 20"),
+        (("--task", "Subterra/StopAt-v1"), "made for observations of 18 numbers, Subterra/StopAt-v1 has 21"),
     ],
 )
 def test_a_mistake_on_the_command_line_is_one_sentence_and_status_2(trained, capsys, arguments, message):

@@ -19,7 +19,7 @@ from train.recurrent.config import make_distill_config
 from train.recurrent.distill import DistillLearner
 from train.recurrent.network import without_critic
 
-TASK = "Subterra/StopAtShort-v0"
+TASK = "Subterra/StopAtShort-v1"
 
 
 @pytest.mark.slow

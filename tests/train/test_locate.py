@@ -45,7 +45,7 @@ def _command(tmp_path, **changes):
         ({"n_steps": 100}, "n_steps must be at least 200, got 100"),
         ({"minutes": 0.0}, "minutes must be positive"),
         ({"begin_from": "nobody"}, "nobody"),
-        ({"begin_from": "StopAt-v0"}, "StopAt-v0: is no localiser"),
+        ({"begin_from": "Traverse-v1"}, "Traverse-v1: is no localiser"),
         ({"begin_from": "locate-transformer"}, "is of network transformer with front match, not gru"),
         ({"begin_from": "locate-faulted", "network": "transformer"}, "with front wide, not transformer with match"),
         ({"map": True, "network": "kalman"}, "a map is taken by gru, s5, transformer with front match"),

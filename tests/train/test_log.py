@@ -82,7 +82,7 @@ def runs(folder, coverages):
     for k, coverage in enumerate(coverages):
         run = folder / f"seed-{k}"
         run.mkdir()
-        (run / "config.json").write_text('{"task": "Subterra/Traverse-v0"}')
+        (run / "config.json").write_text('{"task": "Subterra/Traverse-v1"}')
         rows = [f"{i + 1},{100 * (i + 1)},{c},{c > 0.5:d},7,0" for i, c in enumerate(coverage)]
         (run / "episodes.csv").write_text("\n".join(["episode,step,coverage,success,length,contact", *rows, ""]))
     return sorted(folder.iterdir())

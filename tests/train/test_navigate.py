@@ -37,7 +37,7 @@ def test_a_run_folder_holds_everything(trained):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--task", "Subterra/Nowhere-v0"), "no task 'Subterra/Nowhere-v0'"),
+        (("--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
         (("--preset", "abacus"), "unknown preset 'abacus'"),
         (("--minibatches", "7"), "n_envs = 128 cannot be divided into minibatches = 7"),
         (("--steps", "0"), "steps must be at least 1, got 0"),

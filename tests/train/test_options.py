@@ -22,20 +22,20 @@ from train.world import open_world, with_reward
 pytestmark = pytest.mark.door
 
 YAML = """
-task: Subterra/StopAtShort-v0
+task: Subterra/StopAtShort-v1
 memory: gru
 teacher: oracle
 hidden: 48
 bin_width: 0.25
 reward: {jerk: 0.5}
 """
-TOML = "task = 'Subterra/TraverseShort-v0'\nhidden = [24, 12]\nframes = 2\n[reward]\nlateral = 0.7\n"
+TOML = "task = 'Subterra/TraverseShort-v1'\nhidden = [24, 12]\nframes = 2\n[reward]\nlateral = 0.7\n"
 
 
 def test_a_file_sets_what_the_command_line_sets_and_the_command_line_has_the_last_word(tmp_path):
     (tmp_path / "mine.yaml").write_text(YAML)
     command = read_command(["--config", str(tmp_path / "mine.yaml"), "--out", "o", "--hidden", "32"])
-    assert (type(command).__name__, command.task) == ("DistillCommand", "Subterra/StopAtShort-v0")
+    assert (type(command).__name__, command.task) == ("DistillCommand", "Subterra/StopAtShort-v1")
     assert (command.config.hidden, command.config.bin_width, command.config.teacher) == (32, 0.25, "oracle")
     assert reward_of(command)["jerk"] == 0.5
     (tmp_path / "mine.toml").write_text(TOML)
@@ -48,7 +48,7 @@ def test_a_file_sets_what_the_command_line_sets_and_the_command_line_has_the_las
     "words", [(), ("--memory", "gru"), ("--memory", "gru", "--teacher", "fused"), ("--memory=map",)]
 )
 def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
-    task = "Subterra/Relocalise-v0" if "--memory=map" in words else "Subterra/StopAtShort-v0"
+    task = "Subterra/Relocalise-v1" if "--memory=map" in words else "Subterra/StopAtShort-v1"
     given = ["--task", task, *words, "--n-envs=96", "--reward.miss", "3.5", "--out", "o", "--log", "json:dumps"]
     command = read_command(given)
     (tmp_path / "config.json").write_text(json.dumps({"schema": "subterra.run/1", "command": settings_of(command)}))
@@ -188,5 +188,5 @@ def test_weights_and_biases_gets_every_number_at_its_step(tmp_path, monkeypatch)
 
 def test_every_kind_of_network_names_its_size_on_the_command_line():
     assert read_command(["--out", "o", "--hidden", "8", "4", "--frames", "3"]).config.hidden == (8, 4)
-    assert read_command(["--out", "o", "--task", "Subterra/StopAt-v0", "--memory=gru", "--hidden=8"]).config.hidden == 8
+    assert read_command(["--out", "o", "--task", "Subterra/StopAt-v1", "--memory=gru", "--hidden=8"]).config.hidden == 8
     assert SMALL[-2:] == ("32", "32")

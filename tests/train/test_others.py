@@ -16,7 +16,7 @@ from train.others.watch import Act, OnHost, Watch
 
 pytestmark = pytest.mark.door
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 FEW_METRES = {"horizon": 30, "goal_coverage": 0.06}  # 3.6 m in 3 s; one who stands or circles does not get there
 
 
@@ -151,7 +151,7 @@ def test_the_command_trains_the_short_task_and_writes_what_it_saw(tmp_path, monk
     [
         (["sb4_ppo"], "sb4_ppo"),
         (["rejax_ppo"], "rejax_ppo needs rejax, which is not installed; the head of train/others/rejax_ppo.py"),
-        (["ours", "--task", "Subterra/Nowhere-v0"], "no task 'Subterra/Nowhere-v0'"),
+        (["ours", "--task", "Subterra/Nowhere-v1"], "no task 'Subterra/Nowhere-v1'"),
         (["ours", "--steps", "0"], "steps must be at least 1"),
     ],
 )

@@ -21,7 +21,7 @@ from train.recurrent.drive import make_layout
 from train.recurrent.learner import RecurrentLearner, nearer
 from train.recurrent.network import RecurrentLayout, RecurrentNetworks, estimation_loss
 
-TASK = "Subterra/StopAtShort-v0"
+TASK = "Subterra/StopAtShort-v1"
 CONFIG = RecurrentConfig(steps=512, n_envs=8, unroll=32, minibatches=2, epochs=1, hidden=8, bins=9)
 SMALL = ("--n-envs=8", "--unroll=32", "--minibatches=2", "--epochs=1", "--hidden=8", "--bins=9")
 
@@ -108,7 +108,7 @@ def test_goals_move_away_while_it_learns_and_end_where_the_task_has_them():
     assert float(end.still_speed) == pytest.approx(float(params.goal.still_speed))
 
 
-@pytest.mark.parametrize("task", ["Subterra/Traverse-v0", "Subterra/Relocalise-v0"])
+@pytest.mark.parametrize("task", ["Subterra/Traverse-v1", "Subterra/Relocalise-v1"])
 def test_a_task_that_has_no_goal_is_refused_before_anything_compiles(task):
     with pytest.raises(ConfigError, match=f"which {task} does not ask for"):
         RecurrentLearner(*st.make(task), CONFIG)
@@ -123,7 +123,7 @@ def test_a_setting_that_makes_no_sense_is_refused_by_name(name, value):
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu"])
-@pytest.mark.parametrize("task", [id for id in st.TASKS if id.endswith("-v0")])
+@pytest.mark.parametrize("task", [id for id in st.TASKS])
 def test_every_task_has_a_preset_that_makes_sense(task, preset):
     check_recurrent(make_recurrent_config(task, preset))
 

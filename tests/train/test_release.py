@@ -22,7 +22,7 @@ from train.recurrent.config import RecurrentConfig
 from train.recurrent.drive import make_layout
 from train.recurrent.network import RecurrentNetworks, without_critic
 
-GOAL_TASK = "Subterra/StopAtShort-v0"
+GOAL_TASK = "Subterra/StopAtShort-v1"
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def gru():
 
 @pytest.fixture(scope="module")
 def among_boxes():
-    env, params = st.make("Subterra/ObstructedShort-v0")
+    env, params = st.make("Subterra/Obstructed-v1")
     nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
     weights = jax.tree.map(lambda x: x + 0.05, jax.jit(nets.init)(jax.random.PRNGKey(1)))
     return nets, without_critic(weights)
@@ -159,7 +159,7 @@ def test_tensors_that_are_not_those_of_the_facts_are_refused(released, perceptro
 def test_a_policy_is_refused_where_it_cannot_drive(released, perceptron):
     agent, _ = policies.load(released)
     policies.check_fits(agent, *st.make(GOAL_TASK), released)
-    for task in (TASK, "Subterra/RelocaliseShort-v0"):
+    for task in (TASK, "Subterra/Relocalise-v1"):
         with pytest.raises(policies.PolicyError, match=f"which {task} does not ask for"):
             policies.check_fits(agent, *st.make(task), released)
     with pytest.raises(policies.PolicyError, match="observations of 18 numbers"):
@@ -200,7 +200,7 @@ def test_a_policy_is_refused_where_the_control_period_is_another_than_it_was_tra
         policies.check_fits(again, *with_period(TASK, 0.05), out)
 
 
-@pytest.mark.parametrize(("name", "period"), [("StopAt-v0", 0.1), ("Traverse-v0", 0.1), ("B2Traverse-v0", 0.2)])
+@pytest.mark.parametrize(("name", "period"), [("Traverse-v1", 0.1), ("B2Traverse-v1", 0.2)])
 def test_policies_released_before_conditions_were_kept_imply_their_period(name, period):
     agent, facts = policies.load(name)
     assert "trained_under" not in facts
@@ -211,22 +211,22 @@ def test_policies_released_before_conditions_were_kept_imply_their_period(name, 
 
 def test_a_released_policy_among_the_agents_is_refused_as_well():
     policies.register_released()
-    _, params = with_period("Subterra/StopAt-v0", 0.05)
-    with pytest.raises(policies.PolicyError, match=r"StopAt-v0: trained with .* 0\.1 s, this task has 0\.05 s"):
-        registry.make_agent("policy:StopAt-v0", params)
+    _, params = with_period("Subterra/Traverse-v1", 0.05)
+    with pytest.raises(policies.PolicyError, match=r"Traverse-v1: trained with .* 0\.1 s, this task has 0\.05 s"):
+        registry.make_agent("policy:Traverse-v1", params)
 
 
 @pytest.mark.parametrize(
     ("conditions", "message"),
     [
-        ({"period": 0.1, "n_beams": 24}, "mine: trained with 24 beams, Subterra/TraverseShort-v0 has 16"),
+        ({"period": 0.1, "n_beams": 24}, "mine: trained with 24 beams, Subterra/TraverseShort-v1 has 16"),
         (
             {"period": 0.1, "constants": "0123456789abcdef"},
-            "mine: trained under constants 0123456789ab of Subterra/TraverseShort-v0, which has [0-9a-f]{12} here",
+            "mine: trained under constants 0123456789ab of Subterra/TraverseShort-v1, which has [0-9a-f]{12} here",
         ),
         (
             {"period": 0.1, "fields": ["odometry", "ranges"]},
-            "mine: trained on the fields odometry, ranges; Subterra/TraverseShort-v0 has ranges, odometry",
+            "mine: trained on the fields odometry, ranges; Subterra/TraverseShort-v1 has ranges, odometry",
         ),
     ],
 )

@@ -16,7 +16,7 @@ HORIZON, N_ENVS, N_STEPS, N_FRAMES = 5, 3, 12, 4
 @pytest.fixture(scope="module")
 def driven(tunnel):
     """An unroll with episodes of five steps, and the same steps taken one by one outside of `collect`."""
-    env, params = st.make("Subterra/TraverseShort-v0", tunnel=tunnel, horizon=HORIZON)
+    env, params = st.make("Subterra/TraverseShort-v1", tunnel=tunnel, horizon=HORIZON)
     nets = networks.Networks(networks.Layout(18, (0.0, -1.5), (2.0, 1.5), N_FRAMES, (8,), 0.5, 0.01))
     weights, statistics = nets.init(jax.random.PRNGKey(0)), learning.start_statistics((18,))
     batch, key = st.batch.AutoReset(env), jax.random.PRNGKey(2)
@@ -76,7 +76,7 @@ def test_the_next_unroll_goes_on_where_this_one_ended(driven):
 
 
 def test_the_value_target_of_a_truncated_step_goes_on_with_its_final_observation(tunnel):
-    env, params = st.make("Subterra/TraverseShort-v0", tunnel=tunnel, horizon=HORIZON)
+    env, params = st.make("Subterra/TraverseShort-v1", tunnel=tunnel, horizon=HORIZON)
     config = PPOConfig(n_envs=4, unroll=12, minibatches=2, hidden=(8,), frames=N_FRAMES)
     learner = Learner(env, params, config)
     state = learner.init(jax.random.PRNGKey(0), params)

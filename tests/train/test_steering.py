@@ -135,7 +135,7 @@ def test_tensors_that_do_not_fit_are_refused(written):
 def test_mistakes_are_told_before_anything_is_written(tmp_path):
     out = tmp_path / "run"
     for localiser, more, sentence in (
-        ("StopAt-v0", {}, "StopAt-v0: is no localiser"),
+        ("Traverse-v1", {}, "Traverse-v1: is no localiser"),
         ("locate-transformer", {"task": "Subterra/Return-v1"}, "asks to return"),
         ("locate-transformer", {"steering": "locate-map"}, "locate-map: has no steering that was learnt"),
     ):

@@ -21,7 +21,7 @@ def test_no_tunnel_and_one_tunnel_need_no_other_process():
 @pytest.mark.parametrize(
     ("task", "sensor"),
     [
-        ("StopAtShort-v0", "planar16"),  # a piece is cut out of each
+        ("StopAtShort-v1", "planar16"),  # a piece is cut out of each
         pytest.param("StopAt-v1", "spin16x64", marks=pytest.mark.slow),  # two processes
     ],
 )

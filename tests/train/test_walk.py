@@ -61,7 +61,7 @@ def test_the_policy_does_not_see_the_truth_and_the_critic_does(networks, policy)
 
 def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v0", "world": {}})
+    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v1", "world": {}})
     loaded, facts = gaits.load_policy(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
     np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), networks.act(policy, seen[:, None]), atol=1e-6)
@@ -79,7 +79,7 @@ def test_a_missing_gait_is_refused_by_name(tmp_path):
 
 def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v0", "world": {}})
+    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v1", "world": {}})
     facts = out.with_suffix(".json")
     facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "mlp"}))
     with pytest.raises(PolicyError, match="kind 'mlp', which is no gait"):
@@ -127,7 +127,7 @@ def test_settings_that_make_no_sense_are_refused_before_anything_is_compiled(tmp
 
 
 def test_the_critic_s_observation_is_the_policy_s_and_more():
-    env, params = st.make("Subterra/B2Walk-v0", privileged=True)
+    env, params = st.make("Subterra/B2Walk-v1", privileged=True)
     plain = dataclasses.replace(env, privileged=False)
     assert plain.observation_size(params) == N_SEEN
     assert env.observation_size(params) == N_SEEN + N_TRUTH

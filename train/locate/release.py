@@ -56,7 +56,7 @@ def release(folder: Path, out: Path, episodes: int, measured: tuple[Path, ...]) 
     card = {
         **facts,
         "name": out.name.removesuffix(TENSORS),
-        "constants_v1_sha256": st.constants_digest(version="v1"),
+        "constants_sha256": st.constants_digest(),
         "world": {"tunnel": facts["tunnels"], "lining": None, "sensor": sensor},
         "inputs": f"{_SEES.get(sensor, f'the image of {sensor}')}, {INPUTS}; {A_MAP if agent.takes_map else NO_MAP}",
         "learnt": LEARNT,

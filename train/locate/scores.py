@@ -94,8 +94,8 @@ def with_map(weights: Any, drive: Drive, answers: Any, truth: Array, use: Array,
     age, zero = jnp.arange(1.0, len(truth) + 1.0), jnp.zeros(())
     # Drawn from the start itself, so that the same drive is told the same at every score.
     key = jax.random.key(jax.lax.bitcast_convert_type(drive.start, jnp.uint32))
-    drawn = constants.INSIDE_SIGMA * jnp.clip(jax.random.normal(key), -3.0, 3.0)
-    hidden = jnp.full((), constants.INSIDE_SIGMA)
+    drawn = constants.HIDDEN_START_SIGMA * jnp.clip(jax.random.normal(key), -3.0, 3.0)
+    hidden = jnp.full((), constants.HIDDEN_START_SIGMA)
     other = (drive.tunnel + 1) % strip.n_bins.shape[0]
     right = jnp.array([True, True, False])
     cases = Told(

@@ -37,7 +37,7 @@ class Command:
 
     trainer: Annotated[Trainer, tyro.conf.Positional]
     out: Path
-    task: str = "Subterra/TraverseShort-v0"
+    task: str = "Subterra/TraverseShort-v1"
     steps: int = 2_000_000
     seed: int = 0
     episodes: int = 500

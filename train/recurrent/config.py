@@ -62,7 +62,7 @@ _PRESETS: dict[str, dict[str, Any]] = {
     "gpu": {},
     "cpu": {"steps": 30_000_000, "n_envs": 512, "hidden": 96, "minibatches": 8, "checkpoint_every": 10},
 }
-_STEPS = {"Subterra/StopAt-v0": 400_000_000}
+_STEPS = {"Subterra/StopAt-v1": 400_000_000}
 
 
 def make_recurrent_config(task: str, preset: str = "gpu") -> RecurrentConfig:

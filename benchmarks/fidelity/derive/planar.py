@@ -17,7 +17,7 @@ from subterra_jax import lidar
 from subterra_jax.parts import Noise, odometer
 from subterra_jax.state import EnvParams, State
 
-TASK = "Subterra/Traverse-v0"
+TASK = "Subterra/Traverse-v1"
 PLAN_LINING = "pockets"
 _POSE_COUNT = 400
 _LATERAL = 0.8  # m to either side of the centreline

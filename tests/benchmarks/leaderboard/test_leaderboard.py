@@ -35,13 +35,13 @@ def run(monkeypatch, *arguments: str) -> int:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--tasks", "Fly"), "error: no task 'Fly'; there are Subterra/Traverse-v0"),
+        (("--tasks", "Fly"), "error: no task 'Fly'; there are Subterra/Traverse-v1"),
         (("--agents", "nobody"), "error: no agent 'nobody'; there are random"),
         (("--episodes", "501"), "error: episodes must be at most 500, got 501"),
         (("--batch", "0"), "error: batch must be at least 1, got 0"),
         (("--tunnels", "no.npz"), "error: no.npz: no such tunnel file"),
         (("--agents", "policy:Fly-v0"), "error: no agent 'policy:Fly-v0'; there are random"),
-        (("--tasks", "Relocalise", "--agents", "policy:StopAt-v0"), "error: policy:StopAt-v0: a policy that drives to"),
+        (("--tasks", "Relocalise", "--agents", "policy:Traverse-v1"), "error: policy:Traverse-v1: made for"),
         (("--agents", "policy:mine.safetensors"), "error: mine.safetensors: no such policy"),
         (("--agents", "no.py:Mine"), "error: no.py: cannot be read (No such file or directory)"),
         (("--agents", "nowhere:Mine"), "error: nowhere: No module named 'nowhere'"),
@@ -61,12 +61,12 @@ def test_what_cannot_be_had_is_one_sentence_and_status_2(monkeypatch, capsys, tm
 
 
 def test_where_no_agent_is_named_the_policy_released_for_the_task_drives_beside_the_baselines():
-    config = check(LeaderboardConfig(tasks=("TraverseShort", "RelocaliseShort")))
+    config = check(LeaderboardConfig(tasks=("TraverseShort", "Relocalise")))
     with_policy, without = (agents_for(config, task) for task in config.tasks)
     assert set(with_policy) - set(without) == {"released-policy"}
     assert {"ring-count", "particle-filter", "oracle"} <= set(without)
     # What a robot on legs has learnt does not drive the planar one.
-    assert "policy:StopAt-v0" in registry.names()
+    assert "policy:Traverse-v1" in registry.names()
     assert not any(name.startswith("policy:B2") for name in registry.names())
 
 
@@ -103,7 +103,7 @@ def entry(task: str, agent: str, successes: int) -> Entry:
     columns |= {"group": index // 10, "success": index % 10 < successes // 10, "contact": np.zeros(100, bool)}
     columns["travelled"] = np.full(100, 10.0)
     traits = {"uses_lidar": True, "uses_map": False, "privileged": agent == "oracle"}
-    bounds = {"command": 0.2, "odometry": 0.25, "fused": 0.3} if task == "Subterra/StopAt-v0" else None
+    bounds = {"command": 0.2, "odometry": 0.25, "fused": 0.3} if task == "Subterra/StopAt-v1" else None
     return Entry(task, "a tunnel, smooth", agent, traits, Records(**columns), bounds)
 
 
@@ -113,15 +113,15 @@ def entries():
     return [
         entry(task, agent, both[i])
         for agent, both in percent.items()
-        for i, task in enumerate(("Subterra/StopAt-v0", "Subterra/Traverse-v0"))
+        for i, task in enumerate(("Subterra/StopAt-v1", "Subterra/Traverse-v1"))
     ]
 
 
 def test_an_agent_half_way_between_dead_reckoning_and_the_oracle_scores_a_half(entries):
     rows = {(row["agent"], row["task"]): row for row in scores(entries)}
-    assert rows["filter", "Subterra/StopAt-v0"]["normalised"] == pytest.approx(0.5)
+    assert rows["filter", "Subterra/StopAt-v1"]["normalised"] == pytest.approx(0.5)
     # Where dead reckoning is as good as the oracle there is nothing to tell.
-    assert rows["filter", "Subterra/Traverse-v0"]["normalised"] is None
+    assert rows["filter", "Subterra/Traverse-v1"]["normalised"] is None
     overall = {row["agent"]: row for row in totals(entries)}
     assert overall["filter"]["normalised_iqm"] == pytest.approx(0.5)
     assert overall["oracle"]["normalised_iqm"] == pytest.approx(1.0)
@@ -219,7 +219,7 @@ def test_a_users_own_classes_files_and_policies_drive(monkeypatch, tmp_path):
     (tmp_path / "more.py").write_text(MINE.replace("NAME = None", "NAME = 'standing'"))
     released = resources.files("subterra_jax") / "data" / "policies"
     for ending in (".safetensors", ".json"):
-        with resources.as_file(released / f"Traverse-v0{ending}") as path:
+        with resources.as_file(released / f"Traverse-v1{ending}") as path:
             shutil.copy(path, tmp_path / f"weights{ending}")
     agents = (f"{mine}:Standing", f"{mine}:of_params", "standing", f"policy:{tmp_path / 'weights.safetensors'}")
     words = ("--tasks", "Traverse", "--agents", *agents, "--load", str(tmp_path / "more.py"), "--episodes", "2")
@@ -242,19 +242,19 @@ TASK = """
 from subterra_jax import tasks
 from subterra_jax.rules import Traverse
 
-tasks.register("Mine/Cover-v0", Traverse(), horizon=HORIZON, piece=(0.0, 60.0))
+tasks.register("Mine/Cover-v1", Traverse(), horizon=HORIZON, piece=(0.0, 60.0))
 """
 
 
 def test_a_task_of_a_users_own_file_is_driven_and_driven_again_once_the_file_changes(monkeypatch, tmp_path):
     for known in (st.TASKS, gymnasium.registry):  # puts them back at the end
-        monkeypatch.setitem(known, "Mine/Cover-v0", None)
-        monkeypatch.delitem(known, "Mine/Cover-v0")
+        monkeypatch.setitem(known, "Mine/Cover-v1", None)
+        monkeypatch.delitem(known, "Mine/Cover-v1")
     mine, out = tmp_path / "cover.py", tmp_path / "out"
     words = ("--agents", "dead-reckoning", "--episodes", "2", "--out", str(out))
     for horizon, success in ((450, 1.0), (450, 1.0), (20, 0.0)):
         mine.write_text(TASK.replace("HORIZON", str(horizon)))
-        assert run(monkeypatch, *words, "--tasks", f"{mine}:Mine/Cover-v0") == 0
+        assert run(monkeypatch, *words, "--tasks", f"{mine}:Mine/Cover-v1") == 0
         (row,) = json.loads((out / "leaderboard.json").read_text())["scores"]
-        assert (row["task"], row["success"]) == ("Mine/Cover-v0", success)
-    assert run(monkeypatch, *words, "--tasks", "Mine/Cover-v0", "--load", str(mine)) == 0
+        assert (row["task"], row["success"]) == ("Mine/Cover-v1", success)
+    assert run(monkeypatch, *words, "--tasks", "Mine/Cover-v1", "--load", str(mine)) == 0

@@ -15,7 +15,7 @@ from benchmarks.paper.learning import find_runs
 from benchmarks.paper.steps import Step, is_done, make, scene_step, survey_step, training_step
 
 
-def write_run(folder, coverage, task="Subterra/TraverseShort-v0"):
+def write_run(folder, coverage, task="Subterra/TraverseShort-v1"):
     folder.mkdir(parents=True)
     told = {"task": task, "tunnel": "corridor", "tunnel_provenance": "simulated", "device": "cpu: cpu"}
     (folder / "config.json").write_text(json.dumps(told))
@@ -86,11 +86,11 @@ def test_a_figure_is_drawn_again_when_its_input_changes(figures, capsys):
 
 def test_runs_are_in_the_order_of_their_seeds_and_of_one_task(figures, capsys):
     assert [run.name for run in find_runs(figures / "runs")] == ["seed-2", "seed-10"]
-    write_run(figures / "runs" / "seed-11", [0.5], task="Subterra/StopAt-v0")
+    write_run(figures / "runs" / "seed-11", [0.5], task="Subterra/StopAt-v1")
     assert draw(figures) == 2
     told = capsys.readouterr().err
     assert told.startswith("error: ")
-    assert "seed-11: is a run of Subterra/StopAt-v0, but seed-2 of Subterra/TraverseShort-v0" in told
+    assert "seed-11: is a run of Subterra/StopAt-v1, but seed-2 of Subterra/TraverseShort-v1" in told
 
 
 @pytest.mark.parametrize(

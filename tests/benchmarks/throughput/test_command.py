@@ -22,7 +22,7 @@ def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path, monkeypatch):
     size = ("--n", "8", "--steps", "4", "--repeats", "3", "--poses", "500", "--peers", "mujoco")
-    arguments = ("--task", "Subterra/TraverseShort-v0", *size, "--out", str(tmp_path / "speed"))
+    arguments = ("--task", "Subterra/TraverseShort-v1", *size, "--out", str(tmp_path / "speed"))
     assert run_here(monkeypatch, *arguments) == 0
     result = json.loads((tmp_path / "speed" / "throughput.json").read_text())
     assert result["schema"] == "subterra.throughput/2"
@@ -46,7 +46,7 @@ def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (("--task", "Subterra/Nowhere-v0"), "Nowhere"),
+        (("--task", "Subterra/Nowhere-v1"), "Nowhere"),
         (("--lining", "velvet"), "velvet"),
         (("--linings", "smooth", "velvet"), "velvet"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz"),
@@ -93,7 +93,7 @@ def test_a_peer_that_was_asked_for_and_is_not_there_is_a_mistake(monkeypatch, ca
 
 def test_a_lidar_that_is_a_centimetre_off_fails_the_run(monkeypatch, capsys):
     plan, true_scan = st.load_tunnel().slice(0.0, 50.0), measure.lidar.scan
-    params = st.make("Subterra/Traverse-v0", plan)[1]
+    params = st.make("Subterra/Traverse-v1", plan)[1]
     monkeypatch.setattr(measure.lidar, "scan", lambda *args, **rest: true_scan(*args, **rest) + 0.01)
     gate = measure.measure_exactness(plan, "pockets", params, 20, seed=0)
     # Beams that leave through a mouth report the largest range, a centimetre more now.

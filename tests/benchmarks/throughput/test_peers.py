@@ -21,11 +21,11 @@ def plan() -> st.TunnelPlan:
 
 
 def route(plan: st.TunnelPlan, **overrides) -> tuple[mujoco_route.MujocoTunnel, st.TunnelEnv, st.EnvParams]:
-    quiet = st.make("Subterra/Traverse-v0")[1]
+    quiet = st.make("Subterra/Traverse-v1")[1]
     sigmas = ("distance_sigma", "distance_bias_sigma", "heading_sigma", "heading_bias_sigma")
     overrides["odometry"] = OdometryParams(**dict.fromkeys(sigmas, 0.0))
     overrides["lidar"] = quiet.lidar.replace(range_sigma=0.0)
-    env, params = st.make("Subterra/Traverse-v0", plan, **overrides)
+    env, params = st.make("Subterra/Traverse-v1", plan, **overrides)
     return mujoco_route.MujocoTunnel(mujoco_route.extrude_walls(plan, "pockets"), plan, params), env, params
 
 
@@ -90,7 +90,7 @@ def test_a_peer_that_is_not_installed_is_left_out_with_its_reason(plan, monkeypa
     monkeypatch.setitem(sys.modules, "gymnax", None)
     found = find_peers(("auto",))
     assert set(found) == {"jaxnav", "gymnax", "mujoco"}
-    where = Route(plan, "pockets", st.make("Subterra/Traverse-v0", plan)[1], None)
+    where = Route(plan, "pockets", st.make("Subterra/Traverse-v1", plan)[1], None)
     peer = measure_peer("gymnax", found["gymnax"], (1, 2), where, Timing(), lambda _: None)
     assert peer.speeds == []
     assert "gymnax" in peer.left_out["all"]
@@ -102,7 +102,7 @@ def test_a_peer_that_breaks_is_left_out_with_its_reason(plan):
         raise RuntimeError("RESOURCE_EXHAUSTED: 1 TiB" if n_envs > 4 else "no such map")
 
     module = BatchedPeer("numpy", "a", 16, broken)
-    where = Route(plan, "pockets", st.make("Subterra/Traverse-v0", plan)[1], None)
+    where = Route(plan, "pockets", st.make("Subterra/Traverse-v1", plan)[1], None)
     peer = measure_peer("jaxnav", module, (4, 8), where, Timing(), lambda _: None)
     assert peer.left_out == {"4": "RuntimeError: no such map", "8": "out of memory"}
     assert peer.speeds == []

@@ -50,7 +50,7 @@ def test_one_number_of_any_observation_changes_the_digest():
 
 
 def test_the_same_seed_measures_the_same_steps():
-    env, params = st.make("Subterra/TraverseShort-v0")
+    env, params = st.make("Subterra/TraverseShort-v1")
     program = prepare(environment_loop(env, params, 4), 4, Timing(steps=3), restart=True)
     for seed in (0, 0, 1):
         program.call(jax.random.key(seed))

@@ -60,7 +60,7 @@ def test_it_does_not_meet_itself(plan):
 
 def test_its_lidar_is_exact_across_the_seams(plan):
     long = extend_tunnel(plan.slice(0.0, 40.0), 110.0)
-    _, params = st.make("Subterra/Traverse-v0", long)
+    _, params = st.make("Subterra/Traverse-v1", long)
     gate = measure_exactness(long, "pockets", params, 300, seed=0)
     assert gate.n_wrong == 0
     assert gate.n_rays == 4800

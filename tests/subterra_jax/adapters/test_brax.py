@@ -20,7 +20,7 @@ KEYS = jax.random.split(jax.random.PRNGKey(0), 4)
 
 @pytest.fixture(scope="module")
 def env():
-    return SubterraBraxEnv("Subterra/TraverseShort-v0", horizon=LENGTH)
+    return SubterraBraxEnv("Subterra/TraverseShort-v1", horizon=LENGTH)
 
 
 class Drive:

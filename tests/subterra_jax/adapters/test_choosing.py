@@ -9,22 +9,25 @@ from subterra_jax.adapters.choosing import OptionError, read_choice
 from subterra_jax.adapters.sb3 import SubterraVecEnv
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.vector import SubterraVectorEnv
-from subterra_jax.rules import Choice
+from subterra_jax.rules import Choice, GoalParams
 
 pytestmark = pytest.mark.door
 
-STOP, RETURN, RELOCALISE = "Subterra/StopAtShort-v0", "Subterra/ReturnShort-v0", "Subterra/RelocaliseShort-v0"
+STOP, RETURN, RELOCALISE = "Subterra/StopAtShort-v1", "Subterra/Return-v1", "Subterra/Relocalise-v1"
+# Room for goals from 5 to 60 m.
+PIECE = st.load_tunnel("subterra-351").slice(0.0, 65.0)
+WORLD = {"tunnel": PIECE, "goal": GoalParams(low=10.0, high=50.0, margin=5.0, tolerance=0.25)}
 AHEAD = np.array([1.0, 0.0], np.float32)
 
 
 @pytest.fixture(scope="module")
 def env():
-    return SubterraEnv(STOP)
+    return SubterraEnv(STOP, **WORLD)
 
 
 @pytest.fixture(scope="module")
 def envs():
-    return SubterraVectorEnv(3, "Disabled", STOP)
+    return SubterraVectorEnv(3, "Disabled", STOP, **WORLD)
 
 
 def test_goal_and_start_are_where_they_were_asked_for(env):
@@ -47,7 +50,7 @@ def test_a_heading_turns_to_the_left(env):
 
 
 def test_a_heading_counts_where_a_task_draws_the_direction():
-    made, params = st.make(RELOCALISE)
+    made, params = st.make(RELOCALISE, tunnel="control")
     keys = jax.random.split(jax.random.key(0), 16)
 
     def ahead(key, choice):
@@ -80,9 +83,9 @@ def test_a_stop_at_a_chosen_goal_succeeds(env):
     assert info["goal_error"] == pytest.approx(0.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(("task", "field"), [(RETURN, "start"), (RELOCALISE, "station")])
+@pytest.mark.parametrize(("task", "field"), [(RETURN, "told"), (RELOCALISE, "station")])
 def test_a_rule_whose_state_depends_on_the_start_brings_it_along(task, field):
-    made, params = st.make(task)
+    made, params = st.make(task, tunnel="control")
     draws = {**made.draw_reset(jax.random.key(0), (), params), "choice": Choice(station=17.0)}
     state = made.begin(draws, params)
     assert float(state.station) == pytest.approx(17.0)
@@ -92,8 +95,9 @@ def test_a_rule_whose_state_depends_on_the_start_brings_it_along(task, field):
 def test_every_environment_of_a_batch_has_its_own(envs):
     goals = np.array([15.0, np.nan, 45.0])
     drawn, _ = envs.reset(seed=5)
+    kept = 10.0 + (drawn["goal"] - drawn["start"])[:, 0]  # as far from the chosen start as from the drawn one
     obs, _ = envs.reset(seed=5, options={"goal": goals, "start": {"station": [0.0, 10.0, 30.0], "lateral": 0.0}})
-    np.testing.assert_allclose(obs["goal"][:, 0], np.where(np.isnan(goals), drawn["goal"][:, 0], goals))
+    np.testing.assert_allclose(obs["goal"][:, 0], np.where(np.isnan(goals), kept, goals), rtol=1e-5)
     np.testing.assert_allclose([envs.batch.state(k).station for k in range(3)], [0.0, 10.0, 30.0])
     mask = np.array([False, True, False])
     masked, _ = envs.reset(options={"goal": 33.0, "reset_mask": mask})
@@ -101,7 +105,7 @@ def test_every_environment_of_a_batch_has_its_own(envs):
 
 
 def test_sb3_passes_the_options_of_each_environment_once():
-    vec = SubterraVecEnv(3, STOP)
+    vec = SubterraVecEnv(3, STOP, **WORLD)
     vec.set_options([{"goal": 15.0, "start": 5.0}, {}, {"start": {"lateral": 0.25}, "goal": 45.0}])
     goal = vec.reset()["goal"][:, 0]
     assert goal[[0, 2]].tolist() == [15.0, 45.0]
@@ -113,7 +117,7 @@ def test_sb3_passes_the_options_of_each_environment_once():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"gaol": 3.0}, r"no option 'gaol' in a reset of Subterra/StopAtShort-v0; there are 'goal' and 'start'"),
+        ({"gaol": 3.0}, r"no option 'gaol' in a reset of Subterra/StopAtShort-v1; there are 'goal' and 'start'"),
         ({"start": {"speed": 1.0}}, r"no 'speed' in options\['start'\]; there are station, lateral, heading"),
         ({"goal": 62.0}, r"options\['goal'\] must lie from 5.00 to 60.00 m here, got 62"),
         ({"goal": -1.0}, "must lie from 5.00 to 60.00 m here, got -1"),
@@ -137,10 +141,10 @@ def test_what_cannot_be_is_refused_in_one_sentence_and_nothing_changes(env, opti
     np.testing.assert_array_equal(env.get_state().words, before.words)
 
 
-@pytest.mark.parametrize("task", ["Subterra/TraverseShort-v0", RELOCALISE])
+@pytest.mark.parametrize("task", ["Subterra/TraverseShort-v1", RELOCALISE])
 def test_a_task_without_a_goal_says_so(task):
     with pytest.raises(OptionError, match=f"{task} has no goal to choose; its options may hold 'start' alone"):
-        read_choice(*st.make(task), {"goal": 10.0})
+        read_choice(*st.make(task, tunnel="control"), {"goal": 10.0})
 
 
 def test_a_batch_names_the_number_that_it_wants_and_the_start_that_is_wrong(envs):

@@ -10,15 +10,20 @@ from stable_baselines3.common.env_checker import check_env
 
 import subterra_jax as st
 from subterra_jax.adapters.goal import GoalConditioned, GoalError
+from subterra_jax.rules import GoalParams
 
 pytestmark = pytest.mark.door
 
-TASK = "Subterra/StopAtShort-v0"
+TASK = "Subterra/StopAtShort-v1"
+WORLD = {
+    "tunnel": st.load_tunnel("subterra-351").slice(0.0, 65.0),
+    "goal": GoalParams(low=10.0, high=50.0, margin=5.0, tolerance=0.25),
+}
 
 
 @pytest.fixture(scope="module")
 def env():
-    return GoalConditioned(gymnasium.make(f"subterra_jax:{TASK}", flat=True, horizon=40))
+    return GoalConditioned(gymnasium.make(f"subterra_jax:{TASK}", flat=True, horizon=40, **WORLD))
 
 
 def test_sb3s_checker_has_nothing_to_say_and_the_spaces_hold(env):
@@ -32,18 +37,18 @@ def test_sb3s_checker_has_nothing_to_say_and_the_spaces_hold(env):
 
 
 def test_the_observation_has_neither_the_goal_nor_the_truth(env):
-    """Another goal alone leaves the observation as it is, and another true start the achieved goal."""
+    """Another goal alone leaves the observation as it is; what is achieved is counted from the start that is told."""
     near, _ = env.reset(seed=1, options={"goal": 12.0})
     far, _ = env.reset(seed=1, options={"goal": 50.0})
     np.testing.assert_array_equal(near["observation"], far["observation"])
     assert (near["desired_goal"], far["desired_goal"]) == (12.0, 50.0)
-    assert near["observation"].shape == (19,)
+    assert near["observation"].shape == (20,)
     moved, _ = env.reset(seed=1, options={"start": 7.0})
-    assert moved["achieved_goal"] == near["achieved_goal"] == 0.0
+    assert moved["achieved_goal"] == pytest.approx(7.0)
     for _ in range(20):
         obs, *_, info = env.step(np.array([2.0, 0.0], np.float32))
-    assert obs["achieved_goal"] == pytest.approx(info["station"] - 7.0, abs=0.5)
-    assert obs["achieved_goal"] != info["station"] - 7.0
+    assert obs["achieved_goal"] == pytest.approx(info["station"], abs=0.5)
+    assert obs["achieved_goal"] != info["station"]
 
 
 def test_a_reward_is_what_the_step_gave_and_what_another_goal_would_have_given(env):
@@ -59,20 +64,20 @@ def test_a_reward_is_what_the_step_gave_and_what_another_goal_would_have_given(e
 
 
 def test_named_parts_give_the_same_as_the_bare_vector(env):
-    named = GoalConditioned(gymnasium.make(f"subterra_jax:{TASK}", horizon=40))
+    named = GoalConditioned(gymnasium.make(f"subterra_jax:{TASK}", horizon=40, **WORLD))
     for key, values in named.reset(seed=3)[0].items():
         np.testing.assert_array_equal(values, env.reset(seed=3)[0][key])
 
 
-@pytest.mark.parametrize("task", ["TraverseShort", "ReturnShort", "RelocaliseShort"])
+@pytest.mark.parametrize("task", ["TraverseShort", "Return", "Relocalise"])
 def test_a_task_that_does_not_stop_at_a_goal_is_refused(task):
     class Bare(gymnasium.Env):
         """An environment of which nothing is compiled."""
 
-        spec = gymnasium.spec(f"Subterra/{task}-v0")
-        task_env, task_params = st.make(spec.id)
+        spec = gymnasium.spec(f"Subterra/{task}-v1")
+        task_env, task_params = st.make(spec.id, tunnel="control")
 
-    with pytest.raises(GoalError, match=f"Subterra/{task}-v0 does not ask for a stop at a goal"):
+    with pytest.raises(GoalError, match=f"Subterra/{task}-v1 does not ask for a stop at a goal"):
         GoalConditioned(Bare())
 
 

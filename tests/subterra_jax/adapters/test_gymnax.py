@@ -12,7 +12,7 @@ from subterra_jax.adapters.gymnax import SubterraGymnax, SubterraGymnax5
 
 pytestmark = pytest.mark.door
 
-TASK, HORIZON = "Subterra/TraverseShort-v0", 5
+TASK, HORIZON = "Subterra/TraverseShort-v1", 5
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from subterra_jax.adapters import packing
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.parts import make_sensor
 
-TASK = "Subterra/TraverseShort-v0"
+TASK = "Subterra/TraverseShort-v1"
 
 
 def world():

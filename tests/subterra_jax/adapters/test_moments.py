@@ -21,7 +21,7 @@ from tests.subterra_jax.adapters.test_vector import ACTIONS
 
 pytestmark = pytest.mark.door
 
-TASK, HORIZON = "Subterra/TraverseShort-v0", 12
+TASK, HORIZON = "Subterra/TraverseShort-v1", 12
 WAYS = pytest.mark.parametrize(
     "way", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["deepcopy", "pickle"]
 )
@@ -86,8 +86,8 @@ def test_a_moment_of_another_environment_is_refused(env, envs):
         env.get_state()
     env.reset(seed=0)
     envs.reset(seed=0)
-    with pytest.raises(MomentError, match=r"Subterra/StopAt-v0 cannot be set in Subterra/TraverseShort-v0"):
-        env.set_state(env.get_state()._replace(task="Subterra/StopAt-v0"))
+    with pytest.raises(MomentError, match=r"Subterra/StopAt-v1 cannot be set in Subterra/TraverseShort-v1"):
+        env.set_state(env.get_state()._replace(task="Subterra/StopAt-v1"))
     with pytest.raises(MomentError, match="shape"):
         env.set_state(envs.get_state())
     with pytest.raises(MomentError, match="shape"):

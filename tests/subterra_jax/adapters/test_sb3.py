@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from subterra_jax.adapters.sb3 import SubterraVecEnv
 from subterra_jax.adapters.single import SubterraEnv
 
-TASK, HORIZON = "Subterra/TraverseShort-v0", 24
+TASK, HORIZON = "Subterra/TraverseShort-v1", 24
 ACTIONS = np.array([[1.0, 0.0], [2.0, 1.5]], np.float32)
 
 
@@ -86,6 +86,6 @@ def test_ppo_takes_a_few_updates_through_sb3s_wrappers():
 
 
 def test_a_task_with_named_fields_suits_the_policy_for_dicts():
-    task = "Subterra/StopAtShort-v0"
+    task = "Subterra/StopAtShort-v1"
     assert set(SubterraVecEnv(2, task).observation_space.keys()) >= {"ranges", "odometry", "goal"}
     assert SubterraVecEnv(2, task, flat=True).observation_space.shape == (20,)

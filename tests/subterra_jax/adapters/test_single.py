@@ -18,7 +18,7 @@ from subterra_jax.adapters import register_tasks
 from subterra_jax.adapters.packing import start_streams, take_key
 from subterra_jax.adapters.single import SubterraEnv
 
-TASK, FURTHER = "Subterra/TraverseShort-v0", "Subterra/RelocaliseShort-v0"
+TASK, FURTHER = "Subterra/TraverseShort-v1", "Subterra/Relocalise-v1"
 # Actions are m/s and rad/s, and a dead-reckoned distance has no bounds; the checkers would like it otherwise.
 ADVICE = ("symmetric and normalized", "infinity")
 
@@ -68,14 +68,6 @@ def test_registering_again_changes_nothing():
     register_tasks()
     assert gymnasium.registry == before
     assert set(st.TASKS) <= set(gymnasium.registry)
-
-
-@pytest.mark.parametrize(("id", "newer"), [("StopAtShort-v0", True), ("TraverseShort-v0", False), ("StopAt-v1", False)])
-def test_gymnasium_names_the_newer_version_of_a_task_that_has_one(id, newer):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        gymnasium.make(f"subterra_jax:Subterra/{id}")
-    assert any("upgrading to version `v1`" in str(w.message) for w in caught) == newer
 
 
 def test_the_same_seed_gives_the_same_episodes_and_another_seed_others(env):

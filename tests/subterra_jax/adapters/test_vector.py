@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.vector import SubterraVectorEnv
 
-TASK, HORIZON = "Subterra/ReturnShort-v0", 26
+TASK, HORIZON = "Subterra/Return-v1", 26
 # Straight on to the horizon; and round in a circle that touches the wall before it.
 ACTIONS = np.array([[1.0, 0.0], [2.0, 1.5], [0.5, -0.1]], np.float32)
 

@@ -22,7 +22,7 @@ def colours(picture):
 
 @pytest.fixture(scope="module")
 def begun():
-    env, params = st.make("Subterra/ObstructedShort-v0")
+    env, params = st.make("Subterra/Obstructed-v1")
     obs, state = jax.device_get(jax.jit(env.reset)(jax.random.key(1), params))
     return env, params, state, obs
 

@@ -45,7 +45,7 @@ class Walking:
 
 @pytest.fixture(scope="session")
 def walking() -> Walking:
-    env, params = st.make("Subterra/B2Walk-v0")
+    env, params = st.make("Subterra/B2Walk-v1")
     batch = st.AutoReset(env)
     key, action = jax.random.key(0), jnp.zeros((N_ROBOTS, 12))
     # Compiling with less zeal: half the time, the same numbers to rounding.

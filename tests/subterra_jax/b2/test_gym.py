@@ -20,7 +20,7 @@ from subterra_jax.b2.track import TrackError
 from subterra_jax.policies import PolicyError
 from tests.subterra_jax.drawn import draw
 
-ID = "Subterra/B2Traverse-v0"
+ID = "Subterra/B2Traverse-v1"
 QUIET = {"rate": 0.0, "gravity": 0.0, "angle": 0.0, "speed": 0.0}
 
 
@@ -59,7 +59,7 @@ def with_body(state, qpos):
 
 
 def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env):
-    planar, _ = st.make("Subterra/Traverse-v0")
+    planar, _ = st.make("Subterra/Traverse-v1")
     assert env.observation_space.shape == (18,)
     np.testing.assert_allclose(env.action_space.high, [0.8, 0.8])
     np.testing.assert_allclose(env.action_space.low, [0.0, -0.8])
@@ -68,7 +68,7 @@ def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env
 
 
 def test_a_chosen_start_is_refused_in_one_sentence(env):
-    with pytest.raises(ValueError, match="a reset of Subterra/B2Traverse-v0 takes no options, got 'start'"):
+    with pytest.raises(ValueError, match="a reset of Subterra/B2Traverse-v1 takes no options, got 'start'"):
         env.unwrapped.reset(options={"start": 5.0})
 
 
@@ -147,11 +147,11 @@ def test_success_is_the_share_of_the_tunnel_that_the_rule_asks_for(env):
 @pytest.fixture(scope="module")
 def walk(plan):
     onward = CommandParams(low=(0.5, 0.0, 0.0), high=(0.5, 0.0, 0.0), still=0.0)
-    return gymnasium.make("Subterra/B2Walk-v0", tunnel=plan, command=onward)
+    return gymnasium.make("Subterra/B2Walk-v1", tunnel=plan, command=onward)
 
 
 def test_gymnasium_knows_the_walking_task_by_its_id(plan):
-    inner: Any = gymnasium.make("Subterra/B2Walk-v0", tunnel=plan).unwrapped
+    inner: Any = gymnasium.make("Subterra/B2Walk-v1", tunnel=plan).unwrapped
     assert (inner.action_space.shape, inner.observation_space.shape) == ((12,), (56,))
     assert inner.walk.physics.period == pytest.approx(0.02)
     with pytest.raises(ResetNeeded):
@@ -220,8 +220,8 @@ def test_a_lidar_in_three_dimensions_stands_on_the_trunk(plan):
     for sensor, sweep in (("spin16x64", True), (swept, False), (swept, True), ("planar16", True)):
         with pytest.raises(ValueError, match="sweep=True does not go with a robot on legs"):
             st.make(ID, tunnel=plan, policy="trot", sensor=sensor, sweep=sweep)
-    with pytest.raises(ValueError, match="Subterra/B2Walk-v0 has the sensor 'planar16' alone"):
-        st.make("Subterra/B2Walk-v0", tunnel=plan, sensor="spin16x64")
+    with pytest.raises(ValueError, match="Subterra/B2Walk-v1 has the sensor 'planar16' alone"):
+        st.make("Subterra/B2Walk-v1", tunnel=plan, sensor="spin16x64")
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ LAG = Lag(speed=0.6, yaw_rate=0.25, speed_gain=0.9, yaw_rate_gain=0.8)
 
 @pytest.fixture(scope="module")
 def run():
-    env, params = st.make("Subterra/TraverseShort-v0", vehicle=tasks.VEHICLE, start=tasks.START)
+    env, params = st.make("Subterra/TraverseShort-v1", vehicle=tasks.VEHICLE, start=tasks.START)
     late = stand_in(env, LAG)
     actions = jnp.asarray(np.repeat(np.random.default_rng(0).uniform([0.0, -0.3], [0.8, 0.3], (8, 2)), 6, axis=0))
 
@@ -60,7 +60,7 @@ def test_a_robot_that_does_not_follow_is_refused():
 
 
 def test_beams_that_point_down_end_on_the_ballast_and_no_others_change():
-    env, params = st.make("Subterra/TraverseShort-v0", vehicle=tasks.VEHICLE, start=tasks.START)
+    env, params = st.make("Subterra/TraverseShort-v1", vehicle=tasks.VEHICLE, start=tasks.START)
     level = stand_in(env, nod=Nod(0.0, 0.0, 0.0))
     nose_down = stand_in(env, nod=Nod(0.1, 0.0, 0.0, height=0.75))
     key = jax.random.key(0)

@@ -69,6 +69,6 @@ class _Rolling(TunnelEnv):
 @pytest.mark.parametrize("name", ["nothing", "truth"])
 def test_a_robot_on_legs_is_driven_by_what_its_agent_declares_and_no_more(name):
     agent, speed = probes.PROBES[name]
-    env, params = st.make("Subterra/TraverseShort-v0", horizon=3)
+    env, params = st.make("Subterra/TraverseShort-v1", horizon=3)
     walk, _ = transfer.walk_robots(_Rolling(env.id, env.rule), params, agent, 2)
     np.testing.assert_allclose(walk.state.command[:, 0], speed, rtol=1e-4)

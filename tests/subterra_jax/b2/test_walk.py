@@ -211,12 +211,12 @@ def test_a_scene_without_a_track_is_refused(tmp_path, plan_of):
     np.savez(tmp_path / "tunnel.npz", **tunnel_arrays(straight(20.0)))
     (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
     with pytest.raises(TrackError, match="no track to walk on"):
-        st.make("Subterra/B2Walk-v0", scene=tmp_path)
+        st.make("Subterra/B2Walk-v1", scene=tmp_path)
 
 
 def test_a_misspelt_field_is_refused_by_name():
     with pytest.raises(ValueError, match="no field \\['horizn'\\] in WalkParams"):
-        st.make("Subterra/B2Walk-v0", horizn=3)
+        st.make("Subterra/B2Walk-v1", horizn=3)
 
 
 def test_contacts_and_rows_stay_as_few_as_they_are_meant_to_be(walking):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import subterra_jax as st
+from subterra_jax.parts import FaultParams
 from subterra_jax.tunnel import at_station
 
 SPEED, PERIOD = 2.0, 0.1
@@ -15,8 +16,9 @@ MANY, FEW = 3000, 400  # robots; two sizes only, or each would be compiled anew
 
 @functools.cache
 def made(id):
-    """A task, its functions for batches of robots compiled once."""
-    env, params = st.make(id)
+    """A task, its functions for batches of robots compiled once. Faults have the middle of their sizes."""
+    middle = {"faults": FaultParams(spread=0.0)} if "Faulted" in id else {}
+    env, params = st.make(id, tunnel="subterra-351", **middle)
     begin = jax.jit(
         lambda key, n: jax.vmap(env.begin, (0, None))(env.draw_reset(key, (n,), params), params), static_argnums=1
     )

@@ -14,7 +14,7 @@ from tests.subterra_jax.net.robots import FEW, MANY, advanced, assert_mean, begu
 
 
 def test_nine_tenths_covered_in_contact_with_a_wall_are_no_success():
-    id = "Subterra/Traverse-v0"
+    id = "Subterra/Traverse-v1"
     _, params, *_ = made(id)
     threshold, n = 0.9 * float(params.tunnel.length), FEW
     lateral = np.where(np.arange(n) < n // 2, 0.0, 2.6)  # the walls are 2.8 m away, the robot's radius is 0.4 m
@@ -39,21 +39,29 @@ def blocked(plan_of):
 
 @pytest.mark.parametrize("name", ["command-integrator"])
 def test_neither_evaluation_nor_viewer_counts_coverage_in_contact_as_success(blocked, name):
-    env, params = st.make("Subterra/Traverse-v0", tunnel=blocked, lining="smooth")
+    env, params = st.make("Subterra/Traverse-v1", tunnel=blocked, lining="smooth")
     one = np.zeros(4, np.int32)
     episodes = Episodes(np.arange(4, dtype=np.uint32), one, one, one)
     records = evaluate(env, params, registry.make_agent(name, params), episodes)
     assert (records.coverage >= 0.9).any()
     assert records.contact.all()
     assert not records.success.any()
-    *_, whole = library.drive_episode(blocked, "0", "blocked", "smooth", "Subterra/Traverse-v0", name, 0)
+    *_, whole = library.drive_episode(blocked, "0", "blocked", "smooth", "Subterra/Traverse-v1", name, 0)
     assert (whole.contact, whole.success) == (1.0, 0.0)
 
 
+def among_boxes(id, n):
+    """Robots at their starts, and boxes as if all had begun at the mouth."""
+    state = begun(id, n)
+    if "Obstructed" not in id:
+        return state
+    return state.replace(obstacles=state.obstacles.replace(start=jnp.zeros(n)))
+
+
 def test_where_a_beam_ends_on_a_box_the_robot_would_touch_it():
-    id, plain = "Subterra/Obstructed-v0", "Subterra/StopAt-v0"
+    id, plain = "Subterra/Obstructed-v1", "Subterra/StopAt-v1"
     station = np.random.default_rng(0).uniform(20.0, 300.0, FEW)
-    state, empty = (placed(name, begun(name, FEW), station) for name in (id, plain))
+    state, empty = (placed(name, among_boxes(name, FEW), station) for name in (id, plain))
     seen, walls = (observed(name, there)["ranges"] for name, there in ((id, state), (plain, empty)))
     robot, beam = np.nonzero((seen < walls - 0.5) & (seen < 6.0))
     assert len(robot) > 200
@@ -81,17 +89,17 @@ def test_where_a_beam_ends_on_a_box_the_robot_would_touch_it():
 
 def test_a_robot_that_drives_blindly_among_boxes_runs_into_them():
     contacts = {}
-    for id in ("Subterra/StopAtShort-v0", "Subterra/ObstructedShort-v0"):
-        _, series = driven(id, placed(id, begun(id, MANY), 10.0), 150)
+    for id in ("Subterra/StopAt-v1", "Subterra/Obstructed-v1"):
+        _, series = driven(id, placed(id, among_boxes(id, MANY), 10.0), 150)
         contacts[id] = series["contact"].any(axis=0).mean()
-    assert contacts["Subterra/StopAtShort-v0"] == 0.0
-    assert 0.3 < contacts["Subterra/ObstructedShort-v0"] < 0.99
+    assert contacts["Subterra/StopAt-v1"] == 0.0
+    assert 0.3 < contacts["Subterra/Obstructed-v1"] < 0.99
 
 
 def test_boxes_are_as_many_and_as_large_as_stated():
-    id, points = "Subterra/Obstructed-v0", 150
+    id, points = "Subterra/Obstructed-v1", 150
     _, params, *_ = made(id)
-    state, rng, inside = begun(id, MANY), np.random.default_rng(0), np.zeros(MANY)
+    state, rng, inside = among_boxes(id, MANY), np.random.default_rng(0), np.zeros(MANY)
     for k in range(points):
         there = placed(id, state, rng.uniform(30.0, 315.0, MANY), rng.uniform(-3.0, 3.0, MANY))
         inside += np.asarray(advanced(id, there, np.zeros(2), key=k)[4]["clearance"]) == 0.0

@@ -30,7 +30,7 @@ def stretches(series):
 
 
 def test_in_t0_the_plant_is_exact_and_the_odometer_has_a_scale_of_2_percent_and_noise_of_1_cm():
-    _, series = driven("Subterra/Traverse-v0", begun("Subterra/Traverse-v0", MANY), 100)
+    _, series = driven("Subterra/Traverse-v1", begun("Subterra/Traverse-v1", MANY), 100)
     np.testing.assert_allclose(series["moved"], 0.2, rtol=2e-3)
     np.testing.assert_allclose(series["turned"], series["asked"], atol=2e-5)
     first, second = stretches(series["counted"]) - 10.0
@@ -40,7 +40,7 @@ def test_in_t0_the_plant_is_exact_and_the_odometer_has_a_scale_of_2_percent_and_
     assert_covariance(first - second, first - second, 2 * 50 * 0.01**2)
 
 
-@pytest.mark.parametrize("id", ["Subterra/Traverse-v0", "Subterra/Return-v0"])
+@pytest.mark.parametrize("id", ["Subterra/Traverse-v1", "Subterra/Return-v1"])
 def test_the_odometers_yaw_rate_is_off_by_2_mrad_a_second(id):
     start = begun(id, MANY)
     middle, _ = driven(id, start, 50)
@@ -66,7 +66,7 @@ def drive_of_100_metres(id, backward):
 
 
 def test_from_t1_on_the_plant_slips_by_2_percent_an_episode_and_2_percent_that_wander_over_30_metres():
-    slip, _, yaw = drive_of_100_metres("Subterra/StopAt-v0", False)
+    slip, _, yaw = drive_of_100_metres("Subterra/StopAt-v1", False)
     assert_mean(slip[0], 0.0)
     for lag in (1, 3, 9):
         assert_covariance(slip[0], slip[lag], 0.02**2 + wandering(10.0 * lag, 0.02))
@@ -75,7 +75,7 @@ def test_from_t1_on_the_plant_slips_by_2_percent_an_episode_and_2_percent_that_w
 
 
 def test_from_t1_on_the_odometer_errs_by_2_percent_an_episode_and_1_percent_that_wanders_over_30_metres():
-    _, scale, _ = drive_of_100_metres("Subterra/StopAt-v0", False)
+    _, scale, _ = drive_of_100_metres("Subterra/StopAt-v1", False)
     assert_mean(scale[0], 0.0)
     for lag in (1, 3, 9):
         assert_covariance(scale[0], scale[lag], 0.02**2 + wandering(10.0 * lag, 0.01))
@@ -83,12 +83,12 @@ def test_from_t1_on_the_odometer_errs_by_2_percent_an_episode_and_1_percent_that
 
 
 def test_facing_falling_stations_adds_another_2_percent_to_the_odometers_scale():
-    _, scale, _ = drive_of_100_metres("Subterra/Return-v0", True)
+    _, scale, _ = drive_of_100_metres("Subterra/Return-v1", True)
     assert_covariance(scale[0], scale[9], 0.02**2 + 0.02**2 + wandering(90.0, 0.01))
 
 
 def test_the_error_of_the_way_back_is_not_that_of_the_way_out():
-    id = "Subterra/Return-v0"
+    id = "Subterra/Return-v1"
     state, out = driven(id, placed(id, begun(id, MANY), 100.0), 150)
     _, back = driven(id, placed(id, state, 130.0, backward=True), 150, key=2)
     out, back = ((stretches(s["counted"]) / stretches(s["moved"]) - 1.0) for s in (out, back))
@@ -98,7 +98,7 @@ def test_the_error_of_the_way_back_is_not_that_of_the_way_out():
 
 
 def test_ranges_have_5_cm_of_noise_and_end_at_30_metres():
-    id = "Subterra/StopAt-v0"
+    id = "Subterra/StopAt-v1"
     state = placed(id, begun(id, FEW), np.linspace(20.0, 330.0, FEW))
     one, two = (observed(id, state, key)["ranges"] for key in (1, 2))
     wall = (one < 29.0) & (two < 29.0)

@@ -18,45 +18,43 @@ from tests.subterra_jax.net.robots import (
     stand,
 )
 
-WITH_GOAL = tuple(name for name in st.TASKS if "Traverse" not in name and name.endswith("-v0"))
+WITH_GOAL = tuple(name for name in st.TASKS if "Traverse" not in name)
+LENGTH, MARGIN = 351.0, 40.0  # m: of the tunnel, and between a mouth and starts and goals
 
 
 @pytest.mark.parametrize(
     ("id", "low", "high"),
     [
-        ("Subterra/StopAt-v0", 60.0, 320.0),
-        ("Subterra/StopAtOffset-v0", 60.0, 320.0),
-        ("Subterra/Return-v0", 60.0, 320.0),
-        ("Subterra/Obstructed-v0", 60.0, 320.0),
-        ("Subterra/Faulted-v0", 60.0, 320.0),
-        ("Subterra/StopAtShort-v0", 10.0, 60.0),
-        ("Subterra/StopAtOffsetShort-v0", 20.0, 60.0),
-        ("Subterra/ReturnShort-v0", 10.0, 60.0),
-        ("Subterra/ObstructedShort-v0", 10.0, 60.0),
-        ("Subterra/FaultedShort-v0", 10.0, 60.0),
+        ("Subterra/StopAt-v1", 60.0, 271.0),
+        ("Subterra/Return-v1", 60.0, 271.0),
+        ("Subterra/Obstructed-v1", 60.0, 271.0),
+        ("Subterra/Faulted-v1", 60.0, 271.0),
+        ("Subterra/StopAtShort-v1", 10.0, 60.0),
     ],
 )
-def test_goals_lie_anywhere_in_their_range(id, low, high):
-    goal = np.asarray(begun(id, MANY).goal.station, np.float64)
-    assert low <= goal.min() < low + 0.01 * (high - low)
-    assert high - 0.01 * (high - low) < goal.max() <= high
-    assert_mean(goal, 0.5 * (low + high))
-    share = np.histogram(goal, 10, (low, high))[0] / len(goal)
-    assert np.abs(share - 0.1).max() < 4.0 * np.sqrt(0.1 * 0.9 / len(goal))
-
-
-@pytest.mark.parametrize(
-    ("id", "station", "sigma"),
-    [("Subterra/StopAt-v0", 0.0, 0.0), ("Subterra/Return-v0", 5.0, 0.0), ("Subterra/StopAtOffset-v0", 9.0, 3.0)],
-)
-def test_robots_start_where_the_task_says(id, station, sigma):
+def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in_the_room_left(id, low, high):
     state = begun(id, MANY)
-    start, lateral = (np.asarray(values, np.float64) for values in (state.station, state.lateral))
-    if sigma == 0.0:
-        assert (start == station).all()
-    else:
-        assert_mean(start, station)
-        assert np.std(start) == pytest.approx(sigma, rel=0.06)
+    start, goal = (np.asarray(values, np.float64) for values in (state.goal.told, state.goal.station))
+    way = goal - start
+    assert low - 1e-3 <= way.min() < low + 0.01 * (high - low)
+    assert high - 0.01 * (high - low) < way.max() <= high + 0.05
+    assert_mean(way, 0.5 * (low + high))
+    share = np.histogram(way, 10, (low - 1e-3, high + 0.05))[0] / len(way)
+    assert np.abs(share - 0.1).max() < 4.0 * np.sqrt(0.1 * 0.9 / len(way))
+    # The share of the room in front of the start is uniform from 0 to 1, whatever the way.
+    room = LENGTH - 2.0 * MARGIN - way
+    before = (start - MARGIN)[room > 5.0] / room[room > 5.0]
+    assert before.min() > -0.01
+    assert before.max() < 1.01
+    assert_mean(before, 0.5)
+    assert_mean(before**2, 1.0 / 3.0)
+
+
+@pytest.mark.parametrize("id", ["Subterra/StopAt-v1", "Subterra/Return-v1"])
+def test_robots_start_where_the_task_says(id):
+    state = begun(id, MANY)
+    np.testing.assert_allclose(state.station, state.goal.told, atol=1e-4)
+    lateral = np.asarray(state.lateral, np.float64)
     # Uniform to either side: 0.5 m and 0.1 rad.
     off_axis = np.arcsin(np.asarray(jax.vmap(made(id)[0].privileged, (0, None))(state, made(id)[1])["heading_sin"]))
     for values, largest in ((lateral, 0.5), (off_axis, 0.1)):
@@ -81,7 +79,7 @@ def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tas
     else:
         target = state.goal.station
         if "Return" in id:
-            state, target = advanced(id, placed(id, state, target), np.zeros(2))[0], 5.0
+            state, target = advanced(id, placed(id, state, target), np.zeros(2))[0], state.goal.told
         state = placed(id, state, target + error)
     _, _, early, before = stand(id, state, 9 if "Return" not in id else 8, report)
     assert not before["stopped"].any()
@@ -95,7 +93,7 @@ def test_a_stop_counts_within_1_metre_and_within_25_centimetres_in_the_short_tas
 
 
 def test_a_report_of_the_wrong_direction_is_no_success():
-    id = "Subterra/Relocalise-v0"
+    id = "Subterra/Relocalise-v1"
     state = begun(id, FEW)
     state = placed(id, state, state.station, backward=True)
     _, _, ended, info = stand(id, state, 10, np.asarray(state.station))
@@ -104,7 +102,7 @@ def test_a_report_of_the_wrong_direction_is_no_success():
 
 
 def test_the_flag_is_raised_within_2_metres_of_the_goal():
-    id = "Subterra/Return-v0"
+    id = "Subterra/Return-v1"
     state = begun(id, FEW)
     error, inside = errors_about(2.0, FEW)
     _, _, _, info = stand(id, placed(id, state, state.goal.station + error), 1)
@@ -115,7 +113,7 @@ def test_the_flag_is_raised_within_2_metres_of_the_goal():
     ("command", "stands"), [((0.043, 0.0), True), ((0.058, 0.0), False), ((0.0, 0.48), True), ((0.0, 0.52), False)]
 )
 def test_below_5_centimetres_and_half_a_radian_a_second_is_standing(command, stands):
-    id = "Subterra/StopAt-v0"
+    id = "Subterra/StopAt-v1"
     state = placed(id, begun(id, FEW), 100.0)
     for k in range(10):
         state, _, _, _, info = advanced(id, state, command, key=k)
@@ -123,8 +121,8 @@ def test_below_5_centimetres_and_half_a_radian_a_second_is_standing(command, sta
     assert np.mean(info["stopped"]) == (1.0 if stands else 0.0)
 
 
-@pytest.mark.parametrize(("id", "limit"), [("Subterra/Relocalise-v0", 120.0), ("Subterra/RelocaliseShort-v0", 40.0)])
-def test_a_robot_that_has_not_reported_within_120_metres_has_failed(id, limit):
+def test_a_robot_that_has_not_reported_within_60_metres_has_failed():
+    id, limit = "Subterra/Relocalise-v1", 60.0
     state, travelled, ended = begun(id, FEW), np.zeros(FEW), np.zeros(FEW, bool)
     # Back and forth over 20 m: the limit is of the distance, wherever it is driven.
     for k in range(round(limit / 20.0) + 1):

@@ -23,7 +23,7 @@ def reward_cases(id):
     yield placed(id, moving, 30.0, 2.6), first, second
 
 
-@pytest.mark.parametrize("id", ["Subterra/StopAt-v0", "Subterra/StopAtShort-v0"])
+@pytest.mark.parametrize("id", ["Subterra/StopAt-v1", "Subterra/StopAtShort-v1"])
 def test_the_terms_of_the_reward_of_a_goal_are_those_that_are_written_down(id):
     tolerance, stops, contacts = (0.25 if "Short" in id else 1.0), 0, 0
     for before, previous, command in reward_cases(id):
@@ -52,7 +52,7 @@ def test_the_terms_of_the_reward_of_a_goal_are_those_that_are_written_down(id):
 
 
 def test_a_stop_pays_less_the_further_it_is_from_the_goal_and_a_far_one_costs():
-    id = "Subterra/StopAt-v0"
+    id = "Subterra/StopAt-v1"
     error = np.linspace(0.0, 40.0, FEW)
     state = begun(id, FEW)
     state = placed(id, state.replace(goal=state.goal.replace(station=jnp.full(FEW, 100.0))), 100.0 + error)
@@ -63,7 +63,7 @@ def test_a_stop_pays_less_the_further_it_is_from_the_goal_and_a_far_one_costs():
 
 
 def test_the_terms_of_eq_1_are_those_that_are_written_down():
-    id = "Subterra/Traverse-v0"
+    id = "Subterra/Traverse-v1"
     length = float(made(id)[1].tunnel.length)
     for before, previous, command in reward_cases_of_t0(id):
         _, gain, _, _, info = advanced(id, before, command)

@@ -23,7 +23,7 @@ def probe(name):
 @pytest.mark.parametrize("name", PROBES)
 def test_the_evaluation_gives_an_agent_what_it_declares_and_no_more(name):
     agent, speed = PROBES[name]
-    env, params = st.make("Subterra/TraverseShort-v0", horizon=3)
+    env, params = st.make("Subterra/TraverseShort-v1", horizon=3)
     one = np.zeros(2, np.int32)
     records = evaluate(env, params, agent, Episodes(np.arange(2, dtype=np.uint32), one, one, one))
     np.testing.assert_allclose(records.travelled / records.time, speed, rtol=1e-4)
@@ -38,13 +38,13 @@ def test_the_recorder_gives_an_agent_what_it_declares_and_no_more(name, tmp_path
 @pytest.mark.parametrize("name", ["nothing", "truth"])
 def test_the_viewer_gives_an_agent_what_it_declares_and_no_more(name):
     plan = st.load_tunnel()
-    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/TraverseShort-v0", probe(name), 0)
+    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/TraverseShort-v1", probe(name), 0)
     next(parts)
     np.testing.assert_allclose(next(parts).command[1:, 0], PROBES[name][1], rtol=1e-4)
 
 
 def test_the_truth_that_is_handed_out_is_the_truth():
-    id = "Subterra/StopAt-v0"
+    id = "Subterra/StopAt-v1"
     env, params, *_ = made(id)
     state, _ = driven(id, begun(id, 50), 50)
     known = jax.vmap(env.privileged, (0, None))(state, params)

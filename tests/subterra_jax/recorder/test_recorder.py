@@ -18,7 +18,7 @@ from subterra_jax.recorder import record
 from subterra_jax.recorder.__main__ import main
 from subterra_jax.recorder.messages import EPOCH, store
 
-TASK = "Subterra/StopAtShort-v0"
+TASK = "Subterra/StopAtShort-v1"
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 TOPICS = {"/cmd_vel", "/imu", "/odom", "/scan", "/scan_dense", "/tf", "/tf_static"}
 

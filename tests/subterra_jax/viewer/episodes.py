@@ -14,7 +14,7 @@ def straight(n: int = 21, **changes: Any) -> Recording:
     estimate = np.stack([x + 1.0, np.full(n, 0.5)], axis=-1).astype(np.float32)
     estimate[0] = np.nan
     fields: dict[str, Any] = {
-        "task": "Subterra/StopAt-v0",
+        "task": "Subterra/StopAt-v1",
         "agent": "by hand",
         "tunnel": "t",
         "tunnel_sha256": "0",

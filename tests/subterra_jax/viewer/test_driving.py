@@ -21,7 +21,7 @@ _NAMES = {"tunnel": "t", "tunnel_sha256": "0", "lining": "smooth", "agent": "bli
 @pytest.fixture(scope="module")
 def task(plan_of):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
-    return st.make("Subterra/Traverse-v0", tunnel=plan, lining="smooth")
+    return st.make("Subterra/Traverse-v1", tunnel=plan, lining="smooth")
 
 
 @pytest.fixture(scope="module")
@@ -59,14 +59,14 @@ def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
     few = FeedForward({"statistics.mean": jnp.zeros(3)}, jnp.zeros(2), jnp.ones(2), frames=1)
     monkeypatch.setitem(library.registry._FACTORIES, "few", lambda params: few)
-    with pytest.raises(SubterraError, match="few: made for observations of 3 numbers, Subterra/Traverse-v0 has 18"):
-        next(library.drive_episode(plan, "0", "t", "smooth", "Subterra/Traverse-v0", "few", 0))
+    with pytest.raises(SubterraError, match="few: made for observations of 3 numbers, Subterra/Traverse-v1 has 18"):
+        next(library.drive_episode(plan, "0", "t", "smooth", "Subterra/Traverse-v1", "few", 0))
 
 
 @pytest.mark.slow
 def test_the_points_of_a_lidar_in_three_dimensions_are_recorded_and_shown():
     plan = st.load_tunnel("metro-asbuilt", solid=True)
-    words = ("0", "t", "smooth", "Subterra/TraverseShort-v0", "dead-reckoning", 0, "spin16x64")
+    words = ("0", "t", "smooth", "Subterra/TraverseShort-v1", "dead-reckoning", 0, "spin16x64")
     first = next(library.drive_episode(plan, *words))
     assert first.points.shape == (1, 1024, 3)
     points = first.points[0][np.isfinite(first.points[0]).all(axis=1)]
@@ -80,4 +80,4 @@ def test_the_points_of_a_lidar_in_three_dimensions_are_recorded_and_shown():
 
 
 def test_baselines_and_released_policies_are_offered():
-    assert {"particle-filter", "oracle", "policy:StopAt-v0"} <= set(library.register_agents(()))
+    assert {"particle-filter", "oracle", "policy:Traverse-v1"} <= set(library.register_agents(()))

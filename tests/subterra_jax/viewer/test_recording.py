@@ -20,7 +20,7 @@ def test_the_same_episode_has_the_same_bytes_and_name(tmp_path):
     for name in ("a.npz", "b.npz"):
         save(straight(), tmp_path / name)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert straight().file_name == "StopAt-v0_by-hand_t_smooth_3.npz"
+    assert straight().file_name == "StopAt-v1_by-hand_t_smooth_3.npz"
     assert "/" not in straight(tunnel="../../etc/passwd").file_name
 
 

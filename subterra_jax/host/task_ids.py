@@ -1,0 +1,45 @@
+"""The ids of the benchmark's tasks, without jax; and the sentence for an id that does not exist."""
+
+from collections.abc import Iterable
+
+PLANAR = tuple(
+    f"Subterra/{name}-v1"
+    for name in ("Traverse", "TraverseShort", "StopAt", "StopAtShort", "Return", "Obstructed", "Faulted", "Relocalise")
+)
+WALK = "Subterra/B2Walk-v1"
+B2_TRAVERSE = "Subterra/B2Traverse-v1"
+MISSIONS = (B2_TRAVERSE,)  # planar tasks, done on a learnt gait
+BENCHMARK = (*PLANAR, WALK, *MISSIONS)
+
+
+def full_id(name: str) -> str:
+    """Return `Subterra/StopAt-v1` for `StopAt`; any other name unchanged."""
+    full = f"Subterra/{name}-v1"
+    return full if full in BENCHMARK else name
+
+
+def no_task(task: str, known: Iterable[str]) -> str:
+    """Explain in one sentence that a task id does not exist, and which id to use.
+
+    Args:
+        task: The id as it was given, with `Subterra/` or without.
+        known: The ids that exist.
+    """
+    if now := successor(task):
+        return f"no task {task!r}: version 1 is the benchmark; use {now}"
+    name = task.removeprefix("Subterra/").partition("-v")[0]
+    if (meant := full_id(name)) in BENCHMARK:
+        return f"no task {task!r}: its id is {meant}"
+    return f"no task {task!r}; there are {', '.join(known)}"
+
+
+def successor(task: str) -> str | None:
+    """Return what took the place of an id of version 0, or of an id of its own for a hidden start; None for others."""
+    name, _, version = task.removeprefix("Subterra/").partition("-v")
+    plain = name.replace("Offset", "")
+    if version not in ("0", "1") or (version == "1" and plain == name):
+        return None
+    for candidate in (full_id(plain), full_id(plain.removesuffix("Short"))):
+        if candidate in BENCHMARK:
+            return candidate + (" with hidden_start=True" if plain != name else "")
+    return None
