@@ -31,6 +31,8 @@ from subterra_jax.tunnel_env import TunnelEnv
 
 PLAIN: tuple[Part, ...] = (Odometer(), PlanarLidar())
 SLIPPING: tuple[Part, ...] = (*PLAIN, Slip())
+PAPER_TUNNEL = "subterra-351"
+N_TUNNELS = 12  # of the open world where none is named: every kind of every split is as often in them as any other
 OPTIONAL: tuple[Part, ...] = (Slip(), Obstacles(), Faults(), Imu())
 
 
@@ -48,6 +50,7 @@ class Task:
         piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
         parts: Sensors, errors and obstacles, in the order in which they act.
         params: Entries of `EnvParams` that differ from the defaults of parts and rule.
+        tunnel: Tunnel where none is named; None for some of the open world.
     """
 
     rule: Rule
@@ -55,6 +58,7 @@ class Task:
     piece: tuple[float, float] | None = None
     parts: tuple[Part, ...] = PLAIN
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    tunnel: str | None = None
 
 
 def _drifting(**params: Any) -> dict[str, Any]:
@@ -67,8 +71,8 @@ _NEAR = GoalParams(low=c.SHORT_GOAL_LOW, high=c.SHORT_GOAL_HIGH, tolerance=c.SHO
 _REPORT = GoalParams(margin=c.RELOCALISE_MARGIN, travel_max=c.RELOCALISE_TRAVEL)
 
 TASKS: dict[str, Task] = {
-    "Subterra/Traverse-v1": Task(Traverse(), c.HORIZON_TRAVERSE),
-    "Subterra/TraverseShort-v1": Task(Traverse(), c.HORIZON_TRAVERSE_SHORT, (0.0, c.SHORT_LENGTH)),
+    "Subterra/Traverse-v1": Task(Traverse(), c.HORIZON_TRAVERSE, tunnel=PAPER_TUNNEL),
+    "Subterra/TraverseShort-v1": Task(Traverse(), c.HORIZON_TRAVERSE_SHORT, (0.0, c.SHORT_LENGTH), tunnel=PAPER_TUNNEL),
     "Subterra/StopAt-v1": Task(StopAt(), c.HORIZON_STOP, None, SLIPPING, _drifting()),
     "Subterra/StopAtShort-v1": Task(StopAt(), c.HORIZON_STOP_SHORT, None, SLIPPING, _drifting(goal=_NEAR)),
     "Subterra/Return-v1": Task(TurnBack(), c.HORIZON_RETURN, None, SLIPPING, _drifting()),
@@ -91,6 +95,7 @@ def register(
     piece: tuple[float, float] | None = None,
     parts: Sequence[Part] = PLAIN,
     params: Mapping[str, Any] | None = None,
+    tunnel: str | None = None,
 ) -> None:
     """Add a task, here and in Gymnasium. Adding it again under the same id replaces it.
 
@@ -101,6 +106,7 @@ def register(
         piece: Start and length of the piece of tunnel that the task happens in, m; None for the whole tunnel.
         parts: Parts in the order in which they act: `PLAIN`, `SLIPPING`, or parts of one's own.
         params: Entries of `EnvParams` that differ from the defaults of parts and rule.
+        tunnel: Tunnel where none is named, as `subterra-351`; None for some of the open world.
 
     Raises:
         ValueError: The id belongs to the benchmark, has another form, or the rule's errand is unknown.
@@ -114,7 +120,7 @@ def register(
         raise ValueError(f"{id}: rule must be a subterra_jax.rules.Rule, got {type(rule).__name__}")
     if rule.errand not in ERRANDS:
         raise ValueError(f"{id}: errand must be one of {', '.join(ERRANDS)}, {type(rule).__name__} has {rule.errand!r}")
-    TASKS[id] = Task(rule, horizon, piece, tuple(parts), dict(params or {}))
+    TASKS[id] = Task(rule, horizon, piece, tuple(parts), dict(params or {}), tunnel)
     if importlib.util.find_spec("gymnasium") is not None:
         register_tasks((id,))
 
@@ -150,6 +156,7 @@ def make(
     sensor: Any = SENSORS[0],
     sweep: bool = False,
     hidden_start: bool = False,
+    split: str | None = None,
     **overrides: Any,
 ) -> tuple[Any, Any]:
     """Make an environment and its params.
@@ -160,7 +167,8 @@ def make(
             `subterra_jax.b2.tasks.make_mission`.
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
-            another lining. None is the packaged tunnel.
+            another lining. None is `open:train:0-11`, twelve tunnels of the open world of which each episode draws
+            one; `subterra-351` for the paper's task and the B2's.
         lining: Variant of the walls: `pockets` (as in the recorded bore), `smooth` or `furnished`. None is `pockets`,
             or the first where a tunnel has none.
         estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
@@ -171,6 +179,8 @@ def make(
         sweep: Cast each beam of a LiDAR in three dimensions from the pose at its own time.
         hidden_start: The true start is off the reported one by a normal number of 3 m, cut off at three of them; for
             the tasks that report a start: `StopAt`, `StopAtShort`, `Return`, `Obstructed` and `Faulted`.
+        split: Twelve tunnels of this split of the open world, `train`, `val`, `test-seen` or `test-unseen`, in place of
+            `tunnel`.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
             `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
@@ -183,6 +193,10 @@ def make(
         TunnelError: The tunnel file is unreadable or wrong, or has no such lining.
     """
     id = find(id)
+    if id in TASKS:
+        tunnel = tunnel_for(id, tunnel, split)
+    elif split is not None:
+        raise ValueError(f"{id} happens in one tunnel: name it in place of a split")
     if hidden_start:
         overrides = {"start": _hidden_start(id, overrides), **overrides}
     if id == WALK or id in MISSIONS:
@@ -213,6 +227,28 @@ def make(
     check_together(env, params)
     check_length(env, params)
     return env, params
+
+
+def tunnel_for(id: str, tunnel: Source | Sequence[Source] = None, split: str | None = None) -> Any:
+    """Return what `make` takes for the tunnel of a task.
+
+    Args:
+        id: The task's id.
+        tunnel: As for `make`.
+        split: As for `make`.
+
+    Raises:
+        ValueError: There is no such split, or both a tunnel and a split are named.
+    """
+    if split is not None:
+        if tunnel is not None:
+            raise ValueError(f"either a tunnel or a split, got both {str(tunnel)!r} and {split!r}")
+        if split not in open_world.SPLITS:
+            raise ValueError(f"there is no split {split!r}; there are {', '.join(open_world.SPLITS)}")
+    if tunnel is not None:
+        return tunnel
+    usual = TASKS[id].tunnel
+    return usual if usual is not None and split is None else f"open:{split or 'train'}:0-{N_TUNNELS - 1}"
 
 
 def _hidden_start(id: str, overrides: Mapping[str, Any]) -> StartParams:

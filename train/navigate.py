@@ -49,7 +49,7 @@ class Command:
         out: Run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json.
         task: Task id.
         tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, or several of which
-            each episode draws one: `procedural:train:0-255`, `open:train:0-255`.
+            each episode draws one: `open:train:0-255`.
         lining: Variant of the walls; `pockets`, or its first, if left out.
         sensor: LiDAR; `planar16` is the task's own, `avia` no image.
         memory: `none`: a perceptron over a few observations. `gru`: a network that remembers; it learns by reward, or

@@ -110,7 +110,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None = None, 
 
     Args:
         task: Task id.
-        tunnel: File or name; None is the packaged tunnel. `procedural:train:0-255` means several tunnels, of which each
+        tunnel: File or name; None is the packaged tunnel. `open:train:0-255` means several tunnels, of which each
             episode draws one.
         lining: Variant of the walls; None is the tunnel's usual one.
         sensor: LiDAR, as `st.make` takes it by name.

@@ -196,7 +196,7 @@ _JUDGED, _CONTROLS = "benchmarks.fidelity run --out out/fidelity", "benchmarks.f
 _PEERS = "benchmarks.throughput --n 65536 --peers jaxnav --seconds 8 --poses 62500 --out out/peers"
 _LENGTHS = "benchmarks.throughput --n 65536 --lengths 351 3510 --out out/lengths"
 _T1_STEP = "benchmarks.throughput --task Subterra/StopAt-v1 --n 65536 --out out/stop"
-_MANY = "benchmarks.throughput --task Subterra/StopAt-v1 --tunnel procedural:train:0-99 --n 65536"
+_MANY = "benchmarks.throughput --task Subterra/StopAt-v1 --tunnel open:train:0-99 --n 65536"
 _OPEN_STEP = "T1 of version 1 in 1,020 tunnels"
 _OPEN_MANY = (
     "benchmarks.throughput --task Subterra/StopAt-v1 --n 65536 --copies 17 --tunnel open:straight:train:0-9,"
@@ -205,20 +205,20 @@ _OPEN_MANY = (
 )
 _SPIN = (
     "train.navigate --task Subterra/StopAt-v1 --memory gru --teacher oracle --sensor spin16x64 --preset gpu "
-    "--tunnel procedural:test:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any "
+    "--tunnel open:val:0-11 --n-envs 65536 --unroll 64 --hidden 128 --minibatches 8 --half --sums any "
     "--out out/spin"
 )
 _STEP_ON_CPU = "benchmarks.throughput --n 1024 --peers none"
 _FIVE = "train.navigate --task Subterra/Traverse-v1 --preset gpu --seeds 0 1 2 3 4 --out out/five"
 _FAMILY = (
-    "train.navigate --task Subterra/StopAt-v1 --memory gru --teacher oracle --tunnel procedural:train:0-255 "
+    "train.navigate --task Subterra/StopAt-v1 --memory gru --teacher oracle --tunnel open:train:0-255 "
     "--steps 150000000 --out out/family"
 )
 _RELEASED = "benchmarks.leaderboard --agents released-policy --tasks"
 _SMOOTH_METRO = f"{_RELEASED} StopAt --tunnels metro-asbuilt --linings smooth --episodes 100 --out out/smooth"
 _SMOOTH_RETURN = f"{_RELEASED} Return --linings smooth --out out/smooth"
 _AT_THE_METRO = f"{_RELEASED} Obstructed Faulted Relocalise --tunnels metro-asbuilt --out out/metro"
-_UNSEEN = f"{_RELEASED} Obstructed Faulted --tunnels procedural:test:0-63 --out out/unseen"
+_UNSEEN = f"{_RELEASED} Obstructed Faulted --tunnels open:val:0-63 --out out/unseen"
 _SHORT = (
     "train.navigate --task Subterra/StopAtShort-v1 --memory gru --teacher oracle --preset cpu "
     "--evaluation-episodes 500 --out out/short"

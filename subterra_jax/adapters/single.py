@@ -150,13 +150,14 @@ class SubterraEnv(Env[Observation, np.ndarray]):
 
     Args:
         task: Id of the task.
-        tunnel: As for `subterra_jax.make`. `None` is the scene's tunnel if a scene is given, else the packaged one.
+        tunnel: As for `subterra_jax.make`. `None` is the scene's tunnel if a scene is given.
         lining: As for `subterra_jax.make`.
         flat: Return a plain vector for every task.
         render_mode: `None` or `rgb_array`.
         view: Picture of `render`: `top`, the plan from above, drawn without GL; or `mujoco`, from a camera behind the
             robot: the scene, or without one the bore of the tunnel.
         scene: Folder of `scene.build`, or one of its MJCF files.
+        split: As for `subterra_jax.make`.
         **overrides: As for `subterra_jax.make`.
     """
 
@@ -171,14 +172,15 @@ class SubterraEnv(Env[Observation, np.ndarray]):
         render_mode: str | None = None,
         view: str = "top",
         scene: str | Path | None = None,
+        split: str | None = None,
         **overrides: Any,
     ):
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         refuse_fork()
         self.render_mode = render_mode
-        self._view = view_for(view, scene, task, tunnel, lining)
-        env, params = make(task, self._view.tunnel if tunnel is None else tunnel, lining, **overrides)
+        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining)
+        env, params = make(task, tunnel, lining, **overrides)
         self._env, self._params = env, params
         self._fields = packing.named_fields(env, params, flat)
         self.observation_space = packing.observation_space(env, params, self._fields)

@@ -80,6 +80,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         render_mode: As for `SubterraEnv`; `render` returns one picture for each environment.
         view: As for `SubterraEnv`.
         scene: As for `SubterraEnv`.
+        split: As for `subterra_jax.make`.
         **overrides: As for `subterra_jax.make`.
     """
 
@@ -94,6 +95,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         view: str = "top",
         scene: str | Path | None = None,
+        split: str | None = None,
         **overrides: Any,
     ):
         if render_mode not in (None, "rgb_array"):
@@ -102,8 +104,8 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": self.autoreset_mode}
-        self._view = view_for(view, scene, task, tunnel, lining)
-        env, params = make(task, self._view.tunnel if tunnel is None else tunnel, lining, **overrides)
+        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining)
+        env, params = make(task, tunnel, lining, **overrides)
         self.batch = Batch(env, params, num_envs, self.autoreset_mode)
         self.fields = packing.named_fields(env, params, flat)
         self.single_observation_space = packing.observation_space(env, params, self.fields)

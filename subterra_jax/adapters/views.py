@@ -18,7 +18,7 @@ from subterra_jax.pictures.stage import Piece, stage_spec
 from subterra_jax.pictures.top_down import top_down, wall_points
 from subterra_jax.procedural import expand
 from subterra_jax.state import EnvParams, State
-from subterra_jax.tasks import TASKS, find
+from subterra_jax.tasks import TASKS, find, tunnel_for
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import Source, load_tunnel, tunnel_of
@@ -73,11 +73,19 @@ def make_view(view: str, scene: str | Path | None, choice: "TunnelChoice | None"
 
 
 def view_for(
-    view: str, scene: str | Path | None, task: str, tunnel: Source | Sequence[Source], lining: str | None
-) -> View:
-    """Return the view of an environment that `subterra_jax.make` is to make; arguments and errors as there."""
-    known = TASKS.get(find(task))
-    return make_view(view, scene, TunnelChoice(tunnel, lining, None if known is None else known.piece))
+    view: str,
+    scene: str | Path | None,
+    task: str,
+    tunnel: Source | Sequence[Source],
+    split: str | None,
+    lining: str | None,
+) -> tuple[View, Any]:
+    """Return the view of an environment that `subterra_jax.make` is to make, and its tunnel; errors as there."""
+    known = TASKS.get(id := find(task))
+    if scene is not None and tunnel is None and split is None:
+        tunnel = tunnel_of(Path(scene))
+    tunnel = tunnel_for(id, tunnel, split)
+    return make_view(view, scene, TunnelChoice(tunnel, lining, None if known is None else known.piece)), tunnel
 
 
 class TopView:

@@ -1,4 +1,4 @@
-"""The ranges of a family of tunnels; its centrelines; and walls, recesses and furniture beside them, in float64."""
+"""Centrelines, random lines along them, and walls beside them, in float64."""
 
 from __future__ import annotations
 
@@ -14,83 +14,26 @@ Range = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
-class ProceduralConfig:
-    """Ranges of a family of tunnels. A pair is the least and the largest value; draws are uniform unless said.
-
-    Source: widths and pockets are those of the packaged bore (5.65 m between the walls at LiDAR height, pockets 0.20 m
-    long, 0.13 m deep and 0.22 m from the joint), the rest metro practice; radii go down to 60 m where 150 to 300 m are
-    usual.
+class LineRanges:
+    """Ranges that centrelines are drawn from. A pair is the least and the largest value; draws are uniform unless said.
 
     Attributes:
-        length: Length of the centreline, m.
         radius: Radius of a bend, m, drawn uniformly in its logarithm.
         straight: Length between two bends, m.
         arc: Length of constant curvature, m.
         transition: Length of each clothoid, over which the curvature changes evenly, m.
         turn: Largest turn of one bend, without its clothoids, rad.
         reverse_share: Share of bends followed by the opposite bend without a straight.
-        width: Mean distance between the smooth walls, m.
-        width_sd: Standard deviation of the width's slow variation along one tunnel, m.
-        width_wave: Correlation length of that variation, m.
-        roughness: Standard deviation of each wall about its smooth line, m.
-        correlation: Correlation length of that roughness, m.
-        ring_pitch: Distance between ring joints, m.
-        pocket_depth: Depth of the recesses, m.
-        pocket_length: Length of a recess along the wall, m.
-        pocket_offset: Distance of a recess's middle from its joint, m; there is one on either side of a joint.
-        pocket_missing: Share of recesses left out.
-        one_wall_share: Share of tunnels in which the LiDAR plane crosses a row of recesses on one wall only.
-        bracket_spacing: Distance between cable brackets on the right wall of the furnished lining, m.
-        post_spacing: Distance between handrail posts on the left of the furnished lining, m.
-        lidar_height: Height of the LiDAR plane above the floor, m; recorded only, since the family is planar.
         grid_step: Step of the station grid, m.
-        wall_step: Distance between two vertices of a smooth wall, m.
     """
 
-    length: Range = (200.0, 500.0)
-    radius: Range = (60.0, 1000.0)
-    straight: Range = (15.0, 70.0)
-    arc: Range = (20.0, 90.0)
-    transition: Range = (10.0, 30.0)
-    turn: float = 1.6
+    radius: Range
+    straight: Range
+    arc: Range
+    transition: Range
+    turn: float
     reverse_share: float = 0.3
-    width: Range = (5.085, 6.215)
-    width_sd: Range = (0.0, 0.02)
-    width_wave: Range = (15.0, 40.0)
-    roughness: Range = (0.0, 0.015)
-    correlation: Range = (0.5, 3.0)
-    ring_pitch: Range = (1.2, 1.5)
-    pocket_depth: Range = (0.05, 0.15)
-    pocket_length: Range = (0.15, 0.25)
-    pocket_offset: Range = (0.18, 0.28)
-    pocket_missing: Range = (0.0, 0.3)
-    one_wall_share: float = 0.3
-    bracket_spacing: Range = (1.8, 2.2)
-    post_spacing: Range = (1.8, 2.2)
-    lidar_height: float = 0.7
     grid_step: float = 0.25
-    wall_step: float = 0.35
-
-    def check(self) -> None:
-        """Check that tunnels can be drawn from the ranges.
-
-        Raises:
-            ValueError: A range is empty or not positive, a share is outside [0, 1], or recesses would overlap.
-        """
-        may_be_zero = {"width_sd", "roughness", "pocket_missing"}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            low, high = value if isinstance(value, tuple) else (value, value)
-            least_ok = low >= 0.0 if field.name in may_be_zero or field.name.endswith("_share") else low > 0.0
-            if not (least_ok and low <= high):
-                raise ValueError(f"{field.name} of the family must be positive and not empty, got {value}")
-            if (field.name.endswith("_share") or field.name == "pocket_missing") and high > 1.0:
-                raise ValueError(f"{field.name} of the family must be at most 1, got {value}")
-        if self.pocket_length[1] >= min(2.0 * self.pocket_offset[0], self.ring_pitch[0] - 2.0 * self.pocket_offset[1]):
-            raise ValueError(
-                f"recesses of {self.pocket_length} m at {self.pocket_offset} m from joints "
-                f"{self.ring_pitch} m apart would overlap"
-            )
 
 
 # Parts of a tunnel more than _ALONG apart along it stay more than _APART from one another, m: a LiDAR with a reach of
@@ -154,45 +97,45 @@ class Alignment:
         return self.position(station) + lateral[:, None] * normal
 
 
-def draw_alignment(rng: np.random.Generator, length: float, config: ProceduralConfig) -> Alignment:
+def draw_alignment(rng: np.random.Generator, length: float, ranges: LineRanges) -> Alignment:
     """Draw a centreline of bends and straights that stays clear of itself.
 
     Args:
         rng: Source of randomness.
         length: Length, m.
-        config: The family.
+        ranges: Ranges of its bends and straights.
 
     Raises:
-        SubterraError: The family's bends are such that hardly any centreline stays clear of itself.
+        SubterraError: The bends are such that hardly any centreline stays clear of itself.
     """
     for _ in range(_TRIES):
-        knot, curvature = _bends(rng, length, config)
-        alignment = Alignment(knot, curvature, length, config.grid_step)
+        knot, curvature = _bends(rng, length, ranges)
+        alignment = Alignment(knot, curvature, length, ranges.grid_step)
         if _clear(alignment):
             return alignment
     raise SubterraError(
-        f"none of {_TRIES} centrelines of {length:.0f} m with radii of {config.radius} m and turns of up to "
-        f"{config.turn} rad stays {_APART:.0f} m clear of itself"
+        f"none of {_TRIES} centrelines of {length:.0f} m with radii of {ranges.radius} m and turns of up to "
+        f"{ranges.turn} rad stays {_APART:.0f} m clear of itself"
     )
 
 
 def _bends(
-    rng: np.random.Generator, length: float, config: ProceduralConfig
+    rng: np.random.Generator, length: float, ranges: LineRanges
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Draw knots of the curvature until beyond the length."""
-    knot, curvature = [0.0, rng.uniform(*config.straight)], [0.0, 0.0]
+    knot, curvature = [0.0, rng.uniform(*ranges.straight)], [0.0, 0.0]
     side = rng.choice([-1.0, 1.0])
     while knot[-1] < length:
-        bend = side / np.exp(rng.uniform(*np.log(config.radius)))
-        arc = min(rng.uniform(*config.arc), config.turn / abs(bend))
-        knot += [knot[-1] + rng.uniform(*config.transition)]
+        bend = side / np.exp(rng.uniform(*np.log(ranges.radius)))
+        arc = min(rng.uniform(*ranges.arc), ranges.turn / abs(bend))
+        knot += [knot[-1] + rng.uniform(*ranges.transition)]
         knot += [knot[-1] + arc]
         curvature += [bend, bend]
-        if rng.random() < config.reverse_share:
+        if rng.random() < ranges.reverse_share:
             side = -side
             continue
-        knot += [knot[-1] + rng.uniform(*config.transition)]
-        knot += [knot[-1] + rng.uniform(*config.straight)]
+        knot += [knot[-1] + rng.uniform(*ranges.transition)]
+        knot += [knot[-1] + rng.uniform(*ranges.straight)]
         curvature += [0.0, 0.0]
         side = rng.choice([-1.0, 1.0])
     return np.array(knot), np.array(curvature)
@@ -209,8 +152,6 @@ def _clear(alignment: Alignment) -> bool:
 
 
 _FINE = 8  # samples of a random line in one correlation length
-_END = 0.1  # ends of a tunnel without recesses, m
-BRACKET, POST, RAIL, AIR = 0.05, 0.05, 0.15, 0.01  # sides of both; gaps behind posts and brackets, m
 
 
 def wander(
@@ -238,40 +179,3 @@ def wall(
 ) -> Wall:
     """Return a wall `distance` metres to the left (`side` 1) or right (−1) of the centreline."""
     return Wall(vertex=alignment.offset(station, side * distance), station=station)
-
-
-def recess_starts(
-    rng: np.random.Generator, joint: Float[np.ndarray, " j"], offset: float, length: float, missing: float, end: float
-) -> Float[np.ndarray, " p"]:
-    """Draw the stations at which the recesses of one row begin, m: two per joint, less the missing ones.
-
-    Args:
-        rng: Source of randomness.
-        joint: Ring joints, m.
-        offset: Distance of a recess's middle from its joint, m.
-        length: Length of a recess, m.
-        missing: Share to leave out.
-        end: Length of the tunnel, m; recesses across its end are left out too.
-    """
-    starts = (joint[:, None] + np.array([-offset, offset]) - 0.5 * length).ravel()
-    there = rng.random(len(starts)) >= missing
-    return starts[there & (starts > _END) & (starts + length < end - _END)]
-
-
-def outlines(
-    alignment: Alignment, station: Float[np.ndarray, " f"], near: Float[np.ndarray, " f"],
-    far: Float[np.ndarray, " f"], length: float,
-) -> Float[np.ndarray, "g 4"]:  # fmt: skip
-    """Return closed outlines of boxes beside the centreline as segments `x0, y0, x1, y1`, m.
-
-    Args:
-        alignment: The centreline.
-        station: Stations of the boxes' middles, m.
-        near: One side of each box, m to the left of the centreline.
-        far: The other side, m to the left of the centreline.
-        length: Length of each box along the tunnel, m.
-    """
-    before, after = station - 0.5 * length, station + 0.5 * length
-    corners = [alignment.offset(s, d) for s, d in ((before, near), (after, near), (after, far), (before, far))]
-    outline = np.stack(corners, axis=1)
-    return np.concatenate([outline, np.roll(outline, -1, axis=1)], axis=2).reshape(-1, 4)

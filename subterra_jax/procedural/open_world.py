@@ -16,7 +16,7 @@ import numpy as np
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.procedural.bore import Bore, draw_bore
 from subterra_jax.procedural.cut import Cut, cut_lining, plane_walls
-from subterra_jax.procedural.geometry import Alignment, ProceduralConfig, draw_alignment, wander
+from subterra_jax.procedural.geometry import Alignment, LineRanges, draw_alignment, wander
 from subterra_jax.procedural.kinds import (
     BENCHES,
     FIXTURES,
@@ -45,9 +45,7 @@ _HALF = 0.5  # share of the furniture of a kind that a tunnel with `some` has
 _ROOM = 1.0  # m to either side over which the narrowest place counts as the half width
 
 # Radii of main lines and metros; from memory, not looked up.
-LINE = ProceduralConfig(
-    radius=(150.0, 3000.0), straight=(40.0, 400.0), arc=(40.0, 300.0), transition=(30.0, 90.0), turn=1.2
-)
+LINE = LineRanges(radius=(150.0, 3000.0), straight=(40.0, 400.0), arc=(40.0, 300.0), transition=(30.0, 90.0), turn=1.2)
 GRADE_SD, GRADE_MOST, GRADE_WAVE = 0.01, 0.035, 250.0  # 1, 1, m: slopes of railways, from memory, not looked up
 
 
@@ -180,6 +178,12 @@ def _half_width(bore: Bore, station: np.ndarray, rough: Cut) -> np.ndarray:
     reach = round(_ROOM / bore.kind.step)
     rows = np.lib.stride_tricks.sliding_window_view(np.pad(nearest, reach, mode="edge"), 2 * reach + 1)
     return np.interp(station, bore.grid.station, rows.min(axis=1))
+
+
+def in_benchmark(name: str) -> bool:
+    """Tell whether a name is of a tunnel that the benchmark's own kinds make, whatever a user has registered."""
+    match = _NAME.fullmatch(name)
+    return match is not None and (match[1] is None or match[1] in KINDS)
 
 
 def _parse(name: str) -> tuple[str, str, int]:

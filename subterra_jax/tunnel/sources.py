@@ -1,8 +1,10 @@
 """Tunnels by name: packaged ones, files and generated ones. A complaint about a file names the file and the field."""
 
+import concurrent.futures
 import dataclasses
+import functools
 import hashlib
-import re
+import os
 import zipfile
 from collections.abc import Iterable, Sequence
 from importlib import resources
@@ -14,7 +16,9 @@ import numpy as np
 
 from subterra_jax.host.errors import TunnelError
 from subterra_jax.host.versions import BUILD_AGAIN, other_schema
-from subterra_jax.procedural import default_lining, expand, generate
+from subterra_jax.procedural import GENERATED, default_lining, expand, generate
+from subterra_jax.procedural.open_world import in_benchmark
+from subterra_jax.tunnel.kept import keep
 from subterra_jax.tunnel.plan import Lining, TunnelPlan, Wall
 from subterra_jax.tunnel.shell import N_BRICK, SPACING, Shell, ShellLining
 from subterra_jax.tunnel.tunnel import Tunnel, stack
@@ -38,7 +42,7 @@ class _Fields:
             with np.load(path, allow_pickle=False) as data:
                 self.data = {name: data[name] for name in data.files}
         except FileNotFoundError as error:
-            by_name = f"; by name there are {', '.join(PACKAGED)}, control, open:SPLIT:INDEX and procedural:SPLIT:INDEX"
+            by_name = f"; by name there are {', '.join(PACKAGED)}, control, open:SPLIT:INDEX and open:KIND:SPLIT:INDEX"
             a_name = path.parent == Path() and not path.suffix
             raise TunnelError(f"{path}: no such tunnel file{by_name if a_name else ''}") from error
         except Exception as error:  # zipfile, zlib and NumPy each raise their own for a damaged archive
@@ -236,7 +240,6 @@ PACKAGED = ("subterra-351", "metro-asbuilt", "metro-universal", "subterra-univer
 # The walls of packaged tunnels stay, byte for byte, since every score depends on them. The bore in three dimensions of
 # the first two lies beside them, from the same survey built again; that of the others is in the same file.
 SOLID = "-solid.npz"
-GENERATED = re.compile(r"control|procedural:.*|(.+:)?open:.*")  # names of generated tunnels
 
 Source = Tunnel | TunnelPlan | str | Path | None
 
@@ -254,7 +257,7 @@ def load_tunnel(path: str | Path | None = None, *, solid: bool = False) -> Tunne
         path: The file; the name of a packaged tunnel (`subterra-351`, `metro-asbuilt`, `metro-universal`,
             `subterra-universal`); `control`, the bore without landmarks; `open:SPLIT:INDEX` or
             `open:KIND:SPLIT:INDEX`, one of the open world, after `FILE.py:` where a user's file registers
-            the kind; or `procedural:SPLIT:INDEX`, one of the older family. `None` is the first packaged one.
+            the kind. `None` is the first packaged one.
         solid: Give a tunnel of the open world its shell too, the bore in three dimensions; a file that has one always
             comes with it.
 
@@ -323,14 +326,26 @@ def resolve(
     if tunnel is not None and not isinstance(tunnel, TunnelPlan | str | Path):
         if not isinstance(tunnel, Iterable):
             raise ValueError(f"a tunnel is a name, a file, a plan, a Tunnel or a list of these, got {tunnel!r}")
-        return stack([resolve(each, lining, piece, reach, spatial) for each in tunnel])
+        sources = list(tunnel)
+        one = functools.partial(resolve, lining=lining, piece=piece, reach=reach, spatial=spatial)
+        if not all(isinstance(each, str) and in_benchmark(each) for each in sources):
+            return stack([one(each) for each in sources])
+        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:  # most of the work is NumPy's
+            return stack(list(pool.map(one, sources)))
     if isinstance(tunnel, TunnelPlan):
-        plan = tunnel
-    elif GENERATED.fullmatch(str(tunnel)):
-        # No more than is needed is made.
-        plan = generate(str(tunnel), (lining or default_lining(str(tunnel)),), spatial)
-    else:
-        plan = load_tunnel(tunnel)
+        return _put(tunnel, lining, piece, reach, spatial)
+    if not GENERATED.fullmatch(str(tunnel)):
+        return _put(load_tunnel(tunnel), lining, piece, reach, spatial)
+    # No more than is needed is made.
+    name, lining = str(tunnel), lining or default_lining(str(tunnel))
+    make = lambda: _put(generate(name, (lining,), spatial), lining, piece, reach, spatial)  # noqa: E731
+    return keep(make, name, lining, piece, reach, spatial) if in_benchmark(name) else make()
+
+
+def _put(
+    plan: TunnelPlan, lining: str | None, piece: tuple[float, float] | None, reach: float, spatial: bool
+) -> Tunnel:
+    """Put a plan on the device; arguments as for `resolve`."""
     if piece is not None:
         name = lining or plan.default_lining
         plan = dataclasses.replace(plan, linings={name: plan.lining(name)})  # no more than is needed is cut

@@ -102,7 +102,7 @@ def drive_episode(
     yield from drive(env, params, driver, seed, names)
 
 
-_GENERATED = ("control", "procedural:test:0", "procedural:test:1", "procedural:test:2")
+_GENERATED = ("control", "open:val:0", "open:val:1", "open:val:2")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,7 +33,7 @@ def test_a_tunnel_by_name_is_rolled_out(tmp_path: Path) -> None:
 
 def test_a_tunnel_without_a_bore_is_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(BenchmarkError, match="no bore in three dimensions"):
-        linings.run(linings.LiningsConfig(tunnels=("procedural:test:0",), out=tmp_path))
+        linings.run(linings.LiningsConfig(tunnels=("control",), out=tmp_path))
 
 
 def test_a_rendered_bore_is_dark_in_its_middle_and_light_around() -> None:

@@ -1,10 +1,13 @@
 """Boxes around pieces of wall: known rectangles, lids over pockets, and windows found by brute force."""
 
+import functools
+
 import numpy as np
 import pytest
 
-from subterra_jax import procedural
+import subterra_jax as st
 from subterra_jax.lidar import reference
+from subterra_jax.procedural import open_world
 from subterra_jax.tunnel import Tunnel, blocks
 from subterra_jax.tunnel.blocks import windows
 from subterra_jax.tunnel.distances import distance_to_segment
@@ -62,8 +65,8 @@ def test_the_distance_to_a_segment_is_that_to_its_line_or_its_nearer_end():
 
 
 def test_windows_hold_every_block_within_reach_found_one_by_one():
-    plan = procedural.plan(3, linings=("pockets",)).slice(40.0, 90.0)
-    cut = blocks.build_blocks(plan, plan.lining("pockets"), 2.0, 16)
+    plan = st.load_tunnel("open:straight:val:3").slice(40.0, 90.0)
+    cut = blocks.build_blocks(plan, plan.lining("built"), 2.0, 16)
     first, count = windows(plan, cut, 12.0)
     vertex = cut.offset + cut.centre[:, None]
     segments = [np.hstack([v[:-1], v[1:]]) for v in vertex]
@@ -74,7 +77,7 @@ def test_windows_hold_every_block_within_reach_found_one_by_one():
 
 
 def test_a_tunnel_ten_times_as_long_has_no_larger_windows():
-    long = procedural.ProceduralConfig(length=(3510.0, 3510.0))
-    tunnel = Tunnel.from_plan(procedural.plan(4, long, linings=("pockets",)))
-    assert float(tunnel.length) == pytest.approx(3510.0)
-    assert tunnel.n_scan <= procedural.family("train", 8).n_scan + 4
+    make = functools.partial(open_world.plan, "open:straight:val:3", variants=("built",), solid=False)
+    short, long = (Tunnel.from_plan(make(length=length)) for length in (351.0, 3510.0))
+    assert float(long.length) == pytest.approx(3510.0)
+    assert long.n_scan <= short.n_scan + 4

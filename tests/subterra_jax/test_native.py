@@ -213,8 +213,8 @@ print(float(st.AutoReset(env).reset(jax.random.key(0), params, 512)[0].sum()))
 """
     march = """
 import jax.numpy as jnp
-from subterra_jax import lidar3d, procedural
-plan = procedural.plan(4).slice(20.0, 60.0)
+from subterra_jax import lidar3d
+plan = st.load_tunnel("open:straight:val:4").slice(20.0, 60.0)
 relief = lidar3d.Relief.from_plan(plan)
 at = jnp.append(jnp.asarray(plan.centre[40]), plan.elevation[40] + 0.7)
 beams = jnp.tile(jnp.array([0.0, 1.0, 0.0]), (4096, 1))

@@ -52,6 +52,7 @@ def test_scans_among_boxes_agree_with_float64_on_walls_and_boxes_alike(tunnel):
     walls = plan.lining("pockets").segments
     _, state = jax.jit(env.reset)(jax.random.key(3), params)
     slots = jnp.arange(int(plan.length / obstacles.PITCH) + 1)
+    state = state.replace(obstacles=state.obstacles.replace(start=0.0))  # as if it had begun at the mouth
     own, sizes = state.obstacles, params.obstacles
     sizes = sizes.replace(first=sizes.first + own.start)
     boxes = obstacles.boxes_in(own.seed, slots, params.tunnel, sizes)

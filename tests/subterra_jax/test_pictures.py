@@ -43,7 +43,7 @@ def test_a_short_shell_keeps_its_recesses_in_place(plan):
 
 
 def test_a_plan_without_a_bore_has_upright_walls_seen_from_both_sides():
-    plan = st.load_tunnel("procedural:test:0")
+    plan = st.load_tunnel("open:val:0")
     surfaces = {surface.name: surface for surface in tunnel_surfaces(plan, None, -5.0, 20.0)}
     assert set(surfaces) == {"wall", "floor"}
     floor = surfaces["floor"].triangles.vertices
@@ -76,7 +76,7 @@ def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
     choice = TunnelChoice([plan, "control"], piece=(10.0, 60.0))
     assert choice.plan(0).name == "metro-asbuilt"
     assert choice.plan(1).length == pytest.approx(60.0)
-    assert TunnelChoice("procedural:test:0-2").plan(1).name == st.load_tunnel("procedural:test:1").name
+    assert TunnelChoice("open:val:0-2").plan(1).name == st.load_tunnel("open:val:1").name
     ready = st.make("Subterra/TraverseShort-v1")[1].tunnel
     with pytest.raises(ValueError, match="holds no heights"):
         TunnelChoice(ready).plan(0)

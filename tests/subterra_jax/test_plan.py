@@ -112,9 +112,9 @@ def test_the_ring_pitch_is_read_and_is_0_in_a_file_without_it(plan_of, arrays):
 def test_a_digest_tells_tunnels_apart_and_is_that_of_the_file_where_there_is_one(tmp_path, arrays):
     path = tunnels.write_tunnel(tmp_path / "t.npz", arrays)
     assert tunnel_digest(path) == hashlib.sha256(path.read_bytes()).hexdigest()
-    names = ("control", "procedural:test:1", "procedural:test:2", None)
+    names = ("control", "open:val:1", "open:val:2", None)
     assert len({tunnel_digest(name) for name in names}) == 4
-    assert tunnel_digest("procedural:test:1") == tunnel_digest("procedural:test:1")
+    assert tunnel_digest("open:val:1") == tunnel_digest("open:val:1")
 
 
 def test_the_packaged_tunnels_load_by_name():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax import lidar, lidar3d, procedural
+from subterra_jax import lidar, lidar3d
 from subterra_jax.lidar import reference
 from subterra_jax.lidar3d import beams
 from subterra_jax.tunnel import Tunnel
@@ -18,7 +18,8 @@ N = 64
 
 @pytest.fixture(scope="module")
 def family() -> tuple[list[st.TunnelPlan], lidar3d.Relief]:
-    plans = [procedural.plan(seed).slice(20.0, 90.0) for seed in range(4)]
+    plans = [st.load_tunnel(f"open:val:{i}").slice(20.0, 90.0) for i in range(4)]
+    plans = [dataclasses.replace(plan, elevation=0.0 * plan.elevation) for plan in plans]
     return plans, lidar3d.stack_reliefs([lidar3d.Relief.from_plan(plan) for plan in plans])
 
 

@@ -47,7 +47,7 @@ def test_the_scout_is_who_drives_unless_told_otherwise():
         ("Subterra/StopAt-v1", None, NO_TRIAL, ConfigError, "does not do 'Subterra/StopAt-v1'"),
         (SHORT, None, Legs(gait="nobody"), PolicyError, "nobody: no such policy"),
         (SHORT, None, Legs(robots=-1), ConfigError, "robots must not be negative, got -1"),
-        (SHORT, "procedural:train:0-1", NO_TRIAL, ConfigError, "the B2 walks one"),
+        (SHORT, "open:train:0-1", NO_TRIAL, ConfigError, "the B2 walks one"),
     ],
 )
 def test_what_cannot_be_is_refused_in_a_sentence(task, tunnel, legs, error, said):

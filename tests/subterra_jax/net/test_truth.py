@@ -50,4 +50,4 @@ def test_the_truth_that_is_handed_out_is_the_truth():
     known = jax.vmap(env.privileged, (0, None))(state, params)
     np.testing.assert_array_equal(known["station"], state.station)
     np.testing.assert_allclose(known["to_goal"], state.goal.station - state.station, atol=1e-4)
-    assert set(env.fields(params)) == {"ranges", "odometry", "goal", "ring_pitch"}
+    assert set(env.fields(params)) == {"ranges", "odometry", "goal", "ring_pitch", "start"}
