@@ -1,0 +1,128 @@
+"""Some episodes of each cell on record again: whether agents, tasks and tunnels are still those that were scored.
+
+`python -m benchmarks.board.again --episodes 20 --out out/again`
+"""
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from benchmarks.board.cells import read_cells, setting_of
+from benchmarks.board.columns import Column, Setting, draw_episodes, tunnel_names
+from benchmarks.board.drive import BoardConfig, Job, conditions_of_parts, enter
+from benchmarks.board.roster import make_agent
+from benchmarks.command import BenchmarkError, require_least, run_main
+from benchmarks.results import environment_facts, write_file
+from subterra_jax.evaluation import Episodes, evaluate
+from subterra_jax.host.files import require_folder
+from train.tunnels import load
+
+ON_RECORD = Path(__file__).parent / "cells.jsonl"
+_progress = Console(stderr=True, highlight=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class AgainConfig:
+    """Settings of a check.
+
+    Attributes:
+        out: Folder for `again.json`, a line for each cell.
+        cells: File of the cells.
+        tasks: Tasks of the cells to drive; all if not given.
+        agents: Agents of the cells to drive; all if not given.
+        episodes: Episodes of each cell, spread evenly over its tunnels.
+        cache: Folder in which made tunnels are kept from run to run.
+    """
+
+    out: Path
+    cells: Path = ON_RECORD
+    tasks: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()
+    episodes: int = 20
+    cache: Path | None = None
+
+
+def run(config: AgainConfig) -> int:
+    """Drives, compares and writes; returns 1 where a cell is another one.
+
+    Raises:
+        SubterraError: No cell is asked for, or the folder cannot be written.
+    """
+    require_least(config, episodes=1)
+    cells = read_cells(config.cells, conditions_of_parts(BoardConfig(config.out)))
+    cells = [cell for cell in cells if not config.tasks or cell["task"] in config.tasks]
+    cells = [cell for cell in cells if not config.agents or cell["agent"] in config.agents]
+    if not cells:
+        raise BenchmarkError(f"{config.cells}: holds no cell of these tasks and agents")
+    require_folder(config.out)
+    found = []
+    for cell in cells:
+        started = time.monotonic()
+        found.append(compare(cell, config))
+        _progress.print(f"{describe(found[-1])} ({time.monotonic() - started:.0f} s)")
+        content = {"facts": environment_facts(), "cells": found}
+        write_file(config.out / "again.json", (json.dumps(content) + "\n").encode())
+    same = sum(row["same"] for row in found)
+    print(f"{same} of {len(found)} cells have the same successes and contacts in {config.episodes} episodes")
+    return int(same < len(found))
+
+
+def compare(cell: dict[str, Any], config: AgainConfig) -> dict[str, Any]:
+    """Drive some episodes of a cell again.
+
+    Returns:
+        Task, agent, whether successes and contacts are the same, how many are not, and the largest difference of the
+        distance from the goal, m; that is rounded to 1 mm in cells.
+    """
+    setting = setting_of(cell)
+    rows = np.unique(np.linspace(0, len(cell["success"]) - 1, config.episodes).round().astype(int))
+    env, params, episodes = _enter(cell, setting, rows, config)
+    records = evaluate(env, params, make_agent(cell["agent"], env, params), episodes, len(rows))
+    then = {name: [cell[name][row] for row in rows] for name in ("success", "contact", "goal_error")}
+    differ = (records.success.astype(int) != then["success"]) | (records.contact.astype(int) != then["contact"])
+    stopped = np.array([np.nan if error is None else error for error in then["goal_error"]])
+    apart = np.abs(records.goal_error - stopped)
+    return {
+        "task": setting.words,
+        "agent": cell["agent"],
+        "same": not differ.any(),
+        "differ": int(differ.sum()),
+        "episodes": len(rows),
+        "apart": float(np.nanmax(apart)) if np.isfinite(apart).any() else None,
+        "rounded_alike": int(np.sum(np.round(records.goal_error, 3) == stopped) + np.sum(np.isnan(stopped))),
+    }
+
+
+def _enter(cell: dict[str, Any], setting: Setting, rows: np.ndarray, config: AgainConfig) -> tuple[Any, Any, Episodes]:
+    """Return environment, params and episodes of some rows of a cell, with the tunnels of these alone."""
+    columns = [Column(**column) for column in cell["columns"]]
+    size = len(cell["success"]) // len(columns)
+    drawn = draw_episodes(setting, columns, cell["tunnels"], size, setting.task == "Faulted")
+    used = np.unique(drawn.tunnel[rows])
+    names = tunnel_names(columns, cell["tunnels"])
+    made = load([names[i] for i in used], cache=config.cache, sensor=cell["sensor"])
+    env, params = enter(Job(setting, cell["agent"], cell["sensor"]), made if len(made) > 1 else made[0])
+    some = {name: values[rows] for name, values in vars(drawn).items()}
+    return env, params, Episodes(**{**some, "tunnel": np.searchsorted(used, some["tunnel"]).astype(np.int32)})
+
+
+def describe(row: dict[str, Any]) -> str:
+    """Return the comparison of a cell in a line."""
+    apart = "" if row["apart"] is None else f", stops at most {row['apart']:.3f} m apart"
+    verdict = "the same" if row["same"] else f"{row['differ']} of {row['episodes']} differ"
+    return f"{row['task']}, {row['agent']}: {verdict}{apart}"
+
+
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 0 where all cells are the same, 1 where one is not, 2 for a user's mistake."""
+    return run_main("board.again", AgainConfig, run, description=__doc__, words=words)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

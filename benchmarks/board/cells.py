@@ -1,0 +1,170 @@
+"""Cells of the board: read, put in order, summed up with their intervals, and compared with floor and ceiling."""
+
+import dataclasses
+import json
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.board.columns import Setting, tunnels_in
+from benchmarks.board.roster import ROSTER, entry_of
+from benchmarks.command import BenchmarkError
+from subterra_jax.evaluation.floor import is_above
+from subterra_jax.evaluation.records import grouped, interval
+
+SCHEMA = "subterra.board/1"
+CEILING = "ceiling"
+_ORDER = ("StopAt", "Return", "Obstructed", "Faulted", "Relocalise")
+_AGENTS = tuple(entry.name for entry in ROSTER)
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """Success of an agent in one column, or over several.
+
+    Attributes:
+        success: Share of the episodes, 0 to 1.
+        low: Lower end of its 95 % interval, by a bootstrap within tunnels.
+        high: Upper end.
+        contact: Share of the episodes that end at a wall or a box.
+        median_error: Median distance from the goal at the stop, m; None where nobody stopped.
+        floor: Success that theory allows without a look at the walls; None where it is not known.
+        n: Episodes.
+    """
+
+    success: float
+    low: float
+    high: float
+    contact: float
+    median_error: float | None
+    floor: float | None
+    n: int
+
+
+Key = tuple[str, str]  # split, kind
+
+
+def read_cells(source: Path, conditions: Collection[str]) -> list[dict[str, Any]]:
+    """Read the cells that were driven under some conditions, in the order of tasks and agents.
+
+    Args:
+        source: Folder with a file for each cell, or a file with a line for each.
+        conditions: Digests of the conditions: those of all splits, and of a few of them.
+
+    Raises:
+        BenchmarkError: There is none, or a line is no cell.
+    """
+    try:
+        files = [source] if source.is_file() else sorted(source.glob("*.json"))
+        cells = [json.loads(line) for file in files for line in file.read_text().splitlines()]
+        cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] in conditions]
+    except (ValueError, AttributeError, KeyError) as error:
+        raise BenchmarkError(f"{source}: holds something that is no cell of the board") from error
+    if not cells:
+        raise BenchmarkError(f"{source}: holds no cell of these tunnels, episodes and constants")
+    return sorted(cells, key=_place)
+
+
+def _place(cell: dict[str, Any]) -> tuple[Any, ...]:
+    place = lambda names, name: names.index(name) if name in names else len(names)  # noqa: E731
+    return cell["hidden_start"], place(_ORDER, cell["task"]), cell["task"], place(_AGENTS, cell["agent"]), cell["agent"]
+
+
+def setting_of(cell: dict[str, Any]) -> Setting:
+    """Return what was driven."""
+    return Setting(cell["task"], cell["hidden_start"])
+
+
+def settings_of(cells: Sequence[dict[str, Any]]) -> list[Setting]:
+    """Return all that was driven, in order."""
+    return list(dict.fromkeys(setting_of(cell) for cell in cells))
+
+
+def keys_of(cells: Sequence[dict[str, Any]]) -> list[Key]:
+    """Return split and kind of all columns, those of the cell with most of them first."""
+    widest = sorted(cells, key=lambda cell: -len(cell["columns"]))
+    return list(dict.fromkeys((column["split"], column["kind"]) for cell in widest for column in cell["columns"]))
+
+
+def summarise(cell: dict[str, Any], chosen: Collection[Key] | None = None) -> Score | None:
+    """Sum up the columns of a cell that are chosen, each counted alike.
+
+    Args:
+        cell: The cell.
+        chosen: Split and kind of the columns; all if None.
+
+    Returns:
+        The score; None where the cell has none of these columns.
+    """
+    size = len(cell["success"]) // len(cell["columns"])
+    rows, groups, floors, first = [], [], [], 0
+    for place, column in enumerate(cell["columns"]):
+        tunnels = tunnels_in(column["split"], cell["tunnels"])
+        if chosen is None or (column["split"], column["kind"]) in chosen:
+            rows.append(np.arange(place * size, (place + 1) * size))
+            groups.append(first + np.arange(size) % tunnels)
+            floors += [] if cell["floor"] is None else [np.mean(cell["floor"][first : first + tunnels])]
+        first += tunnels
+    if not rows:
+        return None
+    row, group = np.concatenate(rows), np.concatenate(groups)
+    success, contact = (np.array(cell[name], float)[row] for name in ("success", "contact"))
+    error = np.array([np.nan if e is None else e for e in cell["goal_error"]], float)[row]
+    low, high = interval(grouped(success, group), lambda s: s.mean(axis=(-2, -1)))
+    stopped = np.abs(error[~np.isnan(error) & (contact == 0.0)])
+    return Score(
+        success=float(success.mean()),
+        low=low,
+        high=high,
+        contact=float(contact.mean()),
+        median_error=float(np.median(stopped)) if len(stopped) else None,
+        floor=float(np.mean(floors)) if floors else None,
+        n=len(row),
+    )
+
+
+def scores_of(cells: Sequence[dict[str, Any]], setting: Setting) -> dict[str, dict[Key, Score]]:
+    """Return the scores of each agent of a task by split and kind, of all splits that it was driven in."""
+    found: dict[str, dict[Key, Score]] = {}
+    for cell in cells:
+        if setting_of(cell) == setting:
+            for column in cell["columns"]:
+                key = (column["split"], column["kind"])
+                score = summarise(cell, (key,))
+                assert score is not None
+                found.setdefault(cell["agent"], {})[key] = score
+    return found
+
+
+def over_split(cells: Sequence[dict[str, Any]], setting: Setting, agent: str, split: str) -> Score | None:
+    """Return the score of an agent over all kinds of a split; None where it was not driven in all of them."""
+    wanted = {key for key in keys_of(cells) if key[0] == split}
+    for cell in cells:
+        there = {(column["split"], column["kind"]) for column in cell["columns"]}
+        if setting_of(cell) == setting and cell["agent"] == agent and wanted <= there:
+            return summarise(cell, wanted)
+    return None
+
+
+def find_leaks(cells: Sequence[dict[str, Any]]) -> list[str]:
+    """Name the figures beyond a bound: a blind agent above the floor, or any agent above the ceiling.
+
+    A figure is beyond where the difference is more than four standard errors of the two: a table has some hundred.
+    """
+    found = []
+    for setting in settings_of(cells):
+        scores = scores_of(cells, setting)
+        for agent, of_agent in scores.items():
+            if entry_of(agent).group == "truth":
+                continue
+            for (split, kind), score in of_agent.items():
+                where = f"{agent}, {setting.words}, {kind} of {split}: {100 * score.success:.0f} % is above"
+                blind = entry_of(agent).group == "blind" and score.floor is not None
+                if blind and is_above(score.success, score.floor, score.n, 0):  # type: ignore[arg-type]
+                    found.append(f"{where} the floor, {100 * score.floor:.0f} %")  # type: ignore[operator]
+                top = scores.get(CEILING, {}).get((split, kind))
+                if top is not None and is_above(score.success, top.success, score.n, top.n):
+                    found.append(f"{where} the ceiling, {100 * top.success:.0f} %")
+    return found

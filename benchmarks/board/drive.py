@@ -1,0 +1,240 @@
+"""Drives what the board lacks: one cell for a task and an agent, in a file of its own."""
+
+import dataclasses
+import hashlib
+import itertools
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from rich.console import Console
+
+import subterra_jax as st
+from benchmarks.board.cells import SCHEMA
+from benchmarks.board.columns import FIRST, Setting, columns_of, draw_episodes, tunnel_names
+from benchmarks.board.roster import ROSTER, bare, entry_of, make_agent
+from benchmarks.command import BenchmarkError, require_least
+from benchmarks.results import environment_facts, write_file
+from subterra_jax.evaluation import evaluate
+from subterra_jax.evaluation.floor import floor
+from subterra_jax.evaluation.harness import fitting_batch
+from subterra_jax.parts.spatial_lidar import SENSORS
+from subterra_jax.policies.files import read_facts
+from subterra_jax.policies.opening import policy_source, require_known
+from subterra_jax.tasks import TASKS as TABLE
+from subterra_jax.tasks import find
+from subterra_jax.tunnel.sources import tunnel_digest
+from train.tunnels import load
+
+PLANAR = SENSORS[0]
+TASKS = ("StopAt", "Return", "Obstructed", "Faulted", "Relocalise")
+_NOT_HIDDEN = ("Relocalise",)  # its start is always hidden
+_STARTS = {"given": (False,), "hidden": (True,), "both": (False, True)}
+_progress = Console(stderr=True, highlight=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class BoardConfig:
+    """Settings of the board.
+
+    Attributes:
+        out: Folder for the cells, `board.md`, `board.png` and `records.json`.
+        tasks: Tasks, as `StopAt`, `Subterra/StopAt-v1` or `FILE.py:ID` of one's own.
+        start: Whether the start is `given`, as tasks do, `hidden`, or one after the other where a task has both.
+        agents: Agents by name; policies by name, file or run folder; code as `module:Class` or `FILE.py:Class`;
+            `cut:` and `nomap:` before a learnt localiser take away what its walls tell, or its map. All of the
+            roster if not given.
+        splits: Splits of the open world; a choice may be made on `val` alone.
+        episodes: Episodes of each kind and split.
+        tunnels: Tunnels of each kind and split, over which the episodes are spread.
+        further: Names or files of further tunnels, a column each.
+        sensor: The LiDAR of agents without a line in the roster, by name.
+        load: Python files to run first, which register tasks, agents or kinds of one's own.
+        memory: Memory that driving may take at once, GB; an agent that needs more is driven in parts of the episodes.
+        cache: Folder in which made tunnels are kept from run to run.
+        report_only: Drive nothing.
+        cells: File of cells to report in place of those in `out`, with `report_only`.
+    """
+
+    out: Path
+    tasks: tuple[str, ...] = TASKS
+    start: Literal["given", "hidden", "both"] = "both"
+    agents: tuple[str, ...] = ()
+    splits: tuple[str, ...] = ("val", "test-seen", "test-unseen")
+    episodes: int = 50
+    tunnels: int = 5
+    further: tuple[str, ...] = ()
+    sensor: str = PLANAR
+    load: tuple[Path, ...] = ()
+    memory: float = 8.0
+    cache: Path | None = None
+    report_only: bool = False
+    cells: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """One cell to drive: what, by whom, with which LiDAR."""
+
+    setting: Setting
+    agent: str
+    sensor: str
+
+
+def check(config: BoardConfig) -> None:
+    """Refuse what cannot be run, before anything is made.
+
+    Raises:
+        BenchmarkError: An agent, split or sensor is unknown, or a number is too small.
+    """
+    for agent in config.agents:
+        require_known(bare(agent))
+    require_least(config, tunnels=1, episodes=2)
+    if not columns_of(config.splits, config.further):
+        raise BenchmarkError("there is nowhere to drive: name splits or further tunnels")
+    if config.sensor not in SENSORS:
+        raise BenchmarkError(f"no sensor {config.sensor!r}; there are {', '.join(SENSORS)}")
+    if not config.memory > 0.0:
+        raise BenchmarkError(f"memory must be above 0, got {config.memory}")
+    if config.cells is not None and not (config.report_only and config.cells.is_file()):
+        raise BenchmarkError(f"{config.cells}: --cells takes a file, with --report-only")
+
+
+def jobs_of(config: BoardConfig) -> list[Job]:
+    """Return all cells that settings ask for, in the order of tasks and agents.
+
+    Raises:
+        TaskError: A task is unknown.
+    """
+    found = []
+    for name in config.tasks:
+        task = _task_name(name)
+        for hidden in _STARTS[config.start]:
+            if hidden and not _may_hide(task):
+                continue
+            for agent in config.agents or tuple(entry.name for entry in ROSTER):
+                entry, asked = entry_of(agent), bool(config.agents)
+                fits = (not entry.tasks or task in entry.tasks) and (entry.hidden or not hidden)
+                if asked or fits:
+                    sensor = config.sensor if entry.group == "other" else entry.sensor
+                    found.append(Job(Setting(task, hidden), agent, sensor))
+    return list(dict.fromkeys(found))
+
+
+def _task_name(name: str) -> str:
+    """Return a task as cells name it: the benchmark's by its short name, one's own by its id."""
+    id = find(name if "/" in name or ":" in name else f"Subterra/{name}-v1")
+    return id.removeprefix("Subterra/").removesuffix("-v1") if id.startswith("Subterra/") else id
+
+
+def _may_hide(task: str) -> bool:
+    return task not in _NOT_HIDDEN and f"Subterra/{task}Offset-v1" in TABLE
+
+
+def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
+    """Return environment and params of a cell."""
+    name = job.setting.task
+    hidden = "Offset" if job.setting.hidden_start else ""
+    id = name if "/" in name else f"Subterra/{name}{hidden}-v1"
+    return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor)
+
+
+def conditions(config: BoardConfig, sensor: str) -> str:
+    """Return a digest of what a cell depends on: constants, world, tunnels, episodes and LiDAR."""
+    content: list[Any] = [
+        st.constants_digest(version="v1"), config.splits, config.episodes, config.tunnels, FIRST
+    ]  # fmt: skip
+    if sensor != PLANAR:
+        content.append(sensor)
+    if config.further:
+        content.append([tunnel_digest(name) for name in config.further])
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
+
+
+def conditions_of_parts(config: BoardConfig) -> set[str]:
+    """Return the digests of all splits together and of every choice of them, with any LiDAR."""
+    parts = {
+        some
+        for n in range(not config.further, len(config.splits) + 1)
+        for some in itertools.combinations(config.splits, n)
+    }
+    return {conditions(dataclasses.replace(config, splits=some), sensor) for some in parts for sensor in SENSORS}
+
+
+def cell_file(config: BoardConfig, job: Job) -> Path:
+    """Return the file of a cell."""
+    words = (job.setting.words.replace(", ", "-"), job.agent, *(() if job.sensor == PLANAR else (job.sensor,)))
+    return config.out / "cells" / f"{'.'.join(re.sub(r'[^A-Za-z0-9_-]', '_', word) for word in words)}.json"
+
+
+def is_there(config: BoardConfig, job: Job) -> bool:
+    """Tell whether a cell was driven under the same conditions, with the same weights."""
+    file = cell_file(config, job)
+    if not file.exists():
+        return False
+    kept = json.loads(file.read_text())
+    return bool(kept.get("conditions") == conditions(config, job.sensor) and kept.get("policy") == weights(job.agent))
+
+
+def weights(agent: str) -> str | None:
+    """Return the digest of a policy's weights; None of a written agent."""
+    source = policy_source(bare(agent))
+    return None if source is None else str(read_facts(source)["tensors_sha256"])
+
+
+def drive(config: BoardConfig, missing: list[Job]) -> None:
+    """Drive cells, the tunnels made once for each LiDAR, and write each when it is done."""
+    columns = columns_of(config.splits, config.further)
+    names = tunnel_names(columns, config.tunnels)
+    for sensor in dict.fromkeys(job.sensor for job in missing):
+        started = time.monotonic()
+        made = load(names, cache=config.cache, sensor=sensor)
+        _progress.print(f"{len(names)} tunnels: {time.monotonic() - started:.0f} s")
+        tunnel: Any = made if len(made) > 1 else made[0]
+        floors: dict[Setting, list[float] | None] = {}
+        for job in (job for job in missing if job.sensor == sensor):
+            started = time.monotonic()
+            env, params = enter(job, tunnel)
+            tunnel = params.tunnel
+            if job.setting not in floors:
+                floors[job.setting] = floors_of(params, len(names))
+            content = cell_of(config, job, env, params, floors[job.setting])
+            content["seconds"] = round(time.monotonic() - started, 1)
+            write_file(cell_file(config, job), (json.dumps(content) + "\n").encode())
+            success, seconds = 100.0 * np.mean(content["success"]), content["seconds"]
+            _progress.print(f"{job.setting.words}, {job.agent}: {success:.1f} % ({seconds:.0f} s)")
+
+
+def floors_of(params: Any, n: int) -> list[float] | None:
+    """Return the floor in each tunnel; None where nobody has derived one, as for a task of one's own."""
+    if params.errand == "cover" or "slip" not in params.parts:
+        return None
+    return [round(floor(params, index), 4) for index in range(n)]
+
+
+def cell_of(config: BoardConfig, job: Job, env: Any, params: Any, floors: list[float] | None) -> dict[str, Any]:
+    """Drive one cell."""
+    columns = columns_of(config.splits, config.further)
+    episodes = draw_episodes(job.setting, columns, config.tunnels, config.episodes, "faults" in params.parts)
+    driver = make_agent(job.agent, env, params)
+    at_once = fitting_batch(env, params, driver, len(episodes), config.memory)
+    records = evaluate(env, params, driver, episodes, at_once)
+    return {
+        "schema": SCHEMA,
+        "conditions": conditions(config, job.sensor),
+        "task": job.setting.task,
+        "hidden_start": job.setting.hidden_start,
+        "agent": job.agent,
+        "policy": weights(job.agent),
+        "columns": [dataclasses.asdict(column) for column in columns],
+        "tunnels": config.tunnels,
+        "sensor": job.sensor,
+        "success": records.success.astype(int).tolist(),
+        "contact": records.contact.astype(int).tolist(),
+        "goal_error": [None if np.isnan(e) else round(float(e), 3) for e in records.goal_error],
+        "floor": floors,
+        "facts": {**environment_facts(), "constants_sha256": st.constants_digest(version="v1")},
+    }
