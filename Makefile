@@ -22,7 +22,7 @@ test-slow: $(STAMP)  ## the tests that take minutes
 doors: $(STAMP)    ## modes of JAX, adapters, policies and training; a part of the tests
 	$(BIN)/python -m pytest -m 'door and not slow'
 
-reproduce: $(STAMP)  ## the numbers of README and docs/results.md again, those that a CPU can measure, about 45 minutes; says which differ
+reproduce: $(STAMP)  ## the results on record again, those that a CPU can measure, about 45 minutes; says which differ
 	$(BIN)/python -m benchmarks.reproduce --shared $(SHARED)
 
 arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 8 to 10 minutes and 2.2 GB; goes on where it stopped
@@ -31,7 +31,8 @@ arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 8 t
 figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores; goes on where it stopped
 	$(BIN)/python -m benchmarks.paper --out out/figures
 
-docs: $(STAMP)   ## the documentation into build/site, warnings as errors, nothing fetched
+docs: $(STAMP)   ## the documentation into build/site, its tables checked against the records, warnings as errors
+	$(BIN)/python -m benchmarks.records check
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 lint: $(STAMP)   ## ruff and mypy

@@ -22,6 +22,7 @@ from benchmarks.command import run_main
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.derive.surface import Nearest, visible_mesh
 from benchmarks.fidelity.references import HoldConfig, load_hold
+from benchmarks.records import Record, measured, write_records
 from benchmarks.truth import compare, load_truth
 from scene.survey.config import SurveyConfig, TruthName, check_survey
 from subterra_jax.host.files import require_folder
@@ -187,6 +188,41 @@ def run(config: ReconstructionConfig) -> None:
     facts = {"config": asdict(config) | {"out": str(config.out)}, "provenance": "simulated", "rows": rows}
     name = f"figures-{config.truth}-{config.length:g}.json"
     (config.out / name).write_text(json.dumps(facts, indent=1) + "\n")
+    write_records(config.out / "records.json", records_of(config, rows))
+
+
+# Record of a figure: its name, its scale and its unit; sizes alone count.
+_RECORDS = {
+    "length_error": ("length", 1.0, "%"),
+    "lateral_rmse": ("centreline", 100.0, "cm"),
+    "width_rmse": ("width", 100.0, "cm"),
+    "height_rmse": ("height", 100.0, "cm"),
+    "hold_mean": ("held-out", 100.0, "cm"),
+    "hold_within_10cm": ("within-10-cm", 100.0, "%"),
+    "seconds": ("time", 1.0 / 60.0, "min"),
+}
+
+
+def records_of(config: ReconstructionConfig, rows: list[dict[str, Any]]) -> list[Record]:
+    """Return the figures of the first seed as records."""
+    command = (
+        f"benchmarks.reconstruction --seeds {config.seeds[0]} --length {config.length:g} --truth {config.truth} "
+        "--out out/reconstruction"
+    )
+    where = f"simulated survey of {config.length:g} m"
+    return [
+        measured(
+            f"reconstruction/{row['poses']}/{id}",
+            round(scale * abs(row[name]), 3),
+            unit,
+            command,
+            split=where,
+            seed=row["seed"],
+        )
+        for row in rows
+        if row["seed"] == config.seeds[0]
+        for name, (id, scale, unit) in _RECORDS.items()
+    ]
 
 
 REACH = 0.15  # m, largest distance between a feature and its match

@@ -4,7 +4,7 @@ A record is one figure. Commands write theirs to `records.json` beside their oth
 `python -m benchmarks.records keep out/board/records.json` takes them over into `benchmarks/results/`, a file for each
 family (the first word of an id). A page holds a table's template in a comment, with ids in braces, and the rendered
 table behind it: `python -m benchmarks.records render` writes it anew, and `check` fails where a record is missing or a
-page is stale.
+page is stale. A line `{board: SPLIT}` stands for the board's tables by kind.
 """
 
 import dataclasses
@@ -26,6 +26,7 @@ SCHEMA = "subterra.records/1"
 _VERSIONS = ("python", "jax", "numpy", "subterra-jax")
 _BLOCK = re.compile(r"<!-- records\n(.*?)-->\n(.*?)<!-- /records -->", re.DOTALL)
 _FIGURE = re.compile(r"\{([\w.+-]+(?:/[\w.+-]+)+)(?:\|(\w+))?\}")
+_BOARD = re.compile(r"\{board: ([\w-]+)\}\n")
 _ID = re.compile(r"[\w.+-]+(/[\w.+-]+)+")
 
 
@@ -204,9 +205,19 @@ def rendered(text: str, records: dict[str, Record], page: str) -> str:
 
     def block(found: re.Match[str]) -> str:
         template = found[1]
-        return f"<!-- records\n{template}-->\n{_FIGURE.sub(figure, template)}<!-- /records -->"
+        text = _BOARD.sub(lambda split: board(split[1]), template)
+        return f"<!-- records\n{template}-->\n{_FIGURE.sub(figure, text)}<!-- /records -->"
 
     return _BLOCK.sub(block, text)
+
+
+def board(split: str) -> str:
+    """Return tables of the board's cells on record: by kind of lining in one split, or the one of a `screen`."""
+    from benchmarks.board.cells import read_cells  # with JAX, which the other pages do without
+    from benchmarks.board.tables import kinds_markdown, screen_markdown
+
+    cells = read_cells(FOLDER.parent / "board" / "cells.jsonl")
+    return screen_markdown(cells) if split == "screen" else kinds_markdown(cells, split)
 
 
 def pages() -> list[Path]:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks import render
+from benchmarks.draw import scene as drawing
 from benchmarks.truth import Comparison, Truth, centreline, compare, start_placement
 
 _STYLE = """
@@ -273,7 +273,7 @@ def _bore_parts(out: Path, summary: dict[str, Any], truth: Truth) -> list[str]:
         placement = start_placement(blind / "odometry.tum", out / "survey" / "groundtruth.tum")
         odometry = Axis("reconstructed, odometry alone", *centreline(blind, placement))
     parts = []
-    view = render.picture(scene)
+    view = drawing.picture(scene)
     if view is not None:
         parts.append(html_figure(view, "The scene in MuJoCo, from the camera of its scout robot."))
     else:

@@ -18,6 +18,7 @@ from benchmarks.board.columns import Column, Setting, draw_episodes, tunnel_name
 from benchmarks.board.drive import BoardConfig, Job, conditions_of_parts, enter
 from benchmarks.board.roster import make_agent
 from benchmarks.command import BenchmarkError, require_least, run_main
+from benchmarks.records import measured, write_records
 from benchmarks.results import environment_facts, write_file
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.host.files import require_folder
@@ -69,6 +70,9 @@ def run(config: AgainConfig) -> int:
         content = {"facts": environment_facts(), "cells": found}
         write_file(config.out / "again.json", (json.dumps(content) + "\n").encode())
     same = sum(row["same"] for row in found)
+    command = f"benchmarks.board.again --episodes {config.episodes} --out out/again"
+    share = measured("board/again/same", round(100.0 * same / len(found), 1), "%", command, n=len(found))
+    write_records(config.out / "records.json", [share])
     print(f"{same} of {len(found)} cells have the same successes and contacts in {config.episodes} episodes")
     return int(same < len(found))
 

@@ -46,12 +46,12 @@ class Score:
 Key = tuple[str, str]  # split, kind
 
 
-def read_cells(source: Path, conditions: Collection[str]) -> list[dict[str, Any]]:
+def read_cells(source: Path, conditions: Collection[str] | None = None) -> list[dict[str, Any]]:
     """Read the cells that were driven under some conditions, in the order of tasks and agents.
 
     Args:
         source: Folder with a file for each cell, or a file with a line for each.
-        conditions: Digests of the conditions: those of all splits, and of a few of them.
+        conditions: Digests of the conditions: those of all splits, and of a few of them; None takes all.
 
     Raises:
         BenchmarkError: There is none, or a line is no cell.
@@ -59,7 +59,8 @@ def read_cells(source: Path, conditions: Collection[str]) -> list[dict[str, Any]
     try:
         files = [source] if source.is_file() else sorted(source.glob("*.json"))
         cells = [json.loads(line) for file in files for line in file.read_text().splitlines()]
-        cells = [cell for cell in cells if cell.get("schema") == SCHEMA and cell["conditions"] in conditions]
+        cells = [cell for cell in cells if cell.get("schema") == SCHEMA]
+        cells = [cell for cell in cells if conditions is None or cell["conditions"] in conditions]
     except (ValueError, AttributeError, KeyError) as error:
         raise BenchmarkError(f"{source}: holds something that is no cell of the board") from error
     if not cells:

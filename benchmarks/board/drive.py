@@ -24,14 +24,13 @@ from subterra_jax.evaluation.harness import fitting_batch
 from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.policies.files import read_facts
 from subterra_jax.policies.opening import policy_source, require_known
-from subterra_jax.tasks import TASKS as TABLE
 from subterra_jax.tasks import find
 from subterra_jax.tunnel.sources import tunnel_digest
 from train.tunnels import load
 
 PLANAR = SENSORS[0]
 TASKS = ("StopAt", "Return", "Obstructed", "Faulted", "Relocalise")
-_NOT_HIDDEN = ("Relocalise",)  # its start is always hidden
+_HIDES = ("StopAt", "Return", "Obstructed", "Faulted")
 _STARTS = {"given": (False,), "hidden": (True,), "both": (False, True)}
 _progress = Console(stderr=True, highlight=False)
 
@@ -126,26 +125,26 @@ def jobs_of(config: BoardConfig) -> list[Job]:
 
 def _task_name(name: str) -> str:
     """Return a task as cells name it: the benchmark's by its short name, one's own by its id."""
-    id = find(name if "/" in name or ":" in name else f"Subterra/{name}-v1")
+    id = find(name, short=True)
     return id.removeprefix("Subterra/").removesuffix("-v1") if id.startswith("Subterra/") else id
 
 
 def _may_hide(task: str) -> bool:
-    return task not in _NOT_HIDDEN and f"Subterra/{task}Offset-v1" in TABLE
+    return task in _HIDES
 
 
 def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
     """Return environment and params of a cell."""
     name = job.setting.task
-    hidden = "Offset" if job.setting.hidden_start else ""
-    id = name if "/" in name else f"Subterra/{name}{hidden}-v1"
-    return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor)
+    id = name if "/" in name else f"Subterra/{name}-v1"
+    hidden = {"hidden_start": True} if job.setting.hidden_start else {}
+    return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor, **hidden)
 
 
 def conditions(config: BoardConfig, sensor: str) -> str:
     """Return a digest of what a cell depends on: constants, world, tunnels, episodes and LiDAR."""
     content: list[Any] = [
-        st.constants_digest(version="v1"), config.splits, config.episodes, config.tunnels, FIRST
+        st.constants_digest(), config.splits, config.episodes, config.tunnels, FIRST
     ]  # fmt: skip
     if sensor != PLANAR:
         content.append(sensor)
@@ -236,5 +235,5 @@ def cell_of(config: BoardConfig, job: Job, env: Any, params: Any, floors: list[f
         "contact": records.contact.astype(int).tolist(),
         "goal_error": [None if np.isnan(e) else round(float(e), 3) for e in records.goal_error],
         "floor": floors,
-        "facts": {**environment_facts(), "constants_sha256": st.constants_digest(version="v1")},
+        "facts": {**environment_facts(), "constants_sha256": st.constants_digest()},
     }

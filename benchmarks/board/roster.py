@@ -79,7 +79,7 @@ def make_agent(name: str, env: Any, params: EnvParams) -> Any:
         BenchmarkError: It has nothing to do without.
         SubterraError: There is no such agent or policy, or it does not fit the task.
     """
-    agent = open_agent(bare(name), env, params)
+    agent: Any = open_agent(bare(name), env, params)
     if name == bare(name):
         return agent
     method, lacks = ("without_walls", "walls") if name.startswith(CUT) else ("without_map", "map")

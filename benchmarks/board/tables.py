@@ -43,7 +43,7 @@ def best_of(cells: Sequence[dict[str, Any]], setting: Setting, groups: tuple[Gro
     return max(sorted(agents), key=lambda agent: chosen[agent].success, default=None)  # type: ignore[union-attr]
 
 
-def screen(cells: Sequence[dict[str, Any]], split: str = SPLIT) -> list[dict[str, tuple[str, Score] | float | None]]:
+def screen(cells: Sequence[dict[str, Any]], split: str = SPLIT) -> list[dict[str, Any]]:
     """Return a row for each task: setting, floor, and by heading the agent and its score over all kinds of a split."""
     rows = []
     for setting in settings_of(cells):
@@ -134,6 +134,29 @@ def _by_kind(cells: Sequence[dict[str, Any]], setting: Setting, split: str) -> l
     for agent, some in scores.items():
         lines.append(f"| {agent} | {entry_of(agent).tuned} | " + " | ".join(_cell(some.get(k)) for k in kinds) + " |")
     return lines
+
+
+def kinds_markdown(cells: Sequence[dict[str, Any]], split: str) -> str:
+    """Return one table for each task of a split: success in % alone, by kind."""
+    lines: list[str] = []
+    for setting in settings_of(cells):
+        scores = scores_of(cells, setting)
+        kinds = [kind for at, kind in keys_of(cells) if at == split]
+        rows = {agent: [some.get((split, kind)) for kind in kinds] for agent, some in scores.items()}
+        rows = {agent: row for agent, row in rows.items() if any(row)}
+        if not rows:
+            continue
+        lines += ["", f"| **{setting.words}** | {' | '.join(kinds)} |", "|---|" + "---|" * len(kinds)]
+        floors = [
+            next((score.floor for row in rows.values() if (score := row[i]) is not None), None)
+            for i in range(len(kinds))
+        ]
+        if any(bound is not None for bound in floors):
+            lines.append(f"| *floor* | {' | '.join('-' if b is None else f'{100 * b:.0f}' for b in floors)} |")
+        for agent, row in rows.items():
+            name = f"*{agent}*" if entry_of(agent).group in ("ceiling", "truth") else agent
+            lines.append(f"| {name} | {' | '.join('-' if s is None else f'{100 * s.success:.0f}' for s in row)} |")
+    return "\n".join(lines[1:]) + "\n"
 
 
 def _cell(score: Score | None) -> str:

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from benchmarks.command import BenchmarkError, run_main
-from benchmarks.render import BACKENDS, light_up, render_in_subprocess
+from benchmarks.draw.scene import BACKENDS, light_up, render_in_subprocess
 
 _NAME = "paper"
 _TIMEOUT = 300.0  # s

@@ -202,12 +202,12 @@ def test_recorder_and_viewer_take_a_file_a_run_folder_and_a_class_of_other_peopl
 
 
 @pytest.mark.slow
-def test_leaderboard_recorder_and_viewer_drive_with_each_of_them(places):
-    from benchmarks.leaderboard.__main__ import main as leaderboard
+def test_board_recorder_and_viewer_drive_with_each_of_them(places):
+    from benchmarks.board.__main__ import main as board
 
-    words = ("--tasks", "TraverseShort", "--episodes", "1", "--batch", "1", "--out", "board", "--agents", *DRIVERS)
-    assert leaderboard(list(words)) == 0
-    table = (places / "board" / "leaderboard.md").read_text()
+    words = ("--tasks", DRIVEN, "--episodes", "2", "--out", "board", "--agents", *DRIVERS)
+    assert board([*words, "--splits", "--further", "subterra-351"]) == 0
+    table = (places / "board" / "board.md").read_text()
     assert all(f"| {name} |" in table for name in DRIVERS)
     plan = st.load_tunnel().slice(0.0, 60.0)
     for k, name in enumerate(DRIVERS):

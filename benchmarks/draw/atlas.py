@@ -1,11 +1,10 @@
 """Atlas of a tunnel: bound of one scan and drift of a perfect filter along it, by lining and sensor.
 
-`python -m benchmarks.atlas build/tunnel --linings pockets smooth --out out/atlas`
+`python -m benchmarks.draw atlas build/tunnel --linings pockets smooth --out out/atlas`
 """
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -146,8 +145,4 @@ def draw_atlas(name: str, found: dict[str, Localisability]) -> Figure:
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
-    return run_main("atlas", AtlasConfig, run, description=__doc__, words=words)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return run_main("draw atlas", AtlasConfig, run, description=__doc__, words=words)

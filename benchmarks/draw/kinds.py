@@ -1,12 +1,10 @@
 """Pictures of the kinds of lining: the wall rolled out flat, a section with the sensor's plane, and the plan.
 
-`python -m benchmarks.linings --out docs/kinds`; with `--tunnels metro-universal --render` tunnels by name rolled out
-flat, and a sheet of all kinds rendered.
+`python -m benchmarks.draw kinds --out docs/kinds`
 """
 
 import dataclasses
 import io
-import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -16,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from benchmarks.bores import contact_sheet, unrolled_picture
 from benchmarks.command import BenchmarkError, run_main
 from benchmarks.results import png_bytes, write_file
 from subterra_jax.host.files import require_folder
@@ -24,35 +21,29 @@ from subterra_jax.host.loading import load_module
 from subterra_jax.procedural.bore import Bore
 from subterra_jax.procedural.kinds import KINDS, all_kinds
 from subterra_jax.procedural.open_world import HELD_OUT, UNSEEN, Drawn, draw, plan
-from subterra_jax.tunnel.sources import load_tunnel
 
-_RENDERED = 80.0  # m of tunnel made for a rendered picture
 _COLOURS = 48  # of a picture, to keep it small
 _INK, _PLANE, _POCKET, _BOX = "#222222", "#c1121f", "#1b4965", "#e09f3e"
 
 
 @dataclasses.dataclass(frozen=True)
-class LiningsConfig:
+class KindsConfig:
     """Settings of the pictures.
 
     Attributes:
         kinds: Kinds of lining, `FILE.py:NAME` for one of your own; all of the benchmark if not given.
         index: Index of the tunnel in its split; the default lies behind every tunnel that results are made with.
         length: Length of tunnel to draw, m.
-        tunnels: Tunnels by name or file to roll out instead, in their default lining.
-        render: Render the kinds into one sheet, `rendered.webp`, instead.
         out: Folder for a PNG of each kind.
     """
 
     kinds: tuple[str, ...] = ()
     index: int = 900_010
     length: float = 40.0
-    tunnels: tuple[str, ...] = ()
-    render: bool = False
     out: Path = Path("out/linings")
 
 
-def run(config: LiningsConfig) -> None:
+def run(config: KindsConfig) -> None:
     """Draws the pictures.
 
     Raises:
@@ -62,18 +53,7 @@ def run(config: LiningsConfig) -> None:
     if not config.length >= 20.0:
         raise BenchmarkError(f"length must be at least 20 m, got {config.length:g}")
     require_folder(config.out)
-    for tunnel in config.tunnels:
-        scene = load_tunnel(tunnel, solid=True)
-        png = png_bytes(unrolled_picture(scene, scene.default_lining, config.length), 80)
-        write_file(config.out / f"{Path(scene.name).stem}.png", few_colours(png))
-        print(config.out / f"{Path(scene.name).stem}.png")
     names = {kind: f"open:{kind}:{'train' if kind in HELD_OUT else UNSEEN}:{config.index}" for kind in kinds}
-    if config.render:
-        plans = [(all_kinds()[kind].title, plan(name, length=_RENDERED)) for kind, name in names.items()]
-        write_file(config.out / "rendered.webp", contact_sheet(plans))
-        print(config.out / "rendered.webp")
-    if config.tunnels or config.render:
-        return
     for kind, name in names.items():
         write_file(config.out / f"{kind}.png", few_colours(png_bytes(picture(name, config.length), 80)))
         print(config.out / f"{kind}.png")
@@ -171,8 +151,4 @@ def few_colours(png: bytes) -> bytes:
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
-    return run_main("linings", LiningsConfig, run, description=__doc__, words=words)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return run_main("draw kinds", KindsConfig, run, description=__doc__, words=words)

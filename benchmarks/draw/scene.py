@@ -1,4 +1,4 @@
-"""Renders a scene off screen: `python -m benchmarks.render SCENE --out PNG`."""
+"""Renders a scene off screen: `python -m benchmarks.draw scene SCENE --out PNG`."""
 
 import os
 import subprocess
@@ -28,7 +28,7 @@ _LOOK_AHEAD = 8.0  # m
 class RenderConfig:
     """Renders a scene as one of its cameras sees it.
 
-    Example: python -m benchmarks.render build/tunnel --camera chase --out view.png
+    Example: python -m benchmarks.draw scene build/tunnel --camera chase --out view.png
 
     Attributes:
         scene: Scene folder, or an MJCF file.
@@ -47,7 +47,7 @@ class RenderConfig:
 
 def picture(scene: Path) -> np.ndarray | None:
     """Renders a view down the bore, `(height, width, 3)` uint8; `None` where no OpenGL backend works."""
-    return render_in_subprocess(["benchmarks.render", str(scene)], BACKENDS, _TIMEOUT)[0]
+    return render_in_subprocess(["benchmarks.draw", "scene", str(scene)], BACKENDS, _TIMEOUT)[0]
 
 
 def render_in_subprocess(
@@ -132,5 +132,6 @@ def check_and_render(config: RenderConfig) -> None:
         raise ValueError(f"{config.scene}: {fault}") from fault
 
 
-if __name__ == "__main__":
-    sys.exit(run_main("render", RenderConfig, check_and_render))
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 2 for a user's mistake."""
+    return run_main("draw scene", RenderConfig, check_and_render, words=words)

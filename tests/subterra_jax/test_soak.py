@@ -1,50 +1,19 @@
-"""Random and extreme actions over all tasks: observation, reward and state must stay finite and inside their spaces.
+"""Random and extreme actions over all tasks: observation, reward and state stay finite and inside their spaces."""
 
-`python -m benchmarks.soak --steps 10000000`
-"""
-
-import sys
-from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.experimental import checkify
 from jaxtyping import Array, Float, Int, PRNGKeyArray
-from rich.console import Console
 
 import subterra_jax as st
-from benchmarks.command import require_least, run_main
-from subterra_jax.procedural import expand
 
 _EXTREMES = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0, -0.0, 1e-38)
 _CHUNK = 100
 _CHECKED_ENVS, _CHECKED_STEPS = 8, 50
-
-
-@dataclass(frozen=True)
-class SoakConfig:
-    """Settings of a soak.
-
-    Attributes:
-        steps: Environment steps of all tasks together.
-        tasks: Task ids; all tasks if not given.
-        n_envs: Environments in a batch.
-        tunnel: Tunnel file, or a name as for `st.make`, of a family of tunnels too (`open:test-unseen:0-5`), of which
-            each episode draws one; the packaged default if not given.
-        lining: Variant of the walls; `None` is the tunnel's first.
-        checkify: Run a short piece of each task under `jax.experimental.checkify` as well.
-        seed: Seed for environments and actions.
-    """
-
-    steps: int = 10_000_000
-    tasks: tuple[str, ...] = ()
-    n_envs: int = 1024
-    tunnel: str | None = None
-    lining: str | None = "pockets"
-    checkify: bool = True
-    seed: int = 0
 
 
 def wild_actions(key: PRNGKeyArray, n_envs: int, low: np.ndarray, high: np.ndarray) -> Float[Array, "n_envs n_action"]:
@@ -125,34 +94,34 @@ def first_complaint(env: st.TunnelEnv, params: st.EnvParams, seed: int) -> str |
     return error.get()
 
 
-def run(config: SoakConfig, console: Console) -> bool:
-    """Runs every task; returns whether all are clean.
-
-    Raises:
-        SubterraError: A number is out of range, or there is no such tunnel.
-        ValueError: No such task.
-    """
-    require_least(config, steps=1, n_envs=1, seed=0)
-    tasks = config.tasks or tuple(st.TASKS)
-    several = config.tunnel is not None and len(names := expand(config.tunnel)) > 1
-    plans: Any = [st.load_tunnel(name) for name in names] if several else st.load_tunnel(config.tunnel)
-    made = [st.make(task, plans, config.lining, estimates=True) for task in tasks]
-    clean = True
-    for task, (env, params) in zip(tasks, made, strict=True):
-        complaints = soak(env, params, config.n_envs, -(-config.steps // len(tasks)), config.seed)
-        messages = [f"{name}: {count}" for name, count in complaints.items()]
-        if config.checkify and (complaint := first_complaint(env, params, config.seed)) is not None:
-            messages.append(f"checkify: {complaint.splitlines()[0]}")
-        clean = clean and not messages
-        console.print(f"{task}: {'; '.join(messages) or 'clean'}")
-    return clean
+def test_actions_are_inside_outside_and_extreme():
+    low, high = np.float32([0.0, -1.5]), np.float32([2.0, 1.5])
+    actions = np.asarray(wild_actions(jax.random.key(0), 4096, low, high))
+    assert np.isnan(actions).any()
+    assert np.isposinf(actions).any()
+    assert np.isneginf(actions).any()
+    inside = ((actions >= low) & (actions <= high)).all(axis=1)
+    assert 0.2 < inside.mean() < 0.7
+    assert inside[::8].all()
+    assert (np.abs(actions[np.isfinite(actions)]) > 2.0).any()
 
 
-def main(words: list[str] | None = None) -> int:
-    """Runs the command line; returns 0 where everything is clean, 1 where not, 2 for a user's mistake."""
-    console = Console(highlight=False)
-    return run_main("soak", SoakConfig, lambda config: int(not run(config, console)), description=__doc__, words=words)
+def test_violations_are_counted_by_name():
+    low, high = np.float32([0.0, -np.inf]), np.float32([30.0, np.inf])
+    state = {"good": jnp.zeros(3), "bad": jnp.array([0.0, jnp.nan]), "steps": jnp.zeros(3, jnp.int32)}
+    obs = jnp.array([[0.0, 1e9], [31.0, 0.0], [jnp.nan, jnp.inf]])
+    found = {k: int(v) for k, v in _violations(state, obs, jnp.array([0.0, jnp.inf]), low, high).items() if v}
+    assert found == {
+        "state['bad'] not finite": 1,
+        "observation outside its space": 2,
+        "observation not finite": 2,
+        "reward not finite": 1,
+    }
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+@pytest.mark.slow
+@pytest.mark.parametrize("task", st.TASKS)
+def test_every_task_is_clean_under_wild_actions_and_checkify(task):
+    env, params = st.make(task, estimates=True)
+    assert first_complaint(env, params, seed=0) is None
+    assert soak(env, params, 1000, 200_000, seed=1) == {}

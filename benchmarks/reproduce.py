@@ -1,0 +1,188 @@
+"""Measures results on record again, says which differ, and lists the others with the command that measures them.
+
+Example: python -m benchmarks.reproduce --jobs speed metro --out out/reproduce
+"""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.command import BenchmarkError, run_main
+from benchmarks.records import Record, number, on_record, read_records
+from benchmarks.results import environment_facts, write_file
+from subterra_jax.host.files import require_folder
+
+
+@dataclass(frozen=True)
+class Job:
+    """Commands that measure records on a CPU.
+
+    Attributes:
+        commands: Words after `python -m`; `{out}` is the job's folder, `{shared}` that of surveys not packaged.
+        minutes: Duration on two idle cores, minutes.
+        records: File below the job's folder that holds the records once it is done.
+        needs: Path that must exist, or empty.
+        read: Reads the figures by id where the command writes none.
+    """
+
+    commands: tuple[str, ...]
+    minutes: float
+    records: str = "records.json"
+    needs: str = ""
+    read: Callable[[Any], dict[str, float]] | None = None
+
+
+_METRO, _DIRTY = "{shared}/data/metro_asbuilt", "{shared}/data/dirty_clouds"
+_SURVEY_351 = (
+    "scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out {out}/survey",
+    "scene.build {out}/survey/survey.bag --trajectory {out}/survey/groundtruth.tum --provenance simulated "
+    "--name subterra-351 --out {out}/scene",
+)
+_FIDELITY = (
+    "benchmarks.fidelity run --scene {out}/scene --recording {out}/survey/survey_os1.bag "
+    "--trajectory {out}/survey/groundtruth_os1.tum --truth {out}/survey --out {out}/report"
+)
+
+
+def _length(manifest: Any) -> dict[str, float]:
+    return {"reconstruction/metro/length": manifest["bore"]["length"]}
+
+
+def _verdict(report: Any) -> dict[str, float]:
+    return {
+        "fidelity/subterra-351/global": report["global"],
+        "fidelity/subterra-351/null-tube": report["global_null"],
+        "fidelity/categories": len(report["categories"]),
+    }
+
+
+JOBS = {
+    "speed": Job(("benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out {out}",), 2.0),
+    "metro": Job(
+        (f"scene.build {_METRO} --out {{out}}/scene",), 2.0, "scene/manifest.json", _METRO, _length
+    ),
+    "dirty": Job((f"benchmarks.dirty {_DIRTY} --out {{out}}",), 3.0, needs=_DIRTY),
+    "rays": Job((*_SURVEY_351, "benchmarks.rays --scene {out}/scene --out {out}/rays.json"), 8.0),
+    "reconstruction": Job(("benchmarks.reconstruction --seeds 203 --length 351 --truth metro --out {out}",), 12.0),
+    "fidelity": Job((*_SURVEY_351, _FIDELITY), 15.0, "report/report.json", read=_verdict),
+    "board": Job(
+        ("benchmarks.board.again --agents dead-reckoning fused ring-filter scan-matching --out {out}",), 20.0
+    ),
+}  # fmt: skip
+_QUICK = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)
+
+
+@dataclass(frozen=True)
+class ReproduceConfig:
+    """Settings of a reproduction.
+
+    Attributes:
+        jobs: Measurements to make.
+        out: Folder for results; finished jobs in it are not run again.
+        shared: Folder that holds surveys that are not packaged.
+    """
+
+    jobs: tuple[str, ...] = _QUICK
+    out: Path = Path("out/reproduce")
+    shared: Path = Path("../shared")
+
+
+def run_job(job: Job, folder: Path, shared: Path) -> dict[str, float] | None:
+    """Run a job unless its result is there.
+
+    Args:
+        job: Job to run.
+        folder: Its folder.
+        shared: Folder of the surveys that are not packaged.
+
+    Returns:
+        Its figures by the ids of records; None where its input is missing.
+
+    Raises:
+        BenchmarkError: A command failed.
+    """
+    result = folder / job.records
+    if not result.exists():
+        if job.needs and not Path(job.needs.format(shared=shared)).exists():
+            return None
+        folder.mkdir(parents=True, exist_ok=True)
+        for command in job.commands:
+            words = [word.format(out=folder, shared=shared) for word in command.split()]
+            print(f"$ python -m {' '.join(words)}", flush=True)
+            with (folder / "log.txt").open("a") as log:
+                code = subprocess.run([sys.executable, "-m", *words], stdout=log, stderr=log, check=False).returncode
+            if code and not result.exists():  # a missed goal also ends with a status
+                raise BenchmarkError(f"{folder / 'log.txt'}: python -m {words[0]} ended with status {code}")
+    if job.read is not None:
+        return job.read(json.loads(result.read_text()))
+    return {record.id: record.value for record in read_records(result)}
+
+
+def compare(records: dict[str, Record], figures: dict[str, float]) -> list[dict[str, Any]]:
+    """Return a row for each figure that is on record, with the verdict `same` or `differs`."""
+    return [
+        {
+            "id": id,
+            "recorded": records[id].value,
+            "measured": value,
+            "unit": records[id].unit,
+            "verdict": "same" if records[id].holds(value) else "differs",
+        }
+        for id, value in figures.items()
+        if id in records
+    ]
+
+
+def show(rows: list[dict[str, Any]], others: list[Record], console: Console) -> None:
+    """Print what was measured, then what is only listed, each command once."""
+    table = Table("record", "recorded", "measured", "unit", "verdict")
+    for row in rows:
+        table.add_row(row["id"], number(row["recorded"]), number(row["measured"]), row["unit"], row["verdict"])
+    console.print(table)
+    console.print("Not measured here:")
+    for command in dict.fromkeys(record.command for record in others):
+        mine = [record for record in others if record.command == command]
+        console.print(f"  python -m {command}", soft_wrap=True, markup=False)
+        for record in mine:
+            console.print(f"    {record.id}: {record.text} ({record.hardware}, {record.date})", soft_wrap=True)
+
+
+def run(config: ReproduceConfig) -> int:
+    """Measures, prints and writes; returns 0 where every figure is the same, 1 where one differs.
+
+    Raises:
+        BenchmarkError: There is no such job, or one failed.
+    """
+    for name in config.jobs:
+        if name not in JOBS:
+            raise BenchmarkError(f"no job {name!r}; there are {', '.join(JOBS)}")
+    require_folder(config.out)
+    console, records = Console(highlight=False), on_record()
+    rows: list[dict[str, Any]] = []
+    for name in config.jobs:
+        console.print(f"{name}: about {JOBS[name].minutes:g} min on two idle cores")
+        figures = run_job(JOBS[name], config.out / name, config.shared)
+        if figures is None:
+            console.print(f"{name}: not measured, {JOBS[name].needs.format(shared=config.shared)} is not there")
+        rows += compare(records, figures or {})
+    content = {"config": asdict(config), "environment": environment_facts(), "rows": rows}
+    write_file(config.out / "reproduce.json", (json.dumps(content, indent=1, default=str) + "\n").encode())
+    measured = {row["id"] for row in rows}
+    show(rows, [record for record in records.values() if record.id not in measured], console)
+    return int(any(row["verdict"] == "differs" for row in rows))
+
+
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 0 where every figure is the same, 1 where one differs, 2 for a mistake."""
+    return run_main("reproduce", ReproduceConfig, run, description=__doc__, words=words)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

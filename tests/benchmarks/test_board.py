@@ -1,0 +1,226 @@
+"""The board: its columns, its resumption, its table of a screen, and that a figure beyond a bound is named."""
+
+import json
+
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from benchmarks.board import __main__ as command
+from benchmarks.board import again, cells, columns, drive, picture, roster, tables
+from benchmarks.board.columns import OWN, Column, Setting
+from benchmarks.board.drive import BoardConfig, Job
+from benchmarks.board.records import records_of
+from benchmarks.command import BenchmarkError
+from benchmarks.records import read_records
+from subterra_jax.baselines import registry
+from subterra_jax.episode import Driver
+from subterra_jax.evaluation import harness
+
+SPLITS = ("val", "test-unseen")
+LITTLE = 1.2e-5  # GB; some episodes, not a dozen
+PLANAR = roster.PLANAR
+
+
+def cell(agent, success, task="StopAt", n=40, floor=0.3, splits=("val",), hidden=False):
+    """A cell of one kind in some splits."""
+    hits = [1] * round(n * success)
+    return {
+        "schema": cells.SCHEMA,
+        "conditions": "x",
+        "task": task,
+        "hidden_start": hidden,
+        "agent": agent,
+        "columns": [{"kind": "cast", "split": split} for split in splits],
+        "tunnels": 2,
+        "success": (hits + [0] * (n - len(hits))) * len(splits),
+        "contact": [0] * n * len(splits),
+        "goal_error": ([0.5] * (n - 1) + [None]) * len(splits),
+        "floor": [floor, floor] * len(splits),
+        "facts": {"constants_sha256": "0" * 64, "device": "none", "platform": "none", "date": "2026-11-26T00:00"},
+    }
+
+
+def test_a_column_has_its_own_tunnels_and_a_split_its_own_seeds():
+    some = columns.columns_of(SPLITS, ("control",))
+    assert len(some) == 11
+    names = columns.tunnel_names(some, 2)
+    assert names[:2] == ["open:straight:val:100", "open:straight:val:101"]
+    assert names[-2].startswith("open:rock:test-unseen:")
+    assert names[-1] == "control"
+    found = columns.draw_episodes(Setting("Faulted"), some, 2, 20, faults=True)
+    for place, column in enumerate(some[:-1]):
+        rows = slice(20 * place, 20 * place + 20)
+        assert {names[i].rsplit(":", 1)[0] for i in found.tunnel[rows]} == {f"open:{column.kind}:{column.split}"}
+        assert np.bincount(found.severity[rows]).tolist() == [4] * 5
+    assert set(found.tunnel[-20:]) == {20}
+    assert not set(found.seed[:20]) & set(found.seed[180:200])
+    np.testing.assert_array_equal(found.seed[:20], found.seed[20:40])
+    assert found.seed.max() < 2**30, "a listed episode lies above"
+    hidden = columns.draw_episodes(Setting("Faulted", True), some, 2, 20, faults=True)
+    assert not set(found.seed) & set(hidden.seed)
+
+
+def test_the_seeds_of_the_cells_on_record_are_still_drawn():
+    found = columns.draw_episodes(Setting("StopAt", True), (Column("cast", "val"),), 5, 50, faults=False)
+    assert found.seed[:3].tolist() == [880160946, 855418373, 572588487]
+
+
+def test_figures_beyond_a_bound_are_named_and_others_are_not():
+    fair = [cell("fused", 0.4), cell("ring-filter", 0.9), cell("ceiling", 0.95), cell("oracle", 1.0)]
+    assert cells.find_leaks(fair) == []
+    assert "fused, StopAt, cast of val: 100 % is above the floor" in cells.find_leaks([cell("fused", 1.0)])[0]
+    above = cells.find_leaks([cell("ring-filter", 1.0), cell("ceiling", 0.5)])
+    assert above == ["ring-filter, StopAt, cast of val: 100 % is above the ceiling, 50 %"]
+
+
+def test_tables_picture_and_records_hold_every_agent():
+    both = {"splits": SPLITS}
+    some = [cell("fused", 0.4, **both), cell("locate-transformer", 0.7, **both), cell("ceiling", 0.95, **both)]
+    text = tables.as_markdown(some)
+    assert "| floor, in theory | | 30 |" in text
+    assert "| locate-transformer | `open:…:train` | 70 (" in text
+    assert picture.as_png(some)[:4] == b"\x89PNG"
+    values = {record.id: record.value for record in records_of(some)}
+    assert values["board/StopAt/test-unseen/locate-transformer"] == 70.0
+    assert values["board/StopAt/best/best-written"] == 40.0
+    assert values["board/StopAt/best/floor"] == 30.0
+
+
+def test_every_group_of_agents_has_its_own_mark_in_the_picture():
+    some = [cell(name, 0.5, splits=SPLITS) for name in ("fused", "ring-filter", "locate-map", "locate-transformer")]
+    figure = picture.draw(some)
+    marks = {line.get_marker() for line in figure.axes[0].lines}
+    assert len(marks) == 4
+    assert "below the floor" in figure.get_suptitle()
+    assert "above the ceiling" in figure.get_suptitle()
+
+
+def test_the_best_of_a_group_is_chosen_on_val_and_not_where_it_is_shown():
+    good_on_val, good_on_test = cell("ring-filter", 0.0, splits=SPLITS), cell("scan-matching", 0.0, splits=SPLITS)
+    good_on_val["success"] = [1] * 40 + [0] * 40
+    good_on_test["success"] = [0] * 40 + [1] * 40
+    row = tables.screen([good_on_val, good_on_test])[0]
+    agent, score = row["best written"]
+    assert (agent, score.success) == ("ring-filter", 0.0)
+    assert row["learnt"] is None
+
+
+def test_a_hidden_start_is_a_row_of_its_own():
+    some = [cell("fused", 0.4, splits=SPLITS), cell("fused", 0.2, splits=SPLITS, hidden=True)]
+    lines = tables.screen_markdown(some).splitlines()
+    assert lines[2].startswith("| StopAt | 30 | **40**")
+    assert lines[3].startswith("| StopAt, hidden start | 30 | **20**")
+
+
+def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():
+    wide, narrow = cell("fused", 0.4, splits=SPLITS), cell("ceiling", 0.9, splits=("test-unseen",))
+    text = tables.as_markdown([narrow, wide])
+    assert text.index("## val by kind") < text.index("## test-unseen by kind") < text.index("| ceiling |")
+    assert text.count("| ceiling |") == 1
+    above = cells.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
+    assert above == []
+    narrow = {**narrow, "success": [0] * 40}
+    above = cells.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
+    assert above == ["ring-filter, StopAt, cast of test-unseen: 100 % is above the ceiling, 0 %"]
+
+
+def test_columns_of_different_numbers_of_tunnels_are_summed_up_by_their_own():
+    mixed = cell("fused", 0.5, splits=SPLITS)
+    mixed["columns"][1] = {"kind": "mine", "split": OWN}
+    mixed["floor"] = [0.2, 0.4, 0.9]
+    assert cells.summarise(mixed, {("val", "cast")}).floor == pytest.approx(0.3)
+    assert cells.summarise(mixed, {(OWN, "mine")}).floor == pytest.approx(0.9)
+    assert cells.summarise(mixed, {("val", "rock")}) is None
+
+
+def test_conditions_of_parts_are_those_of_every_choice_of_splits_and_sensors(tmp_path):
+    config = BoardConfig(tmp_path, splits=SPLITS)
+    found = drive.conditions_of_parts(config)
+    assert drive.conditions(config, PLANAR) in found
+    assert drive.conditions(BoardConfig(tmp_path, splits=("test-unseen",)), "spin16x64") in found
+    assert drive.conditions(BoardConfig(tmp_path, splits=SPLITS, episodes=7), PLANAR) not in found
+    assert drive.conditions(BoardConfig(tmp_path, splits=SPLITS, further=("control",)), PLANAR) not in found
+
+
+def test_all_cells_on_record_are_of_todays_constants():
+    kept = cells.read_cells(again.ON_RECORD, drive.conditions_of_parts(BoardConfig(again.ON_RECORD)))
+    assert len(kept) == len(again.ON_RECORD.read_text().splitlines())
+    assert cells.find_leaks(kept) == []
+
+
+def test_agents_drive_the_tasks_that_they_are_for_unless_they_are_named(tmp_path):
+    jobs = drive.jobs_of(BoardConfig(tmp_path, ("StopAt", "Relocalise")))
+    assert Job(Setting("StopAt", True), "fused", PLANAR) in jobs
+    assert Job(Setting("StopAt"), "locate-spin", "spin16x64") in jobs
+    assert not [job for job in jobs if job.agent == "locate-transformer" and job.setting != Setting("StopAt")]
+    assert not [job for job in jobs if job.setting == Setting("Relocalise", True)]
+    named = drive.jobs_of(BoardConfig(tmp_path, ("StopAt",), "hidden", ("locate-transformer",)))
+    assert named == [Job(Setting("StopAt", True), "locate-transformer", PLANAR)]
+
+
+def test_an_agent_without_a_map_of_its_own_cannot_be_driven_without_one():
+    env, params = st.make("Subterra/StopAt-v1", tunnel="control")
+    with pytest.raises(BenchmarkError, match="nomap:locate-transformer: locate-transformer has no map to go without"):
+        roster.make_agent("nomap:locate-transformer", env, params)
+    with pytest.raises(BenchmarkError, match="cut:fused: fused has no walls to go without"):
+        roster.make_agent("cut:fused", env, params)
+
+
+def test_a_cell_that_is_there_is_not_driven_again(tmp_path, monkeypatch):
+    config = BoardConfig(tmp_path, ("StopAt",), "given", ("fused",), ("val",), 40, 2)
+    job = Job(Setting("StopAt"), "fused", PLANAR)
+    there = {**cell("fused", 0.4), "conditions": drive.conditions(config, PLANAR), "policy": None}
+    drive.cell_file(config, job).parent.mkdir()
+    drive.cell_file(config, job).write_text(json.dumps(there))
+    monkeypatch.setattr(drive, "evaluate", None)
+    command.run(config)
+    assert (tmp_path / "board.png").exists()
+    assert {record.id for record in read_records(tmp_path / "records.json")} == {"board/StopAt/val/fused"}
+    with pytest.raises(st.SubterraError, match="holds no cell"):
+        command.run(BoardConfig(**{**vars(config), "episodes": 41, "report_only": True}))
+    drive.cell_file(config, job).write_text(json.dumps({**there, "policy": "other weights"}))
+    assert not drive.is_there(config, job)
+
+
+def test_what_is_driven_in_parts_and_again_is_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(drive, "columns_of", lambda splits, further: (Column("cast", "val"),))
+    parts = []
+    begin = Driver.begin
+    monkeypatch.setattr(
+        Driver, "begin", lambda self, p, a, seed, *rest: parts.append(seed) or begin(self, p, a, seed, *rest)
+    )
+    found = {}
+    for memory in (8.0, LITTLE):
+        out = tmp_path / str(memory)
+        agents, job = ("dead-reckoning",), Job(Setting("StopAtShort"), "dead-reckoning", PLANAR)
+        config = BoardConfig(out, ("StopAtShort",), "given", agents, ("val",), 12, 1, memory=memory)
+        command.run(config)
+        found[memory] = json.loads(drive.cell_file(config, job).read_text())
+    whole, *some = parts
+    assert len(whole) == 12
+    assert 1 < len(some) < 12
+    assert set(np.concatenate(some).tolist()) == set(whole.tolist())
+    for name in ("success", "contact", "floor"):
+        assert found[8.0][name] == found[LITTLE][name], name
+    np.testing.assert_allclose(found[8.0]["goal_error"], found[LITTLE]["goal_error"], atol=0.002)
+    kept = found[8.0]
+    row = again.compare(kept, again.AgainConfig(tmp_path, episodes=5))
+    assert row["same"]
+    assert row["apart"] < 0.002
+    kept["success"] = [1 - hit for hit in kept["success"]]
+    row = again.compare(kept, again.AgainConfig(tmp_path, episodes=5))
+    assert row["differ"] == row["episodes"] == 5
+
+
+def test_a_batch_takes_no_more_than_the_memory_that_it_may_unless_it_is_one_episode():
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="control", estimates=True)
+    agent = registry.make_agent("dead-reckoning", params)
+    driver = harness._prepare(env, params, agent)[2]
+    needed = driver.bytes_needed(params, agent, 64, harness._CHUNK)
+    assert needed > driver.bytes_needed(params, agent, 16, harness._CHUNK) > 0
+    assert harness.fitting_batch(env, params, agent, 64, needed * 1e-9) == 64
+    least = harness.fitting_batch(env, params, agent, 64, 0.4e-9 * needed)
+    assert 1 < least < 40
+    assert driver.bytes_needed(params, agent, least, harness._CHUNK) <= 0.4 * needed
+    assert harness.fitting_batch(env, params, agent, 64, 1e-9) == 1
