@@ -137,7 +137,7 @@ def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
     """Return environment and params of a cell."""
     name = job.setting.task
     id = name if "/" in name else f"Subterra/{name}-v1"
-    hidden = {"hidden_start": True} if job.setting.hidden_start else {}
+    hidden: dict[str, Any] = {"hidden_start": True} if job.setting.hidden_start else {}
     return st.make(id, tunnel=tunnel, estimates=True, sensor=job.sensor, **hidden)
 
 

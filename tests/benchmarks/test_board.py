@@ -116,8 +116,8 @@ def test_a_hidden_start_is_a_row_of_its_own():
 def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():
     wide, narrow = cell("fused", 0.4, splits=SPLITS), cell("ceiling", 0.9, splits=("test-unseen",))
     text = tables.as_markdown([narrow, wide])
-    assert text.index("## val by kind") < text.index("## test-unseen by kind") < text.index("| ceiling |")
-    assert text.count("| ceiling |") == 1
+    assert text.index("## val by kind") < text.index("## test-unseen by kind") < text.index("| ceiling | nothing")
+    assert text.count("| ceiling | nothing") == 1
     above = cells.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
     assert above == []
     narrow = {**narrow, "success": [0] * 40}

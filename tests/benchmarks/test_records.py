@@ -76,6 +76,7 @@ def test_a_number_is_shown_with_the_digits_that_it_has(value, text):
     assert records.number(value) == text
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # of runpy: the tests have imported the module before
 def test_every_record_has_a_command_that_its_module_understands(command_line):  # noqa: F811
     words = {record.command for record in records.on_record().values()}
     words |= {word.format(out="out", shared="shared") for job in reproduce.JOBS.values() for word in job.commands}
