@@ -1,10 +1,12 @@
-"""Results as records, the tables of the documentation rendered from them, and which of them differ.
+"""Results as records, and the tables of the documentation rendered from them.
 
-A record is one figure. Commands write theirs to `records.json` beside their other results;
-`python -m benchmarks.records keep out/board/records.json` takes them over into `benchmarks/results/`, a file for each
-family (the first word of an id). A page holds a table's template in a comment, with ids in braces, and the rendered
-table behind it: `python -m benchmarks.records render` writes it anew, and `check` fails where a record is missing or a
-page is stale. A line `{board: SPLIT}` stands for the board's tables by kind.
+`python -m benchmarks.records render` writes the tables of all pages anew; `check` fails where a record
+is missing or a page is stale; `keep out/board/records.json` takes records over into
+`benchmarks/results/`, a file for each family (the first word of an id).
+
+A record is one figure. Commands write theirs to `records.json` beside their other results. A page
+holds a table's template in a comment, with ids in braces, and the rendered table behind it. A line
+`{board: SPLIT}` stands for the board's tables by kind, `{board: screen}` for its table of all tasks.
 """
 
 import dataclasses
@@ -255,9 +257,12 @@ def main(words: list[str] | None = None) -> int:
         "check": lambda: render(write=False),
         "keep": lambda: keep([Path(word) for word in words[1:]]),
     }
+    if words and words[0] in ("-h", "--help"):
+        print(__doc__)
+        return 0
     if not words or words[0] not in commands:
-        print(f"{__doc__}\nusage: python -m benchmarks.records render | check | keep FILE...", file=sys.stderr)
-        return 0 if words[:1] in (["-h"], ["--help"]) else 2
+        print(f"error: say one of {', '.join(commands)}; --help says what they do", file=sys.stderr)
+        return 2
     return run_command(commands[words[0]], "interrupted", INPUT_ERRORS)
 
 

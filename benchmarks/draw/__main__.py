@@ -1,6 +1,6 @@
 """Draws kinds of lining, an atlas of a tunnel, or a scene.
 
-`python -m benchmarks.draw kinds|atlas|scene ...`; `--help` after one of them says more.
+`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas` and `scene`, whose `--help` says more.
 """
 
 import sys
@@ -15,12 +15,12 @@ def main(words: list[str] | None = None) -> int:
     words = sys.argv[1:] if words is None else words
     if words and words[0] in COMMANDS:
         return COMMANDS[words[0]](words[1:])
-    asked = bool(words) and words[0] in ("-h", "--help")
-    found = (
-        "" if asked else f"error: nothing to draw is named {words[0] if words else ''!r}; there are kinds, atlas, scene"
-    )
-    print(__doc__ if asked else found, file=sys.stdout if asked else sys.stderr)
-    return 0 if asked else 2
+    if words and words[0] in ("-h", "--help"):
+        print(__doc__)
+        return 0
+    named = repr(words[0]) if words else "''"
+    print(f"error: nothing to draw is named {named}; there are {', '.join(COMMANDS)}", file=sys.stderr)
+    return 2
 
 
 if __name__ == "__main__":
