@@ -6,7 +6,7 @@ is missing or a page is stale; `keep out/board/records.json` takes records over 
 
 A record is one figure. Commands write theirs to `records.json` beside their other results. A page
 holds a table's template in a comment, with ids in braces, and the rendered table behind it. A line
-`{board: SPLIT}` stands for the board's tables by kind, `{board: screen}` for its table of all tasks.
+`{board: SPLIT}` is the board's tables by kind, `{board: screen}` its table of all tasks.
 """
 
 import dataclasses

@@ -1,6 +1,7 @@
 """Draws kinds of lining, an atlas of a tunnel, or a scene.
 
-`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas` and `scene`, whose `--help` says more.
+`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas` and `scene`.
+`--help` after one of them says more.
 """
 
 import sys
