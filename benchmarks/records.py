@@ -1,7 +1,7 @@
 """Results as records, and the tables of the documentation rendered from them.
 
-`python -m benchmarks.records render` writes the tables of all pages anew; `check` fails where a record
-is missing or a page is stale; `keep out/board/records.json` takes records over into
+`python -m benchmarks.records render` writes the tables of all pages anew; `check` fails where a
+record is missing or a page is stale; `keep out/board/records.json` takes records over into
 `benchmarks/results/`, a file for each family (the first word of an id).
 
 A record is one figure. Commands write theirs to `records.json` beside their other results. A page
