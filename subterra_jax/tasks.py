@@ -168,7 +168,8 @@ def make(
         tunnel: A tunnel file, a name as for `load_tunnel`, a plan from it, a list of such, of which each episode draws
             one, or a ready `Tunnel`, one or several, which is taken as it is, neither cut to the task's piece nor given
             another lining. None is `open:train:0-11`, twelve tunnels of the open world of which each episode draws
-            one; `subterra-351` for the paper's task and the B2's.
+            one (with a LiDAR in three dimensions the shortest of each kind among the first hundred); `subterra-351` for
+            the paper's task and the B2's.
         lining: Variant of the walls: `pockets` (as in the recorded bore), `smooth` or `furnished`. None is `pockets`,
             or the first where a tunnel has none.
         estimates: Let the action hold an estimate of the station and the log of its standard deviation as well: the
@@ -179,8 +180,8 @@ def make(
         sweep: Cast each beam of a LiDAR in three dimensions from the pose at its own time.
         hidden_start: The true start is off the reported one by a normal number of 3 m, cut off at three of them; for
             the tasks that report a start: `StopAt`, `StopAtShort`, `Return`, `Obstructed` and `Faulted`.
-        split: Twelve tunnels of this split of the open world, `train`, `val`, `test-seen` or `test-unseen`, in place of
-            `tunnel`.
+        split: In place of `tunnel`, those of another split of the open world: `train`, `val`, `test-seen` or
+            `test-unseen`.
         **overrides: Entries of `EnvParams` to replace: `horizon=100`, `lidar=LidarParams(range_sigma=0.0)`. `slip`,
             `obstacles`, `faults` and `imu` bring their part to a task that lacks it.
 
@@ -194,7 +195,7 @@ def make(
     """
     id = find(id)
     if id in TASKS:
-        tunnel = tunnel_for(id, tunnel, split)
+        tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
     elif split is not None:
         raise ValueError(f"{id} happens in one tunnel: name it in place of a split")
     if hidden_start:
@@ -207,7 +208,7 @@ def make(
             return walking.make(id, tunnel, lining, **overrides)  # type: ignore[arg-type]
         return walking.make_mission(id, tunnel, lining, sensor=sensor, sweep=sweep, **overrides)  # type: ignore[arg-type]
     task = TASKS[id]
-    spatial = not (isinstance(sensor, str) and sensor == SENSORS[0])
+    spatial = not is_planar(sensor)
     if spatial:
         made = sensor if isinstance(sensor, SpatialParams) else make_sensor(sensor)
         overrides = {"lidar": dataclasses.replace(made, sweep=sweep or made.sweep), **overrides}
@@ -229,13 +230,21 @@ def make(
     return env, params
 
 
-def tunnel_for(id: str, tunnel: Source | Sequence[Source] = None, split: str | None = None) -> Any:
+def is_planar(sensor: Any) -> bool:
+    """Tell whether a sensor, as `make` takes it, is the planar LiDAR."""
+    return isinstance(sensor, str) and sensor == SENSORS[0]
+
+
+def tunnel_for(
+    id: str, tunnel: Source | Sequence[Source] = None, split: str | None = None, spatial: bool = False
+) -> Any:
     """Return what `make` takes for the tunnel of a task.
 
     Args:
         id: The task's id.
         tunnel: As for `make`.
         split: As for `make`.
+        spatial: The LiDAR is one in three dimensions, whose surfaces take longer to make: short tunnels are taken.
 
     Raises:
         ValueError: There is no such split, or both a tunnel and a split are named.
@@ -248,7 +257,10 @@ def tunnel_for(id: str, tunnel: Source | Sequence[Source] = None, split: str | N
     if tunnel is not None:
         return tunnel
     usual = TASKS[id].tunnel
-    return usual if usual is not None and split is None else f"open:{split or 'train'}:0-{N_TUNNELS - 1}"
+    if usual is not None and split is None:
+        return usual
+    split = split or "train"
+    return open_world.shortest(split) if spatial else f"open:{split}:0-{N_TUNNELS - 1}"
 
 
 def _hidden_start(id: str, overrides: Mapping[str, Any]) -> StartParams:
@@ -273,7 +285,7 @@ def _checked_horizon(horizon: Any) -> Any:
 
 def _require_planar(id: str, sensor: Any, sweep: bool) -> None:
     """Refuse another LiDAR than the planar one, or its sweep."""
-    if not (isinstance(sensor, str) and sensor == SENSORS[0]):
+    if not is_planar(sensor):
         raise ValueError(f"{id} has the sensor {SENSORS[0]!r} alone, got {sensor!r}")
     if sweep:
         raise ValueError(f"{SENSORS[0]!r} measures a scan at one moment: sweep=True needs a LiDAR in three dimensions")

@@ -70,8 +70,8 @@ def test_the_simulator_is_imported_quickly_and_says_nothing(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_the_wheel_alone_makes_a_tunnel_steps_it_and_loads_a_policy(packages, tmp_path):
+@pytest.mark.timeout(3600)
+def test_the_wheel_alone_loads_a_policy_and_makes_and_steps_every_task_with_every_sensor(packages, tmp_path):
     """Needs a package index."""
     (wheel,) = [path for path in packages if path.suffix == ".whl"]
     subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "fresh")], check=True)
@@ -81,3 +81,7 @@ def test_the_wheel_alone_makes_a_tunnel_steps_it_and_loads_a_policy(packages, tm
     done = subprocess.run([python, "-c", DRIVE], check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
     assert done.stdout.startswith("(18,) ")
     assert done.stderr == ""
+    tour = [python, str(ROOT / "tests" / "wheel_tour.py")]
+    done = subprocess.run(tour, check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
+    print(done.stdout)
+    assert len(done.stdout.splitlines()) == 1 + 9 * 5 + 1

@@ -23,6 +23,7 @@ from subterra_jax.adapters.moments import Moment, check_moment, refuse_fork
 from subterra_jax.adapters.packing import Observation, as_observation, pack, start_streams, take_key, unpacker
 from subterra_jax.adapters.views import view_for
 from subterra_jax.compiled import hashable
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.rules import Choice
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import make
@@ -179,7 +180,7 @@ class SubterraEnv(Env[Observation, np.ndarray]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
         refuse_fork()
         self.render_mode = render_mode
-        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining)
+        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining, overrides.get("sensor", SENSORS[0]))
         env, params = make(task, tunnel, lining, **overrides)
         self._env, self._params = env, params
         self._fields = packing.named_fields(env, params, flat)
@@ -203,8 +204,8 @@ class SubterraEnv(Env[Observation, np.ndarray]):
             seed: Seed of the sequence; `None` goes on with it.
             options: `goal`: station of the goal, m. `start`: station of the start, m, or a mapping with `station` (m),
                 `lateral` (m to the left of the centreline) and `heading` (rad against the centreline; π faces the
-                mouth). What is left out is drawn as ever. The agent is not told of the start: it still believes in
-                `params.start.station`.
+                mouth). What is left out is drawn as ever. A task that observes its start observes the chosen one, as it
+                is; in the others no observation holds it.
 
         Raises:
             OptionError: The task has no such thing, or the robot cannot stand there.

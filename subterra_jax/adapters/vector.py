@@ -19,6 +19,7 @@ from subterra_jax.adapters.choosing import read_choice
 from subterra_jax.adapters.moments import Moment, check_moment, refuse_fork
 from subterra_jax.adapters.packing import Fields, Observation, Report, as_observation, start_streams
 from subterra_jax.adapters.views import view_for
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.tasks import make
 from subterra_jax.tunnel.sources import Source
 
@@ -104,7 +105,7 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": self.autoreset_mode}
-        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining)
+        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining, overrides.get("sensor", SENSORS[0]))
         env, params = make(task, tunnel, lining, **overrides)
         self.batch = Batch(env, params, num_envs, self.autoreset_mode)
         self.fields = packing.named_fields(env, params, flat)

@@ -12,13 +12,14 @@ import numpy as np
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.lidar3d.beams import level_ring
 from subterra_jax.parts.boxes import Boxes
+from subterra_jax.parts.spatial_lidar import SENSORS
 from subterra_jax.pictures.carrier import add_carrier
 from subterra_jax.pictures.renderer import import_mujoco, light_near, open_renderer
 from subterra_jax.pictures.stage import Piece, stage_spec
 from subterra_jax.pictures.top_down import top_down, wall_points
 from subterra_jax.procedural import expand
 from subterra_jax.state import EnvParams, State
-from subterra_jax.tasks import TASKS, find, tunnel_for
+from subterra_jax.tasks import TASKS, find, is_planar, tunnel_for
 from subterra_jax.tunnel import Tunnel
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import Source, load_tunnel, tunnel_of
@@ -79,12 +80,13 @@ def view_for(
     tunnel: Source | Sequence[Source],
     split: str | None,
     lining: str | None,
+    sensor: Any = SENSORS[0],
 ) -> tuple[View, Any]:
     """Return the view of an environment that `subterra_jax.make` is to make, and its tunnel; errors as there."""
     known = TASKS.get(id := find(task))
     if scene is not None and tunnel is None and split is None:
         tunnel = tunnel_of(Path(scene))
-    tunnel = tunnel_for(id, tunnel, split)
+    tunnel = tunnel_for(id, tunnel, split, spatial=not is_planar(sensor))
     return make_view(view, scene, TunnelChoice(tunnel, lining, None if known is None else known.piece)), tunnel
 
 

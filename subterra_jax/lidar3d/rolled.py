@@ -5,6 +5,7 @@ near its rim, so Delaunay's triangulation holds the rim's edges. The triangles a
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +16,7 @@ from subterra_jax.tunnel.shell import Shell, ShellLining, brick_corners
 
 _BAND = 0.6  # share of the spacing around within which no grid point is near a rim or a corner of the section
 _CORNER = np.radians(30.0)  # a section that turns more than this over four of its angles has a corner there
+_NEAR, _WIDE = 2, 3  # steps of the grid
 _PAD = 1.0  # of the sheet, repeated beyond the seam, m
 _AROUND_CUT = 4.0  # of wall beyond a cut that is triangulated, m; further away no triangle depends on it
 _LID = 0.05  # of a recess's box inside the bore, so that a union leaves no film, m
@@ -28,19 +30,18 @@ def raise_shell(shell: Shell, lining: str) -> tuple[Axis, Triangles]:
         lining: Name of the variant.
 
     Raises:
-        TunnelError: The shell does not have the variant; or recesses touch and `manifold3d` is not installed.
+        TunnelError: The shell does not have the variant.
     """
     axis, *parts = raise_parts(shell, lining)
     return axis, join_surfaces(parts)
 
 
-def raise_parts(shell: Shell, lining: str, *, touching: bool = True) -> tuple[Axis, Triangles, Triangles, Triangles]:
+def raise_parts(shell: Shell, lining: str) -> tuple[Axis, Triangles, Triangles, Triangles]:
     """Return the axis and, apart, the wall with its recesses, the track and the furniture.
 
     Args:
         shell: As for `raise_shell`.
         lining: As for `raise_shell`.
-        touching: Sink recesses that touch others, the seam or a mouth too; otherwise they are left out.
 
     Raises:
         TunnelError: As for `raise_shell`.
@@ -50,7 +51,7 @@ def raise_parts(shell: Shell, lining: str, *, touching: bool = True) -> tuple[Ax
     own = shell.linings[lining]
     if own.radius is not None:
         shell = replace(shell, radius=own.radius)
-    wall = _raise_wall(shell, own, touching)
+    wall = _raise_wall(shell, own)
     return _cut_axis(shell), wall, _raise_bricks(shell.track), _raise_bricks(own.brick)
 
 
@@ -74,12 +75,12 @@ def _cut_axis(shell: Shell) -> Axis:
     return Axis(station - start, position, tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
 
 
-def _raise_wall(shell: Shell, lining: ShellLining, touching: bool) -> Triangles:
+def _raise_wall(shell: Shell, lining: ShellLining) -> Triangles:
     plane = _unroll(shell, lining.seam)
     boxes, apart = _rectangles(shell, plane, lining.pocket)
     fold = np.sort(plane.to_around(_section_corners(shell)))
     near = np.array([shell.window[0] - _AROUND_CUT, shell.window[1] + _AROUND_CUT])
-    whole = touching and not apart.all()
+    whole = not apart.all()
     if whole:
         near = np.array([-np.inf, np.inf])  # the union needs the whole, closed at both mouths
     chosen = apart & (boxes[:, 2] > near[0]) & (boxes[:, 3] < near[1])
@@ -212,8 +213,9 @@ def _triangulate(
 ) -> _Sheet:
     """Triangulate one turn between two stations, with edges along the axis at the arc lengths `fold`, m."""
     band = _BAND * spacing[1]
-    u, s = _grid(plane.girth, length, fold, spacing)
-    u, s = (values[(s >= near[0]) & (s <= near[1])] for values in (u, s))
+    grid = _grid(plane.girth, length, fold, spacing)
+    within = (grid.station >= near[0]) & (grid.station <= near[1])
+    u, s, node = (values[within] for values in (grid.around, grid.station, grid.node))
     recess, clear = np.full(len(u), -1), np.ones(len(u), bool)
     for k, (u0, u1, s0, s1) in enumerate(boxes):
         rows = slice(*np.searchsorted(s, [s0 - band, s1 + band]))
@@ -224,13 +226,28 @@ def _triangulate(
     owner = np.repeat(np.arange(len(boxes)), [len(rim) for rim in rims])
     u = np.concatenate([u[clear], *(rim[:, 0] for rim in rims)])
     s = np.concatenate([s[clear], *(rim[:, 1] for rim in rims)])
-    return _Sheet(
-        u, s, np.concatenate([recess[clear], owner]), np.arange(len(u)) >= clear.sum(), _delaunay(u, s, plane.girth)
-    )
+    node = np.concatenate([node[clear], np.full(len(owner), -1)])
+    faces = _faces(u, s, node, grid.shape, plane.girth, length)
+    return _Sheet(u, s, np.concatenate([recess[clear], owner]), np.arange(len(u)) >= clear.sum(), faces)
 
 
-def _grid(girth: float, length: float, fold: np.ndarray, spacing: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points in rows by station, every second row half a step aside, and one of each row on every fold."""
+class _Grid(NamedTuple):
+    """Points in rows by station, every second row half a step aside, and one of each row on every fold.
+
+    Attributes:
+        around: Arc length of each point, m.
+        station: Its station, m.
+        node: Row times columns plus column; -1 of points on folds.
+        shape: Rows and columns.
+    """
+
+    around: Float[np.ndarray, " p"]
+    station: Float[np.ndarray, " p"]
+    node: Int[np.ndarray, " p"]
+    shape: tuple[int, int]
+
+
+def _grid(girth: float, length: float, fold: np.ndarray, spacing: tuple[float, float]) -> _Grid:
     columns, rows = max(round(girth / spacing[1]), 8), max(round(length / spacing[0]), 2)
     station = np.linspace(0.0, length, rows + 1)
     u = (np.arange(columns) + np.where(np.arange(rows + 1) % 2, 0.75, 0.25)[:, None]) * (girth / columns)
@@ -238,8 +255,9 @@ def _grid(girth: float, length: float, fold: np.ndarray, spacing: tuple[float, f
     clear = distance > _BAND * spacing[1]
     u = np.concatenate([u[clear], np.tile(fold, rows + 1)])
     s = np.concatenate([np.repeat(station, columns)[clear.ravel()], np.repeat(station, len(fold))])
+    node = np.concatenate([np.flatnonzero(clear), np.full((rows + 1) * len(fold), -1)])
     order = np.lexsort([u, s])
-    return u[order], s[order]
+    return _Grid(u[order], s[order], node[order], (rows + 1, columns))
 
 
 def _rim(box: Float[np.ndarray, "4"], step: float) -> Float[np.ndarray, "k 2"]:
@@ -249,6 +267,60 @@ def _rim(box: Float[np.ndarray, "4"], step: float) -> Float[np.ndarray, "k 2"]:
     u, s = np.linspace(u0, u1, across + 1), np.linspace(s0, s1, along + 1)
     sides = [(u[:-1], s0), (u1, s[:-1]), (u[:0:-1], s1), (u0, s[:0:-1])]
     return np.concatenate([np.column_stack(np.broadcast_arrays(*side)) for side in sides])
+
+
+def _faces(
+    u: np.ndarray, s: np.ndarray, node: np.ndarray, shape: tuple[int, int], girth: float, length: float
+) -> Int[np.ndarray, "f 3"]:
+    """Return Delaunay's triangles; those of the plain grid, which are known, need not be looked for.
+
+    Around what is not of the grid, and where a point of it is missing, triangles are looked for among the points
+    within `_WIDE` steps of those that may be affected, which lie within `_NEAR` steps.
+    """
+    point = np.full(shape, -1)
+    there = np.flatnonzero(node >= 0)
+    point.ravel()[node[there]] = there
+    foreign = np.flatnonzero(node < 0)
+    rows = np.clip(np.rint(s[foreign] / length * (shape[0] - 1)).astype(int), 0, shape[0] - 1)
+    odd = point < 0
+    odd[rows, np.floor(u[foreign] / girth * shape[1]).astype(int) % shape[1]] = True
+    near = _grown(odd, _NEAR)
+    patch = np.sort(np.concatenate([foreign, point[_grown(near, _WIDE) & (point >= 0)]]))
+    if len(patch) > 0.5 * len(u):
+        return _delaunay(u, s, girth)
+    found = patch[_delaunay(u[patch], s[patch], girth)]
+    affected = np.ones(len(u), bool)
+    affected[point[~near]] = False
+    return np.concatenate([_plain(point, ~near), found[affected[found].any(axis=1)]])
+
+
+def _grown(mask: Bool[np.ndarray, "r c"], steps: int) -> Bool[np.ndarray, "r c"]:
+    """Return a mask grown by some rows and columns to either side; columns go round."""
+    grown = mask.copy()
+    for k in range(1, steps + 1):
+        grown[k:] |= mask[:-k]
+        grown[:-k] |= mask[k:]
+    wide = grown.copy()
+    for k in range(1, steps + 1):
+        wide |= np.roll(grown, k, axis=1) | np.roll(grown, -k, axis=1)
+    return wide
+
+
+def _plain(point: Int[np.ndarray, "r c"], free: Bool[np.ndarray, "r c"]) -> Int[np.ndarray, "f 3"]:
+    """Return the triangles between the rows of a plain grid, of free points alone."""
+    parts = []
+    for first in (0, 1):
+        # The row above an even one lies half a step ahead of it, that above an odd one half a step behind.
+        low, high = point[first:-1:2], point[first + 1 :: 2]
+        ahead = high if first == 0 else np.roll(high, -1, axis=1)
+        parts += [
+            np.stack([low, np.roll(low, -1, axis=1), ahead], axis=-1).reshape(-1, 3),
+            np.stack([ahead, np.roll(ahead, 1, axis=1), low], axis=-1).reshape(-1, 3),
+        ]
+    faces = np.concatenate(parts)
+    known = np.zeros(point.max() + 2, bool)  # the last is that of a missing point, whose number is -1
+    known[point[free]] = True
+    return faces[known[faces].all(axis=1)]
 
 
 def _delaunay(u: np.ndarray, s: np.ndarray, girth: float) -> Int[np.ndarray, "f 3"]:
@@ -291,13 +363,8 @@ def _roll_up(shell: Shell, plane: _Unrolled, sheet: _Sheet, pocket: Float[np.nda
 
 def _sink(wall: Triangles, sheet: _Sheet, shell: Shell, pocket: Float[np.ndarray, "r 5"]) -> Triangles:
     """Return a wall with recesses that touch others, the seam or a mouth, as the union of the air with their boxes."""
-    try:
-        from manifold3d import Manifold, Mesh64, OpType
-    except ImportError as error:
-        raise TunnelError(
-            f"{len(pocket)} recesses touch one another, the seam or a mouth, the first at {pocket[0, 0]:.1f} m; "
-            'that needs manifold3d: pip install "subterra-jax[recordings]"'
-        ) from error
+    from manifold3d import Manifold, Mesh64, OpType  # planar tasks do not need it
+
     caps, n = [], len(wall.vertices)
     for k, station in enumerate((0.0, sheet.station.max())):
         ring = np.flatnonzero((sheet.station == station) & ~sheet.rim)

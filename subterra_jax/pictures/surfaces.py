@@ -1,7 +1,6 @@
 """The visible surfaces of a piece of a tunnel, from its plan alone: wall, recesses, floor, track and furniture."""
 
 import dataclasses
-from importlib.util import find_spec
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -44,8 +43,7 @@ def tunnel_surfaces(plan: TunnelPlan, lining: str | None, start: float, end: flo
     """Return what a camera sees of the tunnel between two stations.
 
     A plan with a shell gives the bore as surveyed or drawn. One without knows its walls at the LiDAR's height alone:
-    they stand upright below a level crown of an assumed height. Without `manifold3d` recesses that touch one another
-    are left out.
+    they stand upright below a level crown of an assumed height.
 
     Args:
         plan: The tunnel.
@@ -63,7 +61,7 @@ def tunnel_surfaces(plan: TunnelPlan, lining: str | None, start: float, end: flo
     plan.lining(name)  # raises the error that names the tunnel
     first = plan.shell.window[0]
     shell = short_shell(plan.shell, first + start, first + end)
-    _, wall, track, furniture = raise_parts(shell, name, touching=find_spec("manifold3d") is not None)
+    _, wall, track, furniture = raise_parts(shell, name)
     wall = Triangles(wall.vertices, wall.faces[:, ::-1])  # it faces the rock; a camera stands in the air
     rolled, within, behind = _unrolled(shell, wall.vertices, name)
     centre = wall.vertices[wall.faces]

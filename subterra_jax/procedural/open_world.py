@@ -118,13 +118,12 @@ def draw(name: str, length: float | None = None) -> Drawn:
         TunnelError: There is no such kind, split or tunnel, or the split does not have the kind.
     """
     kind, split, index = _parse(name)
-    sequence = np.random.SeedSequence([_FAMILY, kind_number(kind), SPLITS[split] + index])
-    rng = dict(zip(_STREAMS, (np.random.default_rng(child) for child in sequence.spawn(len(_STREAMS))), strict=True))
+    rng = _generators(kind, split, index)
     ranges = all_kinds()[kind]
     level = str(rng["items"].choice(levels_of(kind, split)))
     share = {"none": 0.0, "some": _HALF, "all": 1.0}[level]
     items = tuple(item for item in ranges.fixtures if rng["items"].random() < share)
-    drawn_length = float(np.exp(rng["line"].uniform(*np.log(LENGTH))))
+    drawn_length = _draw_length(rng["line"])
     length = drawn_length if length is None else length
     alignment = draw_alignment(rng["line"], length, LINE)
     step = alignment.station[1]
@@ -132,6 +131,23 @@ def draw(name: str, length: float | None = None) -> Drawn:
     height = np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * step)])
     bore = draw_bore(ranges, length, items, [rng[name] for name in _STREAMS[1:6]])
     return Drawn(name, level, items, alignment, height, bore)
+
+
+def _generators(kind: str, split: str, index: int) -> dict[str, np.random.Generator]:
+    """Return the random generators of a tunnel by what they draw, so that none moves another."""
+    sequence = np.random.SeedSequence([_FAMILY, kind_number(kind), SPLITS[split] + index])
+    return dict(zip(_STREAMS, (np.random.default_rng(child) for child in sequence.spawn(len(_STREAMS))), strict=True))
+
+
+def _draw_length(line: np.random.Generator) -> float:
+    """Draw the length of a tunnel, m; it is the first number of its line."""
+    return float(np.exp(line.uniform(*np.log(LENGTH))))
+
+
+def shortest(split: str, among: int = 100) -> list[str]:
+    """Return the shortest of the first tunnels of each kind of a split, by name."""
+    length = lambda kind, index: _draw_length(_generators(kind, split, index)["line"])  # noqa: E731
+    return [f"open:{k}:{split}:{min(range(among), key=lambda i, k=k: length(k, i))}" for k in kinds_of(split)]
 
 
 def plan(

@@ -10,6 +10,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.parts import ImuParams
 from subterra_jax.parts.imu import GRAVITY
+from subterra_jax.parts.unicycle import VehicleParams
 
 TASK, GRADE = "Subterra/TraverseShort-v1", 0.04
 IDEAL = ImuParams(*[0.0] * 6)
@@ -21,16 +22,16 @@ STATED = {
     "gyro_walk": 1.088e-4,  # rad/s/√s
     "accel_bias": 0.02,  # m/s²
     "gyro_bias": 0.003,  # rad/s
-    "rate": 200,
+    "samples": 20,
 }
 
 
-def made(imu, grade=GRADE):
+def made(imu, grade=GRADE, **overrides):
     """A task in a bend of 40 m radius that climbs; its LiDAR in three dimensions brings the ground along."""
     station = np.linspace(0.0, 60.0, 121)
     xy = 40.0 * np.stack([np.sin(station / 40.0), 1.0 - np.cos(station / 40.0)], axis=-1)
     plan = st.tunnel.from_centreline(xy, 2.8, elevation=grade * station)
-    return st.make(TASK, tunnel=plan, sensor=np.array([[1.0, 0.0, 0.0]]), imu=imu)
+    return st.make(TASK, tunnel=plan, sensor=np.array([[1.0, 0.0, 0.0]]), imu=imu, **overrides)
 
 
 def drive(env, params, actions, key=0):
@@ -60,7 +61,7 @@ def rotation(vector):
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [100, 200, 400])
 def test_ten_seconds_integrated_give_the_motion_to_a_millimetre_and_a_hundredth_of_a_degree(rate):
-    env, params = made(dataclasses.replace(IDEAL, rate=rate))
+    env, params = made(dataclasses.replace(IDEAL, samples=rate // 10))
     rng = np.random.default_rng(rate)
     actions = np.stack([rng.uniform(0.5, 1.6, 100), 0.03 + rng.uniform(-0.1, 0.1, 100)], axis=-1)
     first, states = drive(env, params, actions)
@@ -107,7 +108,7 @@ def allan(values, rate, tau):
 
 def check_densities(n_steps, taus):
     """Compare the noise at rest with the stated sizes, in each axis: those of `STATED`, whatever the params say."""
-    env, params = made(ImuParams(rate=100), grade=0.0)
+    env, params = made(ImuParams(samples=10), grade=0.0)
     _, states = drive(env, params, np.zeros((n_steps, 2)))
     samples = np.asarray(states.imu.samples, np.float64).reshape(-1, 6)
     bias = np.asarray(states.imu.bias, np.float64)
@@ -138,6 +139,21 @@ def test_sizes_are_those_stated():
     assert {field.name: getattr(ImuParams(), field.name) for field in dataclasses.fields(ImuParams)} == STATED
 
 
-def test_a_rate_that_does_not_go_into_a_step_is_refused():
-    with pytest.raises(ValueError, match=r"whole number of samples a step of 0\.1 s, got 33"):
-        made(ImuParams(rate=33))
+def test_no_sample_at_all_is_refused():
+    with pytest.raises(ValueError, match="one sample a step or more, got samples=0"):
+        made(ImuParams(samples=0))
+
+
+@pytest.mark.parametrize("period", [0.1, 0.05])
+def test_a_start_a_turn_and_a_bend_are_measured_with_their_size_and_sign_at_any_control_period(period):
+    env, params = made(dataclasses.replace(IDEAL, samples=10), grade=0.0, vehicle=VehicleParams(period=period))
+    speed, yaw_rate = 1.25, 0.4
+    first, states = drive(env, params, np.tile([speed, yaw_rate], (2, 1)))
+    interval = period / 10
+    start, later = np.asarray(states.imu.samples, np.float64)
+    assert start[:, 0].sum() * interval == pytest.approx(speed, abs=2e-3), "from standing to its speed"
+    np.testing.assert_allclose(start[:, 5], yaw_rate, rtol=1e-3)  # to the left is positive
+    np.testing.assert_allclose(later[:, 5], yaw_rate, rtol=1e-3)
+    np.testing.assert_allclose(later[:, 1], speed * yaw_rate, atol=5e-3)  # inwards, to the left
+    np.testing.assert_allclose(later[:, 2], GRAVITY, rtol=1e-4)
+    assert float(states.heading[-1] - first.heading) == pytest.approx(2 * period * yaw_rate, rel=1e-3)

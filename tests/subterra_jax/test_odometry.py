@@ -7,6 +7,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.parts import odometer as odometry
+from subterra_jax.parts.wander import WanderParams
 
 TASK = "Subterra/TraverseShort-v1"
 N, T = 4000, 50
@@ -55,6 +56,14 @@ def test_noise_and_bias_are_recovered_within_three_standard_errors(channel):
     expected = bias_sigma**2 + noise_sigma**2 / (T - 1)
     assert of_means == pytest.approx(expected, abs=3 * expected * np.sqrt(2 / N))
     assert steps.mean() == pytest.approx(motion, abs=3 * np.sqrt(expected / N))
+
+
+def test_every_error_of_an_episode_has_a_draw_of_its_own():
+    params = odometry.OdometryParams(0.0, 0.02, 0.0, 0.002, WanderParams(sigma=0.01), backward_bias_sigma=0.02)
+    noise = jax.random.normal(jax.random.key(4), (N, params.n_reset_noise))
+    state = jax.vmap(odometry.start_odometry, (0, None))(noise, params)
+    errors = np.corrcoef([state.distance_bias, state.heading_bias, state.wander, state.backward_bias])
+    np.testing.assert_allclose(errors, np.eye(4), atol=4.5 / np.sqrt(N))  # of independent numbers: 1 / sqrt(N)
 
 
 def test_dead_reckoned_headings_stay_within_half_a_turn():

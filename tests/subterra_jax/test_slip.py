@@ -43,6 +43,9 @@ def test_slip_acts_on_the_motion_with_the_stated_spread():
     assert abs(motion[:, 0].std() - expected) < 3 * expected / np.sqrt(2 * N)
     assert abs(motion[:, 1].std() - 0.002) < 3 * 0.002 / np.sqrt(2 * N)
     assert abs(motion[:, 0].mean() - 2.0) < 3 * expected / np.sqrt(N)
+    # Each error has a draw of its own: 4.5 standard errors of a correlation of independent numbers.
+    errors = np.corrcoef([states.gain, states.yaw, states.wander])
+    np.testing.assert_allclose(errors, np.eye(3), atol=4.5 / np.sqrt(N))
 
 
 def test_a_robot_told_to_stand_stands():

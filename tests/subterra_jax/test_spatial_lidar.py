@@ -284,6 +284,18 @@ def test_every_number_of_a_named_sensor_is_the_one_written_here(name):
     np.testing.assert_allclose(azimuth[0] % 360.0, np.arange(n_columns) * 360.0 / n_columns, atol=1e-3)
 
 
+def test_what_is_nearer_than_the_least_range_is_no_return(graded):
+    """Beams to the left wall, 2.8 m away, and ahead and up, further away; the least range lies between."""
+    beam = np.array([[0.0, 1.0, 0.0], [0.0, np.cos(1.2), np.sin(1.2)]])
+    found = {}
+    for least in (0.0, 2.9):
+        env, params = st.make(TASK, tunnel=graded, sensor=exact(beam, range_min=least))
+        found[least] = observe(env, placed(env, params, 15.0, 0.0, 0.0), params)["scan"]
+    assert found[0.0][0] == pytest.approx(HALF, abs=0.01)
+    assert found[0.0][1] > 2.9
+    np.testing.assert_allclose(found[2.9], [30.0, found[0.0][1]], atol=1e-5)
+
+
 def test_the_vlp16_fires_its_lasers_in_the_order_of_the_manual():
     """Lowest, the one 16 degrees above it, the second lowest: 2.304 µs apart."""
     times = np.asarray(make_sensor("vlp16").times, np.float64).reshape(16, 1800)

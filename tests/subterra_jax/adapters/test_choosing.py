@@ -40,6 +40,7 @@ def test_goal_and_start_are_where_they_were_asked_for(env):
     assert info["station"] < 19.95, "it faces the mouth"
     assert info["lateral"] == pytest.approx(-0.25, abs=0.02)
     assert obs["odometry"][0] == 0.0, "the odometer does not know"
+    assert obs["start"] == pytest.approx(20.0), "the task reports it"
 
 
 def test_a_heading_turns_to_the_left(env):
