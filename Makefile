@@ -51,27 +51,15 @@ $(STAMP): pyproject.toml
 	@touch $@
 
 SHARED ?= ../shared
-tunnels: $(STAMP)  ## make the packaged bores in three dimensions again; the planar walls stay as they are; SHARED names the folder that holds data/metro_asbuilt
+tunnels: $(STAMP)  ## build the packaged tunnels anew, about 30 minutes on 2 cores; SHARED names the folder that holds data/metro_asbuilt
 	$(BIN)/python -m scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out build/survey-351
 	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
-		--provenance simulated --name subterra-351 --out build/subterra-351
-	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-asbuilt --reconstruct.lining.clock-angle 0.61 \
-		--out build/metro-asbuilt
-	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro-universal \
-		--reconstruct.lining.kind universal --reconstruct.lining.seed 0 --out build/metro-universal
-	cp build/metro-universal/tunnel.npz subterra_jax/data/metro-universal.npz
-	cp build/metro-universal/manifest.json subterra_jax/data/metro-universal.json
-	$(BIN)/python -c "import subterra_jax as st; from subterra_jax.procedural.open_world import plan; \
-		st.tunnel.save_tunnel(plan('open:universal:test-unseen:900351', length=351.0), 'build/universal.npz')"
-	$(BIN)/python -m scene.survey --truth-file build/universal.npz --lining bare --length 351 --seed 0 --point-rate 80040 \
-		--sensors avia os1 --scan-every 40 --out build/survey-universal
-	$(BIN)/python -m scene.build build/survey-universal/survey.bag \
-		--trajectory build/survey-universal/groundtruth.tum --provenance simulated --name subterra-universal \
-		--out build/subterra-universal
-	cp build/subterra-universal/tunnel.npz subterra_jax/data/subterra-universal.npz
-	cp build/subterra-universal/manifest.json subterra_jax/data/subterra-universal.json
-	for name in subterra-351 metro-asbuilt; do \
-		cp build/$$name/tunnel.npz subterra_jax/data/$$name-solid.npz; \
+		--provenance simulated --name subterra-351 --date $$(date +%F) --out build/subterra-351
+	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro --date $$(date +%F) \
+		--reconstruct.lining.kind universal --reconstruct.lining.seed 0 --out build/metro
+	for name in subterra-351 metro; do \
+		cp build/$$name/tunnel.npz subterra_jax/data/$$name.npz; \
+		cp build/$$name/manifest.json subterra_jax/data/$$name.json; \
 	done
 
 clean:           ## remove what was built

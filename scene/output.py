@@ -14,6 +14,7 @@ import trimesh
 from scene.bore import Bore
 from scene.cloud import thin_cloud
 from scene.errors import FitError
+from scene.fitting.lining import MEASURED, count_alone
 from scene.judging.judge import STATION, DoubtError, Judgement, JudgingConfig, judge_bore, require_trust
 from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
@@ -28,8 +29,9 @@ from scene.writing.furniture import count_pieces
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene
 from scene.writing.planar import cut_walls, save_tunnel
-from scene.writing.shell import Variant, shell_fields
+from scene.writing.shell import Variant, seams, shell_fields
 from scene.writing.track import Track, TrackConfig, describe_track, lay_track, track_provenance
+from subterra_jax.host.versions import VERSION
 
 SCENES = ("scene.xml", "scene_furnished.xml")
 
@@ -66,10 +68,18 @@ def write_geometry(
         "furnished": Variant(furnished.bore if furnished.niches else bore, True, dressed),
     }
     shell = shell_fields(bore, track.elevation, track.config, variants)
-    save_tunnel(folder / "tunnel.npz", name, provenance, bore, track.elevation, height, walls, segments, shell)
+    plane = (bore, track.elevation, height, walls, segments)
+    save_tunnel(folder / "tunnel.npz", name, provenance, *plane, shell, seams(variants))
     placed = {f"furniture_{kind}": number for kind, number in count_pieces(furnished.pieces).items()}
     count |= {**placed, "furniture_niche": len(furnished.niches), "lining_faces": len(lining.faces)}
     return count, {"furniture": "by standard, in the variant furnished alone"}
+
+
+def _pockets_without_nail(result: Reconstruction) -> dict[str, int]:
+    """Return the number of pockets that no nail joins to another, by why; empty where no nails were laid."""
+    if not len(result.bore.nail):
+        return {}
+    return count_alone(result.bore, result.bore.ring_station if result.provenance["pockets"] == MEASURED else None)
 
 
 MANIFEST_SCHEMA = "subterra.manifest/1"
@@ -84,6 +94,7 @@ def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
     whole = {
         "schema": MANIFEST_SCHEMA,
         "files": hash_files(path.parent),
+        "builder": VERSION,
         "config": _json_value(dataclasses.asdict(config)),
         "versions": library_versions(_LIBRARIES),
         **_json_value(content),
@@ -121,6 +132,7 @@ class BuildConfig:
     """Everything a build depends on beside its input."""
 
     name: str = ""  # Name of the tunnel; that of the output folder where not given.
+    date: str = ""  # Day that the manifest states; none by default, so that the same input gives the same bytes.
     provenance: str = "measured"  # Kind of recording, such as `simulated` for a simulated survey.
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)  # Steps from the input to a bore.
     track: TrackConfig = field(default_factory=TrackConfig)  # Standard by which the track is laid.
@@ -219,6 +231,7 @@ def _describe_scene(
             "rings": len(bore.ring_station),
             "pockets": len(bore.pocket),
         },
+        "pockets_without_nail": _pockets_without_nail(result),
         "track": describe_track(track, result.seen),
         "provenance": {
             "bore": provenance,

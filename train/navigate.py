@@ -48,7 +48,7 @@ class Command:
     Attributes:
         out: Run folder to write: checkpoint/, config.json, log.jsonl, log.csv, episodes.csv, curve.*, evaluation.json.
         task: Task id.
-        tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro-asbuilt`, `control`, or several of which
+        tunnel: Tunnel file, or a name: `subterra-351` (if left out), `metro`, `control`, or several of which
             each episode draws one: `open:train:0-255`.
         lining: Variant of the walls; `pockets`, or its first, if left out.
         sensor: LiDAR; `planar16` is the task's own, `avia` no image.

@@ -37,7 +37,7 @@ class PictureConfig:
     """
 
     out: Path
-    tunnel: str = "metro-universal"
+    tunnel: str = "metro"
     lining: str = "pockets"
     station: float = 40.0
     seed: int = 0

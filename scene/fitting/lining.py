@@ -67,6 +67,15 @@ def pair_pockets(bore: Bore, joint: Float[np.ndarray, " r"] | None = None) -> In
     return np.array(result, np.intp).reshape(-1, 2)
 
 
+def count_alone(bore: Bore, joint: Float[np.ndarray, " r"] | None = None) -> dict[str, int]:
+    """Count the pockets that no nail joins to the next one of their joint, by why; see `pair_pockets` for `joint`."""
+    pairs = len(pair_pockets(bore, joint))
+    return {
+        "no pocket across the joint": len(bore.pocket) - 2 * pairs,
+        "seen to have no nail": 2 * (pairs - len(bore.nail)),
+    }
+
+
 def make_nails(bore: Bore, pair: Int[np.ndarray, "b 2"], depth: float, diameter: float) -> Shaped[np.ndarray, " b"]:
     """Makes nails from the middle of one pocket to that of the other, marked as not measured."""
     first, second = bore.pocket[pair[:, 0]], bore.pocket[pair[:, 1]]

@@ -21,6 +21,13 @@ def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) ->
     if sought and all(line.rails is None for line in seen.lines) and (pose_doubt or seen.thin):
         why = f"{pose_doubt}: rails blur as the walls do, and may be there" if pose_doubt else _THIN
         return [Warned("rails", f"no rails were seen, but {why}; --track standard lays a track")]
+    left_out = sum(line.left_out for line in track.lines)
+    if left_out:
+        return [Warned(
+            "sleepers",
+            f"{left_out} sleepers are left out: {track.config.sleeper_length:g} m long, they would come within "
+            f"{track.config.margin:g} m of a wall; --track.sleeper-length gives them the length that is there",
+        )]  # fmt: skip
     if track.config.lay != "auto" or not seen.sought or len(seen.lines) != len(track.lines):
         return []
     count, measured = len(track.measured), int(track.measured.sum())

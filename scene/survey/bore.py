@@ -22,9 +22,12 @@ from scene.survey.section import (
     rectangle,
     vault,
 )  # fmt: skip
-from scene.survey.sizes import DESIGN, draw_sizes
+from scene.survey.sizes import DESIGN, Sizes, draw_sizes
 from scene.survey.surroundings import Cutting, Thing, box_thing, cutting_mesh, draw_cutting, round_thing, thing_mesh
 
+# The paper counts 351 m / 0.6 m + 1 = 586 sleepers, which needs one in the middle of each mouth. So far apart, 586 lie
+# whole between the mouths wherever the first is drawn; 0.6 m apart there are 585.
+_PAPER_SLEEPERS = Sizes(sleeper_spacing=0.5988)
 _IRREGULAR_SIGMA = 0.13  # m, standard deviation of the walls
 _CROSSFALL = 0.02  # of the irregular bore's floor
 
@@ -145,11 +148,12 @@ class _Class:
     cutting: bool = False
     dark: float = 0.0  # m of lining that give no echo
     strays: float = 0.0
+    sizes: Sizes = DESIGN
 
 
 _CLASSES: dict[TruthName, _Class] = {
     "paper": _Class("D"),
-    "metro": _Class("D", elements=metro_elements),
+    "metro": _Class("D", elements=metro_elements, sizes=_PAPER_SLEEPERS),
     "ellipse": _Class("ellipse", ellipse),
     "widening": _Class("D, widening", widening=_wider_middle),
     "horseshoe": _Class("horseshoe", horseshoe),
@@ -204,8 +208,8 @@ def draw_bore(
     `tolerances` the sizes of track, rings and pockets are drawn too; the other draws stay as they are without.
     """
     first, second, third, fourth, fifth = (np.random.default_rng(s) for s in seed.spawn(5))
-    sizes = draw_sizes(fifth) if tolerances else DESIGN
     kind = _CLASSES[truth]
+    sizes = draw_sizes(fifth) if tolerances else kind.sizes
     alignment = lay_out(first, length, kind.elements(first, length))
     section = _draw_section(second, kind, length, correlation)
     furniture = draw_furniture(third, length, kind.rings and not kind.rough, sizes)

@@ -16,7 +16,7 @@ from scene.survey.alignment import MARGIN, Alignment, Frames
 from scene.survey.mesh import EMPTY, Mesh, Part, box_mesh, join_meshes
 from scene.survey.rolled import Recess, Sheet, place_recesses, wall_mesh
 
-SCHEMA = "subterra.tunnel/2"
+SCHEMA = "subterra.tunnel/3"
 _RAIL = 0.1  # m, half the width of what is no wider than a rail
 _NEAR = 1e-6  # m
 
@@ -90,7 +90,7 @@ def read_given(path: Path, lining: str, length: float) -> GivenBore:
     """Reads the first `length` m of a tunnel file.
 
     Args:
-        path: A `tunnel.npz` of schema 2.
+        path: A `tunnel.npz` with its bore in three dimensions.
         lining: Variant of its walls; empty for `pockets`, or the first where there is none of that name.
         length: Length wanted, m.
 
@@ -107,8 +107,7 @@ def read_given(path: Path, lining: str, length: float) -> GivenBore:
         raise ValueError(f"length must be at most {station[-1]:g} m for {path}, got {length:g}")
     rows = int(np.searchsorted(station, length + _NEAR))
     own = f"shell_radius_{chosen}"
-    radius = float(fields["shell_unit"]) * fields[own if own in fields else "shell_radius"].astype(float)
-    radius = radius.cumsum(axis=1).cumsum(axis=0)[:rows]
+    radius = fields[own if own in fields else "shell_radius"][:rows]
     level = np.sqrt(1.0 - fields["shell_rise"][:rows, None] ** 2)
     tangent = np.column_stack([level * fields["tangent"][:rows], fields["shell_rise"][:rows]])
     axis = np.column_stack([fields["centre"], fields["elevation"] + fields["shell_height"]])[:rows]
@@ -138,14 +137,16 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: no such tunnel file") from error
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: not a readable .npz archive") from error
+    fields = {name: _values(fields, name) for name in fields}
     found = str(fields["schema"]) if "schema" in fields else "missing"
-    if found != SCHEMA:
+    if found != SCHEMA or "shell_radius" not in fields:
+        why = "it is planar" if found == SCHEMA else f"schema {found}; {SCHEMA} does"
         raise ValueError(
-            f"{path}: holds no bore in three dimensions (schema {found}; {SCHEMA} does): build its scene again, or "
-            "save a tunnel of the open world with st.tunnel.save_tunnel"
+            f"{path}: holds no bore in three dimensions ({why}): build its scene again, or save a tunnel of the open "
+            "world with st.tunnel.save_tunnel"
         )
     wanted = ["name", "lining", "station", "centre", "tangent", "elevation", "shell_height", "shell_rise"]
-    wanted += ["shell_angle", "shell_section", "shell_unit", "shell_radius", "shell_track"]
+    wanted += ["shell_angle", "shell_section", "shell_radius", "shell_track"]
     wanted += [f"shell_{part}_{name}" for part in ("pocket", "brick", "seam") for name in fields.get("lining", [])]
     for name in wanted:
         if name not in fields:
@@ -153,6 +154,14 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         if fields[name].dtype.kind in "fiu" and not np.isfinite(fields[name]).all():
             raise ValueError(f"{path}: field {name!r} has a value that is not finite")
     return fields
+
+
+def _values(fields: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """Return a field, its whole numbers summed up along the first axis and in their unit."""
+    unit = fields.get("shell_unit" if name.startswith("shell_radius") else "unit")
+    if unit is None or not fields[name].ndim or fields[name].dtype.kind != "i":
+        return fields[name]
+    return float(unit) * fields[name].cumsum(axis=0, dtype=np.int64)
 
 
 def _roll_up(

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -11,8 +10,8 @@ from manifold3d import Manifold, Mesh64
 from scene.bore import Axis, Bore, make_axis
 from scene.errors import FitError
 from scene.writing.mesh import has_rings
+from subterra_jax.host.tunnelfile import write_tunnel
 
-SCHEMA, PLANAR_SCHEMA = "subterra.tunnel/2", "subterra.tunnel/1"
 _SAME_JOINT = 0.4  # m: less than a ring is wide
 _COLLINEAR = 0.001  # m; half of it would add half as many vertices to a smooth wall
 
@@ -102,32 +101,45 @@ def save_tunnel(
     lidar_height: float,
     variants: dict[str, Walls],
     furniture: dict[str, Float[np.ndarray, "f 4"]] | None = None,
-    shell: dict[str, Any] | None = None,
+    shell: dict[str, np.ndarray] | None = None,
+    seams: dict[str, float] | None = None,
 ) -> None:
-    """Writes `tunnel.npz`; docs/formats.md says what each field means. `variants` holds `smooth` first.
+    """Writes `tunnel.npz`; docs/formats.md says what each field means.
 
-    `furniture` holds, by variant, segments beside the walls; none where a variant is not named. Without the fields of
-    `scene.writing.shell` the file is one of the first schema, which holds the plane alone.
+    Args:
+        path: File to write.
+        name: Name of the tunnel.
+        provenance: `measured` or `simulated`.
+        bore: The bore.
+        elevation: z of the track at each station, m.
+        lidar_height: Height of the LiDAR's plane above it, m.
+        variants: Walls by the name of the lining, `smooth` first.
+        furniture: Segments beside the walls by lining, m; none where it is not named.
+        shell: Fields of `scene.writing.shell`; without them and `seams` the file holds the plane alone.
+        seams: The same.
     """
     plan = flatten_axis(bore.axis)
-    fields: dict[str, Any] = {
-        "schema": np.array(SCHEMA if shell else PLANAR_SCHEMA),
-        "name": np.array(name),
-        "provenance": np.array(provenance),
+    facts = {
+        "name": name,
+        "provenance": provenance,
+        "lidar_height": lidar_height,
+        "ring_pitch": ring_pitch(bore),
+        "lining": list(variants),
+        **(seams or {}),
+    }
+    arrays = {
         "station": bore.station,
         "centre": plan.position[:, :2],
         "tangent": plan.tangent[:, :2],
         "elevation": elevation,
         "half_width": half_widths(variants["smooth"], bore),
-        "lidar_height": np.array(lidar_height),
-        "ring_pitch": np.array(ring_pitch(bore)),
-        "lining": np.array(list(variants)),
+        **(shell or {}),
     }
     for variant, walls in variants.items():
-        fields[f"left_{variant}"], fields[f"left_station_{variant}"] = walls.left, walls.left_station
-        fields[f"right_{variant}"], fields[f"right_station_{variant}"] = walls.right, walls.right_station
-        fields[f"furniture_{variant}"] = (furniture or {}).get(variant, np.empty((0, 4)))
-    np.savez_compressed(path, **fields, **(shell or {}))
+        arrays |= {f"left_{variant}": walls.left, f"left_station_{variant}": walls.left_station}
+        arrays |= {f"right_{variant}": walls.right, f"right_station_{variant}": walls.right_station}
+        arrays[f"furniture_{variant}"] = (furniture or {}).get(variant, np.empty((0, 4)))
+    write_tunnel(path, facts, arrays)
 
 
 def _area(polygon: Float[np.ndarray, "k 2"]) -> float:

@@ -5,14 +5,13 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from scene.bore import Bore
 from scene.writing.track import TrackConfig
 from scene.writing.unrolled import unroll_section
 
-_UNIT = 1e-4  # of a radius, m: half of it is the largest error
 _SEEN = ("0", "1")  # groups of geoms that a camera sees
 
 
@@ -23,6 +22,11 @@ class Variant:
     bore: Bore  # With the recesses that its wall is rolled out with
     recesses: bool  # True where they are cut
     scene: Path  # MJCF file that draws it
+
+
+def seams(variants: dict[str, Variant]) -> dict[str, float]:
+    """Return the angle at which the wall of each variant is cut open to be rolled out flat, rad, by field."""
+    return {f"shell_seam_{name}": float(unroll_section(each.bore).angle[0]) for name, each in variants.items()}
 
 
 def shell_fields(
@@ -40,28 +44,20 @@ def shell_fields(
         "shell_rise": bore.tangent[:, 2],
         "shell_angle": bore.angle,
         "shell_section": bore.radius.mean(axis=0),
-        "shell_unit": np.array(_UNIT),
-        "shell_radius": _encode(bore.radius),
+        "shell_radius": bore.radius,
         "shell_track": _rows([row for name, row in first.items() if name in common]),
     }
     for name, variant in variants.items():
         pocket = variant.bore.pocket if variant.recesses else variant.bore.pocket[:0]
         columns = [pocket[field] for field in ("station", "angle", "length", "width", "depth")]
         fields[f"shell_pocket_{name}"] = np.stack(columns, axis=-1)
-        fields[f"shell_seam_{name}"] = np.array(unroll_section(variant.bore).angle[0])
         own = [row for brick, row in scenes[variant.scene].items() if brick not in common]
         fields[f"shell_brick_{name}"] = _rows(own)
     return fields
 
 
-def _encode(radius: Float[np.ndarray, "n m"]) -> Int[np.ndarray, "n m"]:
-    """Return whole units as differences along and around, which are small and pack well."""
-    units = np.rint(radius / _UNIT).astype(np.int64)
-    return np.diff(np.diff(units, axis=0, prepend=0), axis=1, prepend=0).astype(np.int32)
-
-
 def _rows(rows: list[np.ndarray]) -> Float[np.ndarray, "k 13"]:
-    return np.array(rows, np.float32).reshape(-1, 13)
+    return np.array(rows, float).reshape(-1, 13)
 
 
 def _read_bricks(scene: Path, track: TrackConfig) -> dict[str, Float[np.ndarray, "13"]]:

@@ -77,6 +77,7 @@ class Line:
     sleeper_station: Float[np.ndarray, " k"]
     measured: Bool[np.ndarray, " k"]  # Sleepers that the survey shows; the others lie where the spacing asks for one
     clearance: Float[np.ndarray, " k"]  # Distance of each sleeper's nearer end to the wall, m
+    left_out: int = 0  # Sleepers between seen rails that would come nearer to a wall than the margin
 
     def rail_offset(self, rail: RailProfile) -> float:
         """Distance from the middle of the track to that of a rail's head, m; the gauge itself is face to face."""
@@ -113,8 +114,10 @@ class Track:
 def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) -> Track:
     """Lays the tracks on the flat floor, or one on a bed just wide enough where the bore is round.
 
-    Rails and sleepers that the survey shows are taken as they lie, and stand out as far as they do. Raises `FitError`
-    where a sleeper would come closer to the wall than the margin, if it is not the survey that shows it there.
+    Rails and sleepers that the survey shows are taken as they lie, and stand out as far as they do. Each sleeper is
+    checked against the wall at its level on both sides: one that would come nearer than the margin is left out between
+    rails that the survey shows, whose sleepers are not as long as the standard's; without such rails it raises
+    `FitError`.
     """
     half_width = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]
@@ -166,7 +169,8 @@ def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) 
     nearer = np.minimum(wall_offset(bore, level, 1) - offset, wall_offset(bore, level, -1) + offset)
     row = np.clip(np.rint(station / bore.station[1]).astype(int), 0, count - 1)
     clearance = nearer[row] - config.sleeper_length / 2
-    if (clearance < config.margin).any() and rails is None:
+    fits = clearance >= config.margin
+    if not fits.all() and rails is None:
         worst = int(np.argmin(clearance))
         raise FitError(
             f"the sleeper at {station[worst]:.1f} m comes within {clearance[worst]:.2f} m of the wall; "
@@ -174,7 +178,12 @@ def _lay_line(bore: Bore, config: TrackConfig, bed: np.ndarray, seen: SeenLine) 
         )
     known = rails is not None and rails.measured
     gauge = rails.gauge if rails is not None and known else config.gauge
-    return Line(gauge, known, offset, cant, seat, rail_height, footing, station, measured, clearance)
+    if not fits.any():
+        footing = protrusion
+    return Line(
+        gauge, known, offset, cant, seat, rail_height, footing,
+        station[fits], measured[fits], clearance[fits], int((~fits).sum()),
+    )  # fmt: skip
 
 
 def _radius_down(bore: Bore) -> np.ndarray:
@@ -251,6 +260,7 @@ def _describe_line(line: Line, rails: SeenRails | None) -> dict[str, Any]:
         "cant_from": "measured" if rails is not None else "by standard",
         "sleepers": len(line.sleeper_station),
         "sleepers_seen": int(line.measured.sum()),
+        "sleepers_left_out": line.left_out,
     }
 
 

@@ -1,7 +1,7 @@
 """Policies on disk: tensors in `NAME.safetensors`, everything else in `NAME.json` beside it.
 
 A safetensors file is eight bytes of header length, little-endian, a JSON header with type, shape and place of every
-tensor, and their bytes. Only float32 is used here. Format: github.com/huggingface/safetensors, README.
+tensor, and their bytes. Tensors of 16 and of 32 bits are used here. Format: github.com/huggingface/safetensors, README.
 """
 
 import hashlib
@@ -23,6 +23,7 @@ SCHEMA = "subterra.policy/1"
 AGAIN = "release it again from its run folder with `python -m train.release`"
 TENSORS, FACTS = ".safetensors", ".json"
 CHECKPOINTS, CHECKPOINT_POLICY = "checkpoint", "policy"  # of a run folder: numbered checkpoints, a policy in each
+_TYPES = {"F32": "<f4", "F16": "<f2"}  # of tensors on disk; in memory all are float32
 GAIT = "walk"  # the kind that moves legs and drives no task
 TRAINED_UNDER = "trained_under"  # field of the facts
 _PERIODS = {None: 0.1, "b2": 0.2}  # s, by embodiment, of files without `TRAINED_UNDER`
@@ -173,11 +174,11 @@ def parse(content: bytes, name: str) -> dict[str, np.ndarray]:
 
 def _tensor(entry: dict[str, Any], data: bytes) -> np.ndarray:
     begin, end = entry["data_offsets"]
-    if entry["dtype"] != "F32":
-        raise ValueError(f"type {entry['dtype']}, not F32")
+    if entry["dtype"] not in _TYPES:
+        raise ValueError(f"type {entry['dtype']}, not {' or '.join(_TYPES)}")
     if end > len(data):
         raise ValueError(f"{len(data)} bytes of tensors, not {end}")
-    return np.frombuffer(data[begin:end], "<f4").reshape(entry["shape"])
+    return np.frombuffer(data[begin:end], _TYPES[entry["dtype"]]).astype(np.float32).reshape(entry["shape"])
 
 
 def _facts(path: Traversable, tensors: bytes) -> dict[str, Any]:

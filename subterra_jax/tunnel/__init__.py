@@ -1,7 +1,7 @@
 """A tunnel in the plane: from a file, a plan or arrays to the pytree that every step reads."""
 
 from subterra_jax.tunnel.arrays import from_centreline, from_polylines
-from subterra_jax.tunnel.save import save_tunnel
+from subterra_jax.tunnel.file import save_tunnel
 from subterra_jax.tunnel.tunnel import CONTACT_REACH, Foot, Tunnel, at_station, beside, foot, node_at
 
 __all__ = [

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import other_schema
-from subterra_jax.tunnel.sources import describe_damage
+from subterra_jax.tunnel.file import describe_damage
 from subterra_jax.viewer.config import ViewerError
 
 SCHEMA = "subterra.episode/1"

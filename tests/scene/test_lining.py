@@ -1,5 +1,7 @@
 """Pockets and nails are measured where they can be seen, by standard where not, and never invented."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from scene.bore import Bore, load_bore
 from scene.cloud import Cloud
 from scene.fitting.assemble import bore_from_sections
 from scene.fitting.centreline import CentrelineConfig, fit_centreline
-from scene.fitting.lining import LiningConfig, add_lining
+from scene.fitting.lining import LiningConfig, add_lining, count_alone, make_nails, pair_pockets
 from scene.fitting.section import fit_sections
 from tests.scene.shapes import swept
 from tests.scene.test_irregular_walls import Irregular
@@ -73,6 +75,22 @@ def test_nails_are_seen_in_their_pockets(with_nails):
     off_joint = np.abs(seen["station"][:, None] - bore.ring_station).min(axis=1)
     assert np.quantile(off_joint, 0.95) < 0.05
     assert seen["confidence"].min() > 0.8
+
+
+def test_every_pocket_is_joined_to_the_next_of_its_joint_and_those_alone_are_counted_by_why(bore):
+    pairs = pair_pockets(bore, bore.ring_station)
+    first, second = bore.pocket[pairs[:, 0]], bore.pocket[pairs[:, 1]]
+    assert len(pairs) == len(bore.pocket) // 2  # each has one across its joint
+    assert (np.abs(second["station"] - first["station"] - 0.4) < 1e-9).all()
+    np.testing.assert_allclose(first["angle"], second["angle"])
+    assert np.abs((first["station"] + second["station"])[:, None] / 2 - bore.ring_station).min(axis=1).max() < 1e-9
+    whole = replace(bore, nail=make_nails(bore, pairs, 0.06, 0.027))
+    across, none = "no pocket across the joint", "seen to have no nail"
+    assert count_alone(whole, bore.ring_station) == {across: 0, none: 0}
+    lost = pairs[0, 0]  # mortared flush
+    fewer = replace(whole, pocket=np.delete(bore.pocket, lost), nail=whole.nail[3:])
+    assert count_alone(fewer, bore.ring_station) == {across: 1, none: 4}
+    assert 1 + 4 + 2 * len(fewer.nail) == len(fewer.pocket)
 
 
 def test_empty_pockets_have_no_nails():

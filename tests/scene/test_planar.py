@@ -59,7 +59,7 @@ def test_the_tunnel_file_holds_every_field_of_the_format(bore, walls, tmp_path):
         tmp_path / "t.npz", "x", "simulated", bore, laid.elevation, 0.7, {**walls, "furnished": walls["pockets"]}
     )
     with np.load(tmp_path / "t.npz") as data:
-        assert str(data["schema"]) == "subterra.tunnel/1"
+        assert str(data["schema"]) == "subterra.tunnel/3"
         assert list(data["lining"]) == ["smooth", "pockets", "furnished"]
         n = len(data["station"])
         assert data["centre"].shape == data["tangent"].shape == (n, 2)

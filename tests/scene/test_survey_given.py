@@ -124,7 +124,7 @@ def test_the_same_seed_gives_the_same_bytes(universal: Path, survey: Path, tmp_p
 
 
 def test_a_packaged_tunnel_is_surveyed_with_its_track() -> None:
-    with resources.as_file(resources.files("subterra_jax") / "data" / "metro-universal.npz") as path:
+    with resources.as_file(resources.files("subterra_jax") / "data" / "metro.npz") as path:
         bore = read_given(path, "", 30.0)
     parts = np.bincount(bore.mesh().part, minlength=9)
     assert parts[Part.SLEEPER] / 12 == pytest.approx(30.0 / 0.6, abs=1.0)
@@ -173,9 +173,11 @@ def test_what_is_no_truth_is_refused_in_one_sentence(
         assert not (tmp_path / "out").exists()
 
 
-def test_a_plan_without_a_shell_or_a_piece_of_one_is_not_saved(tmp_path: Path) -> None:
-    with pytest.raises(TunnelError, match="no shell to save"):
-        st.tunnel.save_tunnel(plan(name_of("cast"), solid=False, length=LENGTH), tmp_path / "t.npz")
+def test_a_plan_without_a_shell_is_saved_for_planar_sensors_and_a_piece_of_one_is_not(tmp_path: Path) -> None:
+    st.tunnel.save_tunnel(plan(name_of("cast"), solid=False, length=LENGTH), tmp_path / "t.npz")
+    assert st.load_tunnel(tmp_path / "t.npz").shell is None
+    with pytest.raises(ValueError, match=r"holds no bore in three dimensions \(it is planar"):
+        read_given(tmp_path / "t.npz", "", LENGTH)
     with pytest.raises(TunnelError, match="piece of a tunnel"):
         st.tunnel.save_tunnel(plan(name_of("cast"), length=LENGTH).slice(5.0, 10.0), tmp_path / "t.npz")
 
@@ -185,9 +187,9 @@ def test_a_saved_tunnel_loads_as_it_was(tmp_path: Path) -> None:
     st.tunnel.save_tunnel(made, tmp_path / "t.npz")
     loaded = st.load_tunnel(tmp_path / "t.npz")
     assert (loaded.name, loaded.ring_pitch, loaded.lidar_height) == (made.name, made.ring_pitch, made.lidar_height)
-    np.testing.assert_array_equal(loaded.ring_joint, made.ring_joint)
+    np.testing.assert_allclose(loaded.ring_joint, made.ring_joint, atol=6e-6)
     np.testing.assert_allclose(loaded.shell.radius, made.shell.radius, atol=6e-5)
     np.testing.assert_allclose(loaded.shell.linings["smooth"].radius, made.shell.linings["smooth"].radius, atol=6e-5)
-    np.testing.assert_allclose(loaded.shell.tangent, made.shell.tangent, atol=1e-12)
-    np.testing.assert_array_equal(loaded.lining("built").left.vertex, made.lining("built").left.vertex)
-    assert loaded.shell.spacing == made.shell.spacing
+    np.testing.assert_allclose(loaded.shell.tangent, made.shell.tangent, atol=2e-5)
+    np.testing.assert_allclose(loaded.lining("built").left.vertex, made.lining("built").left.vertex, atol=6e-6)
+    np.testing.assert_allclose(loaded.shell.spacing, made.shell.spacing, atol=6e-6)

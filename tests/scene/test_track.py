@@ -1,11 +1,15 @@
 from dataclasses import replace
+from xml.etree import ElementTree as ET
 
 import mujoco
 import numpy as np
 import pytest
 
-from scene.bore import NAIL
+from scene.bore import NAIL, Bore
 from scene.errors import FitError
+from scene.fitting.rails import SeenRails
+from scene.fitting.trackseen import SeenLine, SeenSleepers, SeenTrack
+from scene.judging.trackdoubt import doubt_track
 from scene.writing import mjcf
 from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.planar import cut_walls
@@ -66,9 +70,52 @@ def test_a_bore_too_low_for_a_track_gets_none(bore):
     assert not len(lay_track(pipe, TrackConfig()).sleeper_station)
 
 
-def test_a_sleeper_too_near_the_wall_is_an_error_with_its_place():
-    with pytest.raises(FitError, match=r"the sleeper at .* m comes within"):
-        lay_track(arc_bore(half_width=1.3), TrackConfig(shoulder=0.0))
+def narrowed(bore: Bore, side: int, half_width: float, stations: slice = slice(None)) -> Bore:
+    """The bore with one wall (1 the left one) nearer to the axis, at some stations."""
+    radius = bore.radius.copy()
+    with np.errstate(divide="ignore"):
+        wall = half_width / np.maximum(side * np.cos(bore.angle), 0.0)
+    radius[stations] = np.minimum(radius[stations], wall)
+    return replace(bore, radius=radius)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_clearance_of_a_sleeper_is_that_to_the_nearer_wall(bore, side):
+    laid = lay_track(narrowed(bore, side, 1.5), TrackConfig(shoulder=0.0))
+    np.testing.assert_allclose(laid.clearance, 1.5 - 1.25, atol=0.02)
+    with pytest.raises(FitError, match=r"the sleeper at .* m comes within 0\.05 m of the wall"):
+        lay_track(narrowed(bore, side, 1.3), TrackConfig(shoulder=0.0))
+
+
+def seen_rails(bore: Bore, aside: float = 0.0) -> SeenTrack:
+    """Rails that a survey shows, so far to the left of the axis, on sleepers that stand out by 6 cm."""
+    there, ones = bore.station[[0, -1]], np.ones(2)
+    rails = SeenRails(there, aside * ones, 0.0 * ones, 1.508, 1.435, 0.001, 9, 0.246)
+    sleepers = SeenSleepers(np.arange(0.3, bore.length, 0.6), np.ones(40, bool), 0.06)
+    return SeenTrack((SeenLine(sleepers, rails),), sought=True)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_sleepers_between_seen_rails_that_would_meet_a_wall_are_left_out_and_told_of(bore, side):
+    squeezed = slice(40, 61)  # 10 to 15 m
+    seen = seen_rails(bore)
+    laid = lay_track(narrowed(bore, side, 1.3, squeezed), TrackConfig(), seen)
+    (line,) = laid.lines
+    inside = (seen.lines[0].sleepers.station > 9.8) & (seen.lines[0].sleepers.station < 15.1)
+    np.testing.assert_allclose(line.sleeper_station, seen.lines[0].sleepers.station[~inside])
+    assert line.left_out == inside.sum() > 5
+    assert line.clearance.min() >= TrackConfig().margin
+    (warning,) = doubt_track(laid, seen)
+    assert warning.text.startswith(f"{line.left_out} sleepers are left out")
+    whole = lay_track(bore, TrackConfig(), seen)
+    assert whole.lines[0].left_out == 0
+    assert not doubt_track(whole, seen)
+
+
+@pytest.mark.parametrize("aside", [1.3, -1.3])
+def test_a_track_beside_the_axis_is_as_near_to_a_wall_as_its_nearer_end(bore, aside):
+    laid = lay_track(bore, TrackConfig(), seen_rails(bore, aside))
+    np.testing.assert_allclose(laid.clearance, 2.8 - 1.3 - 1.25, atol=0.02)
 
 
 def test_the_scene_file_names_every_sleeper_and_both_rails(written):
@@ -89,6 +136,18 @@ def test_each_sleeper_has_two_pads_and_four_clips_on_the_rails_feet():
         foot = config.pad_thickness + config.rail.foot_height
         assert inner.min() < config.rail.foot_width / 2
         assert clip.vertices[inner < config.rail.foot_width / 2, 2].min() == pytest.approx(foot, abs=0.005)
+
+
+def test_rails_stand_on_pads_of_a_centimetre(bore, written):
+    laid, _, path = written
+    assert TrackConfig().pad_thickness == 0.010
+    world = ET.parse(path).getroot().find("worldbody")
+    at = {geom.get("name"): geom for geom in world.iter("geom")}
+    foot = at["rail_left_000_foot"]  # to 3 m
+    middle, half = (np.array(foot.get(key).split(), float)[2] for key in ("pos", "size"))
+    assert middle - half - np.interp(1.5, bore.station, laid.elevation) == pytest.approx(0.010, abs=1e-3)
+    pads = [part for part in fastening_mesh(TrackConfig()).split(only_watertight=True) if len(part.vertices) == 8]
+    assert sum(np.ptp(part.vertices[:, 2]) == pytest.approx(0.010) for part in pads) == 2
 
 
 def test_nails_bridge_the_joint_behind_the_wall(bore, tmp_path):

@@ -136,7 +136,7 @@ def test_noise_has_its_size_stays_in_range_and_spares_beams_without_a_hit():
         ("subterra-351", "pockets", 20_000),
         ("subterra-351", "smooth", 20_000),
         ("subterra-351", "furnished", 20_000),
-        ("metro-asbuilt", "smooth", 10_000),
+        ("metro", "smooth", 10_000),
     ],
 )
 def test_the_packaged_tunnels_are_exact_at_random_poses(name, lining, n_poses):

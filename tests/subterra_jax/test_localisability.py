@@ -153,7 +153,7 @@ def test_the_bound_of_one_unknown_leaves_the_others_free():
 
 def test_a_long_cell_is_told_what_its_scans_tell_in_the_mean():
     """The walls of the real metro narrow near its mouth: a pose for all of 5 m would be told 30 times as much."""
-    plan = st.load_tunnel("metro-asbuilt").slice(0.0, 60.0)
+    plan = st.load_tunnel("metro").slice(0.0, 60.0)
     params = st.make(TASK, tunnel=plan, lining="smooth", goal=_near())[1]
     short, long = (localisability(params, step=step) for step in (0.5, 5.0))
     told = (short.station_bound**-2.0).reshape(-1, 10).mean(axis=1)
@@ -210,7 +210,7 @@ def test_the_drift_of_a_perfect_filter_takes_each_scan_as_blurred_as_the_filter_
 
 
 def test_in_a_bend_a_scan_tells_as_much_as_another_place_differs_once_offset_and_heading_are_fitted():
-    _, params = st.make("Subterra/StopAt-v1", tunnel="metro-asbuilt", lining="smooth")
+    _, params = st.make("Subterra/StopAt-v1", tunnel="metro", lining="smooth")
     station, shift = np.arange(100.0, 132.0, 0.5, dtype=np.float32), 0.8
 
     @jax.jit

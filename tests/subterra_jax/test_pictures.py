@@ -14,7 +14,7 @@ from tests.subterra_jax.drawn import draw
 
 @pytest.fixture(scope="module")
 def plan():
-    return st.load_tunnel("metro-asbuilt", solid=True)
+    return st.load_tunnel("metro", solid=True)
 
 
 def test_surfaces_of_a_bore_lie_on_it_and_face_the_air(plan):
@@ -74,7 +74,7 @@ def test_a_stage_is_for_looks_alone(plan):
 
 def test_each_tunnel_of_a_list_is_drawn_by_its_number(plan):
     choice = TunnelChoice([plan, "control"], piece=(10.0, 60.0))
-    assert choice.plan(0).name == "metro-asbuilt"
+    assert choice.plan(0).name == "metro"
     assert choice.plan(1).length == pytest.approx(60.0)
     assert TunnelChoice("open:val:0-2").plan(1).name == st.load_tunnel("open:val:1").name
     ready = st.make("Subterra/TraverseShort-v1")[1].tunnel

@@ -1,7 +1,9 @@
 """A policy is a function: `action, memory = policy(obs, memory)`, whatever it is made of and wherever it is named."""
 
 import dataclasses
+import json
 import shutil
+import struct as binary
 from importlib import resources
 
 import jax
@@ -17,7 +19,7 @@ from subterra_jax.baselines.agent import Agent
 from subterra_jax.baselines.registry import AgentError
 from subterra_jax.episode import Driver
 from subterra_jax.evaluation import Episodes, evaluate
-from subterra_jax.policies import PolicyError, load_policy, loading
+from subterra_jax.policies import PolicyError, files, load_policy, loading
 from subterra_jax.policies.trained import Trained
 from subterra_jax.recorder import RecorderConfig, record
 from subterra_jax.viewer import library
@@ -89,6 +91,20 @@ def test_the_function_drives_the_very_episode_that_the_evaluation_drives(name, w
         state = jax.tree.map(lambda leaf, k=k: leaf[k], kept["state"]) if name == "oracle" else None
         action, memory = policy(kept["obs"][k], memory, state)
         np.testing.assert_allclose(action, kept["action"][k][:2], rtol=1e-5, atol=1e-6, err_msg=f"step {k}")
+
+
+@pytest.mark.parametrize(("kind", "numpy_kind"), [("F16", "<f2"), ("F32", "<f4"), ("BF16", "<f2")])
+def test_tensors_of_16_and_32_bits_are_read_as_32_and_no_others(kind, numpy_kind):
+    values = np.array([[1.5, -0.1, 3e-5]], numpy_kind)
+    header = json.dumps({"w": {"dtype": kind, "shape": [1, 3], "data_offsets": [0, values.nbytes]}}).encode()
+    content = binary.pack("<Q", len(header)) + header + values.tobytes()
+    if kind == "BF16":
+        with pytest.raises(PolicyError, match=r"x: damaged policy: .*type BF16, not F32 or F16"):
+            files.parse(content, "x")
+        return
+    read = files.parse(content, "x")["w"]
+    assert read.dtype == np.float32
+    np.testing.assert_array_equal(read, values.astype(np.float32))
 
 
 def test_a_batch_is_many_robots_and_each_has_a_key_of_its_own(world):

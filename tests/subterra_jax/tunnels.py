@@ -133,7 +133,7 @@ def tunnel_arrays(
     station = np.linspace(0.0, plan.length, round(plan.length / centre_step) + 1)
     wall_station = np.linspace(0.0, plan.length, round(plan.length / wall_step) + 1)
     arrays: dict[str, Any] = {
-        "schema": "subterra.tunnel/1",
+        "schema": "subterra.tunnel/3",
         "name": name,
         "provenance": "simulated",
         "station": station,

@@ -9,7 +9,7 @@ def write(path: Path, length: float, half_width: float) -> Path:
     station = np.arange(0.0, length + 0.25, 0.5)
     ones, zeros = np.ones_like(station), np.zeros_like(station)
     fields = {
-        "schema": np.array("subterra.tunnel/1"),
+        "schema": np.array("subterra.tunnel/3"),
         "name": np.array("corridor"),
         "provenance": np.array("simulated"),
         "station": station,

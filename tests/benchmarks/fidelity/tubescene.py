@@ -96,7 +96,7 @@ def _plan(path: Path, tube: Tube) -> None:
         for side, sign in (("left", 1), ("right", -1))
     }
     fields = {
-        "schema": "subterra.tunnel/1", "name": "tube", "provenance": "simulated", "station": station,
+        "schema": "subterra.tunnel/3", "name": "tube", "provenance": "simulated", "station": station,
         "centre": position[:, :2], "half_width": half, "lidar_height": LIDAR_HEIGHT, "lining": ["smooth", "pockets"],
         "tangent": tangent[:, :2] / np.linalg.norm(tangent[:, :2], axis=1, keepdims=True),
         "elevation": tube.point(station, np.zeros_like(station), level)[:, 2],

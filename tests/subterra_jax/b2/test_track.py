@@ -121,7 +121,7 @@ def test_sleepers_reach_a_metre_to_either_side_wherever_the_robot_is(track):
 
 
 def test_the_anchor_follows_the_robot_and_places_add_up_to_a_tenth_of_a_millimetre():
-    long = lay_standard_track(st.load_tunnel("metro-asbuilt"))
+    long = lay_standard_track(st.load_tunnel("metro"))
     anchor, local = jnp.int32(1500), jnp.zeros(3)
     start = np.asarray(long.position[1500], np.float64)
     walked = np.zeros(3)

@@ -65,7 +65,7 @@ def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
 
 @pytest.mark.slow
 def test_the_points_of_a_lidar_in_three_dimensions_are_recorded_and_shown():
-    plan = st.load_tunnel("metro-asbuilt", solid=True)
+    plan = st.load_tunnel("metro", solid=True)
     words = ("0", "t", "smooth", "Subterra/TraverseShort-v1", "dead-reckoning", 0, "spin16x64")
     first = next(library.drive_episode(plan, *words))
     assert first.points.shape == (1, 1024, 3)
