@@ -35,6 +35,7 @@ def packages(tmp_path_factory) -> list[Path]:
 
 def test_the_wheel_holds_the_simulator_and_its_tunnels_alone(packages):
     (wheel,) = [path for path in packages if path.suffix == ".whl"]
+    assert wheel.stat().st_size <= 10_000_000
     names = zipfile.ZipFile(wheel).namelist()
     tops = {name.split("/")[0] for name in names if ".dist-info" not in name}
     assert tops == {"subterra_jax"}
