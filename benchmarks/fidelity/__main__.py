@@ -16,7 +16,7 @@ import tyro
 
 from benchmarks.fidelity import judge, outside, scoring
 from benchmarks.fidelity.case import Case, case_hash
-from benchmarks.fidelity.controls.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
+from benchmarks.fidelity.faults.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.files import FidelityError, write_json
 from benchmarks.fidelity.inputs import (
     FOREIGN,
@@ -31,7 +31,6 @@ from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, evaluate
 from benchmarks.fidelity.report import write_report
-from benchmarks.fidelity.tools import calibrate
 from benchmarks.fidelity.windows import commands as windows
 from scene.errors import require_input
 from subterra_jax.host.command import parse, run_command
@@ -48,7 +47,7 @@ class RunConfig(Inputs):
     """Run of the suite.
 
     Attributes:
-        processes: With 2, the null tubes are scored beside the reconstruction.
+        processes: With 2, half of the categories are scored in a second process.
     """
 
     processes: int = 2
@@ -109,14 +108,19 @@ class OpenCase:
     values: dict[str, dict[str, Value]] = field(default_factory=dict)
 
 
+def load_outside(inputs: Inputs) -> None:
+    """Registers the metrics and faults of a user's file, and nothing else from outside."""
+    outside.clear()
+    if inputs.metrics is not None:
+        outside.load_file(inputs.metrics)
+
+
 def open_case(inputs: Inputs, processes: int = 1) -> OpenCase:
     """Reads the inputs and judges the case without controls; values of an earlier command are read again."""
     if processes < 1:
         raise FidelityError(f"processes must be at least 1, got {processes}")
     require_folder(inputs.out)
-    outside.clear()
-    if inputs.metrics is not None:
-        outside.load_metrics(inputs.metrics)
+    load_outside(inputs)
     resolved = complete_inputs(inputs)
     case = read_case(resolved)
     judgement = judge.judge_case(case, resolved.out, resolved.strict, processes)
@@ -141,10 +145,10 @@ def run_controls(config: ControlsConfig) -> None:
     foreign = config.foreign
     if foreign is None and (not config.only or "N33" in config.only):
         foreign = foreign_scene(opened.case, config.out)
-    bench = Bench(opened.case, opened.values["base"], config.out / "controls", foreign)
+    bench = Bench(opened.case, opened.values["base"], config.out / "controls", foreign, more=opened.inputs.metrics)
     jobs = [job for job in list_jobs(config.only, foreign is not None) if not config.bold_only or is_bold(job)]
     outcomes = run_jobs(bench, jobs, config.processes)
-    rows = judge_outcomes(outcomes, opened.judgement.base)
+    rows = judge_outcomes(outcomes, opened.judgement)
     content = {"schema": CONTROLS_SCHEMA, "key": case_hash(opened.case), "rows": rows}
     write_json(config.out / "controls.json", content)
     _print_summary(_write_report(opened))
@@ -152,6 +156,7 @@ def run_controls(config: ControlsConfig) -> None:
 
 def _check_controls(config: ControlsConfig) -> None:
     """Refuses wrong controls before the scene is judged, which takes minutes."""
+    load_outside(config)
     known = {job.control for job in list_jobs()}
     if unknown := [name for name in config.only if name not in known]:
         raise FidelityError(f"no control {unknown[0]!r}; there are {', '.join(sorted(known))}")
@@ -258,7 +263,7 @@ def main() -> int:
         sys.argv.append("run")
     actions: dict[str, Callable[[Any], None]] = {
         "run": run, "controls": run_controls, "sweep": run_sweep,
-        "calibrate": calibrate.run, "split": run_split, "report": run_report,
+        "split": run_split, "report": run_report,
         "windows": windows.run_windows, "faults": windows.run_faults,
     }  # fmt: skip
     commands = {name: _without_prefix(action) for name, action in actions.items()}

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 from jaxtyping import Float, Shaped
-from scipy.spatial.transform import Rotation
 
 from benchmarks.fidelity.files import FidelityError, file_hash
+from benchmarks.fidelity.geoms import Geoms, load_model
+from benchmarks.fidelity.meshes import concatenate_meshes
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,6 @@ class Track:
         rail: Inner face of the rail head at its top, along the rail, by side (`left`, `right`), m, `(k, 3)`.
         rail_mesh: Mesh of all rails.
         fastening_mesh: Mesh of pads, clips and shoulders.
-        gauge: Gauge of the track's configuration, m; `None` without a track.
     """
 
     sleeper: Float[np.ndarray, "s 3"]
@@ -32,92 +31,30 @@ class Track:
     rail: dict[str, Float[np.ndarray, "k 3"]]
     rail_mesh: trimesh.Trimesh
     fastening_mesh: trimesh.Trimesh
-    gauge: float | None
 
 
-def track_of(model: mujoco.MjModel, manifest: dict[str, Any]) -> Track:
-    """Return the track of the compiled scene, from its geoms by name."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+def track_of(geoms: Geoms) -> Track:
+    """Return the track of a compiled scene; a second track is not judged."""
     parts: dict[str, list[trimesh.Trimesh]] = {"sleeper": [], "rail": [], "fastening": []}
     rail: dict[str, list[np.ndarray]] = {"left": [], "right": []}
     top = []
-    for geom in range(model.ngeom):
-        name = model.geom(geom).name
+    for geom, name in enumerate(geoms.names):
         kind = name.split("_")[0].removesuffix("s")
-        if kind not in parts or "_2_" in name:  # a second track is not judged
+        if kind not in parts or "_2_" in name:
             continue
-        mesh = geom_mesh(model, data, geom)
+        mesh = geoms.mesh(geom)
         parts[kind].append(mesh)
         if kind == "sleeper":
             top.append([*mesh.bounds.mean(axis=0)[:2], mesh.bounds[1, 2]])
         elif name.endswith("_head"):
             side = name.split("_")[1]
-            frame, half = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+            frame, half = geoms.data.geom_xmat[geom].reshape(3, 3), geoms.model.geom_size[geom]
             inward = -1.0 if side == "left" else 1.0
             for end in (-half[0], half[0]):
-                rail[side].append(data.geom_xpos[geom] + frame @ [end, inward * half[1], half[2]])
+                rail[side].append(geoms.data.geom_xpos[geom] + frame @ [end, inward * half[1], half[2]])
     joined = {kind: concatenate_meshes(meshes) for kind, meshes in parts.items()}
-    gauge = manifest.get("track", {}).get("gauge") if top else None
-    return Track(
-        np.asarray(top).reshape(-1, 3),
-        joined["sleeper"],
-        {side: np.asarray(points).reshape(-1, 3) for side, points in rail.items()},
-        joined["rail"],
-        joined["fastening"],
-        gauge,
-    )
-
-
-def nails_of(model: mujoco.MjModel) -> trimesh.Trimesh:
-    """Return all nails of the compiled scene, from its geoms by name."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    named = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith("nails_")]
-    return concatenate_meshes([geom_mesh(model, data, geom) for geom in named])
-
-
-def bed_of(model: mujoco.MjModel) -> trimesh.Trimesh:
-    """Return the visible bed of the compiled scene: a slab above the invert of a round bore, else nothing."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    visible = [g for g in range(model.ngeom) if model.geom(g).name.startswith("bed_") and model.geom_group[g] == 0]
-    return concatenate_meshes([geom_mesh(model, data, geom) for geom in visible])
-
-
-def concatenate_meshes(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Joins several meshes; without any, return an empty one."""
-    if not meshes:
-        return trimesh.Trimesh()
-    before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return trimesh.Trimesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, before, strict=False)]),
-        process=False,
-    )
-
-
-def geom_mesh(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> trimesh.Trimesh:
-    """A box or mesh geom as triangles in the world frame, m.
-
-    Raises:
-        ValueError: Another kind of geom.
-    """
-    kind = model.geom_type[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        mesh = trimesh.creation.box(2.0 * model.geom_size[geom])
-    elif kind == mujoco.mjtGeom.mjGEOM_MESH:
-        k = model.geom_dataid[geom]
-        vertices = model.mesh_vert[model.mesh_vertadr[k] : model.mesh_vertadr[k] + model.mesh_vertnum[k]]
-        faces = model.mesh_face[model.mesh_faceadr[k] : model.mesh_faceadr[k] + model.mesh_facenum[k]]
-        mesh = trimesh.Trimesh(vertices.astype(float), faces, process=False)
-    else:
-        raise ValueError(f"geom {model.geom(geom).name} is neither a box nor a mesh")
-    placement = np.eye(4)
-    placement[:3, :3] = Rotation.from_matrix(data.geom_xmat[geom].reshape(3, 3)).as_matrix()
-    placement[:3, 3] = data.geom_xpos[geom]
-    mesh.apply_transform(placement)
-    return mesh
+    inner = {side: np.asarray(points).reshape(-1, 3) for side, points in rail.items()}
+    return Track(np.asarray(top).reshape(-1, 3), joined["sleeper"], inner, joined["rail"], joined["fastening"])
 
 
 # The candidate: the files of one scene folder.
@@ -185,19 +122,6 @@ class Candidate:
         return float(self.bore.station[-1])
 
 
-def load_model(scene: Path) -> mujoco.MjModel:
-    """Compiles an MJCF file and keeps nothing else of it.
-
-    `MjModel.from_xml_path` gives the same model, but MuJoCo then keeps the parsed file, and the meshes that it read:
-    0.45 GiB for a bore of 351 m.
-
-    Raises:
-        ValueError: MuJoCo refuses it.
-    """
-    mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 0)
-    return mujoco.MjSpec.from_file(str(scene)).compile()
-
-
 def load_candidate(folder: Path) -> Candidate:
     """Reads a scene folder.
 
@@ -217,8 +141,8 @@ def load_candidate(folder: Path) -> Candidate:
         )
         for mesh in (lining, solid):
             mesh.metadata.clear()  # the file's own arrays, as large as the mesh
-        model = load_model(scene)
-        track, nails, bed = track_of(model, manifest), nails_of(model), bed_of(model)
+        geoms = Geoms.of(load_model(scene))
+        track, nails, bed = track_of(geoms), geoms.joined("nails_"), geoms.joined("bed_", group=0)
     except (OSError, ValueError, KeyError) as error:
         raise FidelityError(f"{folder}: cannot be read as a scene ({error})") from error
     plan = folder / "tunnel.npz"

@@ -4,7 +4,7 @@ import ctypes
 import gc
 import json
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache as run_once
 from functools import wraps
@@ -14,36 +14,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
 
 Result = TypeVar("Result")
-NOT_VALUES = (
-    "report", "figures", "controls", "tools", "__main__.py", "inputs.py", "judge.py", "leaks.py", "scoring.py",
-    "table.py", "windows",
-)  # fmt: skip  # raw values do not depend on these; the results of controls have a key of their own
 SHARED: dict[tuple[Any, ...], Any] = {}  # results from released files, for all cases of this process
 _KEPT_UNTIL: dict[tuple[str, str], str] = {}
-
-
-@dataclass(frozen=True)
-class Near:
-    """Stretch that windows are judged on, where the rest of the tunnel is known to be unchanged.
-
-    Attributes:
-        path: Stations on the sensor's path that windows against the recording must lie between, m.
-        truth: Stations on the true axis that windows against the truth must lie between, m.
-        ends: First and last station of a profile of the whole tunnel, by the function that reads it, m.
-        box: Lowest and highest corner of a box around all surfaces of the stretch, tunnel frame, m, `(2, 3)`.
-    """
-
-    path: tuple[float, float]
-    truth: tuple[float, float]
-    ends: dict[str, tuple[float, float]]
-    box: Float[np.ndarray, "2 3"]
 
 
 @dataclass(frozen=True)
@@ -57,7 +35,6 @@ class Case:
         truth: Truth of the generator; `None` for real data.
         seed: Seed of sampling, noise and bootstrap.
         tolerance: Factor on the tolerances inside metrics, for the sweep.
-        near: Stretch that windows are judged on; all of the tunnel where `None`.
         cache: Results of `derive` for this case.
     """
 
@@ -67,7 +44,6 @@ class Case:
     truth: Truth | None = None
     seed: int = 0
     tolerance: float = 1.0
-    near: Near | None = None
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def fresh(self) -> "Case":
@@ -84,7 +60,7 @@ class Case:
         A result that is asked for again later goes with the category that asked. Edges, adjacency and normals that
         `trimesh` keeps beside a mesh are several times the mesh.
         """
-        order = list(table.categories())
+        order = list(table.CATEGORIES)
         done = order[: order.index(category) + 1] if category in order else []
         caches = [self.cache, SHARED, *(reference.cache for reference in (self.hold, self.truth) if reference)]
         for results in caches:
@@ -130,13 +106,6 @@ def per_truth(function: Function[Result]) -> Function[Result]:
     return _kept_in(function, lambda case: _reference_cache(case, case.truth))
 
 
-def kept_with(case: Case, reference: Hold | Truth, results: dict[Function[Any], Any]) -> dict[Any, Any]:
-    """Return what is kept of a reference, with other results of some functions of it."""
-    settings = (case.seed, case.tolerance)
-    named = {(function.__module__, function.__qualname__, *settings): value for function, value in results.items()}
-    return reference.cache | named
-
-
 def _kept_in(
     function: Function[Result], place: Callable[[Case], tuple[dict[Any, Any], tuple[Any, ...]]]
 ) -> Function[Result]:
@@ -158,25 +127,10 @@ def _reference_cache(case: Case, reference: Hold | Truth | None) -> tuple[dict[A
 
 @run_once
 def code_hash() -> str:
-    """Return the SHA-256 of the code that raw values depend on; values of other code are not read again.
-
-    Thresholds, roles and required falls are no part of it: they are applied to kept values at no cost.
-    """
-    here = Path(__file__).parent
-    return _hash_of(file for file in here.rglob("*.py") if file.relative_to(here).parts[0] not in NOT_VALUES)
-
-
-@run_once
-def controls_hash() -> str:
-    """Return the SHA-256 of the code of controls and leak detector; required falls are no part of it."""
-    here = Path(__file__).parent
-    return _hash_of([*(here / "controls").glob("*.py"), here / "judge.py", here / "leaks.py"])
-
-
-def _hash_of(files: Iterable[Path]) -> str:
-    digest = sha256()
-    for file in sorted(files):
-        digest.update(file.relative_to(Path(__file__).parent).as_posix().encode() + file.read_bytes())
+    """Return the SHA-256 of the suite's code, tables and limits; results of another code are not read again."""
+    here, digest = Path(__file__).parent, sha256()
+    for file in sorted(path for path in here.rglob("*") if path.suffix in (".py", ".csv", ".json")):
+        digest.update(file.relative_to(here).as_posix().encode() + file.read_bytes())
     return digest.hexdigest()
 
 

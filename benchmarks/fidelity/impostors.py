@@ -7,9 +7,9 @@ import trimesh
 from jaxtyping import Float
 
 from benchmarks.fidelity.candidate import Bore, Candidate, Track
-from benchmarks.fidelity.controls.shape import without_faces
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.derive.surface import Caster
+from benchmarks.fidelity.meshes import without_faces
 from benchmarks.fidelity.references import Truth
 
 NULL_CORNERS = 72  # of the swept polygon
@@ -82,7 +82,7 @@ def sweep_section(
 def no_track() -> Track:
     """Return a track without sleepers and rails."""
     none = {"left": np.zeros((0, 3)), "right": np.zeros((0, 3))}
-    return Track(np.zeros((0, 3)), trimesh.Trimesh(), none, trimesh.Trimesh(), trimesh.Trimesh(), None)
+    return Track(np.zeros((0, 3)), trimesh.Trimesh(), none, trimesh.Trimesh(), trimesh.Trimesh())
 
 
 def _fan(ring: np.ndarray, middle: int, reverse: bool) -> np.ndarray:
@@ -173,7 +173,7 @@ def _true_track(truth: Truth, base: Track) -> Track:
     inner = {side: _move_inward(points, curve, aside) for side, points in heads.items()}
     return Track(
         np.asarray(sleepers["position"], float).reshape(-1, 3) - truth.origin, true_faces(truth, ("sleeper",)), inner,
-        true_faces(truth, ("rail",)), true_faces(truth, ("fastening",)), gauge,
+        true_faces(truth, ("rail",)), true_faces(truth, ("fastening",)),
     )  # fmt: skip
 
 

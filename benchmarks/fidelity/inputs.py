@@ -49,7 +49,7 @@ class Inputs:
         seed: Seed of sampling, noise and bootstrap.
         strict: Count metrics without a reference as 0.
         partial: Judge only the part that the recording shows.
-        metrics: Python file with metrics of your own, see docs/guide/extend.md.
+        metrics: Python file with metrics and faults of your own, see docs/guide/extend.md.
         out: Folder for all results.
     """
 

@@ -1,5 +1,6 @@
 """The judgement of a case: values of reconstruction, null tubes and truth, and the verdict."""
 
+import gc
 import json
 import multiprocessing
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import numpy as np
 from benchmarks.fidelity import outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash, release_memory
-from benchmarks.fidelity.controls import catalogue, local
+from benchmarks.fidelity.faults import rows as faults
 from benchmarks.fidelity.files import write_json
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.leaks import MEDIAN_FLOOR, NOISE_BAND, find_leaks
@@ -23,35 +24,17 @@ from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_valu
 from benchmarks.fidelity.scoring import Scored
 from benchmarks.fidelity.table import Metric
 from benchmarks.fidelity.windows import measures
-from benchmarks.fidelity.windows.judge import Windows, dump_windows, judge_windows, load_windows, windows_hash
+from benchmarks.fidelity.windows.judge import Windows, dump_windows, judge_windows, load_windows
 from scene.progress import Stages
 
 VALUES_SCHEMA = "subterra.fidelity-values/1"
 WINDOWS_SCHEMA = "subterra.fidelity-windows/1"
 
-TUBES = ("null", "null_bare")
 WITHOUT_TRACK = ("SEC", "MSH", "TRI")  # categories that read nothing of the track
 
 NOT_COMPUTED = missing("taken from another candidate")  # in the categories in which both are the same
 
 Values = dict[str, Value]
-
-
-@dataclass(frozen=True)
-class Base:
-    """The judgement that controls are compared with.
-
-    Attributes:
-        scored: Scores of the reconstruction.
-        null: Scores of the null tube.
-        values: Raw values of reconstruction, null tube and truth.
-        reasons: Reasons against the reconstruction itself.
-    """
-
-    scored: Scored
-    null: Scored | None
-    values: dict[str, Values]
-    reasons: list[str]
 
 
 @dataclass(frozen=True)
@@ -82,11 +65,6 @@ class Judgement:
         """`PASS` or `FAIL`, by suite and windows alone."""
         return "FAIL" if self.reasons else "PASS"
 
-    @property
-    def base(self) -> Base:
-        """The part that controls are compared with."""
-        return Base(self.scored["base"], self.scored["null"], self.values, self.reasons)
-
 
 def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 1) -> Judgement:
     """Computes values, windows, leaks and the verdict without the controls of `controls`.
@@ -95,7 +73,7 @@ def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 
         case: Reconstruction and references.
         folder: Folder that keeps what is done.
         strict: Count metrics without a reference as 0.
-        processes: With 2 or more, the tubes are computed in a second process beside reconstruction and windows.
+        processes: With 2 or more, half of the categories are computed in a second process.
     """
     with open_values(case, folder, processes) as values:
         leaks, windows = find_leaks(case, values["base"]), compute_windows(case, folder)
@@ -104,11 +82,11 @@ def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 
 
 def compute_windows(case: Case, folder: Path) -> Windows:
     """Return the worst windows and the stated faults; those of an earlier run of the same case are read again."""
-    path, key = folder / "windows.json", f"{case_hash(case)} {windows_hash()}"
+    path, key = folder / "windows.json", case_hash(case)
     content = json.loads(path.read_text()) if path.exists() else {}
     if content.get("schema") == WINDOWS_SCHEMA and content.get("key") == key:
         return load_windows(content)
-    found = judge_windows(case.fresh())
+    found = judge_windows(replace(case, cache={}))
     write_json(path, {"schema": WINDOWS_SCHEMA, "key": key, **dump_windows(found)}, digits=17)
     release_memory()
     return found
@@ -117,8 +95,7 @@ def compute_windows(case: Case, folder: Path) -> Windows:
 def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Values]:
     """Return the raw values of the reconstruction, its null tubes and the truth.
 
-    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next; those of a
-    second process when the first is through with its own.
+    Each is kept in `values.json` when it is done, so that a run that was cut short goes on with the next.
     """
     with open_values(case, folder, processes) as values:
         pass
@@ -127,69 +104,81 @@ def compute_values(case: Case, folder: Path, processes: int = 1) -> dict[str, Va
 
 @contextmanager
 def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[str, Values]]:
-    """Yields the values of the reconstruction; those of tubes and truth join them by the end of the block.
+    """Yields the values of the reconstruction; those of tubes and truth are there by the end of the block.
 
     Args:
         case: Reconstruction and references.
         folder: Folder for `values.json`.
-        processes: With 2 or more, the tubes are computed in a second process meanwhile; the truth, which needs the
-            most memory, waits for the end of the block.
+        processes: With 2 or more, a second process computes half of the categories of every candidate. So what is
+            derived from a reference serves all candidates, and is mostly derived in one of the processes alone.
     """
     path, key = folder / "values.json", case_hash(case)
     values = _kept_values(path, key)
+    gc.freeze()  # what was imported stays: memory is released after every category, and to walk all of it takes long
     names = [name for name in make_candidates(case) if name not in values]
-    others = [name for name in names if name != "base"]
+    mine: dict[str, Values] = {}
+    theirs: dict[str, Future[Values]] = {}
 
-    def keep(name: str, found: Values) -> None:
-        values[name] = _with_reused(name, found, values)
-        dumped = {name: dump_values(values[name]) for name in make_candidates(case) if name in values}
-        write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
+    def keep(wait: tuple[str, ...] = ()) -> None:
+        """Keeps what both processes are through with, in order."""
+        for name in names:
+            if name in values:
+                continue
+            if name not in mine or (name in theirs and name not in wait and not theirs[name].done()):
+                return
+            found = mine[name] | (_chosen(theirs[name].result(), SECOND_HALF) if name in theirs else {})
+            values[name] = _with_reused(name, found, values)
+            dumped = {one: dump_values(values[one]) for one in make_candidates(case) if one in values}
+            write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
 
     with Stages() as progress, ExitStack() as second:
         stages = {name: progress.start(f"metrics of {name}", table.COUNT) for name in names}
-        beside: dict[str, Future[Values]] = {}
-        if processes > 1 and set(others) & set(TUBES):
+        if processes > 1 and names:
             context = multiprocessing.get_context("spawn")
             pool = second.enter_context(ProcessPoolExecutor(1, context, _start_second, (case.fresh(),)))
             second.callback(pool.shutdown, cancel_futures=True)  # an interrupt waits for what is under way alone
-            beside = {name: pool.submit(_value_in_second, name) for name in others if name in TUBES}
-        if "base" in names:
-            stage = stages["base"]
-            keep("base", _value_candidate(case, "base", lambda id: stage.advance()))
-        if beside:  # what windows and second process do not share would lie there for nothing
-            for reference in (case.hold, case.fit, case.truth):
-                if reference is not None:
-                    reference.cache.clear()
-            release_memory()
-        yield values
-        for name, future in beside.items():
-            keep(name, future.result())
-            stages[name].advance(table.COUNT)
-        second.close()
-        for name in others:
+            theirs = {name: pool.submit(_value_in_second, name) for name in names}
+        own = FIRST_HALF if theirs else tuple(table.CATEGORIES)
+        for name in names:
             stage = stages[name]
-            if name not in beside:
-                keep(name, _value_candidate(case, name, lambda id, stage=stage: stage.advance()))  # type: ignore[misc]
+            mine[name] = _value_candidate(case, name, own, lambda id, stage=stage: stage.advance())  # type: ignore[misc]
+            keep()
+        keep(("base",))
+        yield values
+        keep(tuple(names))
 
 
-def _value_candidate(case: Case, name: str, advance: Callable[[str], None] = lambda id: None) -> Values:
-    """Return the values of one candidate in the categories in which it differs from another; NOT_COMPUTED elsewhere."""
+# Halves of about the same time; what beams derive serves the first, what the bore derives the second.
+FIRST_HALF = ("CEN", "SEC", "C2M", "CMP", "BEA", "DIS", "SCN", "PAR")
+SECOND_HALF = tuple(name for name in table.CATEGORIES if name not in FIRST_HALF)
+
+
+def _value_candidate(
+    case: Case, name: str, categories: tuple[str, ...], advance: Callable[[str], None] = lambda id: None
+) -> Values:
+    """Return the values of a candidate in those of some categories in which it differs from another."""
     one = replace(case, candidate=make_candidates(case)[name](), cache={})
-    found = evaluate(one, _what_differs(name)[0], dict.fromkeys(table.load(), NOT_COMPUTED), advance)
+    chosen = [category for category in _what_differs(name)[0] if category in categories]
+    found = evaluate(one, chosen, dict.fromkeys(table.load(), NOT_COMPUTED), advance)
     one.cache.clear()
     release_memory()
     return found
+
+
+def _chosen(values: Values, categories: tuple[str, ...]) -> Values:
+    return {id: values[id] for id, row in table.load().items() if row.category in categories}
 
 
 _second: dict[str, Case] = {}
 
 
 def _start_second(case: Case) -> None:
+    gc.freeze()
     _second["case"] = case
 
 
 def _value_in_second(name: str) -> Values:
-    return _value_candidate(_second["case"], name)
+    return _value_candidate(_second["case"], name, SECOND_HALF)
 
 
 def make_candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
@@ -215,7 +204,7 @@ def _kept_values(path: Path, key: str) -> dict[str, Values]:
 def _what_differs(name: str) -> tuple[tuple[str, ...], str]:
     """Return the categories to compute for a candidate, and the candidate that the others are taken from."""
     if name == "base":
-        return tuple(table.categories()), ""
+        return tuple(table.CATEGORIES), ""
     if name == "null_bare":
         return tuple(c for c in geometry_categories() if c not in WITHOUT_TRACK), "null"
     return geometry_categories(), "base"
@@ -229,7 +218,7 @@ def _with_reused(name: str, found: Values, values: dict[str, Values]) -> Values:
 
 def geometry_categories() -> tuple[str, ...]:
     """Return the categories that do not read the compiled scene."""
-    return tuple(name for name in table.categories() if name not in ("SCN", "PAR"))
+    return tuple(name for name in table.CATEGORIES if name not in ("SCN", "PAR"))
 
 
 def make_judgement(
@@ -252,7 +241,7 @@ def add_outside(judgement: Judgement, case: Case, folder: Path, strict: bool = F
     """Return the judgement with the metrics from outside computed and scored; its verdict stays the suite's."""
     more = outside.compute_values(case, make_candidates(case), folder)
     scored = {
-        name: scoring.score_all(judgement.values[name] | values, strict=strict, rows=outside.rows())
+        name: scoring.score_all(judgement.values[name] | values, strict=strict, rows=table.load_all())
         for name, values in more.items()
     }
     return replace(judgement, outside=scored)
@@ -297,16 +286,13 @@ def loud(rows: list[dict[str, Any]]) -> list[str]:
 def constants() -> dict[str, Any]:
     """Return everything frozen that a verdict depends on: metrics, gates, limits, controls, leaks, windows."""
     return {
-        "metrics": [asdict(row) for row in table.load().values()],
+        "metrics": [row.as_row() for row in table.load().values()],
         "scoring": {name: value for name, value in vars(scoring).items() if name.isupper()},
-        "controls": [asdict(control) for control in catalogue.load_controls().values()],
-        "invariances": {
-            id: [one.category_limit, list(one.exempt)] for id, one in catalogue.INVARIANCES.items()
-        } | {"global": [catalogue.GLOBAL_LIMIT, catalogue.THINNED_LIMIT]},
-        "quiet": [catalogue.QUIET_LIMIT, catalogue.MONOTONE, list(catalogue.UNORDERED)],
+        "controls": [asdict(control) for control in faults.suite_controls().values()],
+        "quiet": [faults.GLOBAL_LIMIT, faults.THINNED_LIMIT, faults.QUIET_LIMIT, faults.MONOTONE, faults.UNORDERED],
         "leaks": [list(NOISE_BAND), MEDIAN_FLOOR],
         "windows": {sensor: measures.limits(sensor) for sensor in measures.SENSORS},
-        "faults": {name: asdict(one) for name, one in local.stated_faults(100.0).items()},
+        "faults": {name: asdict(one) for name, one in faults.stated_faults(100.0).items()},
     }  # fmt: skip
 
 

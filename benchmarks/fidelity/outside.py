@@ -1,110 +1,30 @@
-"""Metrics from outside: a user's own file adds metrics to a category without a change in the package.
+"""Metrics and faults from outside: a user's own file adds them without a change in the package.
 
-They are computed, scored and listed beside the 199 of the suite. The verdict stays the verdict of the suite alone.
+Metrics are computed, scored and listed beside the 199 of the suite. The verdict stays the verdict of the suite alone.
 """
 
 import json
 import runpy
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, get_args
 
-from benchmarks.fidelity import table
+from benchmarks.fidelity import faults, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.files import FidelityError, write_json
-from benchmarks.fidelity.registry import Entry, Need, Value, compute_metric, dump_values, load_values, number
-from benchmarks.fidelity.table import Metric, parse_map
+from benchmarks.fidelity.registry import Value, compute_metric, dump_values, load_values
+from benchmarks.fidelity.table import Metric
 from subterra_jax.host.loading import file_digest
 
 SCHEMA = "subterra.fidelity-outside/1"
-Compute = Callable[[Case], Value | float]
-_EVIDENCE = {"hold": "H", "truth": "T", "reference": "HT", None: "S"}
-_DIRECTION = {"D": "down", "U": "up", "B": "band", "P": "up", "-": "info"}
+_LOADED: set[str] = set()  # metrics and kinds of fault of the file
+_FILES: dict[str, str] = {}  # its SHA-256 by its name
 
 
-@dataclass(frozen=True)
-class Outside:
-    """A metric from outside.
-
-    Attributes:
-        row: Its row, numbered from 200 on.
-        entry: Its function and the reference that it needs.
-        source: Name of the file that registers it.
-    """
-
-    row: Metric
-    entry: Entry
-    source: str
-
-
-_METRICS: dict[str, Outside] = {}
-_FILES: dict[str, str] = {}  # SHA-256 of each loaded file by its name
-
-
-def register(
-    id: str,
-    compute: Compute | None = None,
-    *,
-    category: str,
-    definition: str,
-    unit: str = "1",
-    map: str = "-",
-    needs: Need | None = None,
-) -> Any:
-    """Adds a metric to a category; as a decorator, or with the function as second argument.
-
-    Args:
-        id: Unique name.
-        compute: Function from a `Case` to a `Value` or a float.
-        category: Three letters of one of the 18 categories.
-        definition: Definition in a sentence.
-        unit: Unit of the value.
-        map: Score map as in `metrics.csv`: `D(good,bad)`, `U(bad,good)`, `B(target;good,bad)`, `P`; `-` only lists it.
-        needs: `hold`, `truth`, `reference` (either) or `None`.
-
-    Raises:
-        FidelityError: The category is unknown, the id is taken, the map or need is none, or `compute` is no function.
-    """
-    names = table.categories()
-    if category not in names:
-        raise FidelityError(f"metric {id!r}: unknown category {category!r}; choose one of {', '.join(names)}")
-    if id in table.load():
-        raise FidelityError(f"metric {id!r}: this id belongs to the suite, choose another")
-    if id in _METRICS:
-        raise FidelityError(f"metric {id!r}: this id is registered twice")
-    if needs not in (None, *get_args(Need)):
-        raise FidelityError(f"metric {id!r}: needs must be hold, truth, reference or None, got {needs!r}")
-    try:
-        score_map = parse_map(map)
-    except ValueError as error:
-        raise FidelityError(
-            f"metric {id!r}: {error}, write D(good,bad), U(bad,good), B(target;good,bad), P or -"
-        ) from None
-    row = Metric(
-        table.COUNT + len(_METRICS) + 1, category, names[category], id, definition, unit, _DIRECTION[score_map.kind],
-        "L" if score_map.kind == "-" else "S", score_map, _EVIDENCE[needs], "",
-    )  # fmt: skip
-
-    def add(function: Compute) -> Compute:
-        if not callable(function):
-            raise FidelityError(f"metric {id!r}: compute must be a function of a Case, got {type(function).__name__}")
-        _METRICS[id] = Outside(
-            row, Entry(lambda case: _as_value(function(case)), needs), next(reversed(_FILES), "Python")
-        )
-        return function
-
-    return add if compute is None else add(compute)
-
-
-def _as_value(result: Value | float) -> Value:
-    return result if isinstance(result, Value) else number(float(result))
-
-
-def load_metrics(path: Path) -> None:
-    """Runs a file that registers metrics; metrics of files loaded before are dropped.
+def load_file(path: Path) -> None:
+    """Runs a file that registers metrics or faults; those of a file loaded before are dropped.
 
     Raises:
         UserCodeError: The file cannot be read.
@@ -112,35 +32,36 @@ def load_metrics(path: Path) -> None:
     """
     clear()
     _FILES[path.name] = file_digest(path)
+    before = {*table.load_all(), *faults.KINDS}
     try:
         runpy.run_path(str(path))
     except FidelityError as error:
         raise FidelityError(f"{path}: {error}") from error
     except Exception as error:  # anything may go wrong in a user's file
         raise FidelityError(f"{path}: cannot be run ({type(error).__name__}: {error})") from error
-    if not _METRICS:
-        raise FidelityError(f"{path}: registers no metric")
+    finally:
+        _LOADED.update({*table.load_all(), *faults.KINDS} - before)
+    if not _LOADED:
+        raise FidelityError(f"{path}: registers neither a metric nor a fault")
 
 
 def clear() -> None:
-    """Forgets all metrics from outside."""
-    _METRICS.clear()
+    """Forgets all metrics from outside, and the faults of the file."""
+    table.forget(set(metrics()))
+    for name in _LOADED & set(faults.KINDS):
+        del faults.KINDS[name]
+    _LOADED.clear()
     _FILES.clear()
 
 
-def metrics() -> dict[str, Outside]:
+def metrics() -> dict[str, Metric]:
     """Return the metrics from outside by id, in the order of their registration."""
-    return dict(_METRICS)
+    return {id: row for id, row in table.load_all().items() if id not in table.load()}
 
 
 def files() -> dict[str, str]:
     """Return the SHA-256 of the file that they come from, by its name."""
     return dict(_FILES)
-
-
-def rows() -> dict[str, Metric]:
-    """Return the rows of suite and outside together, by id."""
-    return table.load() | {id: one.row for id, one in _METRICS.items()}
 
 
 def compute_values(
@@ -153,7 +74,8 @@ def compute_values(
         candidates: Makers of the candidates by name.
         folder: Folder for `outside.json`.
     """
-    if not _METRICS:
+    rows = metrics()
+    if not rows:
         return {}
     path, key = folder / "outside.json", sha256(f"{case_hash(case)} {sorted(_FILES.items())}".encode()).hexdigest()
     content = json.loads(path.read_text()) if path.exists() and _FILES else {}
@@ -162,7 +84,7 @@ def compute_values(
     values: dict[str, dict[str, Value]] = {}
     for name, make in candidates.items():
         one = case if name == "base" else replace(case, candidate=make(), cache={})
-        values[name] = {id: compute_metric(one, id, metric.entry) for id, metric in _METRICS.items()}
+        values[name] = {id: compute_metric(one, row) for id, row in rows.items()}
     dumped = {name: dump_values(entry) for name, entry in values.items()}
     write_json(path, {"schema": SCHEMA, "key": key, "values": dumped}, digits=17)
     return values

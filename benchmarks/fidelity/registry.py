@@ -1,22 +1,21 @@
-"""Values, the registry of metrics, and the computation of all of them."""
+"""Values, and the computation of all metrics."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import asdict, dataclass
-from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case, release_memory
+from benchmarks.fidelity.table import Metric
 
 BLOCK = 10.0  # m along the tunnel; points nearer than this are not independent
 RESAMPLES = 200
 FEWEST_IN_BLOCK = 5  # samples of a stretch that has a value of its own
 
 Statistic = Callable[[Float[np.ndarray, " k"]], float]
-Need = Literal["hold", "truth", "reference"]
 _ABSENT = {
     "hold": "no held-out recording",
     "truth": "no truth and no control that the builder had not seen",
@@ -137,90 +136,18 @@ def _extremes(
     return None if not found else (min(found)[::-1], max(found)[::-1])
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A registered metric.
-
-    Attributes:
-        compute: Function from a case to a value.
-        needs: Reference that it cannot do without.
-    """
-
-    compute: Callable[[Case], Value]
-    needs: Need | None
-
-
-_REGISTRY: dict[str, Entry] = {}
-
-
-def metric(id: str, needs: Need | None = None) -> Callable[[Callable[[Case], Value]], Callable[[Case], Value]]:
-    """Registers the function that computes a metric of the table.
-
-    Args:
-        id: Id in `metrics.csv`.
-        needs: `hold` a held-out recording; `truth` the generator's truth or unseen control; `reference` either.
-
-    Raises:
-        ValueError: The id is not in the table, or registered before.
-    """
-    if id not in table.load():
-        raise ValueError(f"{id} is not in {table.METRICS.name}")
-    if id in _REGISTRY:
-        raise ValueError(f"{id} is registered twice")
-
-    def register(function: Callable[[Case], Value]) -> Callable[[Case], Value]:
-        _REGISTRY[id] = Entry(function, needs)
-        return function
-
-    return register
-
-
-def family(needs: Need | None, members: Mapping[str, Any]) -> Callable[[Callable[..., Value]], Callable[..., Value]]:
-    """Registers one function for several metrics.
-
-    Args:
-        needs: As for `metric`.
-        members: By id the arguments after case and id; a single one need not be a tuple.
-    """
-
-    def register(function: Callable[..., Value]) -> Callable[..., Value]:
-        for id, arguments in members.items():
-            rest = arguments if isinstance(arguments, tuple) else (arguments,)
-            metric(id, needs)(partial(_call_member, function, id, rest))
-        return function
-
-    return register
-
-
-def _call_member(function: Callable[..., Value], id: str, rest: tuple[Any, ...], case: Case) -> Value:
-    return function(case, id, *rest)
-
-
-def all_metrics() -> dict[str, Entry]:
-    """Return all metrics of the suite, in the order of the table.
-
-    Raises:
-        ValueError: Nothing computes some metric of the table.
-    """
-    import benchmarks.fidelity.categories  # noqa: F401  (registers them)
-
-    absent = [id for id in table.load() if id not in _REGISTRY]
-    if absent:
-        raise ValueError(f"{len(absent)} of {table.COUNT} metrics are computed by nothing: {', '.join(absent)}")
-    return {id: _REGISTRY[id] for id in table.load()}
-
-
-def compute_metric(case: Case, id: str, entry: Entry) -> Value:
+def compute_metric(case: Case, row: Metric) -> Value:
     """Return the value of one metric; a computation that breaks counts as failed, with its reason."""
     present = {
         "hold": case.hold is not None,
         "truth": case.truth is not None,
         "reference": case.truth is not None or case.hold is not None,
     }
-    if entry.needs is not None and not present[entry.needs]:
-        return missing(_ABSENT[entry.needs])
+    if row.needs is not None and not present[row.needs]:
+        return missing(_ABSENT[row.needs])
     try:
-        return entry.compute(case)
+        found = row.compute(case)
+        return found if isinstance(found, Value) else number(float(found))
     except ImportError as error:
         return missing(f"{error.name} is not installed")
     except Exception as error:  # a spoilt candidate may break any library
@@ -241,16 +168,17 @@ def evaluate(
         reuse: Values of a case that differs in nothing that the other categories read.
         advance: Function called with each id that is done.
     """
-    rows, values, last = table.load(), {}, ""
-    for id, entry in all_metrics().items():
-        category = rows[id].category
+    values: dict[str, Value] = {}
+    last = ""
+    for id, row in table.load().items():
+        category = row.category
         if reuse is not None and categories is not None and category not in categories:
             values[id] = reuse[id]
         else:
             if category != last:
                 case.forget(last)
                 release_memory()
-            values[id], last = compute_metric(case, id, entry), category
+            values[id], last = compute_metric(case, row), category
         advance(id)
     return values
 

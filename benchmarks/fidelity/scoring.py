@@ -101,7 +101,7 @@ def score_all(
     scores = {id: score_one(rows[id], values[id], (maps or {}).get(id)) for id in rows}
     categories = {
         name: _category_score([s for s in scores.values() if s.metric.category == name], strict)
-        for name in table.categories()
+        for name in table.CATEGORIES
     }
     gates = tuple(
         id for id, s in scores.items() if s.metric.role == "G" and s.score is not None and s.score < GATE_FLOOR
@@ -178,7 +178,7 @@ def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
     rows = table.load()
     for factor in FACTORS:
         yield "common", f"x{factor}", {id: row.map.scaled(factor) for id, row in rows.items()}
-    for name in table.categories():
+    for name in table.CATEGORIES:
         for factor in FACTORS:
             maps = {id: row.map.scaled(factor) for id, row in rows.items() if row.category == name}
             yield "category", f"{name} x{factor}", maps

@@ -1,25 +1,27 @@
-"""The table of the 199 metrics of the suite: `metrics.csv` with the thresholds that calibration has set."""
+"""Metrics: one function with one decorator each, and the maps from their values to scores."""
 
-import csv
-import json
 import math
-import re
-from dataclasses import dataclass, replace
-from functools import cache
-from hashlib import sha256
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-HERE = Path(__file__).parent
-METRICS = HERE / "metrics.csv"
-THRESHOLDS = HERE / "thresholds.json"
-CATEGORIES = 18
+from benchmarks.fidelity.files import FidelityError
+
+Need = Literal["hold", "truth", "reference"]
 COUNT = 199
-_MAP = re.compile(
-    r"^(?:(?P<kind>[DU])\((?P<a>[\d.]+),(?P<b>[\d.]+)\)|B\((?P<t>[\d.]+);(?P<ba>[\d.]+),(?P<bb>[\d.]+)\)|(?P<p>P)|-)$"
-)
+CATEGORIES = {
+    "CEN": "Centreline and alignment", "SEC": "Cross-section dimensions",
+    "C2M": "Surface accuracy: held-out real points to mesh", "CMP": "Completeness, Chamfer, F-score",
+    "BEA": "Paired-beam agreement at held-out poses", "DIS": "Sensor distribution and map statistics",
+    "MSH": "Mesh validity", "TRI": "Triangle quality and resolution", "TOP": "Topology", "F2D": "2-D free space",
+    "F3D": "3-D free space", "OCC": "Voxel occupancy agreement (Fig. 3)", "NAV": "Navigability",
+    "LIN": "Lining detail: pockets and ring grid", "TRK": "Track assets", "SCN": "MuJoCo scene on CPU",
+    "PAR": "Backend and environment parity", "DEG": "Degeneracy and observability",
+}  # fmt: skip
+_EVIDENCE = {"hold": "H", "truth": "T", "reference": "HT", None: "S"}
 
 
 @dataclass(frozen=True)
@@ -61,104 +63,162 @@ class Map:
             return replace(self, good=factor * self.good, bad=factor * self.bad)
         return self
 
+    def __str__(self) -> str:
+        """Return the map as its maker is called."""
+        good, bad, target = (np.format_float_positional(v, trim="-") for v in (self.good, self.bad, self.target))
+        texts = {"D": f"D({good},{bad})", "U": f"U({bad},{good})", "B": f"B({target};{good},{bad})"}
+        return texts.get(self.kind, self.kind)
+
+
+def D(good: float, bad: float) -> Map:
+    """Return the map of a value of which less is better."""
+    return Map("D", good, bad)
+
+
+def U(bad: float, good: float) -> Map:
+    """Return the map of a value of which more is better."""
+    return Map("U", good, bad)
+
+
+def B(target: float, good: float, bad: float) -> Map:
+    """Return the map of a value that is best at a target; the ends are distances from it."""
+    return Map("B", good, bad, target)
+
+
+P = Map("P")
+LOGGED, LOGGED_UP = Map("-"), Map("-", good=1.0)  # not scored; the second is better where it is larger
+
 
 @dataclass(frozen=True)
 class Metric:
-    """A row of the table.
+    """A metric.
 
     Attributes:
-        number: Row, 1 to 199 in the suite.
+        number: Place in the order of categories and files, 1 to 199 in the suite.
         category: Three letters.
-        category_name: Name in words.
         id: Unique name.
-        definition: Definition in a sentence.
+        definition: Definition in a sentence: the first one of its function's docstring.
         unit: Unit of value and thresholds. SI: `m`, `1/m`, `1/s`, `1` (a share, ratio or correlation), `bool`, `count`.
             Not SI, as surveyors write them: `%`, `deg`, `mm`, `mm/m`, `m/100 m`, `1/100 scans`, `nat`.
-        direction: `down`, `up`, `band` or `info`.
         role: `S` scored, `G` scored and a gate, `L` logged.
         map: Map to a score.
         evidence: Letters of H held-out, T truth, K standard, S self-consistency, C true by construction.
-        library: Libraries that its code calls on the way to the value; `numpy` only where there is no other.
+        needs: Reference that it cannot do without.
+        compute: Function from a case to a value.
     """
 
     number: int
     category: str
-    category_name: str
     id: str
     definition: str
     unit: str
-    direction: str
     role: str
     map: Map
     evidence: str
-    library: str
+    needs: Need | None
+    compute: Callable[[Any], Any] = field(compare=False, repr=False)
 
     @property
     def scored(self) -> bool:
         """True where the metric counts in its category."""
         return self.role in "SG"
 
+    @property
+    def rises(self) -> bool:
+        """True where a larger value is better."""
+        return self.map.kind in "UP" or self.map == LOGGED_UP
 
-def parse_map(text: str) -> Map:
-    """Reads `D(a,b)`, `U(a,b)`, `B(t;a,b)`, `P` or `-`.
-
-    Raises:
-        ValueError: Any other text.
-    """
-    match = _MAP.match(text.strip())
-    if match is None:
-        raise ValueError(f"{text!r} is no score map")
-    if match["kind"] == "D":
-        return Map("D", float(match["a"]), float(match["b"]))
-    if match["kind"] == "U":
-        return Map("U", float(match["b"]), float(match["a"]))
-    if match["t"]:
-        return Map("B", float(match["ba"]), float(match["bb"]), float(match["t"]))
-    return Map("P" if match["p"] else "-")
+    def as_row(self) -> dict[str, Any]:
+        """Return everything that a verdict depends on, as plain data."""
+        return {key: value for key, value in asdict(replace(self, compute=str)).items() if key != "compute"}
 
 
-def map_text(map: Map) -> str:
-    """Return the map as the table writes it."""
-    good, bad, target = (np.format_float_positional(v, trim="-") for v in (map.good, map.bad, map.target))
-    texts = {"D": f"D({good},{bad})", "U": f"U({bad},{good})", "B": f"B({target};{good},{bad})"}
-    return texts.get(map.kind, map.kind)
+_METRICS: dict[str, Metric] = {}
+_order: list[str] = []  # ids as they stand in their files: decorators of one function are applied from below
 
 
-def load(frozen: dict[str, Any] | None = None) -> dict[str, Metric]:
-    """Return the table by id, in its order, with calibrated thresholds, roles and noise floors.
+def metric(
+    id: str,
+    category: str,
+    map: Map = LOGGED,
+    unit: str = "1",
+    *,
+    gate: bool = False,
+    needs: Need | None = None,
+    evidence: str | None = None,
+    args: tuple[Any, ...] | None = None,
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Registers the function that computes a metric from a case; several on one function register as many metrics.
 
     Args:
-        frozen: Content of a calibration; that of the suite where not given.
+        id: Unique name.
+        category: Three letters of one of the 18 categories.
+        map: `D(good, bad)`, `U(bad, good)`, `B(target, good, bad)` or `P`; `LOGGED` is listed and not scored.
+        unit: Unit of the value.
+        gate: A score below 50 caps the category.
+        needs: `hold` a held-out recording; `truth` the generator's truth or unseen control; `reference` either.
+        evidence: Letters as in `Metric`, where they do not follow from `needs`.
+        args: What the function is called with after case and id; without it the function is called with the case alone.
+
+    Raises:
+        FidelityError: The category is unknown, the id is taken, or `needs` or `map` is none.
     """
-    return _load() if frozen is None else _with_thresholds(frozen)
+    if category not in CATEGORIES:
+        raise FidelityError(f"metric {id!r}: unknown category {category!r}; choose one of {', '.join(CATEGORIES)}")
+    if id in _order:
+        raise FidelityError(f"metric {id!r}: this id is taken, choose another")
+    if needs not in (None, *get_args(Need)):
+        raise FidelityError(f"metric {id!r}: needs must be hold, truth, reference or None, got {needs!r}")
+    if not isinstance(map, Map):
+        raise FidelityError(f"metric {id!r}: {map!r} is no score map, write D(good, bad), U(bad, good), "
+                            "B(target, good, bad) or P")  # fmt: skip
+    _order.append(id)
+    role = "L" if map.kind == "-" else "G" if gate else "S"
+
+    def register(function: Callable[..., Any]) -> Callable[..., Any]:
+        if not callable(function):
+            raise FidelityError(f"metric {id!r}: compute must be a function of a Case, got {type(function).__name__}")
+        words = (function.__doc__ or id).strip().split("\n")[0].removesuffix(".")
+        compute = function if args is None else partial(_call_member, function, id, args)
+        letters = _EVIDENCE[needs] if evidence is None else evidence
+        _METRICS[id] = Metric(0, category, id, words, unit, role, map, letters, needs, compute)
+        return function
+
+    return register
 
 
-@cache
-def _load() -> dict[str, Metric]:
-    return _with_thresholds(json.loads(THRESHOLDS.read_text()) if THRESHOLDS.exists() else {})
+def _call_member(function: Callable[..., Any], id: str, args: tuple[Any, ...], case: Any) -> Any:
+    return function(case, id, *args)
 
 
-def _with_thresholds(frozen: dict[str, Any]) -> dict[str, Metric]:
-    calibrated, floors = frozen.get("maps", {}), frozen.get("floors", {})
-    table: dict[str, Metric] = {}
-    with METRICS.open(newline="") as file:
-        for row in csv.DictReader(file):
-            moved = calibrated.get(row["id"], {})
-            text, role = moved.get("map", row["map"]), moved.get("role", row["role"])
-            map = parse_map(text)
-            table[row["id"]] = Metric(
-                int(row["n"]), row["cat"], row["cat_name"], row["id"], row["definition"], row["unit"],
-                row["direction"], role, replace(map, good=floors.get(row["id"], map.good)), row["evidence"], row["lib"],
-            )  # fmt: skip
-    return table
+_SUITE: set[str] = set()
 
 
-def categories() -> dict[str, str]:
-    """Return the names of the categories by their three letters, in the order of the table."""
-    return {metric.category: metric.category_name for metric in load().values()}
+def load() -> dict[str, Metric]:
+    """Return the metrics of the suite by id, by category and then as they stand in their files."""
+    if not _SUITE:
+        outside = set(_METRICS)
+        import benchmarks.fidelity.categories  # noqa: F401  (registers them)
+
+        _SUITE.update(set(_METRICS) - outside)
+    return _numbered({id: row for id, row in _METRICS.items() if id in _SUITE})
 
 
-def thresholds_hash() -> str:
-    """Return the SHA-256 of table and calibrated thresholds as files."""
-    frozen = THRESHOLDS.read_bytes() if THRESHOLDS.exists() else b""
-    return sha256(METRICS.read_bytes() + frozen).hexdigest()
+def load_all() -> dict[str, Metric]:
+    """Return the metrics of the suite, then those from outside, by id."""
+    suite = load()
+    return suite | _numbered({id: row for id, row in _METRICS.items() if id not in _SUITE}, len(suite))
+
+
+def forget(ids: set[str]) -> None:
+    """Forgets metrics from outside."""
+    for id in ids - _SUITE:
+        _METRICS.pop(id, None)
+    _order[:] = [id for id in _order if id in _METRICS]
+
+
+def _numbered(rows: dict[str, Metric], before: int = 0) -> dict[str, Metric]:
+    place = {id: number for number, id in enumerate(_order)}
+    names = list(CATEGORIES)
+    ids = sorted(rows, key=lambda id: (names.index(rows[id].category) if not before else 0, place[id]))
+    return {id: replace(rows[id], number=before + number + 1) for number, id in enumerate(ids)}

@@ -22,14 +22,13 @@ from benchmarks.fidelity.derive.lining import (
     PHASE_PITCHES,
     RING_BAND,
     both_maps,
-    coarse_pitch,
     judged_pockets,
     matched_pockets,
     paired_depths,
     pocket_rows,
     reference_arc,
+    reference_pitch,
     reference_pockets,
-    relief_along,
     ring_phases,
     ring_pitch,
 )
@@ -38,15 +37,14 @@ from benchmarks.fidelity.registry import (
     Statistic,
     Value,
     estimate,
-    family,
     mean,
     mean_magnitude,
-    metric,
     missing,
     number,
     percentile,
     rms,
 )
+from benchmarks.fidelity.table import B, D, U, metric
 
 _FEWEST_FEATURES = 10  # features that show a drift
 _NO_VARIATION = 1e-3  # m; a section that varies by less is constant
@@ -61,34 +59,34 @@ _SAME_ROW = 0.05  # rad
 # CEN: the axis of the lining against the axis of the reference, sampled every metre.
 
 
-@metric("cl_lateral_rmse", needs="reference")
+@metric("cl_lateral_rmse", "CEN", D(0.00588, 0.099), "m", gate=True, needs="reference")
 def cl_lateral_rmse(case: Case) -> Value:
     """Root mean square of the horizontal offset, m."""
     return estimate(rms, axis_pair(case).left, axis_pair(case).station, case.rng("cl_lateral_rmse"))
 
 
-@metric("cl_lateral_p95", needs="reference")
+@metric("cl_lateral_p95", "CEN", D(0.0113, 0.4), "m", needs="reference")
 def cl_lateral_p95(case: Case) -> Value:
     """95th percentile of the horizontal offset, m."""
     both = axis_pair(case)
     return estimate(percentile(95), np.abs(both.left), both.station, case.rng("cl_lateral_p95"))
 
 
-@metric("cl_vertical_rmse", needs="reference")
+@metric("cl_vertical_rmse", "CEN", D(0.00529, 0.2), "m", needs="reference")
 def cl_vertical_rmse(case: Case) -> Value:
     """Root mean square of the vertical offset, m."""
     both = axis_pair(case)
     return estimate(rms, both.judged[:, 2] - both.reference[:, 2], both.station, case.rng("cl_vertical_rmse"))
 
 
-@metric("cl_length_rel_err", needs="truth")
+@metric("cl_length_rel_err", "CEN", D(0.0012, 5), "%", gate=True, needs="truth")
 def cl_length_rel_err(case: Case) -> Value:
     """Error of the arc length from mouth to mouth, %."""
     true = truth_curve(case).length
     return number(100.0 * abs(lining_curve(case).length - true) / true, 1)
 
 
-@metric("cl_end_station_err", needs="truth")
+@metric("cl_end_station_err", "CEN", D(6.17e-06, 3), "m", needs="truth")
 def cl_end_station_err(case: Case) -> Value:
     """Larger axial error of the two mouths, m."""
     curve = truth_curve(case)
@@ -96,7 +94,7 @@ def cl_end_station_err(case: Case) -> Value:
     return number(max(abs(low - curve.station[0]), abs(high - curve.station[-1])), 2)
 
 
-@metric("cl_heading_rmse", needs="reference")
+@metric("cl_heading_rmse", "CEN", D(0.212, 3), "deg", needs="reference")
 def cl_heading_rmse(case: Case) -> Value:
     """Root mean square of the heading error on a base of 2 m, degrees."""
     both = axis_pair(case)
@@ -105,7 +103,8 @@ def cl_heading_rmse(case: Case) -> Value:
     return estimate(rms, gap, both.station[1:-1], case.rng("cl_heading_rmse"))
 
 
-@family("reference", {"cl_curvature_rmse": (plan_curvature, 1.0), "cl_grade_rmse": (longitudinal_slope, 100.0)})
+@metric("cl_curvature_rmse", "CEN", D(0.000805, 0.005), "1/m", needs="reference", args=(plan_curvature, 1.0))
+@metric("cl_grade_rmse", "CEN", D(0.144, 2), "%", needs="reference", args=(longitudinal_slope, 100.0))
 def axis_shape_error(case: Case, id: str, quantity: Callable[[np.ndarray], np.ndarray], factor: float) -> Value:
     """Root mean square error of curvature (1/m) or longitudinal slope (%), each over 10 m."""
     both = axis_pair(case)
@@ -114,7 +113,7 @@ def axis_shape_error(case: Case, id: str, quantity: Callable[[np.ndarray], np.nd
     return estimate(rms, factor * difference, both.station[trim : len(both.station) - trim], case.rng(id))
 
 
-@metric("cl_axial_drift_slope", needs="truth")
+@metric("cl_axial_drift_slope", "CEN", D(1e-06, 3), "m/100 m", needs="truth")
 def cl_axial_drift_slope(case: Case) -> Value:
     """Drift of the ring joints along the true axis, of the sleepers where there are no joints, m per 100 m."""
     assert case.truth is not None
@@ -131,13 +130,13 @@ def cl_axial_drift_slope(case: Case) -> Value:
     return missing("neither ring joints nor sleepers to follow along the tunnel")
 
 
-@metric("cl_icp_rotation", needs="hold")
+@metric("cl_icp_rotation", "CEN", D(0.0416, 1.5), "deg", needs="hold")
 def cl_icp_rotation(case: Case) -> Value:
     """Angle of the best rigid motion onto the held-out cloud, degrees; the motion is not applied."""
     return number(rotation_angle(registration(case)), 1)
 
 
-@metric("cl_icp_translation", needs="hold")
+@metric("cl_icp_translation", "CEN", unit="m", needs="hold")
 def cl_icp_translation(case: Case) -> Value:
     """Shift of that motion at the middle of the cloud, m."""
     return number(float(np.linalg.norm(registration(case)[:3, 3])), 1)
@@ -146,24 +145,26 @@ def cl_icp_translation(case: Case) -> Value:
 # SEC: size and shape of the sections, every metre, pockets left out.
 
 
-@family("reference", {
-    "sec_width_bias": ("width", mean_magnitude), "sec_width_rmse": ("width", rms),
-    "sec_height_bias": ("height", mean_magnitude), "sec_height_rmse": ("height", rms),
-})  # fmt: skip
+@metric("sec_width_bias", "SEC", D(1e-06, 0.25), "m", needs="reference", args=("width", mean_magnitude))
+@metric("sec_width_rmse", "SEC", D(1e-06, 0.066), "m", needs="reference", args=("width", rms))
+@metric("sec_height_bias", "SEC", D(1e-06, 0.25), "m", needs="reference", args=("height", mean_magnitude))
+@metric("sec_height_rmse", "SEC", D(1e-06, 0.057), "m", needs="reference", args=("height", rms))
 def size_error(case: Case, id: str, name: str, statistic: Statistic) -> Value:
     """Error of the width 1.2 m above the floor, or of the height on the axis, m."""
     judged, reference = dimensions(case)[name]
     return estimate(statistic, judged - reference, sections(case).station, case.rng(id))
 
 
-@family("reference", {"sec_area_rel_err_mean": mean, "sec_area_rel_err_p95": percentile(95)})
+@metric("sec_area_rel_err_mean", "SEC", D(1e-06, 0.91), "%", needs="reference", args=(mean,))
+@metric("sec_area_rel_err_p95", "SEC", D(1e-06, 2), "%", needs="reference", args=(percentile(95),))
 def area_error(case: Case, id: str, statistic: Statistic) -> Value:
     """Relative error of the area, %."""
     judged, reference = dimensions(case)["area"]
     return estimate(statistic, 100.0 * np.abs(judged / reference - 1.0), sections(case).station, case.rng(id))
 
 
-@family("reference", {"sec_iou_mean": mean, "sec_iou_p05": percentile(5)})
+@metric("sec_iou_mean", "SEC", U(0.85, 0.999999), gate=True, needs="reference", args=(mean,))
+@metric("sec_iou_p05", "SEC", U(0.967, 0.999999), needs="reference", args=(percentile(5),))
 def outline_overlap(case: Case, id: str, statistic: Statistic) -> Value:
     """Intersection over union of the outlines."""
     cut = sections(case)
@@ -171,7 +172,8 @@ def outline_overlap(case: Case, id: str, statistic: Statistic) -> Value:
     return estimate(statistic, shapely.area(cut.common) / union, cut.station, case.rng(id))
 
 
-@family("reference", {"sec_overbreak_vol": 0, "sec_underbreak_vol": 1})
+@metric("sec_overbreak_vol", "SEC", D(1e-06, 0.99), "%", needs="reference", args=(0,))
+@metric("sec_underbreak_vol", "SEC", D(1e-06, 1.1), "%", needs="reference", args=(1,))
 def outside_volume(case: Case, id: str, side: int) -> Value:
     """Volume of one side (0 lining, 1 reference) outside the other, % of the reference's volume."""
     area = dimensions(case)["area"]
@@ -179,7 +181,7 @@ def outside_volume(case: Case, id: str, side: int) -> Value:
     return estimate(mean, 100.0 * outside / area[1].mean(), sections(case).station, case.rng(id))
 
 
-@metric("sec_radial_rmse", needs="reference")
+@metric("sec_radial_rmse", "SEC", D(1e-06, 0.04), "m", needs="reference")
 def sec_radial_rmse(case: Case) -> Value:
     """Root mean square error of the radius about the reference axis, where the reference is known, m."""
     cut = sections(case)
@@ -187,7 +189,7 @@ def sec_radial_rmse(case: Case) -> Value:
     return estimate(rms, error, np.repeat(cut.station, len(cut.angle)), case.rng("sec_radial_rmse"))
 
 
-@metric("sec_variation_corr", needs="reference")
+@metric("sec_variation_corr", "SEC", U(0.3, 0.999999), needs="reference")
 def sec_variation_corr(case: Case) -> Value:
     """Correlation of width and height, trends removed; 0 for a constant section."""
     judged, reference = variation(case)
@@ -202,7 +204,7 @@ def sec_variation_corr(case: Case) -> Value:
     return estimate(correlation, index, sections(case).station, case.rng("sec_variation_corr"))
 
 
-@metric("sec_variation_ratio", needs="reference")
+@metric("sec_variation_ratio", "SEC", B(1, 1e-06, 1), needs="reference")
 def sec_variation_ratio(case: Case) -> Value:
     """Standard deviation of that variation in the lining over the one in the reference."""
     judged, reference = variation(case)
@@ -218,7 +220,7 @@ def sec_variation_ratio(case: Case) -> Value:
 # LIN: pockets and ring grid on the unrolled lining.
 
 
-@metric("lin_depth_map_ncc", needs="hold")
+@metric("lin_depth_map_ncc", "LIN", U(0.15, 0.7), gate=True, needs="hold")
 def lin_depth_map_ncc(case: Case) -> Value:
     """Correlation of the unrolled depths with those of the held-out recording, smooth section removed."""
     station, judged, hold = paired_depths(case)
@@ -232,7 +234,7 @@ def lin_depth_map_ncc(case: Case) -> Value:
     return estimate(correlation, np.arange(len(judged), dtype=float), station, case.rng("lin_depth_map_ncc"))
 
 
-@metric("lin_pocket_f1", needs="reference")
+@metric("lin_pocket_f1", "LIN", U(0.3, 0.99715), gate=True, needs="reference")
 def lin_pocket_f1(case: Case) -> Value:
     """F1 of the pockets, matched within 15 cm on the unrolled wall."""
     judged, reference = judged_pockets(case), reference_pockets(case)
@@ -241,7 +243,7 @@ def lin_pocket_f1(case: Case) -> Value:
     return number(2.0 * len(matched_pockets(case)) / (len(judged) + len(reference)), len(reference))
 
 
-@metric("lin_pocket_count_rel_err", needs="reference")
+@metric("lin_pocket_count_rel_err", "LIN", D(0.567, 40), "%", needs="reference")
 def lin_pocket_count_rel_err(case: Case) -> Value:
     """Relative error of the number of pockets, %."""
     judged, reference = judged_pockets(case), reference_pockets(case)
@@ -250,18 +252,18 @@ def lin_pocket_count_rel_err(case: Case) -> Value:
     return number(100.0 * abs(len(judged) / len(reference) - 1.0), len(reference))
 
 
-def _relative_error(judged: np.ndarray, true: np.ndarray) -> np.ndarray:
-    return 100.0 * np.abs(judged / true - 1.0)
+def _mean_abs(errors: np.ndarray) -> float:
+    return float(np.mean(np.abs(errors)))
 
 
-@family("reference", {
-    "lin_pocket_depth_bias": ("depth", np.subtract, mean_magnitude),
-    "lin_pocket_depth_mae": ("depth", lambda judged, true: np.abs(judged - true), mean),
-    "lin_pocket_area_rel_err": ("area", _relative_error, np.median),
-})  # fmt: skip
-def matched_pocket_error(
-    case: Case, id: str, name: str, error: Callable[..., np.ndarray], statistic: Statistic
-) -> Value:
+def _median_abs(errors: np.ndarray) -> float:
+    return float(np.median(np.abs(errors)))
+
+
+@metric("lin_pocket_depth_bias", "LIN", D(0.00262, 0.08), "m", needs="reference", args=("depth", mean_magnitude))
+@metric("lin_pocket_depth_mae", "LIN", D(0.00324, 0.08), "m", gate=True, needs="reference", args=("depth", _mean_abs))
+@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", args=("area", _median_abs))
+def matched_pocket_error(case: Case, id: str, name: str, statistic: Statistic) -> Value:
     """Error of depth (m) or area (%) of the matched pockets."""
     if not len(reference_pockets(case)):
         return missing(_NO_POCKETS)
@@ -269,20 +271,15 @@ def matched_pocket_error(
     if not len(pairs):
         return Value(None, None, 0, _NO_MATCH, failed=True)
     judged, reference = judged_pockets(case), reference_pockets(case)
-    sizes = getattr(judged, name)[pairs[:, 0]], getattr(reference, name)[pairs[:, 1]]
-    return estimate(statistic, error(*sizes), reference.station[pairs[:, 1]], case.rng(id))
+    size, real = getattr(judged, name)[pairs[:, 0]], getattr(reference, name)[pairs[:, 1]]
+    error = size - real if name == "depth" else 100.0 * (size / real - 1.0)
+    return estimate(statistic, error, reference.station[pairs[:, 1]], case.rng(id))
 
 
-def _reference_pitch(case: Case) -> float | None:
-    reference = both_maps(case)[1]
-    coarse = coarse_pitch(relief_along(reference))
-    return None if coarse is None else ring_pitch(reference, coarse, 0.1)
-
-
-@metric("lin_axial_pitch_err", needs="reference")
+@metric("lin_axial_pitch_err", "LIN", D(1e-06, 10), "%", needs="reference")
 def lin_axial_pitch_err(case: Case) -> Value:
     """Relative error of the pitch of the rings along the tunnel, %."""
-    reference = _reference_pitch(case)
+    reference = reference_pitch(case)
     if reference is None:
         return missing(_NO_POCKETS)
     judged = ring_pitch(both_maps(case)[0], reference, RING_BAND)
@@ -291,7 +288,7 @@ def lin_axial_pitch_err(case: Case) -> Value:
     return number(100.0 * abs(judged / reference - 1.0), 1, f"{judged:.4f} m against {reference:.4f} m")
 
 
-@metric("lin_circ_pitch_err", needs="reference")
+@metric("lin_circ_pitch_err", "LIN", D(1e-06, 15), "%", needs="reference")
 def lin_circ_pitch_err(case: Case) -> Value:
     """Relative error of the median distance between rows of pockets around the section, %."""
     judged, reference = (np.diff(pocket_rows(side, reference_arc(case))) for side in both_maps(case))
@@ -302,10 +299,10 @@ def lin_circ_pitch_err(case: Case) -> Value:
     return number(100.0 * abs(float(np.median(judged) / np.median(reference)) - 1.0), len(reference))
 
 
-@metric("lin_ring_phase_err", needs="reference")
+@metric("lin_ring_phase_err", "LIN", D(1e-06, 0.25), needs="reference")
 def lin_ring_phase_err(case: Case) -> Value:
     """Mean absolute error of the grid's phase in windows of four pitches, share of a pitch."""
-    length = _reference_pitch(case)
+    length = reference_pitch(case)
     if length is None:
         return missing(_NO_POCKETS)
     judged, reference = (ring_phases(side, length) for side in both_maps(case))
@@ -316,7 +313,7 @@ def lin_ring_phase_err(case: Case) -> Value:
     return estimate(mean, share, centre, case.rng("lin_ring_phase_err"))
 
 
-@metric("lin_nail_count_ratio")
+@metric("lin_nail_count_ratio", "LIN")
 def lin_nail_count_ratio(case: Case) -> Value:
     """Connecting nails of the candidate over its pairs of neighbouring pockets in a row."""
     pocket = case.candidate.bore.pocket

@@ -27,7 +27,8 @@ from benchmarks.fidelity.derive.mesh import (
     welded_lining,
     welded_solid,
 )
-from benchmarks.fidelity.registry import Value, family, metric, missing, number, pass_or_fail
+from benchmarks.fidelity.registry import Value, missing, number, pass_or_fail
+from benchmarks.fidelity.table import B, D, P, U, metric
 
 _THIN = 1e-6  # m; a triangle no higher than this has no normal
 _TURNS = 3
@@ -41,26 +42,26 @@ _LASTING_PERSISTENCE = 0.3  # m of persistence, from which a loop or a void coun
 # MSH: the meshes of a bore are sound, closed and wound alike.
 
 
-@metric("mesh_finite")
+@metric("mesh_finite", "MSH", P, "bool", gate=True)
 def mesh_finite(case: Case) -> Value:
     """Vertices finite and faces in range, of lining, solid and extra surfaces."""
     judged = case.candidate
     return pass_or_fail(all(is_sound(mesh) for mesh in (judged.lining, judged.solid, judged.extra)))
 
 
-@metric("mesh_watertight")
+@metric("mesh_watertight", "MSH", P, "bool", gate=True)
 def mesh_watertight(case: Case) -> Value:
     """Every edge of the solid has two faces."""
     return pass_or_fail(welded_solid(case).is_watertight)
 
 
-@metric("mesh_winding_consistent")
+@metric("mesh_winding_consistent", "MSH", P, "bool", gate=True)
 def mesh_winding_consistent(case: Case) -> Value:
     """Neighbouring faces run along their edge in opposite senses, in lining and solid."""
     return pass_or_fail(welded_lining(case).is_winding_consistent and welded_solid(case).is_winding_consistent)
 
 
-@metric("mesh_orientation_frac")
+@metric("mesh_orientation_frac", "MSH", U(0.98, 0.999), gate=True)
 def mesh_orientation_frac(case: Case) -> Value:
     """Share of the lining's area whose normal looks at the axis; each ray stands for the area that it sees."""
     hits = axis_hits(case)
@@ -69,7 +70,7 @@ def mesh_orientation_frac(case: Case) -> Value:
     return number(np.sum(area * (hits.cosine[met] < 0)) / np.sum(area), int(met.sum()))
 
 
-@metric("mesh_is_volume")
+@metric("mesh_is_volume", "MSH", P, "bool")
 def mesh_is_volume(case: Case) -> Value:
     """The solid is a volume for trimesh and for MuJoCo's exact inertia, which refuses an inverted one."""
     solid = welded_solid(case)
@@ -92,7 +93,7 @@ def _compile_exact(solid: trimesh.Trimesh) -> None:
     spec.compile()
 
 
-@metric("mesh_manifold_status")
+@metric("mesh_manifold_status", "MSH", P, "bool")
 def mesh_manifold_status(case: Case) -> Value:
     """manifold3d accepts the solid as it is."""
     solid = _manifold(welded_solid(case))
@@ -103,7 +104,7 @@ def _manifold(mesh: trimesh.Trimesh) -> Manifold:
     return Manifold(Mesh64(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, np.uint64)))
 
 
-@metric("mesh_boundary_unexpected")
+@metric("mesh_boundary_unexpected", "MSH", D(0, 0.002))
 def mesh_boundary_unexpected(case: Case) -> Value:
     """Length of the lining's rims outside the two mouths over the length of all edges."""
     edges, mouth = lining_edges(case), mouth_vertices(case)
@@ -111,14 +112,14 @@ def mesh_boundary_unexpected(case: Case) -> Value:
     return number(edges.length[rim].sum() / edges.length.sum(), len(edges.length))
 
 
-@metric("mesh_nonmanifold_edges")
+@metric("mesh_nonmanifold_edges", "MSH", D(0, 0.001))
 def mesh_nonmanifold_edges(case: Case) -> Value:
     """Share of edges with more than two faces; the worse of lining and solid."""
     both = lining_edges(case), solid_edges(case)
     return number(max(float(np.mean(edges.faces > 2)) for edges in both), sum(len(edges.faces) for edges in both))
 
 
-@metric("mesh_duplicate_faces")
+@metric("mesh_duplicate_faces", "MSH", D(0, 0.001))
 def mesh_duplicate_faces(case: Case) -> Value:
     """Share of faces that another face repeats, whichever way round; the worse of lining and solid."""
     both = welded_lining(case), welded_solid(case)
@@ -126,7 +127,7 @@ def mesh_duplicate_faces(case: Case) -> Value:
     return number(max(shares), sum(len(mesh.faces) for mesh in both))
 
 
-@metric("mesh_degenerate_faces")
+@metric("mesh_degenerate_faces", "MSH", D(0, 0.001))
 def mesh_degenerate_faces(case: Case) -> Value:
     """Share of faces lower than a thousandth of a millimetre; the worse of lining and solid."""
     both = welded_lining(case), welded_solid(case)
@@ -138,7 +139,7 @@ def _side_lengths(mesh: trimesh.Trimesh) -> Float[np.ndarray, "f 3"]:
     return np.linalg.norm(np.diff(mesh.triangles[:, [0, 1, 2, 0]], axis=1), axis=2)
 
 
-@metric("mesh_self_intersections")
+@metric("mesh_self_intersections", "MSH", D(0, 0.005))
 def mesh_self_intersections(case: Case) -> Value:
     """Share of the lining's faces that cut another one in every pose of the mesh.
 
@@ -161,7 +162,7 @@ def _cut_faces(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
     return np.asarray(judged.current_mesh().face_selection_array(), bool)
 
 
-@metric("mesh_volume_vs_sections")
+@metric("mesh_volume_vs_sections", "MSH", D(0.5, 5), "%")
 def mesh_volume_vs_sections(case: Case) -> Value:
     """Volume of the solid against the sections of `bore.npz` with the pockets that it lists, %."""
     bore, solid = case.candidate.bore, welded_solid(case)
@@ -175,7 +176,7 @@ def mesh_volume_vs_sections(case: Case) -> Value:
 # TRI: the triangles are well shaped and small enough for what they show.
 
 
-@metric("tri_aspect_p95")
+@metric("tri_aspect_p95", "TRI", D(8, 60))
 def tri_aspect_p95(case: Case) -> Value:
     """95th percentile of the longest edge over the shortest height."""
     mesh = welded_lining(case)
@@ -184,14 +185,14 @@ def tri_aspect_p95(case: Case) -> Value:
     return number(np.percentile(aspect, 95), len(aspect))
 
 
-@metric("tri_min_angle_p05")
+@metric("tri_min_angle_p05", "TRI", U(1, 10), "deg")
 def tri_min_angle_p05(case: Case) -> Value:
     """5th percentile of the smallest angle, degrees."""
     angle = _least_angles(welded_lining(case))
     return number(np.percentile(angle, 5), len(angle))
 
 
-@metric("tri_sliver_frac")
+@metric("tri_sliver_frac", "TRI", D(0.001, 0.015))
 def tri_sliver_frac(case: Case) -> Value:
     """Share of triangles with an angle below 1 degree."""
     angle = _least_angles(welded_lining(case))
@@ -202,7 +203,7 @@ def _least_angles(mesh: trimesh.Trimesh) -> Float[np.ndarray, " f"]:
     return np.degrees(np.nan_to_num(mesh.face_angles, nan=0.0).min(axis=1))
 
 
-@metric("tri_edge_p95")
+@metric("tri_edge_p95", "TRI", D(0.25, 1.5), "m")
 def tri_edge_p95(case: Case) -> Value:
     """95th percentile of the edge length on the wall, m."""
     edges, wall = lining_edges(case), _on_wall(case)
@@ -210,7 +211,7 @@ def tri_edge_p95(case: Case) -> Value:
     return number(np.percentile(length, 95), len(length))
 
 
-@metric("tri_chord_error_max")
+@metric("tri_chord_error_max", "TRI", D(0.005, 0.05), "m")
 def tri_chord_error_max(case: Case) -> Value:
     """Largest bulge of the axis from its chord over the stretch that an edge spans, m."""
     curve, edges = candidate_curve(case), lining_edges(case)
@@ -220,7 +221,7 @@ def tri_chord_error_max(case: Case) -> Value:
     return number(np.linalg.norm(between - (here + there) / 2, axis=1).max(), len(start))
 
 
-@metric("tri_normal_noise")
+@metric("tri_normal_noise", "TRI", D(3, 25), "deg")
 def tri_normal_noise(case: Case) -> Value:
     """Median angle between neighbours on the wall away from pockets and corners, degrees."""
     mesh = welded_lining(case)
@@ -252,7 +253,7 @@ def _near_pockets(case: Case) -> Bool[np.ndarray, " v"]:
     return near
 
 
-@metric("tri_roughness_ratio", needs="hold")
+@metric("tri_roughness_ratio", "TRI", B(1, 0.947, 2.8), needs="hold")
 def tri_roughness_ratio(case: Case) -> Value:
     """Residual from planes of 0.5 m: the lining where held-out beams meet it, over those beams' less their noise.
 
@@ -268,7 +269,7 @@ def tri_roughness_ratio(case: Case) -> Value:
     return number(np.sqrt((roughness + real.noise) / whole), real.planes, reason)
 
 
-@metric("tri_face_count")
+@metric("tri_face_count", "TRI", unit="count")
 def tri_face_count(case: Case) -> Value:
     """Number of faces of the lining."""
     return number(len(case.candidate.lining.faces), 1)
@@ -277,7 +278,7 @@ def tri_face_count(case: Case) -> Value:
 # TOP: the bore is one tube with two mouths, whole and empty.
 
 
-@metric("topo_body_count_err")
+@metric("topo_body_count_err", "TOP", D(0, 3), "count")
 def topo_body_count_err(case: Case) -> Value:
     """Components of lining and extra surfaces beyond the one expected."""
     extra = case.candidate.extra
@@ -285,13 +286,13 @@ def topo_body_count_err(case: Case) -> Value:
     return number(abs(int(face_parts(welded_lining(case)).max()) + 1 + loose - 1), 1)
 
 
-@metric("topo_chi_err")
+@metric("topo_chi_err", "TOP", D(0, 6), "count")
 def topo_chi_err(case: Case) -> Value:
     """Difference of the solid's Euler characteristic from the 2 of a ball."""
     return number(abs(welded_solid(case).euler_number - 2), 1)
 
 
-@metric("topo_genus")
+@metric("topo_genus", "TOP", D(0, 3), "count")
 def topo_genus(case: Case) -> Value:
     """Handles of the solid.
 
@@ -304,7 +305,7 @@ def topo_genus(case: Case) -> Value:
     return number(abs(solid.genus()), 1)
 
 
-@metric("topo_mouth_err")
+@metric("topo_mouth_err", "TOP", D(0, 1), "count", gate=True)
 def topo_mouth_err(case: Case) -> Value:
     """Difference of the number of rims of the open lining from the two expected."""
     edges = lining_edges(case)
@@ -317,14 +318,14 @@ def topo_mouth_err(case: Case) -> Value:
     return number(abs(connected_components(graph, directed=False)[0] - 2), len(rim))
 
 
-@metric("topo_free_b0")
+@metric("topo_free_b0", "TOP", B(1, 0, 1), "count", gate=True)
 def topo_free_b0(case: Case) -> Value:
     """Pieces of free space that the centreline runs through; one is right."""
     count, cells = free_components(case)
     return number(count, cells)
 
 
-@metric("topo_leak_frac")
+@metric("topo_leak_frac", "TOP", D(0.0001, 0.01), gate=True)
 def topo_leak_frac(case: Case) -> Value:
     """Share of rays from the axis that meet no lining and leave by neither mouth."""
     hits = axis_hits(case)
@@ -349,7 +350,8 @@ def _through_mouth(case: Case, origin: np.ndarray, direction: np.ndarray, end: i
     return (outward > 0) & (np.hypot(across, above) < wall + deepest + 0.02)
 
 
-@family("reference", {"topo_free_b1_err": 1, "topo_free_b2_err": 2})
+@metric("topo_free_b1_err", "TOP", D(1e-06, 4), "count", needs="reference", args=(1,))
+@metric("topo_free_b2_err", "TOP", D(1e-06, 4), "count", needs="reference", args=(2,))
 def lasting_difference(case: Case, id: str, dimension: int) -> Value:
     """Difference in the number of lasting loops (1) or of bodies that float in the free space (2)."""
     diagrams = candidate_diagrams(case)[dimension], reference_diagrams(case)[dimension]
@@ -357,7 +359,8 @@ def lasting_difference(case: Case, id: str, dimension: int) -> Value:
     return number(abs(judged - real), judged + real)
 
 
-@family("reference", {"topo_bottleneck_h0": 0, "topo_bottleneck_h1": 1})
+@metric("topo_bottleneck_h0", "TOP", D(1e-06, 0.8), "m", needs="reference", args=(0,))
+@metric("topo_bottleneck_h1", "TOP", unit="m", needs="reference", args=(1,))
 def bottleneck_distance(case: Case, id: str, dimension: int) -> Value:
     """Bottleneck distance of the clearance diagrams of components (0) or loops (1), m."""
     import gudhi
@@ -366,7 +369,7 @@ def bottleneck_distance(case: Case, id: str, dimension: int) -> Value:
     return number(gudhi.bottleneck_distance(judged, real), len(judged) + len(real))
 
 
-@metric("topo_floater_area")
+@metric("topo_floater_area", "TOP", D(0, 0.01))
 def topo_floater_area(case: Case) -> Value:
     """Share of the area of lining and extra surfaces that is not in the lining's largest piece."""
     mesh, extra = welded_lining(case), case.candidate.extra

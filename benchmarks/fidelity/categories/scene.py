@@ -8,7 +8,6 @@ import numpy as np
 from packaging.requirements import Requirement
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import geom_mesh
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive import planar
 from benchmarks.fidelity.derive.contact import (
@@ -26,9 +25,11 @@ from benchmarks.fidelity.derive.scene import (
     placed_data,
     rays_from_axis,
     robot_body,
+    scene_geoms,
     scene_model,
 )
-from benchmarks.fidelity.registry import Value, metric, missing, number, pass_or_fail
+from benchmarks.fidelity.registry import Value, missing, number, pass_or_fail
+from benchmarks.fidelity.table import LOGGED_UP, D, P, U, metric
 from scene.poses.trajectory import load_tum
 
 _STEPS = 1000
@@ -42,7 +43,7 @@ _SIGMA = 0.05  # m; the range noise that the paper gives its environment
 # SCN: the released scene is in MuJoCo what the meshes say.
 
 
-@metric("mj_compiles")
+@metric("mj_compiles", "SCN", P, "bool", gate=True)
 def mj_compiles(case: Case) -> Value:
     """MuJoCo compiles the released MJCF."""
     try:
@@ -52,7 +53,7 @@ def mj_compiles(case: Case) -> Value:
     return pass_or_fail(model.ngeom > 0, f"{model.ngeom} geoms")
 
 
-@metric("mj_version_match")
+@metric("mj_version_match", "SCN", LOGGED_UP, "bool", evidence="KC")
 def mj_version_match(case: Case) -> Value:
     """The MuJoCo in use is one that this project asks for."""
     requirements = [Requirement(text) for text in requires("subterra-jax") or ()]
@@ -64,7 +65,7 @@ def mj_version_match(case: Case) -> Value:
     return pass_or_fail(pin.specifier.contains(mujoco.__version__), reason)
 
 
-@metric("mj_step_finite")
+@metric("mj_step_finite", "SCN", P, "bool", gate=True)
 def mj_step_finite(case: Case) -> Value:
     """1,000 steps of the robot, pushed forwards, stay finite and raise no warning."""
     state, warnings, _ = _push_robot(case)
@@ -86,14 +87,14 @@ def _push_robot(case: Case) -> tuple[np.ndarray, int, float]:
     return np.concatenate([data.qpos, data.qvel]), sum(int(w.number) for w in data.warning), rate
 
 
-@metric("mj_probe_free_frac")
+@metric("mj_probe_free_frac", "SCN", U(0.99, 1), gate=True)
 def mj_probe_free_frac(case: Case) -> Value:
     """Share of axis stations where a sphere of 0.3 m touches nothing."""
     free = probe_free(case)
     return number(free.mean(), len(free))
 
 
-@metric("mj_wall_contact_err")
+@metric("mj_wall_contact_err", "SCN", D(0.01, 0.08), "m", gate=True)
 def mj_wall_contact_err(case: Case) -> Value:
     """Median difference between first contact in MuJoCo and in the mesh, towards both walls at LiDAR height, m.
 
@@ -105,7 +106,7 @@ def mj_wall_contact_err(case: Case) -> Value:
     return number(errors[0], len(expected), reason)
 
 
-@metric("mj_ray_vs_mesh_mae")
+@metric("mj_ray_vs_mesh_mae", "SCN", D(0.001, 0.02), "m")
 def mj_ray_vs_mesh_mae(case: Case) -> Value:
     """Mean difference of ranges, compiled scene against the meshes, m."""
     pairs = rays_from_axis(case)
@@ -113,7 +114,7 @@ def mj_ray_vs_mesh_mae(case: Case) -> Value:
     return number(np.mean(np.abs(pairs.scene[both] - pairs.mesh[both])), int(both.sum()))
 
 
-@metric("mj_ray_leak_rate")
+@metric("mj_ray_leak_rate", "SCN", D(1e-05, 0.001))
 def mj_ray_leak_rate(case: Case) -> Value:
     """Share of rays that meet the meshes and nothing in the scene."""
     pairs = rays_from_axis(case)
@@ -121,7 +122,7 @@ def mj_ray_leak_rate(case: Case) -> Value:
     return number(np.mean(~np.isfinite(pairs.scene[due])), int(due.sum()))
 
 
-@metric("mj_manifest_match")
+@metric("mj_manifest_match", "SCN", P, "bool")
 def mj_manifest_match(case: Case) -> Value:
     """The scene holds the numbers of assets that the manifest states."""
     counted, stated = count_assets(case), case.candidate.manifest.get("count", {})
@@ -131,7 +132,7 @@ def mj_manifest_match(case: Case) -> Value:
     return pass_or_fail(bool(shared) and not wrong, reason)
 
 
-@metric("mj_frame_err")
+@metric("mj_frame_err", "SCN", D(0.001, 0.02), "m")
 def mj_frame_err(case: Case) -> Value:
     """Largest distance between a vertex of the compiled lining, the compiler's recentring undone, and the mesh's, m."""
     return number(_frame_error(case), len(case.candidate.lining.vertices))
@@ -139,19 +140,15 @@ def mj_frame_err(case: Case) -> Value:
 
 @per_release("scene", "mesh")
 def _frame_error(case: Case) -> float:
-    model = scene_model(case)
-    data = placed_data(model)
-    lining = [k for k in range(model.ngeom) if model.geom(k).name.split("_")[0] in LINING_NAMES]
+    lining = scene_geoms(case).named(*LINING_NAMES)
     if not lining:
         raise ValueError("no geom of the scene is called lining")
-    compiled, expected = (
-        np.concatenate([geom_mesh(model, data, k).vertices for k in lining]),
-        case.candidate.lining.vertices,
-    )
+    compiled = np.concatenate([scene_geoms(case).mesh(geom).vertices for geom in lining])
+    expected = case.candidate.lining.vertices
     return float(max(cKDTree(expected).query(compiled)[0].max(), cKDTree(compiled).query(expected)[0].max()))
 
 
-@metric("mj_inertia_valid")
+@metric("mj_inertia_valid", "SCN", LOGGED_UP, "bool", evidence="SKC")
 def mj_inertia_valid(case: Case) -> Value:
     """Inertias are positive and possible for a body; compiled masses are those that the MJCF states."""
     model = scene_model(case)
@@ -170,7 +167,7 @@ def mj_inertia_valid(case: Case) -> Value:
     return pass_or_fail(valid, ", ".join(f"{n} {m:g} kg" for n, m in mass.items()))
 
 
-@metric("mj_xml_roundtrip")
+@metric("mj_xml_roundtrip", "SCN", P, "bool")
 def mj_xml_roundtrip(case: Case) -> Value:
     """Written out and read again, the scene has the same geoms at the same places."""
     scene, before = case.candidate.scene, scene_model(case)
@@ -185,7 +182,7 @@ def mj_xml_roundtrip(case: Case) -> Value:
     return pass_or_fail(moved <= _SAME_POSE, f"moved by {moved:.1e}")
 
 
-@metric("mj_step_rate")
+@metric("mj_step_rate", "SCN", unit="1/s")
 def mj_step_rate(case: Case) -> Value:
     """Steps per second on the CPU, 1/s."""
     return number(_push_robot(case)[2], _STEPS)
@@ -194,7 +191,7 @@ def mj_step_rate(case: Case) -> Value:
 # PAR: MJX, the JAX LiDAR and the environment agree with MuJoCo and with the meshes.
 
 
-@metric("mjx_put_model")
+@metric("mjx_put_model", "PAR", P, "bool", gate=True)
 def mjx_put_model(case: Case) -> Value:
     """MJX accepts the whole released scene and makes one compiled step."""
     try:
@@ -203,7 +200,7 @@ def mjx_put_model(case: Case) -> Value:
         return pass_or_fail(False, f"{type(error).__name__}: {error}"[:200])
 
 
-@metric("mjx_ray_parity")
+@metric("mjx_ray_parity", "PAR", D(0.001, 0.02), "m")
 def mjx_ray_parity(case: Case) -> Value:
     """Mean difference between the JAX LiDAR and `mj_multiRay` in the compiled scene at the same poses, m."""
     difference = np.abs(planar.lidar_ranges(case) - planar.mujoco_ranges(case))
@@ -211,7 +208,7 @@ def mjx_ray_parity(case: Case) -> Value:
     return number(difference.mean(), difference.size, reason)
 
 
-@metric("mjx_contact_parity")
+@metric("mjx_contact_parity", "PAR", U(0.95, 1))
 def mjx_contact_parity(case: Case) -> Value:
     """Share of 200 placements of the robot with the same contact decision and a depth within 1 mm."""
     ours, theirs = contact_depths(case)
@@ -219,35 +216,35 @@ def mjx_contact_parity(case: Case) -> Value:
     return number(same.mean(), len(same), f"{np.mean(ours < 0.0):.0%} of them in contact")
 
 
-@metric("mjx_traj_divergence")
+@metric("mjx_traj_divergence", "PAR", D(0.001, 0.05), "m")
 def mjx_traj_divergence(case: Case) -> Value:
     """Largest distance of the robot between MuJoCo and MJX over 100 steps, m."""
     gap = path_divergence(case)
     return number(gap.max(), len(gap))
 
 
-@metric("env_lidar_vs_mesh")
+@metric("env_lidar_vs_mesh", "PAR", D(0.02, 0.15), "m", gate=True)
 def env_lidar_vs_mesh(case: Case) -> Value:
     """Mean difference between the environment's noise-free beams and rays in the meshes, m."""
     difference = np.abs(planar.observed_ranges(case) - planar.mesh_ranges(case))
     return number(difference.mean(), difference.size)
 
 
-@metric("env_noise_sigma_err")
+@metric("env_noise_sigma_err", "PAR", unit="m", evidence="KC")
 def env_noise_sigma_err(case: Case) -> Value:
     """Standard deviation of the environment's range noise against 5 cm, m."""
     noise = planar.range_noise(case)
     return number(abs(float(np.std(noise)) - _SIGMA), len(noise))
 
 
-@metric("env_determinism")
+@metric("env_determinism", "PAR", LOGGED_UP, "bool", evidence="SC")
 def env_determinism(case: Case) -> Value:
     """Same seed and actions give the same observations in two environments made one after the other."""
     same = planar.repeated_observations(case)
     return pass_or_fail(bool(same.all()), f"{int(same.sum())} of {len(same)} observations")
 
 
-@metric("env_odom_drift_ratio", needs="hold")
+@metric("env_odom_drift_ratio", "PAR", needs="hold")
 def env_odom_drift_ratio(case: Case) -> Value:
     """Decimal logarithm of the environment's drift over 100 m by that of the recording's own LiDAR odometry."""
     assert case.hold is not None

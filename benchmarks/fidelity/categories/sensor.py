@@ -39,13 +39,12 @@ from benchmarks.fidelity.registry import (
     Statistic,
     Value,
     estimate,
-    family,
     mean_magnitude,
-    metric,
     missing,
     number,
     percentile,
 )
+from benchmarks.fidelity.table import LOGGED_UP, D, U, metric
 
 _FAR = 0.20  # m
 _DIRECTION_BIN = np.deg2rad(5.0)
@@ -69,21 +68,23 @@ def _range_error(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return cast_beams(case).difference[hit], returns(case).local[hit, 0]
 
 
-@family("hold", {"beam_range_mae": np.mean, "beam_range_medae": np.median, "beam_range_p95": percentile(95)})
+@metric("beam_range_mae", "BEA", D(0.0157, 0.072), "m", gate=True, needs="hold", args=(np.mean,))
+@metric("beam_range_medae", "BEA", D(0.0132, 0.06), "m", needs="hold", args=(np.median,))
+@metric("beam_range_p95", "BEA", D(0.0385, 0.2), "m", needs="hold", args=(percentile(95),))
 def range_error(case: Case, id: str, statistic: Statistic) -> Value:
     """Statistic of the absolute range difference, m."""
     error, station = _range_error(case)
     return estimate(statistic, np.abs(error), station, case.rng(id), BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_range_bias", needs="hold")
+@metric("beam_range_bias", "BEA", D(4.57e-05, 0.1), "m", needs="hold")
 def beam_range_bias(case: Case) -> Value:
     """Magnitude of the mean range difference, m."""
     error, station = _range_error(case)
     return estimate(mean_magnitude, error, station, case.rng("beam_range_bias"), BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_rel_medae", needs="hold")
+@metric("beam_rel_medae", "BEA", D(0.298, 1.3), "%", needs="hold")
 def beam_rel_medae(case: Case) -> Value:
     """Median absolute range difference as a share of the range, %."""
     hit, (error, station) = cast_beams(case).hit, _range_error(case)
@@ -91,19 +92,19 @@ def beam_rel_medae(case: Case) -> Value:
     return estimate(np.median, relative, station, case.rng("beam_rel_medae"), BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_within_10cm", needs="hold")
+@metric("beam_within_10cm", "BEA", U(0.85, 0.999754), needs="hold")
 def beam_within_10cm(case: Case) -> Value:
     """Share of the returns that the candidate gives within 10 cm; a beam that leaves it is not within."""
     return _beam_share(case, "beam_within_10cm", np.abs(cast_beams(case).difference) <= 0.10 * case.tolerance)
 
 
-@metric("beam_early_frac", needs="hold")
+@metric("beam_early_frac", "BEA", D(6.93e-05, 0.03), needs="hold")
 def beam_early_frac(case: Case) -> Value:
     """Share of the returns in front of which, by more than 20 cm, the candidate stands."""
     return _beam_share(case, "beam_early_frac", cast_beams(case).difference < -_FAR * case.tolerance)
 
 
-@metric("beam_late_frac", needs="hold")
+@metric("beam_late_frac", "BEA", D(7.94e-05, 0.05), needs="hold")
 def beam_late_frac(case: Case) -> Value:
     """Share of the returns that the candidate gives more than 20 cm later, or not at all."""
     return _beam_share(case, "beam_late_frac", cast_beams(case).difference > _FAR * case.tolerance)
@@ -113,7 +114,7 @@ def _beam_share(case: Case, id: str, marked: np.ndarray) -> Value:
     return estimate(np.mean, marked.astype(float), returns(case).local[:, 0], case.rng(id), BOOTSTRAP_SAMPLES)
 
 
-@metric("beam_return_bacc", needs="hold")
+@metric("beam_return_bacc", "BEA", U(0.85, 0.99223), needs="hold")
 def beam_return_bacc(case: Case) -> Value:
     """Balanced accuracy of the prediction whether a beam comes back."""
     assert case.hold is not None
@@ -126,20 +127,20 @@ def beam_return_bacc(case: Case) -> Value:
     return number(float(np.mean(right)), len(beams.silent))
 
 
-@metric("selfcast_p2s_mean", needs="hold")
+@metric("selfcast_p2s_mean", "BEA", unit="m", needs="hold", evidence="C")
 def selfcast_p2s_mean(case: Case) -> Value:
     """The paper's headline: mean distance of a cloud cast in the mesh to that mesh, m."""
     return number(float(np.mean(self_cast(case).distance)), len(self_cast(case).distance), _CIRCULAR)
 
 
-@metric("selfcast_within_10cm", needs="hold")
+@metric("selfcast_within_10cm", "BEA", LOGGED_UP, needs="hold", evidence="C")
 def selfcast_within_10cm(case: Case) -> Value:
     """The paper's headline: share of that cloud within 10 cm."""
     near = self_cast(case).distance <= 0.10 * case.tolerance
     return number(float(np.mean(near)), len(near), _CIRCULAR)
 
 
-@metric("selfcast_noise_ratio", needs="hold")
+@metric("selfcast_noise_ratio", "BEA", needs="hold", evidence="C")
 def selfcast_noise_ratio(case: Case) -> Value:
     """That mean over the mean that noise alone gives on a plane; 1: only noise was measured."""
     cloud = self_cast(case)
@@ -155,21 +156,21 @@ def _both_ranges(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return returns(case).range, reach[np.isfinite(reach)]
 
 
-@metric("range_ks", needs="hold")
+@metric("range_ks", "DIS", D(0.00115, 0.1), needs="hold")
 def range_ks(case: Case) -> Value:
     """Kolmogorov-Smirnov statistic of the ranges."""
     real, synthetic = _both_ranges(case)
     return number(float(ks_2samp(real, synthetic, method="asymp").statistic), len(real))
 
 
-@metric("range_w1", needs="hold")
+@metric("range_w1", "DIS", D(0.00144, 0.25), "m", gate=True, needs="hold")
 def range_w1(case: Case) -> Value:
     """Wasserstein-1 distance of the ranges, m."""
     real, synthetic = _both_ranges(case)
     return number(float(wasserstein_distance(real, synthetic)), len(real))
 
 
-@metric("elevation_w1", needs="hold")
+@metric("elevation_w1", "DIS", D(0.00534, 1), "m", needs="hold")
 def elevation_w1(case: Case) -> Value:
     """Mean over bins of 5° of elevation of the ranges' Wasserstein-1 distance, m."""
     elevation = np.round(beam_directions(case).elevation / _DIRECTION_BIN).astype(int)
@@ -177,7 +178,7 @@ def elevation_w1(case: Case) -> Value:
     return number(float(np.mean(distances)), len(elevation))
 
 
-@metric("azimuth_profile_rmse", needs="hold")
+@metric("azimuth_profile_rmse", "DIS", D(0.00191, 0.039), "m", needs="hold")
 def azimuth_profile_rmse(case: Case) -> Value:
     """Root mean square over bins of 5° of azimuth of the difference of middle ranges, m."""
     azimuth = np.round(beam_directions(case).azimuth / _DIRECTION_BIN).astype(int)
@@ -209,7 +210,7 @@ def _ranges_by_bin(case: Case, group: np.ndarray) -> list[tuple[np.ndarray, np.n
     return pairs
 
 
-@metric("incidence_w1", needs="hold")
+@metric("incidence_w1", "DIS", D(0.341, 12), "deg", needs="hold")
 def incidence_w1(case: Case) -> Value:
     """Wasserstein-1 distance of the incidence angles, normals of both clouds by local planes, degrees."""
     real, synthetic = (_incidence_angles(case, planes) for planes in (real_planes(case), synthetic_planes(case)))
@@ -221,7 +222,7 @@ def _incidence_angles(case: Case, planes: Planes) -> np.ndarray:
     return np.rad2deg(np.arccos(np.minimum(cosine[np.isfinite(cosine)], 1.0)))
 
 
-@metric("dropout_diff", needs="hold")
+@metric("dropout_diff", "DIS", D(0.00356, 0.1), needs="hold")
 def dropout_diff(case: Case) -> Value:
     """Difference between the shares of beams without a return."""
     assert case.hold is not None
@@ -231,35 +232,35 @@ def dropout_diff(case: Case) -> Value:
     return number(abs(float(np.mean(beams.silent)) - float(np.mean(beams.expected_silent))), len(beams.silent))
 
 
-@metric("noise_sigma_diff", needs="hold")
+@metric("noise_sigma_diff", "DIS", D(0.0068, 0.03), "m", needs="hold")
 def noise_sigma_diff(case: Case) -> Value:
     """Difference of the median spread about local planes, m."""
     sigma = [float(np.nanmedian(planes.sigma)) for planes in (real_planes(case), synthetic_planes(case))]
     return number(abs(sigma[0] - sigma[1]), len(plane_rows(case)))
 
 
-@metric("awd", needs="hold")
+@metric("awd", "DIS", D(0.028, 0.4), "m", needs="hold")
 def awd(case: Case) -> Value:
     """Mean Wasserstein distance of the points in voxels of 0.5 m, m."""
     _, distance = map_distances(case)
     return number(float(np.mean(distance)), len(distance))
 
 
-@metric("scs_diff", needs="hold")
+@metric("scs_diff", "DIS", needs="hold")
 def scs_diff(case: Case) -> Value:
     """Spatial consistency score against the synthetic map less that of two halves of the held-out cloud."""
     key, distance = map_distances(case)
     return number(abs(spatial_consistency(key, distance) - own_consistency(case)), len(distance))
 
 
-@metric("mme_diff", needs="hold")
+@metric("mme_diff", "DIS", D(0.325, 2), "nat", needs="hold")
 def mme_diff(case: Case) -> Value:
     """Difference of the mean map entropies, nat."""
     cloud, tree = synthetic_tree(case)
     return number(abs(mean_entropy(cloud_tree(case), returns(case).points) - mean_entropy(tree, cloud)))
 
 
-@metric("c2st_auc", needs="hold")
+@metric("c2st_auc", "DIS", D(0.505, 0.95), needs="hold")
 def c2st_auc(case: Case) -> Value:
     """Area under the curve of a forest that separates real from synthetic scans; 0.5: it cannot.
 
@@ -292,11 +293,9 @@ def _condition(scans: ScanInformation) -> np.ndarray:
     return scans.translation[:, 2] / scans.translation[:, 0]
 
 
-@family("hold", {
-    "deg_axial_info_logratio": lambda scans: scans.axial,
-    "deg_cond_logratio": _condition,
-    "deg_rot_info_logratio": lambda scans: scans.rotation,
-})  # fmt: skip
+@metric("deg_axial_info_logratio", "DEG", D(0.0543, 1), gate=True, needs="hold", args=(lambda scans: scans.axial,))
+@metric("deg_cond_logratio", "DEG", D(0.0823, 1), needs="hold", args=(_condition,))
+@metric("deg_rot_info_logratio", "DEG", D(0.00253, 0.14), needs="hold", args=(lambda scans: scans.rotation,))
 def information_logratio(case: Case, id: str, quantity) -> Value:
     """Median over the scans of |log10| of the ratio of an information, synthetic over real."""
     real, synthetic = (quantity(scans) for scans in _both_information(case))
@@ -305,7 +304,7 @@ def information_logratio(case: Case, id: str, quantity) -> Value:
     return estimate(np.median, log, real_information(case).station, case.rng(id))
 
 
-@metric("deg_weak_angle_diff", needs="hold")
+@metric("deg_weak_angle_diff", "DEG", D(0.083, 25), "deg", needs="hold")
 def deg_weak_angle_diff(case: Case) -> Value:
     """Median angle between the weakest directions of translation, degrees."""
     real, synthetic = _both_information(case)
@@ -314,7 +313,7 @@ def deg_weak_angle_diff(case: Case) -> Value:
     return estimate(np.median, angle, real.station, case.rng("deg_weak_angle_diff"))
 
 
-@metric("deg_eig_w1", needs="hold")
+@metric("deg_eig_w1", "DEG", D(0.0783, 0.8), needs="hold")
 def deg_eig_w1(case: Case) -> Value:
     """Wasserstein-1 distance of the distributions of log10 of the smallest eigenvalue."""
     smallest = [np.log10(scans.translation[:, 0]) for scans in _both_information(case)]
@@ -322,14 +321,14 @@ def deg_eig_w1(case: Case) -> Value:
     return number(float(wasserstein_distance(real, synthetic)), len(real))
 
 
-@metric("deg_profile_corr", needs="hold")
+@metric("deg_profile_corr", "DEG", U(0.2, 0.8), needs="hold")
 def deg_profile_corr(case: Case) -> Value:
     """Spearman correlation along the tunnel of the axial information."""
     real, synthetic = _axial_pairs(case)
     return number(float(spearmanr(real, synthetic).statistic), len(real))
 
 
-@metric("deg_class_kappa", needs="hold")
+@metric("deg_class_kappa", "DEG", LOGGED_UP, needs="hold")
 def deg_class_kappa(case: Case) -> Value:
     """Cohen's kappa of the scans' classes: poor, middling or rich in axial information.
 
@@ -357,7 +356,7 @@ def _axial_pairs(case: Case) -> tuple[np.ndarray, np.ndarray]:
     return real.axial[known], np.nan_to_num(synthetic.axial[known])
 
 
-@metric("deg_landmark_diff", needs="hold")
+@metric("deg_landmark_diff", "DEG", D(1e-06, 8), "1/100 scans", gate=True, needs="hold")
 def deg_landmark_diff(case: Case) -> Value:
     """Difference in stations per 100 scans at which the axis is not degenerate.
 
@@ -371,14 +370,14 @@ def deg_landmark_diff(case: Case) -> Value:
     return number(abs(counts[0] - counts[1]), len(real_information(case).axial))
 
 
-@metric("deg_alias_diff", needs="hold")
+@metric("deg_alias_diff", "DEG", D(0.105, 0.6), needs="hold")
 def deg_alias_diff(case: Case) -> Value:
     """Difference of the median alias ratios."""
     real, synthetic = real_alias(case), synthetic_alias(case)
     return number(abs(float(np.median(real)) - float(np.median(synthetic))), len(real))
 
 
-@metric("deg_icp_axial_logratio", needs="hold")
+@metric("deg_icp_axial_logratio", "DEG", needs="hold")
 def deg_icp_axial_logratio(case: Case) -> Value:
     """|log10| of the ratio of median axial errors of scan-to-scan registration."""
     real, synthetic = real_icp(case), synthetic_icp(case)
@@ -387,7 +386,7 @@ def deg_icp_axial_logratio(case: Case) -> Value:
     return number(abs(float(np.log10(np.median(synthetic) / np.median(real)))), len(real))
 
 
-@metric("deg_planar_axial_info")
+@metric("deg_planar_axial_info", "DEG")
 def deg_planar_axial_info(case: Case) -> Value:
     """Share of stations at which the environment's planar scan alone fixes the station."""
     return number(float(np.mean(localised_stations(case))), len(localised_stations(case)))

@@ -37,15 +37,14 @@ from benchmarks.fidelity.derive.surface import surface_nearest
 from benchmarks.fidelity.registry import (
     Value,
     estimate,
-    family,
     mean,
-    metric,
     missing,
     number,
     pass_or_fail,
     percentile,
     root_of_mean,
 )
+from benchmarks.fidelity.table import B, D, P, U, metric
 
 _EDGE_NEAR = 0.10  # m between two edges that agree
 _WIDEST = 20.0  # m in place of an open side
@@ -66,26 +65,26 @@ def _agreement(case: Case, id: str, among: np.ndarray, both: np.ndarray) -> Valu
     return estimate(mean, both[picked].astype(float), station, case.rng(id))
 
 
-@metric("occ2d_free_iou", needs="reference")
+@metric("occ2d_free_iou", "F2D", U(0.85, 0.99624), gate=True, needs="reference")
 def occ2d_free_iou(case: Case) -> Value:
     """Intersection over union of the free cells, where the reference is known."""
     judged, reference = free_plane(case).judged, free_plane(case).reference
     return _agreement(case, "occ2d_free_iou", judged | reference, judged & reference)
 
 
-@metric("occ2d_free_precision", needs="reference")
+@metric("occ2d_free_precision", "F2D", U(0.9, 0.999462), needs="reference")
 def occ2d_free_precision(case: Case) -> Value:
     """Share of the candidate's free cells that are free in the reference."""
     return _agreement(case, "occ2d_free_precision", free_plane(case).judged, free_plane(case).reference)
 
 
-@metric("occ2d_free_recall", needs="reference")
+@metric("occ2d_free_recall", "F2D", U(0.9, 0.99678), needs="reference")
 def occ2d_free_recall(case: Case) -> Value:
     """Share of the reference's free cells that are free in the candidate."""
     return _agreement(case, "occ2d_free_recall", free_plane(case).reference, free_plane(case).judged)
 
 
-@metric("occ2d_boundary_f1", needs="reference")
+@metric("occ2d_boundary_f1", "F2D", U(0.5, 0.999999), needs="reference")
 def occ2d_boundary_f1(case: Case) -> Value:
     """F1 of the edges of free space, matched within 10 cm."""
     judged, reference = (edge_cells(free) for free in gapless_maps(case)[:2])
@@ -95,14 +94,14 @@ def occ2d_boundary_f1(case: Case) -> Value:
     return number(2 * precision * recall / max(precision + recall, 1e-12), int(judged.sum() + reference.sum()))
 
 
-@metric("free2d_area_rel_err", needs="reference")
+@metric("free2d_area_rel_err", "F2D", D(0.269, 8), "%", needs="reference")
 def free2d_area_rel_err(case: Case) -> Value:
     """Relative error of the free area, %."""
     judged, reference, _ = gapless_maps(case)
     return number(100.0 * abs(judged.sum() / max(reference.sum(), 1) - 1.0), int(reference.sum()))
 
 
-@metric("free2d_width_mae", needs="reference")
+@metric("free2d_width_mae", "F2D", D(1e-06, 0.055), "m", needs="reference")
 def free2d_width_mae(case: Case) -> Value:
     """Mean absolute error of the free width, m; an open side counts as 20 m."""
     station, judged, reference = free_widths(case)
@@ -110,14 +109,14 @@ def free2d_width_mae(case: Case) -> Value:
     return estimate(mean, error, station, case.rng("free2d_width_mae"))
 
 
-@metric("free2d_width_min_err", needs="reference")
+@metric("free2d_width_min_err", "F2D", D(1e-06, 0.12), "m", needs="reference")
 def free2d_width_min_err(case: Case) -> Value:
     """Absolute error of the narrowest width, m."""
     _, judged, reference = free_widths(case)
     return number(abs(float(np.min(judged)) - float(np.min(reference))), len(judged))
 
 
-@metric("free2d_edt_rmse", needs="reference")
+@metric("free2d_edt_rmse", "F2D", D(0.0302, 0.14), "m", needs="reference")
 def free2d_edt_rmse(case: Case) -> Value:
     """Root mean square error of the distance to the edge of free space, where either is free, m."""
     judged, reference, rows = gapless_maps(case)
@@ -133,7 +132,7 @@ def _edge_distance(free: np.ndarray, edge: float) -> np.ndarray:
     return cell_distances(np.ones_like(free), ~free, edge).reshape(free.shape)
 
 
-@metric("free2d_skeleton_p95", needs="reference")
+@metric("free2d_skeleton_p95", "F2D", D(0.101, 0.6), "m", needs="reference")
 def free2d_skeleton_p95(case: Case) -> Value:
     """95th percentile of the distance between the medial axes, both ways, m."""
     judged, reference = (medial_axis(free) for free in gapless_maps(case)[:2])
@@ -142,7 +141,7 @@ def free2d_skeleton_p95(case: Case) -> Value:
     return number(float(np.percentile(np.concatenate(apart), 95)), sum(map(len, apart)))
 
 
-@metric("occ2d_unknown_frac", needs="hold")
+@metric("occ2d_unknown_frac", "F2D", needs="hold")
 def occ2d_unknown_frac(case: Case) -> Value:
     """Share of the candidate's free cells that no held-out beam shows."""
     return number(unknown_share(case), int(free_plane(case).judged.sum()))
@@ -151,7 +150,7 @@ def occ2d_unknown_frac(case: Case) -> Value:
 # F3D: free space in three dimensions, along the reference axis.
 
 
-@metric("free3d_iou", needs="reference")
+@metric("free3d_iou", "F3D", U(0.85, 0.998), gate=True, needs="reference")
 def free3d_iou(case: Case) -> Value:
     """Intersection over union of free voxels, where the reference is known."""
     both = air_voxels(case)
@@ -160,7 +159,7 @@ def free3d_iou(case: Case) -> Value:
     return estimate(mean, (both.judged & both.reference)[either].astype(float), station, case.rng("free3d_iou"))
 
 
-@metric("free3d_volume_rel_err", needs="reference")
+@metric("free3d_volume_rel_err", "F3D", D(0.0161, 8), "%", needs="reference")
 def free3d_volume_rel_err(case: Case) -> Value:
     """Relative error of the free volume, where the reference is known, %."""
     both = air_voxels(case)
@@ -168,7 +167,7 @@ def free3d_volume_rel_err(case: Case) -> Value:
     return number(100.0 * abs(judged / max(reference, 1) - 1.0), int(reference))
 
 
-@metric("free3d_false_free", needs="hold")
+@metric("free3d_false_free", "F3D", D(1e-06, 0.05), needs="hold")
 def free3d_false_free(case: Case) -> Value:
     """Share of held-out returns deeper than 20 cm in the candidate's air."""
     points, deep = hold_points(case), _DEEP_RETURN * case.tolerance
@@ -179,7 +178,7 @@ def free3d_false_free(case: Case) -> Value:
     return estimate(mean, wrong, reference_curve(case).local(points)[:, 0], case.rng("free3d_false_free"))
 
 
-@metric("free3d_false_occupied", needs="hold")
+@metric("free3d_false_occupied", "F3D", D(1e-06, 0.05), needs="hold")
 def free3d_false_occupied(case: Case) -> Value:
     """Share of the length of held-out beams, up to 20 cm before their returns, that the candidate holds occupied.
 
@@ -196,7 +195,7 @@ def free3d_false_occupied(case: Case) -> Value:
     return estimate(mean, outside[among].astype(float), local[among, 0], case.rng("free3d_false_occupied"))
 
 
-@metric("free3d_esdf_rmse", needs="reference")
+@metric("free3d_esdf_rmse", "F3D", D(1e-06, 0.3), "m", needs="reference")
 def free3d_esdf_rmse(case: Case) -> Value:
     """Root mean square error of the distance to the nearest surface within 1 m of the axis, m."""
     both = axis_clearances(case)
@@ -205,7 +204,7 @@ def free3d_esdf_rmse(case: Case) -> Value:
     return estimate(root_of_mean, (error**2).ravel(), station, case.rng("free3d_esdf_rmse"))
 
 
-@metric("free3d_inscribed_err", needs="reference")
+@metric("free3d_inscribed_err", "F3D", D(1e-06, 0.3), "m", needs="reference")
 def free3d_inscribed_err(case: Case) -> Value:
     """Mean absolute error of the radius of the largest sphere near the axis, m."""
     both = axis_clearances(case)
@@ -213,7 +212,7 @@ def free3d_inscribed_err(case: Case) -> Value:
     return estimate(mean, error, both.station, case.rng("free3d_inscribed_err"))
 
 
-@metric("free3d_headroom_rmse", needs="reference")
+@metric("free3d_headroom_rmse", "F3D", D(1e-06, 0.06), "m", needs="reference")
 def free3d_headroom_rmse(case: Case) -> Value:
     """Root mean square error of floor to crown in three lanes, m."""
     station, judged, reference = headrooms(case)
@@ -222,7 +221,7 @@ def free3d_headroom_rmse(case: Case) -> Value:
     return estimate(root_of_mean, squares.ravel(), lanes, case.rng("free3d_headroom_rmse"))
 
 
-@metric("free3d_envelope_agree", needs="reference")
+@metric("free3d_envelope_agree", "F3D", U(0.9, 0.999999), needs="reference")
 def free3d_envelope_agree(case: Case) -> Value:
     """Share of sections and envelopes in which lining and reference agree whether the envelope is cut into."""
     judged, reference = infringements(case)
@@ -230,7 +229,7 @@ def free3d_envelope_agree(case: Case) -> Value:
     return estimate(mean, agree, sections(case).station, case.rng("free3d_envelope_agree"))
 
 
-@metric("free3d_hold_poses_free", needs="hold")
+@metric("free3d_hold_poses_free", "F3D", U(0.95, 0.999999), gate=True, needs="hold")
 def free3d_hold_poses_free(case: Case) -> Value:
     """Share of the sensor positions between the reference's mouths that are inside and 20 cm clear of any surface."""
     assert case.hold is not None
@@ -243,7 +242,7 @@ def free3d_hold_poses_free(case: Case) -> Value:
     return estimate(mean, free.astype(float), station, case.rng("free3d_hold_poses_free"))
 
 
-@metric("free3d_voxel_vs_mesh_vol", needs="reference")
+@metric("free3d_voxel_vs_mesh_vol", "F3D", unit="%", needs="reference", evidence="S")
 def free3d_voxel_vs_mesh_vol(case: Case) -> Value:
     """Difference between the volume of the voxels inside the lining and that of the solid, %."""
     both, radii = air_voxels(case), lining_radii(case)
@@ -266,21 +265,21 @@ def _both_ways(case: Case) -> tuple[Route, Route] | Value:
     return judged, reference
 
 
-@metric("nav_path_exists")
+@metric("nav_path_exists", "NAV", P, "bool", gate=True)
 def nav_path_exists(case: Case) -> Value:
     """The robot gets from mouth to mouth."""
     exists = judged_route(case) is not None
     return pass_or_fail(exists, "" if exists else _NO_WAY)
 
 
-@metric("nav_path_len_ratio", needs="reference")
+@metric("nav_path_len_ratio", "NAV", B(1, 1e-06, 0.08), needs="reference")
 def nav_path_len_ratio(case: Case) -> Value:
     """Length of the way over the length of the reference's."""
     ways = _both_ways(case)
     return ways if isinstance(ways, Value) else number(ways[0].length / ways[1].length, len(ways[0].place))
 
 
-@metric("nav_path_dev_p95", needs="reference")
+@metric("nav_path_dev_p95", "NAV", D(1e-06, 0.8), "m", needs="reference")
 def nav_path_dev_p95(case: Case) -> Value:
     """95th percentile of the distance from the way to the reference's, m."""
     ways = _both_ways(case)
@@ -290,7 +289,8 @@ def nav_path_dev_p95(case: Case) -> Value:
     return estimate(percentile(95), apart, ways[0].place[:, 0], case.rng("nav_path_dev_p95"))
 
 
-@family("reference", {"nav_clearance_min_err": np.min, "nav_clearance_mean_err": mean})
+@metric("nav_clearance_min_err", "NAV", D(1e-06, 0.4), "m", needs="reference", args=(np.min,))
+@metric("nav_clearance_mean_err", "NAV", D(1e-06, 0.3), "m", needs="reference", args=(mean,))
 def way_clearance_error(case: Case, id: str, statistic) -> Value:
     """Absolute error of the least or mean clearance on the way, m."""
     ways = _both_ways(case)
@@ -300,7 +300,7 @@ def way_clearance_error(case: Case, id: str, statistic) -> Value:
     return number(abs(float(judged - reference)), len(ways[0].place))
 
 
-@metric("nav_drivable_width_mae", needs="reference")
+@metric("nav_drivable_width_mae", "NAV", D(1e-06, 0.13), "m", needs="reference")
 def nav_drivable_width_mae(case: Case) -> Value:
     """Mean absolute error of the drivable width, m."""
     judged, reference = both_grounds(case)
@@ -308,7 +308,7 @@ def nav_drivable_width_mae(case: Case) -> Value:
     return estimate(mean, error, judged.station, case.rng("nav_drivable_width_mae"))
 
 
-@metric("nav_feasible_agree", needs="reference")
+@metric("nav_feasible_agree", "NAV", U(0.9, 0.999999), needs="reference")
 def nav_feasible_agree(case: Case) -> Value:
     """Share of 1,000 random starts, goals and inflations that are feasible on both grounds or on neither.
 
@@ -321,14 +321,14 @@ def nav_feasible_agree(case: Case) -> Value:
     return number(mean(np.concatenate(agree).astype(float)), sum(map(len, agree)))
 
 
-@metric("nav_blocked_diff", needs="reference")
+@metric("nav_blocked_diff", "NAV", D(1e-06, 4), "count", gate=True, needs="reference")
 def nav_blocked_diff(case: Case) -> Value:
     """Absolute difference in the number of blocked metres between the rails."""
     judged, reference = both_grounds(case)
     return number(abs(blocked_metres(judged) - blocked_metres(reference)), 1)
 
 
-@metric("nav_traversable_iou", needs="reference")
+@metric("nav_traversable_iou", "NAV", U(0.964, 0.999999), needs="reference")
 def nav_traversable_iou(case: Case) -> Value:
     """Intersection over union of traversable cells, where the reference sees the ground."""
     judged, reference = both_grounds(case)
@@ -340,7 +340,7 @@ def nav_traversable_iou(case: Case) -> Value:
     return estimate(mean, (free[0] & free[1])[among].astype(float), station, case.rng("nav_traversable_iou"))
 
 
-@metric("nav_step_p95_err", needs="reference")
+@metric("nav_step_p95_err", "NAV", D(1e-06, 0.12), "m", needs="reference")
 def nav_step_p95_err(case: Case) -> Value:
     """Absolute error of the 95th percentile of the step between neighbouring cells, m, its mean over ten lattices."""
     steps, count = [], 0
@@ -351,7 +351,7 @@ def nav_step_p95_err(case: Case) -> Value:
     return number(abs(float(np.diff(np.mean(steps, axis=0))[0])), count)
 
 
-@metric("nav_footprint_margin")
+@metric("nav_footprint_margin", "NAV", unit="m")
 def nav_footprint_margin(case: Case) -> Value:
     """Least clearance on the way less the robot's radius, m."""
     way = judged_route(case)

@@ -20,7 +20,8 @@ from benchmarks.fidelity.derive.distances import (
     told_together,
     tolerant_f1,
 )
-from benchmarks.fidelity.registry import Statistic, Value, estimate, family, metric, missing, number, percentile, rms
+from benchmarks.fidelity.registry import Statistic, Value, estimate, missing, number, percentile, rms
+from benchmarks.fidelity.table import LOGGED_UP, D, U, metric
 
 _FEWEST_IN_GROUP = 50  # points of a bin or sector that counts
 _FEWEST_RETURNS = 100  # held-out returns of a bin that counts for completeness
@@ -32,17 +33,19 @@ _MOUTH_LENGTH = 2.0  # m
 # C2M: held-out points to the candidate, without any registration.
 
 
-@family("hold", {
-    "c2m_mean": np.mean, "c2m_median": np.median, "c2m_rmse": rms,
-    "c2m_p95": percentile(95), "c2m_p99": percentile(99),
-})  # fmt: skip
+@metric("c2m_mean", "C2M", D(0.0105, 0.048), "m", gate=True, needs="hold", args=(np.mean,))
+@metric("c2m_median", "C2M", D(0.0079, 0.1), "m", needs="hold", args=(np.median,))
+@metric("c2m_rmse", "C2M", D(0.014, 0.063), "m", needs="hold", args=(rms,))
+@metric("c2m_p95", "C2M", D(0.029, 0.13), "m", needs="hold", args=(percentile(95),))
+@metric("c2m_p99", "C2M", unit="m", needs="hold", args=(percentile(99),))
 def mesh_distance(case: Case, id: str, statistic: Statistic) -> Value:
     """Statistic of the distance from held-out points to the surface, m."""
     distances = mesh_distances(case)
     return estimate(statistic, distances.distance, distances.station, case.rng(id), BOOTSTRAP_SAMPLES)
 
 
-@family("hold", {"c2m_within_5cm": 0.05, "c2m_within_10cm": 0.10})
+@metric("c2m_within_5cm", "C2M", U(0.83, 0.99776), needs="hold", args=(0.05,))
+@metric("c2m_within_10cm", "C2M", U(0.949, 0.999999), needs="hold", args=(0.10,))
 def mesh_precision(case: Case, id: str, within: float) -> Value:
     """Share of held-out points within a distance of the surface; at 10 cm the paper's figure on unseen points."""
     distances = mesh_distances(case)
@@ -50,20 +53,20 @@ def mesh_precision(case: Case, id: str, within: float) -> Value:
     return estimate(np.mean, near, distances.station, case.rng(id), BOOTSTRAP_SAMPLES)
 
 
-@metric("c2m_signed_bias", needs="hold")
+@metric("c2m_signed_bias", "C2M", D(0.000154, 0.08), "m", needs="hold")
 def c2m_signed_bias(case: Case) -> Value:
     """Magnitude of the mean distance, signed by the side of the sensor, m."""
     distances, rng = mesh_distances(case), case.rng("c2m_signed_bias")
     return estimate(lambda d: float(abs(np.mean(d))), distances.signed, distances.station, rng, BOOTSTRAP_SAMPLES)
 
 
-@metric("c2m_chainage_worst", needs="hold")
+@metric("c2m_chainage_worst", "C2M", D(0.0109, 0.049), "m", needs="hold")
 def c2m_chainage_worst(case: Case) -> Value:
     """Largest mean distance of a bin of about 10 m, m."""
     return _worst_group(mesh_distances(case).distance, station_bins(case, mesh_distances(case).station))
 
 
-@metric("c2m_sector_worst", needs="hold")
+@metric("c2m_sector_worst", "C2M", D(0.0117, 0.054), "m", needs="hold")
 def c2m_sector_worst(case: Case) -> Value:
     """Largest mean distance of eight sectors about the axis, m."""
     return _worst_group(mesh_distances(case).distance, mesh_distances(case).sector)
@@ -76,13 +79,13 @@ def _worst_group(distance: np.ndarray, group: np.ndarray) -> Value:
     return number(float(mean[full].max()), len(distance))
 
 
-@metric("c2m_noise_ratio", needs="hold")
+@metric("c2m_noise_ratio", "C2M", D(0.845, 3.9), needs="hold")
 def c2m_noise_ratio(case: Case) -> Value:
     """Median distance over the median residual of the held-out points from their own local planes."""
     return number(float(np.median(mesh_distances(case).distance) / np.median(real_planes(case).residual)))
 
 
-@metric("c2m_fit_hold_gap", needs="hold")
+@metric("c2m_fit_hold_gap", "C2M", D(0.005, 0.05), "m", needs="hold")
 def c2m_fit_hold_gap(case: Case) -> Value:
     """Mean distance of held-out points less that of the points that the builder read, m; at least 0."""
     if case.fit is None:
@@ -91,7 +94,7 @@ def c2m_fit_hold_gap(case: Case) -> Value:
     return number(max(gap, 0.0), len(mesh_distances(case).distance))
 
 
-@metric("m3c2_signif_frac", needs="hold")
+@metric("m3c2_signif_frac", "C2M", D(1e-06, 0.5), needs="hold")
 def m3c2_signif_frac(case: Case) -> Value:
     """Share of core points whose M3C2 distance exceeds its level of detection."""
     distances = m3c2_distances(case)
@@ -105,14 +108,17 @@ def _completeness(case: Case, within: float) -> np.ndarray:
     return (cloud_distances(case).distance <= within * case.tolerance).astype(float)
 
 
-@family("hold", {"comp_10cm": 0.10, "comp_20cm": 0.20})
+@metric("comp_10cm", "CMP", U(0.86, 0.999836), needs="hold", args=(0.10,))
+@metric("comp_20cm", "CMP", LOGGED_UP, needs="hold", args=(0.20,))
 def completeness(case: Case, id: str, within: float) -> Value:
     """Share of the observed surface with a held-out point within a distance."""
     station = cloud_distances(case).station
     return estimate(np.mean, _completeness(case, within), station, case.rng(id), BOOTSTRAP_SAMPLES)
 
 
-@family("hold", {"fscore_5cm": 0.05, "fscore_10cm": 0.10, "fscore_20cm": 0.20})
+@metric("fscore_5cm", "CMP", LOGGED_UP, needs="hold", args=(0.05,))
+@metric("fscore_10cm", "CMP", U(0.927, 0.9999181), gate=True, needs="hold", args=(0.10,))
+@metric("fscore_20cm", "CMP", U(0.8, 0.999999), needs="hold", args=(0.20,))
 def fscore(case: Case, id: str, within: float) -> Value:
     """Harmonic mean of precision and completeness at a distance."""
     precision = float(np.mean(mesh_distances(case).distance <= within * case.tolerance))
@@ -120,26 +126,26 @@ def fscore(case: Case, id: str, within: float) -> Value:
     return number(2.0 * precision * recall / max(precision + recall, 1e-12), len(cloud_distances(case).distance))
 
 
-@metric("chamfer_l1", needs="hold")
+@metric("chamfer_l1", "CMP", D(0.0211, 0.25), "m", needs="hold")
 def chamfer_l1(case: Case) -> Value:
     """Mean of the two directed mean distances, m."""
     return number(float(np.mean(mesh_distances(case).distance) + np.mean(cloud_distances(case).distance)) / 2.0)
 
 
-@metric("dcd", needs="hold")
+@metric("dcd", "CMP", needs="hold")
 def dcd(case: Case) -> Value:
     """Density-aware Chamfer distance between held-out and synthetic cloud."""
     return number(density_aware_chamfer(case))
 
 
-@metric("hausdorff_p99", needs="hold")
+@metric("hausdorff_p99", "CMP", D(0.07, 1.5), "m", needs="hold")
 def hausdorff_p99(case: Case) -> Value:
     """Larger of the two directed 99th percentiles, m."""
     both = mesh_distances(case).distance, cloud_distances(case).distance
     return number(max(float(np.percentile(d, 99)) for d in both))
 
 
-@metric("comp_chainage_min", needs="hold")
+@metric("comp_chainage_min", "CMP", U(0.86, 0.999536), needs="hold")
 def comp_chainage_min(case: Case) -> Value:
     """Smallest `comp_10cm` of a bin of about 10 m; 0 where there are held-out returns but no candidate."""
     group = station_bins(case, cloud_distances(case).station)
@@ -151,13 +157,13 @@ def comp_chainage_min(case: Case) -> Value:
     return number(float(share[judged].min()), len(group))
 
 
-@metric("extra_surface_frac", needs="hold")
+@metric("extra_surface_frac", "CMP", D(6.32e-05, 0.05), gate=True, needs="hold")
 def extra_surface_frac(case: Case) -> Value:
     """Share of the observable surface through which held-out beams passed."""
     return number(float(np.mean(phantom_cells(case))), len(phantom_cells(case)))
 
 
-@metric("missing_surface_frac", needs="hold")
+@metric("missing_surface_frac", "CMP", D(1e-06, 0.1), needs="hold")
 def missing_surface_frac(case: Case) -> Value:
     """Share of held-out points with no surface within 20 cm."""
     distances = mesh_distances(case)
@@ -168,21 +174,22 @@ def missing_surface_frac(case: Case) -> Value:
 # OCC: voxels of held-out points against the candidate seen by the same beams (the paper's Fig. 3).
 
 
-@metric("vox_iou_20cm", needs="hold")
+@metric("vox_iou_20cm", "OCC", LOGGED_UP, needs="hold")
 def vox_iou_20cm(case: Case) -> Value:
     """Intersection over union of occupied voxels of 20 cm."""
     grids = occupied_voxels(case)
     return number(iou(grids.real, grids.first), int(grids.real.sum()))
 
 
-@metric("vox_iou_norm", needs="hold")
+@metric("vox_iou_norm", "OCC", U(0.934, 0.99511), gate=True, needs="hold")
 def vox_iou_norm(case: Case) -> Value:
     """Intersection over union of voxels told together, over the value that two noisy draws of the candidate reach."""
     real, first, second = occupied_voxels(case).points
     return number(iou(*told_together(real, first)) / max(iou(*told_together(first, second)), 1e-12), int(real.sum()))
 
 
-@family("hold", {"vox_precision": 1, "vox_recall": 0})
+@metric("vox_precision", "OCC", U(0.951, 0.99356), needs="hold", args=(1,))
+@metric("vox_recall", "OCC", U(0.967, 0.999867), needs="hold", args=(0,))
 def voxel_share(case: Case, id: str, side: int) -> Value:
     """Share of the voxels of one side (1 the candidate, 0 the held-out cloud) that the other has too."""
     both = told_together(*occupied_voxels(case).points[:2])
@@ -190,14 +197,14 @@ def voxel_share(case: Case, id: str, side: int) -> Value:
     return number(float((both[0] & both[1]).sum() / max(own, 1)), int(own))
 
 
-@metric("vox_f1_tol1", needs="hold")
+@metric("vox_f1_tol1", "OCC", U(0.8, 0.999999), needs="hold")
 def vox_f1_tol1(case: Case) -> Value:
     """F1 with a tolerance of one voxel."""
     grids = occupied_voxels(case)
     return number(float(tolerant_f1(grids, np.zeros(len(grids.station), int))[0]), int(grids.real.sum()))
 
 
-@metric("vox_kappa", needs="hold")
+@metric("vox_kappa", "OCC", U(0.955, 0.99575), needs="hold")
 def vox_kappa(case: Case) -> Value:
     """Cohen's kappa over known voxels within 0.6 m of either surface."""
     from sklearn.metrics import cohen_kappa_score
@@ -207,7 +214,7 @@ def vox_kappa(case: Case) -> Value:
     return number(float(cohen_kappa_score(grids.real[judged], grids.first[judged])), int(judged.sum()))
 
 
-@metric("vox_interior_mismatch", needs="hold")
+@metric("vox_interior_mismatch", "OCC", D(1e-06, 0.25), needs="hold")
 def vox_interior_mismatch(case: Case) -> Value:
     """Share of mismatches farther than one voxel from the other surface and over 2 m from a mouth."""
     grids = occupied_voxels(case)
@@ -217,7 +224,7 @@ def vox_interior_mismatch(case: Case) -> Value:
     return number(float(far.sum() / max(mismatches, 1)), mismatches)
 
 
-@metric("vox_mouth_mismatch", needs="hold")
+@metric("vox_mouth_mismatch", "OCC", needs="hold")
 def vox_mouth_mismatch(case: Case) -> Value:
     """Share of mismatches within 2 m of a mouth."""
     grids = occupied_voxels(case)
@@ -232,14 +239,16 @@ def _mouth_slices(case: Case) -> np.ndarray:
     return (station < low + _MOUTH_LENGTH) | (station > high - _MOUTH_LENGTH)
 
 
-@family("hold", {"vox_proj_iou_xy": 2, "vox_proj_iou_xz": 1, "vox_proj_iou_yz": 0})
+@metric("vox_proj_iou_xy", "OCC", U(0.7, 0.99794), needs="hold", args=(2,))
+@metric("vox_proj_iou_xz", "OCC", U(0.7, 0.999816), needs="hold", args=(1,))
+@metric("vox_proj_iou_yz", "OCC", U(0.7, 0.9771), needs="hold", args=(0,))
 def projected_iou(case: Case, id: str, axis: int) -> Value:
     """Intersection over union seen along an axis: 0 the tunnel, 1 from the side, 2 from above."""
     real, first = (grid.sum(axis=axis) for grid in occupied_voxels(case).points[:2])
     return number(iou(*told_together(real, first)), int(real.sum()))
 
 
-@metric("vox_chainage_min_f1", needs="hold")
+@metric("vox_chainage_min_f1", "OCC", U(0.5, 0.999999), needs="hold")
 def vox_chainage_min_f1(case: Case) -> Value:
     """Smallest tolerant F1 of a bin of about 10 m."""
     grids = occupied_voxels(case)

@@ -18,7 +18,8 @@ from benchmarks.fidelity.derive.track import (
     sleeper_spacings,
     sleepers_fit,
 )
-from benchmarks.fidelity.registry import Statistic, Value, estimate, family, metric, missing, number, rms
+from benchmarks.fidelity.registry import Statistic, Value, estimate, missing, number, rms
+from benchmarks.fidelity.table import B, D, U, metric
 
 _SLEEPER_MATCH = 0.15  # m
 _BORE_MARGIN = 0.02  # m between a sleeper and the wall
@@ -28,7 +29,7 @@ _NO_RAILS = "the reference shows no rails"
 _NO_TRACK = "the candidate has no track"
 
 
-@metric("trk_sleeper_f1", needs="reference")
+@metric("trk_sleeper_f1", "TRK", U(0.7, 0.999999), gate=True, needs="reference")
 def trk_sleeper_f1(case: Case) -> Value:
     """F1 of sleepers that are each other's nearest within 0.15 m; 0 where the truth has none but the candidate."""
     real, judged = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
@@ -42,7 +43,7 @@ def trk_sleeper_f1(case: Case) -> Value:
     return number(2.0 * matched.sum() / (len(real) + len(judged)), len(real) + len(judged))
 
 
-@metric("trk_sleeper_count_rel_err", needs="reference")
+@metric("trk_sleeper_count_rel_err", "TRK", D(1e-06, 8), "%", needs="reference")
 def trk_sleeper_count_rel_err(case: Case) -> Value:
     """Relative difference of counts, %."""
     real, judged = reference_sleepers(reference_railway(case)), candidate_sleepers(case)
@@ -51,7 +52,8 @@ def trk_sleeper_count_rel_err(case: Case) -> Value:
     return number(100.0 * abs(len(judged) - len(real)) / len(real), len(real))
 
 
-@family("reference", {"trk_sleeper_spacing_err": np.mean, "trk_sleeper_spacing_std_err": np.std})
+@metric("trk_sleeper_spacing_err", "TRK", D(1e-06, 0.03), "m", needs="reference", evidence="HTK", args=(np.mean,))
+@metric("trk_sleeper_spacing_std_err", "TRK", D(1e-06, 0.06), "m", needs="reference", args=(np.std,))
 def spacing_error(case: Case, id: str, statistic: Statistic) -> Value:
     """Difference of mean or standard deviation of the spacings, missing sleepers left out, m."""
     real = sleeper_spacings(reference_sleepers(reference_railway(case)))
@@ -63,7 +65,7 @@ def spacing_error(case: Case, id: str, statistic: Statistic) -> Value:
     return number(abs(float(statistic(judged)) - float(statistic(real))), len(judged))
 
 
-@metric("trk_sleeper_in_bore")
+@metric("trk_sleeper_in_bore", "TRK", U(0.98, 1))
 def trk_sleeper_in_bore(case: Case) -> Value:
     """Share of sleepers whose top keeps 2 cm from the wall of the local section."""
     if not len(case.candidate.track.sleeper):
@@ -82,7 +84,7 @@ def _reference_gauge(case: Case) -> tuple[float | None, str]:
     return STANDARD_GAUGE, "K: against the standard gauge, held-out returns being too coarse for millimetres"
 
 
-@metric("trk_gauge_mean_err", needs="reference")
+@metric("trk_gauge_mean_err", "TRK", D(1e-06, 10), "mm", gate=True, needs="reference", evidence="HTK")
 def trk_gauge_mean_err(case: Case) -> Value:
     """Error of the mean gauge of the exported rails, mm."""
     asked, reason = _reference_gauge(case)
@@ -91,7 +93,7 @@ def trk_gauge_mean_err(case: Case) -> Value:
     return number(1e3 * abs(candidate_gauge(case).mean() - asked), len(candidate_gauge(case)), reason)
 
 
-@metric("trk_gauge_p95_dev", needs="reference")
+@metric("trk_gauge_p95_dev", "TRK", D(0.000524, 10), "mm", needs="reference", evidence="HTK")
 def trk_gauge_p95_dev(case: Case) -> Value:
     """95th percentile of the deviation of the gauge along the track, mm."""
     asked, reason = _reference_gauge(case)
@@ -101,7 +103,8 @@ def trk_gauge_p95_dev(case: Case) -> Value:
     return number(1e3 * np.percentile(np.abs(gauge - asked), 95), len(gauge), reason)
 
 
-@family("reference", {"trk_rail_lateral_rmse": 1, "trk_rail_height_rmse": 2})
+@metric("trk_rail_lateral_rmse", "TRK", D(2.78e-06, 0.1), "m", needs="reference", args=(1,))
+@metric("trk_rail_height_rmse", "TRK", D(1e-06, 0.12), "m", needs="reference", args=(2,))
 def rail_offset(case: Case, id: str, column: int) -> Value:
     """Root mean square offset of the track's middle (1 lateral, 2 in height), m."""
     if not reference_railway(case).rail.shape[1]:
@@ -110,7 +113,7 @@ def rail_offset(case: Case, id: str, column: int) -> Value:
     return estimate(rms, offsets[:, column], offsets[:, 0], case.rng(id))
 
 
-@metric("trk_rail_gap_max")
+@metric("trk_rail_gap_max", "TRK", D(0.02, 0.5), "m")
 def trk_rail_gap_max(case: Case) -> Value:
     """Longest stretch between the first and the last sleeper that a rail leaves out, m."""
     if not len(case.candidate.track.sleeper):
@@ -118,7 +121,7 @@ def trk_rail_gap_max(case: Case) -> Value:
     return number(max(rail_gaps(case)), 2)
 
 
-@metric("trk_twist_p95")
+@metric("trk_twist_p95", "TRK", unit="mm/m", evidence="K")
 def trk_twist_p95(case: Case) -> Value:
     """95th percentile of the change of the rails' difference in height over 3 m, mm/m."""
     twist = 1e3 * np.abs(rail_twist(case, _TWIST_BASE))
@@ -127,7 +130,7 @@ def trk_twist_p95(case: Case) -> Value:
     return number(np.percentile(twist, 95), len(twist), "K: railway practice judges twist on a base of 3 m")
 
 
-@metric("trk_fastener_ratio")
+@metric("trk_fastener_ratio", "TRK", B(1, 0.005, 0.1), evidence="K")
 def trk_fastener_ratio(case: Case) -> Value:
     """Fastenings over rail seats, two to a sleeper."""
     count = 2 * len(case.candidate.track.sleeper)
@@ -136,7 +139,7 @@ def trk_fastener_ratio(case: Case) -> Value:
     return number(len(fastening_sets(case)) / count, count, "K: one fastening to a seat")
 
 
-@metric("trk_asset_penetration_max")
+@metric("trk_asset_penetration_max", "TRK", D(0.005, 0.05), "m")
 def trk_asset_penetration_max(case: Case) -> Value:
     """Largest overlap or gap of rail, pad, sleeper and bed, m."""
     if not len(case.candidate.track.sleeper):

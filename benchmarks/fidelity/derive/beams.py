@@ -309,7 +309,6 @@ def _describe_scan(reach: Float[np.ndarray, " n"], sector: Int[np.ndarray, " n"]
     return np.concatenate([quantiles, parts])
 
 
-@kept_until("DIS")
 @per_hold
 def cloud_tree(case: Case) -> cKDTree:
     """Return the tree of all held-out returns."""

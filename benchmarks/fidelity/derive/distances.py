@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -192,6 +193,15 @@ class M3C2Distances:
     station: Float[np.ndarray, " n"]
 
 
+@per_hold
+def _held_epoch(case: Case) -> Any:
+    """Return the held-out points about a whole-metre origin, whose tree is built once for all candidates."""
+    import py4dgeo
+
+    points = returns(case).points
+    return py4dgeo.Epoch(points - np.round(points.mean(axis=0)))
+
+
 @per_case
 def m3c2_distances(case: Case) -> M3C2Distances:
     """Computes M3C2 of held-out points against the candidate's points on the same beams.
@@ -211,7 +221,7 @@ def m3c2_distances(case: Case) -> M3C2Distances:
     offset = np.round(real.points.mean(axis=0))
     clean = points_at(case, cast.range)[hit]
     m3c2 = py4dgeo.M3C2(
-        epochs=(py4dgeo.Epoch(real.points - offset), py4dgeo.Epoch(clean - offset)),
+        epochs=(_held_epoch(case), py4dgeo.Epoch(clean - offset)),
         corepoints=flat.point[pick] - offset,
         corepoint_normals=flat.normal[pick],
         cyl_radius=M3C2_RADIUS,

@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import concatenate_meshes
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
 from benchmarks.fidelity.derive.axis import hold_local, hold_points, reference_curve
 from benchmarks.fidelity.derive.beams import returns
 from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian
 from benchmarks.fidelity.derive.sections import lining_radii, sections, true_part, truth_caster, truth_radii
 from benchmarks.fidelity.derive.surface import Nearest, sample_surface, surface_caster, surface_nearest
+from benchmarks.fidelity.meshes import concatenate_meshes
 
 _BEAMS_PER_METRE = 300  # beams followed for each metre of chainage
 _CARVE_STEP = 0.15  # m
@@ -193,9 +193,7 @@ def reference_air(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m k"]
     least two of them end is air where its middle lies nearer to the axis than their ends do.
     """
     if case.truth is not None:
-        inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape)
-        free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge))))
-        return free, binary_dilation(inside, iterations=max(int(KNOWN_AROUND / cells.edge), 1))
+        return _true_air(case)
     passed, ended = carved_about(case, cells.curve)
     cell, kept = cells.cell(ended)
     size = int(np.prod(cells.shape))
@@ -205,6 +203,14 @@ def reference_air(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m k"]
     hit = ends >= HIT_RETURNS
     free = np.where(hit, np.hypot(middle[:, 1], middle[:, 2]) < far, cells.marked(passed).ravel())
     return free.reshape(cells.shape), (free | hit).reshape(cells.shape)
+
+
+@per_truth
+def _true_air(case: Case) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
+    cells = air_lattice(case)
+    inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape)
+    free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge))))
+    return free, binary_dilation(inside, iterations=max(int(KNOWN_AROUND / cells.edge), 1))
 
 
 def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
@@ -268,11 +274,10 @@ def _places_near_axis(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.nda
     return station, reference_curve(case).point(grid.reshape(-1, 3))
 
 
-@kept_until("F3D")
 @per_truth
-def _truth_nearest(case: Case) -> Nearest:
+def _true_clearances(case: Case) -> Float[np.ndarray, " k"]:
     assert case.truth is not None
-    return Nearest(case.truth.surface)
+    return Nearest(case.truth.surface).query(_places_near_axis(case)[1])[0]
 
 
 @per_case
@@ -280,10 +285,7 @@ def axis_clearances(case: Case) -> Clearances:
     """Return the clearances of candidate and reference; a recording's is the distance to its nearest return."""
     station, points = _places_near_axis(case)
     judged = surface_nearest(case).query(points)[0]
-    if case.truth is not None:
-        reference = _truth_nearest(case).query(points)[0]
-    else:
-        reference = cKDTree(hold_points(case)).query(points)[0]
+    reference = _true_clearances(case) if case.truth is not None else cKDTree(hold_points(case)).query(points)[0]
     shape = (len(station), -1)
     return Clearances(station, judged.reshape(shape), reference.reshape(shape))
 
@@ -295,11 +297,21 @@ def headrooms(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n
     Medians over 0.5 m of chainage, so that a sleeper a centimetre off counts by its centimetre.
     """
     curve = reference_curve(case)
-    station = np.arange(curve.station[0] + _LANE_BIN, curve.station[-1] - _LANE_BIN, _LANE_BIN)
+    station = _lane_stations(curve)
     judged = _cast_headroom(surface_caster(case).first, curve, station)
     if case.truth is not None:
-        return station, judged, _cast_headroom(truth_caster(case).first, curve, station)
+        return station, judged, _true_headroom(case)
     return station, judged, _seen_headroom(case)(station)
+
+
+def _lane_stations(curve: Curve) -> Float[np.ndarray, " n"]:
+    return np.arange(curve.station[0] + _LANE_BIN, curve.station[-1] - _LANE_BIN, _LANE_BIN)
+
+
+@per_truth
+def _true_headroom(case: Case) -> Float[np.ndarray, "n 3"]:
+    curve = reference_curve(case)
+    return _cast_headroom(truth_caster(case).first, curve, _lane_stations(curve))
 
 
 def _cast_headroom(first, curve: Curve, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

@@ -107,7 +107,6 @@ def judged_ground(case: Case) -> Ground:
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
 
 
-@kept_until("NAV")
 @per_truth
 def true_ground(case: Case) -> Ground:
     """Return the true ground, by rays."""

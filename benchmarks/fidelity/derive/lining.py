@@ -233,6 +233,26 @@ def ring_pitch(unrolled: Unrolled, near: float, band: float) -> float | None:
     return float(tried[np.argmax(power)])
 
 
+def reference_pitch(case: Case) -> float | None:
+    """Return the pitch of the reference's rings, m; `None` where it shows none."""
+    return _true_pitch(case) if case.truth is not None else _seen_pitch(case)
+
+
+@per_truth
+def _true_pitch(case: Case) -> float | None:
+    return _fine_pitch(truth_map(case))
+
+
+@per_case
+def _seen_pitch(case: Case) -> float | None:
+    return _fine_pitch(hold_map(case))
+
+
+def _fine_pitch(unrolled: Unrolled) -> float | None:
+    coarse = coarse_pitch(relief_along(unrolled))
+    return None if coarse is None else ring_pitch(unrolled, coarse, 0.1)
+
+
 def ring_phases(unrolled: Unrolled, length: float) -> Float[np.ndarray, " w"]:
     """Return the phase of a pitch in overlapping windows, rad; NaN in a window without relief."""
     signal = relief_along(unrolled)

@@ -20,11 +20,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.candidate import Track, concatenate_meshes, geom_mesh, load_model, track_of
+from benchmarks.fidelity.candidate import Track, track_of
 from benchmarks.fidelity.case import SHARED, Case, per_case
 from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.derive.mesh import face_parts
 from benchmarks.fidelity.derive.surface import Caster, surface_caster
+from benchmarks.fidelity.geoms import Geoms, load_model
+from benchmarks.fidelity.meshes import concatenate_meshes
 
 Result = TypeVar("Result")
 
@@ -102,9 +104,15 @@ def scene_model(case: Case) -> mujoco.MjModel:
 
 
 @per_release("scene")
+def scene_geoms(case: Case) -> Geoms:
+    """Return the geoms of the compiled scene where they stand."""
+    return Geoms.of(scene_model(case))
+
+
+@per_release("scene")
 def scene_track(case: Case) -> Track:
     """Return the track of the compiled scene, whatever the candidate has in memory."""
-    return track_of(scene_model(case), case.candidate.manifest)
+    return track_of(scene_geoms(case))
 
 
 def placed_data(model: mujoco.MjModel) -> mujoco.MjData:
@@ -194,7 +202,8 @@ def ray_pairs(case: Case, eye: Float[np.ndarray, "e 3"], way: Float[np.ndarray, 
     flat = way.reshape(-1, 3)
     mesh = surface_caster(case).first(np.repeat(eye, way.shape[1], axis=0), flat)[0]
     # Nails and lamps are of the scene alone.
-    ours = np.array([model.geom(k).name.split("_")[0] in _MESH_NAMES for k in range(model.ngeom)] + [True])
+    ours = np.ones(model.ngeom + 1, bool)  # the last is for a ray that meets nothing
+    ours[:-1] = np.isin(np.arange(model.ngeom), scene_geoms(case).named(*_MESH_NAMES))
     return RayPairs(reach, mesh, ours[geom])
 
 
@@ -226,8 +235,7 @@ _SEAT_REACH = 0.20  # m between parts of the fastening of one seat
 
 def count_assets(case: Case) -> dict[str, int]:
     """Counts assets by the names of the manifest; a fastener is a clip with its shoulder, two to a seat."""
-    model = scene_model(case)
-    names = [model.geom(k).name for k in range(model.ngeom)]
+    names = scene_geoms(case).names
     pieces = fastening_pieces(scene_track(case).fastening_mesh)
     pad = pieces.height <= _PAD_HEIGHT
     return {
@@ -328,20 +336,10 @@ def _surface_level(caster: Caster, at: np.ndarray, up: np.ndarray, above: bool) 
 def _hanging_gaps(case: Case, sleepers: Caster, at: np.ndarray, left: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Return the height of each sleeper's bottom above the bed, or of the bed above its top, m."""
     place = at + _BED_ASIDE * left
-    bed = Caster(concatenate_meshes([case.candidate.lining, *_bed_slabs(case)]))
+    # The slabs on which sleepers lie; a case in memory has no scene.
+    slabs = [scene_geoms(case).joined("bed_")] if case.candidate.scene.exists() else []
+    bed = Caster(concatenate_meshes([case.candidate.lining, *(slab for slab in slabs if len(slab.faces))]))
     # From just above the sleeper: the lining overhead is out of the way.
     level = 0.3 - bed.first(place + 0.3 * up, -up)[0]
     bottom, top = _surface_level(sleepers, place, up, above=False), _surface_level(sleepers, place, up, above=True)
     return np.maximum(bottom - level, level - top)
-
-
-def _bed_slabs(case: Case) -> list[trimesh.Trimesh]:
-    """Return the slabs of the released scene on which sleepers lie; none where there is no scene."""
-    return _scene_slabs(case) if case.candidate.scene.exists() else []
-
-
-@per_release("scene")
-def _scene_slabs(case: Case) -> list[trimesh.Trimesh]:
-    model = scene_model(case)
-    data = placed_data(model)
-    return [geom_mesh(model, data, k) for k in range(model.ngeom) if model.geom(k).name.startswith("bed_")]

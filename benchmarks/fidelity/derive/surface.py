@@ -6,8 +6,9 @@ from jaxtyping import Float, Int, Shaped
 from scipy.spatial import cKDTree
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from benchmarks.fidelity.candidate import Candidate, concatenate_meshes
+from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, kept_until, per_case
+from benchmarks.fidelity.meshes import concatenate_meshes
 
 SAMPLE_CELL = 0.08  # m between the samples that lead to the nearest triangle
 NEAREST_CANDIDATES = 8

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.case import Case, code_hash
-from benchmarks.fidelity.controls.runner import is_bold, list_jobs
+from benchmarks.fidelity.faults.rows import suite_controls
 from benchmarks.fidelity.figures import draw_all
 from benchmarks.fidelity.figures.sheet import Sheet
 from benchmarks.fidelity.files import write_json
@@ -114,7 +114,6 @@ def report_content(
         "split": _split_entry(case, inputs),
         "seed": inputs.seed,
         "constants": judge.constants_digest(),
-        "thresholds_hash": table.thresholds_hash(),
         "code_hash": code_hash(),
         "commit": _commit(),
         "versions": _versions(),
@@ -138,7 +137,7 @@ def _category_entries(scored: dict[str, Scored]) -> dict[str, dict[str, Any]]:
     by = {key: scored[name].categories if name in scored else {} for key, name in _CANDIDATES.items()}
     return {
         name: {"name": words} | {key: scores.get(name) for key, scores in by.items()}
-        for name, words in table.categories().items()
+        for name, words in table.CATEGORIES.items()
     }
 
 
@@ -152,7 +151,7 @@ def _metric_entry(row: Metric, scored: dict[str, Scored]) -> dict[str, Any]:
     return {
         "id": row.id, "category": row.category, "definition": row.definition, "value": value.value, "unit": row.unit,
         "ci95": value.interval, "n": value.n, "score": score.score, "role": row.role, "evidence": row.evidence,
-        "map": table.map_text(row.map), "null_value": null, "ceiling_value": ceiling,
+        "map": str(row.map), "null_value": null, "ceiling_value": ceiling,
         "skill": scoring.skill(value.value, null, ceiling), "status": _status(row, score), "reason": value.reason,
         "worst_stretch": _worst_stretch(row, value),
     }  # fmt: skip
@@ -163,7 +162,7 @@ def _worst_stretch(row: Metric, value: Value) -> dict[str, float | None] | None:
     if value.extremes is None:
         return None
     scores = [row.map.score(one) if row.scored else 0.0 for _, one in value.extremes]
-    worst = int(np.argmin(scores)) if row.scored and scores[0] != scores[1] else int(row.direction != "up")
+    worst = int(np.argmin(scores)) if row.scored and scores[0] != scores[1] else int(not row.rises)
     start, found = value.extremes[worst]
     return {"start": start, "end": start + BLOCK, "value": found, "score": scores[worst] if row.scored else None}
 
@@ -172,8 +171,8 @@ def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
     """Return the metrics from outside, and categories and global figure with them; `None` without such metrics."""
     if not judgement.outside:
         return None
-    metrics = outside.metrics()
-    entries = [_metric_entry(one.row, judgement.outside) | {"source": one.source} for one in metrics.values()]
+    metrics, source = outside.metrics(), next(iter(outside.files()), "Python")
+    entries = [_metric_entry(row, judgement.outside) | {"source": source} for row in metrics.values()]
     return {
         "files": outside.files(),
         "count": len(metrics),
@@ -182,7 +181,7 @@ def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
         "categories": {
             name: entry
             for name, entry in _category_entries(judgement.outside).items()
-            if name in {one.row.category for one in metrics.values()}
+            if name in {row.category for row in metrics.values()}
         },
         "global": judgement.outside["base"].overall,
         "note": "The verdict and all other figures are those of the suite's 199 metrics alone.",
@@ -196,7 +195,7 @@ def report_title(case: Case) -> str:
 
 def _all_bold(rows: list[dict[str, Any]]) -> bool:
     """Return True where every control was run at every dose that must fail."""
-    asked = {(job.control, job.dose) for job in list_jobs() if is_bold(job)}
+    asked = {(control.id, dose) for control in suite_controls().values() for dose in control.bold}
     return asked <= {(row["id"], row["dose"]) for row in rows}
 
 

@@ -59,7 +59,7 @@ def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
         for row in rows
     ]
     columns = ("id", "kind", "corruption", "dose", "bold", "verdict", "detected", "quiet", "spearman", "overall",
-               "short", "moved", "evaluated", "why", *(f"fall_{c}" for c in table.categories()))  # fmt: skip
+               "short", "moved", "evaluated", "why", *(f"fall_{c}" for c in table.CATEGORIES))  # fmt: skip
     return write_csv(folder / "controls.csv", columns, flat)
 
 

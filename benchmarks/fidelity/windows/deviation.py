@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Int
 
-from benchmarks.fidelity.candidate import concatenate_meshes
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
 from benchmarks.fidelity.derive.beams import cast_beams, observed_extent, returns, sensor_path
 from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian, truth_curve
 from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.derive.surface import Caster, visible_parts
+from benchmarks.fidelity.meshes import concatenate_meshes
 
 CELL = 0.5  # m along the tunnel
 SECTORS = 72  # cells around it, of 5 degrees
@@ -176,14 +175,7 @@ def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], stati
 def bore_caster(case: Case) -> Caster:
     """Return the caster of rays into lining, bed and further bodies of the candidate, without its track."""
     one = case.candidate
-    lining = one.lining if case.near is None else _inside(one.lining, case.near.box)
-    return Caster(concatenate_meshes([part for part in (lining, one.bed, one.extra) if len(part.faces)]))
-
-
-def _inside(mesh: trimesh.Trimesh, box: Float[np.ndarray, "2 3"]) -> trimesh.Trimesh:
-    """Return the faces of a mesh that have a corner in a box; vertices stay."""
-    known = ((mesh.vertices > box[0]) & (mesh.vertices < box[1])).all(axis=1)
-    return trimesh.Trimesh(mesh.vertices, mesh.faces[known[mesh.faces].any(axis=1)], process=False)
+    return Caster(concatenate_meshes([part for part in (one.lining, one.bed, one.extra) if len(part.faces)]))
 
 
 @per_truth

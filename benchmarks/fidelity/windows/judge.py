@@ -1,18 +1,16 @@
 """The worst windows of a case, the reasons that they give, and the stated faults that they must notice."""
 
-from dataclasses import asdict, dataclass, replace
-from hashlib import sha256
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.local import make_ground, spoil, stated_faults
 from benchmarks.fidelity.derive.curve import candidate_curve
+from benchmarks.fidelity.faults import put_in
+from benchmarks.fidelity.faults.kinds import local_site
+from benchmarks.fidelity.faults.rows import stated_faults
 from benchmarks.fidelity.windows.measures import (
-    LIMITS,
     MEASURES,
     STANDARD_SENSOR,
     Measure,
@@ -77,17 +75,12 @@ class Worst:
         )
 
 
-def worst_windows(case: Case, series: dict[str, Series] | None = None) -> list[Worst]:
-    """Return the worst window of every measure against every reference of the case; empty without a reference.
-
-    Args:
-        case: Candidate and references.
-        series: Filled with the values of all windows by `id.source`, where given.
-    """
-    return [_worst(case, one, source, series) for source in sources(case) for one in MEASURES]
+def worst_windows(case: Case) -> list[Worst]:
+    """Return the worst window of every measure against every reference of the case; empty without a reference."""
+    return [_worst(case, one, source) for source in sources(case) for one in MEASURES]
 
 
-def _worst(case: Case, one: Measure, source: Source, kept: dict[str, Series] | None) -> Worst:
+def _worst(case: Case, one: Measure, source: Source) -> Worst:
     topic = case.hold.sensor if source == "recording" and case.hold is not None else ""
     sensor = sensor_of(topic) if topic else STANDARD_SENSOR
     limit, foreign = limits(sensor or STANDARD_SENSOR)[f"{one.id}.{source}"], "" if sensor else topic
@@ -95,8 +88,6 @@ def _worst(case: Case, one: Measure, source: Source, kept: dict[str, Series] | N
         return Worst(one.id, one.words, source, one.unit, None, one.gate)
     try:
         series = one.compute(case, source)
-        if kept is not None:
-            kept[f"{one.id}.{source}"] = series
     except Exception as error:  # a spoilt candidate may break any library
         reason = f"{type(error).__name__}: {error}"[:200]
         return Worst(one.id, one.words, source, one.unit, None, limit, error=reason, foreign=foreign)
@@ -145,21 +136,21 @@ def notice_faults(case: Case, before: list[Worst]) -> list[Noticed]:
     """
     if not sources(case):
         return []
-    ground, judged = make_ground(case.candidate), {f"{one.id}.{one.source}" for one in before if one.value is not None}
+    site, judged = local_site(case), {f"{one.id}.{one.source}" for one in before if one.value is not None}
     result = []
     for name, fault in stated_faults(case.candidate.length).items():
         if fault.kind in ("rails", "gauge") and not len(case.candidate.track.rail_mesh.faces):
             continue
         shows = {"gauge": ("gauge.truth",), "mirror": ("hand.truth", "hand.recording")}.get(fault.kind)
         needed = shows is None or bool(judged & set(shows))
-        result.append(Noticed(name, noticed_by(case, spoil(ground, fault), before), needed))
+        result.append(Noticed(name, noticed_by(put_in(site, fault), before), needed))
     return result
 
 
-def noticed_by(case: Case, spoilt: Candidate, before: list[Worst]) -> tuple[str, ...]:
-    """Return the windows that are beyond their limits for a spoilt candidate and were not before, `id.source`."""
+def noticed_by(spoilt: Case, before: list[Worst]) -> tuple[str, ...]:
+    """Return the windows that are beyond their limits in a spoilt case and were not before, `id.source`."""
     known = {(one.id, one.source) for one in before if one.beyond}
-    after = worst_windows(replace(case, candidate=spoilt, cache={}))
+    after = worst_windows(spoilt)
     return tuple(f"{one.id}.{one.source}" for one in after if one.beyond and (one.id, one.source) not in known)
 
 
@@ -203,12 +194,3 @@ def load_windows(content: dict[str, Any]) -> Windows:
     worst = ({key: value for key, value in row.items() if key != "beyond"} for row in content["worst"])
     faults = ({**row, "by": tuple(row["by"])} for row in content["faults"])
     return Windows(tuple(Worst(**row) for row in worst), tuple(Noticed(**row) for row in faults))
-
-
-def windows_hash() -> str:
-    """Return the SHA-256 of the code and limits that windows depend on."""
-    here = Path(__file__).parent
-    files = [*sorted(here.glob("*.py")), here.parent / "controls" / "local.py"]
-    digest = sha256(b"".join(file.read_bytes() for file in files))
-    digest.update(LIMITS.read_bytes() if LIMITS.exists() else b"")
-    return digest.hexdigest()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.windows import track
@@ -154,7 +154,6 @@ def _shift(case: Case, source: Source) -> Series:
     one = unrolled(case, source)
     length = len(one.offset) * CELL
     starts = one.low + np.arange(0.0, max(length - LONG, 0.0) + 1e-6, STEP)
-    starts = starts[_near(case, source, starts, LONG)]
     found = (hold_shift if source == "recording" else truth_shift)(case, starts, LONG)
     return Series(starts, np.abs(found), ("",) * len(starts), LONG)
 
@@ -183,9 +182,8 @@ def _by_profile(
         profile = track.NOTHING if read is None else read(case)
         if not len(profile.station):
             return Series(np.empty(0), np.empty(0), (), window)
-        low, high = _ends(case, read, profile)
+        low, high = float(profile.station.min()), float(profile.station.max())
         starts = low + np.arange(0.0, max(high - low - window, 0.0) + 1e-6, STEP)
-        starts = starts[_near(case, source, starts, window)]
         order = np.argsort(profile.station, kind="stable")
         # Windows begin and end on places of the profile itself: the first counts and the last does not.
         bounds = np.searchsorted(profile.station[order] + _HAIR, [starts, starts + window])
@@ -193,21 +191,6 @@ def _by_profile(
         return Series(starts, np.asarray(values, float), ("",) * len(starts), window)
 
     return compute
-
-
-def _near(case: Case, source: Source, starts: np.ndarray, window: float) -> Bool[np.ndarray, " k"]:
-    """Return True for the windows that lie in the stretch to be judged, all where there is none."""
-    if case.near is None:
-        return np.ones(len(starts), bool)
-    low, high = case.near.path if source == "recording" else case.near.truth
-    return (starts >= low) & (starts + window <= high)
-
-
-def _ends(case: Case, read: Callable[[Case], Profile] | None, profile: Profile) -> tuple[float, float]:
-    """Return first and last station of a profile, those of the whole tunnel where a stretch of it is judged."""
-    known = {} if case.near is None else case.near.ends
-    whole = (float(profile.station.min()), float(profile.station.max()))
-    return known.get(getattr(read, "__name__", ""), whole)
 
 
 def _gauge_change(case: Case) -> Profile:

@@ -103,8 +103,6 @@ def true_bed_error(case: Case) -> Profile:
     curve = real.curve
     tops = [sort_along(curve, top) for top in real.rail]
     station = np.arange(0.5, curve.length - 0.5, BED_BIN)
-    if case.near is not None:
-        station = station[(station >= case.near.truth[0]) & (station <= case.near.truth[1])]
     middle, top = (np.mean([np.interp(station, one[:, 0], one[:, k]) for one in tops], axis=0) for k in (1, 2))
     places = [np.column_stack([station, middle + lane, top + _SOUND_FROM]) for lane in _LANES]
     origin = curve.point(np.concatenate(places))

@@ -5,8 +5,8 @@ import pytest
 
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.catalogue import INVARIANCES
 from benchmarks.fidelity.derive.surface import visible_mesh
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.impostors import null_tube
 from tests.benchmarks.fidelity import tubescene
 from tests.benchmarks.fidelity.tube import Tube
@@ -43,7 +43,7 @@ def test_a_bed_that_only_bodies_touch_is_not(scene) -> None:
 
 def test_the_bed_moves_with_everything_else(scene) -> None:
     judged = with_slab(scene, 0)
-    moved = INVARIANCES["I3"].change(Case(judged), np.random.default_rng(0)).candidate
+    moved = put_in(Site(Case(judged)), Fault("elsewhere")).candidate
     apart = [part.bed.centroid - part.lining.centroid for part in (judged, moved)]
     assert np.linalg.norm(apart[0]) == pytest.approx(np.linalg.norm(apart[1]), abs=1e-6)
     assert np.linalg.norm(moved.bed.centroid - judged.bed.centroid) > 1000.0

@@ -4,9 +4,8 @@ import numpy as np
 
 from benchmarks.fidelity import table
 from benchmarks.fidelity.case import _KEPT_UNTIL
-from benchmarks.fidelity.derive.freespace import _truth_nearest
+from benchmarks.fidelity.derive.sections import truth_caster
 from benchmarks.fidelity.derive.surface import surface_nearest
-from benchmarks.fidelity.registry import all_metrics
 from tests.benchmarks.fidelity import tube
 
 POINTS = np.array([[1.0, 0.2, 0.1], [4.0, -0.3, 0.4]])
@@ -14,13 +13,13 @@ POINTS = np.array([[1.0, 0.2, 0.1], [4.0, -0.3, 0.4]])
 
 def test_what_no_later_category_needs_is_let_go_and_comes_back_the_same() -> None:
     case = tube.case().fresh()
-    before, of_truth = surface_nearest(case), _truth_nearest(case)
+    before, of_truth = surface_nearest(case), truth_caster(case)
     expected = before.query(POINTS)
     case.forget("CEN")
     assert surface_nearest(case) is before
-    case.forget("F3D")
+    case.forget("NAV")
     assert surface_nearest(case) is not before
-    assert _truth_nearest(case) is not of_truth
+    assert truth_caster(case) is not of_truth
     for found, known in zip(surface_nearest(case).query(POINTS), expected, strict=True):
         np.testing.assert_array_equal(found, known)
 
@@ -36,13 +35,13 @@ def test_what_comes_back_after_its_category_goes_with_the_one_that_asked() -> No
 
 
 def test_every_mark_names_a_category() -> None:
-    all_metrics()
-    assert set(_KEPT_UNTIL.values()) <= set(table.categories())
+    table.load()
+    assert set(_KEPT_UNTIL.values()) <= set(table.CATEGORIES)
 
 
 def test_a_fresh_case_shares_data_and_no_results() -> None:
     case = tube.case()
-    surface_nearest(case), _truth_nearest(case)
+    surface_nearest(case), truth_caster(case)
     fresh = case.fresh()
     assert fresh.candidate is case.candidate
     assert fresh.hold.range is case.hold.range

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.catalogue import thin_beams
 from benchmarks.fidelity.derive.degeneracy import localised_stations, real_alias, real_information
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from tests.benchmarks.fidelity import tube
 from tests.benchmarks.fidelity.judged import category, judged, raw
 
@@ -77,6 +77,6 @@ def test_a_planar_scan_is_lost_between_smooth_walls_and_found_between_pilasters(
 
 def test_half_of_the_beams_are_as_informed():
     whole = tube.case(sigma=0.03, beams=8000)
-    half = replace(whole, hold=thin_beams(whole.hold, np.random.default_rng(7)), cache={})
+    half = put_in(Site(whole, np.random.default_rng(7)), Fault("thinned", 0.5))
     full, thin = (np.median(real_information(case).axial) for case in (whole, half))
     assert thin == pytest.approx(full, rel=0.1)

@@ -1,12 +1,10 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.categories.sensor import middle_range
-from benchmarks.fidelity.controls.catalogue import thin_beams
 from benchmarks.fidelity.derive.clouds import fit_planes, mean_entropy, voxel_map, voxel_wasserstein
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from tests.benchmarks.fidelity.judged import category, judged, measure, obstructed, raw
 
 
@@ -72,7 +70,7 @@ def test_the_middle_of_ranges_with_gaps_hardly_moves_with_half_of_the_beams():
 
 def test_half_of_the_beams_hardly_move_the_profile_over_azimuth():
     case = judged()
-    half = replace(case, hold=thin_beams(case.hold, np.random.default_rng(5)), cache={})
+    half = put_in(Site(case, np.random.default_rng(5)), Fault("thinned", 0.5))
     assert raw("azimuth_profile_rmse", half) == pytest.approx(raw("azimuth_profile_rmse", case), abs=0.003)
 
 

@@ -10,8 +10,6 @@ from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.files import FidelityError
 from benchmarks.fidelity.inputs import Inputs, complete_inputs, with_sigma
 from benchmarks.fidelity.references import HoldConfig
-from benchmarks.fidelity.tools import calibrate
-from benchmarks.fidelity.tools.calibrate import CalibrateConfig
 
 
 def test_a_recording_without_poses_is_refused(tmp_path: Path) -> None:
@@ -41,9 +39,3 @@ def test_a_mistake_at_the_command_line_ends_in_one_sentence_and_status_2(tmp_pat
     assert main() == 2
     assert capsys.readouterr().err.strip() == f"error: {tmp_path}: is no scene folder, scene.xml is missing"
     assert not (tmp_path / "o").exists()
-
-
-def test_calibration_asks_for_three_surveys(tmp_path: Path) -> None:
-    with pytest.raises(FidelityError, match="needs 3 simulated surveys, 1 were given"):
-        calibrate.run(CalibrateConfig((tmp_path,), tmp_path / "thresholds.json"))
-    assert not (tmp_path / "thresholds.json").exists()

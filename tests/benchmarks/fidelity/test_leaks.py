@@ -13,7 +13,7 @@ from rich.console import Console
 
 from benchmarks.fidelity import leaks
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.damage import forge_recording, leak_hold
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.registry import Value
 from scene.build import BuildConfig, build
 from scene.survey.config import SurveyConfig
@@ -68,17 +68,17 @@ def test_shared_points_are_duplicates(case: Case) -> None:
 
 
 def test_mesh_samples_without_noise_are_no_recording(case: Case) -> None:
-    forged = forge_recording(case, 0.0, np.random.default_rng(0))
+    forged = put_in(Site(case), Fault("forged", 0.0))
     assert any("scatter" in found for found in leaks.find_leaks(forged, {"c2m_median": Value(0.0)}))
 
 
 def test_mesh_samples_with_noise_are_told_by_their_provenance(case: Case) -> None:
-    forged = forge_recording(case, 0.02, np.random.default_rng(0))
+    forged = put_in(Site(case), Fault("forged", 1.0))
     assert any("hash is another" in found for found in leaks.find_leaks(forged, GOOD, case.hold.hash))
 
 
 def test_a_builder_that_read_the_held_out_recording_is_caught(case: Case) -> None:
-    found = leaks.find_leaks(leak_hold(case), GOOD)
+    found = leaks.find_leaks(put_in(Site(case), Fault("leaked")), GOOD)
     assert any("builder read the held-out recording" in one for one in found)
     assert any("duplicates" in one for one in found)
 

@@ -7,7 +7,7 @@ from benchmarks.fidelity import table
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.judge import WITHOUT_TRACK
-from benchmarks.fidelity.registry import all_metrics, compute_metric
+from benchmarks.fidelity.registry import compute_metric
 from tests.benchmarks.fidelity import tube
 
 
@@ -17,7 +17,7 @@ def case() -> Case:
 
 
 def score(case: Case, id: str) -> float:
-    return table.load()[id].map.score(compute_metric(case, id, all_metrics()[id]).value or 0.0)
+    return table.load()[id].map.score(compute_metric(case, table.load()[id]).value or 0.0)
 
 
 def judged(case: Case, candidate: object) -> Case:
@@ -65,7 +65,7 @@ def test_the_truth_as_candidate_is_the_truth(case: Case) -> None:
     assert known
     for id in ("sec_iou_mean", "sec_width_rmse", "cl_lateral_rmse"):
         assert score(judged(case, made), id) == 100.0, id
-    noise = compute_metric(judged(case, made), "c2m_mean", all_metrics()["c2m_mean"]).value
+    noise = compute_metric(judged(case, made), table.load()["c2m_mean"]).value
     assert noise is not None
     assert noise < 0.0125  # of this tube's own recording; the noise floor is that of another sensor
 
@@ -73,6 +73,6 @@ def test_the_truth_as_candidate_is_the_truth(case: Case) -> None:
 def test_what_reads_no_track_is_the_same_for_the_null_tube_without_track(case: Case) -> None:
     tubes = [judged(case, null_tube(case.candidate, sleepers)) for sleepers in (True, False)]
     ids = [id for id, row in table.load().items() if row.category in WITHOUT_TRACK]
-    values = [{id: compute_metric(one, id, all_metrics()[id]) for id in ids} for one in tubes]
+    values = [{id: compute_metric(one, table.load()[id]) for id in ids} for one in tubes]
     assert values[0] == values[1]
     assert len(tubes[0].candidate.track.sleeper) > len(tubes[1].candidate.track.sleeper) == 0

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.catalogue import thin_beams
 from benchmarks.fidelity.derive.beams import sensor_path
 from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, dilate, occupied_voxels, told_cells, tolerant_f1
+from benchmarks.fidelity.faults import Fault, Site, put_in
 from tests.benchmarks.fidelity.judged import category, judged, obstructed, raw
 
 
@@ -80,6 +80,6 @@ def test_thin_cells_tell_nothing_beside_a_cell_of_the_other_cloud():
 
 @pytest.mark.parametrize("id", ["vox_iou_norm", "vox_precision", "vox_recall", "vox_kappa", "vox_proj_iou_xy"])
 def test_half_of_the_beams_agree_as_well(id):
-    half = replace(judged(), hold=thin_beams(judged().hold, np.random.default_rng(7)), cache={})
+    half = put_in(Site(judged(), np.random.default_rng(7)), Fault("thinned", 0.5))
     assert raw("vox_iou_20cm", half) < raw("vox_iou_20cm", judged()) - 0.02
     assert raw(id, half) == pytest.approx(raw(id, judged()), abs=0.005)

@@ -3,25 +3,29 @@
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.fidelity import judge, outside, table
 from benchmarks.fidelity.__main__ import main
-from benchmarks.fidelity.files import FidelityError
+from benchmarks.fidelity.faults.rows import asked_faults
+from benchmarks.fidelity.faults.runner import Bench, Job, judge_outcomes, list_jobs, run_jobs
 from benchmarks.fidelity.registry import Value, number
+from benchmarks.fidelity.table import D, U, metric
 from tests.benchmarks.fidelity import tube
 
-HEAD = "from benchmarks.fidelity.outside import register\n"
+HEAD = "from benchmarks.fidelity.faults import fault_kind\nfrom benchmarks.fidelity.table import B, D, P, U, metric\n"
 MISTAKES = {
-    'register("lin_x", lambda case: 1.0, category="LNI", definition="x")': "metric 'lin_x': unknown category 'LNI'",
-    'register("c2m_mean", lambda case: 1.0, category="C2M", definition="x")': "metric 'c2m_mean': this id belongs to",
-    'register("lin_x", 1.0, category="LIN", definition="x")': "compute must be a function of a Case, got float",
-    'register("lin_x", lambda case: 1.0, category="LIN", definition="x", map="D(1)")': "'D(1)' is no score map",
-    'register("lin_x", lambda case: 1.0, category="LIN", definition="x", needs="luck")': "needs must be hold, truth",
-    'for _ in "ab": register("lin_x", lambda case: 1.0, category="LIN", definition="x")': "is registered twice",
+    'metric("lin_x", "LNI")(lambda case: 1.0)': "metric 'lin_x': unknown category 'LNI'; choose one of CEN, SEC",
+    'metric("c2m_mean", "C2M")(lambda case: 1.0)': "metric 'c2m_mean': this id is taken",
+    'metric("lin_x", "LIN")(1.0)': "compute must be a function of a Case, got float",
+    'metric("lin_x", "LIN", "D(1)")(lambda case: 1.0)': "'D(1)' is no score map",
+    'metric("lin_x", "LIN", needs="luck")(lambda case: 1.0)': "needs must be hold, truth",
+    'for _ in "ab": metric("lin_x", "LIN")(lambda case: 1.0)': "metric 'lin_x': this id is taken",
     "undefined": "cannot be run (NameError: name 'undefined' is not defined)",
+    'fault_kind("wall", "mine")(lambda site, fault: site.candidate)': "fault 'wall': this kind is registered twice",
     "import": "cannot be run (SyntaxError: ",
-    "": "registers no metric",
+    "": "registers neither a metric nor a fault",
 }
 
 
@@ -52,13 +56,13 @@ def test_a_file_that_is_not_there_is_said_so(tmp_path: Path, monkeypatch, capsys
 def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) -> None:
     calls = []
 
-    @outside.register("lin_given", category="LIN", definition="given", unit="m", map="D(1,3)", needs="truth")
+    @metric("lin_given", "LIN", D(1, 3), "m", needs="truth")
     def given(case) -> Value:
         calls.append(case.candidate.name)
         return number(2.0)
 
-    outside.register("lin_float", lambda case: 4.0, category="LIN", definition="a float, listed")
-    outside.register("sec_broken", lambda case: 1 / 0, category="SEC", definition="broken", map="U(0,1)")
+    metric("lin_float", "LIN")(lambda case: 4.0)
+    metric("sec_broken", "SEC", U(0, 1))(lambda case: 1 / 0)
     case = tube.case(tube.Tube(length=6.0))
     suite = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
              for id, row in table.load().items()}  # fmt: skip
@@ -76,19 +80,19 @@ def test_metrics_are_scored_beside_the_suite_and_leave_it_alone(tmp_path: Path) 
     assert base.categories["LIN"] == pytest.approx((100.0 * len(scored) + 50.0) / (len(scored) + 1))
     assert judged.scored["base"].categories["LIN"] == 100.0
     assert len(calls) == 4  # reconstruction, two null tubes, truth
-    assert outside.metrics()["lin_given"].row.number == 200
-    assert len(outside.rows()) == 202
+    assert outside.metrics()["lin_given"].number == 200
+    assert len(table.load_all()) == 202
     assert len(table.load()) == 199
 
 
 def test_metrics_from_outside_do_not_move_the_digest_of_the_constants() -> None:
     before = judge.constants_digest()
-    outside.register("lin_more", lambda case: 1.0, category="LIN", definition="more", map="U(0,1)")
+    metric("lin_more", "LIN", U(0, 1))(lambda case: 1.0)
     assert judge.constants_digest() == before
 
 
 def test_a_value_that_is_no_number_counts_as_failed(tmp_path: Path) -> None:
-    outside.register("lin_text", lambda case: "much", category="LIN", definition="text", map="U(0,1)")
+    metric("lin_text", "LIN", U(0, 1))(lambda case: "much")
     case = tube.case(tube.Tube(length=6.0))
     values = outside.compute_values(case, {"base": lambda: case.candidate}, tmp_path)
     assert values["base"]["lin_text"].failed
@@ -100,13 +104,39 @@ def test_values_of_a_file_are_kept_until_the_file_changes(tmp_path: Path) -> Non
     case = tube.case(tube.Tube(length=6.0))
     values = []
     for factor in (1.0, 1.0, 2.0):
-        text = f'register("lin_mine", lambda case: {factor}, category="LIN", definition="mine")\n'
+        text = f'metric("lin_mine", "LIN")(lambda case: {factor})\n'
         file.write_text(HEAD + text)
-        outside.load_metrics(file)
+        outside.load_file(file)
         values.append(outside.compute_values(case, {"base": lambda: case.candidate}, tmp_path)["base"]["lin_mine"])
     assert [value.value for value in values] == [1.0, 1.0, 2.0]
 
 
-def test_the_python_function_refuses_what_the_file_may_not_hold() -> None:
-    with pytest.raises(FidelityError, match="unknown category 'XYZ'; choose one of CEN, SEC"):
-        outside.register("x", lambda case: 1.0, category="XYZ", definition="x")
+DENT = """
+@fault_kind("dent", "lining 1 cm smaller", "m", doses=(0.01, 0.1), falls={"C2M": 10.0})
+def dent(site, fault):
+    return site.moved(lambda local: -fault.size * fault.share(local[:, 0])[:, None] * [0.0, 0.3, 0.3], ("lining",))
+"""
+
+
+def test_a_fault_of_a_file_is_a_control_and_a_ladder_beside_the_suite(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(HEAD + DENT)
+    digest = judge.constants_digest()
+    outside.load_file(file)
+    assert judge.constants_digest() == digest
+    assert list_jobs(("dent",)) == [Job("dent", 0.01), Job("dent", 0.1)]
+    assert asked_faults()["dent"].size == 0.1
+    case = tube.case(tube.Tube(length=12.0), beams=500)
+
+    def compute(spoilt, categories, reuse):
+        moved = np.abs(spoilt.candidate.lining.vertices - case.candidate.lining.vertices).max()
+        return reuse | {id: Value(1.0) for id, row in table.load().items() if row.category == "C2M" and moved > 0.02}
+
+    good = {id: Value(1.0 if row.map.kind == "P" else row.map.target if row.map.kind == "B" else row.map.good)
+            for id, row in table.load().items()}  # fmt: skip
+    outcomes = run_jobs(Bench(case, good, compute=compute, more=file), list_jobs(("dent",)), processes=1)
+    rows = judge_outcomes(outcomes, judge.make_judgement({"base": good, "null": good}, []))
+    assert [(row["kind"], row["detected"]) for row in rows] == [("outside", False), ("outside", True)]
+    assert judge.undetected([row | {"detected": False} for row in rows]) == []
+    outside.clear()
+    assert list_jobs(("dent",)) == []

@@ -8,11 +8,12 @@ import trimesh
 
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.catalogue import SPOIL, Setting, load_controls, spoil_case
 from benchmarks.fidelity.derive.surface import visible_mesh
+from benchmarks.fidelity.faults import KINDS, Site, put_in
+from benchmarks.fidelity.faults.rows import load_controls
 from tests.benchmarks.fidelity import tube
 
-NO_SCENE = sorted(set(SPOIL) - {"N01", "N12", "N29", "N30", "N31", "N33"})
+NO_SCENE = [id for id in load_controls() if id not in ("N01", "N12", "N29", "N30", "N31", "N33")]
 
 
 @pytest.fixture(scope="module")
@@ -21,19 +22,21 @@ def base() -> Case:
 
 
 def spoil(case: Case, control: str, dose: float, scratch: Path = Path("unused")) -> Case:
-    return spoil_case(case, control, dose, Setting(np.random.default_rng(0), scratch, lambda: case.candidate))
+    return put_in(Site(case, scratch=scratch, foreign=lambda: case.candidate), load_controls()[control].faults[dose])
 
 
 def candidate(case: Case, control: str, dose: float) -> Candidate:
     return spoil(case, control, dose).candidate
 
 
-def test_the_table_has_36_controls_and_each_has_a_function() -> None:
-    assert list(load_controls()) == [f"N{k:02d}" for k in range(1, 37)]
-    assert set(SPOIL) == set(load_controls())
+def test_the_table_has_36_controls_and_7_invariances_and_each_has_a_function() -> None:
+    assert list(load_controls()) == [f"N{k:02d}" for k in range(1, 37)] + [f"I{k}" for k in range(1, 8)]
     for control in load_controls().values():
-        assert set(control.bold) <= set(control.doses)
-        assert control.falls or "leak" in control.reason
+        assert set(control.bold) <= set(control.faults)
+        assert control.bold
+        assert {fault.kind for fault in control.faults.values()} <= set(KINDS)
+        assert (control.kind == "invariance") == (control.limit is not None)
+        assert control.falls or control.limit or "leak" in control.reason
 
 
 @pytest.mark.parametrize("control", NO_SCENE)
@@ -182,8 +185,7 @@ def test_permuted_poses_keep_every_beam(base: Case) -> None:
 
 def test_a_foreign_tunnel_is_brought_to_our_mouth(base: Case) -> None:
     other = tube.candidate(tube.Tube(heading=1.0, bend=70.0))
-    setting = Setting(np.random.default_rng(0), Path("unused"), lambda: other)
-    spoilt = spoil_case(base, "N33", 1, setting)
+    spoilt = put_in(Site(base, foreign=lambda: other), load_controls()["N33"].faults[1.0])
     assert spoilt.truth.position[0] == pytest.approx(other.bore.position[0], abs=0.2)
     flat = spoilt.truth.tangent[0, :2] @ other.bore.tangent[0, :2]
     assert flat == pytest.approx(1.0, abs=2e-3)

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity import table
-from benchmarks.fidelity.registry import all_metrics, dump_values, estimate, load_values, mean
+from benchmarks.fidelity.registry import dump_values, estimate, load_values, mean
 from benchmarks.fidelity.report import _worst_stretch
-from benchmarks.fidelity.table import Map
+from benchmarks.fidelity.table import B, D, Map, P, U
 
 
 def test_there_are_18_categories_and_199_metrics_with_unique_ids() -> None:
     rows = list(table.load().values())
-    assert len(table.categories()) == table.CATEGORIES == 18
+    assert len(table.CATEGORIES) == 18
     assert len(rows) == table.COUNT == 199
     assert [row.number for row in rows] == list(range(1, 200))
     assert len({row.id for row in rows}) == 199
@@ -28,38 +28,38 @@ def test_nothing_that_is_true_by_construction_is_scored() -> None:
     assert not any(row.scored for row in by_construction)
 
 
-def test_every_metric_of_the_table_is_computed_by_something() -> None:
-    assert list(all_metrics()) == list(table.load())
-
-
-def test_every_scored_metric_has_a_map_and_every_logged_one_has_none() -> None:
-    for row in table.load().values():
+def test_every_metric_says_what_it_is_and_stands_with_its_category() -> None:
+    rows = list(table.load().values())
+    assert [row.category for row in rows] == sorted((row.category for row in rows), key=list(table.CATEGORIES).index)
+    for row in rows:
+        assert len(row.definition) > 15, row.id
         assert (row.map.kind == "-") == (not row.scored), row.id
+        assert row.map.kind not in "DUB" or row.map.good != row.map.bad, row.id
 
 
 @pytest.mark.parametrize(
-    ("text", "value", "score"),
+    ("map", "value", "score"),
     [
-        ("D(1,3)", 1.0, 100.0),
-        ("D(1,3)", 2.0, 50.0),
-        ("D(1,3)", 9.0, 0.0),
-        ("U(0.5,0.9)", 0.7, 50.0),
-        ("B(1;0.2,1.0)", 0.4, 50.0),
-        ("B(1;0.2,1.0)", 1.6, 50.0),
-        ("P", 1.0, 100.0),
-        ("P", 0.0, 0.0),
-        ("D(1,3)", math.nan, 0.0),
+        (D(1, 3), 1.0, 100.0),
+        (D(1, 3), 2.0, 50.0),
+        (D(1, 3), 9.0, 0.0),
+        (U(0.5, 0.9), 0.7, 50.0),
+        (B(1, 0.2, 1.0), 0.4, 50.0),
+        (B(1, 0.2, 1.0), 1.6, 50.0),
+        (P, 1.0, 100.0),
+        (P, 0.0, 0.0),
+        (D(1, 3), math.nan, 0.0),
     ],
 )
-def test_a_map_scores_as_the_specification_says(text: str, value: float, score: float) -> None:
-    assert table.parse_map(text).score(value) == pytest.approx(score)
+def test_a_map_scores_as_the_specification_says(map: Map, value: float, score: float) -> None:
+    assert map.score(value) == pytest.approx(score)
 
 
 def test_a_share_moves_by_its_shortfall_and_never_past_one() -> None:
-    moved = table.parse_map("U(0.85,0.97)").scaled(1.1)
+    moved = U(0.85, 0.97).scaled(1.1)
     assert (moved.good, moved.bad) == (pytest.approx(0.967), pytest.approx(0.835))
-    assert table.parse_map("D(1,3)").scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
-    assert table.parse_map("P").scaled(1.1) == table.parse_map("P")
+    assert D(1, 3).scaled(1.1) == Map("D", pytest.approx(1.1), pytest.approx(3.3))
+    assert P.scaled(1.1) == P
 
 
 def test_the_worst_stretch_of_a_metric_along_the_tunnel_is_kept_with_its_place() -> None:

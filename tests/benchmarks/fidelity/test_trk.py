@@ -52,8 +52,9 @@ def test_a_missing_third_of_the_sleepers_costs_recall():
     assert measure("trk_sleeper_f1", tube.spoiled(case, track=fewer)).value == pytest.approx(2 * kept / (kept + 20))
 
 
-def test_a_wide_gauge_is_wide_by_millimetres():
-    case = judged(gauge=1.445)
+@pytest.mark.parametrize("gauge", [1.445, 1.425])
+def test_a_wide_or_narrow_gauge_is_off_by_millimetres(gauge):
+    case = judged(gauge=gauge)
     assert measure("trk_gauge_mean_err", case).value == pytest.approx(10.0, abs=0.2)
     assert measure("trk_gauge_p95_dev", case).value == pytest.approx(10.0, abs=0.5)
 

@@ -10,8 +10,8 @@ import pytest
 
 from benchmarks.fidelity import figures, judge, scoring, table
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.catalogue import INVARIANCES
-from benchmarks.fidelity.controls.runner import (
+from benchmarks.fidelity.faults.rows import load_controls
+from benchmarks.fidelity.faults.runner import (
     Bench,
     Job,
     Outcome,
@@ -24,7 +24,7 @@ from benchmarks.fidelity.controls.runner import (
 )
 from benchmarks.fidelity.figures.sheet import Sheet, draw_categories
 from benchmarks.fidelity.inputs import Inputs
-from benchmarks.fidelity.judge import Base
+from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.registry import Value, missing
 from benchmarks.fidelity.report import write_report
 from tests.benchmarks.fidelity import tube
@@ -44,10 +44,10 @@ def values(quality: float, worse: tuple[str, ...] = (), much: float = 0.0) -> Va
     return made
 
 
-def base() -> Base:
+def base() -> Judgement:
     all_of = {"base": values(0.98), "null": values(0.8), "ceiling": values(1.0)}
     scored = {name: scoring.score_all(entry) for name, entry in all_of.items()}
-    return Base(scored["base"], scored["null"], all_of, [])
+    return Judgement(all_of, scored, None, [], [])
 
 
 def outcome(control: str, dose: float, made: Values, leaks: tuple[str, ...] = ()) -> Outcome:
@@ -87,13 +87,14 @@ def test_a_fall_to_the_cap_of_a_gate_that_newly_fails_is_deep_enough_and_no_othe
     low = values(0.98, ("PAR",), 0.74)  # a circle's, from which 30 points cannot be lost
     scored = scoring.score_all(low)
     assert scored.categories["PAR"] - scoring.GATE_FLOOR < 30.0
-    bare = replace(base(), scored=scored, values=base().values | {"base": low})
+    bare = replace(base(), scored=base().scored | {"base": scored}, values=base().values | {"base": low})
     apart = low | {"env_lidar_vs_mesh": values(0.4)["env_lidar_vs_mesh"]}
     (row,) = judge_outcomes([outcome("N31", 0.3, apart)], bare)
     assert row["categories"]["PAR"] == scoring.GATE_FLOOR
     assert row["detected"], row["short"]
 
-    before = replace(bare, scored=scoring.score_all(apart), values=bare.values | {"base": apart})
+    spoilt = base().scored | {"base": scoring.score_all(apart)}
+    before = replace(bare, scored=spoilt, values=bare.values | {"base": apart})
     (row,) = judge_outcomes([outcome("N31", 0.3, apart)], before)  # the gate failed without the control already
     assert row["short"] == {"PAR": (0.0, 30.0)}
     gone = low | {"mjx_ray_parity": values(0.0)["mjx_ray_parity"]}
@@ -133,6 +134,17 @@ def test_the_sweep_has_its_runs_and_moves_scores_by_the_closed_form() -> None:
     assert summary["independent"]["most"] - summary["independent"]["least"] < looser["delta"] - tighter["delta"]
 
 
+def test_seeds_that_move_one_category_up_and_another_down_are_beyond_the_limit_of_the_sweep() -> None:
+    def seeds(move: float) -> list[Values]:
+        return [values(0.95 + sign * move, ("TRK",), 0.95 - sign * 17 * move) for sign in (-1, 0, 1)]
+
+    for move, within in ((0.0005, True), (0.0025, False)):
+        runs = {str(seed): made for seed, made in enumerate(seeds(move))}
+        found = scoring.summarise(scoring.compare_runs("seed", runs, values(0.95)))["seed"]
+        assert found["sd"] < scoring.SEED_LIMIT
+        assert found["within"] is within
+
+
 def test_the_order_is_lost_where_the_null_tube_overtakes() -> None:
     rows = scoring.sweep_thresholds({"base": values(0.5), "null": values(0.9)})
     assert not any(row["order_kept"] for row in rows)
@@ -153,7 +165,8 @@ def test_the_order_of_every_candidate_counts(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_invariances_and_cheats_have_no_place_in_the_order() -> None:
     ranked = [job for job in list_jobs() if is_ranked(job)]
-    assert {job.control for job in list_jobs()} - {job.control for job in ranked} == {*INVARIANCES, "N35", "N36"}
+    quiet = [id for id, control in load_controls().items() if control.kind == "invariance"]
+    assert {job.control for job in list_jobs()} - {job.control for job in ranked} == {*quiet, "N35", "N36"}
 
 
 def test_without_any_reference_nothing_is_asked_over_the_null_tube() -> None:

@@ -1,18 +1,16 @@
 """Worst windows: known answers on a tube, faults that must be noticed, and where they are."""
 
-import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.fidelity import judge
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.controls.local import KINDS, Fault, draw_fault, make_ground, spoil, stated_faults
-from benchmarks.fidelity.files import FidelityError, write_json
+from benchmarks.fidelity.faults import Fault, put_in
+from benchmarks.fidelity.faults.kinds import local_site
+from benchmarks.fidelity.faults.rows import stated_faults
 from benchmarks.fidelity.registry import Value
-from benchmarks.fidelity.windows import commands
 from benchmarks.fidelity.windows.deviation import COLUMNS, FINE, LEAST, TRACK, Relief, hold_frame, hold_map, parts_hit
 from benchmarks.fidelity.windows.judge import Noticed, Windows, Worst, dump_windows, load_windows, worst_windows
 from benchmarks.fidelity.windows.measures import SENSORS, limits, sensor_of
@@ -37,7 +35,7 @@ def by_name(case: Case) -> dict[str, Worst]:
 
 
 def with_fault(good: Case, fault: Fault) -> dict[str, Worst]:
-    return by_name(replace(good, candidate=spoil(make_ground(good.candidate), fault), cache={}))
+    return by_name(put_in(local_site(good), fault))
 
 
 def test_a_right_tube_has_no_window_beyond_its_limit(before) -> None:
@@ -49,7 +47,7 @@ def test_a_right_tube_has_no_window_beyond_its_limit(before) -> None:
 
 
 def test_a_wall_that_is_out_is_measured_and_placed(good) -> None:
-    found = with_fault(good, Fault("wall", 8.0, 5.0, 0.10, 0.0))
+    found = with_fault(good, Fault("wall", 0.10, 8.0, 5.0, 0.0))
     for name in ("sector.truth", "sector.recording"):
         worst = found[name]
         assert worst.value == pytest.approx(0.10, abs=0.02)
@@ -60,13 +58,13 @@ def test_a_wall_that_is_out_is_measured_and_placed(good) -> None:
 
 
 def test_what_moves_along_the_tunnel_or_stands_apart_is_measured(good) -> None:
-    along = with_fault(good, Fault("along", 7.0, 10.0, 0.15))
+    along = with_fault(good, Fault("along", 0.15, 7.0, 10.0))
     assert along["shift.truth"].value == pytest.approx(0.15, abs=0.03)
     assert along["shift.recording"].value == pytest.approx(0.15, abs=0.03)
-    rails = with_fault(good, Fault("rails", 8.0, 6.0, 0.03))
+    rails = with_fault(good, Fault("rails", 0.03, 8.0, 6.0))
     assert rails["rail_height.truth"].value == pytest.approx(0.03, abs=0.003)
     assert rails["rail_height.recording"].value == pytest.approx(0.03, abs=0.006)
-    gauge = with_fault(good, Fault("gauge", 6.0, 11.0, -0.006))
+    gauge = with_fault(good, Fault("gauge", -0.006, 6.0, 11.0))
     assert gauge["gauge.truth"].value == pytest.approx(0.006, abs=0.001)
     assert {name for name, one in gauge.items() if one.beyond} == {"gauge.truth", "gauge_change.truth"}
 
@@ -95,17 +93,16 @@ def test_a_relief_is_found_where_it_was_moved_to_and_points_beyond_its_ends_coun
 
 def test_filled_pockets_lost_sleepers_and_a_cube_are_noticed(good) -> None:
     for fault, window in (
-        (Fault("pockets", 8.0, 7.0, 0.9), "pockets.truth"),
-        (Fault("missing", 8.0, 7.0, 1.0), "bed.truth"),
-        (Fault("box", 8.0, 5.0, 0.9, np.pi), "spot.recording"),
+        (Fault("pockets", 0.9, 8.0, 7.0), "pockets.truth"),
+        (Fault("missing", 1.0, 8.0, 7.0), "bed.truth"),
+        (Fault("box", 0.9, 8.0, 5.0, np.pi), "spot.recording"),
     ):
         found = with_fault(good, fault)
         assert found[window].beyond, fault
 
 
 def test_a_cell_that_shows_mostly_track_says_nothing_of_the_bore(good) -> None:
-    aside = spoil(make_ground(good.candidate), Fault("track", 0.0, LENGTH, 0.008))
-    case = replace(good, candidate=aside, cache={})
+    case = put_in(local_site(good), Fault("track", 0.008))
     frame, one, on_track = hold_frame(case), hold_map(case), np.isin(parts_hit(case), TRACK)
     cells = one.offset.size
     total, track = (np.bincount(frame.cell[rows & (frame.cell >= 0)], minlength=cells) for rows in (True, on_track))
@@ -117,37 +114,24 @@ def test_a_cell_that_shows_mostly_track_says_nothing_of_the_bore(good) -> None:
 
 def test_a_mirrored_tube_fails_where_its_sides_differ_and_a_symmetric_one_cannot_tell(good, before) -> None:
     assert before["hand.truth"].value is None  # its sides are alike
-    mirror = stated_faults(LENGTH)["mirrored left to right"]
-    one_sided = spoil(make_ground(good.candidate), Fault("wall", 6.0, 4.0, 0.08, np.pi / 4))
+    one_sided = put_in(local_site(good), Fault("wall", 0.08, 6.0, 4.0, np.pi / 4)).candidate
     surface = replace(good.truth, surface=one_sided.lining, part=np.zeros(len(one_sided.lining.faces), int), cache={})
     uneven = replace(good, candidate=one_sided, truth=surface, hold=None, cache={})
     assert by_name(uneven)["hand.truth"].value == pytest.approx(0.0, abs=0.05)
-    mirrored = replace(uneven, candidate=spoil(make_ground(one_sided), mirror), cache={})
-    found = by_name(mirrored)["hand.truth"]
+    found = with_fault(uneven, stated_faults(LENGTH)["mirrored left to right"])["hand.truth"]
     assert found.value == pytest.approx(2.0, abs=0.1)
     assert found.beyond
 
 
 def test_a_fault_leaves_the_rest_of_the_tunnel_exactly_alone(good) -> None:
-    ground = make_ground(good.candidate)
-    for name, kind in KINDS.items():
-        if kind.sizes is None:
-            continue
-        spoilt = spoil(ground, Fault(name, 10.0, 4.0, kind.sizes[1], kind.sides[0]))
-        lining = good.candidate.lining
-        station = ground.line.local(np.asarray(lining.vertices))[:, 0]
+    site, lining = local_site(good), good.candidate.lining
+    station = site.line.local(np.asarray(lining.vertices))[:, 0]
+    for kind, size in (("wall", 0.15), ("floor", 0.15), ("aside", 0.15), ("lift", 0.15), ("along", 0.35),
+                       ("roll", 0.06), ("gauge", 0.02), ("rails", 0.06), ("track", 0.06), ("sleepers", 0.28),
+                       ("missing", 1.0), ("pockets", 1.0), ("box", 1.0), ("section", 0.05)):  # fmt: skip
+        spoilt = put_in(site, Fault(kind, size, 10.0, 4.0)).candidate
         moved = np.abs(np.asarray(spoilt.lining.vertices) - lining.vertices).max(axis=1)
-        assert moved[(station < 6.5) | (station > 17.5)].max() == 0.0, name
-
-
-def test_faults_are_drawn_inside_the_tunnel_in_their_ranges() -> None:
-    rng = np.random.default_rng(3)
-    drawn = [draw_fault(rng, 36.0) for _ in range(300)]
-    assert {one.kind for one in drawn} == {name for name, kind in KINDS.items() if kind.sizes}
-    for one in drawn:
-        low, high = KINDS[one.kind].sizes
-        assert low <= abs(one.size) <= high
-        assert 1.0 <= one.start < one.start + one.length <= 35.0
+        assert moved[(station < 6.5) | (station > 17.5)].max() == 0.0, kind
 
 
 def test_windows_and_faults_that_go_unnoticed_decide_the_verdict() -> None:
@@ -203,28 +187,3 @@ def test_what_a_sensor_cannot_judge_is_not_judged_by_it(good, before) -> None:
     assert not livox["spot.recording"].beyond
     assert before["spot.recording"].value is not None
     assert livox["sector.recording"].value == before["sector.recording"].value
-
-
-def test_limits_of_another_sensor_are_set_beside_those_of_the_standard_one(tmp_path) -> None:
-    def runs(name: str, value: float) -> tuple[Path, ...]:
-        for k in range(3):
-            one = {f"{measure}.{source}": {"start": [0.0], "value": [value]}
-                   for measure in ("wall", "spot") for source in ("recording", "truth")}  # fmt: skip
-            write_json(
-                tmp_path / f"{name}{k}" / "windows.json", {"schema": commands.SCHEMA, "series": {"ceiling": one}}
-            )
-        return tuple(tmp_path / f"{name}{k}" for k in range(3))
-
-    out = tmp_path / "limits.json"
-    commands.set_limits(runs("o", 0.001), out)
-    before = json.loads(out.read_text())
-    commands.set_limits(runs("a", 0.03), out, "avia")
-    commands.set_limits(runs("v", 0.4), out, "vlp16")
-    after, own = json.loads(out.read_text()), ("wall.recording", "spot.recording")
-    assert after["limits"] == before["limits"]
-    assert {name: one["limit"] for name, one in after["sensors"]["avia"].items()} == {
-        "wall.recording": 0.045, "spot.recording": 0.08,
-    }  # fmt: skip
-    assert {name: one["limit"] for name, one in after["sensors"]["vlp16"].items()} == dict.fromkeys(own)
-    with pytest.raises(FidelityError, match="no sensor 'kinect'"):
-        commands.set_limits(runs("o", 0.001), out, "kinect")

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate, Track, concatenate_meshes
+from benchmarks.fidelity.candidate import MANIFEST_SCHEMA, Bore, Candidate, Track
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.meshes import concatenate_meshes
 from benchmarks.fidelity.references import PARTS, Hold, Truth
 from tests.benchmarks.fidelity.tubemesh import rolled
 from tests.benchmarks.fidelity.tubeshape import Tube
@@ -47,7 +48,7 @@ def track(tube: Tube) -> Track:
     points = {name: np.asarray(ends).reshape(-1, 3) for name, ends in rail.items()}
     tops = tube.point(tube.sleepers, np.zeros(len(tube.sleepers)), top).reshape(-1, 3)
     meshes = [concatenate_meshes(parts) for parts in (sleepers, rails, fastenings)]
-    return Track(tops, meshes[0], points, meshes[1], meshes[2], tube.gauge if tube.track else None)
+    return Track(tops, meshes[0], points, meshes[1], meshes[2])
 
 
 def _box(tube: Tube, station: float, left: float, up: float, size: tuple[float, float, float]) -> trimesh.Trimesh:

@@ -1,13 +1,9 @@
-"""Smallest faults noticed: at each of many places sizes are halved in on, and a detection curve is fitted to them.
-
-Only windows near the fault are judged. What they notice the whole tunnel notices; left out are `hand`, and beams that a
-fault holds up on their way to a wall farther on than a window.
-"""
+"""Smallest faults noticed: at each of many places sizes are halved in on, and a detection curve is fitted to them."""
 
 import csv
 import io
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -22,10 +18,11 @@ from scipy.special import ndtr
 from scipy.stats import beta, norm
 
 from benchmarks.fidelity.case import Case, case_hash, release_memory
-from benchmarks.fidelity.controls.local import KINDS, Fault, make_ground, spoil
+from benchmarks.fidelity.faults import Fault, Site, put_in
+from benchmarks.fidelity.faults.kinds import KINDS, local_site
+from benchmarks.fidelity.faults.rows import asked_faults
 from benchmarks.fidelity.files import FidelityError, write_json, write_text
-from benchmarks.fidelity.windows.judge import windows_hash, worst_windows
-from benchmarks.fidelity.windows.near import Nearby
+from benchmarks.fidelity.windows.judge import Worst, noticed_by, worst_windows
 from scene.progress import Stages
 
 matplotlib.use("Agg")
@@ -53,53 +50,32 @@ _COLUMNS = (
 )
 
 
-@dataclass(frozen=True)
-class Asked:
-    """A fault whose size is asked for.
-
-    Attributes:
-        size: Size that must be noticed, in the unit of its kind.
-        length: Length, m.
-    """
-
-    size: float
-    length: float
-
-
-ASKED = {
-    "wall": Asked(0.05, 5.0), "roof": Asked(0.05, 5.0), "aside": Asked(0.05, 5.0), "gauge": Asked(0.005, 10.0),
-    "along": Asked(0.15, 10.0), "rails": Asked(0.02, 5.0),
-}  # fmt: skip
-
-
-def check_ladder(kinds: tuple[str, ...], places: int, length: float) -> None:
-    """Refuses a ladder that cannot be climbed.
+def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
+    """Refuses a ladder that cannot be climbed anywhere.
 
     Raises:
         FidelityError: In one sentence.
     """
     if places < 1:
         raise FidelityError(f"places must be at least 1, got {places}")
-    if unknown := [name for name in kinds if name not in ASKED]:
-        raise FidelityError(f"no size of {unknown[0]!r} is asked for; a ladder has {', '.join(ASKED)}")
-    longest = max(ASKED[name].length for name in kinds or ASKED) + 2.0 * _EDGE
-    if length < longest + 1.0:
-        raise FidelityError(
-            f"a ladder of these faults needs {longest + 1.0:g} m of tunnel, this one has {length:.1f} m"
-        )
+    if draw < 0:
+        raise FidelityError(f"draw must not be negative, got {draw}")
+    if unknown := [name for name in kinds if name not in asked_faults()]:
+        raise FidelityError(f"no size of {unknown[0]!r} is asked for; a ladder has {', '.join(asked_faults())}")
 
 
 def rungs(kind: str) -> Float[np.ndarray, " r"]:
     """Return the sizes of a kind's ladder, the smallest first."""
-    return ASKED[kind].size * _RUNG ** np.arange(-_BELOW, _ABOVE + 1)
+    return asked_faults()[kind].size * _RUNG ** np.arange(-_BELOW, _ABOVE + 1)
 
 
 def draw_place(kind: str, draw: int, number: int, length: float) -> Fault:
     """Draws place, direction and side of a fault of the size asked for, in a tunnel of `length` m."""
-    seed = np.random.SeedSequence(draw, spawn_key=(list(ASKED).index(kind), number))
-    rng, one, run = np.random.default_rng(seed), KINDS[kind], ASKED[kind].length
-    start = float(rng.uniform(_EDGE, length - _EDGE - run))
-    return Fault(kind, start, run, ASKED[kind].size * float(rng.choice([-1.0, 1.0])), float(rng.choice(one.sides)))
+    asked, one = asked_faults()[kind], KINDS[kind]
+    rng = np.random.default_rng(np.random.SeedSequence(draw, spawn_key=(list(asked_faults()).index(kind), number)))
+    start = float(rng.uniform(_EDGE, length - _EDGE - asked.length))
+    sign = float(rng.choice([-1.0, 1.0])) if one.signed else 1.0
+    return replace(asked, start=start, size=asked.size * sign, side=float(rng.choice(one.sides)))
 
 
 def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, folder: Path) -> list[dict[str, Any]]:
@@ -111,16 +87,22 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
         places: Number of places of each kind.
         draw: Seed that draws them.
         folder: Folder that keeps `ladder.json`.
+
+    Raises:
+        FidelityError: The tunnel is too short for one of the kinds.
     """
-    kinds = kinds or tuple(ASKED)
-    key = sha256(f"{case_hash(case)} {windows_hash()} {draw}".encode()).hexdigest()
+    kinds, length = kinds or tuple(asked_faults()), case.candidate.length
+    least = max(asked_faults()[name].length for name in kinds) + 2.0 * _EDGE + 1.0
+    if length < least:
+        raise FidelityError(f"a ladder of these faults needs {least:g} m of tunnel, this one has {length:.1f} m")
+    key = sha256(f"{case_hash(case)} {draw}".encode()).hexdigest()
     path = folder / "ladder.json"
     content = json.loads(path.read_text()) if path.exists() else {}
     kept: list[dict[str, Any]] = content["rows"] if content.get("key") == key else []
     done = {(row["kind"], row["number"]): row for row in kept}
     wanted = [(kind, number) for number in range(places) for kind in kinds]
-    ground = make_ground(case.candidate)
-    nearby = Nearby(case, ground, worst_windows(case))
+    site = local_site(case)
+    before = worst_windows(case)
     with Stages() as progress:
         stage = progress.start("places", len(wanted))
         if known := sum(one in done for one in wanted):
@@ -130,29 +112,29 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
                 continue
             known_rungs = [row["rung"] for row in done.values() if row["kind"] == kind]
             guess = int(np.median(known_rungs)) if known_rungs else -1
-            done[kind, number] = _climb(nearby, draw_place(kind, draw, number, case.candidate.length), number, guess)
+            fault = draw_place(kind, draw, number, length)
+            done[kind, number] = _climb(site, before, fault, guess) | {"number": number}
             write_json(path, {"schema": SCHEMA, "key": key, "rows": list(done.values())})
             release_memory()
             stage.advance()
     return [done[one] for one in wanted]
 
 
-def _climb(nearby: Nearby, fault: Fault, number: int, guess: int = -1) -> dict[str, Any]:
+def _climb(site: Site, before: list[Worst], fault: Fault, guess: int = -1) -> dict[str, Any]:
     """Return a row of one place: the sizes tried and the window that noticed each, and the smallest rung noticed.
 
     The size asked for is tried first, then the rungs above or below it, as if whatever is noticed were noticed at every
     larger size too.
     """
-    sizes, tried = rungs(fault.kind), {}
+    sizes, tried = rungs(fault.kind), dict[int, tuple[str, ...]]()
     low, high, rung = -1, len(sizes), _BELOW  # the smallest noticed rung lies above `low`, and is `high` or below
     while high - low > 1:
-        one = Fault(fault.kind, fault.start, fault.length, float(np.sign(fault.size) * sizes[rung]), fault.side)
-        by = nearby.first_beyond(spoil(nearby.ground, one), *one.extent())
-        tried[rung] = by
+        one = replace(fault, size=float(np.sign(fault.size) * sizes[rung]))
+        by = tried[rung] = noticed_by(put_in(site, one), before)
         low, high = (low, rung) if by else (rung, high)
         rung = next_rung(low, high, guess)
-    return {**asdict(fault), "number": number, "scene": nearby.case.candidate.name, "rung": high,
-            "tried": [{"size": float(sizes[k]), "by": by} for k, by in tried.items()]}  # fmt: skip
+    return {**asdict(fault), "scene": site.candidate.name, "rung": high,
+            "tried": [{"size": float(sizes[k]), "by": list(by)} for k, by in tried.items()]}  # fmt: skip
 
 
 def next_rung(low: int, high: int, guess: int = -1) -> int:
@@ -192,7 +174,7 @@ def fit_curve(rung: np.ndarray, count: int) -> tuple[float, float]:
 def sum_up(rows: list[dict[str, Any]], draw: int = 0) -> list[dict[str, Any]]:
     """Return a row per kind: sizes noticed at half and at 95 % of places, with the interval of the latter."""
     table = []
-    for kind, asked in ASKED.items():
+    for kind, asked in asked_faults().items():
         rung = np.array([row["rung"] for row in rows if row["kind"] == kind])
         if not len(rung):
             continue

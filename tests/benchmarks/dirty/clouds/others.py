@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from manifold3d import Manifold
 
-from benchmarks.dirty.clouds.air import Alignment, Arch, box, draw_alignment, prism
-from benchmarks.dirty.clouds.scanner import HEIGHT
-from benchmarks.dirty.clouds.site import Mask, Site, bore
-from benchmarks.dirty.clouds.troubles import Cloud, finish
+from tests.benchmarks.dirty.clouds.air import Alignment, Arch, box, draw_alignment, prism
+from tests.benchmarks.dirty.clouds.scanner import HEIGHT
+from tests.benchmarks.dirty.clouds.site import Mask, Site, bore
+from tests.benchmarks.dirty.clouds.troubles import Cloud, finish
 
 _SECOND = tuple(f"{one} {what}" for one in ("two", "second", "another", "other") for what in ("tunnel", "bore"))
 

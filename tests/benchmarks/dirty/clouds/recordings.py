@@ -31,9 +31,7 @@ Rows = np.ndarray  # (n, 8): t x y z qx qy qz qw
 Spoil = Callable[[Rows], Rows]
 
 
-def simulate_survey(
-    folder: Path, seed: int, truth: str = "paper", length: float = LENGTH, sensors: tuple[str, ...] = ("avia",)
-) -> None:
+def simulate_survey(folder: Path, seed: int, sensors: tuple[str, ...] = ("avia",)) -> None:
     """Simulates a survey, unless it is there already.
 
     Raises:
@@ -41,7 +39,7 @@ def simulate_survey(
     """
     if all((folder / f"survey{SUFFIX[name]}.bag").is_file() for name in sensors):
         return
-    words = ["--truth", truth, "--length", f"{length:g}", "--seed", str(seed), "--out", str(folder)]
+    words = ["--truth", "paper", "--length", f"{LENGTH:g}", "--seed", str(seed), "--out", str(folder)]
     words += ["--scan-every", "4", "--sensors", *sensors]
     done = subprocess.run([sys.executable, "-m", "scene.survey", *words], capture_output=True, text=True, check=False)
     if done.returncode:

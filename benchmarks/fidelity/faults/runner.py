@@ -14,23 +14,21 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.fidelity import judge, scoring, table
+from benchmarks.fidelity import judge, outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate, load_candidate
-from benchmarks.fidelity.case import Case, candidate_hash, case_hash, controls_hash, release_memory
-from benchmarks.fidelity.controls.catalogue import (
+from benchmarks.fidelity.case import Case, candidate_hash, case_hash, release_memory
+from benchmarks.fidelity.faults import Site, put_in
+from benchmarks.fidelity.faults.rows import (
     GLOBAL_LIMIT,
-    INVARIANCES,
     OUT_OF_SCENE,
     QUIET_LIMIT,
     THINNED_LIMIT,
     UNORDERED,
     Control,
-    Setting,
     load_controls,
-    spoil_case,
 )
 from benchmarks.fidelity.files import read_json, write_json
-from benchmarks.fidelity.judge import Base
+from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
 from scene.progress import Stages
@@ -99,6 +97,7 @@ class Bench:
         folder: Folder for finished controls; `None` keeps nothing.
         foreign: Scene folder of another tunnel, for N33.
         compute: `evaluate`, or a part of it in tests.
+        more: File of a user's own metrics and faults, which every process reads.
     """
 
     case: Case
@@ -106,15 +105,18 @@ class Bench:
     folder: Path | None = None
     foreign: Path | None = None
     compute: Evaluate = evaluate
+    more: Path | None = None
 
     def key(self, job: Job) -> str:
         """Return the SHA-256 of base, code and, for N33, the foreign scene: a kept result of others is not read."""
         other = "" if self.foreign is None or job.control != "N33" else candidate_hash(_foreign_candidate(self))
+        if load_controls()[job.control].kind == "outside":
+            other = str(outside.files())
         return sha256(f"{self._own} {other}".encode()).hexdigest()
 
     @cached_property
     def _own(self) -> str:
-        return f"{case_hash(self.case)} {controls_hash()}"
+        return case_hash(self.case)
 
     def kept(self) -> list[Outcome]:
         """Return the kept outcomes of this base, in the order of `list_jobs`."""
@@ -125,19 +127,14 @@ class Bench:
 
 
 def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
-    """Return every control at every dose, then the invariances; N33 only where a foreign tunnel is at hand."""
-    jobs = [
-        Job(control.id, dose)
-        for control in load_controls().values()
-        for dose in control.doses
-        if foreign or control.id != "N33"
-    ] + [Job(id, 0.0) for id in INVARIANCES]
-    return [job for job in jobs if not only or job.control in only]
+    """Return every control at every dose; N33 only where a foreign tunnel is at hand."""
+    every = [Job(control.id, dose) for control in load_controls().values() for dose in control.faults]
+    return [job for job in every if (foreign or job.control != "N33") and (not only or job.control in only)]
 
 
 def is_bold(job: Job) -> bool:
     """Return True for a dose that must be noticed; invariances always count."""
-    return job.control in INVARIANCES or job.dose in load_controls()[job.control].bold
+    return job.dose in load_controls()[job.control].bold
 
 
 def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]:
@@ -164,15 +161,11 @@ def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]
 def run_control(bench: Bench, job: Job) -> Outcome:
     """Computes one control at one dose."""
     rng = np.random.default_rng(np.random.SeedSequence(bench.case.seed, spawn_key=tuple(job.control.encode())))
-    fresh = replace(bench.case, cache={})
+    control = load_controls()[job.control]
     with tempfile.TemporaryDirectory() as scratch:
-        if job.control in INVARIANCES:
-            spoiled, evaluated = INVARIANCES[job.control].change(fresh, rng), OUT_OF_SCENE
-        else:
-            setting = Setting(rng, Path(scratch), partial(_foreign_candidate, bench))
-            spoiled = spoil_case(fresh, job.control, job.dose, setting)
-            evaluated = load_controls()[job.control].evaluated
-        values = bench.compute(spoiled, _evaluated_categories(evaluated), bench.base)
+        site = Site(replace(bench.case, cache={}), rng, Path(scratch), partial(_foreign_candidate, bench))
+        spoiled = put_in(site, control.faults[job.dose])
+        values = bench.compute(spoiled, _evaluated_categories(control.evaluated), bench.base)
         recorded = None if bench.case.hold is None else bench.case.hold.hash
         return Outcome(job, values, find_leaks(spoiled, values, recorded))
 
@@ -186,7 +179,7 @@ def _evaluated_categories(evaluated: str) -> tuple[str, ...] | None:
     if evaluated == "all":
         return None
     if evaluated == OUT_OF_SCENE:
-        return tuple(name for name in table.categories() if name not in ("SCN", "PAR"))
+        return tuple(name for name in table.CATEGORIES if name not in ("SCN", "PAR"))
     return tuple(evaluated.split())
 
 
@@ -199,6 +192,8 @@ _worker: dict[str, Bench] = {}
 
 
 def _start_worker(bench: Bench) -> None:
+    if bench.more is not None:
+        outside.load_file(bench.more)
     _worker["bench"] = bench
 
 
@@ -223,7 +218,7 @@ def _compute_outcomes(bench: Bench, todo: list[Job], processes: int) -> Iterator
 # The judgement: whether each control was noticed, and whether the rest stayed quiet.
 
 
-def judge_outcomes(outcomes: list[Outcome], base: Base) -> list[dict[str, Any]]:
+def judge_outcomes(outcomes: list[Outcome], base: Judgement) -> list[dict[str, Any]]:
     """Return a row per control and dose, for `controls.csv` and the heat map.
 
     A control is *detected* where its bold doses fail for a reason that the reconstruction has not, and every category
@@ -231,71 +226,66 @@ def judge_outcomes(outcomes: list[Outcome], base: Base) -> list[dict[str, Any]]:
     """
     judged = [_outcome_row(outcome, base) for outcome in outcomes]
     for row in judged:
-        control = load_controls().get(row["id"])
-        row["spearman"] = _spearman([r for r in judged if r["id"] == row["id"]], control, base)
+        same = [other for other in judged if other["id"] == row["id"]]
+        row["spearman"] = _spearman(same, load_controls()[row["id"]], base)
     return judged
 
 
-def _outcome_row(outcome: Outcome, base: Base) -> dict[str, Any]:
+def _outcome_row(outcome: Outcome, base: Judgement) -> dict[str, Any]:
     scored = scoring.score_all(outcome.values)
     reasons = scoring.reasons_against(
-        scored, base.null, judge.median_skill(outcome.values, base.values), [], [], outcome.leaks
+        scored, base.scored["null"], judge.median_skill(outcome.values, base.values), [], [], outcome.leaks
     )
-    falls = {c: _fall(base.scored.categories[c], scored.categories[c]) for c in base.scored.categories}
+    falls = {c: _fall(base.scored["base"].categories[c], scored.categories[c]) for c in base.scored["base"].categories}
     new = sorted(without_figures(reasons) - without_figures(base.reasons))
-    gates = set(scored.failed_gates) - set(base.scored.failed_gates)
+    gates = set(scored.failed_gates) - set(base.scored["base"].failed_gates)
     row = {
         "id": outcome.job.control, "dose": outcome.job.dose, "overall": scored.overall,
         "verdict": "FAIL" if new else "PASS",
         "why": [reason for reason in reasons if without_figures([reason]) & set(new)], "falls": falls,
-        "categories": scored.categories, "base": base.scored.overall,
+        "categories": scored.categories, "base": base.scored["base"].overall,
         "capped": sorted({table.load()[id].category for id in gates}),
     }  # fmt: skip
-    return {**row, **(_invariance_row(row) if outcome.job.control in INVARIANCES else _negative_row(row))}
+    control = load_controls()[outcome.job.control]
+    named = {"kind": control.kind, "corruption": control.corruption, "evaluated": control.evaluated}
+    return row | named | (_negative_row(row, control) if control.limit is None else _invariance_row(row, control))
 
 
-def _negative_row(row: dict[str, Any]) -> dict[str, Any]:
-    control = load_controls()[row["id"]]
+def _negative_row(row: dict[str, Any], control: Control) -> dict[str, Any]:
     bold = row["dose"] in control.bold
     short = {
         c: (row["falls"][c], asked) for c, asked in control.falls.items()
         if (row["falls"][c] or 0.0) < asked and c not in row["capped"]
     }  # fmt: skip
     moved = {c: row["falls"][c] for c in control.quiet if abs(row["falls"][c] or 0.0) > QUIET_LIMIT}
-    return {
-        "kind": "negative", "corruption": control.corruption, "bold": bold, "short": short if bold else {},
-        "detected": row["verdict"] == "FAIL" and not short, "quiet": not moved, "moved": moved,
-        "evaluated": control.evaluated,
-    }  # fmt: skip
+    detected = row["verdict"] == "FAIL" and not short
+    return {"bold": bold, "short": short if bold else {}, "detected": detected, "quiet": not moved, "moved": moved}
 
 
-def _invariance_row(row: dict[str, Any]) -> dict[str, Any]:
-    control = INVARIANCES[row["id"]]
+def _invariance_row(row: dict[str, Any], control: Control) -> dict[str, Any]:
+    assert control.limit is not None
     falls = {c: fall for c, fall in row["falls"].items() if c not in control.exempt and fall is not None}
-    moved = {c: fall for c, fall in falls.items() if abs(fall) > control.category_limit}
+    moved = {c: fall for c, fall in falls.items() if abs(fall) > control.limit}
     known = row["overall"] is not None and row["base"] is not None
-    limit = GLOBAL_LIMIT if control.category_limit < THINNED_LIMIT else THINNED_LIMIT
+    limit = GLOBAL_LIMIT if control.limit < THINNED_LIMIT else THINNED_LIMIT
     quiet = not moved and known and (bool(control.exempt) or abs(row["overall"] - row["base"]) <= limit)
-    return {
-        "kind": "invariance", "corruption": control.text, "bold": True, "short": {}, "detected": False,
-        "quiet": quiet, "moved": moved, "evaluated": OUT_OF_SCENE,
-    }  # fmt: skip
+    return {"bold": True, "short": {}, "detected": False, "quiet": quiet, "moved": moved}
 
 
 def _fall(before: float | None, after: float | None) -> float | None:
     return None if before is None or after is None else before - after
 
 
-def _spearman(same: list[dict[str, Any]], control: Control | None, base: Base) -> float | None:
+def _spearman(same: list[dict[str, Any]], control: Control, base: Judgement) -> float | None:
     """Return the rank correlation of dose and mean score of the named categories; the reconstruction is dose 0."""
-    if control is None or len(same) < 2 or control.id in UNORDERED or not control.falls:
+    if len(same) < 2 or control.id in UNORDERED or not control.falls:
         return None
-    order = sorted(same, key=lambda row: control.doses.index(row["dose"]))
-    before = [base.scored.categories[c] or 0.0 for c in control.falls]
+    order = sorted(same, key=lambda row: list(control.faults).index(row["dose"]))
+    before = [base.scored["base"].categories[c] or 0.0 for c in control.falls]
     scores = [np.mean(before)] + [np.mean([row["categories"][c] or 0.0 for c in control.falls]) for row in order]
     return float(spearmanr(range(len(scores)), scores).statistic)
 
 
 def is_ranked(job: Job) -> bool:
     """Return True where an outcome has a place in the order: invariances change nothing, cheats no geometry."""
-    return job.control not in INVARIANCES and bool(load_controls()[job.control].falls)
+    return bool(load_controls()[job.control].falls)

@@ -7,7 +7,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from jaxtyping import Float
 
-from benchmarks.dirty.clouds.air import Alignment, Surface
+from tests.benchmarks.dirty.clouds.air import Alignment, Surface
 
 HEIGHT = 1.7  # m of a tripod above the floor
 NOISE, NOISE_PER_METRE = 0.004, 0.0002  # m, m/m: standard deviation of a range

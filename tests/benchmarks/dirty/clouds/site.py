@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from manifold3d import Manifold
 
-from benchmarks.dirty.clouds.air import Alignment, Arch, prism, surface_of
-from benchmarks.dirty.clouds.scanner import HEIGHT, Scan, choose, scan
+from tests.benchmarks.dirty.clouds.air import Alignment, Arch, prism, surface_of
+from tests.benchmarks.dirty.clouds.scanner import HEIGHT, Scan, choose, scan
 
 LENGTH = 60.0  # m, where nothing else is said
 _ON_IT = 0.005  # m: a return so near the arch is lining

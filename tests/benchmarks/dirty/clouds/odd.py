@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks.dirty.clouds.air import Alignment, Arch, box, draw_alignment, prism
-from benchmarks.dirty.clouds.scanner import HEIGHT, choose
-from benchmarks.dirty.clouds.site import LENGTH, bore
-from benchmarks.dirty.clouds.troubles import CLEARED, OPENINGS, UNSEEN, Cloud, finish
+from tests.benchmarks.dirty.clouds.air import Alignment, Arch, box, draw_alignment, prism
+from tests.benchmarks.dirty.clouds.scanner import HEIGHT, choose
+from tests.benchmarks.dirty.clouds.site import LENGTH, bore
+from tests.benchmarks.dirty.clouds.troubles import CLEARED, OPENINGS, UNSEEN, Cloud, finish
 
 _DOUBLED = ("thick", "blur", "two layers", "doubled", "twice", "registration", "misaligned", "passes")
 _ROUNDED = ("round", "resolution", "float", "digit", "grid", "quantis")

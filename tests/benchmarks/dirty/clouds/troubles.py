@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from manifold3d import Manifold, OpType
 
-from benchmarks.dirty.clouds.air import Arch, box, draw_alignment, prism, trapezoid
-from benchmarks.dirty.clouds.scanner import HEIGHT, Scan, choose
-from benchmarks.dirty.clouds.site import LENGTH, Site, bore
+from tests.benchmarks.dirty.clouds.air import Arch, box, draw_alignment, prism, trapezoid
+from tests.benchmarks.dirty.clouds.scanner import HEIGHT, Scan, choose
+from tests.benchmarks.dirty.clouds.site import LENGTH, Site, bore
 
 Cloud = tuple[np.ndarray, dict[str, Any]]
 HALF = 2.75  # m, half-width of the arch

@@ -1,0 +1,18 @@
+"""Faults put into a scene: 36 negative controls, which must be noticed, 7 invariances, which must not, local faults.
+
+A fault is one row: kind, size, place, extent. A kind is one function with `fault_kind`; importing this package
+registers those of the suite, and a file of a user's own registers more (`--metrics`).
+"""
+
+from benchmarks.fidelity.faults import alike, bodies, mesh, references, scene, shape, track
+from benchmarks.fidelity.faults.kinds import KINDS, Fault, Kind, Site, fault_kind, put_in
+
+__all__ = ["Fault", "Kind", "Site", "alike", "bodies", "fault_kind", "mesh", "put_in", "references", "scene", "shape",
+           "track"]  # fmt: skip
+
+_SUITE = frozenset(KINDS)
+
+
+def outside_kinds() -> dict[str, Kind]:
+    """Return the kinds that are not the suite's own."""
+    return {name: kind for name, kind in KINDS.items() if name not in _SUITE}

@@ -1,0 +1,128 @@
+"""Faults of the references, cheats, and other candidates in place of the reconstruction."""
+
+from dataclasses import replace
+from hashlib import sha256
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.surface import Caster, visible_mesh
+from benchmarks.fidelity.faults.kinds import Fault, PointMap, Site, fault_kind, warp_mesh
+from benchmarks.fidelity.files import FidelityError
+from benchmarks.fidelity.impostors import null_tube
+from benchmarks.fidelity.references import Hold, Truth
+
+
+@fault_kind("turned", "held-out beams turned about the sensor's vertical and side axis", "rad")
+def turn_beams(site: Site, fault: Fault) -> Case:
+    """Turns the held-out beams about each sensor's own vertical and side axis."""
+    hold = _require_hold(site.case)
+    turn = Rotation.from_euler("zy", [fault.size, fault.size]).as_matrix()
+    return replace(site.case, hold=replace(hold, direction=hold.direction @ turn.T, cache={}), cache={})
+
+
+@fault_kind("shuffled", "scans at each other's places", signed=False)
+def permute_poses(site: Site, fault: Fault) -> Case:
+    """Puts every scan at the place of another."""
+    hold = _require_hold(site.case)
+    scans, first, index = np.unique(hold.scan, return_index=True, return_inverse=True)
+    place = hold.origin[first][site.rng.permutation(len(scans))]
+    origin = hold.origin - hold.origin[first][index] + place[index]
+    return replace(site.case, hold=replace(hold, origin=origin, cache={}), cache={})
+
+
+@fault_kind("foreign", "another tunnel of the same class", signed=False)
+def judge_foreign(site: Site, fault: Fault) -> Case:
+    """Judges another tunnel by this one's references, moved to its mouth and direction."""
+    assert site.foreign is not None
+    other = site.foreign()
+    here, there = site.candidate.bore, other.bore
+    turn = _yaw_matrix(there.tangent[0]) @ _yaw_matrix(here.tangent[0]).T
+    shift = there.position[0] - turn @ here.position[0]
+    return replace(move_references(site.case, turn, shift), candidate=other)
+
+
+@fault_kind("tube", "null tube; 1 with sleepers, 2 without", signed=False)
+def judge_tube(site: Site, fault: Fault) -> Candidate:
+    """Judges the null tube."""
+    return null_tube(site.candidate, sleepers=fault.size < 2)
+
+
+@fault_kind("forged", "recording cast in the candidate itself, with its noise times a factor", signed=False)
+def forge_recording(site: Site, fault: Fault) -> Case:
+    """Replaces the recording by beams cast in the candidate itself, with range noise or without."""
+    hold = _require_hold(site.case)
+    reach, _ = Caster(visible_mesh(site.candidate)).first(hold.origin, hold.direction)
+    reach = reach + site.rng.normal(0.0, 1.0, len(reach)) * (fault.size * hold.sigma)
+    keep = np.isfinite(reach)
+    columns: dict[str, Any] = {name: getattr(hold, name)[keep] for name in ("time", "scan", "origin", "direction")}
+    forged = replace(hold, **columns, range=reach[keep], hash=sha256(reach.tobytes()).hexdigest(), cache={})
+    return replace(site.case, hold=forged, cache={})
+
+
+@fault_kind("leaked", "builder read the held-out recording", signed=False)
+def leak_hold(site: Site, fault: Fault) -> Case:
+    """Gives the builder the held-out recording: the manifest's inputs hold its hash, and the fit is the hold."""
+    hold = _require_hold(site.case)
+    manifest = dict(site.candidate.manifest)
+    manifest["inputs"] = [*manifest.get("inputs", []), {"file": "hold", "sha256": hold.hash}]
+    return replace(site.case, candidate=replace(site.candidate, manifest=manifest), fit=hold, cache={})
+
+
+def _require_hold(case: Case) -> Hold:
+    if case.hold is None:
+        raise FidelityError("this control needs a held-out recording, give one with --recording and --trajectory")
+    return case.hold
+
+
+def _yaw_matrix(tangent: np.ndarray) -> np.ndarray:
+    return Rotation.from_euler("z", np.arctan2(tangent[1], tangent[0])).as_matrix()
+
+
+def move_references(case: Case, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Case:
+    """Turns held-out recording, fit and truth about the origin and shifts them."""
+    hold, fit = (None if h is None else move_hold(h, turn, shift) for h in (case.hold, case.fit))
+    truth = None if case.truth is None else move_truth(case.truth, turn, shift)
+    return replace(case, hold=hold, fit=fit, truth=truth, cache={})
+
+
+def move_hold(hold: Hold, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Hold:
+    """Turns a recording about the origin and shifts it; kept results are dropped."""
+    return replace(hold, origin=hold.origin @ turn.T + shift, direction=hold.direction @ turn.T, cache={})
+
+
+def move_truth(truth: Truth, turn: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"]) -> Truth:
+    """Turns a truth about the origin of the tunnel frame and shifts it; kept results are dropped."""
+    surface = warp_mesh(truth.surface, lambda points: points @ turn.T + shift)
+    return replace(
+        truth, position=truth.position @ turn.T + shift, tangent=truth.tangent @ turn.T, surface=surface,
+        furniture=_turn_positions(truth.furniture, truth.origin, turn, shift), cache={},
+    )  # fmt: skip
+
+
+def bend_recording(hold: Hold, move: PointMap) -> Hold:
+    """Moves sensor positions and returns of a recording, and the beams with them."""
+    ends = hold.origin + np.where(hold.returned, hold.range, 1.0)[:, None] * hold.direction
+    origin = move(hold.origin)
+    away = move(ends) - origin
+    reach = np.linalg.norm(away, axis=1)
+    direction = away / np.maximum(reach, 1e-9)[:, None]
+    return replace(hold, origin=origin, direction=direction, range=np.where(hold.returned, reach, hold.range), cache={})
+
+
+def _turn_positions(value: Any, origin: np.ndarray, turn: np.ndarray, shift: np.ndarray, key: str = "") -> Any:
+    """Turns the positions of truth.json (survey frame) with the rest."""
+    if isinstance(value, dict):
+        return {name: _turn_positions(inner, origin, turn, shift, name) for name, inner in value.items()}
+    if key in ("position", "left", "right"):
+        moved = (np.asarray(value, float).reshape(-1, 3) - origin) @ turn.T + shift + origin
+        return moved.reshape(np.shape(value)).tolist()
+    if key == "outward":
+        return (turn @ np.asarray(value, float)).tolist()
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return [_turn_positions(inner, origin, turn, shift) for inner in value]
+    return value

@@ -1,0 +1,61 @@
+"""Meshes of many bodies: joined, taken apart, each moved by itself."""
+
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+
+def concatenate_meshes(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Joins several meshes; without any, return an empty one."""
+    if not meshes:
+        return trimesh.Trimesh()
+    before = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    return trimesh.Trimesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + start for mesh, start in zip(meshes, before, strict=False)]),
+        process=False,
+    )
+
+
+def without_faces(mesh: trimesh.Trimesh, gone: Bool[np.ndarray, " f"]) -> trimesh.Trimesh:
+    """Removes some faces, and the vertices that no face uses then."""
+    left = trimesh.Trimesh(mesh.vertices, mesh.faces[~gone], process=False)
+    left.remove_unreferenced_vertices()
+    return left
+
+
+def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:
+    """Return the number of the body of each vertex, and the middle of each body, m."""
+    count = len(mesh.vertices)
+    if not count:
+        return np.zeros(0, int), np.zeros((0, 3))
+    welded = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)[1].ravel()
+    first, second = welded[mesh.faces[:, [0, 0]].ravel()], welded[mesh.faces[:, [1, 2]].ravel()]
+    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
+    label = np.unique(connected_components(graph, directed=False)[1][welded], return_inverse=True)[1]
+    size = np.maximum(np.bincount(label), 1)[:, None]
+    return label, np.stack([np.bincount(label, axis) for axis in mesh.vertices.T], axis=1) / size
+
+
+def keep_bodies(
+    mesh: trimesh.Trimesh, keep: Callable[[Float[np.ndarray, "b 3"]], Bool[np.ndarray, " b"]]
+) -> trimesh.Trimesh:
+    """Keeps the bodies whose middle passes a test."""
+    if not len(mesh.faces):
+        return mesh
+    label, middle = find_bodies(mesh)
+    return without_faces(mesh, ~keep(middle)[label[mesh.faces[:, 0]]])
+
+
+def move_bodies(
+    mesh: trimesh.Trimesh, shift: Callable[[Float[np.ndarray, "b 3"]], Float[np.ndarray, "b 3"]]
+) -> trimesh.Trimesh:
+    """Moves each body by the shift of its middle."""
+    if not len(mesh.faces):
+        return mesh
+    label, middle = find_bodies(mesh)
+    return trimesh.Trimesh(mesh.vertices + shift(middle)[label], mesh.faces, process=False)

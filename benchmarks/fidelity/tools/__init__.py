@@ -1,1 +1,0 @@
-"""Programs that made the frozen data of the suite."""
