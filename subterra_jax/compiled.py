@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
-import os
 import platform
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any, TypeVar
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
+from subterra_jax.host.cache import cache_folder, make_writable
 from subterra_jax.host.errors import SubterraError
 
 _Method = TypeVar("_Method", bound=Callable[..., Any])
@@ -70,14 +70,9 @@ def cache_programs(folder: str | Path | None = None) -> Path:
     if folder is None and config.jax_compilation_cache_dir:
         return Path(config.jax_compilation_cache_dir)
     if folder is None:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        folder = base / "subterra" / "compiled" / _processor()
+        folder = cache_folder("compiled") / _processor()
     folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SubterraError(f"{folder}: cannot be written ({error.strerror})") from error
-    if not os.access(folder, os.W_OK):
+    if not make_writable(folder):
         raise SubterraError(f"{folder}: cannot be written")
     config.update("jax_compilation_cache_dir", str(folder))
     config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -2,12 +2,12 @@
 
 import argparse
 import logging
-import os
 import sys
 import time
 import warnings
 from pathlib import Path
 
+from subterra_jax.host.cache import cache_folder
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.viewer.config import LOOPBACK, ViewerConfig, ViewerError
 
@@ -100,9 +100,8 @@ def _compile_once() -> None:
     """Compute on the CPU, which suits one episode, and keep compiled programs on disk."""
     import jax
 
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     jax.config.update("jax_platforms", "cpu")
-    jax.config.update("jax_compilation_cache_dir", str(base / "subterra" / "viewer"))
+    jax.config.update("jax_compilation_cache_dir", str(cache_folder("viewer")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
