@@ -82,7 +82,7 @@ def test_the_wheel_alone_loads_a_policy_and_makes_and_steps_every_task_with_ever
     done = subprocess.run([python, "-c", DRIVE], check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
     assert done.stdout.startswith("(18,) ")
     assert done.stderr == ""
-    tour = [python, str(ROOT / "tests" / "wheel_tour.py")]
+    tour = [python, "-P", str(ROOT / "tests" / "wheel_tour.py")]  # beside it lies a folder `subterra_jax`
     done = subprocess.run(tour, check=True, capture_output=True, text=True, cwd=tmp_path, env=plain)
     print(done.stdout)
     assert len(done.stdout.splitlines()) == 1 + 9 * 5 + 1

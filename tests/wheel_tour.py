@@ -1,6 +1,6 @@
 """Makes, resets and steps every task with every sensor, and prints CPU-seconds and megabytes; needs the wheel alone.
 
-python wheel_tour.py [ID ...] [SENSOR ...]: all ids, all sensors where none is named. Twice, the second time is that
+python -P wheel_tour.py [ID ...] [SENSOR ...]: all ids, all sensors where none is named. A second time is that
 with the tunnels on disk.
 """
 

@@ -121,7 +121,7 @@ def resolve(
     if not GENERATED.fullmatch(str(tunnel)):
         put = lambda: _put(load_tunnel(tunnel), lining, piece, reach, spatial)  # noqa: E731
         file = Path(str(tunnel_file(tunnel)))  # a surface takes a quarter of a minute
-        return keep(put, file.read_bytes(), lining, piece, reach) if spatial and file.is_file() else put()
+        return keep(put, tunnel_digest(tunnel), lining, piece, reach) if spatial and file.is_file() else put()
     # No more than is needed is made.
     name, lining = str(tunnel), lining or default_lining(str(tunnel))
     make = lambda: _put(generate(name, (lining,), spatial), lining, piece, reach, spatial)  # noqa: E731
