@@ -51,7 +51,7 @@ $(STAMP): pyproject.toml
 	@touch $@
 
 SHARED ?= ../shared
-tunnels: $(STAMP)  ## build the packaged tunnels anew, about 30 minutes on 2 cores; SHARED names the folder that holds data/metro_asbuilt
+tunnels: $(STAMP)  ## build the packaged tunnels anew, about 15 minutes on 2 idle cores; SHARED names the folder that holds data/metro_asbuilt
 	$(BIN)/python -m scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out build/survey-351
 	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
 		--provenance simulated --name subterra-351 --date $$(date +%F) --out build/subterra-351
