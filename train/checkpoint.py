@@ -95,11 +95,13 @@ def save_checkpoint(
         for path, leaf in jax.tree_util.tree_flatten_with_path(jax.device_get(tree))[0]
     }
     shapes = {name: list(array.shape) for name, array in arrays.items()}
-    whole = {"schema": SCHEMA, **facts, "shapes": shapes, "digest": _digest(arrays)}
+    # Orbax takes no array without numbers, as the memory of a network without one is.
+    empty = {name: str(array.dtype) for name, array in arrays.items() if array.size == 0}
+    whole = {"schema": SCHEMA, **facts, "shapes": shapes, "empty": empty, "digest": _digest(arrays)}
     place = run / FOLDER / f"{iteration:08d}"
     with replace_folder(place) as fresh:
         # At least one axis each: Orbax gives scalars back as Python numbers.
-        _arrays_file().save((fresh / ARRAYS).resolve(), {k: np.atleast_1d(v) for k, v in arrays.items()})
+        _arrays_file().save((fresh / ARRAYS).resolve(), {k: np.atleast_1d(v) for k, v in arrays.items() if v.size})
         (fresh / FACTS).write_text(json.dumps(whole, indent=1) + "\n")
         if add is not None:
             add(fresh)
@@ -136,7 +138,8 @@ def load_checkpoint(folder: Path, iteration: int | None = None) -> Stored:
         raise CheckpointError(f"{place / FACTS}: {other_schema(found, SCHEMA, 'train anew with `--overwrite`')}")
     try:
         restored = _arrays_file().restore((place / ARRAYS).resolve())
-        arrays = {name: np.asarray(restored[name]).reshape(shape) for name, shape in facts["shapes"].items()}
+        whole = {**restored, **{name: np.zeros(0, dtype) for name, dtype in facts["empty"].items()}}
+        arrays = {name: np.asarray(whole[name]).reshape(shape) for name, shape in facts["shapes"].items()}
     except Exception as error:  # a truncated file surfaces as whatever the storage library makes of it
         raise CheckpointError(f"{place}: damaged checkpoint: its arrays cannot be read") from error
     if _digest(arrays) != facts.get("digest"):

@@ -6,7 +6,10 @@ from typing import Any, ClassVar, Literal
 
 from subterra_jax.b2.gait import RELEASED
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.tasks import TaskError, find
+from subterra_jax.policies.memories import MEMORIES
+from subterra_jax.tasks import TASKS
+
+PRESETS = ("cpu", "gpu")
 
 
 class ConfigError(SubterraError, ValueError):
@@ -43,49 +46,68 @@ def share(config: Any, *names: str) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Settings that every kind of policy is trained with; a preset fills them in, the command line may change each.
+    """Settings of PPO; a preset fills them in, the command line may change each.
 
     Attributes:
         seed: Seed of everything random in the run.
         steps: Environment steps to train for, all environments together; rounded up to whole iterations.
+        memory: `none`; `stack`: the last `frames` observations; `gru`: a network that remembers; `along`: the learnt
+            localiser, which looks along the metres that it has passed.
+        frames: Observations in the stack.
+        cell: Width of the GRU.
+        auxiliary: Learn what only the simulator knows as well: with `gru` the error of the way to go, with `along` the
+            true station. It is a target and never an input.
+        begin_from: Policy whose weights are taken where they fit, by name, file or run folder: network, localiser.
         n_envs: Environments stepped together.
-        unroll: Steps of each environment in one iteration; with memory, the length of back-propagation through time.
+        unroll: Steps of each environment in one iteration; with `gru`, the length of back-propagation through time.
         epochs: Passes over the data of one iteration.
         minibatches: Minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments.
+        hidden: Widths of the hidden layers, of policy and value alike.
+        half: Compute in bfloat16; weights stay float32.
         init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
-        min_std: Floor of that standard deviation.
         learning_rate: Learning rate of Adam, at the start and at most.
+        target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
+            it constant.
         max_grad_norm: Gradients are scaled down to this norm.
         discount: Per control period.
         gae_lambda: Mix of one-step and n-step advantages.
         clip: Half-width of the trust region of the probability ratio.
         entropy_weight: Reward for randomness, in units of the loss.
         value_weight: Weight of the value loss.
+        auxiliary_weight: Weight of the auxiliary loss of `gru`.
         stop_coverage: Training ends once the rolling-100 coverage is at least this (a share of the tunnel)
             and every one of those episodes succeeded; a value above 1 never stops.
         stop_patience: For how many iterations in a row that must hold.
         checkpoint_every: Iterations between checkpoints; one is written at the end in any case.
         parts: Parts that the environments are split into, each with draws of its own. As many devices as divide them
             share them out; the result does not depend on how many those are.
-        sums: `ordered`: one seed gives one result on a GPU as well. `any`: a GPU adds up in any order, some 3 % faster.
+        sums: `ordered`: one seed gives one result on a GPU as well. `any`: a GPU adds up in any order.
     """
 
     seed: int = 0
     steps: int = 1_500_000
+    memory: Literal["none", "stack", "gru", "along"] = "none"
+    frames: int = 4
+    cell: int = 128
+    auxiliary: bool = False
+    begin_from: str | None = None
     n_envs: int = 128
-    unroll: int = 128
+    unroll: int = 64
     epochs: int = 4
-    minibatches: int = 8
+    minibatches: int = 4
+    hidden: tuple[int, ...] = (64, 64)
+    half: bool = False
     init_std: float = 0.5
-    min_std: float = 0.01
-    learning_rate: float = 1e-3
+    learning_rate: float = 4e-4
+    target_kl: float = 0.0
     max_grad_norm: float = 0.5
-    discount: float = 0.98
+    discount: float = 0.997
     gae_lambda: float = 0.95
     clip: float = 0.2
-    entropy_weight: float = 1e-3
+    entropy_weight: float = 2e-3
     value_weight: float = 0.5
-    stop_coverage: float = 0.9
+    auxiliary_weight: float = 0.1
+    stop_coverage: float = 2.0
     stop_patience: int = 40
     checkpoint_every: int = 50
     parts: int = 1
@@ -117,78 +139,52 @@ class TrainConfig:
         return self.n_envs // self.parts
 
 
-@dataclasses.dataclass(frozen=True)
-class PPOConfig(TrainConfig):
-    """Settings of PPO with a multilayer perceptron.
-
-    Attributes:
-        hidden: Widths of the hidden layers, of policy and value alike.
-        frames: Observations stacked into the input of the networks.
-        target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
-            it constant. Early on, all environments are at the same stage of their episode; a rate that rises freely
-            then overfits the network to that stage.
-    """
-
-    hidden: tuple[int, ...] = (64, 64)
-    frames: int = 4
-    target_kl: float = 0.01
-
-
-# Reward weights g = 100, c_d = 0.1, c_s = 0.01 are the environment's own defaults; only PPO's settings are here.
-_PRESETS: dict[str, PPOConfig] = {
-    "cpu": PPOConfig(),
-    # At least a million transitions per iteration, or the launches of SGD cap the rate.
-    "gpu": PPOConfig(
-        steps=60_000_000,
-        # More environments would not learn sooner: each has to drive the whole tunnel once before anyone succeeds.
-        n_envs=4096,
-        unroll=256,
-        epochs=2,
-        minibatches=32,
-        hidden=(256, 256),
-        stop_patience=20,
-        checkpoint_every=20,
-    ),
+# At least half a million transitions per iteration, or the launches of SGD cap the rate.
+_GPU: dict[str, Any] = {
+    "steps": 200_000_000,
+    "n_envs": 8192,
+    "epochs": 2,
+    "minibatches": 8,
+    "hidden": (128, 128),
+    "checkpoint_every": 100,
 }
-# What differs from that by task. T1 to T5 are here for comparison: without memory nobody passes the blind bound, and
-# coverage does not say who has learnt them.
-_GOAL = {"stop_coverage": 2.0}
-_TASKS: dict[str, dict[str, dict[str, Any]]] = {
-    "Subterra/Traverse-v1": {"cpu": {"steps": 4_000_000, "stop_patience": 60}, "gpu": {}},
-    "Subterra/TraverseShort-v1": {"cpu": {}, "gpu": {"steps": 30_000_000}},
+# An iteration of a GRU costs the same launches however many robots there are.
+_BY_MEMORY: dict[str, dict[str, Any]] = {
+    "gru": {"n_envs": 32_768, "unroll": 32, "minibatches": 8},
+    "along": {"n_envs": 2048, "minibatches": 4},
 }
-_OTHERS: dict[str, dict[str, Any]] = {
-    "cpu": {**_GOAL, "steps": 4_000_000},
-    "gpu": {**_GOAL, "steps": 130_000_000, "discount": 0.99},
-}
+_COVER = {"stop_coverage": 0.9}
 
 
-def make_config(task: str, preset: str = "cpu") -> PPOConfig:
+def make_config(task: str, preset: str = "cpu", memory: str = "none") -> TrainConfig:
     """Returns the settings that are known to learn a task on one kind of machine.
 
     Args:
-        task: Task id, `Subterra/TraverseShort-v1` say.
+        task: Task id, `Subterra/StopAtShort-v1` say.
         preset: `cpu` or `gpu`.
+        memory: Memory of the policy.
 
     Raises:
-        ConfigError: There is no preset of that name, or none for that task.
+        ConfigError: There is no preset or memory of that name.
     """
     known_preset(preset)
-    try:
-        task = find(task)
-    except TaskError as error:
-        raise ConfigError(str(error)) from error
-    different = _TASKS[task][preset] if task in _TASKS else _OTHERS[preset]
-    return dataclasses.replace(_PRESETS[preset], **different)
+    if memory not in MEMORIES:
+        raise ConfigError(f"unknown memory {memory!r}; there are {', '.join(MEMORIES)}")
+    settings: dict[str, Any] = {"memory": memory}
+    if preset == "gpu":
+        settings |= {**_GPU, **_BY_MEMORY.get(memory, {})}
+    if task in TASKS and TASKS[task].rule.errand == "cover":
+        settings |= _COVER
+    return TrainConfig(**settings)
 
 
 def known_preset(preset: str) -> None:
     """Raises `ConfigError` where there is no preset of that name."""
-    if preset not in _PRESETS:
-        raise ConfigError(f"unknown preset {preset!r}; there are {', '.join(_PRESETS)}")
+    if preset not in PRESETS:
+        raise ConfigError(f"unknown preset {preset!r}; there are {', '.join(PRESETS)}")
 
 
-def check(config: PPOConfig) -> PPOConfig:
+def check(config: TrainConfig) -> TrainConfig:
     """Refuses settings that make no sense, and returns the others.
 
     Raises:
@@ -196,19 +192,7 @@ def check(config: PPOConfig) -> PPOConfig:
     """
     if not config.hidden or min(config.hidden) < 1:
         raise ConfigError(f"hidden must name at least one width, all at least 1, got {config.hidden}")
-    at_least(config, 1, "frames")
-    not_negative(config, "target_kl")
-    check_common(config)
-    return config
-
-
-def check_common(config: TrainConfig) -> None:
-    """Refuses settings that make no sense for any kind of policy.
-
-    Raises:
-        ConfigError: Naming the first setting that does not, and its value.
-    """
-    at_least(config, 1, "steps", "n_envs", "unroll", "epochs", "minibatches", "parts")
+    at_least(config, 1, "steps", "n_envs", "unroll", "epochs", "minibatches", "parts", "frames", "cell")
     at_least(config, 1, "stop_patience", "checkpoint_every")
     if config.seed < 0:
         raise ConfigError(f"seed must not be negative, got {config.seed}")
@@ -220,10 +204,13 @@ def check_common(config: TrainConfig) -> None:
             f"of minibatches = {config.minibatches}"
         )
     positive(config, "learning_rate", "init_std", "max_grad_norm", "clip")
-    not_negative(config, "entropy_weight", "value_weight", "stop_coverage")
+    not_negative(config, "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
     share(config, "discount", "gae_lambda")
-    if not 0.0 < config.min_std < config.init_std:
-        raise ConfigError(f"min_std must lie between 0 and init_std = {config.init_std}, got {config.min_std}")
+    if config.auxiliary and config.memory not in ("gru", "along"):
+        raise ConfigError(
+            f"auxiliary is learnt by a memory, gru or along, and memory = {config.memory} has none to ask"
+        )
+    return config
 
 
 @dataclasses.dataclass(frozen=True)

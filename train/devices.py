@@ -79,7 +79,7 @@ class Spread:
     """
 
     def __init__(self, learner: Any, devices: list[Any] | None = None) -> None:
-        self.learner, self.config, self.networks = learner, learner.config, learner.networks
+        self.learner, self.config, self.driver = learner, learner.config, learner.driver
         n_parts, found = self.config.parts, jax.devices() if devices is None else devices
         if n_parts < 2:
             raise ConfigError(f"parts must be at least 2 to be spread over devices, got {n_parts}")

@@ -70,11 +70,11 @@ class Command:
     """Scores a trained policy without its exploration noise, on the fixed list of episodes.
 
     Attributes:
-        policy: Run folder of `train.navigate`, one checkpoint in it, a `.safetensors` file, or the name of a released
+        policy: Run folder of `train`, one checkpoint in it, a `.safetensors` file, or the name of a released
             policy; the one released for the task if left out.
         task: Task id; the one it was trained on if left out.
-        tunnel: Tunnel file or name; the packaged tunnel if left out.
-        lining: Variant of the walls; the one it was trained on if left out.
+        tunnel: Tunnel file or names, as in training; the packaged tunnel, or a few of `open:train`, if left out.
+        lining: Variant of the walls; the tunnel's usual one if left out.
         episodes: Episodes to drive, the first of the task's 500.
         json: One line of JSON instead of a table.
     """
@@ -91,10 +91,8 @@ def command(arguments: Command) -> None:
     """Evaluates the policy and prints its scores."""
     check_episodes(arguments.episodes)
     agent, facts = open_agent(arguments.policy, arguments.task)
-    lining = arguments.lining
-    if lining is None and arguments.tunnel is None:
-        lining = facts["world"]["lining"]
-    world = open_world(arguments.task or facts["task"], arguments.tunnel, lining, facts["world"].get("sensor", PLANAR))
+    sensor = facts.get("world", {}).get("sensor", PLANAR)
+    world = open_world(arguments.task or facts["task"], arguments.tunnel, arguments.lining, sensor)
     source = arguments.policy or agent.name
     released.check_fits(agent, world.env, world.params, source)
     found = {**world.facts, **evaluate(world, agent, arguments.episodes)}

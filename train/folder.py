@@ -24,7 +24,7 @@ from train.checkpoint import (
 )
 from train.config import ConfigError, TrainConfig
 from train.log import EPISODES, LOG, TABLE
-from train.policies import write_policy
+from train.policies import write_tensors
 from train.sinks import TENSORBOARD
 from train.snapshot import Best, EpisodeWindow, Snapshot, Trainable
 from train.world import REWARD, World, library_versions
@@ -100,7 +100,7 @@ class RunFolder:
         """
         stored = load_checkpoint(self.path, iteration)
         facts = stored.facts
-        self._check_same(facts.get("kind", "mlp"), facts["world"], facts["config"])
+        self._check_same(facts["kind"], facts["world"], facts["config"])
         shapes = jax.eval_shape(self._learner.init, jax.random.PRNGKey(0), self._world.params)
         best = facts["best"]
         snapshot = Snapshot(
@@ -110,7 +110,7 @@ class RunFolder:
             best=Best(
                 score=(best["success"], best["episode_return"]),
                 iteration=best["iteration"],
-                policy=stored.restore("policy", self._learner.networks.policy_shapes()),
+                policy=stored.restore("policy", jax.eval_shape(self._learner.policy_of, shapes)),
             ),
             solved_for=facts["solved_for"],
         )
@@ -145,8 +145,8 @@ class RunFolder:
             CheckpointError: It is of another network.
             ConfigError: It was trained on something else or with other settings.
         """
-        if kind != self._learner.networks.kind:
-            raise CheckpointError(f"{self.path}: made for another network: {kind}, not {self._learner.networks.kind}")
+        if kind != self._learner.driver.kind:
+            raise CheckpointError(f"{self.path}: made for another network: {kind}, not {self._learner.driver.kind}")
         config = _plain(self._learner.config)
         was = f"{self.path}: was trained with"
         for name in sorted({REWARD, *self._world.facts}):
@@ -163,7 +163,8 @@ class RunFolder:
         score, state = snapshot.best.score, self._learner.gather(snapshot.state)
         if not devices.leads():
             return
-        networks = self._learner.networks
+        driver = self._learner.driver
+        tensors = driver.tensors(snapshot.policy)
         facts = {
             "world": self._world.facts,
             "task": self._world.task,
@@ -177,13 +178,19 @@ class RunFolder:
             {"policy": snapshot.policy, "state": state},
             {
                 **facts,
-                "kind": networks.kind,
-                "layout": dataclasses.asdict(networks.layout),
+                "kind": driver.kind,
+                "layout": driver.layout.to_json(),
                 "best": {"success": score[0], "episode_return": score[1], "iteration": snapshot.best.iteration},
                 "solved_for": snapshot.solved_for,
                 "window": snapshot.window.to_json(),
             },
-            lambda place: write_policy(place / f"{CHECKPOINT_POLICY}{TENSORS}", networks, snapshot.policy, facts),
+            lambda place: write_tensors(
+                place / f"{CHECKPOINT_POLICY}{TENSORS}",
+                driver.kind,
+                driver.layout,
+                driver.tensors(snapshot.policy),
+                facts,
+            ),
         )
 
     def has(self, iteration: int) -> bool:
@@ -202,7 +209,7 @@ class RunFolder:
             {
                 "schema": SCHEMA,
                 **self._world.facts,
-                "kind": self._learner.networks.kind,
+                "kind": self._learner.driver.kind,
                 "config": _plain(self._learner.config),
                 **({} if self._command is None else {"command": self._command}),
                 "device": f"{device.platform}: {device.device_kind}",

@@ -1,110 +1,66 @@
-"""Parts of learning that every learner shares: statistics, advantages, and epochs of minibatches.
+"""Parts of learning: running statistics, advantages, PPO's objective, and epochs of minibatches."""
 
-Of Brax, its networks, distribution and running statistics are used. Importing them loads MuJoCo, which prints to stdout
-the plugins that it did not find. Commands keep stdout for their own answers (`--json` is one line), so the import
-happens with stdout closed. Brax's own PPO trainer is not used: it calls `jax.device_put_replicated`, which jax 0.10 no
-longer has.
-"""
+from typing import Any
 
-import contextlib
-import io
-from collections.abc import Callable
-from typing import Any, TypeAlias
-
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
-from subterra_jax.host.errors import MissingLibraryError
-from subterra_jax.policies import senses
 from train import devices
 
-try:
-    with contextlib.redirect_stdout(io.StringIO()):
-        from brax.training.acme import running_statistics
-        from brax.training.distribution import NormalTanhDistribution
-        from brax.training.networks import MLP
-except ImportError as missing:
-    raise MissingLibraryError(__name__, "brax", "train") from missing
-
-__all__ = [
-    "MLP",
-    "NormalTanhDistribution",
-    "Statistics",
-    "TrainState",
-    "advantages",
-    "clipped_adam",
-    "clipped_objective",
-    "descend",
-    "discounted_returns",
-    "glance",
-    "normalize",
-    "run_epochs",
-    "split_keys",
-    "start_statistics",
-    "update_statistics",
-]
-
-Statistics: TypeAlias = running_statistics.RunningStatisticsState
 # A reading that has not moved yet, such as odometry at a start, would otherwise be divided by nothing.
 _STD_MIN = 1e-3
 _LARGEST = 10.0
-_PATCH_WIDTH, _GLANCE_WIDTH = 32, 64
 
 
 @struct.dataclass
-class TrainState:
-    """State of a run between two iterations, of a learner that needs nothing else.
+class Statistics:
+    """Running mean and standard deviation.
 
     Attributes:
-        weights: Of the networks.
-        moments: State of the optimiser.
-        drive: State of the environments.
-        key: Source of all later randomness.
-        iteration: Iterations done.
+        count: Numbers seen.
+        mean: Their mean.
+        square: Sum of squares of their distances from it.
     """
 
-    weights: Any
-    moments: Any
-    drive: Any
-    key: PRNGKeyArray
-    iteration: Int[Array, ""]
+    count: Float[Array, ""]
+    mean: Float[Array, "*n"]
+    square: Float[Array, "*n"]
+
+    @property
+    def std(self) -> Float[Array, "*n"]:
+        """Standard deviation, at least 0.001; 1 before any number."""
+        spread = jnp.sqrt(self.square / jnp.maximum(self.count, 1.0))
+        return jnp.where(self.count > 0.0, jnp.maximum(spread, _STD_MIN), 1.0)
 
 
 def start_statistics(shape: tuple[int, ...]) -> Statistics:
     """Returns statistics of no data yet: mean 0, standard deviation 1."""
-    statistics = running_statistics.init_state(jnp.zeros(shape, jnp.float32))
-    # Brax starts with Python numbers, which would compile everything twice.
-    return jax.tree.map(jnp.asarray, statistics)
+    return Statistics(jnp.zeros(()), jnp.zeros(shape), jnp.zeros(shape))
 
 
 def update_statistics(statistics: Statistics, batch: Float[Array, "..."], split: devices.Parts = ()) -> Statistics:
-    """Adds a batch of all parts to the statistics; its leading axes are all batch axes."""
-    return running_statistics.update(statistics, batch, std_min_value=_STD_MIN, pmap_axis_name=split or None)
+    """Adds a batch of all parts to the statistics; its leading axes are all batch axes.
 
-
-def normalize(observation: Float[Array, "*batch obs"], statistics: Statistics) -> Float[Array, "*batch obs"]:
-    """Returns the observation in standard deviations from its mean, clipped to ± 10."""
-    return running_statistics.normalize(observation, statistics, max_abs_value=_LARGEST)
-
-
-def glance(
-    image: Float[Array, "*batch pixels"], shape: tuple[int, int], number: Any = jnp.float32
-) -> Float[Array, "*batch 64"]:
-    """Returns what a network sees of an image: first patch by patch, then as a whole. To be called in its `__call__`.
-
-    Args:
-        image: Ranges over 30 m, row by row.
-        shape: Rows and columns, multiples of 4.
-        number: Type that the layers compute with.
+    Source: Chan et al., Updating Formulae and a Pairwise Algorithm for Computing Sample Variances, 1979.
     """
-    tiles = senses.patches(image, shape).astype(number)
-    tiles = nn.swish(nn.Dense(_PATCH_WIDTH, name="patch", dtype=number)(tiles))
-    tiles = tiles.reshape(*tiles.shape[:-2], -1)
-    return nn.swish(nn.Dense(_GLANCE_WIDTH, name="glance", dtype=number)(tiles))
+    axes = tuple(range(batch.ndim - statistics.mean.ndim))
+    n_parts = jax.lax.psum(1.0, split) if split else 1.0
+    n = n_parts * batch.size / max(statistics.mean.size, 1)
+    mean = devices.mean_over_parts(jnp.mean(batch, axis=axes), split)
+    square = n * devices.mean_over_parts(jnp.mean(jnp.square(batch - mean), axis=axes), split)
+    total, apart = statistics.count + n, mean - statistics.mean
+    return Statistics(
+        count=total,
+        mean=statistics.mean + apart * n / total,
+        square=statistics.square + square + jnp.square(apart) * statistics.count * n / total,
+    )
+
+
+def normalize(observation: Float[Array, "*batch obs"], mean: Array, std: Array) -> Float[Array, "*batch obs"]:
+    """Returns the observation in standard deviations from its mean, clipped to ± 10."""
+    return jnp.clip((observation - mean) / std, -_LARGEST, _LARGEST)
 
 
 def discounted_returns(
@@ -202,50 +158,17 @@ def clipped_objective(
     }
 
 
-def clipped_adam(config: Any, final_share: float) -> optax.GradientTransformation:
-    """Returns Adam with clipped gradients; its learning rate falls to a share of itself along a cosine."""
-    updates = config.iterations * config.epochs * config.minibatches
-    rate = optax.cosine_decay_schedule(config.learning_rate, updates, alpha=final_share)
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
-
-
-def descend(optimizer: optax.GradientTransformation, learnt: tuple[Any, Any], gradients: Any) -> tuple[Any, Any]:
-    """Takes one gradient step; `learnt` and the result are weights and the optimiser's moments."""
-    weights, moments = learnt
-    updates, moments = optimizer.update(gradients, moments)
-    return optax.apply_updates(weights, updates), moments
-
-
-def split_keys(key: PRNGKeyArray, shape: tuple[int, ...]) -> Array:
-    """Returns one key for each of `shape[0]` minibatches."""
-    return jax.random.split(key, shape[0])
-
-
-def run_epochs(
-    step: Callable[[Any, Array, Any], tuple[Any, Any]],
-    start: Any,
-    config: Any,
-    key: PRNGKeyArray,
-    make_keys: Callable[[PRNGKeyArray, tuple[int, ...]], Array] | None = split_keys,
-) -> tuple[Any, Any]:
-    """Takes a step for every minibatch of every epoch of one iteration.
+def auxiliary_loss(estimate: Float[Array, "*batch 2"], error: Float[Array, "*batch 1"]) -> Float[Array, ""]:
+    """Returns the mean negative log likelihood of an error under a Laplace distribution about its estimate.
 
     Args:
-        step: From weights and moments, the minibatch's environments `(n,)` and its keys, to weights and moments
-            afterwards, and scalars.
-        start: Weights and moments before.
-        config: A `TrainConfig`.
-        key: Of the order of the environments, and of `make_keys`.
-        make_keys: From a key and `(minibatches, n)` to keys whose first axis is minibatches; None: steps draw nothing.
-
-    Returns:
-        Weights and moments afterwards, and the scalars `(epochs, minibatches, …)`.
+        estimate: Error estimated, m, and log of its scale, m.
+        error: True error, m.
     """
+    log_scale = jnp.clip(estimate[..., 1], -4.0, 5.0)
+    return jnp.mean(jnp.abs(error[..., 0] - estimate[..., 0]) * jnp.exp(-log_scale) + log_scale)
 
-    def epoch(now: Any, key_now: PRNGKeyArray) -> tuple[Any, Any]:
-        key_order, key_steps = (key_now, key_now) if make_keys is None else jax.random.split(key_now)
-        order = jax.random.permutation(key_order, config.part_envs).reshape(config.minibatches, config.minibatch_envs)
-        keys = None if make_keys is None else make_keys(key_steps, order.shape)
-        return jax.lax.scan(lambda so_far, given: step(so_far, *given), now, (order, keys))
 
-    return jax.lax.scan(epoch, start, jax.random.split(key, config.epochs))
+def take_envs(tree: Any, block: Array, width: int, axis: int) -> Any:
+    """Returns a block of `width` environments of every leaf."""
+    return jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, block * width, width, axis), tree)

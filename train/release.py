@@ -8,17 +8,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
+from subterra_jax import policies as released
 from subterra_jax.host.command import parse, run_command
 from subterra_jax.host.files import require_file
 from subterra_jax.policies import TRAINED_UNDER, Conditions
 from subterra_jax.policies.files import TENSORS
-from train.config import Legs
+from subterra_jax.policies.learnt import Learnt
+from train.config import ConfigError, Legs
 from train.evaluate import evaluate
-from train.locate import release as localiser
 from train.log import print_table
-from train.policies import load_policy, make_agent, write_policy
+from train.policies import write_tensors
 from train.world import PLANAR, World, library_versions, open_world
 
 
@@ -27,12 +29,12 @@ class Command:
     """Releases a trained policy with its scores on the task's fixed list of episodes.
 
     Attributes:
-        run: Run folder of `train.navigate`, or one checkpoint in it; or the folder of a seed of `train.locate`.
+        run: Run folder of `train`, or one checkpoint in it.
         out: The tensors' file, which ends in `.safetensors`; the facts go beside it.
         tunnel: Tunnel file or name of the evaluation; the packaged tunnel if left out.
         lining: Variant of the walls of the evaluation; the tunnel's usual one if left out.
         episodes: Episodes of the evaluation.
-        measured: Tables of `benchmarks.kinds` or `train.locate.look` whose rows go into the card of a localiser.
+        half: Write the weights in float16.
     """
 
     run: tyro.conf.Positional[Path]
@@ -40,19 +42,17 @@ class Command:
     tunnel: Path | None = None
     lining: str | None = None
     episodes: int = 500
-    measured: tuple[Path, ...] = ()
+    half: bool = False
 
 
 def command(arguments: Command) -> None:
     """Evaluates the policy and writes its two files."""
     require_file(arguments.out, TENSORS)
-    if localiser.is_localiser(arguments.run):
-        found = localiser.release(arguments.run, arguments.out, arguments.episodes, arguments.measured)
-        print_table(str(arguments.out), {name: value for name, value in found.items() if value is not None})
-        return
-    networks, policy, stored = load_policy(arguments.run)
+    agent, stored = released.load(arguments.run)
     world = _world(stored, arguments)
-    found = evaluate(world, make_agent(networks, policy), arguments.episodes)
+    if not isinstance(agent, Learnt):
+        raise ConfigError(f"{arguments.run}: a policy of kind {stored['kind']}, which this command does not release")
+    found = evaluate(world, agent, arguments.episodes)
     facts = {
         "task": stored["task"],
         "world": stored["world"],
@@ -63,7 +63,8 @@ def command(arguments: Command) -> None:
         "versions": library_versions(),
         "scores": {**world.facts, **found},
     }
-    write_policy(arguments.out, networks, policy, facts)
+    tensors = {name: np.asarray(tensor) for name, tensor in agent.tensors.items()}
+    write_tensors(arguments.out, agent.kind, agent.layout, tensors, facts, arguments.half)
     print_table(str(arguments.out), {name: value for name, value in found.items() if value is not None})
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from subterra_jax.evaluation.episodes import SHA256
 from subterra_jax.host.command import EXIT_INTERRUPTED
 from subterra_jax.host.files import replace_file
-from train import devices
+from train import clock, devices
 from train.checkpoint import iterations
 from train.config import ConfigError
 from train.curve import GOAL, write_curve
@@ -93,14 +93,7 @@ class Session:
                 return stop
 
             try:
-                last = train(
-                    world.env,
-                    world.params,
-                    config,
-                    learner=self.learner,
-                    snapshot=snapshot,
-                    watch=watch,
-                )
+                last = train(self.learner, world.params, snapshot=snapshot, watch=watch)
             finally:
                 bar.close()
                 self.close()
@@ -136,8 +129,8 @@ class Session:
 
     def score(self, snapshot: Snapshot, episodes: int) -> dict[str, Any]:
         """Evaluates the policy that was kept, writes `evaluation.json`, and prints the scores."""
-        agent = make_agent(self.learner.networks, snapshot.policy)
-        found = evaluate(self.world, agent, episodes)
+        agent = make_agent(self.learner.driver, snapshot.policy)
+        found = evaluate(self.world.scored(), agent, episodes)
         self.folder.write_json(EVALUATION, {"schema": "subterra.evaluation/1", **self.world.facts, **found})
         kept = "best" if self.learner.config.KEEPS_BEST else "last"
         told = {name: value for name, value in found.items() if value is not None and value != SHA256}
@@ -191,7 +184,10 @@ def run_seeds(out: Path, sessions: list[Session], *, resume: bool, overwrite: bo
         if interrupt.wanted:
             print("interrupted; go on with --resume", file=sys.stderr)
             return EXIT_INTERRUPTED
+    if not episodes:
+        return 0
     found = [session.score(snapshot, episodes) for session, snapshot in zip(sessions, last, strict=True)]
+    clock.lap("evaluate")
     write_summary(out, [session.folder.path for session in sessions], found)
     return 0
 

@@ -119,10 +119,10 @@ class Trainable(Protocol):
     """A learner of any kind.
 
     Attributes:
-        networks: With `kind`, `layout` and `policy_shapes`.
+        driver: With `kind` and `layout`.
     """
 
-    networks: Any
+    driver: Any
 
     @property
     def config(self) -> Any:
@@ -223,6 +223,8 @@ def advance(
     """
     iteration, window = before.iteration + 1, before.window
     if broken := [name for name, value in metrics.items() if not math.isfinite(value)]:
+        if "reward_mean" in broken:
+            raise TrainingError(f"iteration {iteration}: the task's reward is not finite; a reward must be a number")
         raise TrainingError(
             f"iteration {iteration}: {', '.join(broken)} {'is' if len(broken) == 1 else 'are'} no longer finite; "
             "the last checkpoint is good, and a smaller learning_rate may help"

@@ -20,7 +20,7 @@ from subterra_jax.host.files import require_file
 from subterra_jax.host.task_ids import WALK
 from subterra_jax.policies.files import TENSORS
 from subterra_jax.tunnel.sources import load_tunnel, tunnel_digest
-from train.b2.walking import WalkConfig, WalkLearner, WalkSession, make_walk_config
+from train.b2.walking import WalkConfig, WalkSession, make_walk_config, make_walk_learner
 from train.config import ConfigError, check
 from train.options import insert_file, reward_of, settings_of, with_weights
 from train.session import check_seeds
@@ -132,7 +132,7 @@ def command(arguments: Command) -> int:
 def _train_seed(arguments: Command, world: World, config: WalkConfig, out: Path) -> bool:
     """Trains, scores and releases one seed; False after Ctrl-C."""
     n_seen = dataclasses.replace(world.env, privileged=False).observation_size(world.params)
-    learner = WalkLearner(world.env, world.params, config, n_seen)
+    learner = make_walk_learner(world.env, world.params, config, n_seen)
     alone = settings_of(dataclasses.replace(arguments, config=config))
     session = WalkSession(out, world, learner, logs=arguments.logs, command=alone)
     last = session.train(resume=arguments.resume, overwrite=arguments.overwrite, label=f"seed {config.seed}")

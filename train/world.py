@@ -13,14 +13,13 @@ import jax.numpy as jnp
 import subterra_jax as st
 from subterra_jax.host.versions import VERSION
 from subterra_jax.policies import TRAINED_UNDER, training_conditions
-from subterra_jax.procedural import expand
 from subterra_jax.tasks import TaskError, find
 from train import tunnels
 from train.config import ConfigError
 from train.tunnels import PLANAR
 
 REWARD = "reward"  # fact of a world with other weights than the task's
-_PACKAGES = ("jax", "jaxlib", "flax", "optax", "brax", "orbax-checkpoint", "numpy")
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +32,8 @@ class World:
         params: Its parameters.
         facts: Task, lining, and the tunnel file's name, provenance and SHA-256: the identity of the world.
         unchanged: Its params before `with_reward`; None where nothing was changed.
+        made: The tunnels, of which maps are made.
+        val: World of the evaluation after training; None is this one.
     """
 
     task: str
@@ -40,6 +41,12 @@ class World:
     params: Any
     facts: dict[str, Any]
     unchanged: Any = None
+    made: tuple[Any, ...] = ()
+    val: "World | None" = None
+
+    def scored(self) -> "World":
+        """Returns the world of the evaluation after training."""
+        return self if self.val is None else self.val
 
     @property
     def task_params(self) -> Any:
@@ -97,7 +104,7 @@ def require_task(task: str) -> str:
         ConfigError: There is no such task, or this command does not learn it.
     """
     try:
-        task = find(task)
+        task = find(task if "/" in task or ":" in task else f"Subterra/{task}")
     except TaskError as error:
         raise ConfigError(str(error)) from error
     if task not in st.TASKS:
@@ -105,44 +112,62 @@ def require_task(task: str) -> str:
     return task
 
 
-def open_world(task: str, tunnel: Path | str | None, lining: str | None = None, sensor: str = PLANAR) -> World:
+_TUNNELS = {"cpu": "open:train:0-3", "gpu": "open:train:0-15"}
+
+
+def open_world(
+    task: str,
+    tunnel: Path | str | None,
+    lining: str | None = None,
+    sensor: str = PLANAR,
+    val: Path | str | None = None,
+    preset: str | None = "cpu",
+) -> World:
     """Opens a task on a tunnel.
 
     Args:
         task: Task id.
-        tunnel: File or name; None is the packaged tunnel. `open:train:0-255` means several tunnels, of which each
-            episode draws one.
+        tunnel: File or name, or several names with commas between, as `open:train:0-15`, of which each episode draws
+            one. None is a few of `open:train` in a task with a goal, and the packaged tunnel elsewhere.
         lining: Variant of the walls; None is the tunnel's usual one.
         sensor: LiDAR, as `st.make` takes it by name.
+        val: Tunnels of the evaluation after training; None is `tunnel`.
+        preset: Says how many tunnels are a few.
 
     Raises:
         ConfigError: There is no such task or sensor, or the tunnel has no room for it.
         TunnelError: The tunnel file is missing or wrong, or has no such lining.
     """
     task = require_task(task)
-    names: list[str | Path | None] = [tunnel] if tunnel is None else [*expand(str(tunnel))]
+    if tunnel is None and st.TASKS[task].rule.errand != "cover":
+        tunnel = _TUNNELS[preset or "cpu"]
+    world = _open(task, tunnel, lining, sensor)
+    return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor))
+
+
+def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str) -> World:
+    names: list[str | Path | None] = [tunnel] if tunnel is None else [*tunnels.names_of(str(tunnel))]
     several = len(names) > 1
-    plan = st.load_tunnel(names[0], solid=sensor != PLANAR and not several)
-    lining = lining or plan.default_lining
     try:
-        made = tunnels.load(names, lining, None, sensor, st.TASKS[task].piece) if several else plan
-        env, params = st.make(task, tunnel=made, lining=lining, sensor=sensor)
+        made = tunnels.load(names, lining, None, sensor, st.TASKS[task].piece)
+        env, params = tunnels.enter(task, made, sensor)
     except st.SubterraError:
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from error
+    plan = st.load_tunnel(names[0]) if not several else None
     digests = tunnels.digests(names)
     facts = {
         "task": task,
-        "lining": lining,
-        "tunnel": str(tunnel) if several else plan.name,
-        "tunnel_provenance": plan.provenance,
+        "lining": lining or (plan.default_lining if plan is not None else None),
+        "tunnel": plan.name if plan is not None else str(tunnel),
+        "tunnel_provenance": "generated" if plan is None else plan.provenance,
         "constants": st.constants_digest(env, params),
         "tunnel_sha256": hashlib.sha256("".join(digests).encode()).hexdigest() if several else digests[0],
     }
     if sensor != PLANAR:
         facts["sensor"] = sensor
-    return World(task, env, params, facts)
+    return World(task, env, params, facts, made=tuple(made))
 
 
 def library_versions() -> dict[str, str]:

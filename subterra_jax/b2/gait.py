@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2 import kinematics
 from subterra_jax.policies.files import GAIT, PolicyError, PolicyFile, read
-from subterra_jax.policies.networks import perceptron
-from subterra_jax.policies.trained import Tensors
+from subterra_jax.policies.network import act
+from subterra_jax.policies.trained import Tensors, nested
 
 _OFFSET = np.array([0.0, 0.5, 0.5, 0.0], np.float32)  # of each leg's clock: diagonal legs together
 _WEIGHT = b2.TOTAL_MASS * b2.GRAVITY
@@ -190,7 +190,7 @@ class WalkPolicy:
     It equals itself alone, so that `jax.jit(policy)` takes it.
 
     Attributes:
-        tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `policy.hidden_<i>`.
+        tensors: `statistics.mean` and `statistics.std` of one observation, and the layers `actor.…`.
         name: Name shown to people.
     """
 
@@ -205,8 +205,7 @@ class WalkPolicy:
     def act(self, observation: Float[Array, "*batch n_obs"]) -> Float[Array, "*batch 12"]:
         """Return the action, in [-1, 1]."""
         scaled = (observation - self.tensors["statistics.mean"]) / self.tensors["statistics.std"]
-        parameters = perceptron(self.tensors, "policy", jnp.clip(scaled, -_CLIP, _CLIP), jax.nn.swish)
-        return jnp.tanh(parameters[..., : parameters.shape[-1] // 2])
+        return jnp.tanh(act(nested(self.tensors)["actor"], jnp.clip(scaled, -_CLIP, _CLIP)))
 
     def initial_memory(self, key: PRNGKeyArray | None = None, n_envs: int | None = None) -> tuple[()]:
         """Return no memory; for `subterra_jax.policies.Policy`."""

@@ -75,7 +75,7 @@ class PolicyFile:
 
     Attributes:
         path: The tensors' file, for messages.
-        facts: The JSON file: name, kind (`mlp` or `gru`), task, layout, and where it comes from.
+        facts: The JSON file: name, kind (`ppo`, `locate` or `walk`), task, layout, and where it comes from.
         tensors: By name.
     """
 

@@ -10,16 +10,15 @@ import numpy as np
 
 from subterra_jax.baselines import registry
 from subterra_jax.compiled import in_32_bits
-from subterra_jax.policies.belief import Belief
 from subterra_jax.policies.files import GAIT, Conditions, PolicyError, PolicyFile, read, released
+from subterra_jax.policies.learnt import Learnt
 from subterra_jax.policies.locate.agent import Locating
-from subterra_jax.policies.networks import FeedForward, Recurrent
 from subterra_jax.policies.trained import Trained
 from subterra_jax.state import EnvParams
 from subterra_jax.tasks import TASKS, constants_digest
 from subterra_jax.tunnel_env import TunnelEnv
 
-KINDS: dict[str, type[Trained]] = {one.kind: one for one in (FeedForward, Recurrent, Belief, Locating)}
+KINDS: dict[str, type[Trained]] = {one.kind: one for one in (Learnt, Locating)}
 PREFIX = "policy:"  # of the names of released policies among the agents
 
 
@@ -48,7 +47,7 @@ def from_tensors(
 
     Args:
         kind: One of `KINDS`.
-        layout: `action_low`, `action_high`, and `frames`, `bin_width`, `habits` or `network`.
+        layout: `action_low`, `action_high`, and what `Layout.to_json` or the localiser's class says.
         tensors: By name, as the agent's class says.
         name: Name on the leaderboard.
         conditions: Conditions of its training, which `check_fits` compares; None: any.

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+import jax
 from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Agent
@@ -75,3 +76,21 @@ class Trained(Agent):
         """Returns the agent with the map of a task; itself if it uses none."""
         del params
         return self
+
+
+def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns weights by name as a tree: `match.taps` becomes `{"match": {"taps": …}}`."""
+    tree: dict[str, Any] = {}
+    for name, tensor in tensors.items():
+        *path, last = name.split(".")
+        branch = tree
+        for part in path:
+            branch = branch.setdefault(part, {})
+        branch[last] = tensor
+    return tree
+
+
+def flat(weights: Any) -> dict[str, Any]:
+    """Returns a tree of weights by name; the inverse of `nested`."""
+    leaves = jax.tree_util.tree_flatten_with_path(weights)[0]
+    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

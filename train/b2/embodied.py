@@ -47,7 +47,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
 def score(session: Session, snapshot: Snapshot, tunnel: Path | str | None, legs: Legs) -> dict[str, float]:
     """Has robots walk under the policy that was kept; writes `legs.json` and prints the figures."""
     env, params = _mission(session.world, tunnel, legs)
-    agent = make_agent(session.learner.networks, snapshot.policy)
+    agent = make_agent(session.learner.driver, snapshot.policy)
     found = transfer.figures(*transfer.walk_robots(env, params, agent, legs.robots), params)
     session.folder.write_json(ON_LEGS, {**dataclasses.asdict(legs), **session.world.facts, **found})
     print_table(f"{session.world.task}: {legs.robots} B2s in {legs.engine}, gait {legs.gait}", found)

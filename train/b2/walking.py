@@ -10,26 +10,28 @@ import jax
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from subterra_jax.b2.gait import WalkPolicy
 from subterra_jax.b2.params import WalkParams
 from subterra_jax.b2.walk import WalkEnv
 from subterra_jax.policies.files import GAIT
+from subterra_jax.policies.network import Network, Shape
+from subterra_jax.policies.trained import flat
 from train import learning
-from train.config import PPOConfig, known_preset
-from train.feedforward.learner import Learner, make_layout
-from train.feedforward.networks import Layout, Networks, Policy, Weights
+from train.config import TrainConfig, check, known_preset
+from train.driver import Driver, Policy
+from train.learner import Learner
 from train.log import LOG, print_table
-from train.policies import policy_tensors, write_policy
+from train.policies import write_tensors
 from train.session import EVALUATION, Session
 from train.snapshot import Snapshot
 from train.world import library_versions
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkConfig(PPOConfig):
-    """Settings of PPO for the walking robot; `PPOConfig` says what each is. Steps are control periods of 20 ms.
+class WalkConfig(TrainConfig):
+    """Settings of PPO for the walking robot; `TrainConfig` says what each is. Steps are control periods of 20 ms.
 
     On a GPU two runs of one seed part unless `sums` are `ordered`: MJX adds up by scattering.
     """
@@ -40,7 +42,6 @@ class WalkConfig(PPOConfig):
     epochs: int = 4
     minibatches: int = 32
     init_std: float = 0.3
-    min_std: float = 0.03
     learning_rate: float = 1e-3
     max_grad_norm: float = 1.0
     discount: float = 0.98
@@ -48,7 +49,7 @@ class WalkConfig(PPOConfig):
     value_weight: float = 0.5
     stop_coverage: float = 2.0
     hidden: tuple[int, ...] = (512, 256, 128)
-    frames: int = 1
+    target_kl: float = 0.01
     checkpoint_every: int = 100
     sums: Literal["ordered", "any"] = "any"
 
@@ -74,47 +75,71 @@ def make_walk_config(preset: str) -> WalkConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class WalkLayout(Layout):
-    """Layout of the walking robot's networks; `Layout` explains the other fields.
+class WalkLayout:
+    """Sizes of the walking robot's network.
 
     Attributes:
-        n_seen: Numbers at the head of the observation that the policy sees.
+        shape: Of the network: the actor sees the first `n_seen` numbers of the observation, the critic all.
     """
 
-    n_seen: int = 0
+    shape: Shape
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns the layout as a policy's file holds it."""
+        return dataclasses.asdict(self)
 
 
-class WalkNetworks(Networks):
-    """A policy of the first numbers of the observation, and a value of all of them."""
+class WalkDriver(Driver):
+    """Drives legs: the inputs are the observation, in standard deviations from its mean."""
 
     kind = GAIT
-    layout: WalkLayout
 
-    def init(self, key: PRNGKeyArray) -> dict[str, Weights]:
-        """Returns untrained weights, under `policy` and `value`."""
-        key_policy, key_value = jax.random.split(key)
-        frames, whole, seen = self.layout.frames, self.layout.n_observation, self.layout.n_seen
-        return {
-            "policy": self._policy.init(key_policy, jnp.zeros((1, frames * seen))),
-            "value": self._value.init(key_value, jnp.zeros((1, frames * whole))),
-        }
+    def __init__(self, env: Any, params: Any, config: WalkConfig, n_seen: int) -> None:
+        bounds = env.action_space(params)
+        n = env.observation_size(params)
+        shape = Shape(n, len(bounds.low), tuple(config.hidden), init_std=config.init_std, n_seen=n_seen)
+        self.env, self.layout = env, WalkLayout(shape)
+        self._net, self._n = Network(shape), n
+        self._low, self._high = jnp.asarray(bounds.low), jnp.asarray(bounds.high)
 
-    def parameters(
-        self, weights: Weights, statistics: learning.Statistics, stack: Float[Array, "*batch frames obs"]
-    ) -> Float[Array, "*batch parameters"]:
-        """Returns parameters of the action distribution before the tanh: means, then spreads."""
-        seen = learning.normalize(stack, statistics)[..., : self.layout.n_seen]
-        return self._policy.apply(weights, seen.reshape(*stack.shape[:-2], -1)) + self._offset
+    def start_statistics(self) -> learning.Statistics:
+        """Returns statistics of no observation yet."""
+        return learning.start_statistics((self._n,))
 
-    def tensors(self, policy: Policy) -> dict[str, Any]:
-        """Returns the arrays that walking needs, as a tree whose names `subterra_jax.b2.gait` knows."""
-        seen = slice(0, self.layout.n_seen)
-        statistics = {"mean": policy.statistics.mean[seen], "std": policy.statistics.std[seen]}
-        return {"policy": policy.weights, "statistics": statistics}
+    def begin(self, policy: Policy, observation: Array, params: Any) -> Array:
+        """Returns the observation, which is all that is kept."""
+        return observation
+
+    def take(self, policy: Policy, kept: Array, action: Array, observation: Array, params: Any) -> Array:
+        """Returns the observation."""
+        return observation
+
+    def go_on(self, policy: Policy, kept: Array, action: Array, observation: Array, done: Array, params: Any) -> Array:
+        """Returns the observation."""
+        return observation
+
+    def inputs(self, policy: Policy, kept: Array) -> Array:
+        """Returns the observation in standard deviations from its mean."""
+        return learning.normalize(kept, policy.statistics["mean"], policy.statistics["std"])
+
+    def raw(self, inputs: Array, policy: Policy) -> Array:
+        """Returns the observation that had these inputs."""
+        return inputs * policy.statistics["std"] + policy.statistics["mean"]
+
+    def target(self, env_state: Any, kept: Array, params: Any) -> Array:
+        """Returns no target."""
+        return jnp.zeros((kept.shape[0], 0))
+
+    def tensors(self, policy: Policy) -> dict[str, np.ndarray]:
+        """Returns the arrays that walking needs, by the names that `subterra_jax.b2.gait` knows."""
+        seen = slice(0, self.layout.shape.n_seen)
+        statistics = {name: values[seen] for name, values in policy.statistics.items()}
+        tree = jax.device_get({"actor": policy.network["actor"], "statistics": statistics})
+        return {name: np.asarray(leaf, np.float32) for name, leaf in flat(tree).items()}
 
 
-class WalkLearner(Learner):
-    """PPO whose critic sees the truth.
+def make_walk_learner(env: Any, params: Any, config: WalkConfig, n_seen: int) -> Learner:
+    """Makes PPO whose critic sees the truth.
 
     Args:
         env: A walking environment whose observation ends with the truth.
@@ -125,11 +150,8 @@ class WalkLearner(Learner):
     Raises:
         ConfigError: A setting makes no sense.
     """
-
-    def __init__(self, env: Any, params: Any, config: WalkConfig, n_seen: int) -> None:
-        super().__init__(env, params, config)
-        layout = make_layout(env, params, config)
-        self.networks = WalkNetworks(WalkLayout(**dataclasses.asdict(layout), n_seen=n_seen))
+    check(config)
+    return Learner(env, WalkDriver(env, params, config, n_seen), config)
 
 
 Act = Callable[[Float[Array, "robot obs"]], Float[Array, "robot 12"]]
@@ -227,11 +249,13 @@ class WalkSession(Session):
 
     def policy(self, snapshot: Snapshot) -> WalkPolicy:
         """Returns the policy as the package loads it."""
-        return WalkPolicy({name: jnp.asarray(tensor) for name, tensor in self._tensors(snapshot).items()})
+        return WalkPolicy(
+            {name: jnp.asarray(tensor) for name, tensor in self.learner.driver.tensors(snapshot.policy).items()}
+        )
 
     def release(self, out: Path, snapshot: Snapshot, found: dict[str, Any]) -> None:
         """Writes the policy and its facts."""
-        config, networks = self.learner.config, self.learner.networks
+        config, driver = self.learner.config, self.learner.driver
         facts = {
             "task": self.world.task,
             "world": self.world.facts,
@@ -241,7 +265,7 @@ class WalkSession(Session):
             "versions": library_versions(),
             "scores": {**self.world.facts, **found},
         }
-        write_policy(out, networks, snapshot.policy, facts)
+        write_tensors(out, driver.kind, driver.layout, driver.tensors(snapshot.policy), facts)
         print(out)
 
     def finish(self, snapshot: Snapshot) -> None:
@@ -249,9 +273,6 @@ class WalkSession(Session):
         if not self.folder.has(snapshot.iteration):
             self.folder.save(snapshot)
         draw(self.folder.path)
-
-    def _tensors(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
-        return policy_tensors(self.learner.networks, snapshot.policy)
 
 
 def draw(run: Path) -> None:

@@ -1,8 +1,7 @@
 """A learnt localiser in the written controller: it keeps to the middle and stops where it believes the goal to be.
 
 One that has learnt to take a map gets the one of the task by `with_map`, and drives without one too (`without_map`).
-Round boxes it steers by the written avoidance: what is learnt is where the robot is. A policy that has tensors of a
-steering as well steers by these everywhere; when to stop stays written.
+Round boxes it steers by the written avoidance: what is learnt is where the robot is.
 """
 
 import dataclasses
@@ -22,9 +21,8 @@ from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.locate import memory
 from subterra_jax.policies.locate.locator import Locator
 from subterra_jax.policies.locate.map_strip import MapStrip, map_strip
-from subterra_jax.policies.locate.steering import PREFIX, LearntSteering, check_steering
 from subterra_jax.policies.locate.ways import TwoWays
-from subterra_jax.policies.trained import Tensors, Trained
+from subterra_jax.policies.trained import Tensors, Trained, flat, nested
 from subterra_jax.state import EnvParams
 from subterra_jax.tunnel_env import TunnelEnv
 
@@ -41,7 +39,6 @@ class Locating(Trained):
         low: Smallest action, m/s and rad/s.
         high: Largest action, m/s and rad/s.
         network: Memory behind the front end, of `memory.NETWORKS`.
-        frames: Moments that its learnt steering reads; 0 where the steering is written.
         speed: Speed at which it drives at most, m/s; None is that of the vehicle.
         map: The map; None has none.
         hides_map: Take no map: `with_map` changes nothing.
@@ -56,8 +53,7 @@ class Locating(Trained):
     tensors: Tensors
     low: Float[Array, "2"]
     high: Float[Array, "2"]
-    network: str = struct.field(pytree_node=False, default="kalman")
-    frames: int = struct.field(pytree_node=False, default=0)
+    network: str = struct.field(pytree_node=False, default="transformer")
     speed: float | None = struct.field(pytree_node=False, default=None)
     map: MapStrip | None = None
     hides_map: bool = struct.field(pytree_node=False, default=False)
@@ -67,12 +63,11 @@ class Locating(Trained):
 
     @classmethod
     def of_layout(cls, layout: Mapping[str, Any], **common: Any) -> "Locating":
-        """Makes the agent of a layout with `network`, `frames` if its steering is learnt, and `speed` if it has one."""
+        """Makes the agent of a layout with `network`, and `speed` if it has one."""
         speed = layout.get("speed")
         return cls(
             **common,
             network=str(layout["network"]),
-            frames=int(layout.get("frames", 0)),
             speed=None if speed is None else float(speed),
         )
 
@@ -122,31 +117,12 @@ class Locating(Trained):
         return self._navigator(params).act(key, memory, obs, params, known)
 
     def _navigator(self, params: EnvParams) -> Navigator:
-        mine, steering = parted(self.tensors)
-        locator = Locator(nested(mine), self.network, self.map, self.blind)
+        locator = Locator(nested(self.tensors), self.network, self.map, self.blind)
         localiser = TwoWays(locator) if params.errand == "return" else locator
-        steered: Steering = LearntSteering(steering, self.frames) if steering else steering_of(params, CentreLine())
+        steered: Steering = steering_of(params, CentreLine())
         if self.speed is not None:
             steered = PacedSteering(steered, self.speed)
         return Navigator(localiser, steered, name=self.name)
-
-
-def parted(tensors: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Returns the tensors of the localiser, and those of a learnt steering without their prefix."""
-    mine = {name: tensor for name, tensor in tensors.items() if not name.startswith(PREFIX)}
-    return mine, {name.removeprefix(PREFIX): tensors[name] for name in tensors if name not in mine}
-
-
-def nested(tensors: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns weights by name as a tree: `match.taps` becomes `{"match": {"taps": …}}`."""
-    tree: dict[str, Any] = {}
-    for name, tensor in tensors.items():
-        *path, last = name.split(".")
-        branch = tree
-        for part in path:
-            branch = branch.setdefault(part, {})
-        branch[last] = tensor
-    return tree
 
 
 def check_tensors(agent: Locating) -> None:
@@ -157,18 +133,10 @@ def check_tensors(agent: Locating) -> None:
         ValueError: There is no such network, or a tensor has another shape or name.
     """
     front = memory.front_of(agent.tensors)
-    tensors, steering = parted(agent.tensors)
-    check_steering(steering, agent.frames)
     shapes = jax.eval_shape(lambda key: memory.init(agent.network, front, key, agent.takes_map), jax.random.key(0))
     wanted = flat(shapes)
     for name, leaf in wanted.items():
-        if tensors[name].shape != leaf.shape:
-            raise ValueError(f"{name} is {tensors[name].shape}, not {leaf.shape}")
-    if further := sorted(set(tensors) - set(wanted)):
+        if agent.tensors[name].shape != leaf.shape:
+            raise ValueError(f"{name} is {agent.tensors[name].shape}, not {leaf.shape}")
+    if further := sorted(set(agent.tensors) - set(wanted)):
         raise ValueError(f"{further[0]} is of no {agent.network}")
-
-
-def flat(weights: Any) -> dict[str, Any]:
-    """Returns a tree of weights by name; the inverse of `nested`."""
-    leaves = jax.tree_util.tree_flatten_with_path(weights)[0]
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}

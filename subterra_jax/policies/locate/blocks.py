@@ -5,9 +5,6 @@ from flax import struct
 from jaxtyping import Array, Float
 
 DELAY = 12  # blocks after which all beams have passed a block
-N_RECENT = 5  # parts of a block in the raw scans that a memory may get
-N_ROW = 28  # numbers of one scan
-N_RAW = N_RECENT * N_ROW
 _SLOWEST = 25.0  # steps in a metre; more count as so many, since nobody drives so slowly in training
 
 
@@ -19,13 +16,11 @@ class Block:
         evidence: Log likelihood of each error compared, by the block `DELAY` metres ago; 0 where there is none.
         read: Distance that the odometer counted in this metre, less 1, m.
         steps: Steps taken in this metre.
-        raw: What the beams saw in this metre: distance beyond the wall and ahead, both of order 1.
     """
 
     evidence: Float[Array, "n_shares"]
     read: Float[Array, ""]
     steps: Float[Array, ""]
-    raw: Float[Array, "n_raw"]
 
 
 @struct.dataclass
@@ -52,9 +47,3 @@ def matched_inputs(block: Block, shares: Float[Array, "n_shares"]) -> Float[Arra
     sigma = jnp.sqrt(jnp.sum(belief * (shares - mean) ** 2, axis=-1, keepdims=True) + 1e-10)
     read, steps = block.read[..., None], jnp.minimum(block.steps[..., None], _SLOWEST)
     return jnp.concatenate([0.3 * centred, 30.0 * mean, 30.0 * sigma, 20.0 * read, 0.1 * steps], axis=-1)
-
-
-def raw_inputs(block: Block) -> Float[Array, "n"]:
-    """Returns scans and odometry as inputs of a network, without the front end."""
-    steps = jnp.minimum(block.steps[..., None], _SLOWEST)
-    return jnp.concatenate([block.raw, 20.0 * block.read[..., None], 0.1 * steps], axis=-1)

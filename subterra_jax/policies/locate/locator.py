@@ -11,10 +11,9 @@ from jaxtyping import Array, Float, Int
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.stations import Driven, Localiser, Station, believed_start
 from subterra_jax.policies.locate import bends, map_filter, matching, memory, profiles, strips
-from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, N_ROW, Block, Estimate
+from subterra_jax.policies.locate.blocks import DELAY, Block, Estimate
 from subterra_jax.policies.locate.map_strip import MapStrip
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, REACH, WINDOW, Profiles
-from subterra_jax.policies.locate.streams import raw_rows
 
 _TO_SIGMA = 1.2533  # standard deviation of a normal distribution over its mean absolute error
 _NEWEST = int(REACH / BIN) + 3  # bins ahead of the robot that a point may count in
@@ -35,8 +34,6 @@ class LocatorMemory:
         steps_before: Steps at that time, interpolated.
         bend: Curvature of the tunnel, 1/m.
         window: Profiles about the robot.
-        raw: Sums of the scans in the parts of this metre.
-        counts: Scans in each part.
         cell: Memory behind the front end.
         estimate: Its last answer, with what the map tells.
         belief: Belief of the filter that takes a map; None without one.
@@ -52,8 +49,6 @@ class LocatorMemory:
     steps_before: Float[Array, ""]
     bend: Float[Array, ""]
     window: Profiles
-    raw: Float[Array, "parts row"]
-    counts: Float[Array, "parts"]
     cell: Any
     estimate: Estimate
     belief: map_filter.MapBelief | None
@@ -68,7 +63,7 @@ class Locator(Localiser):
         weights: As `memory.init` makes them, trained.
         network: Name of the memory.
         map: The map; None has none.
-        blind: Leave the evidence and the scans out: the ablation that shows what the walls tell.
+        blind: Leave the evidence out: the ablation that shows what the walls tell.
     """
 
     weights: Any
@@ -90,8 +85,6 @@ class Locator(Localiser):
             steps_before=zero,
             bend=zero,
             window=profiles.blank(WINDOW, strips.n_sides(params.lidar)),
-            raw=jnp.zeros((N_RECENT, N_ROW)),
-            counts=jnp.zeros(N_RECENT),
             cell=memory.start(self.network, self.weights),
             estimate=Estimate(zero, zero, jnp.log(jnp.full((), 0.05))),
             belief=None if self.map is None else map_filter.start(self.weights[memory.MAP], sigma),
@@ -106,7 +99,7 @@ class Locator(Localiser):
         at = before.driven + jnp.clip(driven.speed * params.vehicle.period * driven.cosine, 0.0, _STEP)
         now = dataclasses.replace(before, driven=at, reading=obs.distance, steps=before.steps + 1.0)
         ended = jnp.floor(at).astype(jnp.int32) > before.metres
-        block, now = self._see(before, now, obs, driven, params, ended)
+        block, now = self._see(before, now, obs, driven, params)
         cell, estimate = memory.step(self.network, self.weights, before.cell, block)
         estimate, belief, passed = self._compare(before, now, estimate, params)
         kept = (
@@ -161,7 +154,7 @@ class Locator(Localiser):
         return map_filter.corrected(belief, plain, age, sigma), belief, passed
 
     def _see(
-        self, before: LocatorMemory, now: LocatorMemory, obs: Observed, driven: Driven, params: Any, ended: Array
+        self, before: LocatorMemory, now: LocatorMemory, obs: Observed, driven: Driven, params: Any
     ) -> tuple[Block, LocatorMemory]:
         """Returns the metre that may have ended, and the memory with the scan."""
         walls = getattr(driven.walls, "corridor", driven.walls)  # steering round boxes keeps them with its hits
@@ -172,23 +165,15 @@ class Locator(Localiser):
         share = (metre + 1.0 - before.driven) / jnp.maximum(now.driven - before.driven, 1e-6)
         read = before.reading + share * (now.reading - before.reading)
         steps = before.steps + share
-        match = self.weights.get("match")
-        if self.blind or match is None:
-            evidence = jnp.zeros_like(jnp.asarray(matching.SHARES) if match is None else match["shares"])
+        match = self.weights["match"]
+        if self.blind:
+            evidence = jnp.zeros_like(match["shares"])
         else:
             first = BLOCK * (metre - DELAY) - matching.LAGS - matching.MARGIN
             found = matching.evidence(match, profiles.cut(window, first, matching.N_CUT))
             evidence = jnp.where(metre >= DELAY, found, 0.0)
-        raw = before.raw / jnp.maximum(before.counts, 1.0)[:, None]
-        block = Block(evidence, read - before.read_before - 1.0, steps - before.steps_before, raw.reshape(-1))
-        if self.blind:
-            block = dataclasses.replace(block, raw=jnp.zeros_like(block.raw))
-        part = jnp.floor(now.driven * N_RECENT).astype(jnp.int32) - N_RECENT * jnp.floor(now.driven).astype(jnp.int32)
-        part = jnp.clip(part, 0, N_RECENT - 1)
-        sums, counts = (jnp.where(ended, 0.0, old) for old in (before.raw, before.counts))
-        return block, dataclasses.replace(
-            now, bend=bend, window=window, raw=sums.at[part].add(raw_rows(points)), counts=counts.at[part].add(1.0)
-        )
+        block = Block(evidence, read - before.read_before - 1.0, steps - before.steps_before)
+        return block, dataclasses.replace(now, bend=bend, window=window)
 
 
 def _newest(driven: Float[Array, ""]) -> Int[Array, ""]:

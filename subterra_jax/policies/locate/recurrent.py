@@ -1,6 +1,6 @@
-"""Memories that are networks: GRU, diagonal state space, and attention over the last metres.
+"""Attention over the last metres.
 
-Each turns inputs, one row a metre, into rows of hidden numbers; `sequence` does it for many metres at once, `step` for
+It turns inputs, one row a metre, into rows of hidden numbers; `sequence` does it for many metres at once, `step` for
 the next one, with the same result.
 """
 
@@ -30,81 +30,6 @@ def apply(layer: Weights, x: Array) -> Array:
 def _norm(x: Array) -> Array:
     mean = jnp.mean(x, axis=-1, keepdims=True)
     return (x - mean) * jax.lax.rsqrt(jnp.mean((x - mean) ** 2, axis=-1, keepdims=True) + 1e-6)
-
-
-class Gru:
-    """Gated recurrent unit. Source: Cho et al. 2014."""
-
-    def init(self, key: PRNGKeyArray) -> Weights:
-        """Returns untrained weights."""
-        keys = jax.random.split(key, 2)
-        return {"x": dense(keys[0], HIDDEN, 3 * HIDDEN), "h": dense(keys[1], HIDDEN, 3 * HIDDEN)}
-
-    def start(self) -> Array:
-        """Returns the memory at the start."""
-        return jnp.zeros(HIDDEN)
-
-    def step(self, weights: Weights, memory: Array, x: Array) -> tuple[Array, Array]:
-        """Returns the memory after a row, and the hidden numbers."""
-        xr, xz, xn = jnp.split(apply(weights["x"], x), 3, axis=-1)
-        hr, hz, hn = jnp.split(apply(weights["h"], memory), 3, axis=-1)
-        z = jax.nn.sigmoid(xz + hz + 1.0)
-        after = z * memory + (1.0 - z) * jnp.tanh(xn + jax.nn.sigmoid(xr + hr) * hn)
-        return after, after
-
-    def sequence(self, weights: Weights, rows: Float[Array, "t n"]) -> Float[Array, "t n"]:
-        """Returns the hidden numbers after each row."""
-        return jax.lax.scan(lambda memory, x: self.step(weights, memory, x), self.start(), rows)[1]
-
-
-class StateSpace:
-    """Two diagonal linear recurrences with gates between. Source: Smith et al. 2023 (S5), real and diagonal here."""
-
-    def init(self, key: PRNGKeyArray) -> Weights:
-        """Returns untrained weights; memories last from 1 to 300 m."""
-        layers = {}
-        for i in range(_LAYERS):
-            keys = jax.random.split(jax.random.fold_in(key, i), 4)
-            layers[f"layer_{i}"] = {
-                "in": dense(keys[0], HIDDEN, HIDDEN),
-                "out": dense(keys[1], HIDDEN, HIDDEN),
-                "skip": dense(keys[2], HIDDEN, HIDDEN),
-                "gate": dense(keys[3], HIDDEN, HIDDEN),
-                "log_length": jnp.linspace(0.0, np.log(300.0), HIDDEN),
-            }
-        return layers
-
-    def start(self) -> Array:
-        """Returns the memory at the start."""
-        return jnp.zeros((_LAYERS, HIDDEN))
-
-    def step(self, weights: Weights, memory: Array, x: Array) -> tuple[Array, Array]:
-        """Returns the memory after a row, and the hidden numbers."""
-        after = []
-        for i in range(_LAYERS):
-            layer = weights[f"layer_{i}"]
-            keep, put = self._drive(layer, x)
-            after.append(keep * memory[i] + put)
-            x = self._mix(layer, x, after[-1])
-        return jnp.stack(after), x
-
-    def sequence(self, weights: Weights, rows: Float[Array, "t n"]) -> Float[Array, "t n"]:
-        """Returns the hidden numbers after each row, by an associative scan."""
-        for i in range(_LAYERS):
-            layer = weights[f"layer_{i}"]
-            keep, put = self._drive(layer, rows)
-            keeps = jnp.broadcast_to(keep, put.shape)
-            joined = jax.lax.associative_scan(lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1]), (keeps, put))
-            rows = self._mix(layer, rows, joined[1])
-        return rows
-
-    def _drive(self, layer: Weights, x: Array) -> tuple[Array, Array]:
-        keep = jnp.exp(-jnp.exp(-layer["log_length"]))
-        return keep, jnp.sqrt(1.0 - keep * keep) * apply(layer["in"], _norm(x))
-
-    def _mix(self, layer: Weights, x: Array, state: Array) -> Array:
-        mixed = jax.nn.gelu(apply(layer["out"], state) + apply(layer["skip"], _norm(x)))
-        return x + mixed * jax.nn.sigmoid(apply(layer["gate"], mixed))
 
 
 class Attention:
@@ -168,4 +93,4 @@ class Attention:
         return x + apply(layer["down"], jax.nn.gelu(apply(layer["up"], _norm(x))))
 
 
-CELLS: dict[str, Gru | StateSpace | Attention] = {"gru": Gru(), "s5": StateSpace(), "transformer": Attention()}
+CELLS: dict[str, Attention] = {"transformer": Attention()}

@@ -6,7 +6,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float
 
 from subterra_jax.policies.locate import matching, profiles
-from subterra_jax.policies.locate.blocks import DELAY, N_RECENT, Block
+from subterra_jax.policies.locate.blocks import DELAY, Block
 from subterra_jax.policies.locate.profiles import BIN, BLOCK, Points, Profiles
 
 BEFORE = 120  # bins of the profiles before the start
@@ -28,19 +28,18 @@ class Record:
     points: Points
 
 
-def metres(record: Record, weights: matching.Weights | None, n: int) -> Block:
+def metres(record: Record, weights: matching.Weights, n: int) -> Block:
     """Returns the first `n` metres of a drive.
 
     Args:
         record: The drive.
-        weights: Of the front end; None leaves its evidence at 0.
+        weights: Of the front end.
         n: Number of metres.
     """
     ends = jnp.arange(n + 1, dtype=jnp.float32)
     reads = jnp.interp(ends, record.driven, record.read)
     times = jnp.interp(ends, record.driven, jnp.arange(len(record.driven), dtype=jnp.float32))
-    evidence = jnp.zeros((n, len(matching.SHARES))) if weights is None else _evidence(record, weights, n)
-    return Block(evidence, jnp.diff(reads) - 1.0, jnp.diff(times), _raw(record, n))
+    return Block(_evidence(record, weights, n), jnp.diff(reads) - 1.0, jnp.diff(times))
 
 
 def reached(record: Record, n: int) -> Bool[Array, "n"]:
@@ -70,21 +69,3 @@ def _evidence(record: Record, weights: matching.Weights, n: int) -> Float[Array,
 
     found = jax.vmap(one)(jnp.arange(n - DELAY))
     return jnp.concatenate([jnp.zeros((DELAY, found.shape[-1])), found])
-
-
-def _raw(record: Record, n: int) -> Float[Array, "n n_raw"]:
-    """Returns the mean of the scans in each part of each metre."""
-    part = jnp.floor(record.driven * N_RECENT).astype(jnp.int32)
-    rows = raw_rows(record.points)
-    sums = jnp.zeros((n * N_RECENT, rows.shape[-1])).at[part].add(rows, mode="drop")
-    counts = jnp.zeros(n * N_RECENT).at[part].add(1.0, mode="drop")
-    return (sums / jnp.maximum(counts, 1.0)[:, None]).reshape(n, -1)
-
-
-def raw_rows(points: Points) -> Float[Array, "*t row"]:
-    """Returns a scan as numbers of order 1; of several heights the first, and of several rays the first."""
-    first = slice(0, 2 * points.rays, points.rays)
-    seen, batch = points.seen[..., first, :], points.seen.shape[:-2]
-    out = jnp.where(seen, jnp.arcsinh(points.out[..., first, :] / 0.03), 0.0)
-    along = jnp.where(seen, points.along[..., first, :] / 10.0, 0.0)
-    return jnp.concatenate([out.reshape(*batch, -1), along.reshape(*batch, -1)], axis=-1)

@@ -1,0 +1,52 @@
+"""What a policy's file says of its network: memory, sizes, bounds of the action."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from jaxtyping import Array, Float
+
+from subterra_jax.policies import inputs
+from subterra_jax.policies.memories import MEMORIES, Memory
+from subterra_jax.policies.network import Shape
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Everything about a policy that is no weight.
+
+    Attributes:
+        memory: What is kept between observations.
+        shape: Sizes of the network.
+        action_low: Smallest action, m/s and rad/s.
+        action_high: Largest action, m/s and rad/s.
+    """
+
+    memory: Memory
+    shape: Shape
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Returns what `from_json` reads."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Layout":
+        """Reads a layout.
+
+        Raises:
+            KeyError: Something is missing.
+            TypeError: Something is not known.
+            ValueError: There is no such memory.
+        """
+        memory, shape = Memory(**values["memory"]), dict(values["shape"])
+        if memory.kind not in MEMORIES:
+            raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory.kind!r}")
+        shape["hidden"] = tuple(shape["hidden"])
+        low, high = tuple(values["action_low"]), tuple(values["action_high"])
+        return cls(memory, Shape(**shape), low, high)
+
+    def reckoned_way(self, seen: Float[Array, "n"]) -> Float[Array, ""]:
+        """Returns the reckoned way to go among the inputs of one observation, m."""
+        return inputs.FAR * seen[inputs.WAY_AT]

@@ -1,0 +1,170 @@
+"""What a policy keeps between observations beside the network's own memory: reckoning, a stack, a localiser.
+
+The station that the inputs show as a way to go is dead-reckoned, or with `along` the learnt localiser's. All functions
+take one robot; training and driving call the same ones.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.stations import Driven, Station, told_start
+from subterra_jax.baselines.steering import CentreLine, Corridor
+from subterra_jax.policies import inputs
+from subterra_jax.policies.inputs import Reckoned
+from subterra_jax.policies.locate.locator import Locator
+from subterra_jax.policies.locate.map_strip import MapStrip
+from subterra_jax.policies.locate.ways import TwoWays
+from subterra_jax.state import EnvParams
+
+MEMORIES = ("none", "stack", "gru", "along")
+
+
+@struct.dataclass
+class Located:
+    """A localiser under way.
+
+    Attributes:
+        walls: Walls beside the robot, as tracked.
+        direction: 1 on the way out, -1 on the way back.
+        localiser: Its memory.
+        station: Its estimate.
+    """
+
+    walls: Corridor
+    direction: Float[Array, ""]
+    localiser: Any
+    station: Station
+
+
+@struct.dataclass
+class Kept:
+    """What is kept between two observations.
+
+    Attributes:
+        reckoned: Dead reckoning.
+        stack: Inputs of earlier observations, oldest first; none without a stack.
+        located: The localiser; None without one.
+        seen: Inputs of the newest observation.
+    """
+
+    reckoned: Reckoned
+    stack: Float[Array, "earlier n"]
+    located: Located | None
+    seen: Float[Array, "n"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """A choice of memory.
+
+    Attributes:
+        kind: One of `MEMORIES`.
+        frames: Observations in the stack, the newest included; 1 but with `stack`.
+        localiser: Network of the localiser, of `locate.memory.NETWORKS`; for `along`.
+    """
+
+    kind: str = "none"
+    frames: int = 1
+    localiser: str = "transformer"
+
+    @property
+    def relief(self) -> bool:
+        """True where the inputs show the relief of the walls: who forgets it has no use for it."""
+        return self.kind in ("stack", "gru")
+
+    def begin(self, obs: Observed, params: EnvParams, given: "Given") -> Kept:
+        """Returns what is kept before the first `take`, which gets the same observation and a command of 0."""
+        reckoned = inputs.begin(obs)
+        located = None
+        if self.kind == "along":
+            localiser = given.localiser(self, params)
+            station = Station(told_start(obs, params), jnp.log(jnp.float32(0.05)), jnp.ones(()))
+            memory = localiser.begin(obs, params)
+            located = Located(CentreLine().begin(obs, params), jnp.ones(()), memory, station)
+        seen = self._look(reckoned, located, obs, params)
+        return Kept(reckoned, jnp.repeat(seen[None], self.frames - 1, axis=0), located, seen)
+
+    def take(self, before: Kept, command: Float[Array, "2"], obs: Observed, params: EnvParams, given: "Given") -> Kept:
+        """Returns what is kept after a command (m/s and rad/s, as obeyed) and the observation that followed."""
+        reckoned = inputs.see(inputs.obey(before.reckoned, command), obs)
+        located = before.located
+        if located is not None:
+            raised = reckoned.flag > before.reckoned.flag
+            located = self._locate(located, reckoned, raised, command, obs, params, given)
+        seen = self._look(reckoned, located, obs, params)
+        stack = jnp.concatenate([before.stack[1:], before.seen[None]])[: self.frames - 1]
+        return Kept(reckoned, stack, located, seen)
+
+    def inputs(self, kept: Kept) -> Float[Array, "n"]:
+        """Returns the inputs of the network, the oldest observation first."""
+        return jnp.concatenate([kept.stack.reshape(-1), kept.seen])
+
+    def estimate(self, kept: Kept, obs: Observed, params: EnvParams) -> tuple[Array, Array, Array]:
+        """Returns the station believed (m), the log of its standard deviation (m), and the direction faced."""
+        if kept.located is not None:
+            station = kept.located.station
+            return station.station, station.log_sigma, station.direction
+        turned = inputs.is_turned(kept.reckoned, obs)
+        way = inputs.way_to_go(kept.reckoned, obs, params)
+        target = obs.goal if params.errand in ("stop", "return") else params.tunnel.length
+        out = target - way
+        if params.errand == "return":
+            out = jnp.where(kept.reckoned.flag > 0.5, told_start(obs, params) + way, out)
+        return out, jnp.log(jnp.float32(1.0)), jnp.where(turned, -1.0, 1.0)
+
+    def _look(self, reckoned: Reckoned, located: Located | None, obs: Observed, params: EnvParams) -> Array:
+        way = inputs.way_to_go(reckoned, obs, params)
+        log_sigma = jnp.zeros(())
+        if located is not None and params.errand in ("stop", "return"):
+            station, log_sigma = located.station.station, located.station.log_sigma
+            way = obs.goal - station
+            if params.errand == "return":
+                way = jnp.where(reckoned.flag > 0.5, station - told_start(obs, params), way)
+        seen = inputs.look(reckoned, obs, way, params, self.relief)
+        return jnp.append(seen, log_sigma) if self.kind == "along" else seen
+
+    def _locate(
+        self,
+        before: Located,
+        reckoned: Reckoned,
+        raised: Array,
+        command: Array,
+        obs: Observed,
+        params: EnvParams,
+        given: "Given",
+    ) -> Located:
+        """Moves the walls and the localiser on by one command and the observation after it."""
+        walls = CentreLine().look(before.walls, obs, command, params)
+        direction = jnp.where(inputs.is_turned(reckoned, obs), -1.0, 1.0) * jnp.ones(())
+        fresh = CentreLine().begin(obs, params)
+        turned = direction != before.direction
+        walls = jax.tree.map(lambda new, old: jnp.where(turned, new, old), fresh, walls)
+        driven = Driven(command[0], CentreLine().cosine(walls), direction, raised, walls)
+        station, memory = given.localiser(self, params).update(before.localiser, obs, driven, params, None)
+        return Located(walls, direction, memory, station)
+
+
+@struct.dataclass
+class Given:
+    """What a memory is made with.
+
+    Attributes:
+        weights: Of the localiser, as `locate.memory.init` makes them; None without one.
+        map: The map; None has none.
+        blind: Cut what the walls tell: an ablation.
+    """
+
+    weights: Any = None
+    map: MapStrip | None = None
+    blind: bool = struct.field(pytree_node=False, default=False)
+
+    def localiser(self, memory: Memory, params: EnvParams) -> Any:
+        """Returns the localiser of a task."""
+        locator = Locator(self.weights, memory.localiser, self.map, self.blind)
+        return TwoWays(locator) if params.errand == "return" else locator

@@ -1,0 +1,141 @@
+"""The policy in a batch of environments: what it keeps, what its network answers, what it draws."""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from subterra_jax.baselines.agent import observed
+from subterra_jax.policies.layout import Layout
+from subterra_jax.policies.learnt import KIND, LOCALISER, NETWORK
+from subterra_jax.policies.memories import Given
+from subterra_jax.policies.network import Network, Outputs, init, start_memory, to_action
+from subterra_jax.policies.trained import flat
+
+_HALF_LOG_TAU = 0.5 * math.log(2.0 * math.pi)
+
+
+@struct.dataclass
+class Policy:
+    """All that driving needs.
+
+    Attributes:
+        network: Weights of the network.
+        localiser: Weights of the localiser; None without one.
+        statistics: Mean and standard deviation of the observation; None where the inputs are of order 1 as they are.
+    """
+
+    network: Any
+    localiser: Any = None
+    statistics: Any = None
+
+
+class Driver:
+    """Drives navigation tasks; all arrays have the environments as first axis.
+
+    Args:
+        env: The environment, not batched.
+        layout: Sizes and meaning of the network's inputs and outputs.
+        map: The map, for a localiser that takes one.
+    """
+
+    kind = KIND
+
+    def __init__(self, env: Any, layout: Layout, map: Any = None) -> None:
+        self.env, self.layout, self._map = env, layout, map
+        self._net = Network(layout.shape)
+        self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
+
+    def init(self, key: PRNGKeyArray) -> Any:
+        """Returns untrained weights of the network."""
+        return init(self.layout.shape, key)
+
+    def start_memory(self, batch: tuple[int, ...]) -> Array:
+        """Returns the network's memory at the start of episodes."""
+        return start_memory(self.layout.shape, batch)
+
+    def start_statistics(self) -> Any:
+        """Returns statistics of the observation; None, since the inputs are of order 1 as they are."""
+        return None
+
+    def tensors(self, policy: Policy) -> dict[str, np.ndarray]:
+        """Returns the arrays of a policy by name, parts of the name between dots."""
+        tree = {NETWORK: policy.network, LOCALISER: policy.localiser}
+        parts = {name: part for name, part in tree.items() if part is not None}
+        return {name: np.asarray(leaf, np.float32) for name, leaf in flat(jax.device_get(parts)).items()}
+
+    def begin(self, policy: Policy, observation: Array, params: Any) -> Any:
+        """Returns what is kept at the first observation of episodes, which it has taken in."""
+        fresh = self._fresh(policy, observation, params)
+        return self.take(policy, fresh, jnp.zeros((observation.shape[0], len(self._low))), observation, params)
+
+    def take(self, policy: Policy, kept: Any, action: Array, observation: Array, params: Any) -> Any:
+        """Returns what is kept after actions and the observations that followed."""
+        given, memory = Given(policy.localiser, self._map), self.layout.memory
+
+        def one(kept: Any, action: Array, flat: Array) -> Any:
+            return memory.take(kept, action[:2], observed(self.env, params, flat), params, given)
+
+        return jax.vmap(one)(kept, action, observation)
+
+    def go_on(
+        self, policy: Policy, kept: Any, action: Array, observation: Array, done: Bool[Array, "env"], params: Any
+    ) -> Any:
+        """As `take`, begun anew with the observation where an episode is `done`."""
+        fresh = self._fresh(policy, observation, params)
+        mixed = jax.tree.map(lambda new, old: _where(done, new, old), fresh, kept)
+        return self.take(policy, mixed, jnp.where(done[:, None], 0.0, action), observation, params)
+
+    def _fresh(self, policy: Policy, observation: Array, params: Any) -> Any:
+        given, memory = Given(policy.localiser, self._map), self.layout.memory
+        return jax.vmap(lambda flat: memory.begin(observed(self.env, params, flat), params, given))(observation)
+
+    def inputs(self, policy: Policy, kept: Any) -> Float[Array, "env n"]:
+        """Returns the inputs of the network."""
+        del policy
+        return jax.vmap(self.layout.memory.inputs)(kept)
+
+    def target(self, env_state: Any, kept: Any, params: Any) -> Float[Array, "env n"]:
+        """Returns the auxiliary target: true less reckoned way to go, m; no numbers where nothing is asked for."""
+        if self.layout.shape.way_at is None:
+            return jnp.zeros((kept.seen.shape[0], 0))
+
+        def one(state: Any, seen: Array) -> Array:
+            return self.env.privileged(state, params)["to_goal"] - self.layout.reckoned_way(seen)
+
+        return jax.vmap(one)(env_state, kept.seen)[:, None]
+
+    def answer(self, policy: Policy, inputs: Array, memory: Array) -> tuple[Outputs, Array]:
+        """Returns the network's answers to one step, and its memory."""
+        return self._net.apply({"params": policy.network}, inputs, memory)  # type: ignore[return-value]
+
+    def unroll(self, weights: Any, inputs: Array, memory: Array, first: Array) -> Outputs:
+        """Returns the network's answers to every step of a rollout."""
+        return self._net.apply({"params": weights}, inputs, memory, first, method="unroll")  # type: ignore[return-value]
+
+    def sample(self, out: Outputs, key: PRNGKeyArray) -> Float[Array, "env action"]:
+        """Draws before the tanh."""
+        return out.mean + jnp.exp(out.log_std) * jax.random.normal(key, out.mean.shape)
+
+    def action(self, raw: Float[Array, "env action"]) -> Float[Array, "env action"]:
+        """Returns the actions of draws, m/s and rad/s."""
+        return to_action(raw, self._low, self._high)
+
+    @staticmethod
+    def log_prob(out: Outputs, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:
+        """Returns the log density of draws before the tanh, whose own part cancels in every ratio."""
+        away = (raw - out.mean) * jnp.exp(-out.log_std)
+        return jnp.sum(-0.5 * jnp.square(away) - out.log_std - _HALF_LOG_TAU, axis=-1)
+
+    @staticmethod
+    def entropy(out: Outputs) -> Float[Array, ""]:
+        """Returns the entropy of the Gaussian before the tanh."""
+        return jnp.sum(out.log_std + 0.5 + _HALF_LOG_TAU)
+
+
+def _where(done: Array, new: Array, old: Array) -> Array:
+    return jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)

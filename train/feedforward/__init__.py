@@ -1,1 +1,0 @@
-"""PPO without memory: networks over stacked observations, the unroll, and the epochs that learn from it."""

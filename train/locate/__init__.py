@@ -1,1 +1,0 @@
-"""Training of learnt localisers: `python -m train.locate`."""
