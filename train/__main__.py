@@ -21,7 +21,6 @@ from train.config import ConfigError, Legs, TrainConfig, check, make_config
 from train.devices import Cluster
 from train.evaluate import check_episodes
 from train.options import insert_file, reward_of, settings_of, with_weights
-from train.ppo import seed_axes
 from train.session import Session, check_seeds, run_seeds
 from train.setup import make_learner
 from train.sinks import Logs
@@ -172,7 +171,7 @@ def _several(arguments: Command, world: World) -> int:
         raise ConfigError(f"parts = {arguments.config.parts} cannot be trained for several seeds at once")
     for seed in arguments.seeds:
         config = dataclasses.replace(arguments.config, seed=seed)
-        learner, out = make_learner(world, config, seed_axes()), arguments.out / f"seed-{seed}"
+        learner, out = make_learner(world, config), arguments.out / f"seed-{seed}"
         alone = settings_of(dataclasses.replace(arguments, config=config))
         sessions.append(Session(out, world, learner, logs=arguments.logs, command=alone))
     return run_seeds(

@@ -75,6 +75,12 @@ class TrainConfig:
         entropy_weight: Reward for randomness, in units of the loss.
         value_weight: Weight of the value loss.
         auxiliary_weight: Weight of the auxiliary loss of `gru`.
+        front: Errors of the command that the localiser compares: `match` of slip, `wide` of wet rail too.
+        map: The localiser learns to take a map as well.
+        drives: Drives that the localiser learns from in one iteration.
+        drive_steps: Steps of each.
+        drives_minibatch: Drives in one step of the localiser's optimiser.
+        localiser_rate: Its learning rate, at most.
         stop_coverage: Training ends once the rolling-100 coverage is at least this (a share of the tunnel)
             and every one of those episodes succeeded; a value above 1 never stops.
         stop_patience: For how many iterations in a row that must hold.
@@ -107,6 +113,12 @@ class TrainConfig:
     entropy_weight: float = 2e-3
     value_weight: float = 0.5
     auxiliary_weight: float = 0.1
+    front: Literal["match", "wide"] = "match"
+    map: bool = False
+    drives: int = 32
+    drive_steps: int = 300
+    drives_minibatch: int = 64
+    localiser_rate: float = 2e-3
     stop_coverage: float = 2.0
     stop_patience: int = 40
     checkpoint_every: int = 50
@@ -151,7 +163,7 @@ _GPU: dict[str, Any] = {
 # An iteration of a GRU costs the same launches however many robots there are.
 _BY_MEMORY: dict[str, dict[str, Any]] = {
     "gru": {"n_envs": 32_768, "unroll": 32, "minibatches": 8},
-    "along": {"n_envs": 2048, "minibatches": 4},
+    "along": {"n_envs": 2048, "minibatches": 4, "drives": 512, "drive_steps": 900},
 }
 _COVER = {"stop_coverage": 0.9}
 
@@ -193,6 +205,7 @@ def check(config: TrainConfig) -> TrainConfig:
     if not config.hidden or min(config.hidden) < 1:
         raise ConfigError(f"hidden must name at least one width, all at least 1, got {config.hidden}")
     at_least(config, 1, "steps", "n_envs", "unroll", "epochs", "minibatches", "parts", "frames", "cell")
+    at_least(config, 1, "drives", "drive_steps", "drives_minibatch")
     at_least(config, 1, "stop_patience", "checkpoint_every")
     if config.seed < 0:
         raise ConfigError(f"seed must not be negative, got {config.seed}")
@@ -203,7 +216,11 @@ def check(config: TrainConfig) -> TrainConfig:
             f"n_envs = {config.n_envs} cannot be divided into parts = {config.parts} "
             f"of minibatches = {config.minibatches}"
         )
-    positive(config, "learning_rate", "init_std", "max_grad_norm", "clip")
+    if config.drives % config.parts:
+        raise ConfigError(f"drives = {config.drives} cannot be divided into parts = {config.parts}")
+    if config.map and not (config.memory == "along" and config.front == "match"):
+        raise ConfigError(f"map = True is for memory along with front match, not {config.memory} with {config.front}")
+    positive(config, "localiser_rate", "learning_rate", "init_std", "max_grad_norm", "clip")
     not_negative(config, "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
     share(config, "discount", "gae_lambda")
     if config.auxiliary and config.memory not in ("gru", "along"):

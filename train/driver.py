@@ -68,6 +68,11 @@ class Driver:
         parts = {name: part for name, part in tree.items() if part is not None}
         return {name: np.asarray(leaf, np.float32) for name, leaf in flat(jax.device_get(parts)).items()}
 
+    @property
+    def n_action(self) -> int:
+        """Numbers of an action."""
+        return self.layout.shape.n_action
+
     def begin(self, policy: Policy, observation: Array, params: Any) -> Any:
         """Returns what is kept at the first observation of episodes, which it has taken in."""
         fresh = self._fresh(policy, observation, params)

@@ -185,11 +185,7 @@ class RunFolder:
                 "window": snapshot.window.to_json(),
             },
             lambda place: write_tensors(
-                place / f"{CHECKPOINT_POLICY}{TENSORS}",
-                driver.kind,
-                driver.layout,
-                driver.tensors(snapshot.policy),
-                facts,
+                place / f"{CHECKPOINT_POLICY}{TENSORS}", driver.kind, driver.layout, tensors, facts
             ),
         )
 

@@ -8,7 +8,6 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-import subterra_jax as st
 from train import devices, learning
 from train.config import TrainConfig
 from train.devices import Parts
@@ -91,7 +90,6 @@ class Learner(devices.Whole):
         env: An environment, as `st.make` returns it.
         driver: What drives in it.
         config: Settings.
-        axes: Names of the axes along which `iterate` is vmapped.
         split: Names of the axes along which environments are split; see `devices.Spread`.
         given: Weights to begin with; those that are None begin untrained.
         localiser: Learns the localiser of `--memory along`; None leaves it as it is given.
@@ -104,13 +102,12 @@ class Learner(devices.Whole):
         env: Any,
         driver: Driver,
         config: TrainConfig,
-        axes: Parts = (),
         split: Parts = (),
         given: Policy | None = None,
         localiser: Any = None,
     ) -> None:
-        self.config, self.axes, self.split = config, axes, split
-        self.env, self.driver = st.batch.AutoReset(env, axes=axes), driver
+        self.config, self.split = config, split
+        self.env, self.driver = env, driver
         self._given = Policy(None) if given is None else given
         self._localiser = localiser
         self._adam = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
@@ -152,7 +149,7 @@ class Learner(devices.Whole):
         policy = self.policy_of(state)
         own = devices.own_key(key_drive, self.split)
         drive, rollout, finished, terms = collect(
-            self.env, self.driver, policy, params, state.drive, own, config.unroll, self.axes
+            self.env, self.driver, policy, params, state.drive, own, config.unroll
         )
         discounted, returns = learning.discounted_returns(
             state.discounted, rollout.reward, finished.done, config.discount

@@ -6,12 +6,14 @@ The host only counts finished episodes, keeps the best policy and decides when t
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from train import clock
+from train.config import TrainConfig
 from train.devices import compiler_options
 from train.report import fetch, fetch_all
 from train.sinks import Log
@@ -25,6 +27,35 @@ def begin(learner: Trainable, params: Any) -> Snapshot:
     key = learner.share(jax.random.PRNGKey(learner.config.seed))
     state = jax.jit(learner.init, compiler_options=compiler_options(learner.config))(key, learner.share(params))
     return started(learner, state)
+
+
+def _compile(init: Any, iterate: Any, key: Any, params: Any, state: Any, config: TrainConfig) -> tuple[Any, Any]:
+    """Compiles the beginning of a run and its iteration at the same time.
+
+    Args:
+        init: From key and params to a state.
+        iterate: From state and params to the next state and a report.
+        key: Of the seed, or of all seeds.
+        params: Parameters of the environment.
+        state: State to go on from; None begins anew.
+        config: Settings.
+
+    Returns:
+        The state, and the compiled iteration.
+    """
+    options = compiler_options(config)
+    clock.lap("start")
+    first = None if state is not None else jax.jit(init).lower(key, params)
+    like = jax.eval_shape(init, key, params) if state is None else state
+    lowered = jax.jit(iterate, donate_argnums=0).lower(like, params)
+    clock.lap("trace")
+    with ThreadPoolExecutor(1) as pool:
+        compiled = pool.submit(lowered.compile, options)
+        if first is not None:
+            state = first.compile(options)(key, params)
+        program = compiled.result()
+    clock.lap("compile")
+    return state, program
 
 
 def train(
@@ -51,16 +82,13 @@ def train(
         TrainingError: The loss is no longer finite.
     """
     config = learner.config
-    snapshot = snapshot or begin(learner, params)
-    if finished(snapshot, config):
+    if snapshot is not None and finished(snapshot, config):
         return snapshot
-    params = learner.share(params)
-    began = time.perf_counter()
-    clock.lap("start")
-    lowered = jax.jit(learner.iterate, donate_argnums=0).lower(snapshot.state, params)
-    clock.lap("trace")
-    iterate = lowered.compile(compiler_options(config))
-    clock.lap("compile")
+    params, began = learner.share(params), time.perf_counter()
+    key = learner.share(jax.random.PRNGKey(config.seed))
+    so_far = None if snapshot is None else snapshot.state
+    state, iterate = _compile(learner.init, learner.iterate, key, params, so_far, config)
+    snapshot = snapshot or started(learner, state)
     compiled = time.perf_counter()
     while not finished(snapshot, config):
         before = time.perf_counter()
@@ -75,22 +103,13 @@ def train(
     return snapshot
 
 
-AXIS = "seed"
-
-
-def seed_axes() -> tuple[str, ...]:
-    """Returns the names of the axes along which learners of several seeds are vmapped."""
-    return () if jax.default_backend() == "cpu" else (AXIS,)
-
-
 def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
     """Maps a function of a state (or a key) and params over stacked states.
 
-    An accelerator does all seeds together. A CPU, which one seed fills, does one after the other and so keeps the
-    branches that `vmap` would take both ways.
+    An accelerator does all seeds together; a CPU, which one seed fills, does one after the other.
     """
-    if seed_axes():
-        return jax.vmap(function, in_axes=(0, None), axis_name=AXIS)
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function, in_axes=(0, None))
     return lambda states, params: jax.lax.map(lambda state: function(state, params), states)
 
 
@@ -107,7 +126,7 @@ def train_seeds(
     done its numbers stand still while others go on.
 
     Args:
-        learners: One for each seed, alike but for `config.seed`; those of several seeds know `seed_axes()`.
+        learners: One for each seed, alike but for `config.seed`.
         params: Parameters of the environment.
         snapshots: Snapshots to go on from, all at one iteration but those that are done; None is the beginning.
         watch: Called with the index of the seed after each of its iterations.
@@ -119,16 +138,18 @@ def train_seeds(
     Raises:
         TrainingError: The loss of a seed is no longer finite.
     """
-    now, first = _begin_missing(learners, params, snapshots), learners[0]
-    states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
-    if all(map(_done, now, learners)):
-        return now
-    began = time.perf_counter()
-    clock.lap("start")
-    program = jax.jit(over_seeds(first.iterate), donate_argnums=0).lower(states, params)
-    clock.lap("trace")
-    iterate = program.compile(compiler_options(first.config))
-    clock.lap("compile")
+    began, first = time.perf_counter(), learners[0]
+    done = [s is not None and finished(s, learner.config) for s, learner in zip(snapshots, learners, strict=True)]
+    if all(done):
+        return [snapshot for snapshot in snapshots if snapshot is not None]
+    known = None if None in snapshots else [snapshot.state for snapshot in snapshots if snapshot is not None]
+    states = None if known is None else jax.tree.map(lambda *leaves: jnp.stack(leaves), *known)
+    keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
+    states, iterate = _compile(over_seeds(first.init), over_seeds(first.iterate), keys, params, states, first.config)
+    fresh = _apart(states, len(learners))
+    now = [s or started(learner, state) for s, learner, state in zip(snapshots, learners, fresh, strict=True)]
+    if known is None and any(snapshot is not None for snapshot in snapshots):
+        states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[snapshot.state for snapshot in now])
     compiled = time.perf_counter()
     while not all(map(_done, now, learners)) and not stop():
         before = time.perf_counter()
@@ -145,17 +166,6 @@ def train_seeds(
                 watch(k, now[k])
     clock.lap("train")
     return now
-
-
-def _begin_missing(learners: list[Trainable], params: Any, snapshots: list[Snapshot | None]) -> list[Snapshot]:
-    """Returns the snapshots, an untrained one in place of each that is None."""
-    known = [snapshot for snapshot in snapshots if snapshot is not None]
-    if len(known) == len(snapshots):
-        return known
-    keys = jnp.stack([jax.random.PRNGKey(learner.config.seed) for learner in learners])
-    init = jax.jit(over_seeds(learners[0].init), compiler_options=compiler_options(learners[0].config))
-    untrained = _apart(init(keys, params), len(learners))
-    return [s or started(learner, state) for s, learner, state in zip(snapshots, learners, untrained, strict=True)]
 
 
 def _done(snapshot: Snapshot, learner: Trainable) -> bool:

@@ -1,5 +1,6 @@
 """One unroll of every environment under the sampled policy, stored as learning needs it."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -61,55 +62,69 @@ class Rollout:
 
 def begin(env: Any, driver: Driver, policy: Policy, params: Any, key: PRNGKeyArray, n_envs: int) -> Drive:
     """Starts an episode in every environment."""
-    observation, env_state = env.reset(key, params, n_envs)
+    start_key, scan_key = jax.random.split(key)
+    env_state = _begin(env, params, start_key, n_envs)
+    observation = _observe(env, params, env_state, env.draw_step(scan_key, (n_envs,), params))
     zero = jnp.zeros(n_envs)
     kept = driver.begin(policy, observation, params)
     return Drive(env_state, kept, driver.start_memory((n_envs,)), zero.astype(jnp.int32), zero)
 
 
+@struct.dataclass
+class Last:
+    """The last step of each environment that was cut off by the clock, from which its value is bootstrapped.
+
+    Attributes:
+        env_state: State after it.
+        kept: What the policy kept before it.
+        action: The action.
+        memory: Memory of the network after its inputs.
+    """
+
+    env_state: Any
+    kept: Any
+    action: Float[Array, "env action"]
+    memory: Float[Array, "env cell"]
+
+
 def collect(
-    env: Any,
-    driver: Driver,
-    policy: Policy,
-    params: Any,
-    drive: Drive,
-    key: PRNGKeyArray,
-    n_steps: int,
-    axes: tuple[str, ...] = (),
+    env: Any, driver: Driver, policy: Policy, params: Any, drive: Drive, key: PRNGKeyArray, n_steps: int
 ) -> tuple[Drive, Rollout, Finished, dict[str, Float[Array, ""]]]:
-    """Drives `n_steps` control periods with the sampled policy.
+    """Drives `n_steps` control periods with the sampled policy; who has finished begins anew.
+
+    Nothing in a step depends on whether any episode has ended, so that the device never waits for the host. What the
+    clock cut off is valued once, after the unroll: an episode is longer than that, so each environment has one at most.
 
     Args:
-        env: Batched environments that reset themselves.
+        env: The environment, not batched.
         driver: What drives.
         policy: Its weights.
         params: Parameters of the environments.
         drive: State of the environments.
         key: For actions and environments.
-        n_steps: Length of the unroll.
-        axes: Names of the axes along which this is vmapped.
+        n_steps: Length of the unroll, less than the horizon.
 
     Returns:
         State of the environments afterwards, the stored unroll, the episodes that ended in it, and the mean of every
         reward term per step.
     """
+    n_envs = drive.age.shape[0]
 
-    def step(now: Drive, key_now: PRNGKeyArray) -> tuple[Drive, tuple[Rollout, Finished, dict[str, Array]]]:
-        key_action, key_env = jax.random.split(key_now)
+    def step(carry: tuple[Drive, Last], key_now: PRNGKeyArray) -> tuple[tuple[Drive, Last], Any]:
+        now, last = carry
+        key_action, key_env, key_start = jax.random.split(key_now, 3)
         inputs = driver.inputs(policy, now.kept)
         out, memory = driver.answer(policy, inputs, now.memory)
         raw = driver.sample(out, key_action)
         action = driver.action(raw)
         error = driver.target(now.env_state, now.kept, params)
-        observation, env_state, reward, terminated, truncated, info = env.step(key_env, now.env_state, action, params)
+        noise = env.draw_step(key_env, (n_envs,), params)
+        stepped, reward, terminated, truncated, info = jax.vmap(env.advance, (0, 0, 0, None))(
+            now.env_state, action, noise, params
+        )
         done = terminated | truncated
-
-        def value_of_final() -> Array:
-            final = driver.take(policy, now.kept, action, info["final_observation"], params)
-            return driver.answer(policy, driver.inputs(policy, final), memory)[0].value
-
-        # Truncation is rare, and most steps skip this.
-        final_value = jax.lax.cond(anywhere(truncated, axes), value_of_final, lambda: jnp.zeros_like(reward))
+        env_state = _choose(done, _begin(env, params, key_start, n_envs), stepped)
+        observation = _observe(env, params, env_state, noise)
         total, length = now.episode_return + reward, now.age + 1
         stored = Rollout(
             inputs=inputs,
@@ -120,11 +135,12 @@ def collect(
             reward=reward,
             terminated=terminated,
             truncated=truncated,
-            final_value=jnp.where(truncated, final_value, 0.0),
+            final_value=jnp.zeros_like(reward),
             error=error,
         )
         finished = Finished(done, info["coverage"], info["success"], info["contact"], total, length)
         terms = {name: jnp.mean(value) for name, value in info.items() if name.startswith("reward_")}
+        last = _choose(truncated, Last(stepped, now.kept, action, memory), last)
         after = Drive(
             env_state=env_state,
             kept=driver.go_on(policy, now.kept, action, observation, done, params),
@@ -132,16 +148,27 @@ def collect(
             age=jnp.where(done, 0, length),
             episode_return=jnp.where(done, 0.0, total),
         )
-        return after, (stored, finished, terms)
+        return (after, last), (stored, finished, terms)
 
-    after, (stored, finished, terms) = jax.lax.scan(step, drive, jax.random.split(key, n_steps))
+    key_steps, key_last = jax.random.split(key)
+    nobody = Last(drive.env_state, drive.kept, jnp.zeros((n_envs, driver.n_action)), drive.memory)
+    keys = jax.random.split(key_steps, n_steps)
+    (after, last), (stored, finished, terms) = jax.lax.scan(step, (drive, nobody), keys)
+    final = _observe(env, params, last.env_state, env.draw_step(key_last, (n_envs,), params))
+    kept = driver.take(policy, last.kept, last.action, final, params)
+    value = driver.answer(policy, driver.inputs(policy, kept), last.memory)[0].value
+    stored = dataclasses.replace(stored, final_value=jnp.where(stored.truncated, value, 0.0))
     return after, stored, finished, jax.tree.map(jnp.mean, terms)
 
 
-def anywhere(flag: Bool[Array, "env"], axes: tuple[str, ...]) -> Bool[Array, ""]:
-    """Returns True where a flag is up in any environment, those of other copies along vmapped axes included.
+def _begin(env: Any, params: Any, key: PRNGKeyArray, n_envs: int) -> Any:
+    return jax.vmap(env.begin, (0, None))(env.draw_reset(key, (n_envs,), params), params)
 
-    A condition that differs between copies would have both of its branches computed for all of them.
-    """
-    up = jnp.any(flag)
-    return jax.lax.pmax(up, axes) if axes else up
+
+def _observe(env: Any, params: Any, env_state: Any, noise: Any) -> Array:
+    return jax.vmap(env.observe, (0, 0, None))(env_state, noise, params)
+
+
+def _choose(condition: Bool[Array, "env"], new: Any, old: Any) -> Any:
+    """Returns one of two trees for each environment."""
+    return jax.tree.map(lambda a, b: jnp.where(condition.reshape(-1, *[1] * (b.ndim - 1)), a, b), new, old)

@@ -105,6 +105,10 @@ class Memory:
         """Returns the inputs of the network, the oldest observation first."""
         return jnp.concatenate([kept.stack.reshape(-1), kept.seen])
 
+    def far_from_goal(self, reckoned: Reckoned, obs: Observed, params: EnvParams) -> Float[Array, "n"]:
+        """Returns the inputs of a robot whose goal is far away, for `along`."""
+        return jnp.append(inputs.look(reckoned, obs, jnp.float32(inputs.FAR), params, self.relief), 0.0)
+
     def estimate(self, kept: Kept, obs: Observed, params: EnvParams) -> tuple[Array, Array, Array]:
         """Returns the station believed (m), the log of its standard deviation (m), and the direction faced."""
         if kept.located is not None:
