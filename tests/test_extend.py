@@ -146,7 +146,7 @@ def test_board_recorder_and_viewer_take_a_task_from_outside(desk, capsys):
 
 
 def test_a_policy_is_trained_on_a_task_from_outside(desk):
-    from train import navigate
+    from train import __main__ as navigate
 
     few = ("--steps=16384", "--evaluation-episodes", "2")
     status = call(navigate.main, "--task", TASK, *SMALL, *few, "--out", "run")

@@ -10,9 +10,9 @@ from tests.train import corridor
 
 # Shapes in annotations are checked at run time, so that they cannot go stale. Not those of pytrees: jax also rebuilds
 # them around NumPy arrays, shapes and booleans.
-CHECKED = ("train.learning", "train.feedforward.rollout", "train.feedforward.networks")
+CHECKED = ("train.learning", "train.rollout")
 with install_import_hook(CHECKED, f"{checking.__name__}.check_functions"):
-    from train import navigate
+    from train import __main__ as navigate
 
 TASK = "Subterra/TraverseShort-v1"
 SMALL = ("--n-envs=64", "--unroll=64", "--minibatches=4", "--hidden", "32", "32")

@@ -1,7 +1,8 @@
 import pytest
 
 from tests.train.conftest import call
-from train import curve, evaluate, navigate, release
+from train import __main__ as navigate
+from train import curve, evaluate, release
 
 COMMANDS = {"navigate": navigate, "evaluate": evaluate, "release": release, "curve": curve}
 

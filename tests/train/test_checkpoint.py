@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from train.feedforward import networks
+from train.feedforward.learner import Learner
 
 from train import checkpoint, folder, learning, policies
 from train.checkpoint import CheckpointError
-from train.config import PPOConfig
-from train.feedforward import networks
-from train.feedforward.learner import Learner
+from train.config import TrainConfig
 from train.ppo import begin
 from train.world import open_world
 
@@ -119,7 +119,7 @@ def test_a_file_of_another_schema_is_refused_by_field(saved):
 
 def test_a_resumed_run_knows_for_how_long_the_goal_has_held(tunnel, tmp_path):
     world = open_world("Subterra/TraverseShort-v1", tunnel)
-    learner = Learner(world.env, world.params, PPOConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
+    learner = Learner(world.env, world.params, TrainConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
     run = folder.RunFolder(tmp_path / "run", world, learner)
     run.start()
     run.save(dataclasses.replace(begin(learner, world.params), iteration=9, solved_for=3))

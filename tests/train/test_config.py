@@ -4,7 +4,7 @@ import jax
 import pytest
 
 import subterra_jax as st
-from train.config import ConfigError, PPOConfig, check, make_config
+from train.config import ConfigError, TrainConfig, check, make_config
 from train.devices import compiler_options
 
 WRONG = {
@@ -16,7 +16,7 @@ WRONG = {
     "frames": 0,
     "seed": -1,
     "learning_rate": 0.0,
-    "init_std": 0.001,
+    "init_std": 0.0,
     "discount": 1.5,
     "gae_lambda": -0.1,
     "clip": float("nan"),
@@ -26,31 +26,31 @@ WRONG = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_setting_that_makes_no_sense_is_refused_by_name(name):
-    with pytest.raises(ConfigError, match="min_std" if name == "init_std" else name):
-        check(dataclasses.replace(PPOConfig(), **{name: WRONG[name]}))
+    with pytest.raises(ConfigError, match=name):
+        check(dataclasses.replace(TrainConfig(), **{name: WRONG[name]}))
 
 
 @pytest.mark.parametrize("preset", ["cpu", "gpu"])
 @pytest.mark.parametrize("task", [id for id in st.TASKS])
 def test_every_task_has_presets_that_make_sense(task, preset):
     config = check(make_config(task, preset))
-    assert preset == "cpu" or config.steps_per_iteration >= 1_000_000
+    assert preset == "cpu" or config.steps_per_iteration >= 100_000
 
 
-def test_an_unknown_task_or_preset_is_refused_with_those_there_are():
-    with pytest.raises(ConfigError, match="TraverseShort"):
-        make_config("Subterra/Nowhere-v1")
+def test_an_unknown_memory_or_preset_is_refused_with_those_there_are():
+    with pytest.raises(ConfigError, match="none, stack, gru, along"):
+        make_config("Subterra/Traverse-v1", memory="tape")
     with pytest.raises(ConfigError, match="cpu, gpu"):
         make_config("Subterra/Traverse-v1", "abacus")
 
 
 def test_steps_are_rounded_up_to_whole_iterations():
-    config = dataclasses.replace(PPOConfig(), steps=1001, n_envs=10, unroll=10, minibatches=5)
+    config = dataclasses.replace(TrainConfig(), steps=1001, n_envs=10, unroll=10, minibatches=5)
     assert (config.steps_per_iteration, config.iterations, config.minibatch_envs) == (100, 11, 2)
 
 
 def test_a_gpu_adds_up_in_a_fixed_order_unless_the_settings_say_otherwise(monkeypatch):
-    assert compiler_options(PPOConfig()) is None  # a CPU always does
+    assert compiler_options(TrainConfig()) is None  # a CPU always does
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert compiler_options(PPOConfig()) == {"xla_gpu_deterministic_ops": True}
-    assert compiler_options(PPOConfig(sums="any")) is None
+    assert compiler_options(TrainConfig()) == {"xla_gpu_deterministic_ops": True}
+    assert compiler_options(TrainConfig(sums="any")) is None

@@ -8,10 +8,10 @@ import pytest
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.transfer import Lag, LaggedWheels
 from subterra_jax.policies import PolicyError
-from train import navigate
+from train import __main__ as navigate
+from train.__main__ import read_command
 from train.b2 import embodied
 from train.config import ConfigError, Legs
-from train.navigate import read_command
 
 SHORT = "Subterra/TraverseShort-v1"
 NO_TRIAL = Legs(robots=0)

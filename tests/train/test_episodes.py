@@ -3,8 +3,8 @@ import json
 import jax.numpy as jnp
 import numpy as np
 
-from train import curve, learning
-from train.feedforward.networks import Policy
+from train import curve
+from train.driver import Policy
 from train.report import Finished, Report, fetch, in_a_row, report
 from train.snapshot import Best, EpisodeWindow
 
@@ -69,7 +69,7 @@ def test_few_episodes_are_the_same_rows_without_the_unroll():
 
 def test_a_policy_that_is_not_to_be_kept_gives_way_to_a_later_one_that_does_worse():
     best = Best.of(None, full_window(0.9, 10.0), 1, named("first"), keep=False)
-    assert Best.of(best, full_window(0.1, 1.0), 2, named("later"), keep=False).policy.weights == "later"
+    assert Best.of(best, full_window(0.1, 1.0), 2, named("later"), keep=False).policy.network == "later"
 
 
 def test_a_window_without_episodes_has_no_mean():
@@ -93,24 +93,24 @@ def full_window(success, episode_return):
 
 
 def named(name):
-    return Policy(weights=name, statistics=learning.start_statistics(()))
+    return Policy(name)
 
 
 def test_the_best_policy_is_chosen_by_success_then_by_return_then_by_being_later():
     best = Best.of(None, full_window(0.9, 10.0), 1, named("first"))
     best = Best.of(best, full_window(0.8, 99.0), 2, named("more return, less success"))
-    assert best.policy.weights == "first"
+    assert best.policy.network == "first"
     best = Best.of(best, full_window(0.9, 11.0), 3, named("more return"))
-    assert best.policy.weights == "more return"
+    assert best.policy.network == "more return"
     best = Best.of(best, full_window(0.9, 11.0), 4, named("later"))
-    assert (best.policy.weights, best.iteration) == ("later", 4)
+    assert (best.policy.network, best.iteration) == ("later", 4)
 
 
 def test_no_policy_is_the_best_before_a_hundred_episodes_have_finished():
     best = Best.of(None, EpisodeWindow(), 0, named("untrained"))
     best = Best.of(best, EpisodeWindow(), 1, named("a little trained"))
-    assert best.policy.weights == "a little trained"
-    assert Best.of(best, full_window(0.0, -5.0), 2, named("measured")).policy.weights == "measured"
+    assert best.policy.network == "a little trained"
+    assert Best.of(best, full_window(0.0, -5.0), 2, named("measured")).policy.network == "measured"
 
 
 def test_the_rolling_mean_of_a_curve_is_that_of_the_last_hundred():

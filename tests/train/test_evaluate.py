@@ -3,6 +3,7 @@ import subprocess
 import sys
 
 import jax
+import jax.numpy as jnp
 import pytest
 
 import subterra_jax as st
@@ -10,17 +11,22 @@ from subterra_jax.evaluation import evaluate as drive
 from subterra_jax.evaluation import listed_episodes
 from subterra_jax.rules import StartParams
 from tests.train.conftest import TASK, call
-from train import evaluate, learning
-from train.feedforward import networks
+from train import evaluate
+from train.config import TrainConfig
+from train.driver import Driver, Policy
 from train.policies import make_agent
+from train.setup import make_layout
 
 
 @pytest.fixture(scope="module")
 def straight_driver():
     """A policy that drives straight on at 1 m/s whatever it sees."""
-    nets = networks.Networks(networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (4,), 0.5, 0.01))
-    weights = jax.tree.map(lambda x: 0.0 * x, nets.init(jax.random.PRNGKey(0))["policy"])
-    return make_agent(nets, networks.Policy(weights, learning.start_statistics((18,))))
+    env, params = st.make(TASK)
+    driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
+    weights = jax.tree.map(lambda x: 0.0 * x, driver.init(jax.random.PRNGKey(0)))
+    # A speed of 1 m/s between -0.6 and 2 m/s.
+    weights["actor"]["out"]["bias"] = jnp.arctanh(jnp.array([2.0 * 1.6 / 2.6 - 1.0, 0.0]))
+    return make_agent(driver, Policy(weights))
 
 
 def driven(agent, tunnel, **start):
@@ -72,7 +78,10 @@ def test_the_command_prints_one_line_of_json_and_nothing_else(trained, tunnel):
         (("--lining", "velvet"), "no lining 'velvet'"),
         (("--episodes", "0"), "episodes must be at least 1, got 0"),
         (("--episodes", "501"), "episodes must be at most 500"),
-        (("--task", "Subterra/StopAt-v1"), "made for observations of 18 numbers, Subterra/StopAt-v1 has 21"),
+        (
+            ("--task", "Subterra/StopAt-v1"),
+            "has learnt Subterra/TraverseShort-v1 (to cover); Subterra/StopAt-v1 asks",
+        ),
     ],
 )
 def test_a_mistake_on_the_command_line_is_one_sentence_and_status_2(trained, capsys, arguments, message):

@@ -9,7 +9,8 @@ import time
 import pytest
 
 from tests.train.conftest import SMALL, TASK, call
-from train import checkpoint, curve, evaluate, navigate
+from train import __main__ as navigate
+from train import checkpoint, curve, evaluate
 
 
 def test_a_run_folder_holds_everything(trained):
@@ -40,15 +41,22 @@ def test_a_run_folder_holds_everything(trained):
         (("--task", "Subterra/Nowhere-v1"), "no task 'Subterra/Nowhere-v1'"),
         (("--preset", "abacus"), "unknown preset 'abacus'"),
         (("--minibatches", "7"), "n_envs = 128 cannot be divided into minibatches = 7"),
+        (("--memory", "tape"), "unknown memory 'tape'"),
+        (("--auxiliary",), "auxiliary = True asks a memory, gru or along, and memory = none is none"),
+        (("--map",), "map = True is for memory along with front match, not none with match"),
+        (("--begin-from", "nobody"), "begin_from = nobody: nobody: no such policy"),
+        (("--memory", "gru", "--auxiliary"), "auxiliary = True asks for the way to a goal, and Subterra/"),
+        (("--memory", "along"), "memory = along looks along the way to a goal, and Subterra/"),
+        (("--unroll", "600"), "unroll = 600 must be less than the horizon of Subterra/TraverseShort-v1, 600"),
         (("--steps", "0"), "steps must be at least 1, got 0"),
         (("--tunnel", "nowhere.npz"), "nowhere.npz: no such tunnel file"),
         (("--lining", "velvet"), "no lining 'velvet'"),
-        (("--evaluation-episodes", "0"), "evaluation_episodes must be at least 1, got 0"),
+        (("--evaluation-episodes", "501"), "evaluation_episodes must be at most 500"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_status_2_before_anything_is_written(tmp_path, capsys, arguments, message):
     (tmp_path / "run").mkdir()
-    assert call(navigate.main, "--out", str(tmp_path / "run"), *arguments) == 2
+    assert call(navigate.main, "--task", TASK, "--out", str(tmp_path / "run"), *arguments) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert message in error
@@ -103,7 +111,7 @@ def test_a_truncated_checkpoint_is_one_sentence_when_resumed_or_scored(trained, 
 
 def test_ctrl_c_saves_the_checkpoint_and_exits_with_130(tunnel, tmp_path):
     out = tmp_path / "run"
-    line = [sys.executable, "-m", "train.navigate", "--task", TASK, "--tunnel", str(tunnel), "--out", str(out), *SMALL]
+    line = [sys.executable, "-m", "train", "--task", TASK, "--tunnel", str(tunnel), "--out", str(out), *SMALL]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     process = subprocess.Popen([*line, "--stop-coverage=2"], stderr=subprocess.PIPE, text=True, env=environment)
     log = out / "log.jsonl"

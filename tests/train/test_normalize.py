@@ -16,14 +16,15 @@ def test_running_statistics_equal_those_of_all_the_data_at_once():
 
 def test_normalized_observations_have_no_mean_and_unit_variance():
     data = jnp.asarray(np.random.default_rng(1).normal(7.0, 3.0, (1000, 2)), jnp.float32)
-    normal = learning.normalize(data, learning.update_statistics(learning.start_statistics((2,)), data))
+    statistics = learning.update_statistics(learning.start_statistics((2,)), data)
+    normal = learning.normalize(data, statistics.mean, statistics.std)
     np.testing.assert_allclose(normal.mean(axis=0), 0.0, atol=1e-4)
     np.testing.assert_allclose(normal.std(axis=0), 1.0, rtol=1e-4)
 
 
 def test_a_reading_that_never_moved_stays_finite_and_clipped():
     statistics = learning.update_statistics(learning.start_statistics((1,)), jnp.zeros((100, 1)))
-    assert float(learning.normalize(jnp.array([5.0]), statistics)[0]) == 10.0
+    assert float(learning.normalize(jnp.array([5.0]), statistics.mean, statistics.std)[0]) == 10.0
 
 
 def test_discounted_returns_begin_anew_with_every_episode_and_go_on_between_unrolls():

@@ -11,11 +11,13 @@ import pytest
 import subterra_jax as st
 from subterra_jax.policies import load_policy
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
-from train import navigate, sinks
-from train.config import ConfigError, PPOConfig
-from train.navigate import read_command
+from train import __main__ as navigate
+from train import sinks
+from train.__main__ import read_command
+from train.config import ConfigError, TrainConfig
 from train.options import read_settings, reward_of, settings_of
 from train.ppo import train
+from train.setup import make_learner
 from train.sinks import Logs
 from train.world import open_world, with_reward
 
@@ -24,9 +26,9 @@ pytestmark = pytest.mark.door
 YAML = """
 task: Subterra/StopAtShort-v1
 memory: gru
-teacher: oracle
-hidden: 48
-bin_width: 0.25
+auxiliary: true
+cell: 48
+discount: 0.9
 reward: {jerk: 0.5}
 """
 TOML = "task = 'Subterra/TraverseShort-v1'\nhidden = [24, 12]\nframes = 2\n[reward]\nlateral = 0.7\n"
@@ -34,9 +36,9 @@ TOML = "task = 'Subterra/TraverseShort-v1'\nhidden = [24, 12]\nframes = 2\n[rewa
 
 def test_a_file_sets_what_the_command_line_sets_and_the_command_line_has_the_last_word(tmp_path):
     (tmp_path / "mine.yaml").write_text(YAML)
-    command = read_command(["--config", str(tmp_path / "mine.yaml"), "--out", "o", "--hidden", "32"])
-    assert (type(command).__name__, command.task) == ("DistillCommand", "Subterra/StopAtShort-v1")
-    assert (command.config.hidden, command.config.bin_width, command.config.teacher) == (32, 0.25, "oracle")
+    command = read_command(["--config", str(tmp_path / "mine.yaml"), "--out", "o", "--cell", "32"])
+    assert (command.config.memory, command.task) == ("gru", "Subterra/StopAtShort-v1")
+    assert (command.config.cell, command.config.discount, command.config.auxiliary) == (32, 0.9, True)
     assert reward_of(command)["jerk"] == 0.5
     (tmp_path / "mine.toml").write_text(TOML)
     command = read_command([f"--config={tmp_path / 'mine.toml'}", "--out", "o", "--reward.jerk", "0"])
@@ -44,12 +46,20 @@ def test_a_file_sets_what_the_command_line_sets_and_the_command_line_has_the_las
     assert reward_of(command) == {"terminal": 1.0, "coverage": 100.0, "lateral": 0.7, "jerk": 0.0}
 
 
-@pytest.mark.parametrize(
-    "words", [(), ("--memory", "gru"), ("--memory", "gru", "--teacher", "fused"), ("--memory=map",)]
-)
+@pytest.mark.parametrize("words", [(), ("--memory", "gru"), ("--memory", "along", "--auxiliary", "--map")])
 def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
-    task = "Subterra/Relocalise-v1" if "--memory=map" in words else "Subterra/StopAtShort-v1"
-    given = ["--task", task, *words, "--n-envs=96", "--reward.miss", "3.5", "--out", "o", "--log", "json:dumps"]
+    given = [
+        "--task",
+        "Subterra/StopAtShort-v1",
+        *words,
+        "--n-envs=96",
+        "--reward.miss",
+        "3.5",
+        "--out",
+        "o",
+        "--log",
+        "json:dumps",
+    ]
     command = read_command(given)
     (tmp_path / "config.json").write_text(json.dumps({"schema": "subterra.run/1", "command": settings_of(command)}))
     again = read_command(["--config", str(tmp_path / "config.json"), "--out", "o"])
@@ -61,7 +71,17 @@ def test_the_settings_of_a_run_are_read_back_as_they_were(tmp_path, words):
 @pytest.mark.slow
 def test_a_run_is_done_again_from_its_own_config(train_small, tmp_path):
     (tmp_path / "told.py").write_text("lines = []\ndef keep(line):\n    lines.append(line)\n")
-    few = ("--steps=8192", "--stop-coverage=2", "--frames", "2", "--reward.coverage", "7", "--evaluation-episodes", "5")
+    few = (
+        "--steps=8192",
+        "--stop-coverage=2",
+        "--memory=stack",
+        "--frames",
+        "2",
+        "--reward.coverage",
+        "7",
+        "--evaluation-episodes",
+        "5",
+    )
     status, first = train_small(*few, "--log", f"{tmp_path / 'told.py'}:keep")
     assert status == 0
     assert call(navigate.main, "--config", str(first / "config.json"), "--out", str(tmp_path / "again")) == 0
@@ -72,7 +92,7 @@ def test_a_run_is_done_again_from_its_own_config(train_small, tmp_path):
     assert told["reward"] == {"coverage": 7.0}
     # The reward is how it was taught, and no condition under which it drives.
     env, params = st.make(TASK)
-    assert load_policy(first, env, params).agent.frames == 2
+    assert load_policy(first, env, params).agent.layout.memory.frames == 2
     assert load_policy(first, env, params).agent.conditions.constants == st.constants_digest(env, params)
 
 
@@ -146,8 +166,8 @@ def test_a_function_of_ones_own_gets_every_line_of_the_log(tmp_path, monkeypatch
 
 def test_training_from_python_calls_a_function_with_every_line_of_the_log(tunnel):
     world, told = open_world(TASK, tunnel), []
-    config = PPOConfig(n_envs=64, unroll=64, minibatches=4, hidden=(32, 32), steps=4096)
-    train(world.env, world.params, config, log=told.append)
+    config = TrainConfig(n_envs=64, unroll=64, minibatches=4, hidden=(32, 32), steps=4096)
+    train(make_learner(world, config), world.params, log=told.append)
     assert [line["step"] for line in told] == [4096]
 
 

@@ -1,9 +1,6 @@
 import json
-import subprocess
-import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -11,159 +8,98 @@ from safetensors.numpy import load_file
 import subterra_jax as st
 from subterra_jax import policies
 from subterra_jax.baselines import registry
-from subterra_jax.baselines.agent import Observed
+from subterra_jax.baselines.agent import observed
+from subterra_jax.parts.imu import ImuParams
 from subterra_jax.parts.unicycle import VehicleParams
-from subterra_jax.policies import senses
 from tests.train.conftest import TASK, call
-from train import evaluate, learning, release
-from train.feedforward import networks, rollout
-from train.policies import facts_file, make_agent, open_agent, write_policy
-from train.recurrent.config import RecurrentConfig
-from train.recurrent.drive import make_layout
-from train.recurrent.network import RecurrentNetworks, without_critic
+from train import evaluate, release
+from train.config import TrainConfig
+from train.driver import Driver, Policy
+from train.policies import facts_file, make_agent, open_agent, write_tensors
+from train.setup import make_layout
 
 GOAL_TASK = "Subterra/StopAtShort-v1"
 
 
 @pytest.fixture(scope="module")
-def perceptron():
-    nets = networks.Networks(networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16, 8), 0.5, 0.01))
-    data = 3.0 * jax.random.normal(jax.random.PRNGKey(0), (50, 18)) + 1.0
-    weights = jax.tree.map(lambda x: x + 0.1, nets.init(jax.random.PRNGKey(1))["policy"])
-    return nets, networks.Policy(weights, learning.update_statistics(learning.start_statistics((18,)), data))
-
-
-@pytest.fixture(scope="module")
 def gru():
-    env, params = st.make(GOAL_TASK)
-    nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
-    weights = jax.tree.map(lambda x: x + 0.05, jax.jit(nets.init)(jax.random.PRNGKey(1)))
-    return nets, without_critic(weights)
-
-
-@pytest.fixture(scope="module")
-def among_boxes():
-    env, params = st.make("Subterra/Obstructed-v1")
-    nets = RecurrentNetworks(make_layout(env, params, RecurrentConfig(hidden=12, bins=20)))
-    weights = jax.tree.map(lambda x: x + 0.05, jax.jit(nets.init)(jax.random.PRNGKey(1)))
-    return nets, without_critic(weights)
+    env, params = st.make(GOAL_TASK, tunnel="open:cast:train:0")
+    driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(12,), memory="gru", cell=12, auxiliary=True)))
+    weights = jax.tree.map(lambda x: x + 0.05, driver.init(jax.random.PRNGKey(1)))
+    return env, params, driver, Policy(weights)
 
 
 @pytest.fixture
 def released(gru, tmp_path):
     out = tmp_path / "mine.safetensors"
-    write_policy(out, *gru, {"task": GOAL_TASK, "world": {"lining": "pockets"}})
+    _, _, driver, policy = gru
+    facts = {"task": GOAL_TASK, "world": {"lining": "built"}}
+    write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), facts)
     return out
 
 
-def readings(n_steps):
-    """Observations of an episode with a goal, made up."""
-    rng = np.random.default_rng(0)
-    for step in range(n_steps):
-        ranges = jnp.asarray(rng.uniform(1.0, 6.0, 16), jnp.float32)
-        distance, heading = jnp.float32(0.19 * step), jnp.float32(0.1 * rng.normal())
-        flat = jnp.concatenate([ranges, jnp.stack([distance, heading, 40.0, 1.35])])
-        yield Observed(flat, ranges, distance, heading, jnp.float32(40.0), jnp.float32(1.35))
-
-
-def test_a_perceptron_drives_without_the_trainer_as_it_does_with_it(perceptron):
-    nets, policy = perceptron
-    agent, stack, memory = make_agent(nets, policy), None, None
-    for obs in readings(6):
-        seen = Observed(obs.flat[:18], obs.ranges, obs.distance, obs.heading)
-        stack = (
-            rollout.start_stack(seen.flat, 4)
-            if stack is None
-            else rollout.push_frame(stack, seen.flat, jnp.zeros((), bool))
-        )
-        memory = agent.begin(None, seen, None) if memory is None else memory
-        action, memory = agent.act(None, memory, seen, None, None)
-        np.testing.assert_allclose(action[:2], nets.act(policy, stack), rtol=1e-5)
-        assert np.isnan(action[2])
-
-
-@pytest.mark.parametrize("trained", ["gru", pytest.param("among_boxes", marks=pytest.mark.slow)])
-def test_a_gru_drives_and_estimates_without_the_trainer_as_it_does_with_it(request, trained):
-    nets, weights = request.getfixturevalue(trained)
-    agent, start = make_agent(nets, weights), jnp.float32(5.0)
-    assert (agent.shown.boxes, agent.n_beams) == (trained == "among_boxes", 16)
-    memory, hidden, reckoning = agent.blank(), jnp.zeros((1, 12)), senses.start((1,), 16, nets.layout.shown)
-    answer, look, advance = jax.jit(agent.answer), jax.jit(senses.look), jax.jit(senses.advance)
+def test_a_gru_drives_without_the_trainer_as_it_does_with_it(gru):
+    env, params, driver, policy = gru
+    agent = make_agent(driver, policy)
+    flat, state = env.reset(jax.random.key(0), params)
+    memory = agent.begin(None, observed(env, params, flat), params)
+    kept, cell = driver.begin(policy, flat[None], params), driver.start_memory((1,))
+    act = jax.jit(lambda memory, flat: agent.act(None, memory, observed(env, params, flat), params, None))
 
     @jax.jit
-    def think(seen, hidden):
-        hidden, _ = nets.remember(weights, seen.features[None], hidden, jnp.zeros((1, 1), bool))
-        thought = nets.think(weights, hidden, seen.ahead)
-        return hidden, thought.error, thought.log_sigma, nets.action(thought.parameters[..., :2])
+    def think(kept, cell):
+        out, cell = driver.answer(policy, driver.inputs(policy, kept), cell)
+        return driver.action(out.mean), cell
 
-    for obs in readings(12):
-        odometry = jnp.stack([obs.distance, obs.heading])
-        part = {"ranges": obs.ranges, "odometry": odometry, "goal": obs.goal[None], "ring_pitch": obs.ring_pitch[None]}
-        seen = look({name: value[None] for name, value in part.items()}, start, reckoning)
-        hidden, error, log_sigma, wanted = think(seen, hidden)
-        action, memory = answer(memory, obs, start)
-        np.testing.assert_allclose(action[:2], wanted[0], rtol=2e-4, atol=2e-5)
-        there = start + seen.station[0] + error[0] + 0.1 * max(float(wanted[0, 0]), 0.0)
-        np.testing.assert_allclose(action[2], there, rtol=1e-5, atol=1e-4)
-        np.testing.assert_allclose(action[3], log_sigma[0], rtol=1e-4, atol=1e-5)
-        reckoning = advance(seen.reckoning, wanted, jnp.zeros(1, bool))
+    step = jax.jit(env.step)
+    for i in range(5):
+        wanted, cell = think(kept, cell)
+        action, memory = act(memory, flat)
+        np.testing.assert_allclose(action[:2], wanted[0], atol=1e-5)
+        assert 0.0 < action[2] < params.tunnel.length
+        flat, state, *_ = step(jax.random.key(i), state, wanted[0], params)
+        kept = driver.take(policy, kept, wanted, flat[None], params)
 
 
-def test_released_tensors_are_what_the_safetensors_library_reads_and_act_alike(gru, released):
+def test_released_tensors_are_what_the_safetensors_library_reads(gru, released):
     agent, facts = policies.load(released)
-    assert facts["kind"] == "gru"
+    assert facts["kind"] == "ppo"
     for name, tensor in load_file(released).items():
         np.testing.assert_array_equal(agent.tensors[name], tensor)
-    obs = next(readings(1))
-    for one, other in zip(
-        agent.answer(agent.blank(), obs, jnp.float32(0.0))[0],
-        make_agent(*gru).answer(agent.blank(), obs, jnp.float32(0.0))[0],
-        strict=True,
-    ):
-        assert one == other
     again = released.with_name("again.safetensors")
-    write_policy(again, *gru, {"task": GOAL_TASK, "world": {}})
+    _, _, driver, policy = gru
+    write_tensors(again, driver.kind, driver.layout, driver.tensors(policy), {"task": GOAL_TASK, "world": {}})
     assert again.read_bytes() == released.read_bytes()
 
 
-def test_loading_a_policy_needs_nothing_but_jax(released):
-    code = (
-        "import sys, subterra_jax.policies as p\n"
-        f"agent, facts = p.load({str(released)!r})\n"
-        "print(agent.name, sorted({'train', 'brax', 'orbax', 'safetensors', 'optax'} & set(sys.modules)))"
-    )
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ran.stdout == "mine []\n"
+def test_weights_in_half_precision_take_half_the_bytes_and_are_read_as_float32(gru, released):
+    half = released.with_name("half.safetensors")
+    _, _, driver, policy = gru
+    facts = {"task": GOAL_TASK, "world": {}}
+    write_tensors(half, driver.kind, driver.layout, driver.tensors(policy), facts, half=True)
+    agent, _ = policies.load(half)
+    whole, _ = policies.load(released)
+    assert half.stat().st_size < 0.7 * released.stat().st_size
+    for name, tensor in agent.tensors.items():
+        assert tensor.dtype == np.float32
+        np.testing.assert_allclose(tensor, whole.tensors[name], rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.0005, 0.01, 0.5, 0.999])
-def test_a_policy_cut_short_is_a_clear_error(released, share):
-    content = released.read_bytes()
-    released.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(policies.PolicyError, match=r"mine.*damaged policy"):
-        policies.load(released)
+def test_a_tensor_that_is_missing_or_of_another_shape_is_refused(gru, released):
+    _, _, driver, policy = gru
+    tensors = driver.tensors(policy)
+    name = "network.actor.hidden_0.kernel"
+    for wrong in ({**tensors, name: tensors[name][:-1]}, {k: v for k, v in tensors.items() if k != name}):
+        write_tensors(released, driver.kind, driver.layout, wrong, {"task": GOAL_TASK, "world": {}})
+        with pytest.raises(policies.PolicyError, match=r"do not belong together .*actor\.hidden_0\.kernel"):
+            policies.load(released)
 
 
-def test_tensors_that_are_not_those_of_the_facts_are_refused(released, perceptron):
-    facts = json.loads(facts_file(released).read_text())
-    write_policy(released, *perceptron, {"task": TASK, "world": {}})
-    other = json.loads(facts_file(released).read_text())
-    facts_file(released).write_text(json.dumps(facts))
-    with pytest.raises(policies.PolicyError, match="another SHA-256"):
-        policies.load(released)
-    facts_file(released).write_text(json.dumps({**facts, "tensors_sha256": other["tensors_sha256"]}))
-    with pytest.raises(policies.PolicyError, match="do not belong together"):
-        policies.load(released)
-
-
-def test_a_policy_is_refused_where_it_cannot_drive(released, perceptron):
+def test_a_policy_of_other_fields_is_refused_with_both_sides_named(gru, released):
     agent, _ = policies.load(released)
-    policies.check_fits(agent, *st.make(GOAL_TASK), released)
-    for task in (TASK, "Subterra/Relocalise-v1"):
-        with pytest.raises(policies.PolicyError, match=f"which {task} does not ask for"):
-            policies.check_fits(agent, *st.make(task), released)
-    with pytest.raises(policies.PolicyError, match="observations of 18 numbers"):
-        policies.check_fits(make_agent(*perceptron), *st.make(GOAL_TASK), "mine")
+    env, params = st.make(GOAL_TASK, tunnel="open:cast:train:0", imu=ImuParams())
+    with pytest.raises(policies.PolicyError, match=r"reads 57 numbers; .*StopAtShort-v1 with its fields .*imu.* has"):
+        policies.check_fits(agent, env, params, "mine")
 
 
 def test_what_is_released_is_scored_like_the_run_it_comes_from(trained, tunnel, tmp_path, capsys):
@@ -200,15 +136,6 @@ def test_a_policy_is_refused_where_the_control_period_is_another_than_it_was_tra
         policies.check_fits(again, *with_period(TASK, 0.05), out)
 
 
-@pytest.mark.parametrize(("name", "period"), [("Traverse-v1", 0.1), ("B2Traverse-v1", 0.2)])
-def test_policies_released_before_conditions_were_kept_imply_their_period(name, period):
-    agent, facts = policies.load(name)
-    assert "trained_under" not in facts
-    assert agent.conditions.period == period
-    with pytest.raises(policies.PolicyError, match=f"control period of {period} s, .* has 0.05 s"):
-        policies.check_fits(agent, *with_period(facts["task"], 0.05), name)
-
-
 def test_a_released_policy_among_the_agents_is_refused_as_well():
     policies.register_released()
     _, params = with_period("Subterra/Traverse-v1", 0.05)
@@ -230,8 +157,10 @@ def test_a_released_policy_among_the_agents_is_refused_as_well():
         ),
     ],
 )
-def test_other_beams_and_fields_are_refused_with_both_sides_named(perceptron, conditions, message):
+def test_other_beams_and_fields_are_refused_with_both_sides_named(conditions, message):
     trained_under = policies.Conditions.from_facts({"task": TASK, "trained_under": conditions})
-    agent = make_agent(*perceptron, conditions=trained_under)
+    env, params = st.make(TASK)
+    driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
+    agent = make_agent(driver, Policy(driver.init(jax.random.PRNGKey(0))), conditions=trained_under)
     with pytest.raises(policies.PolicyError, match=message):
-        policies.check_fits(agent, *st.make(TASK), "mine")
+        policies.check_fits(agent, env, params, "mine")

@@ -14,7 +14,8 @@ import pytest
 
 from subterra_jax.policies import load
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
-from train import checkpoint, folder, navigate, session
+from train import __main__ as navigate
+from train import checkpoint, folder, session
 
 pytestmark = pytest.mark.door
 
@@ -70,6 +71,7 @@ def test_before_the_first_checkpoint_a_run_begins_again(whole, train_small, tmp_
         (("--hidden", "16"), "was trained with hidden = [32, 32], not [16]"),
         (("--reward.jerk", "0.5"), "was trained with reward = None, not {'jerk': 0.5}"),
         (("--lining", "smooth"), "was trained with lining = pockets, not smooth"),
+        (("--memory", "gru"), "was trained with"),
     ],
 )
 def test_another_run_that_was_killed_before_its_first_checkpoint_is_not_gone_on_with(
@@ -174,9 +176,9 @@ def test_an_overwritten_run_loses_its_checkpoints_before_anything_else(whole, tm
 
 def test_every_checkpoint_holds_its_policy_as_the_package_loads_it(whole):
     agent, facts = load(whole)
-    assert (agent.name, facts["task"], facts["iteration"]) == ("ppo-mlp", TASK, 3)
+    assert (agent.name, facts["task"], facts["iteration"]) == ("ppo", TASK, 3)
     older, _ = load(whole / "checkpoint" / "00000002")
-    assert older.n_observation == agent.n_observation == 18
+    assert older.layout == agent.layout
 
 
 def lines_of(run):
@@ -189,7 +191,7 @@ def lines_of(run):
 @pytest.mark.timeout(1800)
 def test_a_run_survives_sigkill_at_random_moments(tunnel, tmp_path):
     """Kills the process a dozen times: before it has begun, while it compiles, and in and between checkpoints."""
-    line = [sys.executable, "-m", "train.navigate", "--task", TASK, "--tunnel", str(tunnel), "--preset", "cpu", *SMALL]
+    line = [sys.executable, "-m", "train", "--task", TASK, "--tunnel", str(tunnel), "--preset", "cpu", *SMALL]
     line += ["--steps=204800", "--stop-coverage=2", "--checkpoint-every=1", "--evaluation-episodes", "5"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     subprocess.run([*line, "--out", str(tmp_path / "whole")], env=environment, check=True, capture_output=True)

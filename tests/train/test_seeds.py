@@ -7,15 +7,19 @@ import pytest
 
 import subterra_jax as st
 from tests.train.conftest import SMALL, TASK, call, log_without_timing
-from train import navigate, ppo, session
-from train.config import ConfigError, PPOConfig
-from train.feedforward.learner import Learner
+from train import __main__ as navigate
+from train import ppo, session
+from train.config import ConfigError, TrainConfig
+from train.driver import Driver
+from train.learner import Learner
+from train.setup import make_layout
 
-CONFIG = PPOConfig(steps=3 * 512, n_envs=16, unroll=32, minibatches=2, epochs=2, hidden=(8,), stop_coverage=2.0)
+CONFIG = TrainConfig(steps=3 * 256, n_envs=16, unroll=16, minibatches=2, epochs=2, hidden=(8,), stop_coverage=2.0)
 
 
-def learners(env, params, axes=()):
-    return [Learner(env, params, dataclasses.replace(CONFIG, seed=seed), axes) for seed in (0, 1)]
+def learners(env, params):
+    driver = Driver(env, make_layout(env, params, CONFIG))
+    return [Learner(env, driver, dataclasses.replace(CONFIG, seed=seed)) for seed in (0, 1)]
 
 
 @pytest.fixture(scope="module")
@@ -26,14 +30,15 @@ def world(tunnel):
 
 @pytest.fixture(scope="module")
 def alone(world):
-    return [ppo.train(*world, learner.config, learner=learner) for learner in learners(*world)]
+    return [ppo.train(learner, world[1]) for learner in learners(*world)]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("axes", [(), (ppo.AXIS,)], ids=["one after the other", "vmapped"])
-def test_a_seed_trained_with_others_comes_to_the_numbers_it_comes_to_alone(world, alone, axes, monkeypatch):
-    monkeypatch.setattr(ppo, "seed_axes", lambda: axes)
-    together = ppo.train_seeds(learners(*world, axes), world[1], [None, None])
+@pytest.mark.parametrize("backend", ["cpu", "gpu"], ids=["one after the other", "vmapped"])
+def test_a_seed_trained_with_others_comes_to_the_numbers_it_comes_to_alone(world, alone, backend, monkeypatch):
+    monkeypatch.setattr(ppo, "compiler_options", lambda config: None)
+    monkeypatch.setattr(ppo.jax, "default_backend", lambda: backend)
+    together = ppo.train_seeds(learners(*world), world[1], [None, None])
     for one, other in zip(alone, together, strict=True):
         assert one.iteration == other.iteration == 3
         np.testing.assert_array_equal(one.window.last["step"], other.window.last["step"])
@@ -48,7 +53,7 @@ def test_a_seed_trained_with_others_comes_to_the_numbers_it_comes_to_alone(world
 
 def test_a_seed_that_is_done_stands_still_while_others_go_on(world):
     both, seen = learners(*world), []
-    both[0].config = dataclasses.replace(both[0].config, steps=512)
+    both[0].config = dataclasses.replace(both[0].config, steps=256)
     first, second = ppo.train_seeds(both, world[1], [None, None], lambda k, now: seen.append((k, now.iteration)))
     assert seen == [(0, 1), (1, 1), (1, 2), (1, 3)]
     assert (first.iteration, int(first.state.iteration), second.iteration) == (1, 1, 3)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from tests.train.conftest import TASK, call, log_without_timing
-from train import devices, navigate
+from train import __main__ as navigate
+from train import devices
 from train.config import ConfigError
 from train.devices import Cluster
 
@@ -16,11 +17,11 @@ MORE = ("--stop-coverage=2", "--checkpoint-every=1", "--evaluation-episodes=2", 
 
 
 def processes(n_devices: int, *lines: tuple[str, ...]) -> None:
-    """Runs commands of `train.navigate` at the same time, each with so many CPU devices."""
+    """Runs commands of `train` at the same time, each with so many CPU devices."""
     flags = f"--xla_force_host_platform_device_count={n_devices} " + os.environ.get("XLA_FLAGS", "")
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     started = [
-        subprocess.Popen([sys.executable, "-m", "train.navigate", *line], env=environment, stderr=subprocess.PIPE)
+        subprocess.Popen([sys.executable, "-m", "train", *line], env=environment, stderr=subprocess.PIPE)
         for line in lines
     ]
     try:
@@ -76,7 +77,7 @@ def test_two_processes_come_to_what_one_does(line, one_device, tmp_path):
 def test_parts_that_do_not_divide_the_environments_and_seeds_with_parts_are_refused(tmp_path, capsys):
     out = ("--task", TASK, "--out", str(tmp_path / "run"), "--preset=cpu")
     assert call(navigate.main, *out, "--parts=3") == 2
-    assert "n_envs = 128 cannot be divided into parts = 3 of minibatches = 8" in capsys.readouterr().err
+    assert "n_envs = 128 cannot be divided into parts = 3 of minibatches = 4" in capsys.readouterr().err
     assert call(navigate.main, *out, "--parts=2", "--seeds", "0", "1") == 2
     assert "parts = 2 cannot be trained for several seeds at once" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

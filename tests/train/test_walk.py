@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import jax
 import jax.numpy as jnp
@@ -15,32 +16,35 @@ from subterra_jax.policies.files import PolicyError
 from train import walk
 from train.b2.walking import (
     WalkConfig,
-    WalkLayout,
-    WalkNetworks,
+    WalkDriver,
     make_walk_config,
     score,
 )
 from train.config import ConfigError
-from train.feedforward.networks import Policy
-from train.policies import write_policy
+from train.driver import Policy
+from train.policies import write_tensors
 
 N_SEEN, N_TRUTH = 56, 12
 
 
 @pytest.fixture(scope="module")
-def networks():
-    layout = WalkLayout(N_SEEN + N_TRUTH, (-1.0,) * 12, (1.0,) * 12, 1, (32, 16), 0.3, 0.03, N_SEEN)
-    return WalkNetworks(layout)
+def driver():
+    space = lambda n: types.SimpleNamespace(low=-np.ones(n, np.float32), high=np.ones(n, np.float32))  # noqa: E731
+    env = types.SimpleNamespace(action_space=lambda _: space(12), observation_size=lambda _: N_SEEN + N_TRUTH)
+    return WalkDriver(env, None, WalkConfig(hidden=(32, 16)), N_SEEN)
 
 
 @pytest.fixture(scope="module")
-def policy(networks):
-    shapes = networks.policy_shapes()
+def policy(driver):
+    shapes = jax.eval_shape(driver.init, jax.random.key(0))
     keys = iter(jax.random.split(jax.random.key(0), 100))
-    random = jax.tree.map(lambda leaf: 0.3 * jax.random.normal(next(keys), leaf.shape), shapes.weights)
+    random = jax.tree.map(lambda leaf: 0.3 * jax.random.normal(next(keys), leaf.shape), shapes)
     mean = jnp.linspace(-1.0, 1.0, N_SEEN + N_TRUTH)
-    statistics = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes.statistics)
-    return Policy(random, statistics.replace(mean=mean, std=jnp.full(N_SEEN + N_TRUTH, 2.0)))
+    return Policy(random, statistics={"mean": mean, "std": jnp.full(N_SEEN + N_TRUTH, 2.0)})
+
+
+def answer(driver, policy, seen):
+    return driver.answer(policy, driver.inputs(policy, seen), driver.start_memory(seen.shape[:1]))[0]
 
 
 def records(n_steps=200, n_robots=4, speed=0.5, asked=0.6):
@@ -50,21 +54,20 @@ def records(n_steps=200, n_robots=4, speed=0.5, asked=0.6):
     return {"velocity": velocity, "asked": wanted, "effort": np.full((n_steps, n_robots), 300.0), **flags}
 
 
-def test_the_policy_does_not_see_the_truth_and_the_critic_does(networks, policy):
-    weights = networks.init(jax.random.key(1))
-    stack = jax.random.normal(jax.random.key(2), (3, 1, N_SEEN + N_TRUTH))
-    otherwise = stack.at[..., N_SEEN:].add(1.0)
-    np.testing.assert_array_equal(networks.act(policy, stack), networks.act(policy, otherwise))
-    values = [networks.value(weights["value"], policy.statistics, seen) for seen in (stack, otherwise)]
-    assert not np.allclose(*values)
+def test_the_policy_does_not_see_the_truth_and_the_critic_does(driver, policy):
+    seen = jax.random.normal(jax.random.key(2), (3, N_SEEN + N_TRUTH))
+    one, other = answer(driver, policy, seen), answer(driver, policy, seen.at[:, N_SEEN:].add(1.0))
+    np.testing.assert_array_equal(one.mean, other.mean)
+    assert not np.allclose(one.value, other.value)
 
 
-def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_path):
+def test_a_released_gait_acts_as_the_one_that_was_trained(driver, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v1", "world": {}})
+    write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
     loaded, facts = gaits.load_policy(out)
     seen = jax.random.normal(jax.random.key(3), (5, N_SEEN + N_TRUTH))
-    np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), networks.act(policy, seen[:, None]), atol=1e-6)
+    wanted = driver.action(answer(driver, policy, seen).mean)
+    np.testing.assert_allclose(loaded.act(seen[:, :N_SEEN]), wanted, atol=1e-6)
     assert facts["kind"] == "walk"
     assert loaded.n_observation == N_SEEN
     gaits.check_fits(loaded, N_SEEN, out)
@@ -72,17 +75,22 @@ def test_a_released_gait_acts_as_the_one_that_was_trained(networks, policy, tmp_
         gaits.check_fits(loaded, 60, out)
 
 
+def test_statistics_of_the_observation_are_those_of_what_was_seen(driver, policy):
+    seen = jax.random.normal(jax.random.key(4), (5, N_SEEN + N_TRUTH))
+    np.testing.assert_allclose(driver.raw(driver.inputs(policy, seen), policy), seen, atol=1e-5)
+
+
 def test_a_missing_gait_is_refused_by_name(tmp_path):
     with pytest.raises(PolicyError, match="no such policy"):
         gaits.load_policy(tmp_path / "none.safetensors")
 
 
-def test_a_policy_that_is_no_gait_is_refused(networks, policy, tmp_path):
+def test_a_policy_that_is_no_gait_is_refused(driver, policy, tmp_path):
     out = tmp_path / "gait.safetensors"
-    write_policy(out, networks, policy, {"task": "Subterra/B2Walk-v1", "world": {}})
+    write_tensors(out, driver.kind, driver.layout, driver.tensors(policy), {"task": "Subterra/B2Walk-v1", "world": {}})
     facts = out.with_suffix(".json")
-    facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "mlp"}))
-    with pytest.raises(PolicyError, match="kind 'mlp', which is no gait"):
+    facts.write_text(json.dumps({**json.loads(facts.read_text()), "kind": "ppo"}))
+    with pytest.raises(PolicyError, match="kind 'ppo', which is no gait"):
         gaits.load_policy(out)
 
 

@@ -5,12 +5,12 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from subterra_jax.policies.networks import FeedForward
 
 import subterra_jax as st
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.host.errors import SubterraError
-from subterra_jax.policies.networks import FeedForward
 from subterra_jax.viewer import library
 from subterra_jax.viewer.driving import drive
 from tests.subterra_jax import tunnels

@@ -1,0 +1,140 @@
+"""What a network reads when it is trained is what it reads when it drives, on every task and with every memory."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax.baselines.agent import observed
+from subterra_jax.policies import inputs
+from train.config import TrainConfig
+from train.driver import Driver, Policy
+from train.policies import begin_with, make_agent
+from train.rollout import begin, collect
+from train.setup import make_layout
+
+N_ENVS, N_STEPS = 2, 6
+GOAL_TASKS = ("StopAtShort-v1", "Return-v1", "Obstructed-v1", "Faulted-v1")
+
+
+@pytest.fixture(scope="module")
+def plan():
+    return st.load_tunnel("open:cast:train:0")
+
+
+def train_and_drive(plan, task, config, localiser=None, **made):
+    """An unroll as training drives it, and what an agent with the same weights answers to the same observations."""
+    env, params = st.make(f"Subterra/{task}", tunnel=plan, **made)
+    driver = Driver(env, make_layout(env, params, config, localiser))
+    policy = Policy(jax.tree.map(lambda x: x + 0.01, driver.init(jax.random.PRNGKey(0))), localiser)
+    agent = make_agent(driver, policy)
+    agent.try_out()
+
+    @jax.jit
+    def run(params):
+        drive = begin(env, driver, policy, params, jax.random.PRNGKey(1), N_ENVS)
+        seen, acted, states = [], [], []
+        for step in range(N_STEPS):
+            states.append(drive.env_state)
+            drive, rollout, *_ = collect(env, driver, policy, params, drive, jax.random.PRNGKey(step), 1)
+            seen.append(rollout.inputs[0])
+            acted.append(driver.action(rollout.raw[0]))
+        return jnp.stack(seen), jnp.stack(acted), drive.kept, jax.tree.map(lambda *x: jnp.stack(x), *states)
+
+    return env, params, driver, policy, agent, run(params)
+
+
+@pytest.mark.parametrize("task", [*GOAL_TASKS, "Traverse-v1", "Relocalise-v1"])
+def test_training_and_driving_read_equal_numbers(plan, task):
+    env, params, driver, _, agent, (seen, acted, _, states) = train_and_drive(
+        plan, task, TrainConfig(hidden=(8,), memory="stack", frames=2)
+    )
+    # The scan's noise of a step is drawn anew: what is compared is all but the ranges, to the bit.
+    memory = driver.layout.memory
+    n = seen.shape[-1] // 2
+    ranges = np.zeros(n, bool)
+    ranges[4 : 4 + 32] = True
+    ranges[41 : 41 + 16] = True
+    first = jax.tree.map(lambda leaf: leaf[0, 0], states)
+    flat = env.observe(first, env.draw_step(jax.random.PRNGKey(5), (), params), params)
+    obs = observed(env, params, flat)
+    kept = agent.begin(None, obs, params)
+    for step in range(3):
+        state = jax.tree.map(lambda leaf, step=step: leaf[step, 0], states)
+        flat = env.observe(state, env.draw_step(jax.random.PRNGKey(5), (), params), params)
+        obs = observed(env, params, flat)
+        own = memory.take(kept.kept, kept.command, obs, params, agent._given)
+        there = np.asarray(seen[step, 0, n:])
+        np.testing.assert_allclose(np.asarray(own.seen)[~ranges], there[~ranges], atol=1e-5)
+        assert np.mean(np.abs(np.asarray(own.seen) - there)[4:36]) < 0.1
+        kept = dataclasses.replace(kept, kept=own, command=acted[step, 0, :2])
+
+
+@pytest.mark.parametrize("task", GOAL_TASKS)
+def test_the_way_to_go_is_the_true_one_but_for_the_odometer_and_the_start_that_is_given(plan, task):
+    env, params = st.make(f"Subterra/{task}", tunnel=plan)
+    starts = jax.jit(jax.vmap(env.reset, (0, None)))(jax.random.split(jax.random.key(0), 32), params)
+    way = jax.vmap(lambda flat: way_at_start(env, params, flat))(starts[0])
+    truth = jax.vmap(lambda state: env.privileged(state, params)["to_goal"])(starts[1])
+    np.testing.assert_allclose(way, truth, atol=0.5)
+    assert np.median(truth) > 20.0
+
+
+def way_at_start(env, params, flat):
+    obs = observed(env, params, flat)
+    return inputs.way_to_go(inputs.begin(obs), obs, params)
+
+
+def test_a_start_that_is_40_m_off_makes_another_way_to_go(plan):
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel=plan)
+    flat, _ = env.reset(jax.random.key(0), params)
+    shifted = flat.at[env.fields(params)["start"]].add(40.0)
+    assert way_at_start(env, params, flat) - way_at_start(env, params, shifted) == pytest.approx(40.0, abs=1e-3)
+
+
+def test_after_the_flag_the_way_leads_back_to_the_start(plan):
+    env, params = st.make("Subterra/Return-v1", tunnel=plan)
+    flat, _ = env.reset(jax.random.key(0), params)
+    obs = observed(env, params, flat)
+    out = float(obs.goal - obs.start)
+    now = inputs.begin(obs)
+    there = dataclasses.replace(obs, distance=obs.distance + out - 2.0, flag=jnp.float32(1.0))
+    now = inputs.see(now, there)
+    assert inputs.way_to_go(now, there, params) == pytest.approx(out - params.goal.flag_reach, abs=1e-3)
+    back = dataclasses.replace(there, distance=there.distance + 10.0, heading=obs.heading + 3.0)
+    now = inputs.see(now, back)
+    assert inputs.way_to_go(now, back, params) == pytest.approx(out - params.goal.flag_reach - 10.0, abs=1e-3)
+    assert inputs.is_turned(now, back)
+    assert not inputs.is_turned(now, there)
+
+
+def test_no_input_holds_what_the_auxiliary_head_is_asked_for(plan):
+    """The reckoning reads the odometer, so that the target differs between robots whose inputs are the same."""
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel=plan)
+    config = TrainConfig(hidden=(8,), memory="gru", cell=8, auxiliary=True)
+    driver = Driver(env, make_layout(env, params, config))
+    flat, state = env.reset(jax.random.key(0), params)
+    policy = Policy(driver.init(jax.random.PRNGKey(0)))
+    kept = driver.begin(policy, flat[None], params)
+    moved = dataclasses.replace(state, station=state.station + 5.0)
+    targets = [driver.target(jax.tree.map(lambda leaf: leaf[None], one), kept, params) for one in (state, moved)]
+    assert targets[0][0, 0] - targets[1][0, 0] == pytest.approx(5.0, abs=1e-3)
+    again = driver.begin(policy, flat[None], params)
+    np.testing.assert_array_equal(driver.inputs(policy, kept), driver.inputs(policy, again))
+    # An unroll stores inputs and target apart, and the network is given the former alone.
+    error = jnp.full((1, 1, 1), 1e6)
+    assert driver.unroll(
+        policy.network, driver.inputs(policy, kept)[None], driver.start_memory((1,)), error[..., 0] > 0
+    )
+
+
+def test_a_localiser_drives_in_training_as_in_an_agent(plan):
+    localiser = begin_with("locate-transformer").localiser
+    config = TrainConfig(hidden=(8,), memory="along")
+    _, _, driver, policy, agent, (seen, *_) = train_and_drive(plan, "StopAtShort-v1", config, localiser)
+    assert seen.shape[-1] == driver.layout.shape.n_inputs
+    assert np.isfinite(seen).all()
+    assert agent._given.weights["match"]["taps"].shape == policy.localiser["match"]["taps"].shape
