@@ -45,6 +45,7 @@ class Command:
             covers a tunnel the packaged one.
         lining: Variant of the walls; the tunnel's usual one if left out.
         sensor: LiDAR; `planar16` is the task's own.
+        hidden_start: The true start is off the one that is reported.
         val: Tunnels of the evaluation after training; those of the training if left out.
         preset: `cpu` or `gpu`; what jax runs on if left out.
         seeds: Train these seeds at once, each into `out/seed-<k>`.
@@ -64,6 +65,7 @@ class Command:
     tunnel: Path | None = None
     lining: str | None = None
     sensor: Literal["planar16", "spin16x64", "vlp16", "os1-64", "avia"] = "planar16"
+    hidden_start: bool = False
     val: Path | None = None
     preset: str | None = None
     seeds: tuple[int, ...] = ()
@@ -136,7 +138,13 @@ def _world(arguments: Command) -> World:
     """Opens the task for the robot that is to do it."""
     if arguments.embodiment == "scout":
         return open_world(
-            arguments.task, arguments.tunnel, arguments.lining, arguments.sensor, arguments.val, arguments.preset
+            arguments.task,
+            arguments.tunnel,
+            arguments.lining,
+            arguments.sensor,
+            arguments.val,
+            arguments.preset,
+            arguments.hidden_start,
         )
     if arguments.sensor != "planar16":
         raise ConfigError(f"sensor = {arguments.sensor}: the B2 carries planar16")

@@ -10,10 +10,10 @@ from subterra_jax.baselines.agent import n_ranges, observed
 from subterra_jax.policies.inputs import WAY_AT
 from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.locate import memory
+from subterra_jax.policies.locate.map_strip import map_strip
 from subterra_jax.policies.memories import Given, Memory
 from subterra_jax.policies.network import Shape
 from subterra_jax.policies.trained import flat, nested
-from train import tunnels
 from train.config import ConfigError, TrainConfig, check
 from train.devices import SPLIT, Parts, Spread
 from train.driver import Driver, Policy
@@ -88,7 +88,7 @@ def make_learner(world: World, config: TrainConfig) -> Trainable:
         raise ConfigError(f"memory = along needs 16 level beams or a multiple, and {env.id} has {n_ranges(params)}")
     if given.localiser is None and not config.auxiliary:
         raise ConfigError("memory = along needs auxiliary = True, or a localiser to begin from")
-    strip = tunnels.map_of(list(world.made), params.tunnel) if config.map else None
+    strip = map_strip(params.tunnel) if config.map else None
     shapes = given.localiser
     if shapes is None or config.map:
         fresh = jax.eval_shape(lambda key: memory.init("transformer", config.front, key, config.map), jax.random.key(0))

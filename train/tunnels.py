@@ -17,10 +17,9 @@ from subterra_jax import constants
 from subterra_jax.host.files import replace_file
 from subterra_jax.host.versions import VERSION
 from subterra_jax.parts.spatial_lidar import SENSORS
-from subterra_jax.policies.locate.map_strip import MapStrip, join, walls_of
 from subterra_jax.procedural import expand
 from subterra_jax.tunnel import Tunnel
-from subterra_jax.tunnel.sources import resolve, tunnel_digest
+from subterra_jax.tunnel.sources import resolve
 
 PLANAR = SENSORS[0]
 _FORM = 2  # of the arrays of a tunnel: what was kept in another is not read
@@ -80,21 +79,6 @@ def load(
     missing = [name for name in names if not _is_kept(name, kind, cache)]
     made = dict(zip(missing, in_processes(one, missing, 1 if kind.spatial else _EACH), strict=True))
     return [made[name] if name in made else one(name) for name in names]
-
-
-def digests(names: Sequence[str | Path | None]) -> list[str]:
-    """Returns the SHA-256 of tunnels, as `tunnel_digest` has it, made by several processes."""
-    return in_processes(tunnel_digest, list(names), _EACH)
-
-
-def map_of(made: list[Tunnel], tunnel: Tunnel) -> MapStrip:
-    """Returns the map of a tunnel or a stack, made by several processes.
-
-    Args:
-        made: Its tunnels.
-        tunnel: The tunnel or the stack.
-    """
-    return join(in_processes(walls_of, made, 2 * _EACH), tunnel)
 
 
 def in_processes(work: Callable[[Any], Any], items: list[Any], each: int) -> list[Any]:

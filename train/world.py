@@ -14,6 +14,7 @@ import subterra_jax as st
 from subterra_jax.host.versions import VERSION
 from subterra_jax.policies import TRAINED_UNDER, training_conditions
 from subterra_jax.tasks import TaskError, find
+from subterra_jax.tunnel.sources import tunnel_digest
 from train import tunnels
 from train.config import ConfigError
 from train.tunnels import PLANAR
@@ -32,7 +33,6 @@ class World:
         params: Its parameters.
         facts: Task, lining, and the tunnel file's name, provenance and SHA-256: the identity of the world.
         unchanged: Its params before `with_reward`; None where nothing was changed.
-        made: The tunnels, of which maps are made.
         val: World of the evaluation after training; None is this one.
     """
 
@@ -41,7 +41,6 @@ class World:
     params: Any
     facts: dict[str, Any]
     unchanged: Any = None
-    made: tuple[Any, ...] = ()
     val: "World | None" = None
 
     def scored(self) -> "World":
@@ -122,6 +121,7 @@ def open_world(
     sensor: str = PLANAR,
     val: Path | str | None = None,
     preset: str | None = "cpu",
+    hidden_start: bool = False,
 ) -> World:
     """Opens a task on a tunnel.
 
@@ -133,6 +133,7 @@ def open_world(
         sensor: LiDAR, as `st.make` takes it by name.
         val: Tunnels of the evaluation after training; None is `tunnel`.
         preset: Says how many tunnels are a few.
+        hidden_start: The true start is off the one that is reported.
 
     Raises:
         ConfigError: There is no such task or sensor, or the tunnel has no room for it.
@@ -141,33 +142,44 @@ def open_world(
     task = require_task(task)
     if tunnel is None and st.TASKS[task].rule.errand != "cover":
         tunnel = _TUNNELS[preset or "cpu"]
-    world = _open(task, tunnel, lining, sensor)
-    return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor))
+    world = _open(task, tunnel, lining, sensor, hidden_start)
+    return world if val is None else dataclasses.replace(world, val=_open(task, val, lining, sensor, hidden_start))
 
 
-def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str) -> World:
-    names: list[str | Path | None] = [tunnel] if tunnel is None else [*tunnels.names_of(str(tunnel))]
+def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str, hidden_start: bool) -> World:
+    names: list[Any] = [tunnel] if tunnel is None else [*tunnels.names_of(str(tunnel))]
     several = len(names) > 1
+    given: Any = names if several else names[0]
     try:
-        made = tunnels.load(names, lining, None, sensor, st.TASKS[task].piece)
-        env, params = tunnels.enter(task, made, sensor)
+        if several and sensor != PLANAR:
+            given = tunnels.load(names, lining, None, sensor, st.TASKS[task].piece)
+        env, params = st.make(task, given, lining, sensor=sensor, hidden_start=hidden_start)
     except st.SubterraError:
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    plan = st.load_tunnel(names[0]) if not several else None
-    digests = tunnels.digests(names)
+    plan = None if several else st.load_tunnel(names[0])
     facts = {
         "task": task,
-        "lining": lining or (plan.default_lining if plan is not None else None),
-        "tunnel": plan.name if plan is not None else str(tunnel),
+        "lining": lining or (None if plan is None else plan.default_lining),
+        "tunnel": str(tunnel) if plan is None else plan.name,
         "tunnel_provenance": "generated" if plan is None else plan.provenance,
         "constants": st.constants_digest(env, params),
-        "tunnel_sha256": hashlib.sha256("".join(digests).encode()).hexdigest() if several else digests[0],
+        "tunnel_sha256": _digest(names),
     }
     if sensor != PLANAR:
         facts["sensor"] = sensor
-    return World(task, env, params, facts, made=tuple(made))
+    if hidden_start:
+        facts["hidden_start"] = True
+    return World(task, env, params, facts)
+
+
+def _digest(names: list[Any]) -> str:
+    """Returns the SHA-256 of a tunnel, or of several; generated ones are known by name and version."""
+    if len(names) == 1:
+        return tunnel_digest(names[0])
+    each = [f"{name} {VERSION}" if str(name).startswith("open:") else tunnel_digest(name) for name in names]
+    return hashlib.sha256("\n".join(each).encode()).hexdigest()
 
 
 def library_versions() -> dict[str, str]:
