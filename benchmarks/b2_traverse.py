@@ -34,7 +34,7 @@ class Command:
     Attributes:
         robots: Number of robots.
         seed: Seed for their draws.
-        agent: Driver: a baseline, a run folder of `train.navigate --embodiment b2`, or a policy's file or name.
+        agent: Driver: a baseline, a run folder of `train --embodiment b2`, or a policy's file or name.
         policy: Gait: a file, the name of a released gait, or `trot`.
         engine: `mjx`, or `mujoco` in C on the host.
         tunnel: Tunnel file or name; the packaged tunnel if not given.

@@ -133,7 +133,7 @@ def main(config: DemoConfig) -> None:
         print(", ".join(f"{name} {value}" for name, value in loaded.items()))
     with stages.stage("train", f"5/6 Training on the reconstructed bore ({TASK})"):
         tunnel = scene / "tunnel.npz"
-        run_module("train.navigate", task=TASK, tunnel=tunnel, seed=config.seed, overwrite=True, out=run)
+        run_module("train", task=TASK, tunnel=tunnel, seed=config.seed, overwrite=True, out=run)
     with stages.stage("report", "6/6 Writing the report"):
         truth = load_truth(survey / "truth.json")
         summary: dict[str, Any] = {

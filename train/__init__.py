@@ -1,4 +1,4 @@
-"""Brax-style PPO over batches of tunnels: `python -m train.navigate`, `python -m train.evaluate`."""
+"""PPO over batches of tunnels: `python -m train`, `python -m train.evaluate`, `python -m train.release`."""
 
 from subterra_jax.host.command import require_libraries
 

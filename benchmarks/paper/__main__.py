@@ -40,7 +40,7 @@ class PaperConfig:
         seed: Seed for that survey.
         survey: Survey folder to use instead: `survey.bag`, `survey_os1.bag` and their trajectories.
         scene: Scene folder built from that survey, instead of building it.
-        runs: Folder with run folders `seed-*` of `train.navigate` on T0, instead of training five seeds.
+        runs: Folder with run folders `seed-*` of `train` on T0, instead of training five seeds.
         provenance: Line below figures 1 to 3; read from the scene's manifest if not given.
     """
 

@@ -26,7 +26,7 @@ def find_runs(folder: Path) -> list[Path]:
     """
     runs = [path for path in folder.glob("seed-*") if path.name[5:].isdigit() and (path / "config.json").exists()]
     if not runs:
-        raise BenchmarkError(f"{folder}: holds no run folders seed-0, seed-1, ... of train.navigate")
+        raise BenchmarkError(f"{folder}: holds no run folders seed-0, seed-1, ... of train")
     return sorted(runs, key=lambda path: int(path.name[5:]))
 
 
@@ -50,7 +50,7 @@ def provenance(runs: list[Path]) -> str:
     first = read_config(runs[0])
     tunnel = f"{first.get('tunnel')} ({first.get('tunnel_provenance', 'no')} survey)"
     device = str(first.get("device")).rpartition(": ")[2]
-    return f"train.navigate, {first.get('task')} in {tunnel}, {len(runs)} seeds, on {device}."
+    return f"train, {first.get('task')} in {tunnel}, {len(runs)} seeds, on {device}."
 
 
 def read_config(run: Path) -> dict[str, Any]:

@@ -64,7 +64,7 @@ def training_step(out: Path, scene: Path) -> Step:
     words = ("--task", TASK, "--tunnel", str(scene / "tunnel.npz"), "--seeds", *seeds, "--preset", "cpu")
     files = ("seeds.json", *(f"seed-{seed}/{file}" for seed in SEEDS for file in _RUN_FILES))
     inputs = (scene / "tunnel.npz",)
-    return Step("training", ("train.navigate", *words, "--out", str(out)), out, files, inputs, again=("--resume",))
+    return Step("training", ("train", *words, "--out", str(out)), out, files, inputs, again=("--resume",))
 
 
 def require(folder: Path, files: tuple[str, ...]) -> None:

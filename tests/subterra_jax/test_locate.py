@@ -14,11 +14,12 @@ from subterra_jax.baselines.agent import Observed
 from subterra_jax.baselines.stations import Driven
 from subterra_jax.baselines.steering import Corridor
 from subterra_jax.policies import PolicyError, check_fits, from_tensors, training_conditions
-from subterra_jax.policies.locate import bends, kalman, map_filter, matching, memory, streams
-from subterra_jax.policies.locate.agent import check_tensors, flat
-from subterra_jax.policies.locate.blocks import DELAY, N_RAW, Block
+from subterra_jax.policies.locate import bends, map_filter, matching, memory, streams
+from subterra_jax.policies.locate.agent import check_tensors
+from subterra_jax.policies.locate.blocks import DELAY, Block
 from subterra_jax.policies.locate.locator import Locator
 from subterra_jax.policies.locate.ways import TwoWays
+from subterra_jax.policies.trained import flat
 from tests.subterra_jax.patches import HALF, map_of_walls, patches
 
 
@@ -30,16 +31,12 @@ def _random_blocks(n, key=1):
         jnp.asarray(evidence, jnp.float32),
         jnp.asarray(0.03 * rng.standard_normal(n), jnp.float32),
         jnp.full(n, 5.0),
-        jnp.asarray(rng.standard_normal((n, N_RAW)), jnp.float32),
     )
 
 
 @pytest.mark.parametrize(
     "network",
-    [
-        "gru",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("kalman", "s5", "transformer", "transformer-kalman")),
-    ],
+    memory.NETWORKS,
 )
 def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once(network):
     weights = memory.init(network, "match", jax.random.key(2))
@@ -51,24 +48,11 @@ def test_a_memory_gives_the_same_metre_by_metre_as_all_at_once(network):
         np.testing.assert_allclose(getattr(whole, name), getattr(stepped, name), atol=2e-4)
 
 
-def test_the_filter_trusts_sharp_evidence_over_its_own_odometry():
-    weights = kalman.init(jax.random.key(0))
-    sharp = -0.5 * ((jnp.asarray(matching.SHARES) - 0.02) / 0.002) ** 2
-    n = 60
-    evidence = jnp.broadcast_to(sharp, (n, len(matching.SHARES))).at[:DELAY].set(0.0)
-    blocks = Block(evidence, jnp.full(n, 0.05), jnp.full(n, 5.0), jnp.zeros((n, N_RAW)))
-    with_walls = kalman.sequence(weights, blocks)
-    blind = kalman.sequence(weights, blocks.replace(evidence=jnp.zeros_like(evidence)))
-    assert with_walls.correction[-1] == pytest.approx(0.02 * n, abs=0.1)
-    assert blind.correction[-1] == pytest.approx(0.05 * n * 0.6, abs=0.5)
-    assert with_walls.log_scale[-1] < blind.log_scale[-1] - 1.0
-
-
 def test_a_network_or_front_that_does_not_exist_is_named():
     with pytest.raises(ValueError, match="no network 'lstm'"):
         memory.init("lstm", "match", jax.random.key(0))
-    with pytest.raises(ValueError, match="needs the evidence"):
-        memory.init("kalman", "scans", jax.random.key(0))
+    with pytest.raises(ValueError, match="a map is taken with front match, not with wide"):
+        memory.init("transformer", "wide", jax.random.key(0), with_map=True)
 
 
 def _ranges(driven, share=0.01):
@@ -97,9 +81,8 @@ def _looked_at(ranges, driven, walls):
 @pytest.mark.parametrize(
     ("network", "front", "with_map"),
     [
-        ("kalman", "match", False),
-        ("gru", "match", True),
-        pytest.param("s5", "scans", False, marks=pytest.mark.slow),
+        ("transformer", "match", True),
+        pytest.param("transformer", "wide", False, marks=pytest.mark.slow),
     ],
 )
 def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
@@ -114,7 +97,7 @@ def test_a_robot_makes_the_metres_of_its_training(network, front, with_map):
     weights = memory.init(network, front, jax.random.key(4), with_map)
     n = int(driven[-1])
     record = streams.Record(jnp.asarray(driven, jnp.float32), read, points)
-    whole = memory.sequence(network, weights, streams.metres(record, weights.get("match"), n))
+    whole = memory.sequence(network, weights, streams.metres(record, weights["match"], n))
     strip = map_of_walls(first=-3.0 - 0.7) if with_map else None  # told 0.7 m too far back
     if strip is not None:
         age = jnp.arange(1.0, n + 1.0)
@@ -164,8 +147,8 @@ def test_tensors_of_a_localiser_come_back_as_an_agent_or_are_refused(network):
 
 
 def _trained(env, params):
-    layout = {"network": "kalman", "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
-    tensors = flat(memory.init("kalman", "match", jax.random.key(0)))
+    layout = {"network": "transformer", "action_low": [0.0, -1.5], "action_high": [2.0, 1.5]}
+    tensors = flat(memory.init("transformer", "match", jax.random.key(0)))
     here = dataclasses.replace(training_conditions(env, params), fields=None)
     return from_tensors("locate", layout, tensors, "one", here)
 
@@ -217,7 +200,7 @@ def test_a_way_back_begins_at_the_place_that_the_flag_tells():
         lidar=SimpleNamespace(range_max=30.0),
         goal=SimpleNamespace(flag_reach=2.0),
     )
-    ways = TwoWays(Locator(memory.init("kalman", "match", jax.random.key(0)), "kalman"))
+    ways = TwoWays(Locator(memory.init("transformer", "match", jax.random.key(0)), "transformer"))
     advance = jax.jit(lambda driven, direction, flagged, now: _way(ways, driven, direction, flagged, now, params))
     obs = Observed(jnp.zeros(16), jnp.zeros(16), distance=jnp.zeros(()), heading=jnp.zeros(()))
     now, stations = ways.begin(obs, params), []

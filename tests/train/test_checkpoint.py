@@ -1,43 +1,46 @@
 import dataclasses
-import json
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from train.feedforward import networks
-from train.feedforward.learner import Learner
 
-from train import checkpoint, folder, learning, policies
+import subterra_jax as st
+from train import checkpoint, devices, folder, snapshot
 from train.checkpoint import CheckpointError
 from train.config import TrainConfig
+from train.driver import Driver, Policy
 from train.ppo import begin
+from train.report import Ended
+from train.setup import make_layout, make_learner
+from train.snapshot import Best, EpisodeWindow, Snapshot
 from train.world import open_world
 
-LAYOUT = networks.Layout(18, (0.0, -1.5), (2.0, 1.5), 4, (16,), init_std=0.5, min_std=0.01)
-FACTS = {"layout": LAYOUT.__dict__, "task": "Subterra/TraverseShort-v1"}
+TASK = "Subterra/TraverseShort-v1"
+FACTS = {"task": TASK}
 
 
-def policy_of(seed):
-    nets = networks.Networks(LAYOUT)
-    data = jax.random.normal(jax.random.PRNGKey(seed), (50, 18)) * 3.0 + 1.0
-    weights = nets.init(jax.random.PRNGKey(seed))["policy"]
-    return nets, networks.Policy(weights, learning.update_statistics(learning.start_statistics((18,)), data))
+def policy_of(seed, hidden=16):
+    env, params = st.make(TASK)
+    driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(hidden,))))
+    return Policy(driver.init(jax.random.PRNGKey(seed)))
+
+
+def like(hidden=16):
+    return jax.eval_shape(lambda: policy_of(0, hidden))
 
 
 @pytest.fixture
 def saved(tmp_path):
-    checkpoint.save_checkpoint(tmp_path / "run", 7, {"policy": policy_of(0)[1]}, FACTS)
+    checkpoint.save_checkpoint(tmp_path / "run", 7, {"policy": policy_of(0)}, FACTS)
     return tmp_path / "run"
 
 
-def test_a_policy_read_back_acts_the_same_to_the_bit(saved):
-    nets, policy = policy_of(0)
-    again, restored, facts = policies.load_policy(saved)
-    stack = jnp.asarray(np.random.default_rng(0).normal(0.0, 9.0, (64, 4, 18)), jnp.float32)
-    np.testing.assert_array_equal(again.act(restored, stack), nets.act(policy, stack))
-    assert facts["task"] == "Subterra/TraverseShort-v1"
+def test_a_policy_is_read_back_to_the_bit(saved):
+    stored = checkpoint.load_checkpoint(saved)
+    jax.tree.map(np.testing.assert_array_equal, stored.restore("policy", like()), policy_of(0))
+    assert stored.facts["task"] == TASK
 
 
 def test_a_checkpoint_can_be_named_by_its_run_its_folder_or_itself(saved):
@@ -47,7 +50,7 @@ def test_a_checkpoint_can_be_named_by_its_run_its_folder_or_itself(saved):
 
 def test_the_last_two_checkpoints_are_kept_and_the_newest_is_read(saved):
     for iteration in (8, 20, 100):
-        checkpoint.save_checkpoint(saved, iteration, {"policy": policy_of(iteration)[1]}, FACTS)
+        checkpoint.save_checkpoint(saved, iteration, {"policy": policy_of(iteration)}, FACTS)
     assert sorted(path.name for path in (saved / "checkpoint").iterdir()) == ["00000020", "00000100"]
     assert checkpoint.load_checkpoint(saved).path.name == "00000100"
 
@@ -55,7 +58,7 @@ def test_the_last_two_checkpoints_are_kept_and_the_newest_is_read(saved):
 def test_what_a_kill_leaves_behind_is_never_read(saved):
     shutil.copytree(saved / "checkpoint" / "00000007", saved / "checkpoint" / ".00000009.partial")
     assert checkpoint.load_checkpoint(saved).path.name == "00000007"
-    checkpoint.save_checkpoint(saved, 9, {"policy": policy_of(1)[1]}, FACTS)
+    checkpoint.save_checkpoint(saved, 9, {"policy": policy_of(1)}, FACTS)
     assert checkpoint.load_checkpoint(saved).path.name == "00000009"
 
 
@@ -71,11 +74,11 @@ def test_a_truncated_checkpoint_is_a_clear_error_whichever_file_it_is(saved, tmp
         victim = copy / path.relative_to(place)
         victim.write_bytes(victim.read_bytes()[: victim.stat().st_size // 2])
         try:
-            restored, message = policies.load_policy(copy)[1], None
+            restored, message = checkpoint.load_checkpoint(copy).restore("policy", like()), None
         except CheckpointError as error:
             restored, message = None, str(error)
         if message is None:  # a file that holds nothing needed
-            jax.tree.map(np.testing.assert_array_equal, restored, policy_of(0)[1])
+            jax.tree.map(np.testing.assert_array_equal, restored, policy_of(0))
         else:
             assert str(copy) in message
             assert "damaged checkpoint" in message
@@ -86,7 +89,7 @@ def test_a_truncated_checkpoint_is_a_clear_error_whichever_file_it_is(saved, tmp
 
 def test_an_array_that_was_changed_is_refused(saved, tmp_path):
     other = tmp_path / "other"
-    checkpoint.save_checkpoint(other, 7, {"policy": policy_of(1)[1]}, FACTS)
+    checkpoint.save_checkpoint(other, 7, {"policy": policy_of(1)}, FACTS)
     arrays = saved / "checkpoint" / "00000007" / "arrays"
     shutil.rmtree(arrays)
     shutil.copytree(other / "checkpoint" / "00000007" / "arrays", arrays)
@@ -102,25 +105,50 @@ def test_a_missing_checkpoint_is_a_clear_error(tmp_path):
 
 
 def test_the_checkpoint_of_another_network_is_refused_with_both_shapes(saved):
-    facts = saved / "checkpoint" / "00000007" / checkpoint.FACTS
-    values = json.loads(facts.read_text())
-    values["layout"]["hidden"] = [24]
-    facts.write_text(json.dumps(values))
     with pytest.raises(CheckpointError, match=r"another network: .*\[16\].*\[24\]"):
-        policies.load_policy(saved)
+        checkpoint.load_checkpoint(saved).restore("policy", like(24))
 
 
 def test_a_file_of_another_schema_is_refused_by_field(saved):
     facts = saved / "checkpoint" / "00000007" / checkpoint.FACTS
     facts.write_text('{"schema": "subterra.tunnel/1"}')
     with pytest.raises(CheckpointError, match="'schema'"):
-        policies.load_policy(saved)
+        checkpoint.load_checkpoint(saved)
 
 
-def test_a_resumed_run_knows_for_how_long_the_goal_has_held(tunnel, tmp_path):
-    world = open_world("Subterra/TraverseShort-v1", tunnel)
-    learner = Learner(world.env, world.params, TrainConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
+def test_a_resumed_run_knows_its_best_score_and_for_how_long_the_goal_has_held(tunnel, tmp_path):
+    world = open_world(TASK, tunnel)
+    learner = make_learner(world, TrainConfig(n_envs=4, unroll=8, minibatches=2, hidden=(8,)))
     run = folder.RunFolder(tmp_path / "run", world, learner)
     run.start()
-    run.save(dataclasses.replace(begin(learner, world.params), iteration=9, solved_for=3))
-    assert (run.resume().iteration, run.resume().solved_for) == (9, 3)
+    first = begin(learner, world.params)
+    best = dataclasses.replace(first.best, score=(0.75, 12.5), iteration=4)
+    run.save(dataclasses.replace(first, iteration=9, solved_for=3, best=best))
+    again = run.resume()
+    assert (again.iteration, again.solved_for) == (9, 3)
+    assert (again.best.score, again.best.iteration) == ((0.75, 12.5), 4)
+
+
+@pytest.mark.parametrize(("succeeded", "held"), [(1.0, 1), (0.99, 0), (0.6, 0)])
+def test_the_goal_holds_where_every_one_of_a_hundred_episodes_succeeded(succeeded, held):
+    n = 100
+    good = np.arange(n) < n * succeeded
+    ended = Ended(n, np.arange(n), np.full(n, 0.95, np.float32), good, ~good, np.ones(n), np.full(n, 9))
+    config = TrainConfig(stop_coverage=0.9, n_envs=4, unroll=8)
+    before = Snapshot(0, None, EpisodeWindow(), Best.of(None, EpisodeWindow(), 0, None))
+    assert snapshot.advance(before, None, None, ended, {}, config).solved_for == held
+
+
+def test_advantages_have_no_mean_and_unit_spread_over_all_parts():
+    values = jnp.asarray(np.random.default_rng(0).normal(3.0, 5.0, (4, 8, 3)), jnp.float32)
+    alike = jax.vmap(lambda part: devices.normalised(part, ("part",)), axis_name="part")(values)
+    np.testing.assert_allclose(alike, devices.normalised(values, ()), atol=1e-5)
+    assert float(jnp.mean(alike)) == pytest.approx(0.0, abs=1e-5)
+    assert float(jnp.std(alike)) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_a_reward_that_is_no_number_ends_the_training_in_one_sentence():
+    ended = Ended(0, *(np.zeros(0) for _ in range(6)))
+    before = Snapshot(0, None, EpisodeWindow(), Best.of(None, EpisodeWindow(), 0, None))
+    with pytest.raises(snapshot.TrainingError, match="iteration 1: the task's reward is not finite"):
+        snapshot.advance(before, None, None, ended, {"reward_mean": np.float32("nan")}, TrainConfig())

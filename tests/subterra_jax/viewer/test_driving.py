@@ -5,12 +5,15 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from subterra_jax.policies.networks import FeedForward
 
 import subterra_jax as st
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import Episodes, evaluate
 from subterra_jax.host.errors import SubterraError
+from subterra_jax.policies.layout import Layout
+from subterra_jax.policies.learnt import Learnt
+from subterra_jax.policies.memories import Memory
+from subterra_jax.policies.network import Shape
 from subterra_jax.viewer import library
 from subterra_jax.viewer.driving import drive
 from tests.subterra_jax import tunnels
@@ -57,9 +60,10 @@ def test_an_episode_grows_from_its_start_and_keeps_what_it_had(parts):
 
 def test_a_driver_that_does_not_fit_the_task_is_refused(plan_of, monkeypatch):
     plan = plan_of(tunnels.tunnel_arrays(tunnels.straight(30.0)))
-    few = FeedForward({"statistics.mean": jnp.zeros(3)}, jnp.zeros(2), jnp.ones(2), frames=1)
+    layout = Layout(Memory(), Shape(3, 2, (4,)), (0.0, -1.5), (2.0, 1.5))
+    few = Learnt({}, jnp.zeros(2), jnp.array([2.0, 1.5]), layout, name="few")
     monkeypatch.setitem(library.registry._FACTORIES, "few", lambda params: few)
-    with pytest.raises(SubterraError, match="few: made for observations of 3 numbers, Subterra/Traverse-v1 has 18"):
+    with pytest.raises(SubterraError, match="few: reads 3 numbers; Subterra/Traverse-v1 with its fields"):
         next(library.drive_episode(plan, "0", "t", "smooth", "Subterra/Traverse-v1", "few", 0))
 
 
