@@ -64,6 +64,7 @@ class TrainConfig:
         minibatches: Minibatches per pass; each holds whole unrolls of `n_envs / minibatches` environments.
         hidden: Widths of the hidden layers, of policy and value alike.
         half: Compute in bfloat16; weights stay float32.
+        standing: Share of the largest speed by which the range of actions goes below 0, where a robot stands.
         init_std: Standard deviation of the untrained policy before the tanh, in units of half the action range.
         learning_rate: Learning rate of Adam, at the start and at most.
         target_kl: The learning rate falls where an update moves the policy further than about this divergence; 0 keeps
@@ -103,6 +104,7 @@ class TrainConfig:
     minibatches: int = 4
     hidden: tuple[int, ...] = (64, 64)
     half: bool = False
+    standing: float = 0.5
     init_std: float = 0.5
     learning_rate: float = 4e-4
     target_kl: float = 0.0
@@ -221,7 +223,7 @@ def check(config: TrainConfig) -> TrainConfig:
     if config.map and not (config.memory == "along" and config.front == "match"):
         raise ConfigError(f"map = True is for memory along with front match, not {config.memory} with {config.front}")
     positive(config, "localiser_rate", "learning_rate", "init_std", "max_grad_norm", "clip")
-    not_negative(config, "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
+    not_negative(config, "standing", "entropy_weight", "value_weight", "auxiliary_weight", "stop_coverage", "target_kl")
     share(config, "discount", "gae_lambda")
     if config.auxiliary and config.memory not in ("gru", "along"):
         raise ConfigError(

@@ -49,6 +49,7 @@ class Driver:
         self.env, self.layout, self._map = env, layout, map
         self._net = Network(layout.shape)
         self._low, self._high = jnp.asarray(layout.action_low), jnp.asarray(layout.action_high)
+        self._standing = layout.standing
 
     def init(self, key: PRNGKeyArray) -> Any:
         """Returns untrained weights of the network."""
@@ -128,7 +129,7 @@ class Driver:
 
     def action(self, raw: Float[Array, "env action"]) -> Float[Array, "env action"]:
         """Returns the actions of draws, m/s and rad/s."""
-        return to_action(raw, self._low, self._high)
+        return to_action(raw, self._low, self._high, self._standing)
 
     @staticmethod
     def log_prob(out: Outputs, raw: Float[Array, "*batch action"]) -> Float[Array, "*batch"]:

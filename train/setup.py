@@ -56,7 +56,7 @@ def make_layout(env: Any, params: Any, config: TrainConfig, localiser: Any = Non
         half=config.half,
     )
     low, high = (tuple(float(bound) for bound in side) for side in (bounds.low, bounds.high))
-    return Layout(kept, shape, low, high)
+    return Layout(kept, shape, low, high, config.standing)
 
 
 def make_learner(world: World, config: TrainConfig) -> Trainable:

@@ -20,12 +20,14 @@ class Layout:
         shape: Sizes of the network.
         action_low: Smallest action, m/s and rad/s.
         action_high: Largest action, m/s and rad/s.
+        standing: Share of the largest speed by which the range of the tanh goes below 0.
     """
 
     memory: Memory
     shape: Shape
     action_low: tuple[float, ...]
     action_high: tuple[float, ...]
+    standing: float = 0.5
 
     def to_json(self) -> dict[str, Any]:
         """Returns what `from_json` reads."""
@@ -45,7 +47,7 @@ class Layout:
             raise ValueError(f"memory must be one of {', '.join(MEMORIES)}, got {memory.kind!r}")
         shape["hidden"] = tuple(shape["hidden"])
         low, high = tuple(values["action_low"]), tuple(values["action_high"])
-        return cls(memory, Shape(**shape), low, high)
+        return cls(memory, Shape(**shape), low, high, float(values["standing"]))
 
     def reckoned_way(self, seen: Float[Array, "n"]) -> Float[Array, ""]:
         """Returns the reckoned way to go among the inputs of one observation, m."""

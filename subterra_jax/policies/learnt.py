@@ -153,7 +153,7 @@ class Learnt(Trained):
         weights = {name.removeprefix(prefix): leaf for name, leaf in self.tensors.items() if name.startswith(prefix)}
         variables = {"params": nested(weights)}
         out, cell = Network(self.layout.shape).apply(variables, own.inputs(kept), memory.cell)
-        action = to_action(out.mean, self.low, self.high)
+        action = to_action(out.mean, self.low, self.high, self.layout.standing)
         command = action[:2]
         if action.shape[0] < 5:
             station, log_sigma, direction = own.estimate(kept, obs, params)

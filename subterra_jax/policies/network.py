@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float
 from subterra_jax.policies.inputs import FAR, scaled_way
 
 Weights = Any  # nested dict of arrays, as flax makes it
-_LOWEST = 0.3  # of the largest command, below the end of a range that begins at 0: standing is then not at its end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,11 +213,16 @@ def act(actor: Weights, x: Float[Array, "*batch n"]) -> Float[Array, "*batch act
 
 
 def to_action(
-    raw: Float[Array, "*batch action"], low: Float[Array, "action"], high: Float[Array, "action"]
+    raw: Float[Array, "*batch action"], low: Float[Array, "action"], high: Float[Array, "action"], standing: float
 ) -> Float[Array, "*batch action"]:
     """Returns the action of a draw of the Gaussian, within its bounds.
 
-    A range that begins at 0 is stretched downwards and clipped: to stand is then a region and not the limit of a tanh.
+    Args:
+        raw: The draw, before the tanh.
+        low: Smallest action, m/s and rad/s.
+        high: Largest action, m/s and rad/s.
+        standing: A range that begins at 0 is stretched below it by this share of its end, and clipped: to stand is then
+            a region and not the limit of a tanh.
     """
-    lowest = jnp.where(low == 0.0, -_LOWEST * high, low)
+    lowest = jnp.where(low == 0.0, -standing * high, low)
     return jnp.clip(lowest + 0.5 * (jnp.tanh(raw) + 1.0) * (high - lowest), low, high)

@@ -4,7 +4,7 @@ from tests.train.conftest import call
 from train import __main__ as navigate
 from train import curve, evaluate, release
 
-COMMANDS = {"navigate": navigate, "evaluate": evaluate, "release": release, "curve": curve}
+COMMANDS = {"": navigate, ".evaluate": evaluate, ".release": release, ".curve": curve}
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -12,7 +12,7 @@ def test_help_fits_a_screen_and_has_an_example(name, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     assert call(COMMANDS[name].main, "--help") == 0
     page = capsys.readouterr().out
-    assert f"python -m train.{name} " in " ".join(page.split("\n\n", 1)[1].split())
+    assert f"python -m train{name} " in " ".join(page.split("\n\n", 1)[1].split())
     assert page.count("\n") <= 40
     assert max(map(len, page.splitlines())) <= 100
 
@@ -33,7 +33,7 @@ def test_the_settings_are_on_a_page_of_their_own(capsys):
         (("--out",), "Missing value for argument '--out'"),
         (("--out", "x", "--step-size", "3"), "Unrecognized options: --step-size, 3"),
         (("--out", "x", "--steps", "many"), "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
-        (("--out", "x", "--teacher"), "argument --teacher: expected one argument"),
+        (("--out", "x", "--memory"), "argument --memory: expected one argument"),
     ],
 )
 def test_a_mistyped_command_line_is_one_sentence_and_status_2(words, message, capsys):

@@ -24,8 +24,8 @@ def straight_driver():
     env, params = st.make(TASK)
     driver = Driver(env, make_layout(env, params, TrainConfig(hidden=(4,))))
     weights = jax.tree.map(lambda x: 0.0 * x, driver.init(jax.random.PRNGKey(0)))
-    # A speed of 1 m/s between -0.6 and 2 m/s.
-    weights["actor"]["out"]["bias"] = jnp.arctanh(jnp.array([2.0 * 1.6 / 2.6 - 1.0, 0.0]))
+    # A speed of 1 m/s between -1 and 2 m/s.
+    weights["actor"]["out"]["bias"] = jnp.arctanh(jnp.array([2.0 * 2.0 / 3.0 - 1.0, 0.0]))
     return make_agent(driver, Policy(weights))
 
 

@@ -13,7 +13,7 @@ from train.log import print_table
 from train.policies import make_agent
 from train.session import Session
 from train.snapshot import Snapshot
-from train.world import World
+from train.world import World, require_task
 from train.world import open_world as open_planar_world
 
 B2 = "b2"
@@ -30,6 +30,7 @@ def open_world(task: str, tunnel: Path | str | None, lining: str | None, legs: L
         ConfigError: The B2 does not do this task, or the tunnel is more than one.
         SubterraError: As `tasks.make_mission`.
     """
+    task = require_task(task)
     if task not in TASKS:
         raise ConfigError(f"the B2 does not do {task!r}; it does {', '.join(TASKS)}")
     if legs.robots < 0:

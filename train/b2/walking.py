@@ -101,6 +101,7 @@ class WalkDriver(Driver):
         self.env, self.layout = env, WalkLayout(shape)
         self._net, self._n = Network(shape), n
         self._low, self._high = jnp.asarray(bounds.low), jnp.asarray(bounds.high)
+        self._standing = 0.0
 
     def start_statistics(self) -> learning.Statistics:
         """Returns statistics of no observation yet."""
