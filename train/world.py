@@ -159,7 +159,7 @@ def _open(task: str, tunnel: Path | str | None, lining: str | None, sensor: str,
     except ValueError as error:
         raise ConfigError(str(error)) from error
     plan = None if several else st.load_tunnel(names[0])
-    facts = {
+    facts: dict[str, Any] = {
         "task": task,
         "lining": lining or (None if plan is None else plan.default_lining),
         "tunnel": str(tunnel) if plan is None else plan.name,

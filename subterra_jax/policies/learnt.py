@@ -152,7 +152,8 @@ class Learnt(Trained):
         prefix = f"{NETWORK}."
         weights = {name.removeprefix(prefix): leaf for name, leaf in self.tensors.items() if name.startswith(prefix)}
         variables = {"params": nested(weights)}
-        out, cell = Network(self.layout.shape).apply(variables, own.inputs(kept), memory.cell)
+        answers: Any = Network(self.layout.shape).apply(variables, own.inputs(kept), memory.cell)
+        out, cell = answers
         action = to_action(out.mean, self.low, self.high, self.layout.standing)
         command = action[:2]
         if action.shape[0] < 5:
