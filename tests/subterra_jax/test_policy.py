@@ -110,7 +110,7 @@ def test_tensors_of_16_and_32_bits_are_read_as_32_and_no_others(kind, numpy_kind
 def test_a_batch_is_many_robots_and_each_has_a_key_of_its_own(world):
     env, params = world
     policy = load_policy("random", env, params)
-    obs = jnp.ones((3, 20))
+    obs = jnp.ones((3, 21))
     memory = policy.initial_memory(jax.random.key(1), 3)
     actions, after = policy(obs, memory)
     for k, key in enumerate(jax.random.split(jax.random.key(1), 3)):
@@ -145,7 +145,7 @@ class Drawn(Agent):
 def test_a_batch_begins_the_memories_of_new_episodes_and_computes_few_others(world):
     env, params = world
     policy, n = load_policy(Drawn(), env, params), 64
-    obs, memory = jnp.ones((n, 20)), policy.initial_memory(jax.random.key(1), n)
+    obs, memory = jnp.ones((n, 21)), policy.initial_memory(jax.random.key(1), n)
     _, memory = policy(obs, memory)
     each = jax.jit(jax.vmap(policy))
     for new, computed in (([], 0), ([5], 2), ([0, 63], 2), ([3, 4, 63], n)):
