@@ -1,0 +1,59 @@
+"""PPO of Brax, unchanged; `pip install 'subterra-jax[brax]'`."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.training.agents.ppo import train as ppo
+from watch import Act, Watch
+
+from subterra_jax.adapters.brax import RescaleAction, SubterraBraxEnv, jax_for_brax, wrap
+
+
+class _Enough(Exception):
+    """The goal is reached."""
+
+
+def train(watch: Watch, steps: int, seed: int) -> None:
+    """Trains until the watch says enough."""
+    env = SubterraBraxEnv(watch.task, **watch.options)
+    low, high = env.action_bounds
+    act: Any = None
+
+    def look(now: int, make_policy: Any, weights: Any) -> None:
+        nonlocal act
+        if act is None:
+
+            def act(weights: Any, obs: jax.Array) -> jax.Array:
+                action, _ = make_policy(weights, deterministic=True)(obs, jax.random.key(0))
+                return low + 0.5 * (jnp.clip(action, -1.0, 1.0) + 1.0) * (high - low)
+
+        if now and watch(now, Act(act, weights)):
+            raise _Enough
+
+    try:
+        with jax_for_brax():
+            ppo.train(
+                environment=RescaleAction(env),
+                wrap_env_fn=wrap,
+                episode_length=env.episode_length,
+                num_timesteps=steps,
+                num_envs=128,
+                unroll_length=32,
+                batch_size=32,
+                num_minibatches=8,
+                num_updates_per_batch=4,
+                learning_rate=1e-3,
+                entropy_cost=1e-3,
+                discounting=0.98,
+                gae_lambda=0.95,
+                clipping_epsilon=0.2,
+                max_grad_norm=0.5,
+                normalize_observations=True,
+                seed=seed,
+                num_evals=max(2, steps // 8_192 + 1),
+                run_evals=False,
+                policy_params_fn=look,
+            )
+    except _Enough:
+        pass
