@@ -88,4 +88,4 @@ def test_ppo_takes_a_few_updates_through_sb3s_wrappers():
 def test_a_task_with_named_fields_suits_the_policy_for_dicts():
     task = "Subterra/StopAtShort-v1"
     assert set(SubterraVecEnv(2, task).observation_space.keys()) >= {"ranges", "odometry", "goal"}
-    assert SubterraVecEnv(2, task, flat=True).observation_space.shape == (20,)
+    assert SubterraVecEnv(2, task, flat=True).observation_space.shape == (21,)

@@ -12,19 +12,26 @@ from subterra_jax.adapters.single import SubterraEnv
 from subterra_jax.adapters.vector import SubterraVectorEnv
 
 TASK, HORIZON = "Subterra/Return-v1", 26
+WORLD = {"tunnel": "subterra-351"}
 # Straight on to the horizon; and round in a circle that touches the wall before it.
-ACTIONS = np.array([[1.0, 0.0], [2.0, 1.5], [0.5, -0.1]], np.float32)
+ACTIONS = np.array([[1.0, 0.0], [2.0, 0.9], [0.5, -0.1]], np.float32)
 
 
 def made(mode, **options):
     return gymnasium.make_vec(
-        TASK, num_envs=3, vectorization_mode="vector_entry_point", autoreset_mode=mode, horizon=HORIZON, **options
+        TASK,
+        num_envs=3,
+        vectorization_mode="vector_entry_point",
+        autoreset_mode=mode,
+        horizon=HORIZON,
+        **WORLD,
+        **options,
     )
 
 
 @pytest.fixture(scope="module")
 def singles():
-    one = SubterraEnv(TASK, horizon=HORIZON)
+    one = SubterraEnv(TASK, horizon=HORIZON, **WORLD)
     return [copy.copy(one) for _ in range(3)]  # what is compiled is shared; what changes is not
 
 
@@ -86,7 +93,7 @@ def test_without_autoreset_a_finished_environment_must_be_reset():
 
 
 def test_what_a_caller_gets_wrong_is_named():
-    envs = SubterraVectorEnv(3, task=TASK, horizon=HORIZON)
+    envs = SubterraVectorEnv(3, task=TASK, horizon=HORIZON, **WORLD)
     with pytest.raises(error.ResetNeeded, match="all environments"):
         envs.reset(options={"reset_mask": np.array([True, False, False])})
     envs.reset(seed=0)

@@ -22,7 +22,7 @@ def colours(picture):
 
 @pytest.fixture(scope="module")
 def begun():
-    env, params = st.make("Subterra/Obstructed-v1")
+    env, params = st.make("Subterra/Obstructed-v1", "subterra-351")
     obs, state = jax.device_get(jax.jit(env.reset)(jax.random.key(1), params))
     return env, params, state, obs
 
@@ -43,7 +43,8 @@ def test_the_goal_and_the_boxes_are_shown_where_they_are_near(begun):
     goal = float(begun[2].goal.station)
     assert drawing.GOAL in at(begun, goal - 5.0)
     assert drawing.GOAL not in at(begun, goal - 20.0 if goal > 30.0 else goal + 20.0)
-    assert any(drawing.BOX in at(begun, station) for station in (15.0, 30.0, 45.0))
+    start = float(begun[2].station)  # boxes stand ahead of it
+    assert any(drawing.BOX in at(begun, start + ahead) for ahead in (15.0, 30.0, 45.0))
 
 
 def test_a_box_and_a_goal_are_drawn_where_they_are():
