@@ -55,7 +55,7 @@ tunnels: $(STAMP)  ## build the packaged tunnels anew, about 15 minutes on 2 idl
 	$(BIN)/python -m scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out build/survey-351
 	$(BIN)/python -m scene.build build/survey-351/survey.bag --trajectory build/survey-351/groundtruth.tum \
 		--provenance simulated --name subterra-351 --date $$(date +%F) --out build/subterra-351
-	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro --date $$(date +%F) \
+	$(BIN)/python -m scene.build $(SHARED)/data/metro_asbuilt --name metro --date $$(date +%F) --track standard --lining standard \
 		--reconstruct.lining.kind universal --reconstruct.lining.seed 0 --out build/metro
 	for name in subterra-351 metro; do \
 		cp build/$$name/tunnel.npz subterra_jax/data/$$name.npz; \

@@ -1,61 +1,51 @@
-"""`python -m scene.build INPUT --out DIR`: builds a scene folder from a recording."""
+"""`python -m scene.build INPUT --out DIR`: builds a scene folder from a recording, a cloud or a ring survey.
 
-import json
-import math
+The pipeline, a package each, in this order: `reading` the input, `poses` of its scans, `cleaning` of what is not the
+bore, `fitting` of axis, wall, lining and track, `judging` of the bore against all returns, `writing` of the folder.
+"""
+
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import mujoco
 import numpy as np
 import tyro
 
-from scene.errors import FitError, RecordingError
-from scene.judging.judge import DoubtError, Judgement
-from scene.output import BuildConfig, write_scene_folder
-from scene.poses.calibration import find_calibration
+from scene.cleaning.clean import clean_cloud
+from scene.cleaning.crop import crop_cloud, describe_chainage, keep_stations, turn_round
+from scene.config import BuildConfig, ReconstructConfig, check_number, check_settings
+from scene.errors import FitError, RecordingError, require_input
+from scene.fitting.assemble import describe_bore, fit_unfolded
+from scene.fitting.gauge import measure_gauge
+from scene.fitting.lining import add_lining
+from scene.fitting.rings import fit_ring_survey
+from scene.fitting.trackseen import find_track
+from scene.judging.judge import Judgement, JudgingConfig, judge_bore, require_trust
+from scene.judging.layers import doubt_layers
+from scene.judging.page import render_page
+from scene.judging.returns import track_zone
+from scene.judging.sanity import doubt_bore
+from scene.judging.trackdoubt import doubt_track
+from scene.poses.calibration import UNCALIBRATED, Calibration, find_calibration
+from scene.poses.place import Placed, place_cloud, place_recording
 from scene.progress import Stages
-from scene.reconstruct import Reconstruction, reconstruct
-from scene.resume import Partial, partial_folder
+from scene.reading.formats import describe, detect
+from scene.reading.ringsurvey import read_ring_survey
+from scene.reading.tables import told_columns
+from scene.reconstruction import Reconstruction
+from scene.resume import Partial, hash_inputs, partial_folder
+from scene.writing.folder import write_folder
+from scene.writing.track import Track, describe_track, lay_track
 from subterra_jax.host.command import parse, run_command
-from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.files import replace_file, replace_folder, require_folder
 from subterra_jax.host.loading import load_module
-
-_POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
-
-
-class SettingError(SubterraError):
-    """A setting that no build can have."""
-
-
-def check_settings(config: Any, prefix: str = "") -> None:
-    """Refuses numbers that are negative or not finite in a tree of dataclasses; some may not be 0 either.
-
-    `prefix` stands before the options' names. Raises `SettingError`, which names the option and its value.
-    """
-    for part in fields(config):
-        value, name = getattr(config, part.name), f"{prefix}{part.name.replace('_', '-')}"
-        if is_dataclass(value):
-            check_settings(value, f"{name}.")
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, (int, float)) and not isinstance(number, bool):
-                check_number(name, number)
-
-
-def check_number(name: str, value: float) -> None:
-    """Refuses a number that is negative or not finite; `name` tells whether it may be 0. Raises `SettingError`."""
-    if not math.isfinite(value):
-        raise SettingError(f"--{name} must be a finite number, got {value}")
-    if value < 0.0:
-        raise SettingError(f"--{name} must not be negative, got {value:g}")
-    if value == 0.0 and name.endswith(_POSITIVE):
-        raise SettingError(f"--{name} must be above 0, got {value:g}")
-
 
 _DEFAULT = BuildConfig()
 
@@ -69,11 +59,12 @@ def build(
     calibration: str | None = None,
     partial: Partial | None = None,
     reader: str | None = None,
+    more: tuple[Path, ...] = (),
 ) -> Reconstruction:
     """Reconstructs the tunnel in `source` and writes its scene folder whole, or not at all.
 
     Args:
-        source: The input; see `scene.reconstruct`.
+        source: The input; see `reconstruct`.
         out: Folder to write; a previous one is replaced once the new one is complete.
         trajectory: Poses for a bag, TUM.
         config: Settings; the defaults where not given.
@@ -81,11 +72,13 @@ def build(
         calibration: See `scene.poses.calibration.find_calibration`.
         partial: Place for partial results; beside `out` where not given.
         reader: File or module that registers a reader of the user's own.
+        more: Further bags of the same recording.
 
     Raises:
         SubterraError: The input or a setting is at fault, or the output cannot be written.
     """
     config = config or BuildConfig()
+    name = config.name or out.name
     require_folder(out)
     check_settings(config)
     check_number("keep-every", 0.0 if partial is None else partial.every)
@@ -96,27 +89,184 @@ def build(
     partial = partial or Partial(partial_folder(out))
     try:
         with Stages() as progress:
-            result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, partial)
-        _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
-        print(_describe_stations(result), flush=True)
-        with replace_folder(out) as folder:
-            judgement = _write(folder, source, config.name or out.name, result, config)
+            result = reconstruct(source, trajectory, config.reconstruct, progress, control, mounts, partial, more)
+            _print_time(started, f"bore: {result.bore.length:.2f} m, {result.facts['kind']}")
+            print(_describe_stations(result), flush=True)
+            with _naming(source):
+                track = lay_track(result.bore, config.track, result.seen)
+                judgement = judge(result, track, config.judging)
+                _require_trust(name, result, judgement, config.judging.force)
+                with replace_folder(out) as folder:
+                    write_folder(folder, name, result, track, judgement, config)
             _print_time(started, f"scene: written and compiled by MuJoCo {mujoco.__version__}")
         partial.discard()
         _page_of_refusal(out).unlink(missing_ok=True)  # of an earlier try
     except (RecordingError, FitError) as error:
         partial.discard()  # the input is at fault, and would be again
-        if isinstance(error, DoubtError) and error.page:
+        if isinstance(error, FitError) and error.page:
             raise _leave_page(error, out) from error
         raise
     finally:
         partial.close()
     print(judgement.summary(), flush=True)
-    print(_tell_track(out), flush=True)
+    laid = describe_track(track, result.seen)["laid"]
+    print(f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else ""), flush=True)
     for warning in judgement.warnings:
-        print(f"warning: {warning.text}", file=sys.stderr, flush=True)
+        print(f"warning: {warning.text} [{warning.code}]", file=sys.stderr, flush=True)
     print(f"{out / 'scene.xml'}")
     return result
+
+
+def reconstruct(
+    source: Path,
+    trajectory: Path | None,
+    config: ReconstructConfig,
+    progress: Stages,
+    control: Path | None = None,
+    calibration: Calibration = UNCALIBRATED,
+    partial: Partial | None = None,
+    more: tuple[Path, ...] = (),
+) -> Reconstruction:
+    """Detects the kind of an input and builds its bore.
+
+    Args:
+        source: A recording, a registered cloud or a ring survey, of any format that `scene.reading.formats` knows.
+        trajectory: Poses in TUM form, for a recording.
+        config: Settings.
+        progress: Shows the stages.
+        control: Positions in TUM form, for a recording without a trajectory.
+        calibration: Mounts of prism and IMU against the LiDAR.
+        partial: Partial results of an earlier build, and place for those of this one; none are kept without it.
+        more: Further bags of the same recording.
+
+    Raises:
+        RecordingError: Unreadable, or of no known kind.
+        FitError: No tunnel in it.
+    """
+    partial = partial or Partial(None)
+    detected = detect(require_input(source), config.reading.format)
+    kind, path, parts = detected.format.kind, detected.path, (config.voxel, config.reading, progress, partial)
+    for given, what in ((trajectory, "a trajectory"), (control, "control")):
+        if given is not None and kind != "recording":
+            raise RecordingError(f"{given}: {what} goes with a bag, but {source} is none")
+    if more and kind != "recording":
+        raise RecordingError(f"{more[0]}: several inputs are parts of one recording, but {source} is none")
+    if control is not None and trajectory is not None:
+        raise RecordingError(f"{control}: control is for a recording without a trajectory, but {trajectory} is given")
+    with _naming(source):
+        if kind == "rings":
+            return _fit_rings(path, config, progress)
+        if kind == "cloud":
+            return _fit_cloud(place_cloud(path, *parts), config, progress)
+        placed = place_recording(path, trajectory, control, calibration, *parts, more)
+        try:
+            return _fit_cloud(placed, config, progress)
+        except FitError as error:
+            if doubt := placed.facts.get("clock_doubt") or placed.facts.get(
+                "pose_doubt"
+            ):  # what no bore can be fitted to follows from it
+                raise error.about(f"{doubt}; no bore can be fitted to them ({error})") from error
+            raise
+
+
+@contextmanager
+def _naming(source: Path) -> Iterator[None]:
+    """Names the input in an error of the fit, where it does not name it itself."""
+    try:
+        yield
+    except FitError as error:
+        if str(source) in str(error):
+            raise
+        raise error.about(f"{source}: {error}") from error
+
+
+_ARBITRARY = "arbitrarily: a registered cloud tells no direction, and --reverse turns it"
+
+
+def _fit_cloud(placed: Placed, config: ReconstructConfig, progress: Stages) -> Reconstruction:
+    """Cleans a registered cloud and fits axis, wall, track and lining to it."""
+    located = placed.located
+    stage = progress.start("fitting the bore", 4)
+    everything = crop_cloud(placed.cloud, config.extent.crop)
+    cleaned = clean_cloud(everything, config.cleaning, config.centreline)
+    backwards = False
+    if located is not None:
+        ends = cleaned.axis.local(located.trajectory.positions[[0, -1]] - everything.origin)[0]
+        backwards = bool(ends[1] < ends[0])  # stations grow the way the sensor went
+    if backwards != config.extent.reverse:
+        cleaned = turn_round(cleaned)
+    cleaned, everything, first = keep_stations(cleaned, everything, config.extent)
+    cloud = cleaned.cloud
+    stage.advance()
+    sections, smooth = fit_unfolded(cloud, cleaned.axis, config.centreline.cutoff)
+    stage.advance()
+    seen = measure_gauge(find_track(cloud, smooth, sections.flat_floor), placed.low, smooth)
+    stage.advance()
+    bore, provenance = add_lining(smooth, sections, cloud, config.lining, railway=seen.shows_rails)
+    stage.advance()
+    facts = {
+        "length_fixed_by": "registered cloud as given",
+        **placed.facts,
+        **describe_chainage(config.extent, first, _ARBITRARY if located is None else "with the trajectory"),
+        "returns": cloud.returns,
+        "points": len(cloud.points),
+        "flat_floor": sections.flat_floor,
+        "profile_spacing": sections.spacing or None,
+        **describe_bore(bore),
+    }
+    removed = tuple(part.shifted(-sections.grid.start) for part in cleaned.removed)
+    return Reconstruction(
+        bore, cloud.origin, placed.record, facts, provenance,
+        located.trajectory if located is not None and located.estimated else None,
+        cloud, everything, removed, cleaned.cause, seen,
+    )  # fmt: skip
+
+
+def _fit_rings(path: Path, config: ReconstructConfig, progress: Stages) -> Reconstruction:
+    """Fits a round bore to the rings of an as-built survey."""
+    survey = read_ring_survey(path, config.reading.unit, told_columns(path, config.reading.columns))
+    if config.extent.reverse:
+        survey = survey.reversed()
+    print(f"detected: {describe({'kind': 'ring survey', **survey.facts})}", flush=True)
+    bore, origin, provenance, facts = fit_ring_survey(survey, config.lining)
+    facts |= describe_chainage(config.extent, 0.0, "with the order of the rings in the file")
+    return Reconstruction(bore, origin, hash_inputs([path], progress), facts, provenance)
+
+
+def judge(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgement:
+    """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
+    odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
+    odd += doubt_track(track, result.seen, result.facts.get("pose_doubt"))
+    odd += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
+    judgement = Judgement(config.tolerance, ())
+    if result.everything is not None:
+        spacing = float(result.facts.get("profile_spacing") or 0.0)
+        zone = track_zone(track, result.bore)
+        judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed, spacing)
+    found = sorted([*odd, *judgement.warnings], key=lambda warning: not warning.refuses)
+    return replace(judgement, warnings=tuple(found))
+
+
+def _require_trust(name: str, result: Reconstruction, judgement: Judgement, force: bool) -> None:
+    """Raises `FitError` with the report on a bore that the judgement refuses, unless by `force`."""
+    try:
+        require_trust(judgement, force)
+    except FitError as error:
+        shown = {"detected": result.facts, "removed": [part.facts for part in result.removed]}
+        error.page = render_page(name, result.bore, judgement, shown)
+        raise
+
+
+def _page_of_refusal(out: Path) -> Path:
+    """Return the place of the report on a build that was refused: beside its folder, which stays as it was."""
+    return out.with_name(f"{out.name}-refused.html")
+
+
+def _leave_page(error: FitError, out: Path) -> FitError:
+    """Writes the report of a refused build; returns the error with the place of the report in its sentence."""
+    with replace_file(_page_of_refusal(out)) as fresh:
+        fresh.write_text(error.page, encoding="utf-8")
+    return error.about(f"{error} ({_page_of_refusal(out)} shows why)")
 
 
 def _describe_stations(result: Reconstruction) -> str:
@@ -127,39 +277,15 @@ def _describe_stations(result: Reconstruction) -> str:
     return f"stations: 0 m{chainage} at ({x:.1f}, {y:.1f}, {z:.1f}); they grow {result.facts['chainage_grows']}"
 
 
-def _tell_track(folder: Path) -> str:
-    """Return where a scene's track comes from, and what to do where there is none that one may have looked for."""
-    laid = str(json.loads((folder / "manifest.json").read_text())["track"]["laid"])
-    return f"track: {laid}" + ("; --track standard lays one" if "no rails" in laid else "")
-
-
-def _write(folder: Path, source: Path, name: str, result: Reconstruction, config: BuildConfig) -> Judgement:
-    """Writes the scene folder; an error of the fit names the source."""
-    try:
-        return write_scene_folder(folder, name, result, config)
-    except DoubtError as error:
-        raise DoubtError(f"{source}: {error}", error.page) from error
-
-
-def _page_of_refusal(out: Path) -> Path:
-    """Return the place of the report on a build that was refused: beside its folder, which stays as it was."""
-    return out.with_name(f"{out.name}-refused.html")
-
-
-def _leave_page(error: DoubtError, out: Path) -> DoubtError:
-    """Writes the report of a refused build; returns the error with the place of the report in its sentence."""
-    with replace_file(_page_of_refusal(out)) as fresh:
-        fresh.write_text(error.page, encoding="utf-8")
-    return DoubtError(f"{error} ({_page_of_refusal(out)} shows why)")
-
-
 def _print_time(started: float, text: str) -> None:
     print(f"[{time.monotonic() - started:6.1f} s] {text}", flush=True)
 
 
 def command(
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="input", metavar="INPUT")],
+    more: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[BAG ...]")] = (),
     /,
+    *,
     out: Path,
     trajectory: Path | None = None,
     control: Path | None = None,
@@ -174,8 +300,9 @@ def command(
     Example: python -m scene.build survey.bag --trajectory groundtruth.tum --out build/tunnel
 
     Args:
-        source: A recording (ROS1 or ROS2 bag, MCAP, folder of timed scans), a registered cloud (PLY,
-            PCD, LAS, LAZ, E57, XYZ, CSV, Parquet), or an as-built ring survey (CSV, XLSX).
+        source: A recording (ROS1 or ROS2 bag, MCAP, folder of split bags or of timed scans), a registered
+            cloud (PLY, PCD, LAS, LAZ, E57, PTX, PTS, XYZ, CSV, Parquet), or an as-built ring survey (CSV, XLSX).
+        more: Further bags of the same recording.
         out: Folder to write; replaced only once the new scene is complete.
         trajectory: Poses of the LiDAR in TUM form (t x y z qx qy qz qw), for a bag; without it, LiDAR odometry.
         control: Positions of a prism in TUM form (quaternion zero, any order) that fix odometry's length.
@@ -187,7 +314,7 @@ def command(
         config: Settings.
     """
     results = Partial(partial_folder(out), fresh, keep_every)
-    return partial(build, source, out, trajectory, config, control, calibration, results, reader)
+    return partial(build, source, out, trajectory, config, control, calibration, results, reader, more)
 
 
 def main() -> int:
@@ -196,7 +323,12 @@ def main() -> int:
     wanted = parse(lambda words: tyro.cli(command, prog="python -m scene.build", args=words))
 
     def act() -> None:
-        wanted()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of libraries: what a user must know of is said by this program
+            try:
+                wanted()
+            except FitError as error:
+                raise error.about(f"{error} [{error.code}]" if error.code else str(error)) from error
 
     return run_command(act, "interrupted; the output is as it was, and the same command goes on from here")
 

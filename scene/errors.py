@@ -10,7 +10,21 @@ class RecordingError(SubterraError):
 
 
 class FitError(SubterraError):
-    """The input was read, but no tunnel can be found or measured in it."""
+    """The input was read, but no tunnel can be found or measured in it.
+
+    Attributes:
+        code: Word for programs, where there is one: of a `Refusal`, or of the warning that refuses the bore.
+        page: HTML of the report that shows why; empty where there is none.
+    """
+
+    def __init__(self, message: str, code: str = "", page: str = "") -> None:
+        """Keeps the sentence for the user, the code and the report."""
+        super().__init__(message)
+        self.code, self.page = code, page
+
+    def about(self, message: str) -> "FitError":
+        """Return the same error with another sentence."""
+        return type(self)(message, self.code, self.page)
 
 
 def require_input(path: Path) -> Path:

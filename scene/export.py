@@ -243,6 +243,7 @@ def export(config: ExportConfig) -> Path:
         "provenance": manifest.get("input_provenance", "unknown"),
         "licence": config.licence,
         "origin": manifest["frame"]["origin"],
+        "crs": manifest["frame"].get("crs") or "not stated",
         "frame": "tunnel frame, z up, m; add origin for the input's frame",
         "made_by": "Subterra",
     }

@@ -14,6 +14,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from scene.progress import Stages
 from subterra_jax.host.errors import OutputError
 
 _CHUNK = 1 << 22
@@ -32,6 +33,11 @@ def input_record(paths: list[Path], advance: Callable[[int], None] = lambda _: N
     and `advance` is called with the number of bytes read since.
     """
     return [_folder_record(path, advance) if path.is_dir() else _file_record(path, advance) for path in paths]
+
+
+def hash_inputs(paths: list[Path], progress: Stages) -> list[dict[str, Any]]:
+    """Return name, size and hash of each input, read once from end to end."""
+    return input_record(paths, progress.start("hashing the input, bytes", total_bytes(paths)).advance)
 
 
 def resume_key(record: list[dict[str, Any]], *settings: Any) -> str:

@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from benchmarks.fidelity.files import FidelityError, file_hash
 from scene.poses.trajectory import load_tum
 from scene.reading.recording import Recording
-from scene.reading.scans import POINTCLOUD2_TYPE, TIME_FIELDS, Scan, make_scan
+from scene.reading.scans import POINTCLOUD2_TYPE, make_scan
+from scene.reading.times import TIME_FIELDS, Scan
 
 SILENT_RANGE = 1e6  # m: where the point of a beam without return is put, in its direction
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -45,7 +46,7 @@ def organised_scans(recording: Recording) -> Iterator[Scan]:
         filled = np.where((known & ~back)[..., None], SILENT_RANGE * look, points)
         filled[~known & ~back] = 0.0
         stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-        yield make_scan(stamp, filled.reshape(-1, 3), times.ravel(), name)[0]
+        yield recording.convention.apply(make_scan(stamp, filled.reshape(-1, 3), times.ravel(), name))[0]
 
 
 def beam_directions(

@@ -20,7 +20,7 @@ from benchmarks.paper.steps import SCENE_FILES, SURVEY_FILES, require
 from benchmarks.report import scene_points
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.reading.recording import Recording
-from scene.reading.scans import Scan
+from scene.reading.times import Scan
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ def read_clouds(folder: Path, topic: str = CLOUDS) -> Iterator[Sweep]:
         BenchmarkError: The folder holds no bag, a damaged one, or one without this topic.
     """
     for message in _messages(folder, topic):
-        scan, _ = parse_pointcloud2(message, _stamp(message))
+        scan = parse_pointcloud2(message, _stamp(message))
         yield scan.stamp, np.asarray(scan.points, np.float64)
 
 

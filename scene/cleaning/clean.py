@@ -13,19 +13,18 @@ from scipy.spatial import cKDTree
 from scene.bore import Axis
 from scene.cleaning.follow import Course, follow_bore, join_courses
 from scene.cleaning.refusal import name_cloud
-from scene.cleaning.removed import INSIDE, KEPT, SCATTERED, Cleaned, list_removed, part_of_cloud
+from scene.cleaning.removed import Cause, Cleaned, list_removed, part_of_cloud
 from scene.cleaning.seeds import Seed, find_seeds
 from scene.cleaning.sort import end_stations, has_support, look_around, name_bodies, sort_points
 from scene.cleaning.tube import Tube, measure_tube
 from scene.cloud import Cloud, thin_and_count
 from scene.errors import FitError
-from scene.fitting.centreline import CentrelineConfig, centre_axis, fit_centreline, smooth_axis
+from scene.fitting.centreline import CentrelineConfig, centre_axis, smooth_axis
 
 _COARSE = 0.15  # m, voxel of the cloud that is followed
 _REACH, _AROUND = 3.0, 5  # times the template, and directions around: as far as the wall is looked for
 _STRETCH = 3.0  # m between two stretches of what was removed
 _LITTLE = 0.002  # share of the points: with less to remove, the cloud is clean
-_SAME, _SHORTER = 0.10, 2.0  # m between two axes of one bore; m that the one may be shorter
 _FEWEST = 200  # points
 _TRIED = 8  # seeds followed
 _ENCLOSED = 0.65  # share of the directions
@@ -52,7 +51,7 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     thinned, count = thin_and_count(part_of_cloud(cloud, np.flatnonzero(supported)), _COARSE)
     coarse = thinned.astype(np.float64)
     if len(coarse) < _FEWEST:
-        return _as_it_is(cloud, centreline)  # which says what is missing
+        raise FitError(f"no tunnel in the cloud: it holds {len(coarse)} places of {_COARSE:g} m; {_FEWEST} are needed")
     seeds = find_seeds(coarse)
     course = longest_course(coarse, seeds)
     if course is None or course.length < max(centreline.min_length, _ELONGATION * course.width):
@@ -68,14 +67,9 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
     around = look_around(points, axis)
     behind, cause = sort_points(around, tube, supported, ends)
     cause = _filter(name_bodies(points, cause, behind, supported), config)
-    if (cause != KEPT).mean() < _LITTLE:
-        try:
-            whole = _as_it_is(cloud, centreline)
-        except FitError:
-            whole = None
-        if whole is not None and _agree(whole.axis, axis):
-            return whole
-    kept = part_of_cloud(cloud, np.flatnonzero(cause == KEPT))
+    if (cause != Cause.KEPT).mean() < _LITTLE:
+        cause[:] = Cause.KEPT
+    kept = cloud if (cause == Cause.KEPT).all() else part_of_cloud(cloud, np.flatnonzero(cause == Cause.KEPT))
     usual = _usual_section(axis, tube)
     axis = axis.at(np.linspace(*ends, int(np.ptp(ends)) + 1))
     axis = centre_axis(kept.points, axis, centreline, usual)
@@ -88,8 +82,10 @@ def clean_cloud(cloud: Cloud, config: CleaningConfig, centreline: CentrelineConf
 
 def _filter(cause: Int[np.ndarray, " n"], config: CleaningConfig) -> Int[np.ndarray, " n"]:
     """Return the causes with those that the user wants kept as the bore's."""
-    wanted = [kind for kind, out in ((SCATTERED, config.filter_outliers), (INSIDE, config.filter_moving)) if not out]
-    return np.where(np.isin(cause, wanted), KEPT, cause) if wanted else cause
+    out = {Cause.SCATTERED: config.filter_outliers, Cause.INSIDE: config.filter_moving}
+    result = cause.copy()
+    result[np.isin(cause, [kind for kind, leave in out.items() if not leave])] = Cause.KEPT
+    return result
 
 
 def _sorted_coarse(
@@ -102,7 +98,7 @@ def _sorted_coarse(
     around = look_around(coarse, axis)
     tube = measure_tube(around.station, around.angle, around.radius, count, axis.length, reach)
     ends = end_stations(tube, around)
-    return tube, ends, sort_points(around, tube, np.ones(len(coarse), bool), ends)[1] == KEPT
+    return tube, ends, sort_points(around, tube, np.ones(len(coarse), bool), ends)[1] == Cause.KEPT
 
 
 def require_crown(tube: Tube) -> None:
@@ -112,18 +108,6 @@ def require_crown(tube: Tube) -> None:
     width = 2 * float(np.median(tube.usual[:, sides]))
     if width > _STREET and tube.matched[:, above].mean() < _CROWN:
         raise FitError(f"no tunnel in the cloud: open above and {width:.0f} m wide, so a street or a cutting")
-
-
-def _agree(one: Axis, other: Axis) -> bool:
-    """Return whether two axes are the same but for noise; where a wall was not seen, or hardly, they may not be."""
-    station, lateral, upward = other.local(one.position)
-    inside = (station > 0) & (station < other.length)
-    return one.length > other.length - _SHORTER and bool(np.hypot(lateral, upward)[inside].max(initial=0.0) < _SAME)
-
-
-def _as_it_is(cloud: Cloud, centreline: CentrelineConfig) -> Cleaned:
-    axis = fit_centreline(cloud.points, centreline, cloud.origin)
-    return Cleaned(cloud, axis, (), np.zeros(len(cloud.points), np.int8))
 
 
 def longest_course(points: Float[np.ndarray, "n 3"], seeds: list[Seed]) -> Course | None:

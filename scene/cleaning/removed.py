@@ -1,6 +1,8 @@
 """The bore's returns, its axis, and a list of all that cleaning cut away, with place and cause."""
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,9 +10,25 @@ from jaxtyping import Float, Int
 from scene.bore import Axis
 from scene.cloud import Cloud
 
-# Each point of the uncleaned cloud has one of these, by its index.
-KEPT, SCATTERED, BEHIND, INSIDE, BEYOND, BRANCH, ELSEWHERE = range(7)
-CAUSES = (
+
+class Cause(IntEnum):
+    """Why a point of the uncleaned cloud was cut away; its `words` are for people."""
+
+    KEPT = 0
+    SCATTERED = 1
+    BEHIND = 2
+    INSIDE = 3
+    BEYOND = 4
+    BRANCH = 5
+    ELSEWHERE = 6
+
+    @property
+    def words(self) -> str:
+        """The cause in words."""
+        return _WORDS[self]
+
+
+_WORDS = (
     "the bore",
     "scattered returns without neighbours",
     "returns behind the wall",
@@ -19,6 +37,7 @@ CAUSES = (
     "a branch or a recess",
     "another tunnel or building apart from the bore",
 )
+OUTSIDE = (Cause.BEYOND, Cause.BRANCH, Cause.ELSEWHERE)  # of the bore: no model of it need explain them
 
 _BRANCH = 3.0  # m behind the wall: less is a niche
 _BUILDING = 2000  # points
@@ -36,7 +55,7 @@ class Removed:
 
     start: float  # First station, m
     end: float  # Last station, m
-    cause: str  # One of `CAUSES`
+    cause: Cause
     points: int  # Points of the thinned cloud in it
     place: tuple[float, float, float]  # Median position in the input's frame, m
     nearest: float = 0.0  # How far behind the wall it begins, m
@@ -44,16 +63,21 @@ class Removed:
     mouths: tuple[tuple[float, float], ...] = ()  # First and last stations at which a branch opens into the bore, m
 
     @property
+    def facts(self) -> dict[str, Any]:
+        """Entries for the manifest."""
+        return {**vars(self), "cause": self.cause.words, "code": self.cause.name.lower(), "warning": self.warning}
+
+    @property
     def warning(self) -> str:
         """Sentence for the user; empty where the cut is usual."""
         x, y, z = self.place
         where = f"from station {self.start:.0f} to {self.end:.0f} m, near ({x:.1f}, {y:.1f}, {z:.1f}),"
-        if self.cause == CAUSES[BRANCH] and self.deepest > _BRANCH:
+        if self.cause == Cause.BRANCH and self.deepest > _BRANCH:
             return (
                 f"{where} the bore opens into a branch or a room that reaches {self.deepest:.0f} m behind its wall"
                 f"{self._name_mouths()}; it was cut at its mouth: build it from a cloud of its own"
             )
-        if self.cause == CAUSES[ELSEWHERE] and self.points > _BUILDING:
+        if self.cause == Cause.ELSEWHERE and self.points > _BUILDING:
             return f"{where} another tunnel or building stands {self.nearest:.0f} m behind the wall; it was left out"
         return ""
 
@@ -83,7 +107,7 @@ class Cleaned:
     cloud: Cloud  # The bore's returns; the same object as the input where nothing was cut
     axis: Axis  # Centreline of the bore, m
     removed: tuple[Removed, ...]  # By station of `axis`, m
-    cause: Int[np.ndarray, " n"]  # Index into `CAUSES` of each point of the uncleaned cloud
+    cause: Int[np.ndarray, " n"]  # `Cause` of each point of the uncleaned cloud
 
 
 def part_of_cloud(cloud: Cloud, rows: Int[np.ndarray, " k"]) -> Cloud:
@@ -103,7 +127,7 @@ def list_removed(
     `behind` is how far each point is behind the wall, m; what a user should know of gets a warning by it.
     """
     result = []
-    for index in np.unique(cause[cause != KEPT]):
+    for index in np.unique(cause[cause != Cause.KEPT]):
         rows = np.flatnonzero(cause == index)
         rows = rows[np.argsort(station[rows], kind="stable")]
         for part in np.split(rows, np.flatnonzero(np.diff(station[rows]) > gap) + 1):
@@ -111,9 +135,9 @@ def list_removed(
             first, last = (float(station[part[end]]) for end in (0, -1))
             depth = (0.0, 0.0) if behind is None else np.percentile(behind[part], [1, 99])
             place = (float(x), float(y), float(z))
-            mouths = _find_mouths(station[part], behind[part]) if behind is not None and index == BRANCH else ()
+            mouths = _find_mouths(station[part], behind[part]) if behind is not None and index == Cause.BRANCH else ()
             depths = float(depth[0]), float(depth[1])
-            result.append(Removed(first, last, CAUSES[index], len(part), place, *depths, mouths))
+            result.append(Removed(first, last, Cause(index), len(part), place, *depths, mouths))
     return tuple(sorted(result, key=lambda part: (part.start, part.cause)))
 
 

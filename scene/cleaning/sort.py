@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scene.bore import Axis
-from scene.cleaning.removed import BEHIND, BEYOND, BRANCH, ELSEWHERE, INSIDE, KEPT, SCATTERED
+from scene.cleaning.removed import Cause
 from scene.cleaning.tube import Tube
 
 _OVERRUN = 60.0  # m beyond the axis that points have stations
@@ -95,19 +95,19 @@ def end_stations(tube: Tube, around: Around) -> tuple[float, float]:
 def sort_points(
     around: Around, tube: Tube, supported: Bool[np.ndarray, " n"], ends: tuple[float, float]
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """Return how far each point is behind the wall, m, and its index into `CAUSES`."""
+    """Return how far each point is behind the wall, m, and its `Cause`."""
     angle, radius = around.angle, around.radius
     out, within = tube.off(around.station, angle, radius)
-    cause = np.full(len(radius), KEPT, np.int8)
-    cause[out > _BEHIND] = BEHIND
+    cause = np.full(len(radius), Cause.KEPT, np.int8)
+    cause[out > _BEHIND] = Cause.BEHIND
     height = _height_above_floor(around, tube)
     inside = (within > _INSIDE) & (height > _TRACK)
-    cause[inside] = INSIDE
-    cause[_footprint(around, inside & (height < _TRACK + _FOOT)) & (height > _ABOVE) & (within > _ALONE)] = INSIDE
-    cause[~supported & (np.maximum(out, within) > _ALONE)] = SCATTERED
+    cause[inside] = Cause.INSIDE
+    cause[_footprint(around, inside & (height < _TRACK + _FOOT)) & (height > _ABOVE) & (within > _ALONE)] = Cause.INSIDE
+    cause[~supported & (np.maximum(out, within) > _ALONE)] = Cause.SCATTERED
     beyond = (around.station < ends[0]) | (around.station > ends[1])
-    cause[beyond] = BEYOND
-    cause[~beyond & supported & (radius > _ELSEWHERE * np.median(tube.wall))] = ELSEWHERE
+    cause[beyond] = Cause.BEYOND
+    cause[~beyond & supported & (radius > _ELSEWHERE * np.median(tube.wall))] = Cause.ELSEWHERE
     return out, cause
 
 
@@ -173,7 +173,7 @@ def name_bodies(
 
     `behind` is how far each point is behind the wall, m.
     """
-    off = np.flatnonzero(np.isin(cause, (BEHIND, BEYOND, ELSEWHERE)) & supported)
+    off = np.flatnonzero(np.isin(cause, (Cause.BEHIND, Cause.BEYOND, Cause.ELSEWHERE)) & supported)
     if not len(off):
         return cause
     cells, voxel = np.unique(np.floor(points[off] / _VOXEL).astype(np.int64), axis=0, return_inverse=True)
@@ -185,12 +185,13 @@ def name_bodies(
     depth, nearest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(depth, of_point, behind[off])
     np.minimum.at(nearest, of_point, behind[off])
-    beyond = np.bincount(of_point, cause[off] == BEYOND, count) / np.bincount(of_point, minlength=count)
+    beyond = np.bincount(of_point, cause[off] == Cause.BEYOND, count) / np.bincount(of_point, minlength=count)
     voxels = np.bincount(body, minlength=count)
-    named = np.full(count, BEHIND)
-    named[(voxels >= _BODY) & (depth > _DEEP) & (nearest < _TOUCHING)] = BRANCH
-    named[(voxels >= _BODY) & (nearest >= _TOUCHING)] = ELSEWHERE
-    named[beyond > 0.5] = BEYOND
+    named = np.full(count, Cause.BEHIND)
+    named[(voxels >= _BODY) & (depth > _DEEP) & (nearest < _TOUCHING)] = Cause.BRANCH
+    named[(voxels >= _BODY) & (nearest >= _TOUCHING)] = Cause.ELSEWHERE
+    named[beyond > 0.5] = Cause.BEYOND
     result = cause.copy()
-    result[off] = np.where((cause[off] == BEYOND) & (named[of_point] != ELSEWHERE), BEYOND, named[of_point])
+    stays = (cause[off] == Cause.BEYOND) & (named[of_point] != Cause.ELSEWHERE)
+    result[off] = np.where(stays, Cause.BEYOND, named[of_point])
     return result

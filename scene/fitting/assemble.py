@@ -17,9 +17,11 @@ from jaxtyping import Shaped
 from scipy.optimize import least_squares
 
 from scene.bore import POCKET, STRETCH, Axis, Bore, uniform_stations
+from scene.cloud import Cloud
 from scene.fitting.branches import require_no_room
+from scene.fitting.centreline import smooth_axis
 from scene.fitting.profile import measure_section
-from scene.fitting.section import Sections
+from scene.fitting.section import Sections, fit_sections
 from scene.fitting.unroll import probability_known
 
 _WINDOW = 2.0  # m of bore that one fit is made to
@@ -174,6 +176,23 @@ def find_fold(bore: Bore) -> float | None:
     step = np.einsum("nmi,ni->nm", np.diff(bore.surface(), axis=0), bore.tangent[:-1] + bore.tangent[1:])
     folded = np.flatnonzero((step <= 0).any(axis=1))
     return float(bore.station[folded[0]]) if len(folded) else None
+
+
+_STRAIGHTER = 3  # times that an axis is smoothed over twice the length
+
+
+def fit_unfolded(cloud: Cloud, axis: Axis, cutoff: float) -> tuple[Sections, Bore]:
+    """Fits sections to an axis, which is smoothed further where they fold: at a jump of the wall it may bend sharply.
+
+    `cutoff` is the wavelength that the axis is smooth over, m.
+    """
+    for power in range(1, _STRAIGHTER + 2):
+        sections = fit_sections(cloud, axis)
+        bore = bore_from_sections(axis, sections)
+        if power > _STRAIGHTER or find_fold(bore) is None:
+            break
+        axis = smooth_axis(axis.position, cutoff * 2**power)
+    return sections, bore
 
 
 _STRAIGHT = 1e-5  # 1/m

@@ -5,9 +5,10 @@ middle of the mouth at that depth come from it or from nothing; the rim, the sid
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+import tyro
 from jaxtyping import Bool, Float, Int, Shaped
 from scipy.spatial import cKDTree
 
@@ -149,8 +150,9 @@ MEASURED, STANDARD, NONE = "measured", "by standard", "none found"
 class LiningConfig:
     """The lining that stands where the survey can show none."""
 
-    # Put such a lining in, but not where the survey could have shown one, or where the walls are no even section.
-    by_standard: bool = True
+    # Lining that is put in where the survey could not show one and the walls are an even section: by standard where
+    # the survey shows rails (auto), none, or by standard in any bore.
+    lay: Annotated[Literal["auto", "none", "standard"], tyro.conf.arg(name="lining", prefix_name=False)] = "auto"
     # Rows of pockets across ring joints; or universal rings, each turned to the place of its key segment, with pockets
     # at the joints within a ring (scene/fitting/universal.py has the sources).
     kind: Literal["straight", "universal"] = "straight"
@@ -181,11 +183,15 @@ _NO_JOINTS = np.empty(0)
 
 
 def add_lining(
-    bore: Bore, sections: Sections, cloud: Cloud | None = None, config: LiningConfig | None = None
+    bore: Bore,
+    sections: Sections,
+    cloud: Cloud | None = None,
+    config: LiningConfig | None = None,
+    railway: bool = False,
 ) -> tuple[Bore, dict[str, str]]:
     """Return a smooth bore with its lining, and the provenance of rings, pockets and nails.
 
-    Nails are looked for in the cloud; without one they are by standard.
+    Nails are looked for in the cloud; without one they are by standard. `railway` tells whether the survey shows rails.
     """
     config = config or LiningConfig()
     measured, joints = find_pockets(sections)
@@ -195,24 +201,30 @@ def add_lining(
         return _add_nails(bore, cloud, config, {"rings": rings, "pockets": MEASURED}, joints)
     if could_show_pockets(sections, config.pocket_depth):
         return bore, {"rings": NONE, "pockets": NONE, "nails": NONE}
-    return add_standard_lining(bore, config, sections.flat_floor)
+    return add_standard_lining(bore, config, sections.flat_floor, railway=railway)
 
 
 def add_standard_lining(
-    bore: Bore, config: LiningConfig, flat_floor: bool, joints: Float[np.ndarray, " j"] = _NO_JOINTS
+    bore: Bore,
+    config: LiningConfig,
+    flat_floor: bool,
+    joints: Float[np.ndarray, " j"] = _NO_JOINTS,
+    railway: bool = False,
 ) -> tuple[Bore, dict[str, str]]:
     """Return a smooth bore with the lining of the configuration, marked as not measured; ring stations it has are kept.
 
-    A flat floor, the lowest part of the section, gets no pockets. `joints` are ring joints that the survey tells, m,
-    between which universal rings stand.
+    Nothing is put in where `config.lay` does not ask for it, or only for a `railway`, and this is none. A flat floor,
+    the lowest part of the section, gets no pockets. `joints` are ring joints that the survey tells, m, between which
+    universal rings stand.
     """
-    if config.kind == "universal" and config.by_standard:
+    wanted = config.lay == "standard" or (config.lay == "auto" and railway)
+    if config.kind == "universal" and wanted:
         return _add_universal_lining(bore, config, flat_floor, joints)
     rings = {"rings": MEASURED} if len(bore.ring_station) else {"rings": STANDARD}
     joints = np.arange(config.ring_width / 2, bore.length, config.ring_width)
     joints = joints[_is_even(bore, joints)]
     pockets = _standard_pockets(bore, joints, config, flat_floor)
-    if not config.by_standard or not len(pockets):
+    if not wanted or not len(pockets):
         provenance = rings if len(bore.ring_station) else {"rings": "none"}
         return bore, {**provenance, "pockets": "none: the survey cannot show them", "nails": "none"}
     bore = replace(bore, pocket=pockets, ring_station=bore.ring_station if len(bore.ring_station) else joints)

@@ -1,6 +1,7 @@
 """An as-built survey of rings: a few total-station points on each, one circle a ring, a round bore through them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -9,7 +10,10 @@ from scipy.optimize import least_squares
 
 from scene.bore import POCKET, STATION_STEP, STRETCH, Bore, axis_through, make_axis
 from scene.errors import FitError
+from scene.fitting.assemble import describe_bore
+from scene.fitting.lining import LiningConfig, add_standard_lining
 from scene.fitting.profile import section_angles
+from scene.fitting.universal import joints_by_number
 from scene.fitting.unroll import UNSEEN_GROWTH, probability_known
 from scene.reading.ringsurvey import RingSurvey
 
@@ -157,3 +161,30 @@ def _fit_circle(
         float(np.sqrt(np.mean(misfit(np.array([a, b, radius])) ** 2))),
         float((gap < np.pi / 8).mean()),
     )
+
+
+def fit_ring_survey(
+    survey: RingSurvey, lining: LiningConfig
+) -> tuple[Bore, Float[np.ndarray, "3"], dict[str, str], dict[str, Any]]:
+    """Return the bore of a survey, its origin in the survey's frame, m, and provenance and facts for the manifest."""
+    fit = fit_rings(survey)
+    origin = np.floor(np.median(fit.centre, axis=0))
+    smooth = bore_from_rings(fit, origin)
+    joints = joints_by_number(fit.names, smooth.ring_station)
+    bore, provenance = add_standard_lining(smooth, lining, False, joints)
+    facts = {
+        "kind": "ring survey",
+        **survey.facts,
+        "rings": len(fit.names),
+        "first_ring": fit.names[0],
+        "last_ring": fit.names[-1],
+        "length_fixed_by": "total-station survey",
+        "radius_mean": float(fit.radius.mean()),
+        "radius_sd": float(fit.radius.std()),
+        **describe_bore(bore),
+        "residual_rms": float(np.sqrt(np.mean(fit.rms**2))),
+        "largest_target_offset": float(max(offset.max() for offset in survey.offsets)),
+        "flat_floor": False,
+        **({} if survey.design is None else compare_with_design(fit, survey.design)),
+    }
+    return bore, origin, provenance, facts

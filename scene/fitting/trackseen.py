@@ -57,6 +57,11 @@ class SeenTrack:
     sought: bool = False  # False where the survey could not show any, as rings of points on the wall
     thin: bool = False  # True where too few returns lie on the floor to show rails
 
+    @property
+    def shows_rails(self) -> bool:
+        """True where the survey shows a railway."""
+        return any(line.rails is not None for line in self.lines)
+
 
 def find_track(cloud: Cloud, bore: Bore, flat_floor: bool = True) -> SeenTrack:
     """Finds the tracks in a bore by their rails; where there is no rail, one on its axis by sleepers.

@@ -8,17 +8,16 @@ import tyro
 from jaxtyping import Float, Shaped
 
 from scene.bore import Bore
-from scene.cleaning.removed import CAUSES, KEPT, Removed
+from scene.cleaning.removed import OUTSIDE, Cause, Removed
 from scene.cloud import Cloud
 from scene.errors import FitError
+from scene.judging.codes import Code
 from scene.judging.coverage import Coverage, find_unseen, measure_overruns
 from scene.judging.places import Place, find_places
 from scene.judging.returns import BEHIND, BEYOND, EXPLAINED, INSIDE, Returns, TrackZone, compare_returns
 from scene.judging.words import name_span
 
 _FLAG = tyro.conf.arg(prefix_name=False)
-_CUT_OUTSIDE = tuple(k for k, cause in enumerate(CAUSES) if any(
-    word in cause for word in ("beyond a mouth", "branch", "apart from the bore")))  # fmt: skip
 _LISTED = 10  # places and worst stations that are listed
 _WINDOW = 2.0  # m of bore that one worst station stands for
 _WARN_LOCAL = 0.05  # of the returns at a place's stations: a place with fewer is listed without a warning
@@ -33,14 +32,8 @@ STATION = np.dtype([
 class DoubtError(FitError):
     """A bore was built, but it explains too little of what the scanner saw, or cannot be a tunnel.
 
-    Attributes:
-        page: HTML of the report that shows why; empty where there is none.
+    `code` is that of the warning which refuses it.
     """
-
-    def __init__(self, message: str, page: str = "") -> None:
-        """Keeps the sentence for the user and the report."""
-        super().__init__(message)
-        self.page = page
 
 
 @dataclass(frozen=True)
@@ -57,7 +50,7 @@ class JudgingConfig:
 class Warned:
     """One thing that a user must know."""
 
-    code: str  # Word for programs, such as `unseen`
+    code: Code  # What it is about, for programs
     text: str  # Sentence for people
     start: float | None = None  # First station, m; `None` where it concerns the whole bore
     end: float | None = None  # Last station, m
@@ -134,7 +127,7 @@ def judge_bore(
         everything: The registered cloud before cleaning, in the bore's frame.
         config: Limits.
         track: Space of the track; `None` where none was laid.
-        cause: Index into `CAUSES` of each point of `everything`, `(n,)`; `None` where nothing was cut.
+        cause: `Cause` of each point of `everything`, `(n,)`; `None` where nothing was cut.
         removed: Stretches that were cut away.
         spacing: Distance of the survey's profiles, m; 0 for a dense survey.
     """
@@ -146,7 +139,7 @@ def judge_bore(
     worst = _worst_windows(bore, returns)
     warnings = [
         *_warn_of_share(returns, cause, places, worst, config),
-        *(Warned("cut", part.warning, part.start, part.end) for part in removed if part.warning),
+        *(Warned(Code.CUT, part.warning, part.start, part.end) for part in removed if part.warning),
         *_warn_of_ends(bore, returns),
         *_warn_of_unseen(coverage),
         *_warn_of_places(places, config.tolerance),
@@ -164,7 +157,7 @@ def _warn_of_share(
 ) -> list[Warned]:
     counted = returns.in_span
     if cause is not None:
-        counted = counted & ~np.isin(cause, _CUT_OUTSIDE)
+        counted = counted & ~np.isin(cause, OUTSIDE)
     total = float(returns.weight[counted].sum())
     inside, behind = (
         float(returns.weight[counted & (returns.kind == kind)].sum()) / max(total, 1e-9) for kind in (INSIDE, BEHIND)
@@ -174,7 +167,7 @@ def _warn_of_share(
         where = f", most {name_span(*worst[0][:2])}" if worst else ""
         look = f", where it looks like {places[0].look}" if places else ""
         result.append(Warned(
-            "unexplained",
+            Code.UNEXPLAINED,
             f"{inside + behind:.0%} of the returns lie further than {100 * config.tolerance:.0f} cm from the tunnel "
             f"that was built ({inside:.0%} inside it, {behind:.0%} behind its wall){where}{look}",
             refuses=inside + behind > config.refuse_above,
@@ -190,7 +183,7 @@ def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
     result = []
     if returns.share(BEYOND) > _WARN_BEYOND:
         result.append(Warned(
-            "beyond",
+            Code.BEYOND,
             f"{returns.share(BEYOND):.0%} of all returns lie beyond the ends of what was built, at 0 and "
             f"{bore.length:.0f} m: terrain, a hall, or a piece of tunnel behind a gap, which is a cloud of its own",
         ))  # fmt: skip
@@ -198,7 +191,7 @@ def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
                                       strict=True):  # fmt: skip
         if beyond >= _CUT_SHORT:
             result.append(Warned(
-                "cut_short",
+                Code.CUT_SHORT,
                 f"the lining goes on for at least {beyond:.0f} m {where} station {station:.0f} m, which were not "
                 "built: is it seen from too far away there, or hidden?",
                 station, station,
@@ -209,7 +202,7 @@ def _warn_of_ends(bore: Bore, returns: Returns) -> list[Warned]:
 def _warn_of_unseen(coverage: Coverage) -> list[Warned]:
     return [
         Warned(
-            "unseen",
+            Code.UNSEEN,
             f"{name_span(piece.start, piece.end)} hardly a return lies {_on(piece.sides)} "
             f"({piece.share:.0%} of the girth, {piece.area:.0f} m²): the wall there is a guess",
             piece.start, piece.end,
@@ -225,7 +218,7 @@ def _on(sides: str) -> str:
 def _warn_of_places(places: tuple[Place, ...], tolerance: float) -> list[Warned]:
     return [
         Warned(
-            "place",
+            Code.PLACE,
             f"{name_span(place.start, place.end)}, {place.sides}: {place.share:.0%} of the returns there are not the "
             f"wall that was built, up to {place.furthest:.1f} m {'behind' if place.behind else 'inside'} it: "
             f"{place.look}",
@@ -266,7 +259,7 @@ def _tabulate(bore: Bore, returns: Returns, coverage: Coverage, cause: np.ndarra
     table["seen"], table["floor"] = coverage.seen.mean(axis=1), coverage.floor
     for name, kind in (("explained", EXPLAINED), ("inside", INSIDE), ("behind", BEHIND)):
         table[name] = weigh(returns.kind == kind) / np.maximum(total, 1e-9)
-    table["cut"] = 0.0 if cause is None else weigh((cause != KEPT) & returns.in_span) / np.maximum(total, 1e-9)
+    table["cut"] = 0.0 if cause is None else weigh((cause != Cause.KEPT) & returns.in_span) / np.maximum(total, 1e-9)
     for name, values in (("width", bore.width), ("height", bore.height), ("confidence", bore.confidence)):
         table[name] = np.interp(middle, bore.station, values)
     table["filled"] = np.interp(middle, bore.station, bore.filled.astype(float))
@@ -280,5 +273,5 @@ def require_trust(judgement: Judgement, force: bool) -> None:
     """
     grave = [warning for warning in judgement.warnings if warning.refuses]
     if grave and not force:
-        poses = [f"{warning.text}; so " for warning in judgement.warnings if warning.code == "poses"]
-        raise DoubtError(f"{''.join(poses)}{grave[0].text}; --force builds it all the same")
+        poses = [f"{warning.text}; so " for warning in judgement.warnings if warning.code == Code.POSES]
+        raise DoubtError(f"{''.join(poses)}{grave[0].text}; --force builds it all the same", grave[0].code)

@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from scene.bore import Bore
 from scene.cloud import Cloud
+from scene.judging.codes import Code
 from scene.judging.judge import Warned
 from scene.judging.words import name_span
 
@@ -49,7 +50,7 @@ def doubt_layers(bore: Bore, cloud: Cloud) -> list[Warned]:
     widest = 100 * float(np.percentile(apart[doubled], 90))
     start, end = rows[0] / count * bore.length, (rows[-1] + 1) / count * bore.length
     return [Warned(
-        "doubled",
+        Code.DOUBLED,
         f"{name_span(start, end)} the wall shows twice, up to {widest:.0f} cm apart, at "
         f"{doubled[known].mean():.0%} of its places: two passes of the scan do not fit each other, or its poses "
         "drifted; register them first: the wall that was built is neither",

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from scene.bore import Bore
+from scene.judging.codes import Code
 from scene.judging.judge import Warned
 from scene.judging.words import name_span
 
@@ -38,7 +39,7 @@ def doubt_lean(bore: Bore) -> list[Warned]:
     rows = np.flatnonzero(alike)
     start, end = float(bore.station[rows[0]]), float(bore.station[rows[-1]])
     return [Warned(
-        "lean",
+        Code.LEAN,
         f"{name_span(start, end)} floor and walls lean together by {np.rad2deg(abs(lean)):.1f}°, "
         f"{'left' if lean > 0 else 'right'} side up: is the roll of the LiDAR's mount off, or was the cloud not "
         "levelled? In a bend it may be built so",

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from scene.bore import Bore
 from scene.cloud import Cloud
+from scene.writing.track import Track
 
 EXPLAINED, INSIDE, BEHIND, BEYOND = range(4)
 _CHUNK = 500_000  # points; bounds the memory
@@ -22,6 +23,15 @@ class TrackZone:
 
     half_width: float  # Half the length of a sleeper, m
     top: Float[np.ndarray, " n"]  # Height of the rails' tops above the axis at each station of the bore, m
+
+
+def track_zone(track: Track, bore: Bore) -> TrackZone | None:
+    """Return the space between the ends of the sleepers, up to the rails' tops; `None` without a track."""
+    if not track.lines:
+        return None
+    widest = max(float(np.abs(line.offset).max()) for line in track.lines) + track.config.sleeper_length / 2
+    top = np.max([line.seat + line.rail_height for line in track.lines], axis=0)
+    return TrackZone(widest, top - bore.position[:, 2])
 
 
 @dataclass(frozen=True)

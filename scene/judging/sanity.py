@@ -7,6 +7,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from scene.bore import Bore
+from scene.judging.codes import Code
 from scene.judging.judge import Warned
 from scene.judging.lean import doubt_lean
 from scene.judging.shaft import doubt_shaft
@@ -49,9 +50,9 @@ def _doubt_size(bore: Bore, unit: str) -> list[Warned]:
     size = f"the bore would be {width:.3g} m wide and {height:.3g} m high"
     told = "by flag" in unit
     if not all(_SIZES[0] <= value <= _SIZES[1] for value in (width, height)):
-        return [Warned("size", f"{size}, and no tunnel is; {_propose_unit(width, height, unit)}", refuses=True)]
+        return [Warned(Code.SIZE, f"{size}, and no tunnel is; {_propose_unit(width, height, unit)}", refuses=True)]
     if height > _HIGH and not told:
-        return [Warned("size", f"{size}: a cavern, or is the unit another? {_propose_unit(width, height, unit)}")]
+        return [Warned(Code.SIZE, f"{size}: a cavern, or is the unit another? {_propose_unit(width, height, unit)}")]
     return []
 
 
@@ -81,7 +82,8 @@ def _doubt_grade(bore: Bore, axes: str) -> list[Warned]:
         if lying
         else "is z up (--axes), and were the poses levelled (roll and pitch of the mount)?"
     )
-    return [Warned("grade", f"{climbs}, where no road or railway climbs at more than 20 %: {cause}", start, end, lying)]
+    text = f"{climbs}, where no road or railway climbs at more than 20 %: {cause}"
+    return [Warned(Code.GRADE, text, start, end, lying)]
 
 
 def _propose_axes(bore: Bore) -> str:
@@ -101,7 +103,7 @@ def _doubt_lying(bore: Bore) -> list[Warned]:
             floor, crown = (_bend(bore.angle, section, side * np.pi / 2) for side in (-1, 1))
             if min(floor, crown) > _FLAT or abs(floor - crown) < _FLAT:
                 return [Warned(
-                    "lying",
+                    Code.LYING,
                     f"the section is flat on the {name} and round on the other side, as a tunnel on its side is: is z "
                     "up? --axes x-zy or --axes yzx takes another axis as up",
                 )]  # fmt: skip
@@ -128,7 +130,7 @@ def _doubt_dents(bore: Bore) -> list[Warned]:
         here = depth[first : last + 1]
         deepest, sides = here.max(), name_sides(bore.angle, np.maximum(here.mean(axis=0) - _DENT / 2, 0.0))
         result.append(Warned(
-            "dent",
+            Code.DENT,
             f"{name_span(start, end)} the section is dented inwards by up to {deepest:.1f} m at the {sides}: a duct, "
             "pipes, a platform or cabinets may have been taken for the wall",
             start, end,
@@ -160,21 +162,23 @@ def _doubt_poses(facts: dict[str, Any]) -> list[Warned]:
     result = []
     if str(facts.get("calibration", "")).startswith("none"):
         result.append(Warned(
-            "calibration",
+            Code.CALIBRATION,
             "--control came without --calibration, so the prism was taken for the LiDAR itself: the whole scene is "
             "off by the distance between the two; --calibration x,y,z tells it",
         ))  # fmt: skip
+    if facts.get("clock_doubt"):
+        result.append(Warned(Code.CLOCK, str(facts["clock_doubt"])))
     if facts.get("pose_doubt"):
-        result.append(Warned("poses", str(facts["pose_doubt"])))
+        result.append(Warned(Code.POSES, str(facts["pose_doubt"])))
     if "nothing measured" in str(facts.get("length_fixed_by", "")):
-        result.append(Warned("length", "nothing measured the length: along smooth walls LiDAR odometry does not"))
+        result.append(Warned(Code.LENGTH, "nothing measured the length: along smooth walls LiDAR odometry does not"))
     return result
 
 
 def _doubt_rounding(facts: dict[str, Any]) -> list[Warned]:
     step = float(facts.get("rounded_to", 0.0))
     return [Warned(
-        "rounded",
+        Code.ROUNDED,
         f"the coordinates of the cloud are rounded to {100 * step:.1f} cm, and the wall is known no better: 32-bit "
         "numbers far from the origin do so; export it with an offset, in 64 bits or with more digits",
     )] if step else []  # fmt: skip
@@ -184,8 +188,8 @@ def _tell_standard(bore: Bore, provenance: dict[str, str]) -> list[Warned]:
     if provenance.get("pockets") != "by standard" or not len(bore.pocket):
         return []
     return [Warned(
-        "by_standard",
+        Code.BY_STANDARD,
         f"the returns can show neither ring joints nor pockets, so {len(bore.ring_station)} rings and "
         f"{len(bore.pocket)} pockets stand where a standard lining has them, and none of them was seen; "
-        "--reconstruct.lining.no-by-standard leaves them out",
+        "--lining none leaves them out",
     )]  # fmt: skip

@@ -3,6 +3,7 @@
 import numpy as np
 
 from scene.bore import Bore
+from scene.judging.codes import Code
 from scene.judging.judge import Warned
 
 _EVEN = 0.05  # m rms: a section that differs less from itself upside down has neither floor nor crown
@@ -24,13 +25,13 @@ def doubt_shaft(bore: Bore, axes: str) -> list[Warned]:
     size = f"{bore.length:.0f} m along z and {bore.width.mean():.1f} m across"
     if even:
         return [Warned(
-            "shaft",
+            Code.SHAFT,
             f"no tunnel in the cloud but a vertical shaft, {size}: its section has neither floor nor crown; if it is a "
             "tunnel, --axes x-zy says that y is up in the file",
             refuses=True,
         )]  # fmt: skip
     return [Warned(
-        "axes",
+        Code.AXES,
         f"the cloud is {size}, so y was taken as up; if it is a vertical shaft, it is no tunnel, and if z is up, "
         "--axes xyz says so",
     )]  # fmt: skip

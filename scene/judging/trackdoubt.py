@@ -1,6 +1,7 @@
 """Warnings of a track that was laid beyond what was seen: sleepers by standard, gauges read off blurred rails."""
 
 from scene.fitting.trackseen import SeenTrack
+from scene.judging.codes import Code
 from scene.judging.judge import Warned
 from scene.writing.track import Track
 
@@ -20,11 +21,11 @@ def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) ->
     sought = track.config.lay == "auto" and seen.sought
     if sought and all(line.rails is None for line in seen.lines) and (pose_doubt or seen.thin):
         why = f"{pose_doubt}: rails blur as the walls do, and may be there" if pose_doubt else _THIN
-        return [Warned("rails", f"no rails were seen, but {why}; --track standard lays a track")]
+        return [Warned(Code.RAILS, f"no rails were seen, but {why}; --track standard lays a track")]
     left_out = sum(line.left_out for line in track.lines)
     if left_out:
         return [Warned(
-            "sleepers",
+            Code.SLEEPERS,
             f"{left_out} sleepers are left out: {track.config.sleeper_length:g} m long, they would come within "
             f"{track.config.margin:g} m of a wall; --track.sleeper-length gives them the length that is there",
         )]  # fmt: skip
@@ -35,7 +36,7 @@ def doubt_track(track: Track, seen: SeenTrack, pose_doubt: str | None = None) ->
         return []
     told = "none of them was seen" if not measured else f"only {measured} of them were seen"
     return [Warned(
-        "sleepers",
+        Code.SLEEPERS,
         f"{count} sleepers lie where a spacing of {_spacing(track):.2f} m asks for them, and {told}: the returns "
         "between the rails are too few, or lie too even, to tell them; --track none leaves the track out",
     )]  # fmt: skip

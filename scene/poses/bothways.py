@@ -4,17 +4,14 @@ Such a mount slides upright walls along themselves, and neighbouring sweeps err 
 `d` ahead is placed `d` times the angle too low, and once it is passed, as much too high.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 from jaxtyping import Float
 
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
-from scene.reading.recording import ReadPosition, Recording
-from scene.reading.scans import Scan
+from scene.reading.times import Scan
 
 _STRETCH, _STEP = 36.0, 1.0  # m of the way that are looked at, and between two sweeps of it
 _MOST_SCANS = 600  # that are read for it
@@ -45,13 +42,14 @@ class Tilt:
         return f"{angle:+.1f}° in {('roll', 'pitch', 'yaw')[axis]}"
 
 
-def find_tilt(recording: Recording, poses: Trajectory) -> Tilt | None:
-    """Return the tilt that floor and crown show about the middle of the way; `None` where they show none.
-
-    Raises `RecordingError` where a scan is damaged.
-    """
+def find_tilt(scans: list[Scan], poses: Trajectory) -> Tilt | None:
+    """Return the tilt that floor and crown show in sweeps along a way; `None` where they show none."""
     rows, about = [], []
-    for scan in _sample_scans(recording, poses):
+    for scan in scans:
+        if not len(scan.points) or not poses.covers(scan.stamp, scan.stamp + float(scan.times.max())):
+            continue
+        pick = np.linspace(0, len(scan.points) - 1, min(_POINTS, len(scan.points))).astype(np.intp)
+        scan = Scan(scan.stamp, scan.points[pick], scan.times[pick])
         heading = _heading(poses, scan.stamp)
         if heading is not None:
             position, rotation = poses.at(np.array([scan.stamp]))
@@ -71,22 +69,27 @@ def find_tilt(recording: Recording, poses: Trajectory) -> Tilt | None:
     return Tilt(angle, float(np.median(np.abs(apart))), np.mean(about, axis=0))
 
 
-def _sample_scans(recording: Recording, poses: Trajectory) -> Iterator[Scan]:
-    """Yields sweeps some way apart from a stretch about the middle of a recording; those without poses are left out."""
+def numbers_along(stamps: Float[np.ndarray, " n"], poses: Trajectory) -> list[int]:
+    """Return the numbers of sweeps some way apart from a stretch about the middle of a recording.
+
+    Args:
+        stamps: Header of each sweep, s.
+        poses: Poses of the LiDAR.
+    """
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses.positions, axis=0), axis=1))])
-    first, due = max(recording.scan_count // 2 - _MOST_SCANS // 2, 0), -np.inf
-    last = np.inf
-    for scan in islice(recording.scans(ReadPosition(first)), _MOST_SCANS):
-        if not len(scan.points) or not poses.covers(scan.stamp, scan.stamp + float(scan.times.max())):
+    first, begin, due = max(len(stamps) // 2 - _MOST_SCANS // 2, 0), None, -np.inf
+    chosen: list[int] = []
+    for number in range(first, min(first + _MOST_SCANS, len(stamps))):
+        if not poses.covers(stamps[number], stamps[number]):
             continue
-        at = float(np.interp(scan.stamp, poses.times, way))
-        last = min(last, at + _STRETCH)
-        if at > last:
-            return
+        at = float(np.interp(stamps[number], poses.times, way))
+        begin = at if begin is None else begin
+        if at > begin + _STRETCH:
+            break
         if at >= due:
+            chosen.append(number)
             due = at + _STEP
-            rows = np.linspace(0, len(scan.points) - 1, min(_POINTS, len(scan.points))).astype(np.intp)
-            yield Scan(scan.stamp, scan.points[rows], scan.times[rows])
+    return chosen
 
 
 def _heading(poses: Trajectory, stamp: float) -> Float[np.ndarray, "2"] | None:

@@ -7,9 +7,8 @@ along themselves, and blurs only what of floor and crown a sensor sees. Where no
 crown are looked at as they were seen ahead and from behind (`scene.poses.bothways`).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,11 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scene.poses.bothways import Tilt, find_tilt
+from scene.poses.bothways import Tilt, find_tilt, numbers_along
 from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
-from scene.reading.recording import ReadPosition, Recording
-from scene.reading.scans import Scan
+from scene.reading.recording import Recording
+from scene.reading.times import Scan
 
 _PLACES = (0.25, 0.5, 0.75)  # of the recording
 _SCANS, _EVERY = 5, 15  # sweeps at each place, and how far apart
@@ -84,12 +83,17 @@ class PoseCheck:
         return f"the poses blur the walls: {here} thick{part} where a single sweep has {expected}; {likely}"
 
 
-def check_poses(recording: Recording, trajectory: Trajectory) -> PoseCheck | None:
+def check_poses(recording: Recording, trajectory: Trajectory, orders: bool = True) -> PoseCheck | None:
     """Compares poses with some sweeps of a recording; `None` where they share too few sweeps to tell.
 
-    Raises `RecordingError` where a scan is damaged.
+    Another order of the quaternions is only tried with `orders`: what the user has said is not detected away. Raises
+    `RecordingError` where a scan is damaged.
     """
-    places = [group for group in _sample_scans(recording, trajectory) if len(group) >= 2]
+    groups = [_numbers_of_place(place, recording.scan_count) for place in _PLACES]
+    along = numbers_along(recording.stamps, trajectory)
+    picked = dict(recording.pick([*(number for group in groups for number in group), *along]))
+    places = [[_thinned(picked[number]) for number in group if _usable(picked[number], trajectory)] for group in groups]
+    places = [group for group in places if len(group) >= 2]
     if not places:
         return None
 
@@ -98,8 +102,8 @@ def check_poses(recording: Recording, trajectory: Trajectory) -> PoseCheck | Non
 
     (expected, upper_expected), (given, upper) = thickness(trajectory, single=True), thickness(trajectory)
     check = PoseCheck(given, expected, upper, upper_expected)
-    check = _find_cause(check, trajectory, thickness) if check.blurred else check
-    return check if check.cause else replace(check, tilt=find_tilt(recording, trajectory))
+    check = _find_cause(check, trajectory, thickness, orders) if check.blurred else check
+    return check if check.cause else replace(check, tilt=find_tilt([picked[number] for number in along], trajectory))
 
 
 def reorder(trajectory: Trajectory) -> Trajectory:
@@ -109,18 +113,27 @@ def reorder(trajectory: Trajectory) -> Trajectory:
     return Trajectory(trajectory.times, trajectory.positions, rotations, trajectory.source)
 
 
-def _sample_scans(recording: Recording, trajectory: Trajectory) -> Iterator[list[Scan]]:
-    """Yields a few sweeps from each place, thinned; those without poses are left out."""
-    for place in _PLACES:
-        first = int(place * max(recording.scan_count - _SCANS * _EVERY, 0))
-        group = []
-        for scan in islice(recording.scans(ReadPosition(first)), 0, _SCANS * _EVERY, _EVERY):
-            distance = np.linalg.norm(scan.points, axis=1)
-            rows = np.flatnonzero((distance > 1.0) & (distance < _LONGEST))
-            rows = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(np.intp)]
-            if len(rows) > 10 * _NEIGHBOURS and trajectory.covers(scan.stamp, scan.stamp + float(scan.times.max())):
-                group.append(Scan(scan.stamp, scan.points[rows], scan.times[rows]))
-        yield group
+def _numbers_of_place(place: float, count: int) -> list[int]:
+    """Return the numbers of a few sweeps at a share of the recording."""
+    first = int(place * max(count - _SCANS * _EVERY, 0))
+    return list(range(first, min(first + _SCANS * _EVERY, count), _EVERY))
+
+
+def _near(scan: Scan) -> np.ndarray:
+    distance = np.linalg.norm(scan.points, axis=1)
+    return np.flatnonzero((distance > 1.0) & (distance < _LONGEST))
+
+
+def _usable(scan: Scan, trajectory: Trajectory) -> bool:
+    """Return whether a sweep has poses, and enough returns nearby."""
+    rows = min(_POINTS, len(_near(scan)))
+    return rows > 10 * _NEIGHBOURS and trajectory.covers(scan.stamp, scan.stamp + float(scan.times.max()))
+
+
+def _thinned(scan: Scan) -> Scan:
+    rows = _near(scan)
+    rows = rows[np.linspace(0, len(rows) - 1, min(_POINTS, len(rows))).astype(np.intp)]
+    return Scan(scan.stamp, scan.points[rows], scan.times[rows])
 
 
 def _measure(places: list[list[Scan]], poses: Trajectory, turn: Rotation | None, single: bool) -> tuple[float, float]:
@@ -148,12 +161,16 @@ def _thickness(points: np.ndarray, queries: int) -> Float[np.ndarray, " q"]:
     return np.sqrt(np.maximum(spread[:, 0], 0.0))
 
 
-def _find_cause(check: PoseCheck, poses: Trajectory, thickness: Callable[..., tuple[float, float]]) -> PoseCheck:
+def _find_cause(
+    check: PoseCheck, poses: Trajectory, thickness: Callable[..., tuple[float, float]], orders: bool
+) -> PoseCheck:
     """Undo likely mistakes one by one, and name the one that makes the walls thin."""
     given = check.compared[0]
     which = 0 if given == check.thickness else 1
     limit = min(_EXPLAINS * given, given - _MIN_GAIN)
-    found = [(thickness(reorder(poses))[which], "the quaternions are in the order w, x, y, z", True)]
+    found = [(np.inf, "", False)]
+    if orders:
+        found.append((thickness(reorder(poses))[which], "the quaternions are in the order w, x, y, z", True))
     for shift in (sign * size for size in _SHIFTS for sign in (1, -1)):
         side = "later" if shift > 0 else "earlier"
         words = f"with the poses {abs(shift):g} s {side} they are thin: two clocks differ"

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from scene.errors import RecordingError
 from scene.poses.calibration import Calibration, Mount
+from scene.poses.clocks import settle_inertial
 from scene.poses.imu import Inertial, find_inertial, gyro_guide, level_rotation
 from scene.poses.odometry import LIBRARY, Guide, Odometry, OdometryLog, estimate_odometry
 from scene.poses.smoother import Noise, Problem, imu_steps, inertial_problem, odometry_problem, solve_with_heading
@@ -54,9 +55,25 @@ def locate_given(trajectory: Trajectory) -> Located:
     )
 
 
-def locate_by_odometry(recording: Recording, calibration: Calibration, progress: Stages, partial: Partial) -> Located:
-    """Locates the LiDAR by odometry, helped by the gyro where there is an IMU; raises `FitError` for too few scans."""
+def _find_timed(
+    recording: Recording, calibration: Calibration, auto: bool
+) -> tuple[Inertial | None, Mount | None, dict[str, Any]]:
+    """Return the IMU with its mount, by the LiDAR's clock where `auto`, and the facts of its clock."""
     inertial, mount = find_inertial(recording, calibration)
+    if inertial is None:
+        return None, None, {}
+    clock, inertial = settle_inertial(recording, inertial, auto)
+    return inertial, mount, clock.facts
+
+
+def locate_by_odometry(
+    recording: Recording, calibration: Calibration, progress: Stages, partial: Partial, auto: bool = False
+) -> Located:
+    """Locates the LiDAR by odometry, helped by the gyro where there is an IMU; raises `FitError` for too few scans.
+
+    With `auto` the clock of the IMU is set right.
+    """
+    inertial, mount, clock = _find_timed(recording, calibration, auto)
     guide = gyro_guide(inertial, mount) if inertial and mount else None
     trajectory = run_odometry(recording, guide, progress, partial).trajectory
     level = level_rotation(recording, trajectory, inertial, mount)
@@ -67,6 +84,7 @@ def locate_by_odometry(recording: Recording, calibration: Calibration, progress:
         "length_fixed_by": f"odometry ({LIBRARY}); nothing measured the axial scale",
         "length_uncertainty": None,
         "length_uncertainty_from": "unknown: nobody measured the axial scale",
+        **clock,
     }
     return Located(poses, facts)
 
@@ -79,18 +97,23 @@ _END_ERROR = 0.05  # m; an end of the bore is found to this, on simulated survey
 
 
 def locate_by_control(
-    recording: Recording, control: Control, calibration: Calibration, progress: Stages, partial: Partial
+    recording: Recording,
+    control: Control,
+    calibration: Calibration,
+    progress: Stages,
+    partial: Partial,
+    auto: bool = False,
 ) -> Located:
-    """Locates the LiDAR in the control's frame from control, odometry and IMU.
+    """Locates the LiDAR in the control's frame from control, odometry and IMU, whose clock is set right with `auto`.
 
     Raises `RecordingError` where the control does not overlap the recording, and `FitError` for too few scans, or where
     the measurements do not determine the trajectory.
     """
-    times = [scan.stamp for scan in recording.scans()]
+    times = recording.stamps
     if len(times) < 2:
         raise RecordingError(f"{recording.path}: holds {len(times)} scans; at least 2 are needed")
     control.require_overlap(times[0], times[-1], recording.path)
-    inertial, mount = find_inertial(recording, calibration)
+    inertial, mount, clock = _find_timed(recording, calibration, auto)
     if inertial and mount:
         problem, chain = _solve_with_imu(recording, inertial, mount, control, calibration, progress, partial)
         trajectory = _lidar_poses(chain, mount)
@@ -104,6 +127,7 @@ def locate_by_control(
             "imu": inertial.topic if inertial else None,
             "calibration": calibration.name,
             "prism_lever": calibration.prism,
+            **clock,
             **_control_facts(problem, chain, control),
         },
         # Control often starts late and ends early; what it does not reach is left out, and counted.

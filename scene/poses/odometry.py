@@ -20,7 +20,7 @@ from scene.poses.registration import deskew
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stage
 from scene.reading.recording import START, ReadPosition, Recording
-from scene.reading.scans import Scan
+from scene.reading.times import Scan
 from scene.resume import Partial
 
 LIBRARY = "small-gicp"

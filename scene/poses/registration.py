@@ -1,6 +1,6 @@
 """Scans and poses to one cloud: every return moved from the pose at its own time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from scene.errors import FitError, RecordingError
 from scene.poses.trajectory import Trajectory
 from scene.progress import Stage
 from scene.reading.recording import START, ReadPosition, Recording
-from scene.reading.scans import Scan
+from scene.reading.times import Scan
 from scene.resume import Partial
 
 _KNOTS = 21  # poses interpolated per sweep; between two of them, 5 ms, a walker's motion is straight
@@ -34,6 +34,15 @@ def deskew(scan: Scan, trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
     return (1 - share) * from_pose(low) + share * from_pose(low + 1)
 
 
+@dataclass(frozen=True)
+class Registered:
+    """The scans of a recording in one frame."""
+
+    cloud: Cloud  # Thinned
+    uncovered: int  # Scans without a pose, which are left out
+    low: Float[np.ndarray, "k 3"]  # Single returns below the LiDAR, in the frame of `cloud`, m
+
+
 def register_scans(
     recording: Recording,
     trajectory: Trajectory,
@@ -41,8 +50,8 @@ def register_scans(
     stage: Stage,
     most_uncovered: float = 0.05,
     partial: Partial | None = None,
-) -> tuple[Cloud, int]:
-    """Places every return; returns the cloud, thinned to `voxel`, m, and the number of scans without a pose.
+) -> Registered:
+    """Places every return in a cloud thinned to `voxel`, m, and keeps some of those below the LiDAR as they are.
 
     Scans that the trajectory does not cover are left out. Raises `RecordingError` where they are more than
     `most_uncovered`, a share, and `FitError` where no point is left.
@@ -59,10 +68,12 @@ def register_scans(
         state.span = (min(state.span[0], scan.stamp), max(state.span[1], end))
         if trajectory.covers(scan.stamp, end):
             batch.append(deskew(scan, trajectory))
+            state.keep_low(scan, batch[-1], trajectory)
         else:
             state.uncovered += 1
         if len(batch) == _BATCH:
             state.thinned.add(np.concatenate(batch))
+            state.choose_every(recording.scan_count, trajectory)
             batch, state.position = [], recording.position
             if partial.due():
                 partial.save("cloud", **state.arrays())
@@ -75,7 +86,14 @@ def register_scans(
     cloud = state.thinned.cloud()
     if not len(cloud.points):
         raise FitError(f"{recording.path}: no return is left after registration")
-    return cloud, state.uncovered
+    low = np.concatenate([np.empty((0, 3)), *state.low]) - cloud.origin
+    return Registered(cloud, state.uncovered, low[np.isfinite(low).all(axis=1)])
+
+
+# m from the sensor: nearer, the noise of a range moves a return across the face of a rail; farther, poses do.
+_LOW_RANGE = (4.0, 30.0)
+_BELOW = 0.3  # m under the sensor
+_A_METRE = 70_000  # returns for each metre of the way that are looked at: several thousand then lie on the faces
 
 
 @dataclass
@@ -86,22 +104,44 @@ class _Registration:
     position: ReadPosition = START
     uncovered: int = 0
     span: tuple[float, float] = (np.inf, -np.inf)
+    low: list[np.ndarray] = field(default_factory=list)
+    placed: int = 0  # scans
+    every: int = 1  # scan of which the low returns are kept
+
+    def keep_low(self, scan: Scan, points: Float[np.ndarray, "n 3"], trajectory: Trajectory) -> None:
+        """Keeps returns of a placed scan that may lie on rails."""
+        self.placed += 1
+        if self.placed % self.every:
+            return
+        reach = np.linalg.norm(scan.points, axis=1)
+        ends = np.array([scan.stamp, scan.stamp + float(scan.times.max(initial=0.0))])
+        height = trajectory.at(ends)[0][:, 2].mean() - _BELOW
+        near = (reach > _LOW_RANGE[0]) & (reach < _LOW_RANGE[1]) & (points[:, 2] < height)
+        self.low.append(points[near])
+
+    def choose_every(self, scans: int, trajectory: Trajectory) -> None:
+        """Chooses how many scans give low returns, once the first batch tells how many returns a scan has."""
+        if self.placed != _BATCH:
+            return
+        seconds = np.arange(trajectory.times[0], trajectory.times[-1], 1.0)
+        way = float(np.linalg.norm(np.diff(trajectory.at(seconds)[0], axis=0), axis=1).sum())
+        self.every = max(int(self.thinned.returns / _BATCH * scans / max(way, 1.0) / _A_METRE), 1)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the state as arrays, for a partial result."""
-        counts = {"place": self.position.as_array(), "uncovered": np.array(self.uncovered), "span": np.array(self.span)}
-        return {**counts, **self.thinned.arrays()}
+        counts = {"place": self.position.as_array(), "span": np.array(self.span),
+                  "scans": np.array([self.uncovered, self.placed, self.every])}  # fmt: skip
+        return {**counts, "low": np.concatenate([np.empty((0, 3)), *self.low]), **self.thinned.arrays()}
 
     @classmethod
     def restored(cls, arrays: dict[str, np.ndarray], voxel: float) -> "_Registration":
         """Return the state that `arrays` returned as arrays."""
         start, end = arrays["span"]
+        uncovered, placed, every = (int(count) for count in arrays["scans"])
         return cls(
-            VoxelMean.restored(voxel, arrays),
-            ReadPosition.from_array(arrays["place"]),
-            int(arrays["uncovered"]),
-            (float(start), float(end)),
-        )
+            VoxelMean.restored(voxel, arrays), ReadPosition.from_array(arrays["place"]), uncovered,
+            (float(start), float(end)), [arrays["low"]], placed, every,
+        )  # fmt: skip
 
 
 def _require_covered(state: _Registration, recording: Recording, trajectory: Trajectory, most_uncovered: float) -> None:

@@ -6,10 +6,11 @@ that names the file.
 """
 
 from scene.reading.formats import Format, register_reader
-from scene.reading.scans import Scan, ScanSource, make_scan, scan_from_records
+from scene.reading.scans import ScanSource, make_scan, scan_from_records
 from scene.reading.source import CloudSource, source_from_records
+from scene.reading.times import RawScan
 
 __all__ = [
-    "CloudSource", "Format", "Scan", "ScanSource", "make_scan", "register_reader", "scan_from_records",
+    "CloudSource", "Format", "RawScan", "ScanSource", "make_scan", "register_reader", "scan_from_records",
     "source_from_records",
 ]  # fmt: skip

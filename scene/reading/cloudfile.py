@@ -12,7 +12,7 @@ from scene.errors import RecordingError
 from scene.progress import Stage
 from scene.reading.formats import Format, ReadingConfig, detect
 from scene.reading.source import CloudSource, Frame, choose_frame, needs_local_points, refuse_damage
-from scene.reading.tables import parse_columns
+from scene.reading.tables import told_columns
 from scene.resume import Partial
 
 _TABLES = ("table", "parquet")
@@ -38,12 +38,14 @@ def read_cloud(
     if detected.format.kind != "cloud":
         raise RecordingError(f"{path}: is no registered cloud")
     with refuse_damage(path, f"a readable {detected.format.label} cloud", RecordingError):
-        source: CloudSource = _open_cloud(path, detected.format, config.columns)
+        source: CloudSource = _open_cloud(path, detected.format, config)
         frame = _frame_of(path, source, config)
         thinned, read, rounding = _thin(source, frame, voxel, stage, partial or Partial(None))
     _refuse_unusable(path, thinned, read, rounding, frame.unit)
     rounded = {"rounded_to": rounding} if rounding >= _COARSE else {}
     facts = {**rounded, "kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
+    facts |= {"crs": source.crs} if source.crs else {}
+    facts |= {"points_left_out": dict(source.left_out)} if source.left_out else {}
     return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
 
 
@@ -113,13 +115,10 @@ def measure_rounding(points: Float[np.ndarray, "n 3"]) -> tuple[float, float, fl
     return steps[0], steps[1], steps[2]
 
 
-def _open_cloud(path: Path, row: Format, columns: str | None) -> CloudSource:
+def _open_cloud(path: Path, row: Format, config: ReadingConfig) -> CloudSource:
     """Opens a cloud; raises `RecordingError` for columns that are none, and for a format that has no columns."""
-    if columns is None:
-        return row.open(path)
-    if row.name not in _TABLES:
+    if config.columns is not None and row.name not in _TABLES:
         raise RecordingError(f"{path}: --columns goes with a table, but this is {row.label}")
-    try:
-        return row.open(path, parse_columns(columns))
-    except ValueError as error:
-        raise RecordingError(f"{path}: {error}") from error
+    if config.keep_noise and row.name == "las":
+        return row.open(path, True)
+    return row.open(path) if config.columns is None else row.open(path, told_columns(path, config.columns))

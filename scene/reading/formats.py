@@ -1,7 +1,7 @@
 """The table of input formats: its rows, rows of a user's own, and the search for the format of an input."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,14 +11,16 @@ import tyro
 from scene.errors import RecordingError
 from scene.reading.las_e57 import open_e57, open_las
 from scene.reading.ply_pcd import open_pcd, open_ply
+from scene.reading.ptx import open_ptx
 from scene.reading.ringsurvey import is_ring_survey, read_ring_survey
 from scene.reading.rosbag import RosBag
 from scene.reading.scanfolder import open_folder, scan_files
 from scene.reading.tables import open_parquet, open_table
+from scene.reading.times import TimeConfig
 from subterra_jax.host.loading import source_digest
 
 Kind = Literal["recording", "cloud", "rings"]
-_SHOWN_FACTS = ("format", "topic", "message_type", "times", "point_times", "unit", "axes")
+_SHOWN_FACTS = ("format", "topic", "message_type", "times", "point_times", "unit", "axes", "crs")
 # Flags without the path of the nested configs before them: `--unit mm`, not `--reconstruct.reading.unit mm`.
 _FLAG = tyro.conf.arg(prefix_name=False)
 
@@ -36,6 +38,11 @@ class ReadingConfig:
     axes: Annotated[str | None, _FLAG] = None
     # Order of the quaternions of a trajectory: xyzw, as TUM has it, or wxyz; found by the scans where not given.
     quaternion: Annotated[Literal["xyzw", "wxyz"] | None, _FLAG] = None
+    # Sets the clock of the IMU, or of a trajectory, right where its turns show that it differs from the LiDAR's.
+    clock: Annotated[Literal["auto"] | None, _FLAG] = None
+    times: Annotated[TimeConfig, tyro.conf.arg(name="")] = field(default_factory=TimeConfig)  # Times of points.
+    # Use points of a LAS file that are withheld or classified as noise, too.
+    keep_noise: Annotated[bool, _FLAG] = False
     # Columns of a table or a ring survey by what they hold, as x=Rechtswert,y=Hochwert,z=Hoehe,ring=Ring,point=Punkt.
     columns: Annotated[str | None, _FLAG] = None
 
@@ -47,8 +54,8 @@ class Format:
     name: str  # Word for `--format`
     label: str  # Name for people
     kind: Kind  # `recording`, `cloud` or `rings`
-    # Opens a file: a recording as `(path, topic) -> ScanSource`, a cloud as `path -> CloudSource`, rings as `(path,
-    # unit) -> RingSurvey`; tables and ring surveys take the user's columns as well
+    # Opens a file: a recording as `(path, topic) -> ScanSource`, a bag with further ones of its recording as well; a
+    # cloud as `path -> CloudSource`; rings as `(path, unit) -> RingSurvey`; tables and rings take the user's columns
     open: Callable[..., Any]
     suffixes: tuple[str, ...] = ()  # Endings of file names, lower case
     magic: tuple[bytes, ...] = ()  # First bytes of a file, at most 64; any of them
@@ -64,10 +71,12 @@ _TABLE = (
     Format("pcd", "PCD", "cloud", open_pcd, (".pcd",), (b"# .PCD", b"VERSION ")),
     Format("las", "LAS", "cloud", open_las, (".las", ".laz"), (b"LASF",)),
     Format("e57", "E57", "cloud", open_e57, (".e57",), (b"ASTM-E57",)),
+    Format("ptx", "PTX", "cloud", open_ptx, (".ptx",)),
     Format("table", "table", "cloud", open_table, (".xyz", ".csv", ".txt", ".asc", ".pts")),
     Format("parquet", "Parquet", "cloud", open_parquet, (".parquet",), (b"PAR1",)),
     Format("rings", "ring survey", "rings", read_ring_survey, (".xlsx",)),
 )
+_PACKED = {b"\x28\xb5\x2f\xfd": "zstd -d", b"\x1f\x8b": "gzip -d", b"BZh": "bzip2 -d", b"\xfd7zXZ": "xz -d"}
 _own: dict[str, Format] = {}
 
 
@@ -131,7 +140,7 @@ def detect(path: Path, name: str | None = None) -> Detected:
         own = "".join(f", {row.label}" for row in _own.values())
         raise RecordingError(
             f"{path}: of no known kind; a ROS bag or MCAP, a folder of timed scans, a cloud (PLY, PCD, LAS, LAZ, E57, "
-            f"XYZ, CSV, Parquet) or a ring survey (CSV, XLSX){own} is needed"
+            f"PTX, XYZ, CSV, Parquet) or a ring survey (CSV, XLSX){own} is needed"
         )
     return detected
 
@@ -158,6 +167,9 @@ def _detect_file(path: Path, rows: dict[str, Format]) -> Detected | None:
     own = next((row for row in _own.values() if suffix in row.suffixes), None)
     if own is None and is_ring_survey(path):
         return Detected(path, rows["rings"], "content")
+    packed = next((tool for magic, tool in _PACKED.items() if head.startswith(magic)), None)
+    if own is None and packed is not None:
+        raise RecordingError(f"{path}: is compressed; decompress it first: {packed} {path.name}")
     row_by_name = own or next((row for row in _TABLE if suffix in row.suffixes), None)
     return None if row_by_name is None else Detected(path, row_by_name, "name")
 
@@ -170,7 +182,10 @@ def _detect_in_folder(path: Path, rows: dict[str, Format]) -> Detected | None:
     if len(bags) == 1:
         return _detect_file(bags[0], rows)
     if len(bags) > 1:
-        raise RecordingError(f"{path}: holds {len(bags)} bags and no metadata.yaml; name one of them")
+        kinds = {file.suffix[1:] for file in bags}
+        if len(kinds) > 1:
+            raise RecordingError(f"{path}: holds bags of several kinds ({', '.join(sorted(kinds))}); name those of one")
+        return Detected(path, rows[kinds.pop()], "content")  # a recording that was split
     surveys = [file for file in files if file.is_file() and is_ring_survey(file)]
     if len(surveys) == 1:
         return Detected(surveys[0], rows["rings"], "content")

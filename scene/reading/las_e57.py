@@ -6,6 +6,7 @@ E2807 (E57: coordinates in metres; a pose is a unit quaternion w, x, y, z and a 
 
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import laspy
 import lazrs
 import numpy as np
+from jaxtyping import Bool
 from laspy.vlrs.known import GeoKeyDirectoryVlr, LasZipVlr, WktCoordinateSystemVlr
 from scipy.spatial.transform import Rotation
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 DEGREES = "degrees"
 _CODES = {9001: "m", 9002: "ft", 9003: "us-ft"}
 _MODEL, _GEOGRAPHIC, _LINEAR, _VERTICAL = 1024, 2, 3076, 4099
+_SYSTEMS, _USER_DEFINED = (3072, 4096), 32767  # keys of the projected and the vertical system; a code that is none
 _WKT_UNIT = re.compile(r'\b(?:LENGTH)?UNIT\[\s*"([^"]*)"\s*,\s*([-+.\deE]+)')
 _SAME_FACTOR = 1e-6  # a foot and a US survey foot differ by 2e-6
 
@@ -88,8 +91,15 @@ def _remove_parts(text: str, name: str) -> str:
 _LARGEST_CHUNK = 10_000_000  # points; LASzip writes 50,000
 
 
-def open_las(path: Path) -> CloudSource:
-    """Opens a LAS or LAZ file; raises `ValueError` for damage, or fewer bytes than its header promises."""
+# Source: ASPRS LAS 1.4 R15, table 17: 7 is low noise, 18 high noise.
+_NOISE = (7, 18)
+
+
+def open_las(path: Path, keep_noise: bool = False) -> CloudSource:
+    """Opens a LAS or LAZ file; points that are withheld or noise are left out and counted, unless `keep_noise`.
+
+    Raises `ValueError` for damage, or fewer bytes than its header promises.
+    """
     _require_sane_header(path)
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
         header = reader.header
@@ -107,19 +117,48 @@ def open_las(path: Path) -> CloudSource:
             _require_sane_chunks(path, header)
         name = f"{kind} {header.version}, point format {header.point_format.id}"
         count = header.point_count
-        unit = declared_unit([*header.vlrs, *(header.evlrs or [])])
+        records = [*header.vlrs, *(header.evlrs or [])]
+        unit, crs = declared_unit(records), declared_crs(records)
+
+    left_out: Counter[str] = Counter()
 
     def chunks() -> Iterator[np.ndarray]:
         read = 0
+        left_out.clear()
         # The parallel decoder believes every size in the chunk table, and a wrong one ends the process.
         with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             for points in reader.chunk_iterator(BATCH):
-                yield np.stack([np.asarray(points.x), np.asarray(points.y), np.asarray(points.z)], axis=1)
+                xyz = np.stack([np.asarray(points.x), np.asarray(points.y), np.asarray(points.z)], axis=1)
                 read += len(points)
+                if not keep_noise:
+                    withheld = np.asarray(points.withheld).astype(bool)
+                    noise = ~withheld & np.isin(np.asarray(points.classification), _NOISE)
+                    left_out.update(_counts(withheld=withheld, noise=noise))
+                    xyz = xyz[~withheld & ~noise]
+                yield xyz
         if read != count:
             raise ValueError(f"it ends after {read} of {count} points")
 
-    return CloudSource(name, chunks, box, unit, count)
+    return CloudSource(name, chunks, box, unit, count, crs, left_out)
+
+
+def _counts(**masks: Bool[np.ndarray, " n"]) -> dict[str, int]:
+    """Return how many points each mask holds; none of those that hold no point."""
+    return {name: int(mask.sum()) for name, mask in masks.items() if mask.any()}
+
+
+def declared_crs(records: Iterable[Any]) -> str | None:
+    """Return the WKT of a LAS file's records, or the EPSG code of its GeoTIFF keys; `None` where none says."""
+    known = list(records)
+    for record in known:
+        if isinstance(record, WktCoordinateSystemVlr) and record.string.strip("\0 "):
+            return str(record.string).strip("\0 ")
+    for record in known:
+        if isinstance(record, GeoKeyDirectoryVlr):
+            keys = {key.id: key.value_offset for key in record.geo_keys if not key.tiff_tag_location}
+            codes = [keys[key] for key in _SYSTEMS if 0 < keys.get(key, 0) < _USER_DEFINED]
+            return " + ".join(f"EPSG:{code}" for code in codes) or None
+    return None
 
 
 def _require_sane_header(path: Path) -> None:
@@ -186,20 +225,30 @@ def open_e57(path: Path) -> CloudSource:
     except ImportError as error:
         raise RecordingError(f"{path}: E57 is read by pye57, which is not installed: pip install pye57") from error
     with E57(str(path)) as file:
-        scans = file.scan_count
+        scans, crs = file.scan_count, _e57_crs(file)
+    left_out: Counter[str] = Counter()
 
     def chunks() -> Iterator[np.ndarray]:
+        left_out.clear()
         with E57(str(path)) as file:
             for index in range(scans):
                 try:
-                    yield from _read_e57_scan(file, file.get_header(index))
+                    yield from _read_e57_scan(file, file.get_header(index), left_out)
                 except Exception as error:
                     raise ValueError(f"scan {index} of {scans}: {error}") from error
 
-    return CloudSource(f"E57, {scans} scans", chunks, np.empty((0, 3)), "m")
+    return CloudSource(f"E57, {scans} scans", chunks, np.empty((0, 3)), "m", None, crs, left_out)
 
 
-def _read_e57_scan(file: "E57", header: "ScanHeader") -> Iterator[np.ndarray]:
+def _e57_crs(file: "E57") -> str | None:
+    """Return what the file says of its coordinate reference system; `None` where it says nothing."""
+    root = file.image_file.root()
+    name = "coordinateMetadata"
+    return (str(root[name].value()).strip() or None) if root.isDefined(name) else None
+
+
+def _read_e57_scan(file: "E57", header: "ScanHeader", left_out: Counter[str]) -> Iterator[np.ndarray]:
+    """Yields the points of a scan in the file's frame; what lies in the scanner itself is no return and is counted."""
     fields = header.point_fields
     system = next((s for s in (_CARTESIAN, _SPHERICAL) if set(s) <= set(fields)), None)
     if system is None:
@@ -217,8 +266,11 @@ def _read_e57_scan(file: "E57", header: "ScanHeader") -> Iterator[np.ndarray]:
         if system is _SPHERICAL:
             a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
         points = np.stack([a, b, c], axis=1)
+        back = (points != 0).any(axis=1)
         if flags:
-            points = points[data[flag][:size] == 0]
+            back &= data[flag][:size] == 0
+        left_out.update(_counts(no_return=~back))
+        points = points[back]
         yield rotation.apply(points) + translation
     if read != count:
         raise ValueError(f"it ends after {read} of {count} points")

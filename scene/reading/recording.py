@@ -1,7 +1,8 @@
 """Any recording as a stream of timed scans."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -11,8 +12,9 @@ from jaxtyping import Float
 
 from scene.errors import RecordingError
 from scene.reading.formats import detect
-from scene.reading.scans import Scan, ScanSource
+from scene.reading.scans import ScanSource
 from scene.reading.source import cause, refuse_damage
+from scene.reading.times import MOST_BAD, Convention, RawScan, Scan, Spans, TimeConfig
 
 _IMU_TYPE = "sensor_msgs/msg/Imu"
 _MOST_OUT_OF_ORDER = 0.05
@@ -48,20 +50,32 @@ class Recording:
         path: The recording.
         topic: The LiDAR topic read; the folder's name for a folder of scans.
         scan_count: Scans in the recording.
-        facts: Detected facts, for the manifest; complete once a scan has been read.
+        facts: Detected facts, for the manifest; `point_times` and the counts of what is left out follow on reading.
         position: Position up to which the latest `scans()` has read.
 
     Raises:
         RecordingError: Not a recording, truncated, or without a LiDAR topic.
     """
 
-    def __init__(self, path: Path, topic: str | None = None, format: str | None = None) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: Path,
+        topic: str | None = None,
+        format: str | None = None,
+        times: TimeConfig | None = None,
+        more: tuple[Path, ...] = (),
+    ) -> None:
+        self.path, self._told = path, times or TimeConfig()
+        self._points = self._bad = 0
         detected = detect(path, format)
         if detected.format.kind != "recording":
             raise RecordingError(f"{path}: is no recording of scans, but {detected.format.name}")
+        parts = [detect(part, format) for part in more]
+        if odd := next((part for part in parts if part.format != detected.format), None):
+            raise RecordingError(f"{odd.path}: is no {detected.format.label} as {path} is, so no part of one recording")
         with refuse_damage(path, f"a readable {detected.format.label}", RecordingError):
-            self._source: ScanSource = detected.format.open(detected.path, topic)
+            beside = (tuple(part.path for part in parts),) if parts else ()
+            self._source: ScanSource = detected.format.open(detected.path, topic, *beside)
         self._source.facts["format_by"] = detected.by
         self.position = START
         self.topic, self.scan_count, self.facts = self._source.topic, self._source.scan_count, self._source.facts
@@ -83,16 +97,45 @@ class Recording:
     ) -> None:
         self._source.close()
 
+    @cached_property
+    def _spans(self) -> Spans:
+        """Headers and times of all sweeps, read once from end to end."""
+        spans = Spans()
+        for raw in self._source.scans():
+            spans.add(raw)
+        return spans
+
+    @property
+    def stamps(self) -> Float[np.ndarray, " n"]:
+        """Header of each sweep, s."""
+        return np.array([row[0] for row in self._spans.rows])
+
+    @cached_property
+    def convention(self) -> Convention:
+        """Meaning of the times of points, decided from all sweeps; raises `RecordingError` where they fit nothing."""
+        spans = self._spans
+        try:
+            found = spans.decide(self._told)
+        except ValueError as error:
+            first = spans.timed[0] if spans.timed else 0
+            raise RecordingError(f"{self.path}: scan {first} of {self.topic} {error}") from error
+        self.facts["point_times"] = found.words
+        return found
+
     def scans(self, after: ReadPosition = START) -> Iterator[Scan]:
         """Yields the scans in the order of the recording, from the position `after` on.
 
-        A scan whose time does not grow is left out and counted in `facts`. Raises `RecordingError`, which says which
-        message is damaged, or where more than 5 % of the times do not grow.
+        A scan whose time does not grow is left out and counted in `facts`, and so is a point whose time is none of its
+        sweep. Raises `RecordingError`, which says which message is damaged, or where more than 5 % of either are left
+        out.
         """
         self.position, last, late = after, after.last, after.late
         if late:
             self.facts["scans_out_of_order"] = late
-        for index, scan in enumerate(self._source.scans(after.messages), after.messages):
+        convention = self.convention
+        self._points = self._bad = 0
+        for index, raw in enumerate(self._source.scans(after.messages), after.messages):
+            scan = self._timed(convention, raw)
             if last is not None and scan.stamp <= last:
                 late += 1
                 self.facts["scans_out_of_order"] = late
@@ -110,16 +153,35 @@ class Recording:
             last = scan.stamp
             self.position = ReadPosition(index + 1, last, late)
             yield scan
+        if self._bad > MOST_BAD * self._points:
+            raise RecordingError(
+                f"{self.path}: {self._bad / self._points:.0%} of the points of {self.topic} have a time in "
+                f"`{self._spans.name}` that is none of their sweep; --time-unit none leaves the times out"
+            )
+
+    def pick(self, numbers: Iterable[int]) -> Iterator[tuple[int, Scan]]:
+        """Yields some of the scans with their numbers; the others are not decoded."""
+        wanted = sorted(set(numbers))
+        for number, raw in zip(wanted, self._source.scans(only=frozenset(wanted)), strict=True):
+            yield number, self.convention.apply(raw)[0]
+
+    def _timed(self, convention: Convention, raw: RawScan) -> Scan:
+        """Return a sweep by the convention, and count what has no time in it."""
+        scan, bad = convention.apply(raw)
+        self._points, self._bad = self._points + len(raw.points), self._bad + bad
+        if self._bad:
+            self.facts["points_without_time"] = self._bad
+        return scan
 
     def peek(self) -> dict[str, Any]:
-        """Return `facts` with those that only a scan can tell; reads up to the first scan with a return.
+        """Return `facts` with the meaning of the times; reads all headers.
 
-        Raises `RecordingError` where there is none, or it is damaged.
+        Raises `RecordingError` where no scan has a return, or one is damaged.
         """
-        for scan in self._source.scans():
-            if len(scan.points):  # a sensor that is starting up sends empty sweeps
-                return self.facts
-        raise RecordingError(f"{self.path}: {self.topic} holds no scan with a return in it")
+        if not self._spans.points:  # a sensor that is starting up sends empty sweeps
+            raise RecordingError(f"{self.path}: {self.topic} holds no scan with a return in it")
+        _ = self.convention
+        return self.facts
 
     def up_at_start(self, duration: float) -> Float[np.ndarray, "3"] | None:
         """Return the unit vector against gravity in the LiDAR's frame, over the first `duration` s; `None` without IMU.

@@ -6,7 +6,8 @@ Source: MCAP specification, "Header", "Schema"; well-known profiles `ros1` and `
 writer, and well-known encodings `ros1msg`, `ros2msg` (schemas), `ros1`, `cdr` (messages).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -18,7 +19,7 @@ from scene.errors import RecordingError
 from scene.reading.scans import (
     LIVOX_TYPES,
     POINTCLOUD2_TYPE,
-    Scan,
+    RawScan,
     ScanSource,
     parse_custom_msg,
     parse_custom_msg_cdr,
@@ -88,11 +89,15 @@ class RosBag(ScanSource):
         RecordingError: Not a bag of that format, truncated, or without a LiDAR topic.
     """
 
-    def __init__(self, format: str, path: Path, topic: str | None) -> None:
+    def __init__(self, format: str, path: Path, topic: str | None, more: tuple[Path, ...] = ()) -> None:
         self.path, self._ros1 = path, format == "bag"
         name = _BAG_NAMES[format]
-        with refuse_damage(path, f"a whole {name}; was it truncated or never closed?", RecordingError):
-            self.reader = _open_reader(path, format)
+        parts = [file for given in (path, *more) for file in bags_in(given, format)]
+        readers: list[Any] = []
+        for part in parts:
+            with refuse_damage(part, f"a whole {name}; was it truncated or never closed?", RecordingError):
+                readers.append(_open_reader(part, format))
+        self.reader = readers[0] if len(readers) == 1 else _Chain(readers)
         try:
             self._connections, others = self._choose(topic)
         except RecordingError:
@@ -103,6 +108,8 @@ class RosBag(ScanSource):
         self.topic, self._type = self._connections[0].topic, self._connections[0].msgtype
         self.scan_count = sum(connection.msgcount for connection in self._connections)
         self.facts = {"kind": name, "topic": self.topic, "message_type": self._type}
+        if len(readers) > 1:
+            self.facts["bags"] = len(readers)
         if others:
             self.facts["other_lidar_topics"] = others
 
@@ -116,14 +123,15 @@ class RosBag(ScanSource):
             return self._store.deserialize_ros1(raw, message_type)
         return self._store.deserialize_cdr(raw, message_type)
 
-    def scans(self, skip: int = 0) -> Iterator[Scan]:
+    def scans(self, skip: int = 0, only: frozenset[int] | None = None) -> Iterator[RawScan]:
         """Yields the scans in the order of the bag; a header without a stamp takes the time of its message.
 
-        The first `skip` messages are not parsed. Raises `RecordingError`, which says which message is damaged.
+        The first `skip` messages are not parsed, nor any but `only` some. Raises `RecordingError`, which says which
+        message is damaged.
         """
-        index = 0
+        index, last = 0, self.scan_count if only is None else max(only, default=-1)
         messages = self.reader.messages(connections=self._connections)
-        while True:
+        while index <= last:
             try:
                 _, received, raw = next(messages)
             except StopIteration:
@@ -132,7 +140,7 @@ class RosBag(ScanSource):
                 raise RecordingError(
                     f"{self.path}: damaged after scan {index} of {self.topic} ({cause(error)})"
                 ) from error
-            if index < skip:
+            if index < skip or (only is not None and index not in only):
                 index += 1
                 continue
             try:
@@ -141,20 +149,17 @@ class RosBag(ScanSource):
                 raise RecordingError(f"{self.path}: scan {index} of {self.topic} is {cause(error)}") from error
             index += 1
 
-    def _parse(self, raw: bytes, received: float) -> Scan:
+    def _parse(self, raw: bytes, received: float) -> RawScan:
         if self._type in LIVOX_TYPES:
             scan = parse_custom_msg(raw) if self._ros1 else parse_custom_msg_cdr(raw)
-            convention = "`offset_time`, ns after the stamp (its start)"
         else:
             try:
                 message = self.deserialize(raw, POINTCLOUD2_TYPE)
             except Exception as error:
                 raise ValueError(f"not a whole PointCloud2: {cause(error)}") from error
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-            scan, convention = parse_pointcloud2(message, stamp or received)
-        if convention:
-            self.facts.setdefault("point_times", convention)
-        return scan
+            scan = parse_pointcloud2(message, stamp or received)
+        return replace(scan, received=received)
 
     def _choose(self, topic: str | None) -> tuple[list[Any], list[str]]:
         """Return the LiDAR's connections (one for each publisher), and the other topics that could have been it."""
@@ -167,6 +172,39 @@ class RosBag(ScanSource):
         best = max(chosen, key=_likelihood)
         same = [c for c in chosen if (c.topic, c.msgtype) == (best.topic, best.msgtype)]
         return same, sorted({c.topic for c in lidars} - {best.topic})
+
+
+def bags_in(path: Path, format: str) -> list[Path]:
+    """Return the bags that an input holds: itself, or all of a folder without metadata, by their names."""
+    if not path.is_dir() or (path / "metadata.yaml").is_file():
+        return [path]
+    return sorted(file for file in path.iterdir() if file.suffix == f".{format}")
+
+
+class _Chain:
+    """Bags one after another, in the order of their first messages: a recording that was split."""
+
+    def __init__(self, readers: list[Any]) -> None:
+        self._readers = sorted(readers, key=lambda reader: next((row[1] for row in reader.messages()), 0))
+        self._connections = [list(reader.connections) for reader in self._readers]
+
+    @property
+    def connections(self) -> list[Any]:
+        """Those of all bags."""
+        return [connection for own in self._connections for connection in own]
+
+    def messages(self, connections: Iterable[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        """Yields the messages of some connections, bag by bag."""
+        wanted = {id(connection) for connection in connections}
+        for reader, held in zip(self._readers, self._connections, strict=True):
+            own = [connection for connection in held if id(connection) in wanted]
+            if own:
+                yield from reader.messages(connections=own)
+
+    def close(self) -> None:
+        """Closes all files."""
+        for reader in self._readers:
+            reader.close()
 
 
 def _likelihood(connection: Any) -> tuple[bool, bool, bool, int]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from scene.errors import RecordingError
 from scene.reading.ply_pcd import read_pcd_records, read_ply_records
-from scene.reading.scans import Scan, ScanSource, scan_from_records
+from scene.reading.scans import RawScan, ScanSource, scan_from_records
 from scene.reading.source import cause
 
 _FORMATS = {".pcd": "PCD", ".ply": "PLY", ".bin": "KITTI bin"}
@@ -28,7 +28,7 @@ def open_folder(path: Path, topic: str | None = None) -> ScanSource:
         raise RecordingError(f"{path}: holds no scans ({', '.join(_FORMATS)})")
     times, source = _find_times(path, files)
 
-    def read(index: int) -> tuple[Scan, str]:
+    def read(index: int) -> RawScan:
         try:
             return scan_from_records(times[index], _read_records(files[index]))
         except Exception as error:  # the libraries raise anything on damage

@@ -1,8 +1,4 @@
-"""Timed scans: point times, Livox and PointCloud2 messages, and the class that a reader of recordings returns.
-
-Drivers of LiDARs differ in unit, sign and origin of their point times, and none of them says so. Relative values only
-need their unit: a return's time is the stamp plus the value, whether the stamp is of the end of the sweep (VLP-16,
-values mostly negative) or of its start (Ouster, Livox). Absolute values (Hesai, RoboSense) are matched with the stamp.
+"""Sweeps as recordings hold them: Livox and PointCloud2 messages, and the class that a reader of recordings returns.
 
 Source of Livox' layout: livox_ros_driver, message md5 e4d6829bdfe657cb6c21a746c86b21a6; livox_ros_driver2 publishes the
 same fields.
@@ -10,24 +6,16 @@ same fields.
 
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 
 from scene.errors import RecordingError
 from scene.reading.source import cause, stack_xyz
-
-
-@dataclass(frozen=True)
-class Scan:
-    """A sweep in the sensor frame."""
-
-    stamp: float  # Time of the sweep, s
-    points: Float[np.ndarray, "n 3"]  # Returns at their own time, m
-    times: Float[np.ndarray, " n"]  # Time of each return after `stamp`, s
+from scene.reading.times import TIME_FIELDS, RawScan, make_scan
 
 
 class _NoTopics:
@@ -47,7 +35,7 @@ class ScanSource:
         path: The recording, for messages.
         topic: The LiDAR topic; the file's or folder's name where there are no topics.
         scan_count: Number of scans.
-        facts: Detected facts, for people and the manifest. `kind` is needed; `point_times` is known after a scan.
+        facts: Detected facts, for people and the manifest; `kind` is needed.
         reader: A bag's reader, for the IMU beside the LiDAR: `connections` and `messages(connections=…)`.
     """
 
@@ -62,7 +50,7 @@ class ScanSource:
         path: Path,
         scan_count: int,
         facts: dict[str, Any],
-        read: Callable[[int], tuple[Scan, str]],
+        read: Callable[[int], RawScan],
         close: Callable[[], None] = lambda: None,
     ) -> None:
         """Describes the recording.
@@ -72,18 +60,16 @@ class ScanSource:
         self.path, self.topic, self.scan_count, self.facts = path, path.name, scan_count, facts
         self._read, self._close = read, close
 
-    def scans(self, skip: int = 0) -> Iterator[Scan]:
-        """Yields the scans from number `skip` on; raises `RecordingError`, which says which is damaged."""
-        for index in range(skip, self.scan_count):
+    def scans(self, skip: int = 0, only: frozenset[int] | None = None) -> Iterator[RawScan]:
+        """Yields the scans from number `skip` on, or `only` some; `RecordingError` says which is damaged."""
+        for index in range(skip, self.scan_count) if only is None else sorted(only):
             try:
-                scan, convention = self._read(index)
+                raw = self._read(index)
             except RecordingError:
                 raise
             except Exception as error:  # readers and their libraries raise anything on damage
                 raise RecordingError(f"{self.path}: scan {index} is not readable ({cause(error)})") from error
-            if convention:
-                self.facts.setdefault("point_times", convention)
-            yield scan
+            yield raw
 
     def close(self) -> None:
         """Closes the file."""
@@ -94,80 +80,14 @@ class ScanSource:
         raise RecordingError(f"{self.path}: holds no {message_type}")
 
 
-TIME_FIELDS = ("t", "time", "offset_time", "timestamp", "time_stamp", "timestamps", "ts")
-STATIC = "none: every sweep is taken as static"
-_TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
-_LONGEST_SWEEP = 2.0  # s
-_SAME_CLOCK = 10.0  # s between stamp and absolute point times
-_FIRST_EPOCH = 1e8  # s; absolute times count from 1970, and nothing older than 1973 is a recording
+def scan_from_records(stamp: float, records: Shaped[np.ndarray, " n"]) -> RawScan:
+    """Return a sweep from points with fields x, y, z (m) and perhaps a time, in any unit.
 
-
-def make_scan(
-    stamp: float, points: Float[np.ndarray, "n 3"], values: Shaped[np.ndarray, " n"] | None, name: str = ""
-) -> tuple[Scan, str]:
-    """Return a sweep with its returns in the order of time, and the convention of its point times.
-
-    Returns at the origin (nothing came back) and those that are not finite, in place or time, are dropped. Raises
-    `ValueError` where the point times span more than a sweep can last.
-
-    Args:
-        stamp: Stamp of the message, s.
-        points: Points in the sensor frame, m.
-        values: Point times as stored; `None` where there are none.
-        name: Name of their field.
-    """
-    good = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
-    if values is None:
-        return Scan(stamp, points[good], np.zeros(int(good.sum()))), STATIC
-    raw = values.astype(np.float64)
-    good &= np.isfinite(raw)
-    points, raw = points[good], raw[good]
-    if not len(raw):
-        return Scan(stamp, points, raw), ""
-    start, times, convention = _interpret_times(name, raw, np.issubdtype(values.dtype, np.integer), stamp)
-    if (np.diff(times) < 0).any():
-        order = np.argsort(times, kind="stable")
-        points, times = points[order], times[order]
-    return Scan(start, points, times), convention
-
-
-def scan_from_records(stamp: float, records: Shaped[np.ndarray, " n"]) -> tuple[Scan, str]:
-    """Return a sweep from points with fields x, y, z (m) and perhaps a time, and the convention of its point times.
-
-    Raises `ValueError` where a coordinate is missing, or the times span more than a sweep can last.
+    Raises `ValueError` where a coordinate is missing.
     """
     name = next((name for name in TIME_FIELDS if name in (records.dtype.names or ())), None)
     points = stack_xyz(records).astype(np.float32)
     return make_scan(stamp, points, None if name is None else records[name], name or "")
-
-
-def _interpret_times(name: str, raw: np.ndarray, integer: bool, stamp: float) -> tuple[float, np.ndarray, str]:
-    """Start of the sweep (s), times after it (s), and the convention in words."""
-    low, high = float(raw.min()), float(raw.max())
-    if low == high == 0:
-        return stamp, raw, f"`{name}` is 0 throughout: every sweep is taken as static"
-    for scale, unit in _TIME_UNITS:
-        if low * scale > _FIRST_EPOCH and abs(low * scale - stamp) < _SAME_CLOCK:
-            times = _check_span(name, (raw - low) * scale)
-            return low * scale, times, f"`{name}`, absolute, {unit}"
-    if low > _FIRST_EPOCH and not integer:
-        scale, unit = next((s, u) for s, u in reversed(_TIME_UNITS) if low * s > _FIRST_EPOCH or s == 1.0)
-        return stamp, _check_span(name, (raw - low) * scale), f"`{name}`, absolute by another clock, {unit}"
-    largest = max(-low, high)
-    # Whole numbers are nanoseconds by every driver's convention; other values are seconds unless that is absurd.
-    units = _TIME_UNITS[-1:] if integer else _TIME_UNITS
-    scale, unit = next(((s, u) for s, u in units if largest * s <= _LONGEST_SWEEP), units[-1])
-    times = _check_span(name, raw * scale)
-    side = "before the stamp (its end)" if -low > high else "after the stamp (its start)"
-    shift = min(low * scale, 0.0)
-    return stamp + shift, times - shift, f"`{name}`, {unit} {side}"
-
-
-def _check_span(name: str, times: np.ndarray) -> np.ndarray:
-    span = float(times.max() - times.min())
-    if span > _LONGEST_SWEEP:
-        raise ValueError(f"a sweep whose `{name}` spans {span:.3g} s; at most {_LONGEST_SWEEP:g} s are possible")
-    return times
 
 
 LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
@@ -182,7 +102,7 @@ _LIVOX_POINT_CDR = np.dtype({"names": ["point"], "formats": [_LIVOX_POINT], "ite
 _TAG_RETURN_MASK = 0x20
 
 
-def parse_custom_msg(raw: bytes) -> Scan:
+def parse_custom_msg(raw: bytes) -> RawScan:
     """Parses a `CustomMsg` as ROS1 serialises it; raises `ValueError` where the bytes are not a whole one.
 
     Points at the origin (no return), not finite, or tagged as noise are dropped.
@@ -197,7 +117,7 @@ def parse_custom_msg(raw: bytes) -> Scan:
     return _livox_scan(secs + nsecs * 1e-9, points)
 
 
-def parse_custom_msg_cdr(raw: bytes) -> Scan:
+def parse_custom_msg_cdr(raw: bytes) -> RawScan:
     """Parses a `CustomMsg` as ROS2 serialises it (CDR, little-endian); otherwise as `parse_custom_msg`."""
     try:
         if raw[:2] != b"\x00\x01":
@@ -216,10 +136,10 @@ def parse_custom_msg_cdr(raw: bytes) -> Scan:
     return _livox_scan(secs + nsecs * 1e-9, points)
 
 
-def _livox_scan(stamp: float, points: np.ndarray) -> Scan:
+def _livox_scan(stamp: float, points: np.ndarray) -> RawScan:
     points = points[points["tag"] & _TAG_RETURN_MASK == 0]
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
-    return make_scan(stamp, xyz, points["offset_time"], "offset_time")[0]
+    return replace(make_scan(stamp, xyz, points["offset_time"], "offset_time"), unit="ns")
 
 
 POINTCLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -227,10 +147,10 @@ POINTCLOUD2_TYPE = "sensor_msgs/msg/PointCloud2"
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
-def parse_pointcloud2(message: Any, stamp: float) -> tuple[Scan, str]:
-    """Parses a deserialised message with the stamp of its header, s; returns the sweep and the convention of its times.
+def parse_pointcloud2(message: Any, stamp: float) -> RawScan:
+    """Parses a deserialised message with the stamp of its header, s.
 
-    Raises `ValueError` without coordinates, for a layout that contradicts itself, or times of no sweep.
+    Raises `ValueError` without coordinates, or for a layout that contradicts itself.
     """
     points = _cloud_records(message)
     names = points.dtype.names or ()

@@ -2,9 +2,10 @@
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,9 @@ class CloudSource:
     sample: Float[np.ndarray, "k 3"]
     unit: str | None = None  # `m`, `mm` or a kind of foot, where the format or a header says so
     count: int | None = None  # Points in all, where the file knows
+    crs: str | None = None  # Coordinate reference system, as the file has it
+    # Points that `chunks` has left out so far, by why: withheld, noise, or no return
+    left_out: Counter[str] = field(default_factory=Counter)
 
 
 def stack_xyz(records: np.ndarray) -> Float[np.ndarray, "n 3"]:

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from scene.errors import RecordingError
 from scene.reading.source import BATCH, UNITS, CloudSource, Lines
 
 # English, German, Spanish, French and Italian surveyors' words; the first one is that of a cloud, not of a map.
@@ -56,6 +57,14 @@ def parse_columns(text: str | None) -> dict[str, str]:
 
 
 COLUMN_KEYS = ("x", "y", "z", "ring", "point", "offset")
+
+
+def told_columns(path: Path, text: str | None) -> dict[str, str] | None:
+    """Return the columns of a file that a user names; raises `RecordingError` where they are none."""
+    try:
+        return parse_columns(text) or None
+    except ValueError as error:
+        raise RecordingError(f"{path}: {error}") from error
 
 
 def find_column(names: Sequence[str], told: str) -> int | None:

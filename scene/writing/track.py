@@ -40,8 +40,7 @@ class RailProfile:
 class TrackConfig:
     """Standard-gauge track on concrete monoblock sleepers, m."""
 
-    # Tracks that are laid: those that the survey shows (one by standard where it could show none, as rings of points),
-    # none, or one by standard on the axis.
+    # Tracks that are laid: those that the survey shows, none, or one by standard on the axis.
     lay: Annotated[Literal["auto", "none", "standard"], tyro.conf.arg(name="")] = "auto"
     gauge: float = 1.435  # Distance of the inner faces of the heads. Source: the paper and every standard.
     sleeper_spacing: float = 0.6  # Spacing of the sleepers. Source: the paper.
@@ -114,10 +113,10 @@ class Track:
 def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) -> Track:
     """Lays the tracks on the flat floor, or one on a bed just wide enough where the bore is round.
 
-    Rails and sleepers that the survey shows are taken as they lie, and stand out as far as they do. Each sleeper is
-    checked against the wall at its level on both sides: one that would come nearer than the margin is left out between
-    rails that the survey shows, whose sleepers are not as long as the standard's; without such rails it raises
-    `FitError`.
+    Rails and sleepers that the survey shows are taken as they lie, and stand out as far as they do; without `seen` all
+    is by standard. Each sleeper is checked against the wall at its level on both sides: one that would come nearer than
+    the margin is left out between rails that the survey shows, whose sleepers are not as long as the standard's; without
+    such rails it raises `FitError`.
     """
     half_width = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]
@@ -134,6 +133,8 @@ def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) ->
         why = "none: as asked for"
     elif sought and not lines:
         why = "none: the survey shows no rails"
+    elif config.lay == "auto" and seen is not None and not sought:
+        why = "none: the survey can show no rails"
     elif np.median(floor + bore.height - bed) < config.min_headroom and not shown:
         why = "none: the bore is too low for it"
     if why:

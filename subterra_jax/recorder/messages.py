@@ -60,12 +60,19 @@ def _twist(linear: Float[np.ndarray, "3"], angular: Float[np.ndarray, "3"]) -> A
     return _make("geometry_msgs/msg/Twist")(linear=_vector(linear), angular=_vector(angular))
 
 
+_BLIND = 0.05  # m; nearer a planar LiDAR of the kind reports nothing, and no wall comes so near to the robot's middle
+
+
 def laser_scan(time: float, frame: str, ranges: np.ndarray, range_max: float, period: float) -> Any:
-    """Return a `sensor_msgs/LaserScan`; a beam that hits nothing reports exactly `range_max`, as in the task."""
+    """Return a `sensor_msgs/LaserScan`: +Inf where a beam has no echo within `range_max`, -Inf where it is too near.
+
+    Source: REP-117, Informational Distance Measurements.
+    """
     step = 2.0 * np.pi / len(ranges)
+    ranges = np.where(ranges >= range_max, np.inf, np.where(ranges < _BLIND, -np.inf, ranges))
     return _make("sensor_msgs/msg/LaserScan")(
         header=_header(time, frame), angle_min=0.0, angle_max=float(step * (len(ranges) - 1)), angle_increment=step,
-        time_increment=0.0, scan_time=period, range_min=0.0, range_max=range_max,
+        time_increment=0.0, scan_time=period, range_min=_BLIND, range_max=range_max,
         ranges=np.asarray(ranges, np.float32), intensities=np.zeros(0, np.float32),
     )  # fmt: skip
 

@@ -12,7 +12,7 @@ import trimesh
 from benchmarks.rays import peers, picture, speed
 from benchmarks.rays.__main__ import RaysConfig, command, main, run
 from benchmarks.rays.casting import Agreement
-from scene.output import write_geometry
+from scene.writing.folder import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.lidar3d.relief import Relief

@@ -6,14 +6,14 @@ from pathlib import Path
 
 from plyfile import PlyData
 
-from scene.reading import Scan, ScanSource, register_reader, scan_from_records
+from scene.reading import RawScan, ScanSource, register_reader, scan_from_records
 
 
 def open_zip(path: Path, topic: str | None = None) -> ScanSource:
     archive = zipfile.ZipFile(path)
     names = sorted((name for name in archive.namelist() if name.endswith(".ply")), key=time_of)
 
-    def read(index: int) -> tuple[Scan, str]:
+    def read(index: int) -> RawScan:
         ply = PlyData.read(io.BytesIO(archive.read(names[index])))
         return scan_from_records(time_of(names[index]), ply["vertex"].data)
 

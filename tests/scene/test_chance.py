@@ -5,10 +5,10 @@ import pytest
 
 from scene.bore import POCKET
 from scene.fitting import pockets, trackseen
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.evidence import more_than_chance, steadier_than_chance
 from scene.fitting.section import fit_sections
 from tests.scene.clouds import curved_d_bore
+from tests.scene.fits import axis_of
 from tests.scene.scanned import arch, pillar, scan, with_outliers
 from tests.scene.test_reconstruction import thin
 
@@ -28,7 +28,7 @@ def strewn() -> np.ndarray:
 @pytest.mark.parametrize("cloud", [pillared, strewn])
 def test_no_ring_and_no_pocket_is_measured_where_there_is_none(cloud, monkeypatch):
     thinned = thin(cloud())
-    sections = fit_sections(thinned, fit_centreline(thinned.points, CentrelineConfig(), thinned.origin))
+    sections = fit_sections(thinned, axis_of(thinned))
     found, joints = pockets.find_pockets(sections)
     assert len(found) == len(joints) == 0
     monkeypatch.setattr(pockets, "open_rims", lambda deficit, grid, row, *rest: np.zeros(len(row)))

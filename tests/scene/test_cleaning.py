@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scene.cleaning.clean import CleaningConfig, clean_cloud
-from scene.cleaning.removed import BEYOND, BRANCH, CAUSES, ELSEWHERE, INSIDE, SCATTERED, Cleaned
+from scene.cleaning.removed import Cause, Cleaned
 from scene.cleaning.sort import Around, end_stations
 from scene.cleaning.tube import Tube as WallTube
 from scene.cleaning.tube import measure_tube
@@ -39,7 +39,7 @@ def axis_offsets(result: Cleaned) -> np.ndarray:
 
 
 def causes(result: Cleaned) -> dict[str, int]:
-    return {CAUSES[index]: int((result.cause == index).sum()) for index in np.unique(result.cause)}
+    return {Cause(index): int((result.cause == index).sum()) for index in np.unique(result.cause)}
 
 
 def require_axis_in_the_middle(result: Cleaned, within: float = 0.03) -> None:
@@ -73,7 +73,7 @@ def test_strays_anywhere_move_neither_axis_nor_ends():
     strays = rng.uniform(points.min(axis=0) - 4, points.max(axis=0) + 4, (len(points) // 20, 3))
     result = cleaned(turned(np.concatenate([points, strays])))
     require_axis_in_the_middle(result)
-    assert causes(result)[CAUSES[SCATTERED]] > 0.5 * len(strays)
+    assert causes(result)[Cause.SCATTERED] > 0.5 * len(strays)
     station = axis_offsets(result)[:, 0]
     assert np.ptp(station) == pytest.approx(LENGTH, abs=1.6)  # sections stand a metre apart
 
@@ -85,7 +85,7 @@ def test_a_cutting_is_cut_off_where_the_lining_ends_and_reported():
         placed(unit, *ORIENTATION) - PLACE for unit in np.eye(3)
     ]).T  # fmt: skip
     assert kept[:, 0].max() == pytest.approx(LENGTH, abs=0.3)
-    parts = [part for part in result.removed if part.cause == CAUSES[BEYOND]]
+    parts = [part for part in result.removed if part.cause == Cause.BEYOND]
     assert sum(part.points for part in parts) > 5_000
     assert any(min(abs(part.end - part.start - 10), 99) < 1.5 for part in parts)
 
@@ -95,8 +95,8 @@ def test_a_parked_vehicle_is_taken_out_and_leaves_the_floor():
     points = np.concatenate([arch(), box(rng, (12, -1, 0), (18, 1, 1.8), 12_000)])
     result = cleaned(turned(points))
     require_axis_in_the_middle(result)
-    assert causes(result)[CAUSES[INSIDE]] > 4_000
-    (part,) = [part for part in result.removed if part.cause == CAUSES[INSIDE] and part.points > 1_000]
+    assert causes(result)[Cause.INSIDE] > 4_000
+    (part,) = [part for part in result.removed if part.cause == Cause.INSIDE and part.points > 1_000]
     along = sorted(min(part.start - s, part.end - s, key=abs) for s in (12, 18))
     assert part.end - part.start == pytest.approx(6.0, abs=0.6), along
 
@@ -114,7 +114,7 @@ def test_a_branch_is_cut_at_its_mouth_with_its_place_and_refused_when_strict():
     result = cleaned(points)
     require_axis_in_the_middle(result, within=0.05)
     (part,) = [part for part in result.removed if part.warning]
-    assert part.cause == CAUSES[BRANCH]
+    assert part.cause == Cause.BRANCH
     assert "branch" in part.warning
     there = turned(np.array([[15.0, 8.0, 2.0]]))[0]
     assert np.linalg.norm(np.subtract(part.place, there)) < 3.0
@@ -127,7 +127,7 @@ def test_of_two_tunnels_the_longer_is_built_with_a_warning():
     result = cleaned(turned(np.concatenate([arch(), shorter])))
     require_axis_in_the_middle(result)
     (part,) = [part for part in result.removed if part.warning]
-    assert part.cause == CAUSES[ELSEWHERE]
+    assert part.cause == Cause.ELSEWHERE
 
 
 def test_the_wall_of_a_twin_beside_the_tunnel_is_not_taken_for_its_own():
@@ -135,7 +135,7 @@ def test_the_wall_of_a_twin_beside_the_tunnel_is_not_taken_for_its_own():
     passage = Tube((14, 0), (14, 13), 2.0, 2.4)
     result = cleaned(turned(arch(twin, passage)))
     require_axis_in_the_middle(result)
-    assert {part.cause for part in result.removed if part.warning} <= {CAUSES[ELSEWHERE], CAUSES[BRANCH]}
+    assert {part.cause for part in result.removed if part.warning} <= {Cause.ELSEWHERE, Cause.BRANCH}
     assert any(part.warning for part in result.removed)
 
 
@@ -251,8 +251,8 @@ def test_the_user_may_keep_outliers_and_what_stands_inside():
     points = arch()
     strays = rng.uniform(points.min(axis=0) - 2.0, points.max(axis=0) + 2.0, (len(points) // 100, 3))
     dirty = turned(np.concatenate([points, strays, box(rng, (12, -0.6, 0.0), (15, 0.6, 1.7), 4000)]))
-    assert {CAUSES[SCATTERED], CAUSES[INSIDE]} <= set(causes(cleaned(dirty)))
-    for name, kept in (("filter_outliers", SCATTERED), ("filter_moving", INSIDE)):
+    assert {Cause.SCATTERED, Cause.INSIDE} <= set(causes(cleaned(dirty)))
+    for name, kept in (("filter_outliers", Cause.SCATTERED), ("filter_moving", Cause.INSIDE)):
         told = clean_cloud(thin(dirty), CleaningConfig(**{name: False}), CentrelineConfig())
-        assert CAUSES[kept] not in causes(told)
-        assert {CAUSES[SCATTERED], CAUSES[INSIDE]} - {CAUSES[kept]} <= set(causes(told))
+        assert Cause(kept) not in causes(told)
+        assert {Cause.SCATTERED, Cause.INSIDE} - {Cause(kept)} <= set(causes(told))

@@ -5,7 +5,7 @@ import pytest
 
 from scene.bore import axis_through
 from scene.cleaning.clean import CleaningConfig, clean_cloud
-from scene.cleaning.removed import BEYOND, BRANCH, CAUSES, INSIDE, list_removed
+from scene.cleaning.removed import Cause, list_removed
 from scene.cloud import Cloud
 from scene.fitting.centreline import CentrelineConfig, section_middles
 from scene.fitting.section import visible_span
@@ -25,21 +25,21 @@ def test_a_clean_cloud_is_handed_on_as_it_is():
 def test_what_was_removed_is_listed_by_stretch_with_its_place_in_the_frame_of_the_input():
     cloud = thin(curved_d_bore(length=20).points)
     station, cause = np.linspace(0, 20, len(cloud.points)), np.zeros(len(cloud.points), np.int8)
-    cause[(station > 3) & (station < 5)] = INSIDE
-    cause[(station > 8) & (station < 9)] = INSIDE
-    cause[station > 19] = BEYOND
+    cause[(station > 3) & (station < 5)] = Cause.INSIDE
+    cause[(station > 8) & (station < 9)] = Cause.INSIDE
+    cause[station > 19] = Cause.BEYOND
     removed = list_removed(cloud, cause, station, gap=1.0)
-    assert [part.cause for part in removed] == [CAUSES[INSIDE], CAUSES[INSIDE], CAUSES[BEYOND]]
+    assert [part.cause for part in removed] == [Cause.INSIDE, Cause.INSIDE, Cause.BEYOND]
     np.testing.assert_allclose([(part.start, part.end) for part in removed], [(3, 5), (8, 9), (19, 20)], atol=0.01)
     assert sum(part.points for part in removed) == np.count_nonzero(cause)
-    there = np.median(cloud.points[cause == BEYOND], axis=0) + cloud.origin
+    there = np.median(cloud.points[cause == Cause.BEYOND], axis=0) + cloud.origin
     np.testing.assert_allclose(removed[-1].place, there, atol=1e-3)
 
 
 def test_stations_of_what_was_removed_follow_the_axis():
     cloud = thin(curved_d_bore(length=20).points)
     cause = np.zeros(len(cloud.points), np.int8)
-    cause[:10] = INSIDE
+    cause[:10] = Cause.INSIDE
     (part,) = list_removed(cloud, cause, np.full(len(cause), 4.0), gap=1.0)
     assert (part.shifted(-1.5).start, part.shifted(-1.5).end) == (2.5, 2.5)
     assert (part.reversed(20.0).start, part.reversed(20.0).end) == (16.0, 16.0)
@@ -53,13 +53,13 @@ def test_a_branch_that_runs_on_beside_the_bore_is_named_where_it_meets_it():
     cloud = Cloud(
         np.stack([along, behind, 0 * along], axis=1).astype(np.float32), np.ones(6000), np.zeros(3), 6000, 0.04
     )
-    (part,) = list_removed(cloud, np.full(6000, BRANCH), along, 3.0, behind)
+    (part,) = list_removed(cloud, np.full(6000, Cause.BRANCH), along, 3.0, behind)
     assert "meets it from 22 to 25 m" in part.warning
     assert "meets it from 122 to 125 m" in part.shifted(100.0).warning
     assert "meets it from 35 to 38 m" in part.reversed(60.0).warning
     passage = along > 56  # nothing of it
     passage[4000:] = True
-    alone = list_removed(cloud, np.where(passage, BRANCH, 0), along, 3.0, behind)
+    alone = list_removed(cloud, np.where(passage, Cause.BRANCH, 0), along, 3.0, behind)
     assert "meets" not in alone[0].warning
 
 

@@ -12,12 +12,11 @@ import trimesh
 from scene.bore import STATION_STEP, Bore, axis_through
 from scene.build import build
 from scene.cleaning.crop import ExtentConfig
+from scene.config import BuildConfig, ReconstructConfig
 from scene.judging.judge import DoubtError, JudgingConfig, judge_bore
 from scene.judging.layers import doubt_layers
 from scene.judging.page import render_page
 from scene.judging.sanity import doubt_bore
-from scene.output import BuildConfig
-from scene.reconstruct import ReconstructConfig
 from tests.scene.clouds import curved_d_bore
 from tests.scene.conftest import arc_bore
 from tests.scene.test_judging import about, block, cloud_of, on_wall
@@ -170,11 +169,12 @@ def test_a_build_prints_and_writes_its_judgement(with_vehicle, tmp_path, capsys)
     build(with_vehicle, out)
     shown = capsys.readouterr()
     assert re.search(r"judged: \d+\.\d% of .* returns within 10 cm", shown.out)
+    assert "track: none: the survey shows no rails; --track standard lays one" in shown.out
     manifest = json.loads((out / "manifest.json").read_text())
     judgement = manifest["judgement"]
     assert 0.0 < judgement["share"]["explained"] < 1.0
     for warning in judgement["warnings"]:
-        assert f"warning: {warning['text']}" in shown.err
+        assert f"warning: {warning['text']} [{warning['code']}]" in shown.err
     assert judgement["warnings"]
     for name in ("build.html", "stations.csv"):
         assert manifest["files"][name] == hashlib.sha256((out / name).read_bytes()).hexdigest()

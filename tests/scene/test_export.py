@@ -10,7 +10,7 @@ import trimesh
 
 from scene.bore import Bore
 from scene.export import main
-from scene.output import write_geometry
+from scene.writing.folder import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 

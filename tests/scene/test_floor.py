@@ -6,9 +6,9 @@ import pytest
 from scene.bore import Bore
 from scene.fitting import floor
 from scene.fitting.assemble import bore_from_sections
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from tests.scene import railway
+from tests.scene.fits import axis_of
 from tests.scene.railway import World, arch, thinned
 from tests.scene.shapes import PLACE
 
@@ -35,7 +35,7 @@ SCANS = {
 def built(points: np.ndarray, voxel: float) -> tuple[Bore, np.ndarray]:
     """The bore, and how much its floor on the axis lies too high at each station, m."""
     cloud = thinned(points, voxel)
-    axis = fit_centreline(cloud.points, CentrelineConfig())
+    axis = axis_of(cloud)
     bore = bore_from_sections(axis, fit_sections(cloud, axis))
     down = np.array([np.interp(-np.pi / 2, bore.angle, radius, period=2 * np.pi) for radius in bore.radius])
     foot = bore.position - down[:, None] * bore.up + cloud.origin - PLACE
@@ -122,7 +122,7 @@ def test_a_round_invert_is_no_floor():
     turn = np.linspace(-np.pi, np.pi, 200)[:-1]
     tube = World(np.column_stack([2.7 * np.cos(turn), 2.7 + 2.7 * np.sin(turn)]), L)
     cloud = thinned(SCANS["vlp16"](tube))
-    axis = fit_centreline(cloud.points, CentrelineConfig())
+    axis = axis_of(cloud)
     assert not fit_sections(cloud, axis).flat_floor
 
 

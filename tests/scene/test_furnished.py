@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from scene.output import write_geometry
+from scene.writing.folder import write_geometry
 from scene.writing.furnished import furnish_bore, planar_segments
 from scene.writing.furniture import FurnitureConfig, TunnelSpace, count_pieces
 from scene.writing.mjcf import SceneConfig

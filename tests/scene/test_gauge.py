@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from scene.build import reconstruct
+from scene.config import ReconstructConfig
 from scene.fitting.rails import measure_again
 from scene.fitting.trackseen import above_floor, find_track
 from scene.progress import Stages
-from scene.reconstruct import ReconstructConfig, Reconstruction, reconstruct
+from scene.reconstruction import Reconstruction
 from scene.survey.config import SurveyConfig
 from scene.survey.simulate import simulate
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scene.bore import Bore
-from scene.cleaning.removed import CAUSES
+from scene.cleaning.removed import Cause
 from scene.cloud import Cloud
 from scene.judging.drawing import draw_strips
 from scene.judging.judge import DoubtError, JudgingConfig, Warned, judge_bore, require_trust
@@ -193,7 +193,7 @@ def test_poses_that_blur_the_walls_are_named_before_what_came_of_them(bore, wall
 def test_what_was_cut_away_as_another_tunnel_refuses_nothing(bore, wall):
     far = block(bore, (2, 22), (20, 24), (-2, 2), 60_000)
     cause = np.zeros(120_000, np.int8)
-    cause[60_000:] = next(k for k, words in enumerate(CAUSES) if "apart from the bore" in words)
+    cause[60_000:] = Cause.ELSEWHERE
     cloud = cloud_of(wall, far)
     assert any(w.refuses for w in judge_bore(bore, cloud, JudgingConfig()).warnings)
     judgement = judge_bore(bore, cloud, JudgingConfig(), cause=cause)

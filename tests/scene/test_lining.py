@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scene.bore import Bore, load_bore
+from scene.bore import STRETCH, Bore, load_bore
 from scene.cloud import Cloud
 from scene.fitting.assemble import bore_from_sections
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
-from scene.fitting.lining import LiningConfig, add_lining, count_alone, make_nails, pair_pockets
+from scene.fitting.lining import LiningConfig, add_lining, add_standard_lining, count_alone, make_nails, pair_pockets
 from scene.fitting.section import fit_sections
+from tests.scene.fits import axis_of
 from tests.scene.shapes import swept
 from tests.scene.test_irregular_walls import Irregular
 from tests.scene.test_reconstruction import thin
@@ -44,7 +44,7 @@ def lined(nails: bool) -> np.ndarray:
 
 def built(points: np.ndarray, config: LiningConfig | None = None) -> tuple[Bore, dict[str, str], Cloud]:
     cloud = thin(points)
-    axis = fit_centreline(cloud.points, CentrelineConfig(), cloud.origin)
+    axis = axis_of(cloud)
     sections = fit_sections(cloud, axis)
     return *add_lining(bore_from_sections(axis, sections), sections, cloud, config), cloud
 
@@ -107,10 +107,10 @@ def test_a_smooth_wall_seen_well_gets_nothing():
     assert not len(bore.ring_station)
 
 
-def test_a_wall_seen_too_thinly_gets_the_standard_lining_marked_so(tmp_path):
+def test_a_wall_seen_too_thinly_gets_the_standard_lining_on_request_marked_so(tmp_path):
     points = swept("circle", 30, yaw=0.4)
     along = (points - points.mean(axis=0))[:, :2] @ [np.cos(0.4), np.sin(0.4)]
-    bore, provenance, _ = built(points[np.abs(along - np.rint(along)) < 0.05])
+    bore, provenance, _ = built(points[np.abs(along - np.rint(along)) < 0.05], LiningConfig(lay="standard"))
     assert provenance == {"rings": "by standard", "pockets": "by standard", "nails": "by standard"}
     assert len(bore.pocket) == 2 * 8 * len(bore.ring_station)
     assert len(bore.nail) == 8 * len(bore.ring_station)
@@ -122,14 +122,28 @@ def test_a_wall_seen_too_thinly_gets_the_standard_lining_marked_so(tmp_path):
     np.testing.assert_array_equal(load_bore(tmp_path / "bore.npz").nail, bore.nail)
 
 
-def test_the_standard_lining_can_be_left_out_and_chosen():
+@pytest.mark.parametrize(
+    ("lay", "railway", "some"),
+    [("auto", False, False), ("auto", True, True), ("none", True, False), ("standard", False, True)],
+)
+def test_the_standard_lining_stands_in_a_railway_or_on_request(bore, lay, railway, some):
+    round_bore = replace(
+        bore,
+        radius=np.full_like(bore.radius, 2.8),
+        ring_station=np.empty(0),
+        pocket=bore.pocket[:0],
+        stretch=np.array([(0.0, bore.length, "circle", *[5.6] * 2, 2.8, 2.8, 0.0, 0.0, 1.0)], STRETCH),
+    )
+    lined, provenance = add_standard_lining(round_bore, LiningConfig(lay=lay), False, railway=railway)
+    assert (len(lined.pocket) > 0) == (len(lined.ring_station) > 0) == some
+    assert provenance["pockets"] == ("by standard" if some else "none: the survey cannot show them")
+
+
+def test_the_standard_lining_can_be_chosen():
     points = swept("circle", 30, yaw=0.4)
     along = (points - points.mean(axis=0))[:, :2] @ [np.cos(0.4), np.sin(0.4)]
     sparse = points[np.abs(along - np.rint(along)) < 0.05]
-    bore, provenance, _ = built(sparse, LiningConfig(by_standard=False))
-    assert not len(bore.pocket)
-    assert provenance["pockets"] == "none: the survey cannot show them"
-    chosen = LiningConfig(ring_width=2.0, pockets_per_ring=5, stagger=0.5, pocket_size=(0.25, 0.2))
+    chosen = LiningConfig(lay="standard", ring_width=2.0, pockets_per_ring=5, stagger=0.5, pocket_size=(0.25, 0.2))
     bore, _, _ = built(sparse, chosen)
     assert np.diff(bore.ring_station) == pytest.approx(2.0)
     assert len(bore.pocket) == 10 * len(bore.ring_station)
@@ -141,7 +155,7 @@ def test_the_standard_lining_can_be_left_out_and_chosen():
 def test_walls_too_irregular_for_segments_get_none_by_standard():
     tunnel, rng = Irregular.drawn(2.0, seed=3), np.random.default_rng(0)
     points = np.concatenate([tunnel.profile(station, 2500, rng) for station in np.arange(0.3, 20.0, 1.0)])
-    bore, provenance, _ = built(points + 50.0)
+    bore, provenance, _ = built(points + 50.0, LiningConfig(lay="standard"))
     assert not len(bore.pocket)
     assert provenance["rings"] == "none"
     assert set(bore.section_type) == {"free"}

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scene.build import reconstruct
+from scene.config import ReconstructConfig
 from scene.errors import RecordingError
 from scene.progress import Stages
-from scene.reconstruct import ReconstructConfig, reconstruct
 from tests.scene.bags import write_bag, write_tum
 
 ROOT = Path(__file__).parents[2]

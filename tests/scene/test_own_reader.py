@@ -13,7 +13,7 @@ import trimesh
 
 from scene.build import build
 from scene.errors import RecordingError
-from scene.reading import Scan, ScanSource, formats, make_scan, register_reader
+from scene.reading import RawScan, ScanSource, formats, make_scan, register_reader
 from scene.reading.formats import detect, own_readers
 from scene.reading.recording import Recording
 from subterra_jax.host.loading import UserCodeError, load_module
@@ -122,9 +122,9 @@ def test_partial_results_depend_on_the_readers_own_code(tmp_path):
 
 
 def test_a_source_without_times_is_taken_as_static(tmp_path):
-    def read(index: int) -> tuple[Scan, str]:
+    def read(index: int) -> RawScan:
         return make_scan(float(index), np.ones((4, 3)), None)
 
     source = ScanSource(tmp_path, 2, {"kind": "mine"}, read)
     assert [scan.stamp for scan in source.scans(skip=1)] == [1.0]
-    assert "static" in source.facts["point_times"]
+    assert [scan.stamp for scan in source.scans(only=frozenset([0]))] == [0.0]

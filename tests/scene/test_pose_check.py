@@ -8,13 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from scene.judging.sanity import doubt_bore
 from scene.poses import bothways, consistency
-from scene.poses.bothways import find_tilt
+from scene.poses.bothways import Tilt, find_tilt, numbers_along
 from scene.poses.consistency import check_poses, reorder
 from scene.poses.trajectory import Trajectory
 from scene.reading.recording import Recording
 from tests.scene.bags import write_bag
 
 RATE, COUNT, RAYS = 10.0, 90, 3000
+
+
+def tilt(recording: Recording, poses: Trajectory) -> Tilt | None:
+    return find_tilt([scan for _, scan in recording.pick(numbers_along(recording.stamps, poses))], poses)
 
 
 def pose(time: np.ndarray) -> tuple[np.ndarray, Rotation]:
@@ -141,18 +145,18 @@ def test_a_pitched_mount_shows_in_the_floor_ahead_and_behind(spun, bore, turn, s
 
 def test_a_pitched_mount_shows_in_a_walk_that_begins_outside(tmp_path, monkeypatch):
     with Recording(walk(tmp_path, 10.0)) as entering:  # after 14 m it has seen nothing yet of the floor behind it
-        assert find_tilt(entering, along((0, 0, 0))) is None
-        found = find_tilt(entering, along((0, -3, 0)))
+        assert tilt(entering, along((0, 0, 0))) is None
+        found = tilt(entering, along((0, -3, 0)))
         assert found is not None
         assert "+3.0° in pitch" in found.words
         monkeypatch.setattr(bothways, "_FIRST", 14)
-        assert find_tilt(entering, along((0, -3, 0))) is None, "it was taken for a LiDAR that never looks back"
+        assert tilt(entering, along((0, -3, 0))) is None, "it was taken for a LiDAR that never looks back"
 
 
 def test_a_fan_that_sees_nothing_behind_tells_no_tilt(spun, monkeypatch):
     look = bothways._look
     monkeypatch.setattr(bothways, "_look", lambda *words: (rows := look(*words))[rows[:, 3] > 0])
-    assert find_tilt(spun, along((0, 3, 0))) is None
+    assert tilt(spun, along((0, 3, 0))) is None
 
 
 def test_quaternions_in_the_other_order_are_found(recording):

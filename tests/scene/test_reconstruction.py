@@ -8,9 +8,9 @@ from scene.bore import Bore
 from scene.cloud import Cloud, VoxelMean
 from scene.errors import FitError
 from scene.fitting.assemble import bore_from_sections
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from tests.scene.clouds import KnownBore, curved_d_bore
+from tests.scene.fits import axis_of
 
 
 def thin(points: np.ndarray) -> Cloud:
@@ -21,7 +21,7 @@ def thin(points: np.ndarray) -> Cloud:
 
 def rebuilt(points: np.ndarray) -> tuple[Bore, Cloud]:
     cloud = thin(points)
-    axis = fit_centreline(cloud.points, CentrelineConfig())
+    axis = axis_of(cloud)
     return bore_from_sections(axis, fit_sections(cloud, axis)), cloud
 
 
@@ -80,7 +80,7 @@ def test_a_hole_in_the_survey_is_filled_and_marked():
 
 def test_a_cloud_too_short_is_refused():
     with pytest.raises(FitError, match=r"m long; at least 10 m are needed"):
-        fit_centreline(thin(curved_d_bore(length=5).points).points, CentrelineConfig())
+        axis_of(thin(curved_d_bore(length=5).points))
 
 
 @pytest.mark.parametrize("shape", ["plane", "ball", "noise"])
@@ -95,4 +95,4 @@ def test_a_cloud_without_a_tunnel_is_refused(shape):
         points = rng.uniform(-10, 10, (60000, 3))
     cloud = thin(points)
     with pytest.raises(FitError):
-        fit_sections(cloud, fit_centreline(cloud.points, CentrelineConfig()))
+        fit_sections(cloud, axis_of(cloud))

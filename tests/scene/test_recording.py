@@ -76,6 +76,7 @@ def test_returns_move_with_the_sensor_during_a_sweep(tmp_path):
     rows[:, 1] = 10.0 * (rows[:, 0] - 100.0)
     trajectory = load_tum(write_tum(tmp_path / "t.tum", rows))
     with Recording(write_bag(tmp_path / "a.bag", [(100.0, points)])) as recording:
-        cloud, uncovered = register_scans(recording, trajectory, 0.01, Stages().start("", 1))
-    assert uncovered == 0
+        registered = register_scans(recording, trajectory, 0.01, Stages().start("", 1))
+    assert registered.uncovered == 0
+    cloud = registered.cloud
     np.testing.assert_allclose(cloud.points[:, 0] + cloud.origin[0], 10.0, atol=1e-4)

@@ -95,17 +95,18 @@ def test_a_registration_that_is_killed_ends_on_the_same_bits(bag, tmp_path, caps
     with Recording(bag) as recording:
         poses = estimate_odometry(recording, None, stage(), OdometryLog(Partial(None), "o")).trajectory
         poses = Trajectory(times, *poses.at(times), "poses")
-        whole, uncovered = register_scans(recording, poses, 0.02, stage())
+        whole = register_scans(recording, poses, 0.02, stage())
         kept = partial(tmp_path / "kept")
         with pytest.raises(Killed):
             register_scans(recording, poses, 0.02, stage(45), partial=kept)
         kept.close()
-        again, uncovered_again = register_scans(recording, poses, 0.02, stage(), partial=partial(tmp_path / "kept"))
+        again = register_scans(recording, poses, 0.02, stage(), partial=partial(tmp_path / "kept"))
     assert "Resumed at 72 % of scans" in capsys.readouterr().out
-    assert (again.returns, uncovered_again) == (whole.returns, uncovered)
-    assert uncovered == 3
+    assert (again.cloud.returns, again.uncovered) == (whole.cloud.returns, whole.uncovered)
+    assert whole.uncovered == 3
+    np.testing.assert_array_equal(again.low, whole.low)
     for name in ("points", "weights", "origin"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
+        np.testing.assert_array_equal(getattr(again.cloud, name), getattr(whole.cloud, name))
 
 
 def test_a_cloud_file_goes_on_behind_the_chunks_that_were_thinned(tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scene.output import write_geometry
+from scene.writing.folder import write_geometry
 from scene.writing.furniture import FurnitureConfig
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track

@@ -78,7 +78,8 @@ def test_returns_lie_on_the_truth_as_the_builder_reads_them(
 ) -> None:
     trajectory = load_trajectory(folder / f"groundtruth{suffix}.tum")
     error, facts = errors_of(folder / f"survey{suffix}.bag", trajectory, cast, 5)
-    assert (facts["topic"], facts["point_times"]) == (topic, convention)
+    assert facts["topic"] == topic
+    assert facts["point_times"].startswith(convention)
     close = abs(error) < 0.12
     assert len(error) > 20_000
     assert close.mean() > 0.997

@@ -11,16 +11,16 @@ from scene.bore import Bore
 from scene.cloud import Cloud
 from scene.fitting import rails as rails_seen
 from scene.fitting.assemble import bore_from_sections
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.section import fit_sections
 from scene.fitting.trackseen import SeenTrack, above_floor, find_track
 from scene.judging.trackdoubt import doubt_track
-from scene.output import write_geometry
+from scene.writing.folder import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, describe_track, lay_track, track_provenance
 from subterra_jax.b2.track import TrackError, read_scene_track
 from subterra_jax.tunnel.sources import load_tunnel
 from tests.scene import railway
+from tests.scene.fits import axis_of
 from tests.scene.railway import World, arch, thinned
 from tests.scene.shapes import PLACE
 
@@ -52,7 +52,7 @@ def scanned(name: str, sensor: str = "os1") -> tuple[Cloud, Bore]:
     else:
         rays = railway.os1() if sensor == "os1" else railway.vlp16()
         cloud = thinned(world.scan(rays, railway.carried(L, 1.4, 0.5), 0.012))
-    axis = fit_centreline(cloud.points, CentrelineConfig())
+    axis = axis_of(cloud)
     return cloud, bore_from_sections(axis, fit_sections(cloud, axis))
 
 

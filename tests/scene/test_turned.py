@@ -8,12 +8,12 @@ import pytest
 from scene.bore import POCKET, Bore
 from scene.fitting import pockets
 from scene.fitting.assemble import bore_from_sections
-from scene.fitting.centreline import CentrelineConfig, fit_centreline
 from scene.fitting.evidence import turned_more_than_chance
 from scene.fitting.lining import add_lining, pair_pockets
 from scene.fitting.section import Sections, fit_sections
 from scene.fitting.turned import find_ring
 from scene.fitting.unroll import Grid
+from tests.scene.fits import axis_of
 from tests.scene.test_reconstruction import thin
 
 RADIUS, LENGTH, RING, FIRST = 2.75, 24.0, 1.5, 0.4
@@ -52,7 +52,7 @@ def cloud_of(step: float, anywhere: bool = False) -> tuple[np.ndarray, np.ndarra
 def fitted(points: np.ndarray) -> tuple[Bore, Sections, np.ndarray]:
     """Smooth bore, sections, and origin of their frame, m."""
     cloud = thin(points)
-    axis = fit_centreline(cloud.points, CentrelineConfig(), cloud.origin)
+    axis = axis_of(cloud)
     sections = fit_sections(cloud, axis)
     return bore_from_sections(axis, sections), sections, np.asarray(cloud.origin)
 

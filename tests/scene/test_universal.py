@@ -17,7 +17,7 @@ from scene.writing.planar import ring_pitch
 from tests.scene.test_rings import survey_text
 from tests.shared import METRO, needs_metro
 
-UNIVERSAL = LiningConfig(kind="universal", seed=3)
+UNIVERSAL = LiningConfig(lay="standard", kind="universal", seed=3)
 
 
 def surveyed(text: str, folder) -> tuple[Bore, np.ndarray]:
@@ -115,7 +115,7 @@ def test_the_rings_of_the_metro_are_those_that_are_packaged():
     fit = fit_rings(read_ring_survey(detect(METRO).path))
     bore = bore_from_rings(fit, np.floor(np.median(fit.centre, axis=0)))
     joints = joints_by_number(fit.names, bore.ring_station)
-    made, _ = add_standard_lining(bore, LiningConfig(kind="universal"), False, joints)
+    made, _ = add_standard_lining(bore, LiningConfig(lay="standard", kind="universal"), False, joints)
     packaged = st.load_tunnel("metro").shell.linings["pockets"].pocket
     columns = [made.pocket[name] for name in ("station", "angle", "length", "width", "depth")]
     np.testing.assert_allclose(np.column_stack(columns), packaged, atol=1e-4)

@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 import trimesh
 
+from scene.build import reconstruct
 from scene.cleaning.crop import ExtentConfig, crop_cloud, parse_box
 from scene.cloud import Cloud
+from scene.config import ReconstructConfig
 from scene.errors import FitError, RecordingError
 from scene.progress import Stages
 from scene.reading.cloudfile import read_cloud
 from scene.reading.formats import ReadingConfig, detect
 from scene.reading.ringsurvey import read_ring_survey
-from scene.reconstruct import ReconstructConfig, Reconstruction, reconstruct
+from scene.reconstruction import Reconstruction
 from tests.scene.clouds import curved_d_bore
 from tests.scene.files import write_e57, write_las, write_parquet, write_ply, write_text
 

@@ -14,8 +14,8 @@ from benchmarks.slam import recordings
 from benchmarks.slam import run as libraries
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.recordings import SetConfig, plan_set
-from scene.output import write_geometry
 from scene.poses.trajectory import load_tum
+from scene.writing.folder import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.lidar3d.surface import read_scene

@@ -10,13 +10,15 @@ from mcap.reader import make_reader
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
 import subterra_jax as st
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.recorder import record
 from subterra_jax.recorder.__main__ import main
-from subterra_jax.recorder.messages import EPOCH, store
+from subterra_jax.recorder.messages import EPOCH, laser_scan, odometry, store
+from subterra_jax.recorder.trace import Poses
 
 TASK = "Subterra/StopAtShort-v1"
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -52,7 +54,9 @@ def test_rosbags_reads_what_the_agent_saw_and_did(config, trace, messages):
     assert set(messages) == TOPICS
     assert [len(messages[topic]) for topic in ("/scan", "/odom", "/tf", "/cmd_vel")] == [n + 1, n + 1, n + 1, n]
     ranges = np.array([message.ranges for _, message in messages["/scan"]])
-    np.testing.assert_array_equal(ranges, trace.observation[:, :16])
+    seen, (_, first) = trace.observation[:, :16], messages["/scan"][0]
+    np.testing.assert_array_equal(ranges, np.where(seen >= np.float32(first.range_max), np.inf, seen))
+    assert 0.0 < first.range_min <= np.min(ranges)
     told = np.array([(m.twist.linear.x, m.twist.angular.z) for _, m in messages["/cmd_vel"]])
     np.testing.assert_allclose(told, trace.command, rtol=1e-6)
     np.testing.assert_allclose([time for time, _ in messages["/scan"]], trace.time, atol=1e-6)
@@ -70,6 +74,23 @@ def test_the_reckoned_pose_drives_the_distance_that_the_odometer_counted(trace, 
     assert transform.transform.translation.x == pytest.approx(x[-1, 0])
     mounts = {part.child_frame_id: part.transform.translation.z for part in messages["/tf_static"][0][1].transforms}
     assert mounts == pytest.approx({"laser": 0.7, "imu": 0.7})
+
+
+def test_the_twist_of_the_odometry_is_in_the_frame_of_the_robot():
+    """A robot that heads north and drives ahead: its own x grows, whatever the world's."""
+    north = Rotation.from_euler("z", np.deg2rad([90.0, 95.0]))
+    poses = Poses(np.array([0.0, 0.5]), np.array([[1.0, 2.0, 0.0], [1.0, 2.5, 0.0]]), north)
+    twist = odometry(poses, 1, "odom").twist.twist
+    assert twist.linear.x == pytest.approx(1.0, abs=0.01)
+    assert abs(twist.linear.y) < 0.1
+    assert twist.angular.z == pytest.approx(np.deg2rad(10.0))
+
+
+@pytest.mark.parametrize(("reach", "reported"), [(29.9, 29.9), (30.0, np.inf), (0.01, -np.inf)])
+def test_a_beam_without_echo_and_one_too_near_are_no_distances(reach, reported):
+    scan = laser_scan(0.0, "laser", np.array([5.0, reach]), 30.0, 0.1)
+    assert scan.ranges[1] == pytest.approx(reported)
+    assert scan.range_min > 0.0
 
 
 def test_mcap_and_its_ros2_decoder_read_it_by_the_definitions_inside(config, trace, messages):

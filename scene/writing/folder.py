@@ -1,9 +1,8 @@
-"""From a reconstruction to its scene folder: geometry, manifest, preview cloud and poses."""
+"""The scene folder: geometry, manifest, report, preview cloud and poses."""
 
 import dataclasses
 import hashlib
 import json
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +12,13 @@ import trimesh
 
 from scene.bore import Bore
 from scene.cloud import thin_cloud
+from scene.config import BuildConfig
 from scene.errors import FitError
 from scene.fitting.lining import MEASURED, count_alone
-from scene.judging.judge import STATION, DoubtError, Judgement, JudgingConfig, judge_bore, require_trust
-from scene.judging.layers import doubt_layers
+from scene.judging.judge import STATION, Judgement
 from scene.judging.page import render_page
-from scene.judging.returns import TrackZone
-from scene.judging.sanity import doubt_bore
-from scene.judging.trackdoubt import doubt_track
 from scene.poses.trajectory import save_tum
-from scene.reconstruct import ReconstructConfig, Reconstruction
+from scene.reconstruction import Reconstruction
 from scene.resume import library_versions
 from scene.writing.furnished import furnish_bore, planar_segments
 from scene.writing.furniture import count_pieces
@@ -30,10 +26,37 @@ from scene.writing.mesh import as_trimesh, build_solid, open_lining
 from scene.writing.mjcf import SceneConfig, write_scene
 from scene.writing.planar import cut_walls, save_tunnel
 from scene.writing.shell import Variant, seams, shell_fields
-from scene.writing.track import Track, TrackConfig, describe_track, lay_track, track_provenance
+from scene.writing.track import Track, describe_track, track_provenance
 from subterra_jax.host.versions import VERSION
 
 SCENES = ("scene.xml", "scene_furnished.xml")
+MANIFEST_SCHEMA = "subterra.manifest/1"
+_LIBRARIES = (
+    "numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "small-gicp", "plyfile", "pypcd4", "laspy", "lazrs",
+    "pye57", "pyarrow", "openpyxl", "shapely",
+)  # fmt: skip
+_PREVIEW_VOXEL = 0.06  # m
+
+
+def write_folder(
+    folder: Path, name: str, result: Reconstruction, track: Track, judgement: Judgement, config: BuildConfig
+) -> None:
+    """Writes all parts of a scene folder and compiles both scenes; raises `FitError` where no scene can be made."""
+    count, furnished = write_geometry(folder, name, config.provenance, result.bore, track, config.scene)
+    content = _describe_scene(name, result, track, config.provenance, count, furnished)
+    content |= {"judgement": judgement.facts, "removed": [part.facts for part in result.removed]}
+    write_stations(folder / "stations.csv", judgement)
+    (folder / "build.html").write_text(render_page(name, result.bore, judgement, content), encoding="utf-8")
+    write_manifest(folder / "manifest.json", content, config)
+    if result.cloud is not None:
+        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
+    if result.odometry is not None:
+        save_tum(result.odometry, folder / "odometry.tum")
+    for scene in SCENES:
+        try:
+            mujoco.MjModel.from_xml_path(str(folder / scene))
+        except ValueError as error:
+            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
 
 
 def write_geometry(
@@ -82,13 +105,6 @@ def _pockets_without_nail(result: Reconstruction) -> dict[str, int]:
     return count_alone(result.bore, result.bore.ring_station if result.provenance["pockets"] == MEASURED else None)
 
 
-MANIFEST_SCHEMA = "subterra.manifest/1"
-_LIBRARIES = (
-    "numpy", "scipy", "trimesh", "manifold3d", "mujoco", "rosbags", "small-gicp", "plyfile", "pypcd4", "laspy", "lazrs",
-    "pye57", "pyarrow", "openpyxl", "shapely",
-)  # fmt: skip
-
-
 def write_manifest(path: Path, content: dict[str, Any], config: Any) -> None:
     """Writes the manifest with schema, config, library versions and the folder's hashes added; keys sorted."""
     whole = {
@@ -124,79 +140,6 @@ def _json_value(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-_PREVIEW_VOXEL = 0.06
-
-
-@dataclass(frozen=True)
-class BuildConfig:
-    """Everything a build depends on beside its input."""
-
-    name: str = ""  # Name of the tunnel; that of the output folder where not given.
-    date: str = ""  # Day that the manifest states; none by default, so that the same input gives the same bytes.
-    provenance: str = "measured"  # Kind of recording, such as `simulated` for a simulated survey.
-    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)  # Steps from the input to a bore.
-    track: TrackConfig = field(default_factory=TrackConfig)  # Standard by which the track is laid.
-    scene: SceneConfig = field(default_factory=SceneConfig)  # Cutting and dressing of the scene.
-    judging: JudgingConfig = field(default_factory=JudgingConfig)  # Limits of what a bore may leave unexplained.
-
-
-def judge_reconstruction(result: Reconstruction, track: Track, config: JudgingConfig) -> Judgement:
-    """Judges a bore with its track against all returns, and its sizes against those of tunnels."""
-    odd = doubt_bore(result.bore, result.facts, result.provenance, result.everything is not None)
-    odd += doubt_track(track, result.seen, result.facts.get("pose_doubt"))
-    odd += [] if result.cloud is None else doubt_layers(result.bore, result.cloud)
-    if result.everything is None:
-        judgement = Judgement(config.tolerance, ())
-    else:
-        spacing = float(result.facts.get("profile_spacing") or 0.0)
-        zone = _track_zone(track, result.bore)
-        judgement = judge_bore(result.bore, result.everything, config, zone, result.cause, result.removed, spacing)
-    warnings = sorted([*odd, *judgement.warnings], key=lambda warning: not warning.refuses)
-    return replace(judgement, warnings=tuple(warnings))
-
-
-def _track_zone(track: Track, bore: Bore) -> TrackZone | None:
-    """Return the space between the ends of the sleepers, up to the rails' tops; `None` without a track."""
-    if not track.lines:
-        return None
-    widest = max(float(np.abs(line.offset).max()) for line in track.lines) + track.config.sleeper_length / 2
-    top = np.max([line.seat + line.rail_height for line in track.lines], axis=0)
-    return TrackZone(widest, top - bore.position[:, 2])
-
-
-def write_scene_folder(folder: Path, name: str, result: Reconstruction, config: BuildConfig) -> Judgement:
-    """Judges the bore, writes the parts of a scene folder, and compiles the scene once.
-
-    Raises `DoubtError` where the judgement refuses the bore and `config.judging.force` is not set, and `FitError` where
-    no scene can be made of it.
-    """
-    bore = result.bore
-    track = lay_track(bore, config.track, result.seen)
-    judgement = judge_reconstruction(result, track, config.judging)
-    removed = [{**vars(part), "warning": part.warning} for part in result.removed]
-    try:
-        require_trust(judgement, config.judging.force)
-    except DoubtError as error:
-        shown = {"detected": result.facts, "removed": removed}
-        raise DoubtError(str(error), render_page(name, bore, judgement, shown)) from error
-    count, furnished = write_geometry(folder, name, config.provenance, bore, track, config.scene)
-    content = _describe_scene(name, result, track, config.provenance, count, furnished)
-    content |= {"judgement": judgement.facts, "removed": removed}
-    write_stations(folder / "stations.csv", judgement)
-    (folder / "build.html").write_text(render_page(name, bore, judgement, content), encoding="utf-8")
-    write_manifest(folder / "manifest.json", content, config)
-    if result.cloud is not None:
-        trimesh.PointCloud(thin_cloud(result.cloud, _PREVIEW_VOXEL)).export(folder / "cloud.ply")
-    if result.odometry is not None:
-        save_tum(result.odometry, folder / "odometry.tum")
-    for scene in SCENES:
-        try:
-            mujoco.MjModel.from_xml_path(str(folder / scene))
-        except ValueError as error:
-            raise FitError(f"{scene}: MuJoCo refuses the scene ({error})") from error
-    return judgement
-
-
 def _describe_scene(
     name: str, result: Reconstruction, track: Track, provenance: str, count: dict[str, int], furnished: dict[str, str]
 ) -> dict[str, Any]:
@@ -216,7 +159,7 @@ def _describe_scene(
         "name": name,
         "inputs": result.inputs,
         "input_provenance": provenance,
-        "frame": {"origin": result.origin, "up": "z", "length_unit": "m"},
+        "frame": {"origin": result.origin, "up": "z", "length_unit": "m", "crs": result.facts.get("crs")},
         "seeds": {},
         "detected": result.facts,
         "bore": {

@@ -1,0 +1,71 @@
+"""Settings of a build, and the refusal of those that no build can have."""
+
+import math
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
+
+from scene.cleaning.clean import CleaningConfig
+from scene.cleaning.crop import ExtentConfig
+from scene.fitting.centreline import CentrelineConfig
+from scene.fitting.lining import LiningConfig
+from scene.judging.judge import JudgingConfig
+from scene.reading.formats import ReadingConfig
+from scene.writing.mjcf import SceneConfig
+from scene.writing.track import TrackConfig
+from subterra_jax.host.errors import SubterraError
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Settings of the steps from an input to a bore."""
+
+    voxel: float = 0.04  # Thinning of the cloud, m.
+    reading: ReadingConfig = field(default_factory=ReadingConfig)  # What the user says instead of having it detected.
+    extent: ExtentConfig = field(default_factory=ExtentConfig)  # Part that is built, and how its stations count.
+    cleaning: CleaningConfig = field(default_factory=CleaningConfig)  # Search for what is not the bore.
+    centreline: CentrelineConfig = field(default_factory=CentrelineConfig)  # Search for the axis.
+    lining: LiningConfig = field(default_factory=LiningConfig)  # Lining by standard, where the survey can show none.
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """Everything a build depends on beside its input."""
+
+    name: str = ""  # Name of the tunnel; that of the output folder where not given.
+    date: str = ""  # Day that the manifest states; none by default, so that the same input gives the same bytes.
+    provenance: str = "measured"  # Kind of recording, such as `simulated` for a simulated survey.
+    reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)  # Steps from the input to a bore.
+    track: TrackConfig = field(default_factory=TrackConfig)  # Standard by which the track is laid.
+    scene: SceneConfig = field(default_factory=SceneConfig)  # Cutting and dressing of the scene.
+    judging: JudgingConfig = field(default_factory=JudgingConfig)  # Limits of what a bore may leave unexplained.
+
+
+class SettingError(SubterraError):
+    """A setting that no build can have."""
+
+
+_POSITIVE = ("spacing", "voxel", "cutoff", "gauge", "length", "width", "height", "diameter", "size")
+
+
+def check_settings(config: Any, prefix: str = "") -> None:
+    """Refuses numbers that are negative or not finite in a tree of dataclasses; some may not be 0 either.
+
+    `prefix` stands before the options' names. Raises `SettingError`, which names the option and its value.
+    """
+    for part in fields(config):
+        value, name = getattr(config, part.name), f"{prefix}{part.name.replace('_', '-')}"
+        if is_dataclass(value):
+            check_settings(value, f"{name}.")
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, (int, float)) and not isinstance(number, bool):
+                check_number(name, number)
+
+
+def check_number(name: str, value: float) -> None:
+    """Refuses a number that is negative or not finite; `name` tells whether it may be 0. Raises `SettingError`."""
+    if not math.isfinite(value):
+        raise SettingError(f"--{name} must be a finite number, got {value}")
+    if value < 0.0:
+        raise SettingError(f"--{name} must not be negative, got {value:g}")
+    if value == 0.0 and name.endswith(_POSITIVE):
+        raise SettingError(f"--{name} must be above 0, got {value:g}")

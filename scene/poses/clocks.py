@@ -1,0 +1,183 @@
+"""Offsets between clocks, by turn rates: those of the LiDAR, of an IMU beside it, and of a given trajectory.
+
+The size of a turn rate is the same for everything fixed to one body, whatever the mounts. So the clock of another
+instrument is off by the lag at which its turn rates agree best with those that the LiDAR's own sweeps show.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from scene.errors import RecordingError
+from scene.poses.imu import Inertial
+from scene.poses.odometry import MIN_POINTS, Guide, Tracker
+from scene.poses.trajectory import Trajectory
+from scene.reading.recording import Recording
+from scene.reading.times import Scan
+
+NOTICED = 0.010  # s; a smaller offset is within what turn rates tell
+_SWEEPS, _FEWEST, _PASSES = (
+    100,
+    40,
+    2,
+)  # that are matched one to the next; with fewer nothing is told; times that they are
+_POINTS = 8000  # of a sweep
+_REACH, _STEP = 1.5, 0.005  # s: largest lag that is tried, and between two lags
+_AGREE = 0.75  # correlation of turn rates from which a lag counts
+_BETTER = 0.05  # by which it must beat the correlation without a lag
+_LIVELY = 0.03  # rad/s of standard deviation; a carrier that turns more evenly tells no lag
+_OVERLAP = 0.5  # of the recording's time
+
+Turns = Callable[[Float[np.ndarray, " k"], Float[np.ndarray, " k"]], Float[np.ndarray, " k"]]
+
+
+@dataclass(frozen=True)
+class LidarTurns:
+    """Turn rates that sweeps show, one against the next."""
+
+    start: Float[np.ndarray, " k"]  # s
+    end: Float[np.ndarray, " k"]  # s
+    rate: Float[np.ndarray, " k"]  # rad/s
+
+
+def lidar_turns(recording: Recording) -> LidarTurns | None:
+    """Match sweeps about the middle of a recording one to the next, without any guide; `None` for too few.
+
+    Raises `RecordingError` where a scan is damaged.
+    """
+    first = max(recording.scan_count // 2 - _SWEEPS // 2, 0)
+    numbers = range(first, min(first + _SWEEPS, recording.scan_count))
+    scans = [_thinned(scan) for _, scan in recording.pick(numbers) if len(scan.points) >= MIN_POINTS]
+    if len(scans) < _FEWEST:
+        return None
+    guide = None
+    for _ in range(_PASSES):
+        tracker, times = Tracker(), list[float]()
+        for scan in scans:
+            middle = scan.stamp + 0.5 * float(scan.times.max(initial=0.0))
+            if not times or middle > times[-1]:
+                tracker.register(scan, middle, guide)
+                times.append(middle)
+        stack = np.stack(tracker.poses)
+        poses = Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), "sweeps")
+        guide = Guide(poses, True, np.inf, np.inf)  # a sweep is unwound by its own motion, not by that before it
+    at, turns = poses.times, poses.rotations
+    steps = (turns[:-1].inv() * turns[1:]).magnitude() / np.diff(at)
+    return LidarTurns(at[:-1], at[1:], steps)
+
+
+def _thinned(scan: Scan) -> Scan:
+    rows = np.linspace(0, len(scan.points) - 1, min(_POINTS, len(scan.points))).astype(np.intp)
+    return Scan(scan.stamp, scan.points[rows], scan.times[rows])
+
+
+def turns_of_gyro(inertial: Inertial) -> Turns:
+    """Return the mean turn rates of an IMU over intervals of its own clock, rad/s."""
+    step = 0.5 * (inertial.rate[1:] + inertial.rate[:-1]) * np.diff(inertial.times)[:, None]
+    total = np.vstack([np.zeros(3), np.cumsum(step, axis=0)])
+
+    def rates(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        angle = [np.stack([np.interp(at, inertial.times, column) for column in total.T], axis=1) for at in (start, end)]
+        return np.linalg.norm(angle[1] - angle[0], axis=1) / (end - start)
+
+    return rates
+
+
+def turns_of_poses(poses: Trajectory) -> Turns:
+    """Return the mean turn rates of a trajectory over intervals of its own clock, rad/s."""
+
+    def rates(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        return (poses.at(start)[1].inv() * poses.at(end)[1]).magnitude() / (end - start)
+
+    return rates
+
+
+def find_lag(lidar: LidarTurns, other: Turns) -> float | None:
+    """Return how much later the other clock shows the turns of the LiDAR, s; `None` where the turns do not tell."""
+    if lidar.rate.std() < _LIVELY:
+        return None
+    lags = np.arange(-round(_REACH / _STEP), round(_REACH / _STEP) + 1) * _STEP
+    agree = np.array([_correlate(lidar.rate, other(lidar.start + lag, lidar.end + lag)) for lag in lags])
+    best, none = int(np.argmax(agree)), len(lags) // 2
+    if agree[best] < _AGREE or best in (0, len(lags) - 1):
+        return None
+    if agree[best] < agree[none] + _BETTER * (1.0 - agree[none]):
+        return 0.0
+    before, here, after = agree[best - 1 : best + 2]
+    bend = before - 2.0 * here + after
+    return float(lags[best] + (0.5 * _STEP * (before - after) / bend if bend < 0 else 0.0))
+
+
+def _correlate(one: np.ndarray, other: np.ndarray) -> float:
+    one, other = one - one.mean(), other - other.mean()
+    size = float(np.linalg.norm(one) * np.linalg.norm(other))
+    return float(one @ other) / size if size > 1e-12 else 0.0
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What the turns tell of another clock."""
+
+    of: str  # Whose clock: a topic, or the trajectory
+    offset: float | None  # By which it is later than the LiDAR's, s; `None` where the turns do not tell
+    corrected: bool = False  # True where it was set right
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Entries for the manifest."""
+        known = {"clock_of": self.of, "clock_offset": self.offset, "clock_corrected": self.corrected}
+        return {**known, "clock_doubt": self.words}
+
+    @property
+    def words(self) -> str | None:
+        """Sentence for the user; `None` where nothing is wrong, or no longer."""
+        if self.offset is None or abs(self.offset) < NOTICED or self.corrected:
+            return None
+        side = "late" if self.offset > 0 else "early"
+        return (
+            f"the clock of {self.of} is {abs(self.offset):.3f} s {side} against the LiDAR's, as the turns of both "
+            "show; --clock auto sets it right"
+        )
+
+
+def settle_poses(recording: Recording, poses: Trajectory, auto: bool) -> tuple[Clock, Trajectory]:
+    """Return what the turns of sweeps and poses tell of their clocks, and the poses by the LiDAR's clock."""
+    lidar = lidar_turns(recording)
+    lag = None if lidar is None else find_lag(lidar, turns_of_poses(poses))
+    noticed = lag is not None and abs(lag) >= NOTICED
+    moved = replace(poses, times=poses.times - lag) if lag is not None and noticed else poses
+    return Clock("the trajectory", lag, noticed and auto), moved
+
+
+def settle_inertial(recording: Recording, inertial: Inertial, auto: bool) -> tuple[Clock, Inertial]:
+    """Return what the turns of sweeps and gyro tell of their clocks, and the samples by the LiDAR's clock where `auto`.
+
+    Raises `RecordingError` where the two share no time, and not `auto`.
+    """
+    apart = _apart(recording, inertial, auto)
+    moved = replace(inertial, times=inertial.times - apart) if apart else inertial
+    lidar = lidar_turns(recording)
+    lag = None if lidar is None else find_lag(lidar, turns_of_gyro(moved))
+    if lag is not None and abs(lag) >= NOTICED and auto:
+        moved = replace(moved, times=moved.times - lag)
+    offset = apart + lag if lag is not None else (apart or None)
+    return Clock(f"the IMU {inertial.topic}", offset, auto and moved is not inertial), moved
+
+
+def _apart(recording: Recording, inertial: Inertial, auto: bool) -> float:
+    """Return how far the beginnings of two clocks are apart that share no time, s; 0 where they do."""
+    begin, end = float(recording.stamps.min()), float(recording.stamps.max())
+    first, last = float(inertial.times[0]), float(inertial.times[-1])
+    if min(end, last) - max(begin, first) >= _OVERLAP * (end - begin):
+        return 0.0
+    if auto:
+        return first - begin
+    raise RecordingError(
+        f"{recording.path}: the IMU {inertial.topic} runs from {first:.2f} to {last:.2f} s, but the LiDAR "
+        f"{recording.topic} from {begin:.2f} to {end:.2f} s: their clocks are {first - begin:.6g} s apart; "
+        "--clock auto lays their beginnings on each other"
+    )

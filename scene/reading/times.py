@@ -1,0 +1,294 @@
+"""When each point of a sweep was measured: decided once for a recording, from all of its headers and spans.
+
+Drivers of LiDARs differ in the unit, the sign and the origin of their point times, and none of them says so. What a
+recording itself tells is enough: times that grow from sweep to sweep as the headers do are absolute, of the headers'
+clock or of another one; times that begin anew in each sweep count from the header, before it (VLP-16: its end) or after
+it (Ouster, Livox: its start). The growth, or the span of a sweep against the time between two headers, gives the unit.
+"""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, Float, Shaped
+
+TIME_FIELDS = ("t", "time", "offset_time", "timestamp", "time_stamp", "timestamps", "ts")
+STATIC = "none: every sweep is taken as static"
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_LONGEST_SWEEP = 2.0  # s
+_SAME_CLOCK = 10.0  # s between header and absolute point times
+_FIRST_EPOCH = 1e8  # s; times since 1970 are larger, and nothing older than 1973 is a recording
+_OVER_PERIOD, _UNSURE = 1.2, 5.0  # times the period: longest sweep; up to which a longer unit is not ruled out
+_LEAST_SWEEP = 0.005  # of the period: a shorter sweep makes the unit unsure
+_GROWS = 0.5  # of the span of a sweep, by which the times of the next one are later: they are absolute
+_EVEN = 0.02  # s of spread about one offset between two clocks; with more the headers rule
+_WIDE = 1.5  # times the usual span from the middle of a sweep: further is no time of that sweep
+MOST_BAD = 0.05  # share of all points without a time of their sweep
+_SAMPLE = 4000  # points of a sweep by which its span is told
+_CORE, _AROUND = (0.25, 0.75), 3.0  # quartiles; of their distance, how far from the middle a time of the sweep may lie
+_FLAG = tyro.conf.arg(prefix_name=False)
+
+
+@dataclass(frozen=True)
+class TimeConfig:
+    """What the user says of the times of points; nothing overrules it."""
+
+    # Unit of the times of points: s, ms, us or ns; none leaves them out, and every sweep is static.
+    time_unit: Annotated[Literal["s", "ms", "us", "ns", "none"] | None, _FLAG] = None
+    time_stamp: Annotated[Literal["start", "end"] | None, _FLAG] = None  # Part of a sweep that its header is of.
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A sweep in the sensor frame."""
+
+    stamp: float  # Time of the sweep, s
+    points: Float[np.ndarray, "n 3"]  # Returns at their own time, m
+    times: Float[np.ndarray, " n"]  # Time of each return after `stamp`, s
+
+
+@dataclass(frozen=True)
+class RawScan:
+    """A sweep as it is stored, less points that are no return."""
+
+    stamp: float  # Of its header, s
+    points: Float[np.ndarray, "n 3"]  # m
+    values: Shaped[np.ndarray, " n"] | None = None  # Time of each point as stored; `None` where there are none
+    name: str = ""  # Field of the times
+    unit: str | None = None  # Their unit, where the format says so
+    received: float = np.nan  # When it was recorded, s; NaN where nobody knows
+
+
+def make_scan(
+    stamp: float, points: Float[np.ndarray, "n 3"], values: Shaped[np.ndarray, " n"] | None, name: str = ""
+) -> RawScan:
+    """Return a sweep as a reader has it; points at the origin (nothing came back) and not finite ones are dropped.
+
+    Args:
+        stamp: Stamp of the message, s.
+        points: Points in the sensor frame, m.
+        values: Point times as stored, in whatever unit; `None` where there are none.
+        name: Name of their field.
+    """
+    good = np.isfinite(points).all(axis=1) & (points != 0).any(axis=1)
+    if values is None:
+        return RawScan(stamp, points[good])
+    if not np.issubdtype(values.dtype, np.integer):
+        values = values.astype(np.float64)
+        good &= np.isfinite(values)
+    return RawScan(stamp, points[good], values[good], name)
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Meaning of the point times of one recording."""
+
+    kind: Literal["static", "after", "same clock", "other clock"]
+    words: str  # For people, with the evidence
+    scale: float = 1.0  # s
+    span: float = _LONGEST_SWEEP  # Usual span of a sweep, s
+    reference: Literal["start", "end"] | None = None  # Part of a sweep that its header is of, where the user says so
+    offset: float = 0.0  # Of the headers' clock before the points', s
+    even: bool = True  # True where that offset is one; else each header tells its own
+    by_receipt: bool = False  # True where the headers say nothing and the time of recording stands for them
+
+    def apply(self, raw: RawScan) -> tuple[Scan, int]:
+        """Return the sweep with its returns in the order of time, and the number left out for want of a time."""
+        stamp = raw.received if self.by_receipt else raw.stamp
+        if raw.values is None or self.kind == "static":
+            return Scan(stamp, raw.points, np.zeros(len(raw.points))), 0
+        values, good = _unwrap(raw.values)
+        if not len(values):
+            return Scan(stamp, raw.points, np.zeros(0)), 0
+        middle = np.median(values[good])
+        good &= np.abs(values - middle) * self.scale <= _WIDE * self.span
+        points, values = raw.points[good], values[good]
+        start, times = self._place(stamp, values)
+        if (np.diff(times) < 0).any():
+            order = np.argsort(times, kind="stable")
+            points, times = points[order], times[order]
+        return Scan(start, points, times), int((~good).sum())
+
+    def _place(self, stamp: float, values: Float[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, " n"]]:
+        """Return the start of a sweep, s, and times after it, s."""
+        low = float(values.min())
+        if self.kind == "after":
+            times = values * self.scale
+            shift = min(low * self.scale, 0.0)
+            if self.reference is None or (self.reference == "start" and low >= 0):
+                return stamp + shift, times - shift
+            return stamp - (float(times.max()) if self.reference == "end" else 0.0), times - shift
+        times = (values - low) * self.scale
+        if self.kind == "same clock":
+            return low * self.scale, times
+        if self.even:
+            return low * self.scale + self.offset, times
+        return stamp - (float(times.max()) if self.reference == "end" else 0.0), times
+
+
+def _unwrap(values: Shaped[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return times as float64, and which are of the sweep: counters of 32 bits may pass their end within one.
+
+    A few values across that end are no sign of it: an underflow made them.
+    """
+    times, good = values.astype(np.float64), np.ones(len(values), bool)
+    if values.dtype.kind == "u" and values.dtype.itemsize == 4 and len(values):
+        ahead = times - np.median(times)
+        early, late = ahead < -(2.0**31), ahead > 2.0**31
+        if (early | late).mean() > MOST_BAD:
+            times = times + 2.0**32 * early - 2.0**32 * late
+        else:
+            good = ~(early | late)
+    return times, good
+
+
+@dataclass
+class Spans:
+    """What the headers and times of all sweeps say, gathered sweep by sweep."""
+
+    name: str = ""
+    unit: str | None = None
+    rows: list[tuple[float, float, float, float]] = field(default_factory=list)  # header, receipt, s; first, last value
+    timed: list[int] = field(default_factory=list)  # Number of each sweep with times, among all
+    count: int = 0  # Sweeps
+    points: int = 0  # In all of them
+
+    def add(self, raw: RawScan) -> None:
+        """Adds one sweep."""
+        low = high = np.nan
+        if raw.values is not None and len(raw.values):
+            values, good = _unwrap(raw.values[:: max(1, len(raw.values) // _SAMPLE)])
+            if good.any():
+                core = np.quantile(values[good], _CORE)
+                inside = values[good & (np.abs(values - core.mean()) <= _AROUND * np.ptp(core))]
+                low, high = float(inside.min()), float(inside.max())
+            self.name, self.unit = self.name or raw.name, self.unit or raw.unit
+            self.timed.append(self.count)
+        self.rows.append((raw.stamp, raw.received, low, high))
+        self.count += 1
+        self.points += len(raw.points)
+
+    def decide(self, told: TimeConfig) -> Convention:
+        """Return what the times mean; raises `ValueError` where they fit nothing, or two readings alike."""
+        table = np.array(self.rows).reshape(-1, 4)
+        by_receipt = _headers_repeat(table)
+        stamp = table[:, 1] if by_receipt else table[:, 0]
+        note = "; headers repeat, so the time of recording stands for them" if by_receipt else ""
+        if not self.timed or told.time_unit == "none":
+            return Convention("static", STATIC + note, by_receipt=by_receipt)
+        rows = np.array(self.timed)
+        stamp, low, high = stamp[rows], table[rows, 2], table[rows, 3]
+        span = float(np.nanmedian(high - low))
+        if span == 0.0 or np.mean(high == low) > 0.5:
+            which = "0 throughout" if not np.nanmax(np.abs(high)) else "one value in each sweep"
+            return Convention("static", f"`{self.name}` is {which}: every sweep is taken as static{note}",
+                              by_receipt=by_receipt)  # fmt: skip
+        period = _usual_step(stamp)
+        unit = told.time_unit or self.unit
+        if _is_absolute(stamp, low, span):
+            found = self._decide_absolute(stamp, low, span, period, unit, told)
+        else:
+            found = self._decide_relative(low, high, span, period, unit, told)
+        by = " (by flag)" if told.time_unit or told.time_stamp else ""
+        return Convention(**{**vars(found), "words": found.words + by + note, "by_receipt": by_receipt})
+
+    def _decide_relative(
+        self, low: np.ndarray, high: np.ndarray, span: float, period: float, unit: str | None, told: TimeConfig
+    ) -> Convention:
+        unit = unit or self._unit_of_span(span, float(np.nanmax(np.maximum(high, -low))), period)
+        scale = _UNITS[unit]
+        side = "after the stamp (its start)"
+        if float(np.nanmedian(-low)) > float(np.nanmedian(high)):
+            side = "before the stamp (its end)"
+        if told.time_stamp is not None:
+            side = f"from its start; the stamp is its {told.time_stamp}"
+        evidence = f"; sweeps of {span * scale:.3g} s" + (f", {period:.3g} s apart" if np.isfinite(period) else "")
+        words = f"`{self.name}`, {_shown(unit)} {side}{evidence}"
+        return Convention("after", words, scale, max(span * scale, 1e-9), told.time_stamp)
+
+    def _decide_absolute(
+        self, stamp: np.ndarray, low: np.ndarray, span: float, period: float, unit: str | None, told: TimeConfig
+    ) -> Convention:
+        if unit is None:
+            unit = self._unit_of_growth(stamp, low)
+        scale = _UNITS[unit]
+        ahead = stamp - low * scale
+        offset = float(np.nanmedian(ahead))
+        spread = float(np.nanmedian(np.abs(ahead - offset)))
+        length = f"sweeps of {span * scale:.3g} s"
+        if abs(offset) < _SAME_CLOCK and np.nanmedian(low) * scale > _FIRST_EPOCH and told.time_stamp is None:
+            words = f"`{self.name}`, absolute, {_shown(unit)}; {length}, {offset:+.3g} s from the headers"
+            return Convention("same clock", words, scale, span * scale)
+        even, reference = spread < _EVEN, told.time_stamp or "start"
+        rule = f"{offset:.9g} s behind the headers" if even else "each header tells when its sweep began"
+        words = (
+            f"`{self.name}`, absolute by another clock, {_shown(unit)}; {length}, {rule}; a header is taken for the "
+            f"{reference} of its sweep"
+        )
+        offset -= span * scale if reference == "end" else 0.0
+        return Convention("other clock", words, scale, span * scale, reference, offset, even)
+
+    def _unit_of_span(self, span: float, largest: float, period: float) -> str:
+        """Return the unit in which sweeps are as long as the time between two allows."""
+        longest = min(_OVER_PERIOD * period, _LONGEST_SWEEP) if np.isfinite(period) else _LONGEST_SWEEP
+        fits = [name for name, scale in _UNITS.items() if span * scale <= longest and largest * scale < 1e3]
+        if not fits:
+            raise ValueError(
+                f"is a sweep whose `{self.name}` spans {span:.3g}: at most {_LONGEST_SWEEP:g} s are possible, in "
+                "whatever unit; --time-unit none leaves the times out"
+            )
+        best = fits[0]
+        longer = list(_UNITS)[list(_UNITS).index(best) - 1] if best != "s" else None
+        share = span * _UNITS[best] / period if np.isfinite(period) else 1.0
+        if longer and share < _LEAST_SWEEP and span * _UNITS[longer] < _UNSURE * period:
+            raise ValueError(
+                f"has times in `{self.name}` that fit two readings: {_shown(longer)}, sweeps of "
+                f"{span * _UNITS[longer]:.3g} s, or {_shown(best)}, sweeps of {span * _UNITS[best]:.3g} s, "
+                f"{period:.3g} s apart; --time-unit says which"
+            )
+        return best
+
+    def _unit_of_growth(self, stamp: np.ndarray, low: np.ndarray) -> str:
+        """Return the unit in which the times grow as the headers do; of few sweeps, that which makes them times."""
+        steps = np.diff(stamp) > 0
+        if steps.any():
+            growth = float(np.nanmedian(np.diff(low)[steps] / np.diff(stamp)[steps]))
+            for name, scale in _UNITS.items():
+                if 0.5 < growth * scale < 2.0:
+                    return name
+            raise ValueError(
+                f"has times in `{self.name}` that grow by {growth:.3g} in a second of the headers: by no unit; "
+                "--time-unit says which, or none"
+            )
+        first, at = float(np.nanmedian(low)), float(np.nanmedian(stamp))
+        near = [name for name, scale in _UNITS.items() if abs(first * scale - at) < _SAME_CLOCK]
+        since = [name for name, scale in reversed(_UNITS.items()) if first * scale > _FIRST_EPOCH]
+        return (near + since + ["s"])[0]
+
+
+def _headers_repeat(table: Float[np.ndarray, "n 4"]) -> bool:
+    """Return whether most headers have the time of the one before, though they were recorded one after another."""
+    if len(table) < 3 or not np.isfinite(table[:, 1]).all():
+        return False
+    return bool(np.mean(np.diff(table[:, 0]) == 0) > 0.5 and np.mean(np.diff(table[:, 1]) > 0) > 0.9)
+
+
+def _usual_step(stamp: Float[np.ndarray, " n"]) -> float:
+    """Return the usual time between two headers, s; NaN for fewer than three."""
+    steps = np.diff(stamp)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) > 1 else np.nan
+
+
+def _is_absolute(stamp: np.ndarray, low: np.ndarray, span: float) -> bool:
+    """Return whether times go on from sweep to sweep; of a single sweep, whether they are far above their span."""
+    if len(low) > 1:
+        return bool(np.nanmedian(np.diff(low)) > _GROWS * span)
+    scales = np.array(list(_UNITS.values()))
+    near = (np.abs(low[0] * scales - stamp[0]) < _SAME_CLOCK) & (low[0] * scales > _FIRST_EPOCH)
+    return bool(near.any() or low[0] > _FIRST_EPOCH)
+
+
+def _shown(unit: str) -> str:
+    return "µs" if unit == "us" else unit

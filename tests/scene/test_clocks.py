@@ -1,0 +1,86 @@
+"""Clocks that differ are found by the turns of one body, and set right on request."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scene.errors import RecordingError
+from scene.judging.codes import Code
+from scene.judging.sanity import doubt_bore
+from scene.poses.clocks import NOTICED, Clock, LidarTurns, find_lag, settle_inertial, turns_of_gyro, turns_of_poses
+from scene.poses.imu import Inertial
+from scene.poses.trajectory import Trajectory
+
+AT = np.arange(0.0, 30.0, 0.005)
+
+
+def attitude(time: np.ndarray) -> Rotation:
+    """A walker who sways about three axes, never twice alike."""
+    waves = [(0.07, 0.9, 0.0), (0.05, 1.3, 1.0), (0.10, 0.21, 2.0)]
+    return Rotation.from_euler("xyz", np.column_stack([a * np.sin(2 * np.pi * f * time + p) for a, f, p in waves]))
+
+
+def gyro(late: float, mount: Rotation) -> Inertial:
+    """Rates in the axes of an IMU whose clock is late."""
+    turns = (attitude(AT - 0.0025).inv() * attitude(AT + 0.0025)).as_rotvec() / 0.005
+    return Inertial(AT + late, mount.apply(turns), np.tile([0.0, 0.0, 9.8], (len(AT), 1)), "/imu")
+
+
+@pytest.fixture(scope="module")
+def lidar() -> LidarTurns:
+    middle = np.arange(8.0, 18.0, 0.1)
+    turns = attitude(middle)
+    rate = (turns[:-1].inv() * turns[1:]).magnitude() / 0.1
+    noise = np.random.default_rng(0).normal(0, 0.02, len(rate))
+    return LidarTurns(middle[:-1], middle[1:], rate + noise)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.02, 0.1, -0.1, 0.7, -1.2])
+def test_a_lag_is_found_whatever_the_mount(lidar, late):
+    mount = Rotation.from_euler("zyx", [130.0, -20.0, 70.0], degrees=True)
+    assert find_lag(lidar, turns_of_gyro(gyro(late, mount))) == pytest.approx(late, abs=0.6 * NOTICED)
+    poses = Trajectory(AT + late, np.zeros((len(AT), 3)), attitude(AT) * mount, "poses")
+    assert find_lag(lidar, turns_of_poses(poses)) == pytest.approx(late, abs=0.6 * NOTICED)
+
+
+def test_turns_of_another_drive_and_none_at_all_tell_nothing(lidar):
+    other = Trajectory(AT, np.zeros((len(AT), 3)), attitude(0.61 * AT + 500.0), "poses")
+    assert find_lag(lidar, turns_of_poses(other)) is None
+    even = LidarTurns(lidar.start, lidar.end, np.full(len(lidar.start), 0.2))
+    assert find_lag(even, turns_of_gyro(gyro(0.1, Rotation.identity()))) is None
+
+
+class Beside:
+    """A recording of the same drive, as far as its clock counts."""
+
+    path, topic, scan_count, stamps = "a.bag", "/points", 0, np.array([0.0, 30.0])
+
+    def pick(self, numbers):
+        return iter(())
+
+
+def test_clocks_years_apart_are_named_and_laid_on_each_other_on_request():
+    late = gyro(-2e8, Rotation.identity())
+    with pytest.raises(RecordingError, match=r"their clocks are -2e\+08 s apart; --clock auto"):
+        settle_inertial(Beside(), late, False)
+    clock, moved = settle_inertial(Beside(), late, True)
+    assert clock.corrected
+    assert clock.words is None
+    np.testing.assert_allclose(moved.times, AT, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("clock", "said"),
+    [
+        (Clock("the IMU /imu", 0.1), "the clock of the IMU /imu is 0.100 s late against the LiDAR's"),
+        (Clock("the trajectory", -0.05), "is 0.050 s early"),
+        (Clock("the trajectory", 0.1, True), None),
+        (Clock("the trajectory", 0.004), None),
+        (Clock("the trajectory", None), None),
+    ],
+)
+def test_a_clock_that_is_off_is_warned_of_by_its_own_code(bore, clock, said):
+    found = doubt_bore(bore, {"unit": "m", "axes": "xyz", **clock.facts}, {}, surveyed=True)
+    assert [warning.code for warning in found] == ([Code.CLOCK] if said else [])
+    assert said is None or said in found[0].text
+    assert said is None or "--clock auto" in found[0].text

@@ -1,0 +1,120 @@
+"""Every convention of point times is read as the same drive, or refused for its true reason."""
+
+import numpy as np
+import pytest
+
+from scene.errors import RecordingError
+from scene.reading.recording import Recording
+from scene.reading.times import Scan, TimeConfig
+from tests.scene.conventions import sweeps, write_convention
+from tests.scene.messages import pointcloud2, write_bag1
+
+BOOTS = {"320 s": 320.0, "1500 s": 1500.0, "30000 s": 3e4, "5 s": 5.0}
+
+
+def read(path, **told) -> tuple[list[Scan], dict]:
+    with Recording(path, times=TimeConfig(**told)) as recording:
+        return list(recording.scans()), recording.facts
+
+
+def agree(scans: list[Scan], late: float = 0.0) -> None:
+    """As they were written: each start, each time, each point."""
+    assert len(scans) == 12
+    for scan, (start, points, offset) in zip(scans, sweeps(12), strict=True):
+        assert scan.stamp == pytest.approx(start + late, abs=2e-4)
+        assert len(scan.points) > 0.9 * len(points)
+        index = np.array([np.flatnonzero((points == point).all(axis=1))[0] for point in scan.points[::37]])
+        np.testing.assert_allclose(scan.times[::37], offset[index], atol=2e-4)
+
+
+CONVENTIONS = {
+    "s after the start": ({}, "`timestamp`, s after the stamp (its start)"),
+    "float ms": ({"unit": "ms"}, "`timestamp`, ms after the stamp"),
+    "float µs": ({"unit": "us"}, "`timestamp`, µs after the stamp"),
+    "whole µs": ({"unit": "us", "kind": "u4"}, "`timestamp`, µs after the stamp"),
+    "whole ns": ({"unit": "ns", "kind": "u4"}, "`timestamp`, ns after the stamp"),
+    "s before the end": ({"reference": "end"}, "`timestamp`, s before the stamp (its end)"),
+    "ms before the end": ({"reference": "end", "unit": "ms", "kind": "f4"}, "`timestamp`, ms before the stamp"),
+    "epoch s": ({"reference": "epoch"}, "`timestamp`, absolute, s"),
+    "epoch ns": ({"reference": "epoch", "unit": "ns"}, "`timestamp`, absolute, ns"),
+    "epoch µs": ({"reference": "epoch", "unit": "us"}, "`timestamp`, absolute, µs"),
+    **{f"s since boot, {name}": ({"reference": "boot", "boot": at}, "by another clock, s")
+       for name, at in BOOTS.items()},
+    **{f"float ns since boot, {name}": ({"reference": "boot", "boot": at, "unit": "ns"}, "by another clock, ns")
+       for name, at in BOOTS.items()},
+    "ns since boot in 32 bits, wrapped": (
+        {"reference": "boot", "boot": 320.0, "unit": "ns", "kind": "u4", "wrap": True}, "by another clock, ns"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_a_convention_is_decided_once_and_said(tmp_path, name):
+    how, said = CONVENTIONS[name]
+    scans, facts = read(write_convention(tmp_path / "a.bag", **how))
+    assert said in facts["point_times"]
+    assert "sweeps of 0.098 s" in facts["point_times"]
+    assert "points_without_time" not in facts
+    agree(scans)
+
+
+@pytest.mark.parametrize(("kind", "unit"), [("u4", "ns"), ("f8", "s"), ("f8", "us")])
+def test_a_few_bad_times_are_left_out_and_counted(tmp_path, kind, unit):
+    scans, facts = read(write_convention(tmp_path / "a.bag", kind=kind, unit=unit, bad=0.01))
+    agree(scans)
+    missing = sum(len(points) for _, points, _ in sweeps(12)) - sum(len(scan.points) for scan in scans)
+    assert facts["points_without_time"] == missing > 0
+
+
+def test_many_bad_times_are_refused_with_their_share(tmp_path):
+    bag = write_convention(tmp_path / "a.bag", bad=0.07, count=40)
+    with pytest.raises(RecordingError, match=r"a\.bag: [678]% of the points of /points"):
+        read(bag)
+
+
+def test_one_value_a_sweep_says_nothing_and_the_headers_rule(tmp_path):
+    scans, facts = read(write_convention(tmp_path / "a.bag", reference="constant"))
+    assert facts["point_times"] == "`timestamp` is one value in each sweep: every sweep is taken as static"
+    assert [scan.stamp for scan in scans] == pytest.approx([start for start, _, _ in sweeps(12)])
+    assert not any(scan.times.any() for scan in scans)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_what_the_user_says_of_the_unit_is_never_detected_away(tmp_path, unit):
+    scans, facts = read(write_convention(tmp_path / "a.bag", unit="ms"), time_unit=unit)
+    assert "(by flag)" in facts["point_times"]
+    scale = {"s": 1e3, "ms": 1.0, "us": 1e-3, "ns": 1e-6}[unit]
+    assert scans[3].times.max() == pytest.approx(0.098 * scale)
+
+
+def test_what_the_user_says_of_the_stamp_moves_the_sweeps(tmp_path):
+    after = write_convention(tmp_path / "a.bag")
+    agree(read(after, time_stamp="start")[0])
+    agree(read(after, time_stamp="end")[0], late=-0.098)
+    boot = write_convention(tmp_path / "b.bag", reference="boot", boot=320.0)
+    agree(read(boot, time_stamp="end")[0], late=-0.098)
+    scans, _ = read(boot, time_unit="none")
+    assert not any(scan.times.any() for scan in scans)
+
+
+def test_times_that_fit_two_units_are_asked_for(tmp_path):
+    """Sweeps of 0.25 ms, 0.1 s apart, or of 0.25 s, which overlap: neither is likely."""
+    rows = sweeps(12)
+    fields = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("time", "f4", 12)]
+    raw = [
+        (start, pointcloud2(start, fields, 16, {**dict(zip("xyz", points.T, strict=True)), "time": 2.5 * offset}))
+        for start, points, offset in rows
+    ]
+    bag = write_bag1(tmp_path / "a.bag", {"/points": raw})
+    with pytest.raises(RecordingError, match=r"scan 0 of /points has times in `time` that fit two readings: s, .* ms"):
+        read(bag)
+    assert read(bag, time_unit="s")[0][0].times.max() == pytest.approx(0.245, abs=1e-3)
+
+
+def test_times_that_grow_by_no_unit_are_refused(tmp_path):
+    fields = [("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("time", "f8", 16)]
+    raw = [
+        (start, pointcloud2(start, fields, 24, {**dict(zip("xyz", points.T, strict=True)), "time": 30 * (k + offset)}))
+        for k, (start, points, offset) in enumerate(sweeps(12))
+    ]
+    with pytest.raises(RecordingError, match=r"grow by 300 in a second of the headers: by no unit"):
+        read(write_bag1(tmp_path / "a.bag", {"/points": raw}))
