@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
+from scipy.stats import rankdata
 
 from scene.errors import RecordingError
 from scene.poses.imu import Inertial
@@ -25,9 +26,10 @@ _SWEEPS, _FEWEST, _PASSES = (
     40,
     2,
 )  # that are matched one to the next; with fewer nothing is told; times that they are
-_POINTS = 8000  # of a sweep
+_POINTS = 20_000  # of a sweep
+_WARM_UP = 8  # sweeps that are left out: the map is too thin for them
 _REACH, _STEP = 1.5, 0.005  # s: largest lag that is tried, and between two lags
-_AGREE = 0.75  # correlation of turn rates from which a lag counts
+_AGREE = 0.65  # correlation of turn rates from which a lag counts
 _BETTER = 0.05  # by which it must beat the correlation without a lag
 _LIVELY = 0.03  # rad/s of standard deviation; a carrier that turns more evenly tells no lag
 _OVERLAP = 0.5  # of the recording's time
@@ -65,7 +67,7 @@ def lidar_turns(recording: Recording) -> LidarTurns | None:
         stack = np.stack(tracker.poses)
         poses = Trajectory(np.array(times), stack[:, :3, 3], Rotation.from_matrix(stack[:, :3, :3]), "sweeps")
         guide = Guide(poses, True, np.inf, np.inf)  # a sweep is unwound by its own motion, not by that before it
-    at, turns = poses.times, poses.rotations
+    at, turns = poses.times[_WARM_UP:], poses.rotations[_WARM_UP:]
     steps = (turns[:-1].inv() * turns[1:]).magnitude() / np.diff(at)
     return LidarTurns(at[:-1], at[1:], steps)
 
@@ -113,7 +115,8 @@ def find_lag(lidar: LidarTurns, other: Turns) -> float | None:
 
 
 def _correlate(one: np.ndarray, other: np.ndarray) -> float:
-    one, other = one - one.mean(), other - other.mean()
+    """Return the correlation of the ranks: a sweep that was matched wrongly counts no more than another."""
+    one, other = (ranks - ranks.mean() for ranks in (rankdata(one), rankdata(other)))
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(one @ other) / size if size > 1e-12 else 0.0
 
@@ -146,8 +149,7 @@ class Clock:
 
 def settle_poses(recording: Recording, poses: Trajectory, auto: bool) -> tuple[Clock, Trajectory]:
     """Return what the turns of sweeps and poses tell of their clocks, and the poses by the LiDAR's clock."""
-    lidar = lidar_turns(recording)
-    lag = None if lidar is None else find_lag(lidar, turns_of_poses(poses))
+    lag = _lag(recording, turns_of_poses(poses))
     noticed = lag is not None and abs(lag) >= NOTICED
     moved = replace(poses, times=poses.times - lag) if lag is not None and noticed else poses
     return Clock("the trajectory", lag, noticed and auto), moved
@@ -160,12 +162,30 @@ def settle_inertial(recording: Recording, inertial: Inertial, auto: bool) -> tup
     """
     apart = _apart(recording, inertial, auto)
     moved = replace(inertial, times=inertial.times - apart) if apart else inertial
-    lidar = lidar_turns(recording)
-    lag = None if lidar is None else find_lag(lidar, turns_of_gyro(moved))
+    lag = _lag(recording, turns_of_gyro(moved))
     if lag is not None and abs(lag) >= NOTICED and auto:
         moved = replace(moved, times=moved.times - lag)
     offset = apart + lag if lag is not None else (apart or None)
     return Clock(f"the IMU {inertial.topic}", offset, auto and moved is not inertial), moved
+
+
+def _lag(recording: Recording, other: Turns) -> float | None:
+    """Return the lag of another clock, s; `None` where the turns do not tell.
+
+    Where nothing told whether a header is of the start or the end of its sweep, and the other clock is early by the
+    length of a sweep, the headers are of the end.
+    """
+    lidar = lidar_turns(recording)
+    lag = None if lidar is None else find_lag(lidar, other)
+    if lag is None:
+        return None
+    times = recording.convention
+    if not times.guessed or times.span < 2 * NOTICED or abs(lag + times.span) > 3 * NOTICED:
+        return lag
+    recording.take_end()
+    print(f"point times {recording.facts['point_times']}", flush=True)
+    lidar = lidar_turns(recording)
+    return None if lidar is None else find_lag(lidar, other)
 
 
 def _apart(recording: Recording, inertial: Inertial, auto: bool) -> float:

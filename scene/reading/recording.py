@@ -1,7 +1,7 @@
 """Any recording as a stream of timed scans."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -121,6 +121,12 @@ class Recording:
             raise RecordingError(f"{self.path}: scan {first} of {self.topic} {error}") from error
         self.facts["point_times"] = found.words
         return found
+
+    def take_end(self) -> None:
+        """Take each header for the end of its sweep from now on, as another clock has shown."""
+        found = self._spans.decide(replace(self._told, time_stamp="end"), "as the turns of another clock show")
+        self.__dict__["convention"] = found
+        self.facts["point_times"] = found.words
 
     def scans(self, after: ReadPosition = START) -> Iterator[Scan]:
         """Yields the scans in the order of the recording, from the position `after` on.

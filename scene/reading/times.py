@@ -89,6 +89,7 @@ class Convention:
     scale: float = 1.0  # s
     span: float = _LONGEST_SWEEP  # Usual span of a sweep, s
     reference: Literal["start", "end"] | None = None  # Part of a sweep that its header is of, where the user says so
+    guessed: bool = False  # True where nothing tells whether a header is of the start or the end of its sweep
     offset: float = 0.0  # Of the headers' clock before the points', s
     even: bool = True  # True where that offset is one; else each header tells its own
     by_receipt: bool = False  # True where the headers say nothing and the time of recording stands for them
@@ -169,8 +170,11 @@ class Spans:
         self.count += 1
         self.points += len(raw.points)
 
-    def decide(self, told: TimeConfig) -> Convention:
-        """Return what the times mean; raises `ValueError` where they fit nothing, or two readings alike."""
+    def decide(self, told: TimeConfig, why: str = "by flag") -> Convention:
+        """Return what the times mean; raises `ValueError` where they fit nothing, or two readings alike.
+
+        `why` says where `told` is from.
+        """
         table = np.array(self.rows).reshape(-1, 4)
         by_receipt = _headers_repeat(table)
         stamp = table[:, 1] if by_receipt else table[:, 0]
@@ -190,7 +194,7 @@ class Spans:
             found = self._decide_absolute(stamp, low, span, period, unit, told)
         else:
             found = self._decide_relative(low, high, span, period, unit, told)
-        by = " (by flag)" if told.time_unit or told.time_stamp else ""
+        by = f" ({why})" if told.time_unit or told.time_stamp else ""
         return Convention(**{**vars(found), "words": found.words + by + note, "by_receipt": by_receipt})
 
     def _decide_relative(
@@ -198,14 +202,14 @@ class Spans:
     ) -> Convention:
         unit = unit or self._unit_of_span(span, float(np.nanmax(np.maximum(high, -low))), period)
         scale = _UNITS[unit]
-        side = "after the stamp (its start)"
+        side, guessed = "after the stamp (its start)", self.unit is None and told.time_stamp is None
         if float(np.nanmedian(-low)) > float(np.nanmedian(high)):
-            side = "before the stamp (its end)"
+            side, guessed = "before the stamp (its end)", False
         if told.time_stamp is not None:
             side = f"from its start; the stamp is its {told.time_stamp}"
         evidence = f"; sweeps of {span * scale:.3g} s" + (f", {period:.3g} s apart" if np.isfinite(period) else "")
         words = f"`{self.name}`, {_shown(unit)} {side}{evidence}"
-        return Convention("after", words, scale, max(span * scale, 1e-9), told.time_stamp)
+        return Convention("after", words, scale, max(span * scale, 1e-9), told.time_stamp, guessed)
 
     def _decide_absolute(
         self, stamp: np.ndarray, low: np.ndarray, span: float, period: float, unit: str | None, told: TimeConfig
@@ -227,7 +231,8 @@ class Spans:
             f"{reference} of its sweep"
         )
         offset -= span * scale if reference == "end" else 0.0
-        return Convention("other clock", words, scale, span * scale, reference, offset, even)
+        guessed = told.time_stamp is None
+        return Convention("other clock", words, scale, span * scale, reference, guessed, offset, even)
 
     def _unit_of_span(self, span: float, largest: float, period: float) -> str:
         """Return the unit in which sweeps are as long as the time between two allows."""

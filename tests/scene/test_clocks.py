@@ -7,9 +7,11 @@ from scipy.spatial.transform import Rotation
 from scene.errors import RecordingError
 from scene.judging.codes import Code
 from scene.judging.sanity import doubt_bore
+from scene.poses import clocks
 from scene.poses.clocks import NOTICED, Clock, LidarTurns, find_lag, settle_inertial, turns_of_gyro, turns_of_poses
 from scene.poses.imu import Inertial
 from scene.poses.trajectory import Trajectory
+from scene.reading.times import Convention
 
 AT = np.arange(0.0, 30.0, 0.005)
 
@@ -84,3 +86,30 @@ def test_a_clock_that_is_off_is_warned_of_by_its_own_code(bore, clock, said):
     assert [warning.code for warning in found] == ([Code.CLOCK] if said else [])
     assert said is None or said in found[0].text
     assert said is None or "--clock auto" in found[0].text
+
+
+@pytest.mark.parametrize(("guessed", "ended"), [(True, True), (False, False)])
+def test_headers_at_the_end_of_their_sweeps_are_told_by_the_turns_where_nothing_else_tells(
+    lidar, monkeypatch, guessed, ended
+):
+    """Sweeps of 0.1 s whose headers are of their end, and were taken for their start."""
+
+    class Late(Beside):
+        late = 0.1
+        convention = Convention("after", "", span=0.1, guessed=guessed)
+
+        def __init__(self) -> None:
+            self.facts = {"point_times": "as it was"}
+
+        def take_end(self) -> None:
+            self.late, self.convention = 0.0, Convention("after", "", span=0.1)
+
+    def shifted(recording):
+        return LidarTurns(lidar.start + recording.late, lidar.end + recording.late, lidar.rate)
+
+    monkeypatch.setattr(clocks, "lidar_turns", shifted)
+    recording, poses = Late(), Trajectory(AT, np.zeros((len(AT), 3)), attitude(AT), "poses")
+    clock, _ = clocks.settle_poses(recording, poses, False)
+    assert (recording.late == 0.0) == ended
+    assert clock.offset == pytest.approx(0.0 if ended else -0.1, abs=0.006)
+    assert (clock.words is None) == ended
