@@ -115,8 +115,8 @@ def lay_track(bore: Bore, config: TrackConfig, seen: SeenTrack | None = None) ->
 
     Rails and sleepers that the survey shows are taken as they lie, and stand out as far as they do; without `seen` all
     is by standard. Each sleeper is checked against the wall at its level on both sides: one that would come nearer than
-    the margin is left out between rails that the survey shows, whose sleepers are not as long as the standard's; without
-    such rails it raises `FitError`.
+    the margin is left out between rails that the survey shows, whose sleepers are not as long as the standard's;
+    without such rails it raises `FitError`.
     """
     half_width = config.sleeper_length / 2 + config.shoulder
     floor = bore.position[:, 2] - _radius_down(bore) * bore.up[:, 2]

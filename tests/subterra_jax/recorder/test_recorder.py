@@ -78,7 +78,7 @@ def test_the_reckoned_pose_drives_the_distance_that_the_odometer_counted(trace, 
 
 def test_the_twist_of_the_odometry_is_in_the_frame_of_the_robot():
     """A robot that heads north and drives ahead: its own x grows, whatever the world's."""
-    north = Rotation.from_euler("z", np.deg2rad([90.0, 95.0]))
+    north = Rotation.from_euler("z", np.deg2rad([[90.0], [95.0]]))
     poses = Poses(np.array([0.0, 0.5]), np.array([[1.0, 2.0, 0.0], [1.0, 2.5, 0.0]]), north)
     twist = odometry(poses, 1, "odom").twist.twist
     assert twist.linear.x == pytest.approx(1.0, abs=0.01)
