@@ -22,7 +22,10 @@ from subterra_jax.procedural import kinds
 from tests.test_extend import FILES, forget
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted((ROOT / "docs" / "guide").glob("*.md")), ROOT / "docs" / "results.md"]
+PAGES = [
+    *sorted((ROOT / "docs" / "guide").glob("*.md")),
+    *(ROOT / "docs" / f"{name}.md" for name in ("index", "tasks", "results")),
+]
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 YAML = re.compile(r"```yaml\n(.*?)```", re.DOTALL)
