@@ -14,6 +14,7 @@ import subterra_jax as st
 from scene.build import build
 from scene.config import BuildConfig, ReconstructConfig
 from scene.fitting.lining import LiningConfig
+from scene.writing.track import TrackConfig
 from subterra_jax.lidar import reference
 from subterra_jax.parts import Noise
 from tests.scene.clouds import curved_d_bore
@@ -101,7 +102,9 @@ def metro_rings(folder: Path, first: int, last: int) -> Path:
 @needs_metro
 def test_the_environment_runs_in_a_window_of_the_real_metro(tmp_path):
     # A third of its rings, and without what stands there by standard: that takes a while and changes no wall.
-    bare = BuildConfig(reconstruct=ReconstructConfig(lining=LiningConfig(lay="none")))
+    bare = BuildConfig(
+        reconstruct=ReconstructConfig(lining=LiningConfig(lay="none")), track=TrackConfig(lay="standard")
+    )
     build(metro_rings(tmp_path / "survey", 400, 700), tmp_path / "metro", config=bare)
     window = st.load_tunnel(tmp_path / "metro" / "tunnel.npz").slice(30.0, 351.0)
     assert window.length == pytest.approx(351.0, abs=0.3)
