@@ -53,7 +53,7 @@ class Agent(Protocol):
     by a line in its body, `uses_lidar = True`; any other class may be an agent if it has these four and both methods.
 
     Attributes:
-        name: Name on the leaderboard.
+        name: Name on the board.
     """
 
     name: str

@@ -7,26 +7,25 @@ or how slippery the rail of an episode is. Nothing else of the truth is read.
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from flax import struct
+from jaxtyping import PRNGKeyArray
 
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.cloud import commanded_cloud, log_weights, move, resample, summarise, weigh_odometer
+from subterra_jax.baselines.cloud import Cloud, commanded_cloud, log_weights, move, weigh_odometer
 from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.histogram import HistogramLocaliser
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import FilterMemory, ParticleLocaliser, Relocaliser
-from subterra_jax.baselines.reckoning import Reckoning, reckon, unobserved_distance
+from subterra_jax.baselines.reckoning import Reckoning, reckon
 from subterra_jax.baselines.scanmodel import ScanModel, fit
-from subterra_jax.baselines.stations import Driven, Station
+from subterra_jax.baselines.stations import Driven
 from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.parts.faults import MAX_DELAY, N_SEVERITIES
 from subterra_jax.state import EnvParams
 
 NAME = "ceiling"
-_LEAST_SIGMA = 0.01  # m
 _DENSE_LEAST, _DENSE_DUE = (
     0.02,
     0.3,
@@ -44,29 +43,24 @@ class ExactLocaliser(ParticleLocaliser):
     privileged = True
     exact: ExactParams = struct.field(default_factory=ExactParams)
 
-    def update(
-        self, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
-    ) -> tuple[Station, FilterMemory]:
-        """Advances by dead reckoning and a scan, and resamples where few particles are left."""
-        move_key, draw_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), 1 + memory.step))
+    def advance(
+        self, key: PRNGKeyArray, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
+    ) -> tuple[Cloud, Reckoning]:
+        """Moves the particles with the episode's own sizes of faults, and weighs them by odometer and scan."""
         walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
         before = with_known_delay(memory.reckoning, params, known)
         # The odometer's noise of each step would otherwise be noise of the motion: it is weighed apart.
         motion, apart = self.motion, self.motion.odometer is not None
         distance, turn, reckoning = reckon(before, obs, driven.speed, 0.0 if apart else self.odometer_share, period)
         read = obs.distance - memory.reckoning.distance
-        told, heard = weigh_odometer(memory.cloud, distance, read, turn, motion) if apart else (memory.cloud, 0.0)
+        learnt, heard = weigh_odometer(memory.cloud, distance, read, turn, motion) if apart else (memory.cloud, 0.0)
         if known is not None and "fault_wet_loss" in known:
             motion = dataclasses.replace(motion, slip_loss=params.faults.wet_loss * known["fault_wet_loss"])
-        cloud = move(move_key, told, walls, distance, turn, motion)
+        cloud = move(key, learnt, walls, distance, turn, motion)
         _, pose = fit(walls, cloud.pose, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan)
         cloud = dataclasses.replace(cloud, pose=pose)
-        cloud = log_weights(cloud, heard + exact_likelihood(walls, pose, obs.ranges, params, self.exact), motion)
-        summary = summarise(cloud, motion)
-        station = summary.station + unobserved_distance(reckoning, period) * jnp.cos(summary.heading)
-        direction = jnp.where(jnp.cos(summary.heading) > 0.0, 1.0, -1.0)
-        estimate = Station(station, jnp.log(jnp.maximum(summary.sigma, _LEAST_SIGMA)), direction)
-        return estimate, FilterMemory(resample(draw_key, cloud, motion), reckoning, memory.step + 1)
+        gain = heard + exact_likelihood(walls, pose, obs.ranges, params, self.exact)
+        return log_weights(cloud, gain, motion), reckoning
 
 
 def with_known_delay(before: Reckoning, params: EnvParams, known: Known) -> Reckoning:

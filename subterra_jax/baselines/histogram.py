@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed, range_sigma
 from subterra_jax.baselines.avoidance import steering_of
+from subterra_jax.baselines.bayes import diffuse, neighbours, normalised
 from subterra_jax.baselines.cloud import cloud_params, move_pose
 from subterra_jax.baselines.exactscan import ExactParams, exact_likelihood
 from subterra_jax.baselines.navigator import Navigator
@@ -191,7 +192,7 @@ class HistogramLocaliser(Localiser):
         pose = move_pose(walls, self._poses(memory), distance, turn)
         _, pose = fit(walls, dataclasses.replace(pose, station=self._stations(now)), obs.ranges, range_max, self.scan)
         log_mass = jnp.log(mass) + self._score(walls, pose, obs, params)[:, None, :]
-        log_mass = _normalised(log_mass)
+        log_mass = normalised(log_mass, _FLOOR)
         now = dataclasses.replace(now, log_mass=log_mass, lateral=pose.lateral, heading=pose.heading)
         return self._estimate(now, reckoning, params), now
 
@@ -217,7 +218,7 @@ class HistogramLocaliser(Localiser):
         heading = jnp.broadcast_to(jnp.asarray((0.0, np.pi), jnp.float32)[:ways, None], log_mass.shape)
         zero = jnp.zeros(())
         memory = HistogramMemory(
-            log_mass=_normalised(log_mass[:, None, :] + rows[:, None]),
+            log_mass=normalised(log_mass[:, None, :] + rows[:, None], _FLOOR),
             lateral=jnp.zeros_like(heading),
             heading=heading,
             origin=origin,
@@ -239,14 +240,14 @@ class HistogramLocaliser(Localiser):
         """Slides each row of errors by its share of a step, and spreads what the step adds to errors and way."""
         noise, size = self.noise, jnp.abs(along)
         change = 2.0 * noise.wander.sigma**2 / noise.wander.length * size / (_scales()[1] - _scales()[0]) ** 2
-        mass = _spread(mass, jnp.minimum(change, 0.5), axis=1)
+        mass = diffuse(mass, jnp.minimum(change, 0.5), axis=1)
         sign = jnp.asarray((1.0, -1.0))[: mass.shape[0], None, None]
         shift = sign * jnp.asarray(_scales())[:, None] * along / self.cell
         before, after = jnp.maximum(shift, 0.0), jnp.maximum(-shift, 0.0)
-        wide = jnp.pad(mass, ((0, 0), (0, 0), (1, 1)), mode="edge")
-        mass = (1.0 - before - after) * mass + before * wide[..., :-2] + after * wide[..., 2:]
+        low, high = neighbours(mass)
+        mass = (1.0 - before - after) * mass + before * low + after * high
         share = jnp.where(size > 0.0, jnp.minimum((noise.step_sigma / self.cell) ** 2, 0.5), 0.0)
-        return jnp.maximum(_spread(mass, share, axis=2), np.float32(np.exp(_FLOOR)))
+        return jnp.maximum(diffuse(mass, share), np.float32(np.exp(_FLOOR)))
 
     def _score(self, walls: WallMap, pose: TunnelPose, obs: Observed, params: EnvParams) -> Float[Array, "ways n"]:
         """Computes the log likelihood of a scan in every cell."""
@@ -267,19 +268,6 @@ class HistogramLocaliser(Localiser):
 def _scales() -> np.ndarray:
     """Relative errors of the rows, 1."""
     return np.linspace(-MOST_SCALE, MOST_SCALE, N_SCALES, dtype=np.float32)
-
-
-def _spread(mass: Float[Array, "a b c"], variance: Float[Array, ""], axis: int) -> Float[Array, "a b c"]:
-    """Spreads mass over neighbours by a variance in squares of a cell, at most 0.5."""
-    pads = [(1, 1) if i == axis else (0, 0) for i in range(mass.ndim)]
-    wide = jnp.pad(mass, pads, mode="edge")
-    low, high = (jax.lax.slice_in_dim(wide, first, first + mass.shape[axis], axis=axis) for first in (0, 2))
-    return mass + 0.5 * variance * (low + high - 2.0 * mass)
-
-
-def _normalised(log_mass: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Scales a belief to a sum of 1, with no cell below the floor."""
-    return jnp.maximum(log_mass - jax.scipy.special.logsumexp(log_mass), _FLOOR)
 
 
 def histogram_filter(params: EnvParams, exact: ExactParams | None = None) -> Navigator | Relocaliser:

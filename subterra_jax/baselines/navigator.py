@@ -136,7 +136,7 @@ class Navigator:
     Attributes:
         localiser: Estimates the station.
         steering: Keeps between the walls.
-        name: Name on the leaderboard.
+        name: Name on the board.
         uses_map: The localiser needs the map.
     """
 

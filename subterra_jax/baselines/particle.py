@@ -99,17 +99,25 @@ class ParticleLocaliser(Localiser):
         self, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
     ) -> tuple[Station, FilterMemory]:
         """Advances by dead reckoning and a scan, and resamples where few particles are left."""
-        del known
         move_key, draw_key = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), 1 + memory.step))
-        walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
-        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
-        cloud = move(move_key, memory.cloud, walls, distance, turn, self.motion)
-        cloud = weigh(cloud, walls, obs.ranges, jnp.asarray(params.lidar.range_max), self.scan, self.motion)
+        cloud, reckoning = self.advance(move_key, memory, obs, driven, params, known)
         summary = summarise(cloud, self.motion)
-        station = summary.station + unobserved_distance(reckoning, period) * jnp.cos(summary.heading)
+        unobserved = unobserved_distance(reckoning, jnp.asarray(params.vehicle.period))
+        station = summary.station + unobserved * jnp.cos(summary.heading)
         direction = jnp.where(jnp.cos(summary.heading) > 0.0, 1.0, -1.0)
         estimate = Station(station, jnp.log(jnp.maximum(summary.sigma, _LEAST_SIGMA)), direction)
         return estimate, FilterMemory(resample(draw_key, cloud, self.motion), reckoning, memory.step + 1)
+
+    def advance(
+        self, key: PRNGKeyArray, memory: FilterMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
+    ) -> tuple[Cloud, Reckoning]:
+        """Moves the particles by dead reckoning and weighs them by a scan; returns them and the dead reckoning."""
+        del known
+        walls, period = self.walls.pick(params.tunnel), jnp.asarray(params.vehicle.period)
+        distance, turn, reckoning = reckon(memory.reckoning, obs, driven.speed, self.odometer_share, period)
+        cloud = move(key, memory.cloud, walls, distance, turn, self.motion)
+        range_max = jnp.asarray(params.lidar.range_max)
+        return weigh(cloud, walls, obs.ranges, range_max, self.scan, self.motion), reckoning
 
 
 def particle_filter(params: EnvParams, n_particles: int | None = None) -> Navigator:

@@ -18,17 +18,15 @@ from subterra_jax.baselines.histogram import histogram_filter
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.particle import particle_agent
 from subterra_jax.baselines.rings.grid import ring_filter
-from subterra_jax.baselines.rings.loop import RingCount
 from subterra_jax.baselines.scanmatch import scan_matching
-from subterra_jax.baselines.stations import CommandCount, OdometerCount, Truth
-from subterra_jax.baselines.steering import CentreLine, HeadingHold, Pursuit
+from subterra_jax.baselines.stations import OdometerCount, Truth
+from subterra_jax.baselines.steering import CentreLine
 from subterra_jax.compiled import in_32_bits
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.state import EnvParams
 
 Factory = Callable[[EnvParams], Agent]
 
-DEAD_RECKONING, CEILING = "dead-reckoning", "oracle"
 _FACTORIES: dict[str, Factory] = {}
 
 
@@ -63,7 +61,7 @@ def register(name: str, factory: Factory) -> None:
     """Adds an agent: a trained policy, a filter, a replayed trajectory.
 
     Args:
-        name: Name on the leaderboard and the command line.
+        name: Name on the board and the command line.
         factory: Makes the agent from a task's params, its map for instance.
 
     Raises:
@@ -91,20 +89,15 @@ def make_agent(name: str, params: EnvParams) -> Agent:
     return _FACTORIES[name](params)
 
 
-def _navigator(name: str, localiser: Any, steering: Any) -> None:
-    register(name, lambda params: Navigator(localiser, steering_of(params, steering), name=name))
+def _navigator(name: str, localiser: Any) -> None:
+    register(name, lambda params: Navigator(localiser, steering_of(params, CentreLine()), name=name))
 
 
 register("random", lambda params: Random())
-_navigator("blind-forward", CommandCount(), HeadingHold(gain=0.0))
-_navigator("heading-hold", OdometerCount(), HeadingHold())
-_navigator("command-integrator", CommandCount(), CentreLine())
-_navigator("pure-pursuit", OdometerCount(), Pursuit())
-_navigator(DEAD_RECKONING, OdometerCount(), CentreLine())
-_navigator("fused", FusedCount(), CentreLine())
-_navigator("ring-count", RingCount(), CentreLine())
+_navigator("dead-reckoning", OdometerCount())
+_navigator("fused", FusedCount())
 register("ring-filter", ring_filter)
-_navigator(CEILING, Truth(), CentreLine())
+_navigator("oracle", Truth())
 register("scan-matching", scan_matching)
 register("particle-filter", particle_agent)
 register(HISTOGRAM, histogram_filter)

@@ -1,4 +1,4 @@
-"""Estimates of the station by dead reckoning: from commands, from the odometer, or the truth; and their errors."""
+"""Estimates of the station from the odometer or the truth, their errors, and the sizes of the task's errors."""
 
 from typing import Any, Protocol
 
@@ -37,12 +37,6 @@ def wander_variance(distance: Float[Array, ""], wander: WanderParams | None) -> 
     length = jnp.asarray(wander.length)
     rest = distance + length * jnp.expm1(-distance / length)
     return 2.0 * wander.sigma * wander.sigma * length * jnp.maximum(rest, 0.0)
-
-
-def command_sigma(distance: Float[Array, ""], params: EnvParams) -> Float[Array, ""]:
-    """Compute the standard deviation of a distance counted from commands, m."""
-    slip = slip_sizes(params)
-    return jnp.sqrt((slip.gain_sigma * distance) ** 2 + wander_variance(distance, slip.wander))
 
 
 def odometry_sigma(distance: Float[Array, ""], steps: Float[Array, ""], params: EnvParams) -> Float[Array, ""]:
@@ -159,19 +153,6 @@ class _Summed(Localiser):
         """Begins at the believed start."""
         zero = jnp.zeros(())
         return Count(*believed_start(obs, params), zero, zero, obs.distance)
-
-
-@struct.dataclass
-class CommandCount(_Summed):
-    """Sums the commands. In a task without slip this is a perfect odometer."""
-
-    def update(
-        self, memory: Count, obs: Observed, driven: Driven, params: EnvParams, known: Known
-    ) -> tuple[Station, Count]:
-        """Adds the command."""
-        del known
-        memory = _add_step(memory, driven.speed * params.vehicle.period, driven, obs.distance)
-        return _station(memory, command_sigma(memory.distance, params), driven), memory
 
 
 @struct.dataclass

@@ -1,4 +1,4 @@
-"""Finds the walls in a scan and steers along them: centre line, pure pursuit, heading hold, and a limit of speed."""
+"""Finds the walls in a scan and steers along the middle between them, with a limit of speed."""
 
 import dataclasses
 from typing import Any, Protocol
@@ -169,84 +169,6 @@ class CentreLine(Steering):
     def turn_round(self, memory: Corridor) -> Corridor:
         """Swaps left and right."""
         return mirror_walls(memory)
-
-
-@struct.dataclass
-class Pursuit(Steering):
-    """Pure pursuit of a point midway between the walls, from one scan alone.
-
-    Attributes:
-        beam: Number of the beam on either side whose two hits the point lies between; 1 is the first to the left of
-            straight ahead, and 2 of 16 points 45° to the side.
-
-    Source: Coulter 1992, Implementation of the Pure Pursuit Path Tracking Algorithm.
-    """
-
-    beam: int = struct.field(pytree_node=False, default=2)
-
-    def begin(self, obs: Observed, params: EnvParams) -> Float[Array, "2"]:
-        """Returns the point in the first scan."""
-        return self.look(jnp.zeros(2), obs, jnp.zeros(2), params)
-
-    def look(
-        self, memory: Float[Array, "2"], obs: Observed, command: Float[Array, "2"], params: EnvParams
-    ) -> Float[Array, "2"]:
-        """Returns the point in this scan, ahead and to the left, m."""
-        del memory, command, params
-        bearing = float(bearings(obs.ranges.shape[0])[self.beam])
-        left, right = obs.ranges[self.beam], obs.ranges[-self.beam]
-        return 0.5 * jnp.stack([(left + right) * jnp.cos(bearing), (left - right) * jnp.sin(bearing)])
-
-    def cosine(self, memory: Float[Array, "2"]) -> Float[Array, ""]:
-        """Returns 1: it assumes a heading along the axis."""
-        return jnp.ones_like(memory[0])
-
-    def steer(self, memory: Float[Array, "2"], speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Follows the circle through the point."""
-        del params
-        square = memory[0] * memory[0] + memory[1] * memory[1]
-        return jnp.stack([speed, 2.0 * jnp.maximum(speed, 0.1) * memory[1] / jnp.maximum(square, 0.01)])
-
-    def turn_round(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Returns the memory unchanged; the next scan replaces it."""
-        return memory
-
-
-@struct.dataclass
-class HeadingHold(Steering):
-    """Holds the heading of the start by the odometer, without LiDAR.
-
-    Attributes:
-        gain: Yaw rate for an angle, 1/s; 0 drives straight on and ignores the odometer.
-    """
-
-    uses_lidar = False
-    gain: float = 2.0
-
-    def begin(self, obs: Observed, params: EnvParams) -> Float[Array, "2"]:
-        """Returns the heading read and the heading to hold, rad."""
-        del params
-        return jnp.stack([obs.heading, obs.heading])
-
-    def look(
-        self, memory: Float[Array, "2"], obs: Observed, command: Float[Array, "2"], params: EnvParams
-    ) -> Float[Array, "2"]:
-        """Reads the heading."""
-        del command, params
-        return jnp.stack([obs.heading, memory[1]])
-
-    def cosine(self, memory: Float[Array, "2"]) -> Float[Array, ""]:
-        """Returns 1: it assumes a heading along the axis."""
-        return jnp.ones_like(memory[0])
-
-    def steer(self, memory: Float[Array, "2"], speed: Float[Array, ""], params: EnvParams) -> Float[Array, "2"]:
-        """Steers back to the heading to hold."""
-        del params
-        return jnp.stack([speed, -self.gain * wrap(memory[0] - memory[1])])
-
-    def turn_round(self, memory: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Holds the opposite heading from now on."""
-        return jnp.stack([memory[0], wrap(memory[1] + jnp.pi)])
 
 
 @struct.dataclass

@@ -161,6 +161,6 @@ def test_over_the_whole_list_knowing_the_truth_is_all_that_is_missing(task, leas
 @pytest.mark.slow
 def test_dead_reckoning_knows_how_well_it_knows():
     env, params = st.make("Subterra/StopAt-v1", tunnel="subterra-351")
-    for name in ("command-integrator", "dead-reckoning", "fused"):
+    for name in ("dead-reckoning", "fused"):
         records = evaluate(env, params, make_agent(name, params), listed_episodes(env, params))
         assert 0.85 < records.nees.mean() < 1.15, name

@@ -31,9 +31,7 @@ pytestmark = pytest.mark.door
 TASK, DRIVEN = "Subterra/StopAtShort-v1", "Subterra/TraverseShort-v1"
 SHORT = "TraverseShort-v1"
 FEW = ("random", "fused")
-LONG = tuple(
-    pytest.param(name, marks=pytest.mark.slow) for name in ("oracle", "ring-count", "ring-filter", "particle-filter")
-)
+LONG = tuple(pytest.param(name, marks=pytest.mark.slow) for name in ("oracle", "ring-filter", "particle-filter"))
 MINE = """
 from flax import struct
 import jax.numpy as jnp
@@ -242,7 +240,7 @@ def test_board_recorder_and_viewer_drive_with_each_of_them(places):
         ("policy:nobody", TASK, PolicyError, r"nobody: no such policy; released are"),
         ("empty", TASK, PolicyError, r"empty: holds no policy.safetensors; release it again"),
         ("nobody", None, AgentError, r"no agent 'nobody'; there are random, .*; or policy:NAME"),
-        ("ring-count", None, PolicyError, r"ring-count: drives any task, so name one"),
+        ("ring-filter", None, PolicyError, r"ring-filter: drives any task, so name one"),
         (
             "TraverseShort-v1",
             TASK,

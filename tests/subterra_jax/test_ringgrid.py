@@ -10,7 +10,7 @@ from subterra_jax.baselines.reckoning import StepDistances
 from subterra_jax.baselines.registry import make_agent
 from subterra_jax.baselines.rings import grid as ringgrid
 from subterra_jax.baselines.rings import loop as rings
-from subterra_jax.baselines.steering import HeadingHold, PacedSteering, PaceMemory
+from subterra_jax.baselines.steering import CentreLine, Corridor, PacedSteering, PaceMemory
 from subterra_jax.evaluation import evaluate, listed_episodes
 from tests.subterra_jax.ringscans import N_BEAMS, PITCH, scans
 
@@ -129,11 +129,11 @@ def test_the_agent_drives_slowly_where_it_learns_and_faster_where_it_counts():
     params = st.make("Subterra/Faulted-v1")[1]
     steering = make_agent("ring-filter", params).steering
     assert isinstance(steering, PacedSteering)
-    blind = PacedSteering(HeadingHold(), steering.cruise, steering.slow, steering.learning)
+    blind = PacedSteering(CentreLine(), steering.cruise, steering.slow, steering.learning)
 
     @jax.jit
     def speed(driven, wanted):
-        return blind.steer(PaceMemory(jnp.zeros(2), driven), wanted, params)[0]
+        return blind.steer(PaceMemory(Corridor(*jnp.asarray([2.8, 2.8, 0.0])), driven), wanted, params)[0]
 
     found = [float(speed(driven, wanted)) for driven, wanted in ((1.0, 2.0), (20.0, 2.0), (20.0, 0.1))]
     assert found == pytest.approx([steering.slow, steering.cruise, 0.1])

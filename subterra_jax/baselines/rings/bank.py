@@ -9,6 +9,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
 
+from subterra_jax.baselines.bayes import diffuse
 from subterra_jax.baselines.rings.walls import Bumps, height_variance
 
 HARMONICS = 4  # pockets are 0.2 m long and 0.4 m apart; a fifth harmonic adds more noise than information
@@ -74,10 +75,7 @@ def predict(
     dry, wet = belief[..., 0, :], _shift(belief[..., 1, :], lost)
     wetting, drying = wetting[..., None], drying[..., None]
     mixed = jnp.stack([dry + drying * wet - wetting * dry, wet + wetting * dry - drying * wet], axis=-2)
-    zero = jnp.zeros_like(mixed[..., :1])
-    ahead = jnp.concatenate([mixed[..., 1:], zero], axis=-1)
-    behind = jnp.concatenate([zero, mixed[..., :-1]], axis=-1)
-    return mixed + 0.5 * blur[..., None, None] * (ahead + behind - 2.0 * mixed)
+    return diffuse(mixed, blur[..., None, None], beyond="constant")
 
 
 def correct(belief: Belief, log_likelihood: Float[Array, "*batch phases"]) -> tuple[Belief, Float[Array, "*batch"]]:

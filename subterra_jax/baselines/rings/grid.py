@@ -1,6 +1,6 @@
 """Counting rings through faults, without a map: a bank of Bayes filters of error and grip, with learnt patterns.
 
-The loop of `loop` follows dead reckoning that is wrong by some percent. On wet rail 30 % of the speed is lost while
+Dead reckoning is wrong by some percent. On wet rail 30 % of the speed is lost while
 wheels and odometer turn as before, beams drop out or end in dust, and observations are late. Here the error of dead
 reckoning is a belief on a grid with two modes, dry and wet rail (`bank`). The walls are tracked past unusable beams
 (`walls`). The delay shows when the robot sets off (`reckoning`).
@@ -8,8 +8,6 @@ reckoning is a belief on a grid with two modes, dry and wet rail (`bank`). The w
 Before a pattern is known, wet rail cannot be distinguished from dry, and a pattern learnt then stays wrong. Therefore
 there are two filters, one that begins on dry rail and one that begins on wet rail. The one whose pattern fits the scans
 better is used. Neither the severity of an episode nor the position of wet rail is known to them.
-
-Measured: `docs/measurements.md`.
 """
 
 import dataclasses
@@ -22,7 +20,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.baselines.agent import Known, Observed
 from subterra_jax.baselines.avoidance import steering_of
-from subterra_jax.baselines.fused import FusedCount
+from subterra_jax.baselines.fused import Belief, FusedCount
 from subterra_jax.baselines.navigator import Navigator
 from subterra_jax.baselines.reckoning import (
     Delay,
@@ -33,9 +31,8 @@ from subterra_jax.baselines.reckoning import (
     seems_still,
 )
 from subterra_jax.baselines.rings import bank
-from subterra_jax.baselines.rings.loop import RingMemory, begin_memory
 from subterra_jax.baselines.rings.walls import Bumps, Walls, begin_walls, track_walls
-from subterra_jax.baselines.stations import Driven, Localiser, Station, fault_sizes
+from subterra_jax.baselines.stations import Driven, Localiser, Station, believed_start, fault_sizes
 from subterra_jax.baselines.steering import CentreLine, PacedSteering
 from subterra_jax.parts.faults import FaultParams
 from subterra_jax.state import EnvParams
@@ -237,6 +234,21 @@ def _rate(rate: Array, drive: _Drive, news: Array) -> Array:
 
 
 @struct.dataclass
+class RingMemory:
+    """Memory of the ring filter.
+
+    Attributes:
+        start: Believed station of the start, m, and its standard deviation.
+        track: The rings.
+        reckoning: Estimate by commands and odometry.
+    """
+
+    start: Float[Array, "2"]
+    track: GridTrack
+    reckoning: Belief
+
+
+@struct.dataclass
 class RingFilter(Localiser):
     """Counts rings where the walls have any, on wet rail too, and falls back on commands and odometry elsewhere.
 
@@ -248,7 +260,8 @@ class RingFilter(Localiser):
 
     def begin(self, obs: Observed, params: EnvParams) -> RingMemory:
         """Begins at the believed start."""
-        return begin_memory(start((), obs.ranges.shape[-1], self.wet), obs, params)
+        believed = jnp.stack([jnp.asarray(value, jnp.float32) for value in believed_start(obs, params)])
+        return RingMemory(believed, start((), obs.ranges.shape[-1], self.wet), FusedCount().begin(obs, params))
 
     def update(
         self, memory: RingMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known

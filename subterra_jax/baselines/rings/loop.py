@@ -4,24 +4,16 @@ The walls repeat with every ring. Their relief in a scan is compared with the pa
 harmonics of the ring's pitch for each wall. A pattern seen early or late by a few centimetres shows the error of dead
 reckoning. That error grows slowly, so no ring is ever skipped or counted twice. The pattern is learnt on the way,
 from the start, whose station is known.
-
-Measured on the family's test split: `docs/measurements.md`.
 """
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from subterra_jax.baselines import stations
-from subterra_jax.baselines.agent import Known, Observed
-from subterra_jax.baselines.fused import Belief, FusedCount
 from subterra_jax.baselines.reckoning import ODOMETER_SHARE
 from subterra_jax.baselines.rings.walls import fit_careful, fit_plain, side_beams
-from subterra_jax.baselines.stations import Driven, Localiser, Station
-from subterra_jax.state import EnvParams
 
 HARMONICS = 4  # pockets are 0.2 m long and 0.4 m apart; a fifth harmonic adds more noise than information
 _GAIN, _RATE_GAIN = 0.12, 0.006  # of the loop, per `_STEP`
@@ -33,7 +25,6 @@ _CLEAR = 1.3, 3.0  # noise threshold, in units of what an average leaves of it, 
 _GIVE_UP = 0.02  # share of the correction lost per `_STEP` without a pattern
 _SETTLING = 2.0  # m after the start in which the usual relief is learnt faster
 _RATE_MOST = 0.1
-_LOCKED = 0.15  # standard deviation with a clear pattern, m; median error 0.1 m on the family's test split
 
 
 @struct.dataclass
@@ -178,48 +169,3 @@ def _innovation(
     least, steep = _CLEAR
     strength = jnp.clip(steep * (power - least * left_over) / (power + 1e-9), 0.0, 1.0)
     return radians * pitch / (2.0 * jnp.pi), strength
-
-
-@struct.dataclass
-class RingMemory:
-    """Memory of a ring counter.
-
-    Attributes:
-        start: Believed station of the start, m, and its standard deviation.
-        track: The rings: a `RingTrack`, or the track of another counter.
-        reckoning: Estimate by commands and odometry.
-    """
-
-    start: Float[Array, "2"]
-    track: Any
-    reckoning: Belief
-
-
-def begin_memory(track: Any, obs: Observed, params: EnvParams) -> RingMemory:
-    """Return the memory at the believed start."""
-    start = jnp.stack([jnp.asarray(value, jnp.float32) for value in stations.believed_start(obs, params)])
-    return RingMemory(start, track, FusedCount().begin(obs, params))
-
-
-@struct.dataclass
-class RingCount(Localiser):
-    """Counts rings where the walls have any, and falls back on commands and odometry elsewhere."""
-
-    def begin(self, obs: Observed, params: EnvParams) -> RingMemory:
-        """Begins at the believed start."""
-        return begin_memory(start((), obs.ranges.shape[-1]), obs, params)
-
-    def update(
-        self, memory: RingMemory, obs: Observed, driven: Driven, params: EnvParams, known: Known
-    ) -> tuple[Station, RingMemory]:
-        """Advances by dead reckoning and a scan."""
-        fused, reckoning = FusedCount().update(memory.reckoning, obs, driven, params, known)
-        # The raw step: that of the filter contains the fix of its own error at the flag.
-        commanded = driven.speed * params.vehicle.period
-        moved = driven.cosine * fuse_distances(commanded, obs.distance - memory.reckoning.reading)
-        pitch = jnp.asarray(obs.ring_pitch)
-        track = advance(memory.track, obs.ranges, moved, driven.direction, pitch, careful=True)
-        lost = jnp.exp(fused.log_sigma)
-        sigma = jnp.hypot(track.strength * _LOCKED + (1.0 - track.strength) * lost, memory.start[1])
-        estimate = Station(memory.start[0] + track.station, jnp.log(sigma), driven.direction)
-        return estimate, dataclasses.replace(memory, track=track, reckoning=reckoning)

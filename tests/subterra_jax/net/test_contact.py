@@ -37,7 +37,7 @@ def blocked(plan_of):
     return plan_of(arrays | {"furniture_smooth": across, "furniture_pockets": across})
 
 
-@pytest.mark.parametrize("name", ["command-integrator"])
+@pytest.mark.parametrize("name", ["dead-reckoning"])
 def test_neither_evaluation_nor_viewer_counts_coverage_in_contact_as_success(blocked, name):
     env, params = st.make("Subterra/Traverse-v1", tunnel=blocked, lining="smooth")
     one = np.zeros(4, np.int32)

@@ -18,7 +18,7 @@ from subterra_jax.viewer import library
 from subterra_jax.viewer.driving import drive
 from tests.subterra_jax import tunnels
 
-_NAMES = {"tunnel": "t", "tunnel_sha256": "0", "lining": "smooth", "agent": "blind-forward"}
+_NAMES = {"tunnel": "t", "tunnel_sha256": "0", "lining": "smooth", "agent": "dead-reckoning"}
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +30,14 @@ def task(plan_of):
 @pytest.fixture(scope="module")
 def parts(task):
     env, params = task
-    return list(drive(env, params, make_agent("blind-forward", params), 5, _NAMES))
+    return list(drive(env, params, make_agent("dead-reckoning", params), 5, _NAMES))
 
 
 def test_an_episode_is_the_one_that_the_evaluation_drives(task, parts):
     env, params = task
     one = np.zeros(1, np.int32)
     record = evaluate(
-        env, params, make_agent("blind-forward", params), Episodes(np.array([5], np.uint32), one, one, one)
+        env, params, make_agent("dead-reckoning", params), Episodes(np.array([5], np.uint32), one, one, one)
     )
     whole = parts[-1]
     assert (whole.success, whole.contact) == (record.success[0], record.contact[0])

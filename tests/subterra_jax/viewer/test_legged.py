@@ -84,7 +84,7 @@ def test_a_b2_is_driven_and_its_legs_are_recorded():
 def test_what_a_lidar_on_the_trunk_sees_is_shown_about_the_robot():
     library.register_agents(())
     plan = st.load_tunnel()
-    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/B2Traverse-v1", "pure-pursuit", 3, "spin16x64")
+    parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/B2Traverse-v1", "dead-reckoning", 3, "spin16x64")
     points = list(itertools.islice(parts, 2))[-1].points
     assert points.shape[1:] == (1024, 3)
     half = float(np.interp(2.0, plan.station, plan.half_width))

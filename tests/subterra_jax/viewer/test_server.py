@@ -274,11 +274,11 @@ def test_a_recording_of_a_tunnel_that_it_was_not_given_is_refused_in_a_sentence(
 @pytest.mark.slow
 def test_what_is_chosen_is_driven_when_a_browser_says_so(viewer):
     panel, player = viewer.session.panel, viewer.session.view.player
-    wanted = [(panel.tunnel, "control"), (panel.task, "Subterra/TraverseShort-v1"), (panel.agent, "heading-hold")]
+    wanted = [(panel.tunnel, "control"), (panel.task, "Subterra/TraverseShort-v1"), (panel.agent, "random")]
     with join(viewer.url) as link:
         for control, value in [*wanted, (panel.seed, 11), (panel.drive, True)]:
             say(link, {"type": "GuiUpdateMessage", "uuid": control._impl.uuid, "updates": {"value": value}})
-        until(lambda: player.episode.recording.agent == "heading-hold" and player.episode.finished, 120.0)
+        until(lambda: player.episode.recording.agent == "random" and player.episode.finished, 120.0)
     driven = player.episode.recording
     assert (driven.tunnel, driven.lining, driven.task) == ("control", "smooth", "Subterra/TraverseShort-v1")
     assert (driven.seed, driven.length) == (11.0, 60.0)
