@@ -24,6 +24,7 @@ from benchmarks.rays.casting import (
     meshed_linings,
     require_scene,
 )
+from benchmarks.records import Record, measured, write_records
 from benchmarks.results import environment_facts, png_bytes, write_file
 from subterra_jax.host.files import require_file
 from subterra_jax.tunnel.sources import load_tunnel
@@ -146,6 +147,28 @@ def write(path: Path, config: RaysConfig, comparisons: list[Agreement], rates: d
     }
     write_file(path, (json.dumps(content, indent=1, default=str) + "\n").encode())
     write_file(path.with_suffix(".png"), png_bytes(histograms(comparisons), dpi=130))
+    write_records(path.with_name("records.json"), records_of(config, comparisons))
+
+
+# Title of a comparison, its quantity, scale and unit: what the documentation shows.
+_RECORDS = {
+    "rays/planar-median": ("planar, pockets, levelled mesh", "p50", 1e3, "mm"),
+    "rays/planar-within-1-cm": ("planar, pockets, levelled mesh", "within_1cm", 100.0, "%"),
+    "rays/spatial-median": ("3-D, pockets", "p50", 1e6, "µm"),
+}
+
+
+def records_of(config: RaysConfig, comparisons: list[Agreement]) -> list[Record]:
+    """Return the figures that the documentation shows, of the comparisons that were made."""
+    found = {one.title: one.figures()["all"] for one in comparisons}
+    command = f"benchmarks.rays --scene {config.scene} --out out/rays.json"
+    return [
+        measured(
+            id, round(scale * found[title][name], 3), unit, command, split="pockets, against embree", seed=config.seed
+        )
+        for id, (title, name, scale, unit) in _RECORDS.items()
+        if title in found
+    ]
 
 
 def main(config: RaysConfig) -> int:

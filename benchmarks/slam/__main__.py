@@ -15,13 +15,13 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.command import run_main
+from benchmarks.records import write_records
 from benchmarks.results import environment_facts, png_bytes, write_file
 from benchmarks.slam.arena.sets import ArenaConfig, make_arena
 from benchmarks.slam.board import BoardConfig, make_board
 from benchmarks.slam.board_page import as_markdown as board_markdown
 from benchmarks.slam.board_page import as_png as board_png
-from benchmarks.slam.board_page import as_section as board_section
-from benchmarks.slam.board_page import split_page
+from benchmarks.slam.board_page import records_of as board_records
 from benchmarks.slam.recordings import SetConfig, make_set
 from benchmarks.slam.run import RunConfig, run_all
 from benchmarks.slam.score import SCHEMA, ProgramScore, ScoreConfig, score_all
@@ -78,12 +78,10 @@ def main(config: SetConfig | ArenaConfig | RunConfig | BoardConfig | SubmissionC
         for name, result in run_all(config):
             _progress.print(f"{name}: {result}")
     elif isinstance(config, BoardConfig):
-        page = None if config.page is None else split_page(config.page)
         for name, result in make_board(config):
             _progress.print(f"{name}: {result}")
         board = _write_board(config.out)
-        if page is not None and config.page is not None:
-            write_file(config.page, board_section(board).join(page).encode())
+        write_records(config.out / "records.json", board_records(board))
     elif isinstance(config, SubmissionConfig):
         print("\n".join(check_submission(config)))
     else:

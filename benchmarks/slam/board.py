@@ -37,13 +37,12 @@ class BoardConfig:
 
     Attributes:
         sets: Sets of the arena with their truth, one for each seed; none where `runs` alone make the board.
-        out: Folder for poses, `board.json`, `board.md` and `board.png`.
+        out: Folder for poses, `board.json`, `board.md`, `board.png` and `records.json`.
         programs: Programs to run; by default all, the odometer included.
         jobs: Programs run at a time.
         limit: Time after which a program counts as failed on a recording, s.
         run: Run what is missing; otherwise only poses that are in `out` already are scored, and no bag is needed.
         runs: CSV file of runs: they stand on the board too, and those of `sets` are added to it or replace theirs.
-        page: Markdown page between whose marks `<!-- arena -->` the table is written anew.
     """
 
     out: Path
@@ -53,7 +52,6 @@ class BoardConfig:
     limit: float = 1800.0
     run: bool = True
     runs: Path | None = None
-    page: Path | None = None
 
 
 @dataclass(frozen=True)

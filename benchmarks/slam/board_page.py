@@ -1,7 +1,6 @@
-"""The arena's board as a Markdown table and as the figure of the dial."""
+"""The arena's board as a Markdown table, as records, and as the figure of the dial."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -9,9 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.command import BenchmarkError
+from benchmarks.records import Record, commit, of_facts
 from benchmarks.results import png_bytes
-from benchmarks.slam.inertial import PROGRAMS
 
 Row = dict[str, Any]
 _DIAL = ("walls-smooth", "walls-joints", "walls-pockets", "walls-furnished", "walls-sprayed")
@@ -28,7 +26,6 @@ _OURS = {  # colour, marker and line of what is not a SLAM program
 }  # fmt: skip
 _ASIDE = 0.04  # of the distance between two recordings, from one program to the next
 _LEAST = 3e-5  # m per 100 m, lower end of the figure
-_MARKS = ("<!-- arena -->\n", "<!-- end of arena -->\n")  # around the table of a page
 
 
 def median_drift(rows: list[Row], program: str, recording: str) -> tuple[float, float, float] | None:
@@ -67,31 +64,26 @@ def as_markdown(board: dict[str, Any]) -> str:
     return "\n".join([as_table(board), note, "", *(["Failed:", "", *failed, ""] if failed else [])])
 
 
-def as_section(board: dict[str, Any]) -> str:
-    """Returns what stands between the marks of a page: table, the command of each row, and what did not start."""
-    versions = sorted({f"{PROGRAMS[row['program']]} {row['version']}" for row in board["rows"]
-                       if row["program"] in PROGRAMS and row.get("version")})  # fmt: skip
-    words = "--recordings SET --out POSES"
-    command = (
-        f"The command of a row, its first column being NAME: `python -m benchmarks.slam run --library NAME {words}`"
-        + (f" ({', '.join(versions)})" if versions else "")
-        + "; then `python -m benchmarks.slam score --estimate POSES --truth SET/truth`."
-    )
-    failed = [f"- {one}" for one in _failures(board["rows"])]
-    return "\n".join([as_table(board), command, "", *(["*Failed*:", "", *failed, ""] if failed else [])])
-
-
-def split_page(path: Path) -> tuple[str, str]:
-    """Returns what stands on a Markdown page before and behind its table, marks included.
-
-    Raises:
-        BenchmarkError: The page is missing or has no marks.
-    """
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
-    if any(text.count(mark) != 1 for mark in _MARKS):
-        raise BenchmarkError(f"{path}: has no marks {' and '.join(mark.strip() for mark in _MARKS)} around a table")
-    before, rest = text.split(_MARKS[0])
-    return before + _MARKS[0], _MARKS[1] + rest.split(_MARKS[1])[-1]
+def records_of(board: dict[str, Any]) -> list[Record]:
+    """Returns the drift of each program on each recording, its error across, floor and gate as records."""
+    rows, count = board["rows"], len({row["set"] for row in board["rows"]})
+    facts = {**of_facts(board), "n": count, "seed": None, "commit": commit(), "tolerance": 1.0}
+    where = "drives of the arena; interval: least to largest of the seeds"
+    found = []
+    for program in dict.fromkeys(row["program"] for row in rows):
+        command = f"benchmarks.slam run --library {program} --recordings out/arena --out out/slam/{program}"
+        for recording, name in _NAMES.items():
+            if (drift := median_drift(rows, program, recording)) is not None:
+                middle, low, high = (round(value, 2) for value in drift)
+                id = f"arena/{program}/{name.replace(' ', '-').lower()}"
+                found.append(Record(id, middle, "%", (low, high), split=where, command=command, **facts))
+    for recording, name in _NAMES.items():
+        if any(row["recording"] == recording for row in rows):
+            command = "benchmarks.slam board --sets out/arena --out out/slam/board"
+            floor = round(_of(board["floors"], recording, "drift"), 4)
+            id = f"arena/floor/{name.replace(' ', '-').lower()}"
+            found.append(Record(id, floor, "%", None, split=where, command=command, **facts))
+    return found
 
 
 def _failures(rows: list[Row]) -> list[str]:

@@ -12,9 +12,11 @@ from rich.console import Console
 
 import subterra_jax as st
 from benchmarks.command import BenchmarkError, run_main
+from benchmarks.records import write_records
 from benchmarks.results import environment_facts, write_file
 from benchmarks.throughput import report
 from benchmarks.throughput.config import ThroughputConfig, check
+from benchmarks.throughput.figures import records_of
 from benchmarks.throughput.measure import (
     arithmetic_floor,
     environment_loop,
@@ -136,6 +138,7 @@ def run_and_report(config: ThroughputConfig) -> int:
     if config.out is not None:
         write_file(config.out / "throughput.json", report.as_json(result).encode())
         write_file(config.out / "throughput.png", report.as_png(result))
+        write_records(config.out / "records.json", records_of(result))
     if any(gate.n_wrong for gate in result.gates):
         print("error: the LiDAR disagrees with the reference, so its speed counts for nothing", file=sys.stderr)
         return 1

@@ -105,3 +105,26 @@ def test_a_job_that_fails_names_its_log_and_one_without_its_input_is_left_out(tm
     failing = reproduce.Job(("benchmarks.draw moon",), 1.0)
     with pytest.raises(BenchmarkError, match=r"log.txt: python -m benchmarks.draw ended with status 2"):
         reproduce.run_job(failing, tmp_path / "b", tmp_path)
+
+
+def test_the_worst_of_all_dirty_clouds_is_the_record_and_a_refused_one_has_none():
+    from benchmarks.dirty.__main__ import records_of
+
+    built = {"wall_mean": -0.004, "wall_near": 0.998, "width": 0.02, "floor_worst": 0.1}
+    refused = dict.fromkeys(built, float("nan"))
+    found = {one.id: (one.value, one.n) for one in records_of([built, refused, {**built, "wall_mean": 0.003}])}
+    assert found["dirty/wall-mean"] == (0.4, 2)
+    assert found["dirty/wall-within-10-cm"] == (99.8, 2)
+    assert records_of([refused]) == []
+
+
+def test_the_figures_of_a_reconstruction_are_records_of_its_first_seed():
+    from benchmarks.reconstruction import GOALS, ReconstructionConfig, records_of
+
+    row = {"poses": "given", **dict.fromkeys(GOALS, 0.01), "length_error": -0.02, "seconds": 90.0}
+    found = {
+        one.id: one.value for one in records_of(ReconstructionConfig((7, 8)), [{**row, "seed": s} for s in (7, 8)])
+    }
+    assert found["reconstruction/given/centreline"] == 1.0
+    assert found["reconstruction/given/length"] == 0.02
+    assert found["reconstruction/given/time"] == 1.5

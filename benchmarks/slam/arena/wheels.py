@@ -1,7 +1,7 @@
 """Wheel odometry with the errors of real corridors: one scale error a robot, which wanders along the way.
 
 Source of the sizes: +2.2 % in scale, standard deviation 0.6 % from one 20 m to the next, over 864 m of a real robot's
-corridors, always of one sign (`docs/measurements.md` and the open-world notes of this project).
+corridors, always of one sign.
 """
 
 import numpy as np

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.command import BenchmarkError
+from benchmarks.records import read_records
 from benchmarks.slam import board, board_page
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.arena import bound, gate
@@ -112,9 +113,8 @@ def test_runs_of_other_days_stand_on_the_board_beside_new_ones(sets, tmp_path):
     redone = {**old, "program": "mine", "drift": 77.0}
     floors = [{"set": "one", "recording": name, "program": board.FLOOR, "drift": 0.01, "gate": 0.002}
               for name in ("walls-smooth", "walls-sprayed")]  # fmt: skip
-    path, page = tmp_path / "runs.csv", tmp_path / "page.md"
+    path = tmp_path / "runs.csv"
     path.write_text(board.runs_as_csv([old, crashed, redone, *floors]))
-    page.write_text("Before.\n<!-- arena -->\nold\n<!-- end of arena -->\nBehind.\n")
     place = tmp_path / "poses" / "one" / "mine"
     mine = board.Case("mine", sets[0] / "recordings" / "walls-smooth", place)
     every = board.merge_runs(board.read_runs(path), [board._labels(mine) | board.read_case(mine)])
@@ -125,22 +125,21 @@ def test_runs_of_other_days_stand_on_the_board_beside_new_ones(sets, tmp_path):
     assert rows["walls-sprayed", "other"] == crashed
     assert rows["walls-smooth", "mine"]["drift"] == pytest.approx(1.0, abs=1e-6)
     out = tmp_path / "out"
-    assert command(["board", "--runs", str(path), "--out", str(out), "--page", str(page)]) == 0
-    assert page.read_text().startswith("Before.\n<!-- arena -->\n| program | runs |")
-    assert "| | | |\n\nThe command of a row" in page.read_text()
-    assert "`python -m benchmarks.slam run --library NAME --recordings SET --out POSES`;" in page.read_text()
-    assert page.read_text().endswith("- other on walls-sprayed: crashed (one)\n<!-- end of arena -->\nBehind.\n")
-    assert "| other | 2 | 100 | failed | 0.250 | 4 (1/1) | 50 % |" in page.read_text()
+    assert command(["board", "--runs", str(path), "--out", str(out)]) == 0
+    table = (out / "board.md").read_text()
+    assert table.endswith("- other on walls-sprayed: crashed (one)\n")
+    assert "| other | 2 | 100 | failed | 0.250 | 4 (1/1) | 50 % |" in table
+    found = {one.id: one.value for one in read_records(out / "records.json")}
+    assert found["arena/other/smooth"] == 100.0
+    assert "arena/other/sprayed" not in found, "a failure is no figure"
+    assert found["arena/floor/smooth"] == 0.01
     assert json.loads((out / "board.json").read_text())["floors"][0]["gate"] == 0.002
     assert (out / "board.png").is_file()
 
 
-def test_a_page_or_file_of_runs_that_is_none_is_refused_before_anything_runs(tmp_path, capsys):
-    (tmp_path / "page.md").write_text("<!-- arena -->\n")
+def test_a_file_of_runs_that_is_none_is_refused_before_anything_runs(tmp_path, capsys):
     (tmp_path / "runs.csv").write_text("set,recording\none,walls-smooth\n")
     words = ["board", "--out", str(tmp_path / "out"), "--runs", str(tmp_path / "runs.csv")]
-    assert command([*words, "--page", str(tmp_path / "page.md")]) == 2
-    assert "page.md: has no marks <!-- arena --> and <!-- end of arena --> around a table" in capsys.readouterr().err
     assert command(words) == 2
     assert "runs.csv: not a file of runs, for its columns are others" in capsys.readouterr().err
     good = board.runs_as_csv([{"set": "one", "recording": "a", "program": "b", "drift": 1.0}])
