@@ -21,7 +21,7 @@ CELL, START = 0.1, 30.0
 @pytest.fixture(scope="module")
 def smooth(plan_of):
     """A straight tunnel without relief: the walls tell nothing of the station."""
-    arrays = tunnels.tunnel_arrays(tunnels.straight(90.0), half_width=2.8)
+    arrays = tunnels.tunnel_arrays(tunnels.straight(150.0), half_width=2.8)
     return st.make("Subterra/StopAt-v1", tunnel=plan_of(arrays), lining="smooth", estimates=True)
 
 
