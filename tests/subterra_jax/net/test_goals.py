@@ -19,7 +19,7 @@ from tests.subterra_jax.net.robots import (
 )
 
 WITH_GOAL = tuple(name for name in st.TASKS if "Traverse" not in name)
-LENGTH, MARGIN = 351.0, 40.0  # m: of the tunnel, and between a mouth and starts and goals
+LENGTH, MARGIN = 351.05, 40.0  # m: of the tunnel, and between a mouth and starts and goals
 
 
 @pytest.mark.parametrize(
@@ -37,9 +37,9 @@ def test_goals_lie_anywhere_in_their_range_from_the_start_and_starts_anywhere_in
     start, goal = (np.asarray(values, np.float64) for values in (state.goal.told, state.goal.station))
     way = goal - start
     assert low - 1e-3 <= way.min() < low + 0.01 * (high - low)
-    assert high - 0.01 * (high - low) < way.max() <= high + 0.05
+    assert high - 0.01 * (high - low) < way.max() <= high + 0.1
     assert_mean(way, 0.5 * (low + high))
-    share = np.histogram(way, 10, (low - 1e-3, high + 0.05))[0] / len(way)
+    share = np.histogram(way, 10, (low - 1e-3, high + 0.1))[0] / len(way)
     assert np.abs(share - 0.1).max() < 4.0 * np.sqrt(0.1 * 0.9 / len(way))
     # The share of the room in front of the start is uniform from 0 to 1, whatever the way.
     room = LENGTH - 2.0 * MARGIN - way
