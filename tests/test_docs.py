@@ -67,9 +67,6 @@ def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     run = {"schema": "subterra.run/1", "command": {"task": "Subterra/TraverseShort-v1", "config": {"hidden": [64, 64]}}}
     (tmp_path / "out" / "short").mkdir(parents=True)
     (tmp_path / "out" / "short" / "config.json").write_text(json.dumps(run))
-    run = {"schema": "subterra.locate/1", "command": {"drives": 64, "config": {"network": "gru"}}}
-    (tmp_path / "out" / "locate").mkdir(parents=True)
-    (tmp_path / "out" / "locate" / "config.json").write_text(json.dumps(run))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
     monkeypatch.setattr(kinds, "_OWN", {})

@@ -1,6 +1,7 @@
 """Trained policies that drive without the trainer.
 
-files (safetensors + JSON) ─► load ─► networks or belief, an `Agent` of `subterra_jax.baselines`
+files (safetensors + JSON) ─► load ─► `Learnt` or `Locating`, an `Agent` of `subterra_jax.baselines`
+observation ─► inputs ─► memories (reckoning, stack, localiser) ─► network ─► action, in training and in driving
 any agent ─► load_policy ─► a function of observation and memory
 """
 
