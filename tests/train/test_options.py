@@ -208,5 +208,5 @@ def test_weights_and_biases_gets_every_number_at_its_step(tmp_path, monkeypatch)
 
 def test_every_kind_of_network_names_its_size_on_the_command_line():
     assert read_command(["--out", "o", "--hidden", "8", "4", "--frames", "3"]).config.hidden == (8, 4)
-    assert read_command(["--out", "o", "--task", "Subterra/StopAt-v1", "--memory=gru", "--hidden=8"]).config.hidden == 8
+    assert read_command(["--out", "o", "--task", "Subterra/StopAt-v1", "--memory=gru", "--cell=8"]).config.cell == 8
     assert SMALL[-2:] == ("32", "32")
