@@ -63,6 +63,11 @@ class Driver:
         """Returns statistics of the observation; None, since the inputs are of order 1 as they are."""
         return None
 
+    def raw(self, inputs: Any, policy: Policy) -> Array:
+        """Returns the observation that had these inputs; asked for where `start_statistics` are there alone."""
+        del policy
+        return inputs
+
     def tensors(self, policy: Policy) -> dict[str, np.ndarray]:
         """Returns the arrays of a policy by name, parts of the name between dots."""
         tree = {NETWORK: policy.network, LOCALISER: policy.localiser}

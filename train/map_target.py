@@ -40,7 +40,7 @@ def draw_cases(key: PRNGKeyArray, drive: Drives, params: Any) -> MapCase:
     """Draws what each robot with a map is given: a hidden start or not, the right map or one of another place."""
     keys, shape = jax.random.split(key, 4), drive.start.shape
     hidden, wrong = (jax.random.uniform(k, shape) for k in keys[:2])
-    sigma = jnp.where(hidden < _HIDDEN, constants.INSIDE_SIGMA, 0.0)
+    sigma = jnp.where(hidden < _HIDDEN, constants.HIDDEN_START_SIGMA, 0.0)
     offset = sigma * jnp.clip(jax.random.normal(keys[2], shape), -3.0, 3.0)
     right = wrong >= _WRONG
     count = params.tunnel.count

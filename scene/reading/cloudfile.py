@@ -42,7 +42,7 @@ def read_cloud(
         frame = _frame_of(path, source, config)
         thinned, read, rounding = _thin(source, frame, voxel, stage, partial or Partial(None))
     _refuse_unusable(path, thinned, read, rounding, frame.unit)
-    rounded = {"rounded_to": rounding} if rounding >= _COARSE else {}
+    rounded: dict[str, Any] = {"rounded_to": rounding} if rounding >= _COARSE else {}
     facts = {**rounded, "kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
     facts |= {"crs": source.crs} if source.crs else {}
     facts |= {"points_left_out": dict(source.left_out)} if source.left_out else {}

@@ -146,8 +146,11 @@ def _draw_length(line: np.random.Generator) -> float:
 
 def shortest(split: str, among: int = 100) -> list[str]:
     """Return the shortest of the first tunnels of each kind of a split, by name."""
-    length = lambda kind, index: _draw_length(_generators(kind, split, index)["line"])  # noqa: E731
-    return [f"open:{k}:{split}:{min(range(among), key=lambda i, k=k: length(k, i))}" for k in kinds_of(split)]
+
+    def shortest_of(kind: str) -> int:
+        return min(range(among), key=lambda index: _draw_length(_generators(kind, split, index)["line"]))
+
+    return [f"open:{kind}:{split}:{shortest_of(kind)}" for kind in kinds_of(split)]
 
 
 def plan(

@@ -98,7 +98,7 @@ class WalkDriver(Driver):
         bounds = env.action_space(params)
         n = env.observation_size(params)
         shape = Shape(n, len(bounds.low), tuple(config.hidden), init_std=config.init_std, n_seen=n_seen)
-        self.env, self.layout = env, WalkLayout(shape)
+        self.env, self.layout = env, WalkLayout(shape)  # type: ignore[assignment]  # a gait has no memory to lay out
         self._net, self._n = Network(shape), n
         self._low, self._high = jnp.asarray(bounds.low), jnp.asarray(bounds.high)
         self._standing = 0.0
