@@ -68,7 +68,7 @@ def test_who_gets_the_beams_in_the_wrong_order_cannot_traverse():
     agents, episodes = [make_agent("dead-reckoning", params)], listed_episodes(env, params, 50)
     order = np.random.default_rng(0).permutation(16)
     assert evaluate(env, params, panel(agents), episodes).success.all()
-    assert evaluate(env, params, panel(agents, order=order), episodes).success.mean() < 0.1
+    assert evaluate(env, params, panel(agents, order=order), episodes).success.mean() < 0.2
 
 
 @pytest.mark.slow
