@@ -1,10 +1,8 @@
 """Walls and their relief from the side beams of a scan: ring counters compare it with the pattern of the rings.
 
-Ring joints and pockets stand out of two smooth walls. There are two ways to measure them. `fit_plain` and
-`fit_careful` fit two straight lines to one scan; the careful fit leaves out beams that end short of both walls, on
-something that stands in the tunnel. `track_walls` follows distance, slope and bend of the walls from scan to scan.
-Where another pair of walls has more beams on it than the tracked one, as at the start, after a turn or after a
-dropout, it takes over. Beams that fall short (dust, boxes) or get no echo are not used.
+Ring joints and pockets stand out of two smooth walls. `track_walls` follows distance, slope and bend of the walls from
+scan to scan. Where another pair of walls has more beams on it than the tracked one, as at the start, after a turn or
+after a dropout, it takes over. Beams that fall short (dust, boxes) or get no echo are not used.
 """
 
 import dataclasses
@@ -19,12 +17,6 @@ _NEAREST, _FARTHEST = 1.0, 4.5  # m to a wall; nearer is an obstacle, farther an
 _STEEPEST = math.sqrt(0.5)  # sine of the angle to the axis: flatter beams meet a wall where bends blur the position
 _CLIP = (-0.2, 0.3)  # m, largest relief of one beam
 
-# The fit of one scan.
-_TOUCH, _ACROSS = 0.3, 6.0  # m to a wall for the careful fit, which may run along either wall
-_SHORT_OF_ALL = 0.15  # m; a beam so far before the fitted walls has not met them: three of its standard deviations
-_SHORT_MOST = 6  # beams that may be left out, of ten
-
-# The tracked walls.
 _SHORT, _LONG = -0.15, 0.35  # m against the fitted wall, within which a beam has met it or a pocket in it
 _MOST_BEAMS = 9  # a side; of more, some are left out
 _RANGE_SIGMA, _FIT_SIGMA = 0.05, 0.02  # m, of a range and of the fit
@@ -92,51 +84,6 @@ def side_beams(n_beams: int, most: int = _MOST_BEAMS) -> tuple[np.ndarray, np.nd
 def height_variance(n_beams: int, model_sigma: float) -> Float[np.ndarray, "2 side"]:
     """Return the variance of a height, m²: noise of the range across the wall, and error of the relief model."""
     return np.square(_RANGE_SIGMA * side_beams(n_beams)[1]) + np.float32(model_sigma**2)
-
-
-def fit_plain(ranges: Float[Array, "*env n"]) -> Bumps:
-    """Measures relief by a fit to all beams, for a robot near the middle that faces along a free tunnel."""
-    across, along = _beam_ends(ranges)
-    valid = (across > _NEAREST) & (across < _FARTHEST)
-    off, _ = _fit_lines(across, along, valid)
-    return Bumps(jnp.where(valid, jnp.clip(off, *_CLIP), 0.0), along, valid)
-
-
-def fit_careful(ranges: Float[Array, "*env n"]) -> Bumps:
-    """Measures relief by a fit without short beams, for a robot that swerves round obstacles.
-
-    Short beams are removed one at a time, the shortest first: it distorts the fit most, so that others look short
-    until it is gone. The slope of the fit is the robot's angle to the axis; relief is measured along and across the
-    axis.
-    """
-    across, along = _beam_ends(ranges)
-    valid = (across > _TOUCH) & (across < _ACROSS)
-    for _ in range(_SHORT_MOST):
-        off, _ = _fit_lines(across, along, valid)
-        least = jnp.min(jnp.where(valid, off, 0.0), axis=(-2, -1), keepdims=True)
-        valid = valid & ((off > least) | (least > -_SHORT_OF_ALL))
-    off, slope = _fit_lines(across, along, valid)
-    shrink = 1.0 / jnp.sqrt(1.0 + slope * slope)
-    ahead = (along + slope * across) * shrink
-    return Bumps(jnp.where(valid, jnp.clip(off * shrink, *_CLIP), 0.0), ahead, valid)
-
-
-def _beam_ends(ranges: Float[Array, "*env n"]) -> tuple[Array, Array]:
-    """Ends of the side beams: to the side and ahead of the robot, m."""
-    index, sine, cosine = side_beams(ranges.shape[-1], ranges.shape[-1])
-    distance = ranges[..., index]
-    return distance * sine, distance * cosine
-
-
-def _fit_lines(across: Array, along: Array, valid: Array) -> tuple[Array, Array]:
-    """Distance of ends behind two parallel lines fitted to valid ends, m; slope of each wall away from the robot."""
-    number = jnp.maximum(jnp.sum(valid, axis=-1, keepdims=True), 1)
-    off = jnp.where(valid, across - jnp.sum(across * valid, axis=-1, keepdims=True) / number, 0.0)
-    ahead = jnp.where(valid, along - jnp.sum(along * valid, axis=-1, keepdims=True) / number, 0.0)
-    # Turned by a small angle, the left wall comes nearer ahead and the right one recedes.
-    signed = jnp.asarray([[1.0], [-1.0]])
-    slope = jnp.sum(signed * off * ahead, axis=(-2, -1)) / (jnp.sum(ahead * ahead, axis=(-2, -1)) + 1e-3)
-    return off - slope[..., None, None] * signed * ahead, slope[..., None, None] * signed
 
 
 def track_walls(walls: Walls, ranges: Float[Array, "*env n_beams"], share: Float[Array, "*env"]) -> tuple[Walls, Bumps]:
