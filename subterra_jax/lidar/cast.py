@@ -121,7 +121,7 @@ def _following(
 
 
 def _entries(
-    box: Float[Array, "6 k"],
+    box: Float[Array, "10 k"],
     number: Int[Array, "k"],
     n_bits: int,
     position: Float[Array, "2"],

@@ -39,29 +39,6 @@ def load_words(ref, start, mask=None, n_words: int = _MOST):
     return tuple(jnp.sum(jnp.where(column == i, words, zero), axis=-1, dtype=words.dtype) for i in range(n_words))
 
 
-def store_words(ref, start, words, mask):
-    """Write up to four words of each of many rows by one instruction; the rest of the four become 0.
-
-    Args:
-        ref: Flat array of words.
-        start: First word of each row, a multiple of 4.
-        words: The words, each of all rows.
-        mask: Rows to write.
-    """
-    from jax.experimental.pallas import triton
-
-    column = jax.lax.broadcasted_iota(jnp.int32, (*start.shape, _MOST), start.ndim)
-    value = jnp.zeros(column.shape, words[0].dtype)
-    for i, word in enumerate(words):
-        value = jnp.where(column == i, word[..., None], value)
-    triton.store(ref.at[start[..., None] + column], value, mask=jnp.broadcast_to(mask[..., None], column.shape))
-
-
-def any_thread(what: Array) -> Array:
-    """Tell whether something holds in any thread of a program."""
-    return most(what.astype(jnp.int32)) > 0
-
-
 def most(number: Array) -> Array:
     """Return the largest of the whole numbers of all threads of a program."""
     # In one row, for which a warp has an instruction; by rows and columns it takes five exchanges.

@@ -1,4 +1,4 @@
-"""Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch, by kernels (`fused`, `native`)."""
+"""Planar LiDAR: exact ranges to the wall polylines, by XLA (`cast`) or, for a batch, by kernels (`gpu`, `native`)."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants, native
-from subterra_jax.lidar import cast, fused
+from subterra_jax.lidar import cast, gpu, nvidia
 from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.tunnel import Tunnel, node_at
 
@@ -57,40 +57,40 @@ def scan(
         Ranges without noise, m, in [0, range_max]; exactly `range_max` where a beam meets no wall within it, as when it
         leaves through a mouth.
     """
-    first = tunnel.scan_first[node_at(tunnel, station)]
+    node = node_at(tunnel, station)
     by_kernels = skips_unwanted(params) or (params.fused and native.supported())
     # Nothing that may differ within a batch but the rows themselves, or the kernels could not serve it.
     beams = dataclasses.replace(params, range_max=tunnel.reach, range_sigma=0.0)
     # The kernels know 32 bits.
-    by_kernels = by_kernels and position.dtype == jnp.float32
-    ranges = _true_ranges(by_kernels, (tunnel.walls, beams), position, heading, first, jnp.asarray(wanted))
+    by_kernels = by_kernels and position.dtype == jnp.float32 and tunnel.packed is not None
+    ranges = _true_ranges(by_kernels, (tunnel.walls, beams), position, heading, node, jnp.asarray(wanted))
     return jnp.minimum(ranges, params.range_max)
 
 
 def skips_unwanted(params: LidarParams) -> bool:
     """Tell whether the fused kernels cast a batch of scans; they cost little for scans that nobody wants."""
-    return params.fused and fused.supported(params.n_beams)
+    return params.fused and nvidia.present()
 
 
 def _cast(
     what: tuple[Tunnel, LidarParams],
     position: Float[Array, "2"],
     heading: Float[Array, ""],
-    first: Int[Array, ""],
+    node: Int[Array, ""],
     wanted: Bool[Array, ""],
 ) -> Float[Array, "n_beams"]:
-    """`scan` of a known window, by XLA, wanted or not."""
+    """`scan` from a known node, by XLA, wanted or not."""
     del wanted
     tunnel, params = what
     direction = beam_directions(heading, params.n_beams)
-    return jnp.minimum(cast.nearest(tunnel, first, position, direction), params.range_max)
+    return jnp.minimum(cast.nearest(tunnel, tunnel.scan_first[node], position, direction), params.range_max)
 
 
 def _cast_rows(what: tuple[Tunnel, LidarParams], *rows: Array) -> Float[Array, "n n_beams"]:
     """Many scans in one tunnel."""
     kernels = {}
     if skips_unwanted(what[1]):
-        kernels["cuda"] = _by(fused.scan)
+        kernels["cuda"] = _by(gpu.scan)
     if native.supported():
         from subterra_jax.native import calls  # numba is optional
 
@@ -103,12 +103,13 @@ def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
     """A kernel for many scans, with the arguments of `_cast_rows`."""
 
     def cast_rows(
-        what: tuple[Tunnel, LidarParams], position: Array, heading: Array, first: Array, wanted: Array
+        what: tuple[Tunnel, LidarParams], position: Array, heading: Array, node: Array, wanted: Array
     ) -> Array:
         tunnel, params = what
         limit = jnp.asarray(params.range_max)
-        ranges = kernel(tunnel, position, heading, first, wanted, limit, bearings(params.n_beams))
-        return vary_like(ranges, position, heading, first)
+        start = tunnel.visit_first[node]
+        ranges = kernel(tunnel, position, heading, start, wanted, limit, bearings(params.n_beams))
+        return vary_like(ranges, position, heading, node)
 
     return cast_rows
 
@@ -123,19 +124,19 @@ def _true_ranges(
     what: tuple[Tunnel, LidarParams],
     position: Float[Array, "2"],
     heading: Float[Array, ""],
-    first: Int[Array, ""],
+    node: Int[Array, ""],
     wanted: Bool[Array, ""],
 ) -> Float[Array, "n_beams"]:
-    """`scan` of a known window, differentiable by the pose and by the walls."""
+    """`scan` from a known node, differentiable by the pose and by the walls."""
     take: Callable[..., Array] = _cast_by_kernels if by_kernels else _cast
-    return take(what, position, heading, first, wanted)
+    return take(what, position, heading, node, wanted)
 
 
 def _range_slopes(by_kernels: bool, primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Ranges, and how they change: the wall that a beam meets stays the same."""
-    (tunnel, params), position, heading, first, _ = primals
+    (tunnel, params), position, heading, node, _ = primals
     (along_tunnel, _), *along_pose = tangents[:3]
-    block, vertex = cast.met(tunnel, first, position, beam_directions(heading, params.n_beams))
+    block, vertex = cast.met(tunnel, tunnel.scan_first[node], position, beam_directions(heading, params.n_beams))
     ranges = _true_ranges(by_kernels, *primals)
 
     def measured(tunnel: Tunnel, position: Array, heading: Array) -> Array:

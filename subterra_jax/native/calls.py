@@ -77,7 +77,7 @@ SCAN, CLEARANCE = "subterra_scan", "subterra_clearance"
 @njit
 @no_type_check
 def _scan(frame, begin, end):
-    """Take rows of a scan call: first, wanted, position, heading, box, wall, turn, limit, n_scan to ranges."""
+    """Take rows of a scan call: start, wanted, position, heading, box, wall, turn, limit to ranges."""
     wall = argument(frame, 5)
     scan_rows(
         begin,
@@ -88,10 +88,9 @@ def _scan(frame, begin, end):
         floats(argument(frame, 3)),
         floats(argument(frame, 4)),
         floats(wall),
-        size(wall, 2),
+        np.uint64(size(wall, 2)),
         floats(argument(frame, 6)),
         floats(argument(frame, 7))[0],
-        ints(argument(frame, 8))[0],
         floats(result(frame, 0)),
     )
 
@@ -99,7 +98,7 @@ def _scan(frame, begin, end):
 @njit
 @no_type_check
 def _clearance(frame, begin, end):
-    """Take rows of a clearance call: first, position, box, wall, reach, n_contact to distances."""
+    """Take rows of a clearance call: start, position, box, wall, reach to distances."""
     wall = argument(frame, 3)
     clearance_rows(
         begin,
@@ -108,9 +107,8 @@ def _clearance(frame, begin, end):
         floats(argument(frame, 1)),
         floats(argument(frame, 2)),
         floats(wall),
-        size(wall, 2),
+        np.uint64(size(wall, 2)),
         floats(argument(frame, 4))[0],
-        ints(argument(frame, 5))[0],
         floats(result(frame, 0)),
     )
 
@@ -144,7 +142,7 @@ def scan(
     tunnel: Tunnel,
     position: Float[Array, "n 2"],
     heading: Float[Array, " n"],
-    first: Int[Array, " n"],
+    start: Int[Array, " n"],
     wanted: Bool[Array, " n"],
     range_max: Float[Array, ""],
     bearing: np.ndarray,
@@ -155,7 +153,7 @@ def scan(
         tunnel: The tunnel, one for all.
         position: Positions of the LiDAR, tunnel frame, m.
         heading: Headings of the LiDAR, rad.
-        first: First block of each window.
+        start: First block that each scan visits.
         wanted: Scans to take; the others cost nothing and hold arbitrary numbers.
         range_max: Largest range, m.
         bearing: Of each beam from the heading, rad; if their number is even, the second half opposes the first.
@@ -165,7 +163,7 @@ def scan(
     """
     shape = jax.ShapeDtypeStruct((position.shape[0], len(bearing)), jnp.float32)
     return jax.ffi.ffi_call(SCAN, shape)(
-        first,
+        start,
         wanted.astype(jnp.int32),
         position,
         heading,
@@ -173,27 +171,25 @@ def scan(
         tunnel.wall,
         np.concatenate([np.cos(bearing), np.sin(bearing)]).astype(np.float32),
         jnp.asarray(range_max, jnp.float32).reshape(1),
-        np.full(1, tunnel.n_scan, np.int32),
     )
 
 
-def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
+def clearance(tunnel: Tunnel, position: Float[Array, "n 2"], start: Int[Array, " n"]) -> Float[Array, " n"]:
     """Return the distances from many points in one tunnel to its nearest wall or furniture.
 
     Args:
         tunnel: The tunnel, one for all.
         position: The points, tunnel frame, m.
-        first: First block of each contact window.
+        start: First block that each point visits.
 
     Returns:
         Distances, m; exact up to `CONTACT_REACH`, and exactly that where the true distance is larger.
     """
     shape = jax.ShapeDtypeStruct(position.shape[:1], jnp.float32)
     return jax.ffi.ffi_call(CLEARANCE, shape)(
-        first,
+        start,
         position,
         tunnel.box,
         tunnel.wall,
         np.full(1, CONTACT_REACH, np.float32),
-        np.full(1, tunnel.n_contact, np.int32),
     )

@@ -12,8 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from subterra_jax import constants, native
-from subterra_jax.lidar import nvidia
-from subterra_jax.parts import fused_gap
+from subterra_jax.lidar import gpu, nvidia
 from subterra_jax.parts.part import Drive, Motion, Moved
 from subterra_jax.rows import rowwise, slope_along, vary_like
 from subterra_jax.state import EnvParams, State
@@ -90,23 +89,24 @@ def clearance(tunnel: Tunnel, position: Float[Array, "2"], station: Float[Array,
     Returns:
         Distance, m; exact up to 0.8 m, and exactly that where the truth is beyond.
     """
-    first = tunnel.contact_first[node_at(tunnel, station)]
+    node = node_at(tunnel, station)
     # The kernels know 32 bits.
     by_kernel = (native.supported() or nvidia.present()) and position.dtype == jnp.float32
-    return _measured_gap(by_kernel, tunnel.walls, position, first)
+    by_kernel = by_kernel and tunnel.packed is not None
+    return _measured_gap(by_kernel, tunnel.walls, position, node)
 
 
-def _gap(tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]) -> Float[Array, ""]:
-    """Compute `clearance` in a known window, by XLA."""
-    near_x, near_y = _nearest_points(tunnel, position, first)
+def _gap(tunnel: Tunnel, position: Float[Array, "2"], node: Int[Array, ""]) -> Float[Array, ""]:
+    """Compute `clearance` from a known node, by XLA."""
+    near_x, near_y = _nearest_points(tunnel, position, node)
     return jnp.minimum(jnp.sqrt(jnp.min(near_x * near_x + near_y * near_y)), CONTACT_REACH)
 
 
 def _nearest_points(
-    tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]
+    tunnel: Tunnel, position: Float[Array, "2"], node: Int[Array, ""]
 ) -> tuple[Float[Array, "n_contact n_segments"], Float[Array, "n_contact n_segments"]]:
-    """Return x and y of the nearest point of each segment in a window, from a position, m."""
-    window = first + jnp.arange(tunnel.n_contact, dtype=jnp.int32)
+    """Return x and y of the nearest point of each segment in the window of a node, from a position, m."""
+    window = tunnel.contact_first[node] + jnp.arange(tunnel.n_contact, dtype=jnp.int32)
     vertex = (tunnel.box[:2, window].T - position[None])[:, :, None] + tunnel.wall[window]
     x0, y0, x1, y1 = vertex[:, 0, :-1], vertex[:, 1, :-1], vertex[:, 0, 1:], vertex[:, 1, 1:]
     edge_x, edge_y = x1 - x0, y1 - y0
@@ -116,22 +116,22 @@ def _nearest_points(
     return x0 + share * edge_x, y0 + share * edge_y
 
 
-def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], first: Int[Array, " n"]) -> Float[Array, " n"]:
+def _gap_rows(tunnel: Tunnel, position: Float[Array, "n 2"], node: Int[Array, " n"]) -> Float[Array, " n"]:
     """Compute `clearance` of many points in one tunnel."""
     kernels = {}
     if nvidia.present():
-        kernels["cuda"] = _by(fused_gap.clearance)
+        kernels["cuda"] = _by(gpu.clearance)
     if native.supported():
         from subterra_jax.native import calls  # numba is optional
 
         kernels["cpu"] = _by(calls.clearance)
     by_xla: Callable[..., Array] = jax.vmap(_gap, in_axes=(None, 0, 0))
-    return lax.platform_dependent(tunnel, position, first, **kernels, default=by_xla)
+    return lax.platform_dependent(tunnel, position, node, **kernels, default=by_xla)
 
 
 def _by(kernel: Callable[..., Array]) -> Callable[..., Array]:
     """A kernel whose distances vary like the points."""
-    return lambda tunnel, position, first: vary_like(kernel(tunnel, position, first), position, first)
+    return lambda tunnel, position, node: vary_like(kernel(tunnel, position, tunnel.visit_first[node]), position, node)
 
 
 _gap_by_kernel = rowwise(_gap, _gap_rows)
@@ -139,22 +139,22 @@ _gap_by_kernel = rowwise(_gap, _gap_rows)
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _measured_gap(
-    by_kernel: bool, tunnel: Tunnel, position: Float[Array, "2"], first: Int[Array, ""]
+    by_kernel: bool, tunnel: Tunnel, position: Float[Array, "2"], node: Int[Array, ""]
 ) -> Float[Array, ""]:
-    """Compute `clearance` in a known window, differentiable by the position and by the walls."""
+    """Compute `clearance` from a known node, differentiable by the position and by the walls."""
     take: Callable[..., Array] = _gap_by_kernel if by_kernel else _gap
-    return take(tunnel, position, first)
+    return take(tunnel, position, node)
 
 
 def _gap_slope(by_kernel: bool, primals: Any, tangents: Any) -> tuple[Array, Array]:
     """Return the clearance, and how it changes: the nearest point stays the nearest."""
     gap = _measured_gap(by_kernel, *primals)
-    first = primals[2]
+    node = primals[2]
     x, y = _nearest_points(*primals)
     nearest = jnp.argmin((x * x + y * y).reshape(-1))
 
     def measured(tunnel: Tunnel, position: Array) -> Array:
-        x, y = (part.reshape(-1)[nearest] for part in _nearest_points(tunnel, position, first))
+        x, y = (part.reshape(-1)[nearest] for part in _nearest_points(tunnel, position, node))
         size = x * x + y * y
         return jnp.sqrt(jnp.where(size > 0.0, size, 1.0))
 

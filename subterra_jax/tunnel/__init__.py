@@ -2,10 +2,12 @@
 
 from subterra_jax.tunnel.arrays import from_centreline, from_polylines
 from subterra_jax.tunnel.file import save_tunnel
-from subterra_jax.tunnel.tunnel import CONTACT_REACH, Foot, Tunnel, at_station, beside, foot, node_at
+from subterra_jax.tunnel.tunnel import CONTACT_REACH, GROUP, WIDTH, Foot, Tunnel, at_station, beside, foot, node_at
 
 __all__ = [
     "CONTACT_REACH",
+    "GROUP",
+    "WIDTH",
     "Foot",
     "Tunnel",
     "at_station",

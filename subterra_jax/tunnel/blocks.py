@@ -267,17 +267,72 @@ def build_blocks(plan: TunnelPlan, lining: Lining, length: float, max_segments: 
     return Blocks(centre, half, thickness, vertex - centre[:, None, :], count, pieces.station)
 
 
-def pad(blocks: Blocks, count: int) -> Blocks:
-    """Pad to at least `count` blocks with points too far away to be seen, in boxes that nothing enters."""
-    missing = max(0, count - len(blocks.centre))
-    return Blocks(
-        centre=np.pad(blocks.centre, ((0, missing), (0, 0)), constant_values=PADDING_CENTRE),
-        half=np.pad(blocks.half, ((0, missing), (0, 0))),
-        thickness=np.pad(blocks.thickness, (0, missing), constant_values=PADDING_THICKNESS),
-        offset=np.pad(blocks.offset, ((0, missing), (0, 0), (0, 0))),
-        count=np.pad(blocks.count, (0, missing), constant_values=1),
-        station=np.pad(blocks.station, (0, missing), constant_values=np.inf),
-    )
+# Bounds are made to be less than true by this, m: more than any rounding on the device.
+_BOUND_MARGIN = 1e-3
+_BOUND_ROWS = 64  # blocks at a time, against memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Order:
+    """The order in which a beam visits blocks, and a bound by which it may stop.
+
+    A beam visits the blocks from `start` on, and then those before it, outward. Across the tunnel at each block lies a
+    plane. Whatever is still to be visited lies beyond it, however the tunnel bends, so a beam that does not reach the
+    plane before the wall that it has met is done.
+
+    Attributes:
+        start: First block at or beyond each node of the station grid, `(n,)`.
+        normal: Of the plane at each block, along the tunnel, `(n_blocks, 2)`; at most of length 1, with coordinates of
+            16 bits, so that all kernels read the same.
+        ahead: Distance along the normal from the middle of each block to the plane behind which it and all later
+            blocks lie, m, `(n_blocks,)`, scaled like the normal.
+        behind: The same against the normal, for it and all earlier blocks.
+    """
+
+    start: np.ndarray
+    normal: np.ndarray
+    ahead: np.ndarray
+    behind: np.ndarray
+
+
+def order(plan: TunnelPlan, blocks: Blocks, first: np.ndarray, count: np.ndarray) -> Order:
+    """Return the order of blocks.
+
+    Args:
+        plan: The tunnel, for its station grid.
+        blocks: Its blocks.
+        first: First block within reach of each node, as from `windows`.
+        count: Number of blocks from there on that may be within reach.
+    """
+    n = len(blocks.centre)
+    start = np.searchsorted(blocks.station, plan.station)
+    # Blocks that nobody sees who passes this one on the way out do not count.
+    last, least = np.arange(n), np.arange(n)
+    np.maximum.at(last, np.minimum(start, n - 1), first + count - 1)
+    np.minimum.at(least, np.maximum(start - 1, 0), first)
+    last = np.maximum.accumulate(last)
+    least = np.minimum.accumulate(least[::-1])[::-1]
+    tangent = np.stack([np.interp(blocks.station, plan.station, plan.tangent[:, i]) for i in range(2)], axis=-1)
+    normal = half_float((1.0 - 2.0**-7) * tangent / np.linalg.norm(tangent, axis=1, keepdims=True))
+    along = blocks.half / np.maximum(np.hypot(*blocks.half.T), 1e-12)[:, None]
+    aside = blocks.thickness[:, None] * np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    ahead, behind = np.empty(n), np.empty(n)
+    for begin in range(0, n, _BOUND_ROWS):
+        rows = np.arange(begin, min(begin + _BOUND_ROWS, n))
+        low, high = least[rows].min(), last[rows].max() + 1
+        off = normal[rows] @ blocks.centre[low:high].T - np.sum(normal[rows] * blocks.centre[rows], axis=1)[:, None]
+        size = np.abs(normal[rows] @ blocks.half[low:high].T) + np.abs(normal[rows] @ aside[low:high].T)
+        which, row = np.arange(low, high), rows[:, None]
+        later, earlier = (which >= row) & (which <= last[row]), (which <= row) & (which >= least[row])
+        ahead[rows] = np.where(later, off - size, np.inf).min(axis=1) - _BOUND_MARGIN
+        behind[rows] = np.where(earlier, -off - size, np.inf).min(axis=1) - _BOUND_MARGIN
+    return Order(start, normal, ahead, behind)
+
+
+def half_float(values: np.ndarray) -> np.ndarray:
+    """Return the nearest numbers of which only the upper 16 bits of 32 are set."""
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    return ((bits + 0x8000) & 0xFFFF0000).astype(np.uint32).view(np.float32).astype(np.float64)
 
 
 _ROWS = 128  # segments compared together: close enough to one another to share most of their blocks

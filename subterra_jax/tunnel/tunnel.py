@@ -12,12 +12,14 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from subterra_jax.host.errors import TunnelError
-from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, pad, windows
-from subterra_jax.tunnel.packed import Packed, counts, pack
+from subterra_jax.tunnel.blocks import PADDING_CENTRE, PADDING_THICKNESS, build_blocks, order, windows
+from subterra_jax.tunnel.packed import Packed, join, pack
 from subterra_jax.tunnel.plan import TunnelPlan
 
 CONTACT_REACH = 0.8
 FARTHEST = 2.0**14  # m from the origin: up to there neighbouring numbers of 32 bits are less than 1 mm apart
+GROUP = 16  # blocks that a CPU looks at together; there are twice as many of padding on either side of a tunnel
+WIDTH = 16  # segments that a CPU looks at together
 _CANDIDATES, _CANDIDATES_FURNISHED = 3, 8
 
 
@@ -38,8 +40,11 @@ class Tunnel:
         grid: Centreline x, y (m), unit tangent x, y and half width (m) at each node of the station grid.
         scan_first: First block of the window that a LiDAR near each node can see.
         contact_first: First block of the window that a robot near each node can touch.
+        visit_first: First block at or beyond each node: beams visit blocks from there on, and back; see `blocks.Order`.
         box: Rows of the middle x, y of the box around each block, half its long axis as a vector x, y, half its
-            thickness and half its length, m. Padding has a negative thickness: no beam enters it.
+            thickness and half its length, m; and of the plane at each block: its normal x, y, and how far ahead and
+            behind it is, m; see `blocks.Order`. Padding, as before the first block, has a negative thickness, so that
+            no beam enters it, and nothing beyond its plane.
         wall: Row of x and row of y of the vertices of each block, from the middle of its box, m; the last one repeated
             as padding.
         reach: Largest range for which the scan window was made, m.
@@ -48,7 +53,8 @@ class Tunnel:
         n_contact: Blocks in a contact window.
         n_candidates: Boxes that are sorted by where a beam enters them; affects speed alone.
         space: Surface and ground, a `lidar3d.space.Space`, for LiDARs in three dimensions; `None` without one.
-        packed: Boxes and walls as GPUs read them, a `Packed`. `None` in a tunnel whose `box` or `wall` was replaced.
+        packed: Boxes and walls as GPUs read them, a `Packed`. `None` in a tunnel whose `box` or `wall` was replaced:
+            XLA casts there.
     """
 
     length: Float[Array, "*k"]
@@ -59,7 +65,8 @@ class Tunnel:
     grid: Float[Array, "all_nodes 5"]
     scan_first: Int[Array, "all_nodes"]
     contact_first: Int[Array, "all_nodes"]
-    box: Float[Array, "6 n_blocks"]
+    visit_first: Int[Array, "all_nodes"]
+    box: Float[Array, "10 n_blocks"]
     wall: Float[Array, "n_blocks 2 n_vertices"]
     reach: float = struct.field(pytree_node=False)
     n_scan: int = struct.field(pytree_node=False)
@@ -137,16 +144,19 @@ class Tunnel:
         if n_candidates is None:
             n_candidates = _CANDIDATES if len(walls.furniture) == 0 else _CANDIDATES_FURNISHED
         scan_first, in_window = windows(plan, blocks, reach)
-        n_scan = int(in_window.max())
-        # A slice beyond the end would start earlier than asked for.
-        blocks = pad(blocks, int(scan_first.max()) + n_scan)
         contact_first, in_contact = windows(plan, blocks, CONTACT_REACH)
+        visits, n_scan = order(plan, blocks, scan_first, in_window), int(in_window.max())
         half_length = np.linalg.norm(blocks.half, axis=1)
         grid = np.concatenate([plan.centre, plan.tangent, plan.half_width[:, None]], axis=1)
-        box = np.column_stack([blocks.centre, blocks.half, blocks.thickness, half_length]).T
-        wall = blocks.offset.swapaxes(1, 2).astype(np.float32)
-        window = np.zeros(box.shape[1])
-        np.maximum.at(window, scan_first, in_window)
+        box = np.column_stack(
+            [blocks.centre, blocks.half, blocks.thickness, half_length, visits.normal, visits.ahead, visits.behind]
+        ).T.astype(np.float32)
+        # A slice beyond the end would start earlier than asked for.
+        around = 2 * GROUP, max(2 * GROUP, int(scan_first.max()) + n_scan - len(blocks.centre))
+        box = np.concatenate([_padding(around[0]), box, _padding(around[1])], axis=1)
+        wall = np.pad(blocks.offset.swapaxes(1, 2).astype(np.float32), (around, (0, 0), (0, 0)))
+        wall = np.pad(wall, ((0, 0), (0, 0), (0, (1 - wall.shape[2]) % WIDTH)), mode="edge")
+        count = np.pad(blocks.count, around, constant_values=1)
         real, whole = partial(_on_device, dtype=np.float32), partial(_on_device, dtype=np.int32)
         return cls(
             length=real(plan.length),
@@ -155,15 +165,16 @@ class Tunnel:
             first_node=whole(0),
             n_nodes=whole(len(plan.station)),
             grid=real(grid),
-            scan_first=whole(scan_first),
-            contact_first=whole(contact_first),
+            scan_first=whole(scan_first + around[0]),
+            contact_first=whole(contact_first + around[0]),
+            visit_first=whole(visits.start + around[0]),
             box=real(box),
             wall=real(wall),
             reach=reach,
             n_scan=n_scan,
             n_contact=int(in_contact.max()),
             n_candidates=n_candidates,
-            packed=jax.device_put(pack(box.astype(np.float32), wall, blocks.count, window)),
+            packed=jax.device_put(pack(box, wall, count)),
         )
 
 
@@ -281,6 +292,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         grid=put(np.concatenate([np.asarray(t.grid) for t in tunnels])),
         scan_first=shifted("scan_first"),
         contact_first=shifted("contact_first"),
+        visit_first=shifted("visit_first"),
         box=put(box),
         wall=put(wall),
         reach=min(t.reach for t in tunnels),
@@ -288,7 +300,7 @@ def stack(tunnels: Sequence[Tunnel]) -> Tunnel:
         n_contact=n_contact,
         n_candidates=max(t.n_candidates for t in tunnels),
         space=None if tunnels[0].space is None else tunnels[0].space.join([t.space for t in tunnels]),
-        packed=_join_packed(tunnels, box, wall, n_blocks),
+        packed=_join_packed(tunnels, n_blocks),
     )
 
 
@@ -306,25 +318,19 @@ def _pad(tunnel: Tunnel, n_scan: int, n_contact: int, n_vertices: int) -> tuple[
 
 
 def _padding(count: int) -> np.ndarray:
-    """Return boxes that nothing enters."""
-    fill = np.zeros((6, count), np.float32)
-    fill[:2], fill[4] = PADDING_CENTRE, PADDING_THICKNESS
+    """Return boxes that nothing enters, with nothing beyond their planes."""
+    fill = np.zeros((10, count), np.float32)
+    fill[:2], fill[4], fill[6], fill[8:] = PADDING_CENTRE, PADDING_THICKNESS, 1.0, np.inf
     return fill
 
 
-def _join_packed(tunnels: Sequence[Tunnel], box: np.ndarray, wall: np.ndarray, n_blocks: np.ndarray) -> Packed | None:
-    """Pack the blocks of a stack.
-
-    Args:
-        tunnels: The tunnels.
-        box: Boxes of the stack.
-        wall: Walls of the stack.
-        n_blocks: Blocks of each tunnel with padding.
-    """
+def _join_packed(tunnels: Sequence[Tunnel], n_blocks: np.ndarray) -> Packed | None:
+    """Join the packed blocks of tunnels, padded to numbers of blocks."""
     if any(t.packed is None for t in tunnels):
         return None
-    pairs, window = np.zeros((2, len(wall)), np.int32)
-    for tunnel, begin in zip(tunnels, np.cumsum(n_blocks) - n_blocks, strict=True):
-        own = slice(begin, begin + len(tunnel.packed.box))
-        pairs[own], window[own] = counts(np.asarray(tunnel.packed.box)[:, 3])
-    return jax.device_put(pack(box, wall, 2 * pairs, window))
+    parts = []
+    for tunnel, n in zip(tunnels, n_blocks, strict=True):
+        missing = n - len(tunnel.packed.block)
+        end = pack(_padding(missing), np.zeros((missing, 2, 2), np.float32), np.ones(missing, int))
+        parts += [tunnel.packed, end] if missing else [tunnel.packed]
+    return jax.device_put(join(parts))

@@ -8,7 +8,7 @@ import pytest
 import subterra_jax as st
 from subterra_jax.lidar import reference
 from subterra_jax.procedural import open_world
-from subterra_jax.tunnel import Tunnel, blocks
+from subterra_jax.tunnel import Tunnel, blocks, from_centreline
 from subterra_jax.tunnel.blocks import windows
 from subterra_jax.tunnel.distances import distance_to_segment
 
@@ -81,3 +81,35 @@ def test_a_tunnel_ten_times_as_long_has_no_larger_windows():
     short, long = (Tunnel.from_plan(make(length=length)) for length in (351.0, 3510.0))
     assert float(long.length) == pytest.approx(3510.0)
     assert long.n_scan <= short.n_scan + 4
+
+
+@pytest.mark.parametrize("name", [None, "open:masonry:train:0", "open:rock:test-unseen:0"])
+def test_nothing_still_to_be_visited_lies_before_the_plane_at_a_block(name):
+    plan = (st.load_tunnel(name) if name else st.load_tunnel()).slice(100.0, 90.0)
+    cut = blocks.build_blocks(plan, plan.lining(plan.default_lining), 2.0, 16)
+    first, count = windows(plan, cut, 12.0)
+    visits = blocks.order(plan, cut, first, count)
+    assert np.hypot(*visits.normal.T).max() <= 1.0
+    for node in range(0, len(plan.station), 15):
+        start = int(visits.start[node])
+        for i in range(first[node], first[node] + count[node]):
+            later = range(i, first[node] + count[node]) if i >= start else range(first[node], i + 1)
+            way, bound = (1.0, visits.ahead[i]) if i >= start else (-1.0, visits.behind[i])
+            # Pockets lie behind the lids of their boxes, up to their depth beyond them.
+            corner = np.concatenate([_corners(cut, j) for j in later]) - cut.centre[i]
+            assert (way * corner @ visits.normal[i]).min() >= bound
+
+
+def _corners(cut: blocks.Blocks, i: int) -> np.ndarray:
+    along = cut.half[i]
+    aside = cut.thickness[i] * np.array([-along[1], along[0]]) / np.hypot(*along)
+    return cut.centre[i] + np.array([a * along + b * aside for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
+
+
+def test_a_beam_visits_few_blocks_of_a_straight_tunnel():
+    """The bound at a block of a straight tunnel is its own near end, but for the block beside it."""
+    plan = from_centreline([[0.0, 0.0], [200.0, 0.0]], 2.5)
+    cut = blocks.build_blocks(plan, plan.lining("smooth"), 2.0, 16)
+    visits = blocks.order(plan, cut, *windows(plan, cut, 30.0))
+    assert np.hypot(*cut.half.T).max() == pytest.approx(1.0, abs=0.3)
+    assert min(visits.ahead.min(), visits.behind.min()) > -2.1

@@ -45,9 +45,7 @@ def test_a_range_changes_with_the_wall_that_it_meets(corridor, fused):
     there = jnp.float32(0.0), jnp.float32(40.0)
 
     def range_to_left(walls):
-        moved = dataclasses.replace(
-            corridor, box=corridor.box + jnp.array([0, walls, 0, 0, 0, 0])[:, None], packed=None
-        )
+        moved = dataclasses.replace(corridor, box=corridor.box.at[1].add(walls), packed=None)
         scan = lambda y: lidar.scan(moved, jnp.stack([40.0, y]), *there, LidarParams(fused=fused))  # noqa: E731
         return jax.vmap(scan)(jnp.zeros(2))[0, 4]
 

@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax import lidar
-from subterra_jax.lidar import fused, planar, reference
+from subterra_jax.lidar import gpu, planar, reference
 from subterra_jax.parts import unicycle as vehicle
 from subterra_jax.tunnel import Tunnel, foot, node_at
 from subterra_jax.tunnel.tunnel import stack
@@ -112,13 +112,13 @@ def test_no_window_reaches_the_neighbour(alone, together):
         assert seen.max() - seen.min() == len(seen) - 1
 
 
-def test_the_fused_kernels_see_each_tunnel_of_a_stack(plans, alone):
+def test_the_kernels_of_a_gpu_see_each_tunnel_of_a_stack(plans, alone):
     poses = [reference.Poses(*(v[:24] for v in vars(p).values())) for p in poses_in(plans[:2], 30)]
     stacked = stack(alone[:2])
     position, heading, station = (np.concatenate(part) for part in zip(*(vars(p).values() for p in poses), strict=True))
     index, rows = np.repeat([0, 1], 24), (jnp.asarray(position), jnp.asarray(heading))
-    first = jax.vmap(lambda i, s: stacked.scan_first[node_at(stacked.pick(i), s)])(index, station)
-    ranges = fused.scan(stacked.walls, *rows, first, jnp.ones(48, bool), jnp.float32(30.0), lidar.bearings(2))
+    start = jax.vmap(lambda i, s: stacked.visit_first[node_at(stacked.pick(i), s)])(index, station)
+    ranges = gpu.scan(stacked.walls, *rows, start, jnp.ones(48, bool), jnp.float32(30.0), lidar.bearings(2))
     walls = [plan.lining(lining).segments for plan, lining in zip(plans, LININGS, strict=True)][:2]
     truth = [reference.scan(w, p.position, p.heading, 2) for w, p in zip(walls, poses, strict=True)]
     np.testing.assert_allclose(ranges, np.concatenate(truth), atol=1e-3)

@@ -1,0 +1,238 @@
+"""The kernels for NVIDIA GPUs, here in Pallas' interpreter, against XLA's and against float64 brute force."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import subterra_jax as st
+from subterra_jax import lidar
+from subterra_jax.lidar import gpu, nvidia, reference
+from subterra_jax.parts import unicycle
+from subterra_jax.tunnel import CONTACT_REACH, Tunnel, node_at, packed
+from subterra_jax.tunnel.tunnel import stack
+from tests.subterra_jax.lowering import for_nvidia
+from tests.subterra_jax.modes import wide
+
+KINDS = ("straight:train", "cast:train", "sprayed:train", "masonry:train", "universal:test-unseen", "rock:test-unseen")
+NAMES = [None, *(f"open:{kind}:0" for kind in KINDS)]
+REACH = np.float32(CONTACT_REACH)
+
+
+def piece_of(name: str | None) -> st.TunnelPlan:
+    return (st.load_tunnel(name) if name else st.load_tunnel()).slice(100.0, 60.0)
+
+
+@pytest.fixture(scope="module")
+def plan() -> st.TunnelPlan:
+    return piece_of(None)
+
+
+def nodes(tunnel: Tunnel, station: np.ndarray) -> jax.Array:
+    return jax.vmap(node_at, (None, 0))(tunnel, jnp.asarray(station))
+
+
+def scan_by_kernel(
+    tunnel: Tunnel, poses: reference.Poses, wanted: np.ndarray | None = None, n_beams: int = 16, range_max: float = 30.0
+) -> np.ndarray:
+    wanted = np.ones(len(poses.station), bool) if wanted is None else wanted
+    start = tunnel.visit_first[nodes(tunnel, poses.station)]
+    rows = jnp.asarray(poses.position), jnp.asarray(poses.heading), start, jnp.asarray(wanted)
+    return np.asarray(gpu.scan(tunnel, *rows, jnp.float32(range_max), lidar.bearings(n_beams)))
+
+
+@pytest.mark.parametrize("n_beams", [1, 12, 16])
+def test_scans_are_those_of_the_reference(plan: st.TunnelPlan, n_beams: int) -> None:
+    poses = reference.random_poses(plan, 70, np.random.default_rng(n_beams))
+    ranges = scan_by_kernel(Tunnel.from_plan(plan), poses, n_beams=n_beams)
+    assert ranges.shape == (70, n_beams)
+    assert reference.agreement(plan.lining("pockets").segments, poses, ranges).n_wrong == 0
+
+
+@pytest.mark.parametrize(("name", "lining"), [(NAMES[4], None), (NAMES[6], None), (None, "furnished")])
+def test_deep_recesses_rock_and_furniture_are_met(name: str | None, lining: str | None) -> None:
+    plan = piece_of(name)
+    lining = lining or plan.default_lining
+    poses = reference.random_poses(plan, 500, np.random.default_rng(1))
+    found = reference.agreement(
+        plan.lining(lining).segments, poses, scan_by_kernel(Tunnel.from_plan(plan, lining), poses)
+    )
+    assert (found.n_wrong, found.max_error < 1e-3) == (0, True)
+
+
+def test_blocks_of_any_size_give_the_same_ranges(plan: st.TunnelPlan) -> None:
+    poses = reference.random_poses(plan, 64, np.random.default_rng(5))
+    usual = scan_by_kernel(Tunnel.from_plan(plan), poses)
+    large = scan_by_kernel(Tunnel.from_plan(plan, block_length=20.0, max_segments=90), poses)
+    assert np.mean(np.abs(large - usual) < 1e-4) > 0.999
+
+
+def test_ranges_are_clipped_at_the_largest(plan: st.TunnelPlan) -> None:
+    poses = reference.random_poses(plan, 32, np.random.default_rng(1))
+    ranges = scan_by_kernel(Tunnel.from_plan(plan), poses, range_max=4.0)
+    assert ranges.max() == 4.0
+    assert ranges.min() < 4.0
+
+
+def test_wanted_scans_do_not_depend_on_the_unwanted_ones(plan: st.TunnelPlan) -> None:
+    poses = reference.random_poses(plan, 96, np.random.default_rng(2))
+    tunnel = Tunnel.from_plan(plan)
+    some, everything = (scan_by_kernel(tunnel, poses, mask) for mask in (np.arange(96) == 50, np.ones(96, bool)))
+    np.testing.assert_array_equal(some[50], everything[50])
+
+
+def test_a_kernel_lowers_for_a_gpu_where_there_is_none(plan: st.TunnelPlan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    rows = jnp.zeros((64, 2)), jnp.zeros(64), jnp.zeros(64, jnp.int32), jnp.ones(64, bool)
+
+    def scan(tunnel, *rows):
+        return gpu.scan(tunnel, *rows, jnp.float32(30.0), lidar.bearings(16))
+
+    assert "triton" in for_nvidia(scan, Tunnel.from_plan(plan).walls, *rows)
+
+
+def test_a_tunnel_whose_walls_were_replaced_is_cast_by_xla(
+    plan: st.TunnelPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nvidia, "present", lambda: True)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    tunnel, rows = Tunnel.from_plan(plan), (jnp.zeros((32, 2)), jnp.zeros(32), jnp.zeros(32))
+    scan = jax.vmap(lambda tunnel, *row: lidar.scan(tunnel, *row, lidar.LidarParams()), (None, 0, 0, 0))
+    assert "triton" in for_nvidia(scan, tunnel, *rows)
+    assert "triton" not in for_nvidia(scan, dataclasses.replace(tunnel, packed=None), *rows)
+
+
+def unpacked(tunnel: Tunnel) -> list[np.ndarray]:
+    return [np.asarray(part) for part in packed.unpack(tuple(jnp.asarray(tunnel.packed.block).T))]
+
+
+@pytest.mark.parametrize("name", [None, NAMES[4], NAMES[6]])
+def test_a_packed_block_holds_the_box_its_plane_and_its_vertices(name: str | None) -> None:
+    tunnel = Tunnel.from_plan(piece_of(name))
+    there = np.asarray(tunnel.box)[4] > 0.0
+    x, y, e_x, e_y, thickness, pairs, n_x, n_y, ahead, behind = unpacked(tunnel)
+    np.testing.assert_array_equal(np.stack([x, y]), np.asarray(tunnel.box)[:2])
+    np.testing.assert_array_equal(np.stack([n_x, n_y]), np.asarray(tunnel.box)[6:8])
+    assert np.all(thickness[~there] == -1.0)
+    assert np.all(np.isinf(np.stack([ahead, behind])[:, ~there]))
+    box = np.asarray(tunnel.box, np.float64)[:, there]
+    for plane, exact in ((ahead, box[8]), (behind, box[9])):
+        assert np.all(plane[there] <= exact)
+        assert np.all(plane[there] >= exact - 0.01 * np.abs(exact) - 1e-6)
+    e_x, e_y, grown = e_x[there].astype(float), e_y[there].astype(float), thickness[there].astype(float)
+    length = np.hypot(e_x, e_y)
+    for side in (-1.0, 1.0):
+        corner_x, corner_y = box[2] - side * box[4] * box[3] / box[5], box[3] + side * box[4] * box[2] / box[5]
+        assert np.all(np.abs(corner_y * e_x - corner_x * e_y) <= grown * length)
+        assert np.all(np.abs(corner_x * e_x + corner_y * e_y) <= (length + grown) * length)
+    assert (grown - box[4]).max() < 0.02
+    first = np.asarray(tunnel.packed.block)[:, 6]
+    for i in np.flatnonzero(there)[::17]:
+        own = np.asarray(tunnel.packed.wall)[first[i] : first[i] + pairs[i]].reshape(-1, 2)
+        wall = np.asarray(tunnel.wall)[i].T
+        np.testing.assert_array_equal(own[: len(wall)], wall[: len(own)])
+        assert np.all(wall[len(own) :] == wall[-1])
+
+
+def test_a_stack_is_packed_as_its_tunnels_are(plan: st.TunnelPlan) -> None:
+    one, other = Tunnel.from_plan(plan), Tunnel.from_plan(piece_of(NAMES[4]))
+    both = stack([one, other])
+    for tunnel, begin in ((one, 0), (other, int(both.visit_first[-1] - other.visit_first[-1]))):
+        own, theirs = both.packed.block[begin : begin + len(tunnel.packed.block)], tunnel.packed.block
+        np.testing.assert_array_equal(own[:, :6], theirs[:, :6])
+        shift = int(own[0, 6])
+        np.testing.assert_array_equal(own[:, 6] - shift, theirs[:, 6])
+        np.testing.assert_array_equal(both.packed.wall[shift : shift + len(tunnel.packed.wall)], tunnel.packed.wall)
+
+
+def places(plan: st.TunnelPlan, lining: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (m) and stations (m): in the whole bore, about the mouths, and in corners beside vertices of walls."""
+    rng = np.random.default_rng(seed)
+    inside = reference.random_poses(plan, 300, rng, gap=0.1)
+    mouths = reference.random_poses(plan, 150, rng, gap=0.1, near_mouths=True)
+    corners = plan.lining(lining).segments[rng.integers(0, len(plan.lining(lining).segments), 300), :2]
+    nearest = np.argmin(np.linalg.norm(corners[:, None] - plan.centre, axis=2), axis=1)
+    inward = plan.centre[nearest] - corners
+    away = rng.uniform(0.0, 0.9, (300, 1)) / np.linalg.norm(inward, axis=1, keepdims=True)
+    position = np.concatenate([inside.position, mouths.position, corners + away * inward])
+    station = np.concatenate([inside.station, mouths.station, plan.station[nearest]])
+    return position.astype(np.float32), station.astype(np.float32)
+
+
+def both(tunnel: Tunnel, position: np.ndarray, node: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    """Distances by the kernel and by XLA, m."""
+    by_xla = jax.vmap(unicycle._gap, (None, 0, 0))(tunnel, jnp.asarray(position), node)
+    return np.asarray(gpu.clearance(tunnel, jnp.asarray(position), tunnel.visit_first[node])), np.asarray(by_xla)
+
+
+def assert_equal(found: np.ndarray, truth: np.ndarray) -> None:
+    """To a micrometre, exactly beyond the reach, and nowhere NaN."""
+    np.testing.assert_allclose(found, truth, rtol=0.0, atol=1e-6, equal_nan=False)
+    np.testing.assert_array_equal(found == REACH, truth == REACH)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_clearances_are_those_of_xla_and_of_brute_force(name: str | None) -> None:
+    plan = piece_of(name)
+    tunnel, lining = Tunnel.from_plan(plan), plan.default_lining
+    position, station = places(plan, lining, 1)
+    found, by_xla = both(tunnel, position, nodes(tunnel, station))
+    assert found.shape == station.shape
+    assert_equal(found, by_xla)
+    truth = reference.clearance(plan.lining(lining).segments, position)
+    near = truth < 0.79
+    assert near.sum() > 200
+    assert (~near).sum() > 100
+    np.testing.assert_allclose(found[near], truth[near], atol=1e-5)
+    assert np.all(found[truth > 0.81] == REACH)
+
+
+def test_each_tunnel_of_a_stack_has_its_own_distances(plan: st.TunnelPlan) -> None:
+    plans = [plan, piece_of(NAMES[4]), piece_of(NAMES[2])]
+    tunnels = [Tunnel.from_plan(each, block_length=0.4) for each in plans]
+    joined = stack(tunnels)
+    for i, (each, tunnel) in enumerate(zip(plans, tunnels, strict=True)):
+        position, station = places(each, each.default_lining, i)
+        found, by_xla = both(joined.walls, position, nodes(joined.pick(i), station))
+        assert_equal(found, by_xla)
+        assert_equal(found, both(tunnel, position, nodes(tunnel, station))[0])
+
+
+def test_furniture_counts(plan: st.TunnelPlan) -> None:
+    tunnel = Tunnel.from_plan(plan, "furnished")
+    position, station = places(plan, "furnished", 2)
+    found, by_xla = both(tunnel, position, nodes(tunnel, station))
+    assert_equal(found, by_xla)
+    assert np.any(found < both(Tunnel.from_plan(plan), position, nodes(Tunnel.from_plan(plan), station))[0] - 0.1)
+
+
+@pytest.mark.parametrize("n", [1, 33])
+def test_any_number_of_points(plan: st.TunnelPlan, n: int) -> None:
+    tunnel = Tunnel.from_plan(plan)
+    position, station = (part[-n:] for part in places(plan, plan.default_lining, 3))
+    found, by_xla = both(tunnel, position, nodes(tunnel, station))
+    assert_equal(found, by_xla)
+
+
+@pytest.mark.parametrize("bits", [32, 64])
+@pytest.mark.parametrize("there", [False, True])
+def test_a_batch_of_robots_uses_the_kernel_where_there_is_an_nvidia_gpu(
+    plan: st.TunnelPlan, bits: int, there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(nvidia, "present", lambda: there)
+    one = jnp.zeros((32, 2), jnp.float32), jnp.zeros(32, jnp.float32)
+    tunnel = Tunnel.from_plan(plan)
+    measure = jax.vmap(unicycle.clearance, (None, 0, 0))
+    if bits == 32:
+        assert ("triton" in for_nvidia(measure, tunnel, *one)) is there
+    else:
+        with wide():
+            assert ("triton" in for_nvidia(measure, tunnel, *one)) is there
+
+
+def test_a_range_that_is_no_number_is_wrong(plan: st.TunnelPlan) -> None:
+    poses = reference.random_poses(plan, 4, np.random.default_rng(6))
+    assert reference.agreement(plan.lining("pockets").segments, poses, np.full((4, 16), np.nan)).n_wrong == 64
