@@ -295,7 +295,8 @@ def _gap_kernel(start_ref, x_ref, y_ref, block_ref, wall_ref, gap_ref, *, n_rows
         gap = (n_x * m_x + n_y * m_y) * visit.way + jnp.where(visit.way > 0.0, ahead, behind)
         ends = (gap > 0.0) & (gap * gap > visit.best)
         squared = e_x * e_x + e_y * e_y
-        near = jnp.sqrt(visit.best) + thickness + 1e-3
+        # Not the best so far: from within a pocket its wall is nearer than the box, whose lid closes it.
+        near = CONTACT_REACH + thickness + 1e-3
         length = jnp.sqrt(squared)
         beside = jnp.abs(m_x * e_y - m_y * e_x) <= near * length + 1e-6
         # A packed axis is turned a little, and the box is longer by its half thickness at most.

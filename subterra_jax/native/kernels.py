@@ -184,7 +184,8 @@ def clearance_rows(begin, end, start, position, box, wall, n_vertices, reach, di
                 if gap > _ZERO and gap * gap > best:
                     break
                 e_x, e_y, length = box[_U(2) * n + i], box[_U(3) * n + i], box[_U(5) * n + i]
-                near = _F(math.sqrt(best)) + box[_U(4) * n + i] + _F(1e-5)
+                # Not the best so far: from within a pocket its wall is nearer than the box, whose lid closes it.
+                near = reach + box[_U(4) * n + i] + _F(1e-5)
                 beside = abs(m_x * e_y - m_y * e_x) <= near * length
                 if beside and abs(m_x * e_x + m_y * e_y) <= (length + near) * length:
                     best = _squared(wall, n_vertices, i, m_x, m_y, best, work, bits)

@@ -322,6 +322,9 @@ def order(plan: TunnelPlan, blocks: Blocks, first: np.ndarray, count: np.ndarray
         low, high = least[rows].min(), last[rows].max() + 1
         off = normal[rows] @ blocks.centre[low:high].T - np.sum(normal[rows] * blocks.centre[rows], axis=1)[:, None]
         size = np.abs(normal[rows] @ blocks.half[low:high].T) + np.abs(normal[rows] @ aside[low:high].T)
+        # What lies behind a lid counts too: a clearance may be measured from within a pocket.
+        vertices = np.abs(blocks.offset[low:high].reshape(-1, 2) @ normal[rows].T)
+        size = np.maximum(size, vertices.reshape(high - low, -1, len(rows)).max(axis=1).T)
         which, row = np.arange(low, high), rows[:, None]
         later, earlier = (which >= row) & (which <= last[row]), (which <= row) & (which >= least[row])
         ahead[rows] = np.where(later, off - size, np.inf).min(axis=1) - _BOUND_MARGIN

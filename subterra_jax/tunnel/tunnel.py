@@ -330,7 +330,7 @@ def _join_packed(tunnels: Sequence[Tunnel], n_blocks: np.ndarray) -> Packed | No
         return None
     parts = []
     for tunnel, n in zip(tunnels, n_blocks, strict=True):
-        missing = n - len(tunnel.packed.block)
+        missing = int(n) - len(tunnel.packed.block)
         end = pack(_padding(missing), np.zeros((missing, 2, 2), np.float32), np.ones(missing, int))
         parts += [tunnel.packed, end] if missing else [tunnel.packed]
     return jax.device_put(join(parts))
