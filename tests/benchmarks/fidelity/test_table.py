@@ -67,6 +67,7 @@ def test_the_worst_stretch_of_a_metric_along_the_tunnel_is_kept_with_its_place()
     error = np.where((station >= 20.0) & (station < 30.0), 0.3, 0.1)
     found = estimate(mean, error, station, np.random.default_rng(0))
     assert found.extremes == ((0.0, pytest.approx(0.1)), (20.0, pytest.approx(0.3)))
+    assert found.interval == (pytest.approx(0.1), pytest.approx(0.22, abs=0.025))  # one block in five is worse
     assert load_values(dump_values({"one": found})) == {"one": found}
     row = table.load()["c2m_mean"]
     worst = _worst_stretch(row, found)
