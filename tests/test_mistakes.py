@@ -72,7 +72,7 @@ MISTAKES = {
     "train --out o --memory gru --begin-from junk.safetensors": "damaged policy",
     "train.evaluate": "a task or a policy must be named",
     "train.evaluate --policy none": "none: no such policy",
-    "train.evaluate --policy empty": "empty: holds no checkpoint",
+    "train.evaluate --policy empty": "empty: holds no policy.safetensors",
     "train.evaluate --policy Traverse-v1 --episodes 0": "episodes must be at least 1",
     "train.evaluate --policy Traverse-v1 --task Subterra/StopAt-v7": "its id is Subterra/StopAt-v1",
     "train.release none --out o.safetensors": "none: no such policy",
