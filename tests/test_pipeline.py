@@ -50,8 +50,7 @@ def test_the_environments_lidar_sees_what_mujoco_sees_in_the_scene(scene, lining
     model = mujoco.MjModel.from_xml_path(str(scene / file))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    with np.load(scene / "tunnel.npz") as tunnel:
-        height = np.interp(poses.station, tunnel["station"], tunnel["elevation"]) + tunnel["lidar_height"]
+    height = np.interp(poses.station, plan.station, plan.elevation) + plan.lidar_height
     visible = np.array([1, 1, 0, 0, 0, 0], np.uint8)
     theirs = np.empty_like(ours)
     for k, (position, heading) in enumerate(zip(poses.position, poses.heading, strict=True)):

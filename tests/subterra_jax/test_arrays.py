@@ -86,7 +86,9 @@ def test_walls_with_niches_keep_a_quiet_centreline():
     np.testing.assert_allclose(ranges(plan, 51.0)[[1, 3]], [4.0, 2.5], atol=0.02)
 
 
-@pytest.mark.parametrize("task", [pytest.param("Subterra/Traverse-v1", marks=pytest.mark.slow), "Subterra/StopAtShort-v1"])
+@pytest.mark.parametrize(
+    "task", [pytest.param("Subterra/Traverse-v1", marks=pytest.mark.slow), "Subterra/StopAtShort-v1"]
+)
 def test_a_task_runs_in_a_tunnel_from_arrays_and_in_a_stack_of_them(task):
     plans = [
         st.tunnel.from_centreline(bend(60.0), 2.5, pockets=[[40.0, 1, 0.2, 0.13]]),

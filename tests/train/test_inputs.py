@@ -103,10 +103,11 @@ def test_after_the_flag_the_way_leads_back_to_the_start(plan):
     now = inputs.begin(obs)
     there = dataclasses.replace(obs, distance=obs.distance + out - 2.0, flag=jnp.float32(1.0))
     now = inputs.see(now, there)
-    assert inputs.way_to_go(now, there, params) == pytest.approx(out - params.goal.flag_reach, abs=1e-3)
+    reach = float(params.goal.flag_reach)
+    assert float(inputs.way_to_go(now, there, params)) == pytest.approx(out - reach, abs=1e-3)
     back = dataclasses.replace(there, distance=there.distance + 10.0, heading=obs.heading + 3.0)
     now = inputs.see(now, back)
-    assert inputs.way_to_go(now, back, params) == pytest.approx(out - params.goal.flag_reach - 10.0, abs=1e-3)
+    assert float(inputs.way_to_go(now, back, params)) == pytest.approx(out - reach - 10.0, abs=1e-3)
     assert inputs.is_turned(now, back)
     assert not inputs.is_turned(now, there)
 
