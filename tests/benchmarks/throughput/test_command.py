@@ -40,7 +40,11 @@ def test_one_run_writes_speeds_the_papers_route_and_the_gate(tmp_path, monkeypat
     (route,) = result["peers"]
     assert route["ratios"]["8"] == pytest.approx(result["speed"][0]["median"] / route["speeds"][0]["median"])
     assert (tmp_path / "speed" / "throughput.png").read_bytes().startswith(b"\x89PNG")
-    assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == ["throughput.json", "throughput.png"]
+    assert sorted(path.name for path in (tmp_path / "speed").iterdir()) == [
+        "records.json",
+        "throughput.json",
+        "throughput.png",
+    ]
 
 
 @pytest.mark.parametrize(
