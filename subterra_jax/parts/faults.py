@@ -219,7 +219,7 @@ class Faults(Part):
         """Begin an episode without faults; the robot has stood still until now."""
         faults, odometry = params.faults, params.odometry
         noise = jnp.stack([jnp.asarray(odometry.distance_sigma), jnp.asarray(odometry.heading_sigma)])
-        past = noise * jnp.cumsum(draw[3][:-1], axis=0)
+        past = noise[None, :] * jnp.cumsum(draw[3][:-1], axis=0)
         origin = jnp.stack([jnp.asarray(faults.origin_distance), jnp.asarray(faults.origin_heading)]) * draw[3][-1]
         now = sight(state.position, state.heading, state.station, state.odometry)
         zero = jnp.zeros_like(draw[1])
