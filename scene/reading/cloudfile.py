@@ -43,9 +43,17 @@ def read_cloud(
         thinned, read, rounding = _thin(source, frame, voxel, stage, partial or Partial(None))
     _refuse_unusable(path, thinned, read, rounding, frame.unit)
     rounded: dict[str, Any] = {"rounded_to": rounding} if rounding >= _COARSE else {}
-    facts = {**rounded, "kind": "registered cloud", "format": source.format, "format_by": detected.by, **frame.facts}
-    facts |= {"crs": source.crs} if source.crs else {}
-    facts |= {"points_left_out": dict(source.left_out)} if source.left_out else {}
+    facts: dict[str, Any] = {
+        **rounded,
+        "kind": "registered cloud",
+        "format": source.format,
+        "format_by": detected.by,
+        **frame.facts,
+    }
+    if source.crs:
+        facts["crs"] = source.crs
+    if source.left_out:
+        facts["points_left_out"] = dict(source.left_out)
     return thinned.cloud(), facts | {"points_read": read, "points_dropped": read - thinned.returns}
 
 

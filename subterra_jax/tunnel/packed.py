@@ -5,6 +5,7 @@ err to one side have 16 bits, and the vertices of all blocks follow one another 
 """
 
 from collections.abc import Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -60,9 +61,9 @@ def pack(
         np.zeros_like(axis_x),
     ]
     corners = pair_up(wall)
-    return Packed(
-        block=np.stack(words, axis=1).view(np.int32), wall=corners[np.arange(corners.shape[1]) < pairs[:, None]]
-    )
+    block: Any = np.stack(words, axis=1).view(np.int32)  # on the host until the tunnel goes to a device
+    points: Any = corners[np.arange(corners.shape[1]) < pairs[:, None]]
+    return Packed(block=block, wall=points)
 
 
 def pair_up(wall: Float[np.ndarray, "n_blocks 2 k"]) -> Float[np.ndarray, "n_blocks n_pairs 4"]:
@@ -76,7 +77,8 @@ def join(parts: Sequence[Packed]) -> Packed:
     first = np.cumsum([0, *(len(part.wall) for part in parts)])[:-1]
     block = np.concatenate([np.asarray(part.block) for part in parts])
     block[:, 6] += np.repeat(first, [len(part.block) for part in parts]).astype(np.int32)
-    return Packed(block=block, wall=np.concatenate([np.asarray(part.wall) for part in parts]))
+    words, points = cast(Any, block), cast(Any, np.concatenate([np.asarray(part.wall) for part in parts]))
+    return Packed(block=words, wall=points)
 
 
 def unpack(words: Sequence[Array]) -> tuple[Array, ...]:
