@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.fidelity.references import SILENT_RANGE, beam_directions, is_organised, organised_scans
+from scene.reading.times import Convention
 
 POINT = np.dtype({
     "names": ["x", "y", "z", "t", "ring"], "formats": ["<f4", "<f4", "<f4", "<u4", "u1"],
@@ -42,7 +43,10 @@ def recording(points, height=RINGS):
     )  # fmt: skip
     connection = SimpleNamespace(topic="/ouster/points", msgtype="sensor_msgs/msg/PointCloud2")
     reader = SimpleNamespace(connections=[connection], messages=lambda connections: iter([(connection, 0, b"")]))
-    return SimpleNamespace(reader=reader, topic="/ouster/points", deserialize=lambda raw, kind: message)
+    convention = Convention("after", "nanoseconds after the header", 1e-9, 0.1)
+    return SimpleNamespace(
+        reader=reader, topic="/ouster/points", deserialize=lambda raw, kind: message, convention=convention
+    )
 
 
 @pytest.mark.parametrize("sense", [-1, 1])

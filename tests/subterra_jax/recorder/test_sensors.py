@@ -70,7 +70,7 @@ def test_an_odometer_without_errors_reckons_the_true_path():
 
 
 def test_without_noise_a_dense_scan_of_as_many_beams_is_the_tasks_own(trace):
-    env, params = st.make("Subterra/StopAtShort-v1", lidar=LidarParams(range_sigma=0.0))
+    env, params = st.make("Subterra/StopAtShort-v1", tunnel="subterra-351", lidar=LidarParams(range_sigma=0.0))
     some = dataclasses.replace(trace, state=jax.tree.map(lambda leaf: leaf[:20], trace.state))
     some = dataclasses.replace(some, observation=trace.observation[:20])
     exact = dense_scans(some, env, params, 16, seed=1)
@@ -81,7 +81,7 @@ def test_without_noise_a_dense_scan_of_as_many_beams_is_the_tasks_own(trace):
 
 @pytest.mark.slow
 def test_a_sector_that_drops_out_is_as_wide_in_the_dense_scan():
-    env, params = st.make("Subterra/Faulted-v1", lidar=LidarParams(range_sigma=0.0))
+    env, params = st.make("Subterra/Faulted-v1", tunnel="subterra-351", lidar=LidarParams(range_sigma=0.0))
     begin = jax.jit(jax.vmap(lambda key: env.begin(env.draw_reset(key, (), params), params)))
     states = begin(jax.random.split(jax.random.key(0), 2))
     four = jnp.full(2, 4.0)
