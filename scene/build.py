@@ -300,14 +300,13 @@ def command(
     Example: python -m scene.build survey.bag --trajectory groundtruth.tum --out build/tunnel
 
     Args:
-        source: A recording (ROS1 or ROS2 bag, MCAP, folder of split bags or of timed scans), a registered
-            cloud (PLY, PCD, LAS, LAZ, E57, PTX, PTS, XYZ, CSV, Parquet), or an as-built ring survey (CSV, XLSX).
+        source: A bag (ROS1, ROS2, MCAP, or a folder of them or of timed scans), a cloud (PLY, PCD, LAS, LAZ,
+            E57, PTX, PTS, XYZ, CSV, Parquet), or a ring survey (CSV, XLSX).
         more: Further bags of the same recording.
         out: Folder to write; replaced only once the new scene is complete.
-        trajectory: Poses of the LiDAR in TUM form (t x y z qx qy qz qw), for a bag; without it, LiDAR odometry.
-        control: Positions of a prism in TUM form (quaternion zero, any order) that fix odometry's length.
-        calibration: Mounts of prism and IMU: geode-gamma, geode-beta, …, a YAML file, or the prism's
-            x,y,z in the LiDAR's axes, m.
+        trajectory: Poses of the LiDAR in TUM form, for a bag; without it, LiDAR odometry.
+        control: Positions of a prism in TUM form that fix odometry's length.
+        calibration: Mounts of prism and IMU: geode-gamma, a YAML file, or the prism's x,y,z, m.
         reader: Python file or module of your own that registers a reader.
         fresh: Start over, whatever a killed build got done.
         keep_every: Least time between two partial results, s.

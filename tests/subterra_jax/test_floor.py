@@ -49,7 +49,7 @@ def test_a_way_back_cancels_what_lasts_and_a_flag_tells_a_hidden_start_in_part()
     }
     known = way_back_variance(DISTANCE, task("Return", **lasting))
     assert (known < 1e-3).all(), "a slip that stays cancels on the way back"
-    hidden = way_back_variance(DISTANCE, task("ReturnOffset", **lasting))
+    hidden = way_back_variance(DISTANCE, task("Return", hidden_start=True, **lasting))
     # The flag tells the sum of start and slip; what it leaves of the slip acts on the way back.
     left = 1.0 / (1.0 / (0.02 * DISTANCE) ** 2 + 1.0 / 3.0**2)
     np.testing.assert_allclose(np.sqrt(hidden), np.sqrt(left), rtol=0.02)
@@ -57,7 +57,7 @@ def test_a_way_back_cancels_what_lasts_and_a_flag_tells_a_hidden_start_in_part()
 
 def test_hidden_starts_and_wet_rail_lower_the_floor():
     dry = floor(task("StopAt"))
-    assert 0.25 < floor(task("StopAtOffset")) / dry < 0.75
+    assert 0.25 < floor(task("StopAt", hidden_start=True)) / dry < 0.75
     wet = task("Faulted")
     assert floor(wet) < 0.7 * dry
     none = wet.replace(faults=wet.faults.replace(severity_high=0))
