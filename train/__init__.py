@@ -2,4 +2,4 @@
 
 from subterra_jax.host.command import require_libraries
 
-require_libraries("train", "train", "tyro", "rich", "matplotlib", "orbax.checkpoint", "safetensors", "brax")
+require_libraries("train", "train", "tyro", "rich", "matplotlib", "orbax.checkpoint", "safetensors")
