@@ -105,14 +105,15 @@ def test_gymnasium_makes_tasks_with_a_sensor_from_outside(desk):
 
 
 def test_a_task_from_outside_is_evaluated_on_listed_episodes(desk):
-    env, params = st.make(TASK)
+    env, params = st.make(TASK, tunnel="subterra-351")
     episodes = listed_episodes(env, params, 4)
     np.testing.assert_array_equal(episodes.seed, listed_episodes(env, params, 500).seed[:4])
     records = evaluate(env, params, make_agent("oracle", params), episodes)
     # Its controller keeps to the middle, 2.8 m from the wall, and drives on to the far mouth.
     assert not records.success.any()
     np.testing.assert_allclose(records.progress, 1.0)
-    wide, params = st.make(TASK, lane=load_file(desk / "keep_left.py").LaneParams(gap=2.8))
+    gap = load_file(desk / "keep_left.py").LaneParams(gap=2.8)
+    wide, params = st.make(TASK, tunnel="subterra-351", lane=gap)
     assert evaluate(wide, params, make_agent("oracle", params), episodes).success.all()
 
 

@@ -10,6 +10,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from subterra_jax.baselines.agent import observed
+from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.learnt import KIND, LOCALISER, NETWORK
 from subterra_jax.policies.memories import Given
@@ -79,31 +80,45 @@ class Driver:
         """Numbers of an action."""
         return self.layout.shape.n_action
 
-    def begin(self, policy: Policy, observation: Array, params: Any) -> Any:
+    def begin(self, policy: Policy, observation: Array, params: Any, env_state: Any) -> Any:
         """Returns what is kept at the first observation of episodes, which it has taken in."""
-        fresh = self._fresh(policy, observation, params)
-        return self.take(policy, fresh, jnp.zeros((observation.shape[0], len(self._low))), observation, params)
+        fresh = self._fresh(policy, observation, params, env_state)
+        still = jnp.zeros((observation.shape[0], len(self._low)))
+        return self.take(policy, fresh, still, observation, params, env_state)
 
-    def take(self, policy: Policy, kept: Any, action: Array, observation: Array, params: Any) -> Any:
-        """Returns what is kept after actions and the observations that followed."""
+    def take(self, policy: Policy, kept: Any, action: Array, observation: Array, params: Any, env_state: Any) -> Any:
+        """Returns what is kept after actions and the observations that followed; the states tell the tunnels."""
         given, memory = Given(policy.localiser, self._map), self.layout.memory
 
-        def one(kept: Any, action: Array, flat: Array) -> Any:
-            return memory.take(kept, action[:2], observed(self.env, params, flat), params, given)
+        def one(kept: Any, action: Array, flat: Array, tunnel: Array) -> Any:
+            here = in_tunnel(self.env, params, tunnel)
+            return memory.take(kept, action[:2], observed(self.env, here, flat), here, given)
 
-        return jax.vmap(one)(kept, action, observation)
+        return jax.vmap(one)(kept, action, observation, env_state.tunnel)
 
     def go_on(
-        self, policy: Policy, kept: Any, action: Array, observation: Array, done: Bool[Array, "env"], params: Any
+        self,
+        policy: Policy,
+        kept: Any,
+        action: Array,
+        observation: Array,
+        done: Bool[Array, "env"],
+        params: Any,
+        env_state: Any,
     ) -> Any:
         """As `take`, begun anew with the observation where an episode is `done`."""
-        fresh = self._fresh(policy, observation, params)
+        fresh = self._fresh(policy, observation, params, env_state)
         mixed = jax.tree.map(lambda new, old: _where(done, new, old), fresh, kept)
-        return self.take(policy, mixed, jnp.where(done[:, None], 0.0, action), observation, params)
+        return self.take(policy, mixed, jnp.where(done[:, None], 0.0, action), observation, params, env_state)
 
-    def _fresh(self, policy: Policy, observation: Array, params: Any) -> Any:
+    def _fresh(self, policy: Policy, observation: Array, params: Any, env_state: Any) -> Any:
         given, memory = Given(policy.localiser, self._map), self.layout.memory
-        return jax.vmap(lambda flat: memory.begin(observed(self.env, params, flat), params, given))(observation)
+
+        def one(flat: Array, tunnel: Array) -> Any:
+            here = in_tunnel(self.env, params, tunnel)
+            return memory.begin(observed(self.env, here, flat), here, given)
+
+        return jax.vmap(one)(observation, env_state.tunnel)
 
     def inputs(self, policy: Policy, kept: Any) -> Float[Array, "env n"]:
         """Returns the inputs of the network."""

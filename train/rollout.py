@@ -66,7 +66,7 @@ def begin(env: Any, driver: Driver, policy: Policy, params: Any, key: PRNGKeyArr
     env_state = _begin(env, params, start_key, n_envs)
     observation = _observe(env, params, env_state, env.draw_step(scan_key, (n_envs,), params))
     zero = jnp.zeros(n_envs)
-    kept = driver.begin(policy, observation, params)
+    kept = driver.begin(policy, observation, params, env_state)
     return Drive(env_state, kept, driver.start_memory((n_envs,)), zero.astype(jnp.int32), zero)
 
 
@@ -143,7 +143,7 @@ def collect(
         last = _choose(truncated, Last(stepped, now.kept, action, memory), last)
         after = Drive(
             env_state=env_state,
-            kept=driver.go_on(policy, now.kept, action, observation, done, params),
+            kept=driver.go_on(policy, now.kept, action, observation, done, params, env_state),
             memory=jnp.where(done[:, None], 0.0, memory),
             age=jnp.where(done, 0, length),
             episode_return=jnp.where(done, 0.0, total),
@@ -155,7 +155,7 @@ def collect(
     keys = jax.random.split(key_steps, n_steps)
     (after, last), (stored, finished, terms) = jax.lax.scan(step, (drive, nobody), keys)
     final = _observe(env, params, last.env_state, env.draw_step(key_last, (n_envs,), params))
-    kept = driver.take(policy, last.kept, last.action, final, params)
+    kept = driver.take(policy, last.kept, last.action, final, params, last.env_state)
     value = driver.answer(policy, driver.inputs(policy, kept), last.memory)[0].value
     stored = dataclasses.replace(stored, final_value=jnp.where(stored.truncated, value, 0.0))
     return after, stored, finished, jax.tree.map(jnp.mean, terms)

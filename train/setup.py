@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from subterra_jax.baselines.agent import n_ranges, observed
+from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.inputs import WAY_AT
 from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.locate import memory
@@ -37,10 +38,10 @@ def make_layout(env: Any, params: Any, config: TrainConfig, localiser: Any = Non
         ConfigError: A setting does not go with the task.
     """
     kept = Memory(config.memory, config.frames if config.memory == "stack" else 1)
-    flat = jax.ShapeDtypeStruct((env.observation_size(params),), np.float32)
+    flat, here = jax.ShapeDtypeStruct((env.observation_size(params),), np.float32), in_tunnel(env, params, 0)
 
     def look(flat: Any) -> Any:
-        return kept.inputs(kept.begin(observed(env, params, flat), params, Given(localiser)))
+        return kept.inputs(kept.begin(observed(env, here, flat), here, Given(localiser)))
 
     bounds = env.action_space(params)
     asks = config.auxiliary and config.memory == "gru"

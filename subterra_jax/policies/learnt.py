@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.baselines.agent import Action, Known, Observed
+from subterra_jax.baselines.agent import Action, Known, Observed, observed
+from subterra_jax.episode import in_tunnel
 from subterra_jax.policies.files import Conditions, PolicyError
 from subterra_jax.policies.layout import Layout
 from subterra_jax.policies.locate import memory as localisers
@@ -91,12 +92,10 @@ class Learnt(Trained):
 
     def check_task(self, env: TunnelEnv, params: EnvParams, source: str | Path) -> None:
         """Refuses an observation of another size, and an action of another."""
-        memory = self.layout.memory
+        memory, here = self.layout.memory, in_tunnel(env, params, 0)
 
         def look(flat: Array) -> Array:
-            from subterra_jax.baselines.agent import observed
-
-            return memory.inputs(memory.begin(observed(env, params, flat), params, self._given))
+            return memory.inputs(memory.begin(observed(env, here, flat), here, self._given))
 
         size = jax.ShapeDtypeStruct((env.observation_size(params),), jnp.float32)
         found = jax.eval_shape(look, size).shape[0]

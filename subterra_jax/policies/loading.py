@@ -99,8 +99,12 @@ def check_task(agent: Trained, env: TunnelEnv, params: EnvParams, source: str | 
 
 
 def training_conditions(env: Any, params: Any) -> Conditions:
-    """Returns the conditions of an environment, as a policy that is trained in it carries them."""
-    fields, constants = tuple(env.fields(params)), constants_digest(env, params)
+    """Returns the conditions of an environment, as a policy that is trained in it carries them.
+
+    How far a hidden start is off is none of them: it changes what a robot is told, not what it senses or does.
+    """
+    given = params.replace(start=params.start.replace(station_sigma=0.0))
+    fields, constants = tuple(env.fields(params)), constants_digest(env, given)
     return Conditions(env.id, _period(params), int(params.lidar.n_beams), fields, constants)
 
 

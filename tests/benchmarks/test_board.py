@@ -159,6 +159,14 @@ def test_agents_drive_the_tasks_that_they_are_for_unless_they_are_named(tmp_path
     assert named == [Job(Setting("StopAt", True), "locate-transformer", PLANAR)]
 
 
+def test_a_policy_with_a_map_drives_from_a_hidden_start_with_it_and_without(tmp_path):
+    for job in drive.jobs_of(BoardConfig(tmp_path, ("StopAt",), "hidden", ("locate-map", "nomap:locate-map"))):
+        env, params = drive.enter(job, "control")
+        assert params.start.station_sigma > 0.0
+        agent = roster.make_agent(job.agent, env, params)
+        assert agent.uses_map == (job.agent == "locate-map")
+
+
 def test_an_agent_without_a_map_of_its_own_cannot_be_driven_without_one():
     env, params = st.make("Subterra/StopAt-v1", tunnel="control")
     with pytest.raises(BenchmarkError, match="nomap:locate-transformer: locate-transformer has no map to go without"):

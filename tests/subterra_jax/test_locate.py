@@ -174,7 +174,10 @@ def test_a_localiser_drives_where_it_can_and_is_refused_in_a_sentence_elsewhere(
 def test_another_number_of_beams_or_another_control_period_is_named():
     env, params = st.make("Subterra/StopAt-v1")
     agent = _trained(env, params)
+    check_fits(agent, *st.make("Subterra/StopAt-v1", hidden_start=True), agent.name)  # told otherwise, sensed alike
+    slippery = params.replace(slip=params.slip.replace(gain_sigma=0.5))
     for other, sentence in (
+        (slippery, "trained under constants"),
         (params.replace(lidar=params.lidar.replace(n_beams=32)), "trained with 16 beams, Subterra/StopAt-v1 has 32"),
         (params.replace(lidar=params.lidar.replace(n_beams=20)), "needs 16 level beams or a multiple of them"),
         (params.replace(vehicle=params.vehicle.replace(period=0.05)), "a control period of 0.1 s, .* has 0.05 s"),

@@ -119,11 +119,12 @@ def test_no_input_holds_what_the_auxiliary_head_is_asked_for(plan):
     driver = Driver(env, make_layout(env, params, config))
     flat, state = env.reset(jax.random.key(0), params)
     policy = Policy(driver.init(jax.random.PRNGKey(0)))
-    kept = driver.begin(policy, flat[None], params)
     moved = dataclasses.replace(state, station=state.station + 5.0)
-    targets = [driver.target(jax.tree.map(lambda leaf: leaf[None], one), kept, params) for one in (state, moved)]
+    here, there = (jax.tree.map(lambda leaf: leaf[None], one) for one in (state, moved))
+    kept = driver.begin(policy, flat[None], params, here)
+    targets = [driver.target(one, kept, params) for one in (here, there)]
     assert targets[0][0, 0] - targets[1][0, 0] == pytest.approx(5.0, abs=1e-3)
-    again = driver.begin(policy, flat[None], params)
+    again = driver.begin(policy, flat[None], params, there)
     np.testing.assert_array_equal(driver.inputs(policy, kept), driver.inputs(policy, again))
     # An unroll stores inputs and target apart, and the network is given the former alone.
     error = jnp.full((1, 1, 1), 1e6)

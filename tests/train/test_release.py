@@ -43,7 +43,8 @@ def test_a_gru_drives_without_the_trainer_as_it_does_with_it(gru):
     agent = make_agent(driver, policy)
     flat, state = env.reset(jax.random.key(0), params)
     memory = agent.begin(None, observed(env, params, flat), params)
-    kept, cell = driver.begin(policy, flat[None], params), driver.start_memory((1,))
+    batched = lambda tree: jax.tree.map(lambda leaf: leaf[None], tree)  # noqa: E731
+    kept, cell = driver.begin(policy, flat[None], params, batched(state)), driver.start_memory((1,))
     act = jax.jit(lambda memory, flat: agent.act(None, memory, observed(env, params, flat), params, None))
 
     @jax.jit
@@ -58,7 +59,7 @@ def test_a_gru_drives_without_the_trainer_as_it_does_with_it(gru):
         np.testing.assert_allclose(action[:2], wanted[0], atol=1e-5)
         assert 0.0 < action[2] < params.tunnel.length
         flat, state, *_ = step(jax.random.key(i), state, wanted[0], params)
-        kept = driver.take(policy, kept, wanted, flat[None], params)
+        kept = driver.take(policy, kept, wanted, flat[None], params, batched(state))
 
 
 def test_released_tensors_are_what_the_safetensors_library_reads(gru, released):

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
+from tests.train import corridor
 from train.config import TrainConfig
 from train.driver import Driver, Policy
 from train.learner import Learner
@@ -63,7 +64,7 @@ def test_a_truncated_episode_is_valued_at_its_final_observation_and_no_other_is(
     scan = env.draw_step(key_last, (N_ENVS,), params)
     observation = jax.vmap(env.observe, (0, 0, None))(stepped, scan, params)
     _, memory = driver.answer(policy, rollout.inputs[0], middle.memory)
-    kept = driver.take(policy, middle.kept, action, observation, params)
+    kept = driver.take(policy, middle.kept, action, observation, params, stepped)
     value = driver.answer(policy, driver.inputs(policy, kept), memory)[0].value
     np.testing.assert_allclose(np.asarray(rollout.final_value)[0], value, atol=1e-4)
     assert np.abs(value - rollout.value[1]).max() > 1e-3
@@ -94,3 +95,16 @@ def test_the_value_target_of_a_truncated_step_goes_on_with_its_final_observation
     assert cut.sum() == N_ENVS
     assert np.abs(np.asarray(rollout.final_value)[cut]).min() > 1e-3
     np.testing.assert_allclose(np.asarray(batch.target)[cut], wanted[cut], atol=1e-5)
+
+
+def test_a_robot_is_told_the_length_of_its_own_tunnel_of_a_stack(tmp_path):
+    lengths = np.array([20.0, 30.0])
+    plans = [corridor.write(tmp_path / f"{length}.npz", length=length, half_width=2.0) for length in lengths]
+    env, params = st.make("Subterra/Traverse-v1", tunnel=plans, horizon=HORIZON)
+    driver = Driver(env, make_layout(env, params, CONFIG))
+    policy = Policy(driver.init(jax.random.PRNGKey(0)))
+    drive = begin(env, driver, policy, params, jax.random.PRNGKey(1), 8)
+    assert set(np.asarray(drive.env_state.tunnel)) == {0, 1}
+    way = jax.vmap(driver.layout.reckoned_way)(drive.kept.seen)
+    np.testing.assert_allclose(way, lengths[drive.env_state.tunnel], atol=1e-3)
+    collect(env, driver, policy, params, drive, jax.random.PRNGKey(2), 2)

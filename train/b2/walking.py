@@ -107,15 +107,26 @@ class WalkDriver(Driver):
         """Returns statistics of no observation yet."""
         return learning.start_statistics((self._n,))
 
-    def begin(self, policy: Policy, observation: Array, params: Any) -> Array:
+    def begin(self, policy: Policy, observation: Array, params: Any, env_state: Any) -> Array:
         """Returns the observation, which is all that is kept."""
         return observation
 
-    def take(self, policy: Policy, kept: Array, action: Array, observation: Array, params: Any) -> Array:
+    def take(
+        self, policy: Policy, kept: Array, action: Array, observation: Array, params: Any, env_state: Any
+    ) -> Array:
         """Returns the observation."""
         return observation
 
-    def go_on(self, policy: Policy, kept: Array, action: Array, observation: Array, done: Array, params: Any) -> Array:
+    def go_on(
+        self,
+        policy: Policy,
+        kept: Array,
+        action: Array,
+        observation: Array,
+        done: Array,
+        params: Any,
+        env_state: Any,
+    ) -> Array:
         """Returns the observation."""
         return observation
 
