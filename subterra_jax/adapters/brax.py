@@ -43,25 +43,27 @@ class SubterraBraxEnv(Env):
         task: Id of the task.
         params: Params to use in place of those made from `options`.
         **options: As for `subterra_jax.make`.
+
+    Attributes:
+        sys: The params under the name by which Brax's domain randomisation takes and replaces them.
+        backend: Name of the simulator, which is none of Brax's.
     """
+
+    backend = "subterra"
 
     def __init__(self, task: str = "Subterra/Traverse-v1", params: EnvParams | None = None, **options: Any):
         self.env, made = make(task, **options)
-        self.params = made if params is None else params
+        self.sys = made if params is None else params
 
     @property
-    def sys(self) -> EnvParams:
-        """The params under the name by which Brax's domain randomisation takes and replaces them."""
-        return self.params
-
-    @sys.setter
-    def sys(self, params: EnvParams) -> None:
-        self.params = params
+    def params(self) -> EnvParams:
+        """The params."""
+        return self.sys
 
     @property
     def observation_size(self) -> int:
         """Numbers in one observation."""
-        return self.env.observation_size(self.params)
+        return self.env.observation_size(self.sys)
 
     @property
     def action_size(self) -> int:
@@ -71,26 +73,20 @@ class SubterraBraxEnv(Env):
     @property
     def action_bounds(self) -> tuple[jax.Array, jax.Array]:
         """Least and largest action; `RescaleAction` maps [-1, 1] to this range."""
-        space = self.env.action_space(self.params)
+        space = self.env.action_space(self.sys)
         return jnp.asarray(space.low), jnp.asarray(space.high)
 
     @property
     def episode_length(self) -> int:
         """Horizon of the task, steps."""
-        return int(self.params.horizon)
-
-    @property
-    def backend(self) -> str:
-        """Name of the simulator, which is none of Brax's."""
-        return "subterra"
+        return int(self.sys.horizon)
 
     def reset(self, rng: jax.Array) -> State:
         """Begin an episode; `rng` may be a key of either kind."""
         key, stream = take_key(jax.random.bits(rng, (2,), jnp.uint32))
-        obs, state = self.env.reset(key, self.params)
+        obs, state = self.env.reset(key, self.sys)
         # Brax wants the metrics of every step at a reset too: they are 0.
-        action = jnp.zeros(self.action_size, jnp.float32)
-        _, _, _, _, _, info = jax.eval_shape(self.env.step, key, state, action, self.params)
+        *_, info = jax.eval_shape(self.env.step, key, state, jnp.zeros(self.action_size, jnp.float32), self.sys)
         metrics = {name: jnp.zeros(leaf.shape, jnp.float32) for name, leaf in info.items()}
         zero = jnp.zeros((), jnp.float32)
         return State(pipeline_state=state, obs=obs, reward=zero, done=zero, metrics=metrics, info={"rng": stream})
@@ -98,16 +94,15 @@ class SubterraBraxEnv(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """Take one step of 0.1 s; the action is clipped."""
         key, stream = take_key(state.info["rng"])
-        obs, after, reward, terminated, _, info = self.env.step(key, state.pipeline_state, action, self.params)
+        obs, after, reward, terminated, _, info = self.env.step(key, state.pipeline_state, action, self.sys)
         own = {name: jnp.asarray(value, jnp.float32) for name, value in info.items()}
-        # What wrappers have put there stays: Brax's `EvalWrapper` keeps the reward among the metrics.
-        metrics = {**state.metrics, **own}
         return state.replace(
             pipeline_state=after,
             obs=obs,
             reward=reward,
             done=terminated.astype(jnp.float32),
-            metrics=metrics,
+            # What wrappers have put there stays: Brax's `EvalWrapper` keeps the reward among the metrics.
+            metrics={**state.metrics, **own},
             info={**state.info, "rng": stream},
         )
 
@@ -139,18 +134,17 @@ class FreshResetWrapper(Wrapper):
         if "steps" in state.info:
             state.info.update(steps=jnp.where(state.done, jnp.zeros_like(state.info["steps"]), state.info["steps"]))
         stepped = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
+        done, now = stepped.done, (stepped.pipeline_state, stepped.obs, stepped.info["rng"])
+
+        def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(done.reshape(done.shape + (1,) * (old.ndim - done.ndim)) > 0.0, new, old)
 
         def reset_finished() -> Any:
             fresh = self.env.reset(stepped.info["rng"])
-            pick = _where(stepped.done)
-            now = stepped.pipeline_state, stepped.obs, stepped.info["rng"]
             return jax.tree.map(pick, (fresh.pipeline_state, fresh.obs, fresh.info["rng"]), now)
 
-        def keep_all() -> Any:
-            return stepped.pipeline_state, stepped.obs, stepped.info["rng"]
-
         # A reset costs a scan of every environment; most steps need none.
-        pipeline_state, obs, rng = jax.lax.cond(jnp.any(stepped.done > 0.0), reset_finished, keep_all)
+        pipeline_state, obs, rng = jax.lax.cond(jnp.any(done > 0.0), reset_finished, lambda: now)
         info = {**stepped.info, "rng": rng, "final_observation": stepped.obs}
         return stepped.replace(pipeline_state=pipeline_state, obs=obs, info=info)
 
@@ -171,24 +165,23 @@ class RandomizedVmapWrapper(Wrapper):
 
     def reset(self, rng: jax.Array) -> State:
         """Begin an episode in each environment."""
-        return jax.vmap(self._under(self.env.reset), (self._axes, 0))(self._batch, rng)
+        return self._with_own_params(self.env.reset, rng)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Take one step in each environment."""
-        return jax.vmap(self._under(self.env.step), (self._axes, 0, 0))(self._batch, state, action)
+        return self._with_own_params(self.env.step, state, action)
 
-    def _under(self, function: Callable[..., State]) -> Callable[..., State]:
-        """Return a function that takes the params first, and calls another while the environment has them."""
+    def _with_own_params(self, function: Callable[..., State], *arguments: Any) -> State:
+        inner = self.unwrapped
 
         def call(params: EnvParams, *arguments: Any) -> State:
-            inner = self.unwrapped
             before, inner.sys = inner.sys, params
             try:
                 return function(*arguments)
             finally:
                 inner.sys = before
 
-        return call
+        return jax.vmap(call, (self._axes, *(0 for _ in arguments)))(self._batch, *arguments)
 
 
 def wrap(
@@ -221,8 +214,7 @@ def jax_for_brax() -> Iterator[None]:
         with jax_for_brax():
             ppo.train(environment=env, wrap_env_fn=wrap, episode_length=env.episode_length, ...)
 
-    Brax up to 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 removed. Where JAX has it, nothing changes.
-    Inside the block every thread of the process sees the function; outside nothing does.
+    Where JAX has it, nothing changes. Inside the block every thread of the process sees the function.
     """
     if hasattr(jax, _MISSED):
         yield
@@ -239,8 +231,3 @@ def _put_replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
     mesh = jax.sharding.Mesh(np.array(devices), ("devices",))
     split = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("devices"))
     return jax.tree.map(lambda leaf: jax.device_put(jnp.stack([jnp.asarray(leaf)] * len(devices)), split), tree)
-
-
-def _where(done: jax.Array) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    """Return a choice of the first argument where an environment is done, else the second, for any rank."""
-    return lambda new, old: jnp.where(done.reshape(done.shape + (1,) * (old.ndim - done.ndim)) > 0.0, new, old)

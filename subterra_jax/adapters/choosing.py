@@ -16,14 +16,15 @@ from subterra_jax.tunnel import at_station
 from subterra_jax.tunnel_env import TunnelEnv
 
 _PLACE = ("station", "lateral", "heading")
-Wish = Mapping[str, Any]
 
 
 class OptionError(SubterraError, ValueError):
     """An episode cannot begin as the options ask."""
 
 
-def read_choice(env: TunnelEnv, params: EnvParams, options: Wish | None, n_envs: int | None = None) -> Choice | None:
+def read_choice(
+    env: TunnelEnv, params: EnvParams, options: Mapping[str, Any] | None, n_envs: int | None = None
+) -> Choice | None:
     """Read the options of a reset.
 
     Args:

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from subterra_jax.adapters.packing import as_vector
 from subterra_jax.host.errors import SubterraError
 
 GoalObservation = dict[str, np.ndarray]
@@ -43,12 +44,11 @@ class GoalConditioned(gymnasium.Wrapper[GoalObservation, np.ndarray, Any, np.nda
             name = getattr(env.spec, "id", type(inner).__name__)
             raise GoalError(f"{name} does not ask for a stop at a goal, so that no goal can be exchanged")
         fields = task.fields(params)
-        self._tolerance, self._told_start = float(params.goal.tolerance), float(params.start.station)
+        self._tolerance, self._prior_start = float(params.goal.tolerance), float(params.start.station)
         self._start = fields["start"].start if "start" in fields else None
         self._goal, self._distance = fields["goal"].start, fields["odometry"].start
         self._rest = [at for name, where in fields.items() if name != "goal" for at in range(where.start, where.stop)]
-        box = task.observation_space(params)
-        end = float(np.max(np.asarray(params.tunnel.length)))
+        box, end = task.observation_space(params), float(np.max(np.asarray(params.tunnel.length)))
         space: Any = spaces.Dict(
             {
                 "observation": spaces.Box(box.low[self._rest], box.high[self._rest], dtype=np.float32),
@@ -86,17 +86,16 @@ class GoalConditioned(gymnasium.Wrapper[GoalObservation, np.ndarray, Any, np.nda
         Raises:
             GoalError: The infos are missing, which Stable-Baselines3 keeps with `copy_info_dict=True`.
         """
-        del achieved_goal
         infos = [info] if isinstance(info, dict) else list(info)
         if any("station" not in one or "stopped" not in one for one in infos):
             raise GoalError("a goal is judged by the true station in info: keep it, with copy_info_dict=True for SB3")
-        error = np.array([one["station"] for one in infos]) - np.asarray(desired_goal).reshape(-1)
-        stopped = np.array([one["stopped"] for one in infos])
-        reward = (stopped & (np.abs(error) <= self._tolerance)).astype(np.float32)
+        off, stopped = (np.array([one[name] for one in infos]) for name in ("station", "stopped"))
+        off = off - np.asarray(desired_goal).reshape(-1)
+        reward = (stopped & (np.abs(off) <= self._tolerance)).astype(np.float32)
         return reward[0] if isinstance(info, dict) else reward
 
     def _split(self, obs: Any) -> GoalObservation:
-        flat = np.concatenate(list(obs.values())) if isinstance(obs, dict) else obs
-        told = self._told_start if self._start is None else flat[self._start]
-        achieved = np.array([told + flat[self._distance]], np.float32)
+        flat = as_vector(obs)
+        start = self._prior_start if self._start is None else flat[self._start]
+        achieved = np.array([start + flat[self._distance]], np.float32)
         return {"observation": flat[self._rest], "achieved_goal": achieved, "desired_goal": flat[[self._goal]]}

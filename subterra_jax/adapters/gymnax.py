@@ -11,15 +11,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
-from subterra_jax.env import Box, Info
+from subterra_jax.env import Box
 from subterra_jax.state import EnvParams, State
 from subterra_jax.tasks import make
 from subterra_jax.tunnel_env import TunnelEnv
-
-Stepped6 = tuple[Float[Array, "n_obs"], State, Float[Array, ""], Bool[Array, ""], Bool[Array, ""], Info]
-Stepped5 = tuple[Float[Array, "n_obs"], State, Float[Array, ""], Bool[Array, ""], Info]
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["tunnel", "horizon", "parts"], meta_fields=["errand"])
@@ -49,68 +46,50 @@ class SubterraGymnax:
     Args:
         task: Id of the task.
         **options: As for `subterra_jax.make`.
+
+    Attributes:
+        default_params: Params of the task as it was made.
+        name: Id of the task.
+        num_actions: Numbers in one action.
     """
 
     def __init__(self, task: str = "Subterra/Traverse-v1", **options: Any):
         self.env: TunnelEnv
         self.env, params = make(task, **options)
-        self._params = GymnaxParams(params.tunnel, params.horizon, params.parts, params.errand)
-
-    @property
-    def default_params(self) -> GymnaxParams:
-        """Params of the task as it was made."""
-        return self._params
-
-    @property
-    def name(self) -> str:
-        """Id of the task."""
-        return self.env.id
-
-    @property
-    def num_actions(self) -> int:
-        """Numbers in one action."""
-        return self.env.action_size
+        self.default_params = GymnaxParams(params.tunnel, params.horizon, params.parts, params.errand)
+        self.name, self.num_actions = self.env.id, self.env.action_size
 
     def action_space(self, params: EnvParams | None = None) -> Any:
         """Bounds of an action; `sample(key)` draws one. Params may be no argument of a function under trace."""
         with jax.ensure_compile_time_eval():  # loops ask for it inside of a jitted function
-            return _in_gymnax(self.env.action_space(self._or_default(params)))
+            return _in_gymnax(self.env.action_space(params or self.default_params))
 
     def observation_space(self, params: EnvParams | None = None) -> Any:
         """Bounds of an observation; params as for `action_space`."""
         with jax.ensure_compile_time_eval():
-            return _in_gymnax(self.env.observation_space(self._or_default(params)))
+            return _in_gymnax(self.env.observation_space(params or self.default_params))
 
     @partial(jax.jit, static_argnums=0)
     def reset(self, key: PRNGKeyArray, params: EnvParams | None = None) -> tuple[Float[Array, "n_obs"], State]:
         """Begin an episode."""
-        return self.env.reset(key, self._or_default(params))
+        return self.env.reset(key, params or self.default_params)
 
     @partial(jax.jit, static_argnums=0)
     def step(
         self, key: PRNGKeyArray, state: State, action: Float[Array, "n_action"], params: EnvParams | None = None
-    ) -> Any:
+    ) -> tuple[Any, ...]:
         """Take one step; after the end of an episode, observation and state are those of a freshly drawn next one.
 
         Returns:
             Observation, state, reward, terminated, truncated and info. In info, `final_observation` is the step's own
             observation, and `done` tells whether the episode ended.
         """
-        return self._step(key, state, action, params)
-
-    def _step(self, key: PRNGKeyArray, state: State, action: Array, params: EnvParams | None) -> Stepped6:
-        params = self._or_default(params)
+        params = params or self.default_params
         step_key, reset_key = jax.random.split(key)
-        stepped_obs, stepped, reward, terminated, truncated, info = self.env.step(step_key, state, action, params)
-        begun_obs, begun = self.env.reset(reset_key, params)
-        done = terminated | truncated
-        obs, state = jax.tree.map(
-            lambda new, old: jnp.where(done, new, old), (begun_obs, begun), (stepped_obs, stepped)
-        )
-        return obs, state, reward, terminated, truncated, {**info, "final_observation": stepped_obs, "done": done}
-
-    def _or_default(self, params: EnvParams | None) -> EnvParams:
-        return self._params if params is None else params
+        own, after, reward, terminated, truncated, info = self.env.step(step_key, state, action, params)
+        begun, done = self.env.reset(reset_key, params), terminated | truncated
+        obs, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), begun, (own, after))
+        return obs, state, reward, terminated, truncated, {**info, "final_observation": own, "done": done}
 
 
 class SubterraGymnax5(SubterraGymnax):
@@ -124,7 +103,7 @@ class SubterraGymnax5(SubterraGymnax):
     @partial(jax.jit, static_argnums=0)
     def step(
         self, key: PRNGKeyArray, state: State, action: Float[Array, "n_action"], params: EnvParams | None = None
-    ) -> Stepped5:
+    ) -> tuple[Any, ...]:
         """Take one step; after the end of an episode, observation and state are those of a freshly drawn next one.
 
         Returns:
@@ -132,7 +111,7 @@ class SubterraGymnax5(SubterraGymnax):
             two apart, `info["discount"]` is 0 after an end before the horizon and else 1, and
             `info["final_observation"]` is the step's own observation.
         """
-        obs, state, reward, terminated, truncated, info = self._step(key, state, action, params)
+        obs, state, reward, terminated, truncated, info = super().step(key, state, action, params)
         flags = {"terminated": terminated, "truncated": truncated, "discount": 1.0 - terminated}
         return obs, state, reward, info["done"], {**info, **flags}
 

@@ -1,25 +1,30 @@
-"""Observations, states and reports between JAX and Gymnasium: spaces, streams of keys, and packed words.
+"""Observations, states and reports between JAX and Gymnasium: streams of keys, and packed words.
 
 Passing many small arrays between host and device would cost more than a step itself, so a pytree travels as one array.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium import spaces
 from jaxtyping import Array, PRNGKeyArray, UInt32
 
-from subterra_jax.state import EnvParams
-from subterra_jax.tunnel_env import TunnelEnv
+_WORD = 0xFFFFFFFF
+Fields = dict[str, tuple[slice, tuple[int, ...]]]  # place in the vector, and shape, of each part of an observation
+Observation = np.ndarray | dict[str, np.ndarray]
 
 
 def pack(tree: Any) -> UInt32[Array, "n_words"]:
     """Join the leaves of a pytree into one array of words, their bits unchanged, a bool as 0 or 1."""
-    return jnp.concatenate([_words(jnp.asarray(leaf)).reshape(-1) for leaf in jax.tree.leaves(tree)])
+
+    def words(leaf: Array) -> Array:
+        _check_kind(leaf.dtype)
+        return leaf.astype(jnp.uint32) if leaf.dtype == jnp.bool_ else jax.lax.bitcast_convert_type(leaf, jnp.uint32)
+
+    return jnp.concatenate([words(jnp.asarray(leaf)).reshape(-1) for leaf in jax.tree.leaves(tree)])
 
 
 def unpacker(example: Any) -> Callable[[Any], Any]:
@@ -40,37 +45,24 @@ def unpacker(example: Any) -> Callable[[Any], Any]:
     shapes = [tuple(leaf.shape) for leaf in leaves]
     ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
 
+    def values(words: Any, kind: np.dtype) -> Any:
+        if kind == np.bool_:
+            return words != 0
+        return words.view(kind) if isinstance(words, np.ndarray) else jax.lax.bitcast_convert_type(words, kind)
+
     def unpack(words: Any) -> Any:
         parts = [words[..., start:end] for start, end in zip([0, *ends], ends, strict=False)]
-        return jax.tree.unflatten(
-            structure,
-            [
-                _values(part, kind).reshape((*part.shape[:-1], *shape))
-                for part, kind, shape in zip(parts, kinds, shapes, strict=True)
-            ],
-        )
+        made = zip(parts, kinds, shapes, strict=True)
+        leaves = [values(part, kind).reshape((*part.shape[:-1], *shape)) for part, kind, shape in made]
+        return jax.tree.unflatten(structure, leaves)
 
     return unpack
-
-
-def _words(leaf: Array) -> Array:
-    _check_kind(leaf.dtype)
-    return leaf.astype(jnp.uint32) if leaf.dtype == jnp.bool_ else jax.lax.bitcast_convert_type(leaf, jnp.uint32)
-
-
-def _values(words: Any, kind: np.dtype) -> Any:
-    if kind == np.bool_:
-        return words != 0
-    return words.view(kind) if isinstance(words, np.ndarray) else jax.lax.bitcast_convert_type(words, kind)
 
 
 def _check_kind(kind: np.dtype) -> np.dtype:
     if kind != np.bool_ and kind.itemsize != 4:
         raise TypeError(f"only bools and 32-bit numbers can be packed, got {kind}")
     return kind
-
-
-_WORD = 0xFFFFFFFF
 
 
 def start_streams(seeds: Sequence[int | None], fallback: np.random.Generator) -> UInt32[np.ndarray, "n 2"]:
@@ -117,21 +109,6 @@ class Report(NamedTuple):
     info: dict[str, Any]
 
 
-def step_and_pack(env: TunnelEnv, key: Any, state: Any, action: Any, params: EnvParams) -> tuple[jax.Array, Any]:
-    """Step an environment; return the report as words, and the state."""
-    obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
-    return pack(Report(obs, reward, terminated, truncated, info)), state
-
-
-def report_shapes(env: TunnelEnv, params: EnvParams) -> tuple[Any, Report]:
-    """Return shapes and dtypes of a state and of a report, without computing either."""
-    key = jax.eval_shape(jax.random.key, 0)
-    _, state = jax.eval_shape(env.reset, key, params)
-    action = jax.ShapeDtypeStruct((env.action_size,), np.float32)
-    obs, _, reward, terminated, truncated, info = jax.eval_shape(env.step, key, state, action, params)
-    return state, Report(obs, reward, terminated, truncated, info)
-
-
 def python_reader(example: Report) -> Callable[[np.ndarray], Report]:
     """Return a reader of one step's words as Python's own floats, ints and bools; quicker than `unpacker`.
 
@@ -140,13 +117,14 @@ def python_reader(example: Report) -> Callable[[np.ndarray], Report]:
             reward, the flags, and info in the order of its names.
     """
     n_obs = example.obs.shape[0]
-    entries, at = [], 3
+    scalars, arrays, at = [], [], 3
     for name in sorted(example.info):
         leaf = example.info[name]
-        entries.append((name, leaf.dtype.kind, slice(at, at + leaf.size) if leaf.ndim else at, leaf.shape))
+        if leaf.ndim:
+            arrays.append((name, leaf.dtype.kind, slice(at, at + leaf.size), leaf.shape))
+        else:
+            scalars.append((name, leaf.dtype.kind, at))
         at += leaf.size
-    scalars = [(name, kind, at) for name, kind, at, shape in entries if not shape]
-    arrays = [(name, kind, at, shape) for name, kind, at, shape in entries if shape]
 
     def read(words: np.ndarray) -> Report:
         rest = words[n_obs:]
@@ -155,69 +133,18 @@ def python_reader(example: Report) -> Callable[[np.ndarray], Report]:
             name: real[at] if kind == "f" else bool(whole[at]) if kind == "b" else whole[at]
             for name, kind, at in scalars
         }
-        for name, kind, at, shape in arrays:
-            info[name] = (rest[at] != 0 if kind == "b" else rest[at].view(f"{kind}4")).reshape(shape)
+        for name, kind, where, shape in arrays:
+            info[name] = (rest[where] != 0 if kind == "b" else rest[where].view(f"{kind}4")).reshape(shape)
         return Report(words[:n_obs].view(np.float32), real[0], bool(whole[1]), bool(whole[2]), info)
 
     return read
 
 
-PAPER_FIELDS = ("ranges", "odometry")  # of the paper's task, whose observation is a plain vector
-Observation = np.ndarray | dict[str, np.ndarray]
-
-
-def action_space(env: TunnelEnv, params: EnvParams) -> spaces.Box:
-    """Return the bounds of an action."""
-    box = env.action_space(params)
-    return spaces.Box(box.low, box.high, dtype=np.float32)
-
-
-class Fields(dict[str, slice]):
-    """Parts of an observation by name, and the shapes of those that are images.
-
-    Args:
-        fields: Place of each part.
-        images: Rows and columns of those that lie row by row.
-    """
-
-    def __init__(self, fields: Mapping[str, slice], images: Mapping[str, tuple[int, int]]):
-        super().__init__(fields)
-        self.images = dict(images)
-
-    def shaped(self, name: str, values: np.ndarray) -> np.ndarray:
-        """Return the values `(..., n)` of a part in its shape."""
-        return values.reshape(*values.shape[:-1], *self.images[name]) if name in self.images else values
-
-    def __reduce__(self) -> tuple[Any, tuple[dict[str, slice], dict[str, tuple[int, int]]]]:
-        """Make it anew in a copy or another process."""
-        return Fields, (dict(self), self.images)
-
-
-def named_fields(env: TunnelEnv, params: EnvParams, flat: bool) -> Fields | None:
-    """Return the parts of an observation by name; `None` for a plain vector.
-
-    Args:
-        env: The environment.
-        params: Its params.
-        flat: Return a plain vector for every task; a task with `PAPER_FIELDS` alone does so anyway.
-    """
-    fields = env.fields(params)
-    return None if flat or tuple(fields) == PAPER_FIELDS else Fields(fields, env.images(params))
-
-
-def observation_space(env: TunnelEnv, params: EnvParams, fields: Fields | None) -> spaces.Space[Any]:
-    """Return a `Box`, or a `Dict` with one `Box` for each named field; that of an image has rows and columns."""
-    box = env.observation_space(params)
-    if fields is None:
-        return spaces.Box(box.low, box.high, dtype=np.float32)
-    # Gymnasium would sort the keys of a plain dict; this order is that of the vector.
-    bounds = {name: [fields.shaped(name, side[at]) for side in (box.low, box.high)] for name, at in fields.items()}
-    return spaces.Dict([(name, spaces.Box(low, high, dtype=np.float32)) for name, (low, high) in bounds.items()])
-
-
 def as_observation(vector: np.ndarray, fields: Fields | None) -> Observation:
     """Bring vectors `(..., n_obs)` into the form of the space; the parts of a dict are views."""
-    return vector if fields is None else {name: fields.shaped(name, vector[..., at]) for name, at in fields.items()}
+    if fields is None:
+        return vector
+    return {name: vector[..., at].reshape(*vector.shape[:-1], *shape) for name, (at, shape) in fields.items()}
 
 
 def as_vector(observation: Observation) -> np.ndarray:

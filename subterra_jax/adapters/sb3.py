@@ -9,8 +9,7 @@ from gymnasium.vector import AutoresetMode
 from subterra_jax.adapters.packing import Observation, as_observation
 from subterra_jax.adapters.vector import SubterraVectorEnv
 from subterra_jax.host.errors import MissingLibraryError
-from subterra_jax.state import EnvParams, State
-from subterra_jax.tunnel_env import TunnelEnv
+from subterra_jax.state import State
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -19,43 +18,18 @@ except ImportError as missing:
 
 
 class EnvRow:
-    """Attributes of one environment of a batch; further ones may be set on it.
-
-    Args:
-        envs: The batch.
-        index: Number of the environment.
-    """
+    """One environment of a batch: what it shares with the others, its `state`, and what a caller sets on it."""
 
     def __init__(self, envs: SubterraVectorEnv, index: int):
         self._envs, self._index = envs, index
-        self.render_mode = envs.render_mode
+        self.unwrapped, self.spec, self.render_mode = self, envs.spec, envs.render_mode
         self.observation_space, self.action_space = envs.single_observation_space, envs.single_action_space
-        self.spec = envs.spec
-
-    @property
-    def unwrapped(self) -> "EnvRow":
-        """Itself."""
-        return self
-
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        return self.env.id
-
-    @property
-    def env(self) -> TunnelEnv:
-        """The JAX environment, shared by the batch."""
-        return self._envs.batch.env
-
-    @property
-    def params(self) -> EnvParams:
-        """Its params, shared by the batch."""
-        return self._envs.batch.params
+        self.env, self.params, self.task = envs.task_env, envs.task_params, envs.task_env.id
 
     @property
     def state(self) -> State | None:
         """State on the host; `None` before the first reset."""
-        return self._envs.batch.state(self._index)
+        return self._envs.state_of(self._index)
 
     def render(self) -> np.ndarray | None:
         """Return a picture, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
@@ -124,7 +98,7 @@ class SubterraVecEnv(VecEnv):
         infos = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         done = terminated | truncated
         for index in np.flatnonzero(done):
-            infos[index]["terminal_observation"] = as_observation(np.array(step.obs[index]), self._envs.fields)
+            infos[index]["terminal_observation"] = as_observation(np.array(step.obs[index]), self._envs.task.fields)
         return obs, np.array(reward), done, infos
 
     def close(self) -> None:
@@ -135,22 +109,22 @@ class SubterraVecEnv(VecEnv):
         """Return a picture of each environment."""
         return self._envs.render() or [None] * self.num_envs
 
+    def _chosen(self, indices: Any) -> list[EnvRow]:
+        return [self._rows[index] for index in self._get_indices(indices)]
+
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of each environment: one of `EnvRow`, or one that was set before."""
-        return [getattr(self._rows[index], attr_name) for index in self._get_indices(indices)]
+        return [getattr(row, attr_name) for row in self._chosen(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Keep a value with each environment for `get_attr`; the simulator ignores it."""
-        for index in self._get_indices(indices):
-            setattr(self._rows[index], attr_name, value)
+        for row in self._chosen(indices):
+            setattr(row, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of `EnvRow` for each environment."""
-        return [
-            getattr(self._rows[index], method_name)(*method_args, **method_kwargs)
-            for index in self._get_indices(indices)
-        ]
+        return [getattr(row, method_name)(*method_args, **method_kwargs) for row in self._chosen(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return False for each environment: only the batch as a whole is wrapped."""
-        return [False for _ in self._get_indices(indices)]
+        return [False for _ in self._chosen(indices)]

@@ -5,23 +5,32 @@ whatever its neighbours do. `AutoReset` shares one key and is quicker inside a g
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import error
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from jaxtyping import Array, Bool, Float
 
-from subterra_jax.adapters import packing
-from subterra_jax.adapters.batch import Batch
-from subterra_jax.adapters.choosing import read_choice
-from subterra_jax.adapters.moments import Moment, check_moment, refuse_fork
-from subterra_jax.adapters.packing import Fields, Observation, Report, as_observation, start_streams
-from subterra_jax.adapters.views import view_for
-from subterra_jax.parts.spatial_lidar import SENSORS
-from subterra_jax.tasks import make
-from subterra_jax.tunnel.sources import Source
+from subterra_jax.adapters.choosing import check_clear, read_choice, reset_chosen
+from subterra_jax.adapters.packing import (
+    Fields,
+    Observation,
+    Report,
+    as_observation,
+    pack,
+    start_streams,
+    take_key,
+)
+from subterra_jax.adapters.task import Door, open_task, refuse_fork
+from subterra_jax.rules import Choice
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel_env import TunnelEnv
 
 
 def mask_info(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
@@ -43,27 +52,25 @@ def mask_info(info: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, Any
 
 
 def final_info(step: Report, done: np.ndarray, fields: Fields | None) -> dict[str, Any]:
-    """Return `final_obs` and `final_info` of the episodes that ended in a step; empty if none did.
-
-    Args:
-        step: Report of the batch.
-        done: Environments whose episode ended, `(n,)`.
-        fields: Names of the parts of an observation, if it is a dict.
-    """
+    """Return `final_obs` and `final_info` of the episodes that ended in a step, `done` `(n,)`; empty if none did."""
     if not done.any():
         return {}
     final = np.full(len(done), None, dtype=object)
     for index in np.flatnonzero(done):
         final[index] = as_observation(np.array(step.obs[index]), fields)
-    return {
-        "final_obs": final,
-        "_final_obs": done.copy(),
-        "final_info": mask_info(step.info, done),
-        "_final_info": done.copy(),
-    }
+    ended = {"final_obs": final, "final_info": mask_info(step.info, done)}
+    return {**ended, "_final_obs": done.copy(), "_final_info": done.copy()}
 
 
-class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
+class Rows(NamedTuple):
+    """Streams `(n, 2)`, states and observations `(n, n_obs)` of all environments."""
+
+    stream: Any
+    state: Any
+    obs: Any
+
+
+class SubterraVectorEnv(Door, VectorEnv[Observation, np.ndarray, np.ndarray]):
     """A batch of environments in one compiled program, on JAX's default device.
 
     Environment i seeded with s + i does what a single `SubterraEnv` seeded with s + i does, up to rounding. Flags,
@@ -75,14 +82,11 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             `SAME_STEP` (the last step returns the next episode's first observation, and its own in
             `info["final_obs"]`), or `DISABLED` (the caller resets with `options={"reset_mask": ...}`).
         task: Id of the task.
-        tunnel: As for `SubterraEnv`.
-        lining: As for `SubterraEnv`.
         flat: As for `SubterraEnv`.
         render_mode: As for `SubterraEnv`; `render` returns one picture for each environment.
         view: As for `SubterraEnv`.
         scene: As for `SubterraEnv`.
-        split: As for `subterra_jax.make`.
-        **overrides: As for `subterra_jax.make`.
+        **options: As for `SubterraEnv`.
     """
 
     def __init__(
@@ -90,30 +94,24 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         num_envs: int = 1,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         task: str = "Subterra/Traverse-v1",
-        tunnel: Source | Sequence[Source] = None,
-        lining: str | None = None,
+        *,
         flat: bool = False,
         render_mode: str | None = None,
         view: str = "top",
         scene: str | Path | None = None,
-        split: str | None = None,
-        **overrides: Any,
+        **options: Any,
     ):
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
-        refuse_fork()
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        self.task, self.view = open_task(task, flat, render_mode, view, scene, options)
         self.num_envs, self.render_mode = num_envs, render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10, "autoreset_mode": self.autoreset_mode}
-        self._view, tunnel = view_for(view, scene, task, tunnel, split, lining, overrides.get("sensor", SENSORS[0]))
-        env, params = make(task, tunnel, lining, **overrides)
-        self.batch = Batch(env, params, num_envs, self.autoreset_mode)
-        self.fields = packing.named_fields(env, params, flat)
-        self.single_observation_space = packing.observation_space(env, params, self.fields)
-        self.single_action_space = packing.action_space(env, params)
+        self.single_observation_space, self.single_action_space = self.task.observation_space, self.task.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._pending = np.zeros(num_envs, np.bool_)
+        self._rows: Rows | None = None
+        self._pending: np.ndarray = np.zeros(num_envs, np.bool_)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -131,16 +129,20 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             Observations of all environments, and an empty info.
 
         Raises:
-            OptionError: The task has no such thing, or a robot cannot stand there.
+            OptionError: The task has no such thing, or a robot cannot stand there; all environments stay as they were.
         """
         refuse_fork()
         mask = self._reset_mask(options)
         wishes = {name: wish for name, wish in (options or {}).items() if name != "reset_mask"}
-        choice = read_choice(self.batch.env, self.batch.params, wishes, self.num_envs)
+        env, params = self.task_env, self.task_params
+        choice = read_choice(env, params, wishes, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
-        self._obs = self.batch.reset(self._streams(seed, mask), mask, choice)
-        self._pending = self._pending & ~mask
-        return as_observation(self._obs, self.fields), {}
+        others = self._empty() if self._rows is None else self._rows
+        rows, clear = _reset(env, mask, self._streams(seed, mask), others, params, choice)
+        if choice is not None:
+            check_clear(clear, choice)
+        self._rows, self._obs, self._pending = rows, np.array(rows.obs), self._pending & ~mask
+        return as_observation(self._obs, self.task.fields), {}
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Take one step of 0.1 s in every environment; see `autoreset_mode` for those that have finished.
@@ -152,60 +154,67 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
         obs, reward, terminated, truncated, step = self.advance(actions)
         done = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            info = {**mask_info(step.info, ~done), **final_info(step, done, self.fields)}
+            info = {**mask_info(step.info, ~done), **final_info(step, done, self.task.fields)}
         else:
             info = mask_info(step.info, ~begun)
         return obs, reward.astype(np.float64), terminated, truncated, info
 
     def advance(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Report]:
-        """Take one step; return the batch's own report in place of info."""
-        begun = self._pending
-        if self.autoreset_mode == AutoresetMode.DISABLED and begun.any():
+        """Take one step; return the batch's own report in place of info.
+
+        The report's observation is from before any reset; that of an environment that is reset instead of stepping
+        means nothing.
+        """
+        begun, mode = self._pending, self.autoreset_mode
+        if mode == AutoresetMode.DISABLED and begun.any():
             raise error.ResetNeeded(f"environments {np.flatnonzero(begun).tolist()} have finished: reset them first")
-        self._obs, step = self.batch.step(np.asarray(actions), begun)
+        action, env, params = np.asarray(actions), self.task_env, self.task_params
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"actions must have shape {self.action_space.shape}, got {action.shape}")
+        if (before := self._rows) is None:
+            raise error.ResetNeeded("reset() must come before step()")
+        rows, words = _step(env, before, action.astype(np.float32), params)
+        step: Report = self.task.read(np.asarray(words))
         reward = np.where(begun, np.float32(0.0), step.reward)
         terminated, truncated = step.terminated & ~begun, step.truncated & ~begun
-        if self.autoreset_mode != AutoresetMode.SAME_STEP:
-            self._pending = terminated | truncated
-        return as_observation(self._obs, self.fields), reward, terminated, truncated, step
+        done = terminated | truncated
+        if mode == AutoresetMode.NEXT_STEP and begun.any():
+            rows, _ = _reset(env, begun, before.stream, rows, params)
+        elif mode == AutoresetMode.SAME_STEP and done.any():
+            rows, _ = _reset(env, done, rows.stream, rows, params)
+        if mode != AutoresetMode.SAME_STEP:
+            self._pending = done
+        self._rows, self._obs = rows, np.array(rows.obs)
+        return as_observation(self._obs, self.task.fields), reward, terminated, truncated, step
 
-    def get_state(self) -> Moment:
-        """Return all that changes, to be set again later; see `SubterraEnv.get_state`."""
-        if (words := self.batch.words()) is None:
-            raise error.ResetNeeded("reset() must come before get_state()")
-        return Moment(self.batch.env.id, words, self._obs.copy(), self._pending.copy())
-
-    def set_state(self, moment: Moment) -> Observation:
-        """Go back to a moment; what follows has the same bits as it had then.
-
-        Returns:
-            The observations of that moment.
-
-        Raises:
-            MomentError: It belongs to another task, or to another number of environments.
-        """
-        n_obs = self.batch.env.observation_size(self.batch.params)
-        check_moment(moment, self.batch.env.id, (self.num_envs, self.batch.n_words), (self.num_envs, n_obs))
-        self.batch.set_words(moment.words, moment.obs)
-        self._obs = moment.obs.copy()
-        self._pending = np.zeros(self.num_envs, bool) if moment.pending is None else moment.pending.copy()
-        return as_observation(self._obs, self.fields)
+    def state_of(self, index: int) -> State | None:
+        """Return the state of one environment on the host; `None` before the first reset."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf[index]), self._rows.state) if self._rows else None
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return a picture of each environment, `(480, 480, 3)` uint8; `None` without `rgb_array`."""
-        if self.render_mode is None:
-            return None
-        return tuple(self.picture(index) for index in range(self.num_envs))
+        return None if self.render_mode is None else tuple(self.picture(index) for index in range(self.num_envs))
 
     def picture(self, index: int) -> np.ndarray:
         """Return a picture of one environment, `(480, 480, 3)` uint8."""
-        if self.batch.rows is None:
-            raise error.ResetNeeded("reset() must come before render()")
-        return self._view.picture(self.batch.env, self.batch.params, self.batch.state(index), self._obs[index])
+        obs = self._last("render")[index]
+        return self.view.picture(self.task_env, self.task_params, self.state_of(index), obs)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release the renderer, if there is one."""
-        self._view.close()
+        self.view.close()
+
+    def _words(self) -> np.ndarray:
+        return np.asarray(_pack_rows(self._rows))
+
+    def _put(self, words: np.ndarray, obs: np.ndarray) -> None:
+        stream, state = self.task.unpack(words)
+        self._rows = jax.tree.map(jnp.asarray, Rows(stream, state, obs))
+
+    def _empty(self) -> Rows:
+        """Return rows of zeros for the first reset to fill."""
+        zeros = lambda leaf: jnp.zeros((self.num_envs, *leaf.shape), leaf.dtype)  # noqa: E731
+        return jax.tree.map(zeros, Rows(jax.ShapeDtypeStruct((2,), np.uint32), self.task.state, self.task.report.obs))
 
     def _reset_mask(self, options: dict[str, Any] | None) -> np.ndarray:
         """Return the caller's mask, checked; all environments without one."""
@@ -216,19 +225,62 @@ class SubterraVectorEnv(VectorEnv[Observation, np.ndarray, np.ndarray]):
             raise TypeError(f"options['reset_mask'] must be a bool array, got {type(mask).__name__} {mask!r}")
         if mask.shape != (self.num_envs,) or not mask.any():
             raise ValueError(f"options['reset_mask'] must have shape ({self.num_envs},) and a True in it, got {mask!r}")
-        if self.batch.rows is None and not mask.all():
+        if self._rows is None and not mask.all():
             raise error.ResetNeeded("the first reset must be of all environments")
         return mask
 
     def _streams(self, seed: int | Sequence[int | None] | None, mask: np.ndarray) -> np.ndarray:
         """Return streams for the next reset: newly seeded for a given seed or at first, else those that go on."""
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-        if seeds is None:
-            seeds = [None] * self.num_envs
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"there must be one seed for each of the {self.num_envs} environments, got {len(seeds)}")
-        running = self.batch.stream
-        fresh = np.array([running is None or one is not None for one in seeds]) & mask
-        streams = np.zeros((self.num_envs, 2), np.uint32) if running is None else running.copy()
+        n = self.num_envs
+        seeds = [seed + i for i in range(n)] if isinstance(seed, int) else [None] * n if seed is None else seed
+        if len(seeds) != n:
+            raise ValueError(f"there must be one seed for each of the {n} environments, got {len(seeds)}")
+        fresh = np.array([self._rows is None or one is not None for one in seeds]) & mask
+        streams = np.zeros((n, 2), np.uint32) if self._rows is None else np.array(self._rows.stream)
         streams[fresh] = start_streams([one for one, new in zip(seeds, fresh, strict=True) if new], self.np_random)
         return streams
+
+
+@partial(jax.jit, static_argnums=0)
+def _reset(
+    env: TunnelEnv, mask: Bool[Array, "n"], stream: Array, others: Rows, params: EnvParams, choice: Choice | None = None
+) -> tuple[Rows, Bool[Array, "n"] | None]:
+    """Reset the rows of a mask from their streams; take the other rows from `others`.
+
+    A reset costs a scan, and few environments finish in one step: so a few at a time are gathered and reset. With a
+    choice the second result tells which robots stand clear.
+    """
+    n_envs = mask.shape[0]
+    n_few = max(1, n_envs // 32)
+    Carry = tuple[Array, Rows, Any]
+
+    def some(carry: Carry) -> Carry:
+        left, rows, clear = carry
+        (index,) = jnp.nonzero(left, size=n_few, fill_value=n_envs)
+        key, after = jax.vmap(take_key)(jnp.take(stream, index, axis=0, mode="clip"))
+        if choice is None:
+            obs, state = jax.vmap(env.reset, (0, None))(key, params)
+        else:
+            own = Choice(*(jnp.take(jnp.asarray(values), index, mode="clip") for values in choice))
+            obs, state, stands = jax.vmap(partial(reset_chosen, env), (0, None, 0))(key, params, own)
+            clear = clear.at[index].set(stands, mode="drop")
+        rows = jax.tree.map(lambda old, new: old.at[index].set(new, mode="drop"), rows, Rows(after, state, obs))
+        return left.at[index].set(False, mode="drop"), rows, clear
+
+    clear = None if choice is None else jnp.ones(n_envs, bool)
+    return jax.lax.while_loop(lambda carry: jnp.any(carry[0]), some, (mask, others, clear))[1:]
+
+
+@jax.jit
+def _pack_rows(rows: Rows) -> Array:
+    return jax.vmap(pack)((rows.stream, rows.state))
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(env: TunnelEnv, before: Rows, action: Float[Array, "n n_action"], params: EnvParams) -> tuple[Rows, Array]:
+    def one(stream: Array, state: State, action: Array) -> tuple[Rows, Array]:
+        key, stream = take_key(stream)
+        obs, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+        return Rows(stream, state, obs), pack(Report(obs, reward, terminated, truncated, info))
+
+    return jax.vmap(one)(before.stream, before.state, action)

@@ -4,3 +4,7 @@ constants ─► model ─┐
 track ──────────────┴► physics (MJX) or engine (MuJoCo in C) ─► walk (50 Hz) ─► mission (5 Hz)
 kinematics ─► gait ───────────────────────────────────────────────┘
 """
+
+from subterra_jax.pictures.renderer import choose_gl
+
+choose_gl()  # before anything here imports MuJoCo

@@ -71,6 +71,8 @@ def inertial(leg: str, part: str) -> Inertial:
 
 
 GRAVITY = 9.81  # m/s²
+TIMESTEP = 0.004  # of the physics, s
+FOOT_FRICTION = 0.8  # on any material; rubber on concrete, where the MJCFs say 0.4
 
 # Geometry, m.
 HIP_X, HIP_Y = 0.3285, 0.072  # of the abduction axis from the middle of the trunk
@@ -117,8 +119,7 @@ JOINT = {
 STAND = {"hip": 0.0, "thigh": 0.8, "calf": -1.5}
 STAND_HEIGHT = 0.5435  # of the trunk's middle over the feet's soles in that pose, m
 
-# Frames in the trunk's frame, m.
-IMU = (0.0, -0.02341, 0.04927)
+# Frame in the trunk's frame, m.
 LIDAR = (0.34218, 0.0, 0.17851)
 
 # Bits of `contype` and `conaffinity`, as docs/formats.md gives them for scene.xml.

@@ -79,7 +79,6 @@ def _start_sleeper(along: Float[Array, ""], params: WalkParams) -> Int[Array, ""
 
 
 def _draw_build(noise: Float[Array, "29"], params: RandomisationParams) -> Build:
-    """Properties of one robot."""
 
     def between(limits: Any, share: Float[Array, "..."]) -> Float[Array, "..."]:
         return limits[0] + 0.5 * (share + 1.0) * (limits[1] - limits[0])

@@ -40,7 +40,7 @@ class Workbench:
     Attributes:
         model: The model.
         data: Its data.
-        lock: Lock to hold from `put` to `take`.
+        lock: Held while a robot is advanced.
         watch: Called at the end of each control period, as for a film, with the data and the position of its origin in
             the tunnel frame, m; `None` by default.
     """
@@ -67,22 +67,28 @@ class Workbench:
         model.actuator_biasprm[:, 1] = self._bias[:, 1] * build.stiffness
         model.actuator_biasprm[:, 2] = self._bias[:, 2] * build.damping
 
-    def run(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build, n_steps: int) -> Body:
-        """Advances a robot on the window of track.
+    def run(
+        self, body: Body, targets: np.ndarray, around: Surroundings, build: Build, n_steps: int, in_scene: bool = False
+    ) -> Body:
+        """Advances a robot.
 
         Args:
-            body: State before.
+            body: State before, its position from the anchor.
             targets: Targets of the servos, rad.
-            around: Ground and walls.
+            around: Ground and walls of the window of track; of them a scene takes the anchor alone.
             build: Properties of the robot.
             n_steps: Steps of physics.
+            in_scene: Whether the model is a scene in its own coordinates.
         """
-        data = self.data
+        data, anchor = self.data, np.asarray(around.origin, np.float64) if in_scene else np.zeros(3)
         with self.lock:
             self.apply_build(build)
-            self.put(body, targets)
-            data.mocap_pos[:], data.mocap_quat[:] = around.ground
-            if far_from_walls(body.qpos, around):
+            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = body.qpos, body.qvel, body.warmstart
+            data.qpos[:3] += anchor
+            data.ctrl[:] = targets
+            if not in_scene:
+                data.mocap_pos[:], data.mocap_quat[:] = around.ground
+            if in_scene or far_from_walls(body.qpos, around):
                 data.xfrc_applied[self.trunk] = 0.0
                 mujoco.mj_step(self.model, data, n_steps)
             else:
@@ -90,22 +96,10 @@ class Workbench:
                     data.xfrc_applied[self.trunk] = wall_wrench(data.qpos, data.qvel, around)
                     mujoco.mj_step(self.model, data)
             if self.watch is not None:
-                self.watch(data, around.origin)
-            return self.take()
-
-    def put(self, body: Body, targets: np.ndarray, origin: np.ndarray | float = 0.0) -> None:
-        """Sets the state of the robot, its position from `origin` (m), and the targets of its servos."""
-        data = self.data
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = body.qpos, body.qvel, body.warmstart
-        data.qpos[:3] += origin
-        data.ctrl[:] = targets
-
-    def take(self, origin: np.ndarray | float = 0.0) -> Body:
-        """Return the state of the robot, its position from `origin`, m."""
-        data = self.data
-        qpos = data.qpos.copy()
-        qpos[:3] -= origin
-        return Body(*(part.astype(np.float32) for part in (qpos, data.qvel, data.qacc_warmstart)))
+                self.watch(data, np.zeros(3) if in_scene else around.origin)
+            qpos = data.qpos.copy()
+            qpos[:3] -= anchor
+            return Body(*(part.astype(np.float32) for part in (qpos, data.qvel, data.qacc_warmstart)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -164,7 +158,7 @@ class ScenePhysics(MujocoPhysics):
             raise TrackError(f"{self.scene}: not a readable scene ({cause})") from cause
         if scout := spec.body(_SCOUT):
             spec.delete(scout)
-        robot = robot_spec(self.robot)
+        robot = robot_spec()
         option, own = spec.option, robot.option
         option.timestep, option.integrator, option.cone = own.timestep, own.integrator, own.cone
         option.disableflags = own.disableflags
@@ -176,14 +170,7 @@ class ScenePhysics(MujocoPhysics):
 
     def run_one(self, body: Body, targets: np.ndarray, around: Surroundings, build: Build) -> Body:
         """Advances one robot by one control period, in the scene's coordinates."""
-        bench, origin = self.bench, np.asarray(around.origin, np.float64)
-        with bench.lock:
-            bench.apply_build(build)
-            bench.put(body, targets, origin)
-            mujoco.mj_step(bench.model, bench.data, self.substeps)
-            if bench.watch is not None:
-                bench.watch(bench.data, np.zeros(3))
-            return bench.take(origin)
+        return self.bench.run(body, targets, around, build, self.substeps, in_scene=True)
 
 
 def walk_in_scene(walk: WalkEnv, folder: Path, lining: str | None) -> WalkEnv:
@@ -195,7 +182,7 @@ def walk_in_scene(walk: WalkEnv, folder: Path, lining: str | None) -> WalkEnv:
     file = folder / ("scene_furnished.xml" if lining == "furnished" else "scene.xml")
     if not file.is_file():
         raise TrackError(f"{file} is missing")
-    return dataclasses.replace(walk, physics=ScenePhysics(robot=walk.physics.robot, scene=file))
+    return dataclasses.replace(walk, physics=ScenePhysics(scene=file))
 
 
 def far_from_walls(qpos: Any, around: Surroundings) -> bool:

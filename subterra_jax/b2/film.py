@@ -3,22 +3,19 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
-from subterra_jax.adapters.packing import Observation, as_vector
-from subterra_jax.b2.gait import RELEASED
-from subterra_jax.b2.gym import B2Env  # first: it chooses how MuJoCo draws
-from subterra_jax.b2.view import PictureError, place
-
-# isort: split
 import jax
 import numpy as np
 
 from subterra_jax import policies
-from subterra_jax.baselines.agent import observed
-from subterra_jax.baselines.registry import make_agent, names
+from subterra_jax.adapters.kernel import first_cpu
+from subterra_jax.b2.gait import RELEASED
+from subterra_jax.b2.gym import B2Env
+from subterra_jax.baselines.agent import Agent
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
 from subterra_jax.host.files import require_file
+from subterra_jax.pictures.renderer import PictureError
+from subterra_jax.recorder.trace import N_POSE, drive
 
 _EVERY = 3  # control periods of 20 ms per picture
 _DURATION = 20 * _EVERY  # time of a picture on screen, ms
@@ -26,58 +23,17 @@ _ANIMATED = (".gif", ".webp")
 _MOST_PIXELS, _LONGEST = 4096, 3600.0  # s
 
 
-class Driver:
-    """An agent that chooses commands step by step."""
-
-    def __init__(self, env: B2Env, name: str):
-        params, mission = env.params, env.env
-        agent: Any
-        if name in names():
-            agent = make_agent(name, params)
-        else:
-            agent, _ = policies.load(name)
-            policies.check_fits(agent, mission, params, name)
-        key = jax.random.key(0)
-        self._begin = jax.jit(lambda obs: agent.begin(key, observed(mission, params, obs), params))
-        self._act = jax.jit(lambda memory, obs: agent.act(key, memory, observed(mission, params, obs), params, None))
-        self._memory: Any = None
-
-    def act(self, seen: Observation) -> np.ndarray:
-        """Return the command `[v, ω]` for an observation."""
-        obs = as_vector(seen)
-        if self._memory is None:
-            self._memory = self._begin(obs)
-        action, self._memory = self._act(self._memory, obs)
-        return np.asarray(action[:2])
-
-    def reset(self) -> None:
-        """Clears the memory: the agent begins anew with the next observation."""
-        self._memory = None
-
-
-def film(env: B2Env, driver: Driver, seconds: float, seed: int = 0) -> list[np.ndarray]:
+def film(env: B2Env, agent: Agent, seconds: float, seed: int = 0) -> list[np.ndarray]:
     """Films an episode: one picture of `(height, width, 3)` uint8 per 60 ms; fewer if the episode ends before.
 
     Raises:
         PictureError: There is no OpenGL.
     """
-    physics: Any = env.walk.physics
-    moments: list[np.ndarray] = []
-    count = 0
-    physics.bench.watch = lambda data, origin: moments.append(place(data, origin))
-    pictures = []
-    try:
-        obs, _ = env.reset(seed=seed)
-        for _ in range(round(seconds / float(env.params.vehicle.period))):
-            moments.clear()
-            obs, _, terminated, truncated, _ = env.step(driver.act(obs))
-            pictures += [env.camera().draw(moment) for moment in moments[-count % _EVERY :: _EVERY]]
-            count += len(moments)
-            if terminated or truncated:
-                break
-    finally:
-        physics.bench.watch = None
-    return pictures
+    steps = max(round(seconds / float(env.task_params.vehicle.period)), 1)
+    with jax.default_device(first_cpu()):
+        start, *_, trace = drive(env.task_env, env.task_params, agent, seed, steps=steps)
+    poses = trace.pose[len(start.pose) :].reshape(-1, N_POSE)
+    return [env.camera.draw(pose) for pose in poses[::_EVERY]]
 
 
 def write(path: Path, pictures: list[np.ndarray]) -> None:
@@ -127,7 +83,8 @@ def main(arguments: list[str] | None = None) -> int:
         _check(settings)
         size = {"width": settings.width, "height": settings.height}
         env = B2Env(scene=settings.scene, policy=settings.policy, render_mode="rgb_array", **size)
-        pictures = film(env, Driver(env, settings.agent), settings.seconds, settings.seed)
+        agent = policies.open_agent(settings.agent, env.task_env, env.task_params)
+        pictures = film(env, agent, settings.seconds, settings.seed)
         write(settings.out, pictures)
         env.close()
         print(f"{settings.out}: {len(pictures)} pictures")

@@ -173,7 +173,6 @@ def foot_targets(state: GaitState, gravity: Float[Array, "3"], params: GaitParam
 
 
 def _leg_phase(state: GaitState) -> Float[Array, "4"]:
-    """Phase of each leg, in [0, 1)."""
     phase = state.phase + _OFFSET
     return phase - jnp.floor(phase)
 

@@ -116,11 +116,6 @@ class Legs(Unicycle):
             info={"height": height, "fall": fall},
         )
 
-    def height(self, state: State, params: EnvParams) -> Float[Array, ""]:
-        """Return the height of the trunk, tunnel frame, m."""
-        walk = state.legs.walk
-        return params.walk.track.position[walk.anchor, 2] + walk.body.qpos[2]
-
     def _walk(
         self, walk: WalkState, command: Float[Array, "2"], noise: WalkStepNoise, params: EnvParams
     ) -> tuple[WalkState, StepSums, Float[Array, ""]]:
@@ -221,7 +216,6 @@ def _mean_motion(
 
 
 def _outside(station: Float[Array, ""], tunnel: Tunnel) -> Bool[Array, ""]:
-    """Tell whether the trunk's middle has left the tunnel."""
     return (station < -_BEYOND) | (station > tunnel.length + _BEYOND)
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.kinematics import inverse, rotate
-from subterra_jax.b2.model import RobotConfig, add_stand, robot_spec
+from subterra_jax.b2.model import add_stand, robot_spec
 from subterra_jax.b2.params import Body, Build, Surroundings
 from subterra_jax.b2.track import WindowConfig, add_window
 
@@ -32,14 +32,12 @@ class Physics:
     """The compiled robot. It is compared by identity, so that bound methods can be jitted.
 
     Attributes:
-        robot: Settings of the robot's model.
         window: The part of the track that can be touched.
         substeps: Steps of physics in a control period.
         iterations: Iterations of the solver in each step.
         ls_iterations: Iterations of its line search.
     """
 
-    robot: RobotConfig = dataclasses.field(default_factory=RobotConfig)
     window: WindowConfig = dataclasses.field(default_factory=WindowConfig)
     substeps: int = 5
     iterations: int = 1
@@ -48,11 +46,11 @@ class Physics:
     @property
     def period(self) -> float:
         """Control period, s."""
-        return self.substeps * self.robot.timestep
+        return self.substeps * b2.TIMESTEP
 
     def spec(self) -> mujoco.MjSpec:
         """Return the MJCF of the robot on its window of track."""
-        spec = robot_spec(self.robot)
+        spec = robot_spec()
         add_window(spec, self.window)
         spec.option.iterations, spec.option.ls_iterations = self.iterations, self.ls_iterations
         add_stand(spec)
@@ -147,5 +145,4 @@ def wall_wrench(body: Body, around: Surroundings) -> Float[Array, "6"]:
 
 
 def _cross(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Cross product, written out."""
     return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

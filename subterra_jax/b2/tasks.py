@@ -106,7 +106,6 @@ def check_width(plan: TunnelPlan) -> None:
 
 
 def _load_track(tunnel: TunnelPlan | str | Path | None, scene: str | Path | None) -> tuple[TunnelPlan, Track]:
-    """Tunnel and track of a scene, or of a tunnel with standard sleepers."""
     if scene is not None:
         plan = load_tunnel(Path(scene) / "tunnel.npz")
         return plan, read_scene_track(Path(scene), plan)
@@ -209,7 +208,6 @@ def _check_period(params: EnvParams, commanded: float) -> None:
 
 
 def _gait(policy: WalkPolicy | str | Path, size: int) -> WalkPolicy | None:
-    """The gait, loaded and checked; `None` for the trot."""
     if policy == TROT:
         return None
     if isinstance(policy, str | Path):

@@ -115,7 +115,6 @@ def read_scene_track(folder: Path, plan: TunnelPlan) -> Track:
 
 
 def _geom_pose(geom: ElementTree.Element) -> tuple[np.ndarray, np.ndarray]:
-    """Position and quaternion of a geom of the MJCF."""
     position = np.array([float(number) for number in geom.get("pos", "0 0 0").split()])
     return position, np.array([float(number) for number in geom.get("quat", "1 0 0 0").split()])
 
@@ -170,7 +169,6 @@ def _contact_bits() -> dict[str, int]:
 
 
 def _add_box(spec: mujoco.MjSpec, name: str, half: tuple[float, ...], colour: tuple[float, ...]) -> None:
-    """Adds a mocap body with a box of given half sizes, m."""
     body = spec.worldbody.add_body(name=name, mocap=True)
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, rgba=colour, **_contact_bits())
 

@@ -209,7 +209,6 @@ def _start(state: State, params: EnvParams) -> tuple[Array, Array, Array]:
 
 
 def _add(now: Episode, taken: Taken, params: EnvParams) -> tuple[tuple[Array, Array, Array], Array]:
-    """Note how the robot fares."""
     del now, params
     flags = (taken.info["success"], taken.info["contact"], taken.info["fall"])
     return flags, taken.terminated | taken.truncated

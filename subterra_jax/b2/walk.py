@@ -187,7 +187,6 @@ class WalkEnv:
 
 
 def _push(body: Body, noise: WalkStepNoise, period: float, params: WalkParams) -> Body:
-    """The robot after a push, if one arrives."""
     arrives = 0.5 * (noise.push[2] + 1.0) < period / params.randomisation.push_every
     kick = jnp.where(arrives, params.randomisation.push * noise.push[:2], 0.0)
     return dataclasses.replace(body, qvel=body.qvel.at[:2].add(kick))

@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
@@ -306,11 +305,6 @@ class Motion(Part):
     @abc.abstractmethod
     def obey(self, action: Float[Array, n_action], state: State, params: EnvParams) -> Float[Array, 2]:
         """Return the command that the robot obeys: the action within its limits, a NaN read as 0."""
-
-    def height(self, state: State, params: EnvParams) -> Array:
-        """Return the height of the trunk of a robot on legs, tunnel frame, m; 0 on wheels."""
-        del params
-        return jnp.zeros_like(state.station)
 
     @abc.abstractmethod
     def move(self, state: State, drive: Drive, noise: Any, tunnel: Tunnel, params: EnvParams) -> Moved:

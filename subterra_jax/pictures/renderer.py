@@ -22,14 +22,19 @@ class PictureError(SubterraError):
     """MuJoCo cannot draw here."""
 
 
+def choose_gl() -> None:
+    """Have MuJoCo draw with EGL where there is no display: it reads `MUJOCO_GL` once, at its import."""
+    if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
 def import_mujoco(purpose: str) -> Any:
-    """Import MuJoCo, with EGL where there is no display: MuJoCo reads `MUJOCO_GL` once, at its import.
+    """Import MuJoCo after `choose_gl`.
 
     Raises:
         MissingLibraryError: MuJoCo is not installed.
     """
-    if sys.platform == "linux" and "mujoco" not in sys.modules and not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
+    choose_gl()
     try:
         import mujoco
     except ImportError as missing:

@@ -122,7 +122,6 @@ def short_shell(shell: Shell, start: float, end: float) -> Shell:
 
 
 def _upright_surfaces(plan: TunnelPlan, lining: str) -> list[Surface]:
-    """Return the upright walls and crown, and the floor, of a plan without a shell."""
     _, surface = raise_walls(plan, lining)
     corner = surface.vertices[surface.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -150,7 +149,6 @@ def _track_surfaces(track: Triangles) -> list[Surface]:
 def _pick(
     name: str, surface: Triangles, mask: np.ndarray, colour: Colour, rolled: Float[np.ndarray, "v 2"] | None
 ) -> Surface:
-    """Return some faces of a surface, without the vertices that they do not use."""
     used, faces = np.unique(surface.faces[mask], return_inverse=True)
     picked = Triangles(surface.vertices[used], faces.reshape(-1, 3))
     return Surface(name, picked, colour, None if rolled is None else rolled[used])

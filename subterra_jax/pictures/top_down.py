@@ -42,7 +42,6 @@ def _along(start: np.ndarray, end: np.ndarray, step: float) -> np.ndarray:
 
 
 def _filled(boxes: Sequence[Boxes], position: np.ndarray, view: float, step: float) -> np.ndarray:
-    """Points all over the boxes that may be seen."""
     points = [np.zeros((0, 2))]
     for centre, axis, half in (side for of in boxes for side in zip(of.centre, of.axis, of.half, strict=True)):
         if np.abs(centre - position).max() < view:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from subterra_jax.host.errors import MissingLibraryError
-from subterra_jax.recorder.trace import Poses
+from subterra_jax.recorder.sensors import Poses
 
 _ONCE = "/tf_static"
 EPOCH = 1_700_000_000  # s since 1970, stamp of the start of every episode

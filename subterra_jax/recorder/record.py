@@ -26,41 +26,37 @@ from subterra_jax.recorder.config import (
     open_world,
 )
 from subterra_jax.recorder.messages import Message, write_bag
-from subterra_jax.recorder.trace import (
+from subterra_jax.recorder.sensors import (
     CLOUD_RANGE,
     CLOUD_SIGMA,
     IMU_RATE,
     Inertial,
     Poses,
-    Trace,
     axis_rows,
     clouds,
     dense_scans,
-    drive,
     measure_imu,
     reckoned_poses,
     true_poses,
     tum_rows,
 )
+from subterra_jax.recorder.trace import Trace, drive
 from subterra_jax.tasks import constants_digest
 
 _IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 def _merge(streams: list[Iterator[Message]]) -> Iterator[Message]:
-    """Merge streams in order of time; at equal times in the order of the list."""
     return heapq.merge(*streams, key=lambda message: message.time)
 
 
 def _mounts(height: float, frames: tuple[str, ...]) -> Iterator[Message]:
-    """Yield the transforms of the sensors, sent once."""
     lift = np.array([0.0, 0.0, height])
     parts = [messages.transform(0.0, "base_link", frame, lift, _IDENTITY) for frame in frames]
     yield Message(0.0, "/tf_static", messages.transforms(parts))
 
 
 def _scans(topic: str, trace: Trace, ranges: Float[np.ndarray, "rows n"], range_max: float) -> Iterator[Message]:
-    """Yield the scans of a planar LiDAR."""
     for time, row in zip(trace.time, ranges, strict=True):
         yield Message(time, topic, messages.laser_scan(time, "laser", row, range_max, trace.period))
 
@@ -72,13 +68,11 @@ def _commands(trace: Trace) -> Iterator[Message]:
 
 
 def _odometry(topic: str, poses: Poses, frame: str) -> Iterator[Message]:
-    """Yield the poses of `base_link` in a frame as odometry."""
     for k, time in enumerate(poses.time):
         yield Message(time, topic, messages.odometry(poses, k, frame))
 
 
 def _frames(poses: Poses, parent: str) -> Iterator[Message]:
-    """Yield the poses of `base_link` in a frame as transforms."""
     quaternion = poses.rotation.as_quat(canonical=True)
     for k, time in enumerate(poses.time):
         part = messages.transform(time, parent, "base_link", poses.position[k], quaternion[k])
@@ -86,7 +80,6 @@ def _frames(poses: Poses, parent: str) -> Iterator[Message]:
 
 
 def _imu(samples: Inertial) -> Iterator[Message]:
-    """Yield the samples of an IMU."""
     for time, gyro, accel in zip(samples.time, samples.gyro, samples.accel, strict=True):
         yield Message(time, "/imu", messages.imu(time, gyro, accel))
 
@@ -103,7 +96,6 @@ def _points(trace: Trace, scans: Float[np.ndarray, "rows m"], sensor: Any, every
 def _clouds(
     relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], config: RecorderConfig, seed: int
 ) -> Iterator[Message]:
-    """Yield the sweeps of a LiDAR in three dimensions, in its own frame."""
     some = slice(None, None, config.every)
     taken = Poses(poses.time[some], poses.position[some], poses.rotation[some])
     beams = config.directions
@@ -152,7 +144,6 @@ def _recording_facts(config: RecorderConfig, trace: Trace, world: World, topics:
 
 
 def _outcome(trace: Trace, seed: int, severity: int | None) -> dict[str, Any]:
-    """Return seed, severity and result of the episode."""
     state = trace.state
     moved = np.hypot(*np.diff(np.asarray(state.position, np.float64), axis=0).T)
     return {
@@ -169,7 +160,6 @@ def _outcome(trace: Trace, seed: int, severity: int | None) -> dict[str, Any]:
 def _truth_facts(
     config: RecorderConfig, recording: Path, outcome: dict[str, Any], topics: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the facts of the truth, with the digest of its recording."""
     bag = recording / f"{recording.name}.mcap"
     return {
         "schema": _TRUTH_SCHEMA,
@@ -213,7 +203,7 @@ def record(config: RecorderConfig) -> Trace:
     agent = open_agent(config, world)
     relief = None if config.cloud == "none" else Relief.from_scene(config.scene or "", config.lining or "pockets")
     seed, severity = draw_episode(config, world)
-    trace = drive(world.env, world.params, agent, seed, severity, config.steps)
+    *_, trace = drive(world.env, world.params, agent, seed, severity, config.steps)
     with ExitStack() as stack:
         recording, truth = (stack.enter_context(_new_folder(f)) for f in (config.recording_folder, config.truth_folder))
         _write_recording(recording, config, trace, world, relief, seed)

@@ -1,8 +1,4 @@
-"""One episode, state by state; the robot's poses and further sensors along it.
-
-Frames as in REP 105: `map` is the tunnel frame, `base_link` stands on the track under the LiDARs, x ahead, y to the
-left, z square to the track; `odom` is `base_link` at the start. Both LiDARs and the IMU sit at LiDAR height above it.
-"""
+"""One driven episode, state by state: what the recorder writes, the viewer shows and a film draws."""
 
 import dataclasses
 import functools
@@ -13,28 +9,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
 
-from subterra_jax import lidar3d
 from subterra_jax.baselines.agent import Agent
-from subterra_jax.episode import Driver, Episode, Taken, concatenate
-from subterra_jax.lidar3d import Relief
+from subterra_jax.baselines.cloud import Cloud
+from subterra_jax.episode import Driver, Episode, Taken
 from subterra_jax.state import EnvParams, State
-from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel_env import TunnelEnv
 
-_CHUNK = 200  # steps between two tests for the end of the episode
+_CHUNK, _FEW = 100, 5  # steps between two tests for the end: of a robot on wheels, of one on legs
+_PARTICLES = 96  # particles that are kept: enough to show the shape of a cloud
+N_POSE = 19  # position, quaternion and joints of a robot on legs
 
 
 @dataclasses.dataclass(frozen=True)
 class Trace:
-    """An episode of `n` steps, on the host; row k is the moment after k periods, from 0 to n.
+    """An episode of `n` steps so far, on the host; row k is the moment after k periods, from 0 to n.
 
     Attributes:
         state: States, each leaf with a leading axis of `n + 1`.
-        observation: Observations as the agent got them, `(n + 1, n_obs)`.
-        command: Speed (m/s) and yaw rate (rad/s) obeyed from row k to row k + 1, `(n, 2)`.
+        observation: Observations as the agent got them.
+        action: Action that led to row k + 1 as the agent gave it: speed (m/s), yaw rate (rad/s), estimated station
+            (m; NaN for none), log of its standard deviation, direction.
+        reward: Reward of the step that led to row k + 1.
+        coverage: Share of the tunnel covered by then.
+        cloud: Some of the agent's particles: station and lateral offset, m, and weight over the mean weight; `p` is 0
+            without a particle filter.
+        pose: Position (tunnel frame, m), orientation w, x, y, z and joints (rad) of a robot on legs at `m` even times
+            up to a row, the last at the row itself; `m` is 0 on wheels.
         period: Control period, s.
         success: The task was achieved.
         contact: The episode ended at a wall or an obstacle.
@@ -42,53 +43,83 @@ class Trace:
 
     state: State
     observation: Float[np.ndarray, "rows n_obs"]
-    command: Float[np.ndarray, "n 2"]
+    action: Float[np.ndarray, "n 5"]
+    reward: Float[np.ndarray, "n"]
+    coverage: Float[np.ndarray, "n"]
+    cloud: Float[np.ndarray, "rows p 3"]
+    pose: Float[np.ndarray, "rows m 19"]
     period: float
-    success: bool
-    contact: bool
+    success: bool = False
+    contact: bool = False
+
+    def __len__(self) -> int:
+        return len(self.action)
 
     @property
-    def time(self) -> Float[np.ndarray, " rows"]:
+    def time(self) -> Float[np.ndarray, "rows"]:
         """Time of each row since the start, s."""
         return np.arange(len(self.observation)) * self.period
+
+    @property
+    def command(self) -> Float[np.ndarray, "n 2"]:
+        """Speed (m/s) and yaw rate (rad/s) obeyed from row k to row k + 1."""
+        return np.asarray(self.state.command)[1:]
 
 
 def drive(
     env: TunnelEnv, params: EnvParams, agent: Agent, seed: int, severity: int | None = None, steps: int | None = None
-) -> Trace:
-    """Drive to the end of the episode, or for a number of steps.
+) -> Iterator[Trace]:
+    """Drive to the end of the episode, the one that `evaluation.evaluate` drives for the same seed and severity.
 
     Args:
-        env: The environment.
+        env: The environment; it need not have been made with `estimates`. Legs must be simulated by MuJoCo itself.
         params: The task in one tunnel.
         agent: The agent that drives.
         seed: Seed of everything random.
         severity: Severity of the faults; drawn where it is left out.
         steps: Steps at most; the task's horizon if left out.
+
+    Yields:
+        The trace so far: first the start alone, at last the whole.
     """
-    driver = Driver(dataclasses.replace(env, estimates=True), keep=_row)
-    begun = driver.begin(params, agent, seed, level=severity)
-    rows = concatenate([jax.device_get(kept) for _, kept in driver.drive(params, agent, begun, _CHUNK, steps)])
+    env, legs = dataclasses.replace(env, estimates=True), _Legs(env)
+    driver = Driver(env, keep=_keep)
+    now = driver.begin(params, agent, seed, level=severity)
+    state, obs, cloud = jax.device_get(_begun(driver, params, now))
+    none, period = np.zeros(0, np.float32), round(float(params.vehicle.period), 6)  # 0.1 in float32 is not 0.1
+    trace = Trace(state, obs, np.zeros((0, 5), np.float32), none, none, cloud, legs.standing(state, params), period)
     limit = int(params.horizon) if steps is None else min(steps, int(params.horizon))
-    n = min(limit, int(np.argmax(rows["over"])) + 1 if rows["over"].any() else limit)
-    last = jax.device_get(_last(driver.env, params, jax.tree.map(lambda leaf: leaf[n - 1], rows["after"])))
-    return Trace(
-        state=jax.tree.map(lambda before, end: np.concatenate([before[:n], end[None]]), rows["before"], last[0]),
-        observation=np.concatenate([rows["observation"][:n], last[1][None]]),
-        command=rows["after"][0].command[:n],
-        period=round(float(params.vehicle.period), 6),  # 0.1 in float32 is not 0.1
-        success=bool(rows["success"][n - 1]),
-        contact=bool(rows["contact"][n - 1]),
-    )
+    chunk = _CHUNK if legs.physics is None else _FEW
+    try:
+        yield trace
+        for _, kept in driver.drive(params, agent, now, chunk, steps):
+            rows: dict[str, Any]
+            (after, noise), rows = jax.device_get(kept)
+            over, left = rows.pop("over"), limit - len(trace)
+            n = min(int(np.argmax(over)) + 1 if over.any() else chunk, left)
+            end = jax.tree.map(lambda leaf, n=n: leaf[n - 1], (after, noise))
+            ends: dict[str, Any] = {name: bool(rows.pop(name)[n - 1]) for name in ("success", "contact")}
+            rows["pose"] = legs.take(chunk)
+            observed = [trace.observation[:-1], rows.pop("observation")[:n], _look(env, params, *end)[None]]
+            series: dict[str, Any] = {
+                name: np.concatenate([getattr(trace, name), values[:n]]) for name, values in rows.items()
+            }
+            state = jax.tree.map(lambda old, new, n=n: np.concatenate([old, new[:n]]), trace.state, after)
+            trace = dataclasses.replace(trace, state=state, observation=np.concatenate(observed), **ends, **series)
+            yield trace
+    finally:
+        legs.release()
 
 
-def _row(now: Episode, taken: Taken, params: EnvParams) -> dict[str, Any]:
-    """Keep one step."""
+def _keep(now: Episode, taken: Taken, params: EnvParams) -> tuple[Any, dict[str, Any]]:
+    """Keep one step: its end, and a row of each series."""
     del now, params
-    return {
-        "before": taken.before,
-        "after": (taken.after, taken.noise),
+    return (taken.after, taken.noise), {
         "observation": taken.observation,
+        "action": taken.action,
+        "reward": taken.reward,
+        "coverage": taken.info["coverage"],
+        "cloud": _particles(taken.memory),
         "over": taken.terminated | taken.truncated,
         "success": taken.info["success"],
         "contact": taken.info["contact"],
@@ -96,203 +127,76 @@ def _row(now: Episode, taken: Taken, params: EnvParams) -> dict[str, Any]:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _last(env: TunnelEnv, params: EnvParams, after: tuple[State, Any]) -> tuple[State, Float[Array, "n_obs"]]:
-    """Return the last state and its observation."""
-    state, noise = after
-    return state, env.observe(state, noise, params)
-
-
-@dataclasses.dataclass(frozen=True)
-class Poses:
-    """Poses over time.
-
-    Attributes:
-        time: Time since the start, s, `(n,)`.
-        position: Positions, m, `(n, 3)`.
-        rotation: Rotations from the body to the fixed frame, `n` of them.
-    """
-
-    time: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    rotation: Rotation
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def lift(self, height: float) -> "Poses":
-        """Return the poses of a sensor `height` metres above the body's origin."""
-        return dataclasses.replace(self, position=self.position + self.rotation.apply([0.0, 0.0, height]))
-
-
-def true_poses(trace: Trace, plan: TunnelPlan) -> Poses:
-    """Return the poses of `base_link` in the tunnel frame: on the track, pitched by its grade, never rolled.
-
-    Args:
-        trace: The episode.
-        plan: Its tunnel.
-    """
-    state = trace.state
-    station = np.asarray(state.station, np.float64)
-    tangent = np.stack([np.interp(station, plan.station, plan.tangent[:, i]) for i in range(2)], axis=-1)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    grade = np.interp(station, plan.station, np.gradient(plan.elevation, plan.station))
-    along = np.column_stack([tangent, grade]) / np.sqrt(1.0 + grade * grade)[:, None]
-    left = np.column_stack([-tangent[:, 1], tangent[:, 0], np.zeros(len(station))])
-    turn = np.asarray(state.heading, np.float64) - np.arctan2(tangent[:, 1], tangent[:, 0])
-    ahead = np.cos(turn)[:, None] * along + np.sin(turn)[:, None] * left
-    up = np.cross(along, left)
-    axes = np.stack([ahead, np.cross(up, ahead), up], axis=-1)
-    height = np.interp(station, plan.station, plan.elevation)
-    position = np.column_stack([np.asarray(state.position, np.float64), height])
-    return Poses(trace.time, position, Rotation.from_matrix(axes))
-
-
-def reckoned_poses(trace: Trace, reading: Float[np.ndarray, "n 2"]) -> Poses:
-    """Return the poses of `base_link` in `odom`: the odometer's distance (m) along its heading (rad), level.
-
-    Args:
-        trace: The episode.
-        reading: Odometer as observed by the agent, with the task's delay.
-    """
-    distance, heading = np.asarray(reading, np.float64).T
-    turned = np.unwrap(heading)
-    middle, moved = 0.5 * (turned[1:] + turned[:-1]), np.diff(distance)
-    steps = np.column_stack([moved * np.cos(middle), moved * np.sin(middle), np.zeros(len(moved))])
-    position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    return Poses(trace.time, position, Rotation.from_rotvec(turned[:, None] * np.array([0.0, 0.0, 1.0])))
-
-
-def axis_rows(plan: TunnelPlan) -> Float[np.ndarray, "n 4"]:
-    """Return station (m) and position (m) of the track's centre, for scoring along and across."""
-    return np.column_stack([plan.station, plan.centre, plan.elevation])
-
-
-def tum_rows(poses: Poses, epoch: float) -> Float[np.ndarray, "n 8"]:
-    """Return rows `t x y z qx qy qz qw`, t in s since 1970."""
-    return np.column_stack([epoch + poses.time, poses.position, poses.rotation.as_quat(canonical=True)])
-
-
-IMU_RATE = 100.0  # Hz
-GRAVITY = 9.80665  # m/s²
-# Standard deviations of a sample, random walks and constant biases of an MTi-30. Source: GEODE dataset, calibration
-# of its γ rack (`acc_n`, `gyr_n`, `acc_w`, `gyr_w`); the biases are the data sheet's order of magnitude.
-ACCEL_SIGMA, ACCEL_WALK, ACCEL_BIAS = 5.574e-3, 1.208e-4, 0.02  # m/s², m/s²/√s, m/s²
-GYRO_SIGMA, GYRO_WALK, GYRO_BIAS = 5.144e-3, 1.088e-4, 0.003  # rad/s, rad/s/√s, rad/s
-_HALF_STEP = 1e-3  # s, of the central difference of the attitude
-
-
-@dataclasses.dataclass(frozen=True)
-class Inertial:
-    """Samples of the IMU in its own frame, which is oriented like `base_link`.
-
-    Attributes:
-        time: Time since the start, s, `(n,)`.
-        gyro: Rates, rad/s, `(n, 3)`.
-        accel: Specific force, m/s², `(n, 3)`; +9.8 upwards at rest.
-    """
-
-    time: Float[np.ndarray, " n"]
-    gyro: Float[np.ndarray, "n 3"]
-    accel: Float[np.ndarray, "n 3"]
-
-
-def measure_imu(poses: Poses, seed: int, noise: float = 1.0) -> Inertial:
-    """Simulate IMU samples along cubic splines through poses.
-
-    Commands change the speed at once; the splines spread that over a control period or two.
-
-    Args:
-        poses: Poses of the IMU, at least two.
-        seed: Seed of noise and biases.
-        noise: Factor on all errors; 0 gives the truth.
-    """
-    n = int(np.floor(poses.time[-1] * IMU_RATE + 1e-6)) + 1
-    time = np.arange(n) / IMU_RATE
-    angles = np.unwrap(poses.rotation.as_euler("ZYX"), axis=0)
-    place, turn = CubicSpline(poses.time, poses.position), CubicSpline(poses.time, angles)
-
-    def attitude(at: Float[np.ndarray, " n"]) -> Rotation:
-        return Rotation.from_euler("ZYX", turn(at))
-
-    gyro = (attitude(time - _HALF_STEP).inv() * attitude(time + _HALF_STEP)).as_rotvec() / (2.0 * _HALF_STEP)
-    accel = attitude(time).inv().apply(place(time, 2) + np.array([0.0, 0.0, GRAVITY]))
-    rng = np.random.default_rng([seed, 0x1A1])
-    walk = rng.standard_normal((2, n, 3)).cumsum(axis=1) / np.sqrt(IMU_RATE)
-    white, bias = rng.standard_normal((2, n, 3)), rng.standard_normal((2, 1, 3))
-    gyro = gyro + noise * (GYRO_SIGMA * white[0] + GYRO_WALK * walk[0] + GYRO_BIAS * bias[0])
-    accel = accel + noise * (ACCEL_SIGMA * white[1] + ACCEL_WALK * walk[1] + ACCEL_BIAS * bias[1])
-    return Inertial(time, gyro, accel)
-
-
-CLOUD_RANGE = 100.0  # m
-CLOUD_SIGMA = 0.01  # m. Source: VLP-16 user manual, "up to ±3 cm (typical)", taken as three standard deviations
-_SCANS = 128  # planar scans in one batch
-_RAYS = 200_000  # rays of clouds in one batch
-_DENSE_STREAM = 0x5CA7  # a separate key: the episode's draws stay as they are
-
-
-def dense_scans(
-    trace: Trace, env: TunnelEnv, params: EnvParams, n_beams: int, seed: int
-) -> Float[np.ndarray, "n n_beams"]:
-    """Take planar scans of more beams, with the same range, noise, boxes and faults as the task's own.
-
-    A sector that drops out is as wide as that of the task's LiDAR.
-
-    Args:
-        trace: The episode.
-        env: Its environment.
-        params: Its task.
-        n_beams: Beams, the first straight ahead, the others counter-clockwise.
-        seed: Seed of the episode.
-    """
-    n, wider = len(trace.observation), n_beams / params.lidar.n_beams
-    dense = params.replace(lidar=dataclasses.replace(params.lidar, n_beams=n_beams))
-    state = trace.state.replace(
-        **{part.name: part.with_beams(trace.state.parts[part.name], wider) for part in env.parts}
-    )
-    key = jax.random.fold_in(jax.random.key(jnp.uint32(seed)), _DENSE_STREAM)
-    rows = np.minimum(np.arange(-(-n // _SCANS) * _SCANS), n - 1).reshape(-1, _SCANS)
-    parts = [_perceive(env, jax.tree.map(lambda leaf, some=some: leaf[some], state), key, some, dense) for some in rows]
-    return np.concatenate([np.asarray(part) for part in parts])[:n]
+def _begun(driver: Driver, params: EnvParams, now: Episode) -> Any:
+    first = now.state, driver.env.observe(now.state, now.noise, params), _particles(now.memory)
+    return jax.tree.map(lambda leaf: leaf[None], first)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _perceive(env: TunnelEnv, state: State, key: Array, index: Array, params: EnvParams) -> Float[Array, "n n_beams"]:
-    def one(state: State, index: Array) -> Array:
-        noise = env.draw_step(jax.random.fold_in(key, index), (), params)
-        return env.observe(state, noise, params)[env.fields(params)["ranges"]]
-
-    return jax.vmap(one)(state, index)
+def _look(env: TunnelEnv, params: EnvParams, state: State, noise: Any) -> Float[Array, "n_obs"]:
+    return env.observe(state, noise, params)
 
 
-def clouds(
-    relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], directions: Float[np.ndarray, "m 3"], seed: int
-) -> Iterator[Float[np.ndarray, " m"]]:
-    """Yield the noisy ranges of each sweep, m; NaN for a beam that meets nothing within `CLOUD_RANGE`.
+def _particles(memory: Any) -> Float[Array, "p 3"]:
+    """Return about `_PARTICLES` of the particles in an agent's memory; none for an agent without."""
+    clouds = [leaf for leaf in jax.tree.leaves(memory, is_leaf=_is_cloud) if _is_cloud(leaf)]
+    if not clouds:
+        return jnp.zeros((0, 3))
+    cloud: Cloud = clouds[0]
+    stride = max(1, cloud.log_weight.shape[0] // _PARTICLES)
+    weight = jnp.exp(cloud.log_weight) * cloud.log_weight.shape[0]
+    return jnp.stack([cloud.pose.station, cloud.pose.lateral, weight], axis=-1)[::stride][:_PARTICLES]
 
-    A sweep is taken at one instant: the robot's motion during a turn of the head is not simulated.
+
+def _is_cloud(leaf: Any) -> bool:
+    return isinstance(leaf, Cloud)
+
+
+class _Legs:
+    """Collects the poses of a walking robot as MuJoCo moves it; none of a wheeled one."""
+
+    def __init__(self, env: TunnelEnv):
+        walk: Any = getattr(env.motion, "walk", None)
+        self.physics = None if walk is None else walk.physics
+        self._poses: list[np.ndarray] = []
+        if self.physics is not None:
+            from subterra_jax.b2.view import place  # MuJoCo is loaded only where a robot walks
+
+            self.physics.bench.watch = lambda data, origin: self._poses.append(place(data, origin))
+
+    def standing(self, state: State, params: EnvParams) -> Float[np.ndarray, "1 m 19"]:
+        """Return the pose before the first step, as often as a step has control periods."""
+        if self.physics is None:
+            return np.zeros((1, 0, N_POSE))
+        walk = state.legs.walk
+        pose = np.array(walk.body.qpos[0], np.float64)
+        pose[:3] += np.asarray(params.walk.track.position[walk.anchor[0]], np.float64)
+        return np.tile(pose, (1, round(float(params.vehicle.period) / self.physics.period), 1))
+
+    def release(self) -> None:
+        """Collect no more."""
+        if self.physics is not None:
+            self.physics.bench.watch = None
+
+    def take(self, n_rows: int) -> Float[np.ndarray, "n_rows m 19"]:
+        """Return the poses since the last call, in `n_rows` rows."""
+        poses, self._poses = self._poses, []
+        return np.array(poses).reshape(n_rows, -1, N_POSE) if poses else np.zeros((n_rows, 0, N_POSE))
+
+
+def reckon(
+    reading: Float[np.ndarray, "n 2"], position: Any = (0.0, 0.0), heading: float = 0.0
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+    """Return positions (m) and headings (rad, unwrapped) by the odometer alone.
 
     Args:
-        relief: The bore's surface.
-        poses: Poses of the LiDAR in the tunnel frame.
-        station: Stations of the LiDAR, m.
-        directions: Beams of the LiDAR.
-        seed: Seed of the noise; sweep k depends on the seed and k alone.
+        reading: Dead-reckoned distance (m) and heading since the start (rad); each step is taken along the mean of the
+            headings before and after it.
+        position: Position at the start, m.
+        heading: Heading at the start, rad.
     """
-    size = max(1, min(len(poses), _RAYS // len(directions)))
-    beams = jnp.asarray(directions, jnp.float32)
-    quaternion = poses.rotation.as_quat()[:, [3, 0, 1, 2]]
-    for first in range(0, len(poses), size):
-        # The last batch is filled up, so that all have one shape.
-        rows = np.minimum(np.arange(first, first + size), len(poses) - 1)
-        there = (np.asarray(values[rows], np.float32) for values in (poses.position, quaternion, station))
-        ranges = np.asarray(_cast()(relief, *there, beams, CLOUD_RANGE))
-        for k in range(first, min(first + size, len(poses))):
-            noise = np.random.default_rng([seed, k]).normal(0.0, CLOUD_SIGMA, len(directions))
-            exact = ranges[k - first]
-            yield np.where(exact < CLOUD_RANGE, exact + noise, np.nan).astype(np.float32)
-
-
-@functools.cache
-def _cast() -> Any:
-    return jax.jit(jax.vmap(lidar3d.scan, in_axes=(None, 0, 0, 0, None, None)))
+    distance, turned = np.asarray(reading, np.float64).T
+    turned = heading + np.unwrap(turned)
+    middle, moved = 0.5 * (turned[1:] + turned[:-1]), np.diff(distance)
+    steps = np.column_stack([moved * np.cos(middle), moved * np.sin(middle)])
+    return np.asarray(position) + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)]), turned

@@ -6,6 +6,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 from subterra_jax.host.cache import cache_folder
 from subterra_jax.host.command import INPUT_ERRORS, parse, run_command
@@ -20,50 +21,26 @@ def parse_arguments(arguments: list[str] | None = None) -> ViewerConfig:
     Raises:
         SystemExit: The command line is malformed, or help was shown.
     """
-    default = ViewerConfig()
     parser = argparse.ArgumentParser(
         prog="python -m subterra_jax.viewer", description="Shows episodes in the browser.", epilog=_EXAMPLE
     )
     add = parser.add_argument
     add("--scene", type=Path, metavar="DIR", help="scene folder of scene.build: its lining, track and tunnel")
-    add("--tunnel", action="append", default=[], metavar="NAME|FILE", help="offer another tunnel; may be repeated")
-    add("--lining", default=default.lining, metavar="NAME", help="pockets (default), smooth or furnished")
-    add("--task", default=default.task, metavar="ID", help="first task, as StopAt or Subterra/StopAt-v1 (the default)")
-    add("--sensor", default=default.sensor, metavar="NAME", help="planar16 (default), spin16x64, vlp16, os1-64 or avia")
+    many: dict[str, Any] = {"action": "append", "default": []}
+    add("--tunnel", dest="tunnels", metavar="NAME|FILE", help="offer another tunnel; may be repeated", **many)
+    add("--lining", metavar="NAME", help="pockets (default), smooth or furnished")
+    add("--task", metavar="ID", help="first task, as StopAt or Subterra/StopAt-v1 (the default)")
+    add("--sensor", metavar="NAME", help="planar16 (default), spin16x64, vlp16, os1-64 or avia")
     drivers = "first driver: a baseline, policy:NAME|FILE|RUN-FOLDER, module:Class or FILE.py:Class"
-    add("--driver", default=default.agent, metavar="NAME", help=drivers)
-    add("--policy", action="append", default=[], type=Path, metavar="FILE", help="offer this policy as driver too")
-    add("--seed", type=int, default=default.seed, metavar="N", help="seed of the first episode")
-    add(
-        "--recordings",
-        type=Path,
-        default=default.recordings,
-        metavar="DIR",
-        help="folder for saved episodes and pictures",
-    )
+    add("--driver", dest="agent", metavar="NAME", help=drivers)
+    add("--policy", dest="policies", type=Path, metavar="FILE", help="offer this policy as driver too", **many)
+    add("--seed", type=int, metavar="N", help="seed of the first episode")
+    add("--recordings", type=Path, metavar="DIR", help="folder for saved episodes and pictures")
     add("--replay", type=Path, metavar="FILE", help="begin with this recorded episode")
-    add(
-        "--host",
-        default=default.host,
-        metavar="ADDRESS",
-        help="address to listen on; the default is this machine alone",
-    )
-    add("--port", type=int, default=default.port, metavar="N", help="first port to try")
-    given = parse(parser.parse_args, arguments)
-    return ViewerConfig(
-        scene=given.scene,
-        tunnels=tuple(given.tunnel),
-        lining=given.lining,
-        sensor=given.sensor,
-        task=given.task,
-        agent=given.driver,
-        policies=tuple(given.policy),
-        seed=given.seed,
-        recordings=given.recordings,
-        replay=given.replay,
-        host=given.host,
-        port=given.port,
-    )
+    add("--host", metavar="ADDRESS", help="address to listen on; the default is this machine alone")
+    add("--port", type=int, metavar="N", help="first port to try")
+    given = {name: value for name, value in vars(parse(parser.parse_args, arguments)).items() if value is not None}
+    return ViewerConfig(**{**given, "tunnels": tuple(given["tunnels"]), "policies": tuple(given["policies"])})
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -73,7 +50,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _serve(config: ViewerConfig) -> None:
-    """Show episodes until Ctrl-C."""
     # Malformed messages are refused silently: a traceback for each would bury the others.
     for name in ("websockets.server", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)

@@ -59,7 +59,6 @@ def move_camera(client: viser.ClientHandle, at: Float[np.ndarray, "3"], target: 
 
 
 def _robot(centreline: Centreline, moment: Moment | None) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the robot's position and direction."""
     if moment is not None:
         return moment.position, np.array([np.cos(moment.heading), np.sin(moment.heading), 0.0])
     zero = np.zeros(1)

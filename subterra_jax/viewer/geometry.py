@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from subterra_jax.lidar3d.surface import LINING_KINDS, SCENES, ScenePart, join_surfaces, read_mesh, scene_parts
+from subterra_jax.recorder.trace import reckon
 from subterra_jax.tunnel.plan import TunnelPlan, Wall
 from subterra_jax.viewer.recording import Recording
 
@@ -48,25 +49,6 @@ class Centreline:
     ) -> Float[np.ndarray, "n 3"]:
         """Add the height `above` the ground to plan positions at known stations, m."""
         return np.column_stack([points, self.ground(station) + above])
-
-
-def dead_reckon(
-    position: Float[np.ndarray, "2"], heading: float, odometry: Float[np.ndarray, "t 2"]
-) -> Float[np.ndarray, "t 2"]:
-    """Return the robot's positions by the odometer alone.
-
-    Args:
-        position: True position at the start, m.
-        heading: True heading at the start, rad.
-        odometry: Dead-reckoned distance (m) and heading since the start (rad).
-
-    Returns:
-        Positions, m: each step along the mean of the headings before and after it.
-    """
-    turned = heading + np.unwrap(odometry[:, 1].astype(np.float64))
-    middle, moved = 0.5 * (turned[1:] + turned[:-1]), np.diff(odometry[:, 0].astype(np.float64))
-    steps = moved[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-    return position + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
 
 
 _TRAIL_POINTS = 500  # of a whole trail
@@ -110,13 +92,12 @@ class EpisodeGeometry:
 
     def __init__(self, recording: Recording, centreline: Centreline, *, finished: bool = True):
         self.recording, self.centreline, self.finished = recording, centreline, finished
-        start = recording.position[0].astype(np.float64)
-        reckoned = dead_reckon(start, float(recording.heading[0]), recording.odometry)
+        begun = recording.position[0].astype(np.float64), float(recording.heading[0])
+        reckoned, self._reckoned_heading = reckon(recording.odometry, *begun)
         self._truth = centreline.lift(recording.position, recording.station, 0.0)
         self._reckoned = centreline.lift(reckoned, recording.station, 0.0)
         self._way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(self._truth, axis=0), axis=1)))
         self._heading = np.unwrap(recording.heading.astype(np.float64))
-        self._reckoned_heading = recording.heading[0] + np.unwrap(recording.odometry[:, 1].astype(np.float64))
 
     def __len__(self) -> int:
         return len(self.recording)
@@ -141,7 +122,6 @@ class EpisodeGeometry:
         )
 
     def _pose(self, row: int, after: int, share: float) -> Float[np.ndarray, "k"]:
-        """Return the pose between two rows."""
         poses = self.recording.pose[after]
         if not len(poses) or after == row:
             return poses[-1] if len(poses) else np.zeros(0)
@@ -236,7 +216,6 @@ class EpisodeGeometry:
 
 
 def _chain(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 2 3"]:
-    """Join neighbouring points by segments."""
     return np.stack([points[:-1], points[1:]], axis=1)
 
 
@@ -292,7 +271,6 @@ def _ribbon(name: str, centreline: Centreline, wall: Wall, colour: Colour, *, in
 
 
 def _floor(centreline: Centreline) -> Shape:
-    """Return the ground between the smooth walls."""
     plan = centreline.plan
     left, right = (centreline.points_at(plan.station, side * plan.half_width) for side in (1.0, -1.0))
     n = len(left)

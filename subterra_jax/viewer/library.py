@@ -13,9 +13,9 @@ from subterra_jax import policies, tasks
 from subterra_jax.baselines import registry
 from subterra_jax.host.errors import SubterraError
 from subterra_jax.host.loading import load_object
-from subterra_jax.host.task_ids import MISSIONS
+from subterra_jax.host.task_ids import MISSIONS, WALK
 from subterra_jax.parts.spatial_lidar import SENSORS
-from subterra_jax.policies.opening import FORMS, call_factory, names_code, policy_source
+from subterra_jax.policies.opening import FORMS, names_code, policy_source
 from subterra_jax.tunnel.plan import TunnelPlan
 from subterra_jax.tunnel.sources import PACKAGED, load_tunnel, tunnel_digest
 from subterra_jax.viewer.config import ViewerConfig, ViewerError
@@ -30,43 +30,32 @@ def task_names() -> tuple[str, ...]:
     return (*tasks.TASKS, *MISSIONS)
 
 
-def register_agents(files: tuple[Path, ...]) -> tuple[str, ...]:
-    """Register all released policies and those of the command line; return the names of all agents.
+def driver_names(files: tuple[Path, ...] = (), chosen: str | None = None) -> tuple[str, ...]:
+    """Return the names of all drivers: baselines, released policies, files of the command line, and its own driver.
 
     Args:
-        files: Trained policies, as files or run folders, registered as `file:STEM`.
+        files: Trained policies, as files or run folders.
+        chosen: The driver of the command line, as for `policies.open_agent`.
 
     Raises:
-        PolicyError: A file is missing or damaged.
-    """
-    policies.register_released()
-    for name in sorted(policies.released().keys() & {policies.name_for(task) for task in MISSIONS}):
-        _register(policies.PREFIX + name, policies.load(name)[0])
-    for path in files:
-        agent, _ = policies.load(path)
-        _register(f"file:{path.stem}", agent)
-    return registry.names()
-
-
-def offer_driver(name: str) -> None:
-    """Offer the driver of the command line beside the registered ones, where it is a policy or a class.
-
-    Raises:
-        PolicyError: The policy is missing or damaged.
+        PolicyError: A policy is missing or damaged.
         UserCodeError: The class cannot be loaded.
+        ViewerError: There is no such driver.
     """
-    if name in registry.names():
-        return
-    if (source := policy_source(name)) is not None:
-        _register(name, policies.load(source)[0])
-    elif names_code(name):
-        factory = load_object(name)
-        registry.register(name, lambda params: call_factory(factory, params))
-
-
-def _register(name: str, agent: Any) -> None:
-    if name not in registry.names():
-        registry.register(name, lambda params: policies.with_map(agent, params))
+    released = [policies.PREFIX + name for name in policies.released() if name != policies.name_for(WALK)]
+    for path in files:
+        policies.load(path)
+    names = (*registry.names(), *sorted(released), *(f"{policies.PREFIX}{path}" for path in files))
+    names = tuple(dict.fromkeys(names))
+    if chosen is None or chosen in names:
+        return names
+    if (source := policy_source(chosen)) is not None:
+        policies.load(source)
+    elif names_code(chosen):
+        load_object(chosen)
+    else:
+        raise ViewerError(f"no driver {chosen!r}; there are {', '.join(names)}; or {FORMS}")
+    return (*names, chosen)
 
 
 def drive_episode(
@@ -148,11 +137,7 @@ class Library:
             self.tunnels.setdefault(source, TunnelEntry(source, source))
         for source in config.tunnels:
             self.plan(source)
-        register_agents(config.policies)
-        offer_driver(config.agent)
-        self.agents = registry.names()
-        if config.agent not in self.agents:
-            raise ViewerError(f"no driver {config.agent!r}; there are {', '.join(self.agents)}; or {FORMS}")
+        self.agents = driver_names(config.policies, config.agent)
 
     def plan(self, title: str) -> TunnelPlan:
         """Return a tunnel, read at its first use.

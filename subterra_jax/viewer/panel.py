@@ -35,7 +35,6 @@ def _goal(recording: Recording) -> str:
 
 
 def _errors(recording: Recording, row: int) -> str:
-    """Return the errors of odometry and estimate along the tunnel."""
     moved = np.linalg.norm(np.diff(recording.position[: row + 1].astype(float), axis=0), axis=1).sum()
     odometry = f"error of odometry {recording.odometry[row, 0] - moved:+.2f} m"
     station, sigma = recording.estimate[row]
@@ -131,7 +130,6 @@ def _sample_rows(row: int) -> np.ndarray:
 def _chart(
     server: viser.ViserServer, title: str, lines: tuple[uplot.Series, ...], *, visible: bool = True
 ) -> viser.GuiUplotHandle:
-    """Add an empty chart of lines over time."""
     return server.gui.add_uplot(
         (np.zeros(1),) * (1 + len(lines)),
         (_TIME, *lines),

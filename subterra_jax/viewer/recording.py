@@ -72,9 +72,9 @@ class Recording:
         boxes: Obstacles: middle x, y (m), unit vector along the first side, half sides (m).
         trunk: Height of a walking robot's trunk, tunnel frame, m; 0 for wheeled robots.
         pose: Orientation w, x, y, z and joints (rad) of a walking robot at even times up to this row, the last at the
-            row itself; `m` is 0 for wheeled robots and in older files.
+            row itself; `m` is 0 for wheeled robots.
         points: Returns of a LiDAR in three dimensions in the robot's frame on the ground, m, some of them where it has
-            many beams; NaN without a return. `p` is 0 for a planar LiDAR and in older files.
+            many beams; NaN without a return. `p` is 0 for a planar LiDAR.
     """
 
     task: str
@@ -152,10 +152,6 @@ def load(path: Path) -> Recording:
         raise EpisodeFileError(f"{path}: no such recording") from error
     except Exception as error:  # zipfile, zlib and NumPy each raise their own for a damaged archive
         raise EpisodeFileError(f"{path}: not a readable recording ({describe_damage(path, error)})") from error
-    if "station" in fields and "pose" not in fields:
-        fields |= {"trunk": np.zeros(len(fields["station"])), "pose": np.zeros((len(fields["station"]), 0, N_POSE))}
-    if "station" in fields and "points" not in fields:
-        fields["points"] = np.zeros((len(fields["station"]), 0, 3))
     schema = str(fields["schema"]) if "schema" in fields else None
     if schema != SCHEMA:
         raise EpisodeFileError(f"{path}: {other_schema(schema, SCHEMA, 'save the episode again in the viewer')}")
@@ -179,7 +175,6 @@ def _check_values(path: Path, series: dict[str, Any], period: float) -> None:
 
 
 def _field(path: Path, fields: dict[str, Any], name: str, shape: tuple[str | int, ...], kinds: str) -> Any:
-    """Return one array of the right kind and rank."""
     if name not in fields:
         raise EpisodeFileError(f"{path}: field {name!r} is missing")
     value = fields[name]

@@ -143,7 +143,6 @@ class EpisodeView:
         return episode
 
     def _update_panel(self, episode: EpisodeGeometry, moment: Moment) -> None:
-        """Update text, slider, button and charts."""
         panel = self._panel
         rate = f" <small>· {self.player.frames_per_second:.0f} frames/s</small>" if self.player.playing else ""
         with self._server.atomic():
@@ -245,7 +244,6 @@ class Session:
         return str(path)
 
     def _attach(self) -> None:
-        """Attach an effect to each control."""
         panel, view = self.panel, self.view
         player = view.player
         panel.play.on_click(lambda event: player.toggle())

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import KDTree
 
 import subterra_jax as st
-from subterra_jax.adapters.views import TunnelChoice
+from subterra_jax.pictures.camera import TunnelChoice
 from subterra_jax.pictures.carrier import carrier_parts
 from subterra_jax.pictures.stage import Piece, stage_spec
 from subterra_jax.pictures.surfaces import short_shell, tunnel_surfaces

@@ -19,7 +19,7 @@ from scene.writing.folder import write_geometry
 from scene.writing.mjcf import SceneConfig
 from scene.writing.track import TrackConfig, lay_track
 from subterra_jax.lidar3d.surface import read_scene
-from subterra_jax.recorder.trace import CLOUD_SIGMA
+from subterra_jax.recorder.sensors import CLOUD_SIGMA
 from tests.benchmarks.slam.tracks import EPOCH, line, write_axis, write_tum
 from tests.scene.conftest import arc_bore
 

@@ -99,7 +99,7 @@ def test_every_environment_of_a_batch_has_its_own(envs):
     kept = 10.0 + (drawn["goal"] - drawn["start"])[:, 0]  # as far from the chosen start as from the drawn one
     obs, _ = envs.reset(seed=5, options={"goal": goals, "start": {"station": [0.0, 10.0, 30.0], "lateral": 0.0}})
     np.testing.assert_allclose(obs["goal"][:, 0], np.where(np.isnan(goals), kept, goals), rtol=1e-5)
-    np.testing.assert_allclose([envs.batch.state(k).station for k in range(3)], [0.0, 10.0, 30.0])
+    np.testing.assert_allclose([envs.state_of(k).station for k in range(3)], [0.0, 10.0, 30.0])
     mask = np.array([False, True, False])
     masked, _ = envs.reset(options={"goal": 33.0, "reset_mask": mask})
     np.testing.assert_allclose(masked["goal"][:, 0], [15.0, 33.0, 45.0])

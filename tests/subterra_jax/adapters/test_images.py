@@ -1,13 +1,12 @@
 """Gymnasium and Stable-Baselines3 get the scan of a LiDAR in three dimensions as an image."""
 
-import pickle
-
 import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.adapters import packing
+from subterra_jax.adapters.packing import as_observation
 from subterra_jax.adapters.single import SubterraEnv
+from subterra_jax.adapters.task import Task
 from subterra_jax.parts import make_sensor
 
 TASK = "Subterra/TraverseShort-v1"
@@ -23,17 +22,14 @@ def world():
 
 
 def test_spaces_and_observations_have_the_shape_of_the_image():
-    env, params = st.make(TASK, **world())
-    fields = packing.named_fields(env, params, flat=False)
-    space = packing.observation_space(env, params, fields)
-    assert space["scan"].shape == (4, 8)
+    task = Task(*st.make(TASK, **world()))
+    assert task.observation_space["scan"].shape == (4, 8)
     vector = np.arange(3 * 34, dtype=np.float32).reshape(3, 34)
-    seen = packing.as_observation(vector, fields)
+    seen = as_observation(vector, task.fields)
     assert seen["scan"].shape == (3, 4, 8)
     assert seen["odometry"].shape == (3, 2)
     np.testing.assert_array_equal(seen["scan"][1, 2], vector[1, 16:24])
-    assert pickle.loads(pickle.dumps(fields)).images == {"scan": (4, 8)}
-    assert packing.named_fields(*st.make(TASK, tunnel=world()["tunnel"]), flat=False) is None
+    assert Task(*st.make(TASK, tunnel=world()["tunnel"])).fields is None
 
 
 @pytest.mark.slow

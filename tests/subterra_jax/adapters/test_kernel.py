@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from subterra_jax.adapters.kernel import compile_as_one_kernel
 from subterra_jax.adapters.packing import pack, start_streams, unpacker
-from subterra_jax.adapters.single import compile_as_one_kernel
 
 
 def test_packing_keeps_every_bit():

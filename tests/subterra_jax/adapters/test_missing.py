@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import subterra_jax as st
-from subterra_jax.adapters.views import make_view
+from subterra_jax.pictures.views import make_view
 
 
 @pytest.mark.parametrize(

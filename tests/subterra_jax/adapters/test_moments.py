@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from gymnasium import error
 
-from subterra_jax.adapters import moments
-from subterra_jax.adapters.moments import ForkError, MomentError
+from subterra_jax.adapters import task as adapters_task
 from subterra_jax.adapters.sb3 import SubterraVecEnv
 from subterra_jax.adapters.single import SubterraEnv
+from subterra_jax.adapters.task import ForkError, MomentError
 from subterra_jax.adapters.vector import SubterraVectorEnv
 from tests.subterra_jax.adapters.test_vector import ACTIONS
 
@@ -111,7 +111,7 @@ def test_a_copy_goes_on_with_the_same_bits_and_leaves_the_original_alone(way):
 
 
 def test_a_deep_copy_compiles_nothing(made):
-    assert copy.deepcopy(made)._step is made._step
+    assert copy.deepcopy(made).task is made.task
 
 
 @WAYS
@@ -135,7 +135,7 @@ def test_sb3s_view_of_a_batch_can_be_pickled():
 
 def test_a_forked_process_is_told_what_to_do_instead(env, monkeypatch):
     """As in a fork: the process that used JAX first was another one."""
-    monkeypatch.setattr(moments, "_first_process", os.getpid() + 1)
+    monkeypatch.setattr(adapters_task, "_first_process", os.getpid() + 1)
     for use in (lambda: SubterraEnv(TASK), lambda: SubterraVectorEnv(2, task=TASK), env.reset):
         with pytest.raises(ForkError, match=r"JAX does not survive a fork: .*context='spawn'"):
             use()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import subterra_jax as st
-from subterra_jax.adapters.views import make_view
 from subterra_jax.parts.boxes import Boxes
 from subterra_jax.pictures import top_down as drawing
+from subterra_jax.pictures.views import make_view
 from tests.subterra_jax.drawn import draw
 
 
@@ -62,7 +62,7 @@ def test_a_box_and_a_goal_are_drawn_where_they_are():
 
 
 def test_a_scene_that_is_not_there_is_named(tmp_path):
-    from subterra_jax.adapters.views import SceneError
+    from subterra_jax.pictures.views import SceneError
 
     with pytest.raises(SceneError, match=r"scene\.xml is missing"):
         make_view("mujoco", tmp_path)
@@ -78,7 +78,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from subterra_jax.adapters.views import MujocoView, Path, SceneError
+from subterra_jax.pictures.views import MujocoView, Path, SceneError
 
 x, y, heading = (float(word) for word in sys.argv[3:])
 view = MujocoView(Path(sys.argv[2]))

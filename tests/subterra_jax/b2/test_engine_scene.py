@@ -12,7 +12,6 @@ import subterra_jax as st
 from subterra_jax.b2 import constants as b2
 from subterra_jax.b2.engine import MujocoPhysics, ScenePhysics, walk_in_scene
 from subterra_jax.b2.kinematics import standing_pose
-from subterra_jax.b2.model import RobotConfig
 from subterra_jax.b2.params import Body, Build, Surroundings
 from subterra_jax.b2.tasks import make
 from subterra_jax.b2.track import SLEEPER_HALF, TrackError
@@ -74,7 +73,7 @@ def test_the_scene_keeps_everything_but_the_scout(scene):
     assert "scout" not in names
     assert len(names) == 1 + 1 + 12
     assert model.nv == 18
-    assert model.opt.timestep == RobotConfig().timestep
+    assert model.opt.timestep == b2.TIMESTEP
 
 
 def test_it_stands_in_the_scene_as_on_the_window_of_track(scene):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 
 import subterra_jax as st
+from subterra_jax.adapters.packing import pack
 from subterra_jax.b2 import mission, tasks
 from subterra_jax.b2.model import RobotError
 from subterra_jax.b2.params import CommandParams
@@ -33,12 +35,10 @@ def plan():
 def env(plan):
     """One environment, compiled with less zeal: half the time, the same numbers to rounding."""
     made = gymnasium.make(ID, tunnel=plan, policy="trot", walk={"sensor": tasks.SensorParams(**QUIET)})
-    inner: Any = made.unwrapped
-    key, params, _action = jax.random.key(0), inner.params, jnp.zeros(2)
-    options = {"xla_backend_optimization_level": 0}
-    inner._reset = inner._reset.lower(key, params).compile(options)
-    _, state = inner._reset(key, params)
-    inner._step = inner._step.lower(key, state, np.zeros(2, np.float32), params).compile(options)
+    quick = {"xla_backend_optimization_level": 0}
+    made.unwrapped.task.compile = lambda f, params, *like: partial(
+        jax.jit(f).lower(params, *like).compile(quick), params
+    )
     return made
 
 
@@ -50,7 +50,8 @@ def drive(env, action, n_steps, seed=1):
 def changed(env, **fields):
     """Another state of the environment's robot."""
     inner = env.unwrapped
-    inner.state = inner.state.replace(**fields)
+    stream, state = inner.task.unpack(np.asarray(inner._packed))
+    inner._packed = np.asarray(pack((stream, state.replace(**fields))))
 
 
 def with_body(state, qpos):
@@ -63,7 +64,7 @@ def test_spaces_are_those_of_the_planar_task_and_five_commands_make_a_second(env
     assert env.observation_space.shape == (18,)
     np.testing.assert_allclose(env.action_space.high, [0.8, 0.8])
     np.testing.assert_allclose(env.action_space.low, [0.0, -0.8])
-    assert env.unwrapped.env.rule == planar.rule
+    assert env.unwrapped.task_env.rule == planar.rule
     assert env.metadata["render_fps"] == 5
 
 
@@ -113,7 +114,7 @@ def test_a_fall_ends_the_episode_and_is_no_success(env):
 
 def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
     env.reset(seed=0)
-    state, params = env.unwrapped.state, env.unwrapped.params
+    state, params = env.unwrapped.state, env.unwrapped.task_params
     at = np.argmin(np.abs(plan.station - 2.0))
     lateral = float(plan.half_width[at]) - 0.3
     normal = np.array([-plan.tangent[at, 1], plan.tangent[at, 0]])
@@ -130,15 +131,16 @@ def test_a_wall_stops_the_robot_and_ends_the_episode(env, plan):
 
 
 def test_success_is_the_share_of_the_tunnel_that_the_rule_asks_for(env):
-    inner, params = env.unwrapped, env.unwrapped.params
-    inner.params = params.replace(goal_coverage=jnp.float32(0.052))
+    task, near = env.unwrapped.task, env.unwrapped.task_params.replace(goal_coverage=jnp.float32(0.052))
+    programs = task.programs
+    task.programs = programs._replace(step=partial(programs.step.func, near))
     try:
         told = []
         env.reset(seed=2)
         while not (told and (told[-1][2] or told[-1][3])) and len(told) < 20:
             told.append(env.step(np.array([0.8, 0.0], np.float32)))
     finally:
-        inner.params = params
+        task.programs = programs
     assert told[-1][2]
     assert told[-1][4]["success"]
     assert told[-1][4]["coverage"] >= 0.052
@@ -194,7 +196,7 @@ import imageio.v3 as imageio
 import numpy as np
 import subterra_jax as st
 from subterra_jax.b2.gym import B2Env
-from subterra_jax.b2.view import PictureError
+from subterra_jax.pictures.renderer import PictureError
 env = B2Env(tunnel=st.load_tunnel().slice(0.0, 10.0), policy="trot", render_mode="rgb_array", width=160, height=120)
 env.reset(seed=0)
 try:

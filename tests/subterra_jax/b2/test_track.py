@@ -77,15 +77,18 @@ def test_a_scenes_own_sleepers_are_taken_with_grade_and_protrusion(tmp_path, pla
     )
 
 
-def test_a_scene_without_a_track_is_refused_by_name(tmp_path, plan_of):
-    (tmp_path / "scene.xml").write_text("<mujoco><worldbody/></mujoco>")
-    with pytest.raises(TrackError, match=r"scene\.xml: 0 sleepers: the scene has no track to walk on"):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<mujoco><worldbody/></mujoco>", "0 sleepers: the scene has no track to walk on"),
+        (None, "not a readable scene"),
+    ],
+)
+def test_a_scene_without_a_track_is_refused_by_name(tmp_path, plan_of, text, message):
+    if text is not None:
+        (tmp_path / "scene.xml").write_text(text)
+    with pytest.raises(TrackError, match=rf"scene\.xml: {message}"):
         read_scene_track(tmp_path, plan_of(tunnel_arrays(straight(20.0))))
-
-
-def test_a_missing_scene_is_refused_by_name(tmp_path, plan_of):
-    with pytest.raises(TrackError, match="not a readable scene"):
-        read_scene_track(tmp_path / "nowhere", plan_of(tunnel_arrays(straight(20.0))))
 
 
 def test_a_tunnel_of_three_metres_is_too_short_for_a_track(plan_of):

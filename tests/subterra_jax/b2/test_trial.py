@@ -9,7 +9,7 @@ import pytest
 
 import subterra_jax as st
 from subterra_jax.b2 import film, transfer
-from subterra_jax.b2.view import PictureError
+from subterra_jax.pictures.renderer import PictureError
 from subterra_jax.tunnel_env import TunnelEnv
 from tests.subterra_jax import probes
 

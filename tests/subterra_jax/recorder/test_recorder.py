@@ -18,7 +18,7 @@ from subterra_jax.evaluation import evaluate, listed_episodes
 from subterra_jax.recorder import record
 from subterra_jax.recorder.__main__ import main
 from subterra_jax.recorder.messages import EPOCH, laser_scan, odometry, store
-from subterra_jax.recorder.trace import Poses
+from subterra_jax.recorder.sensors import Poses
 
 TASK = "Subterra/StopAtShort-v1"
 TYPES = get_typestore(Stores.ROS2_JAZZY)

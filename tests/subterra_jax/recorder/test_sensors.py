@@ -13,17 +13,17 @@ import subterra_jax as st
 from subterra_jax.lidar import LidarParams
 from subterra_jax.lidar3d import Relief, beams
 from subterra_jax.lidar3d.surface import Axis, Triangles
-from subterra_jax.recorder.trace import (
+from subterra_jax.recorder.sensors import (
     CLOUD_SIGMA,
     GRAVITY,
     Poses,
-    Trace,
     clouds,
     dense_scans,
     measure_imu,
     reckoned_poses,
     true_poses,
 )
+from subterra_jax.recorder.trace import Trace
 from subterra_jax.state import State
 from tests.subterra_jax import surfaces
 from tests.subterra_jax.recorder.conftest import BEAMS
@@ -39,8 +39,14 @@ class Places:
 
 
 def trace_of(position, heading, station, period: float = 0.1) -> Trace:
-    places = Places(np.asarray(position), np.asarray(heading), np.asarray(station))
-    return Trace(places, np.zeros((len(station), 18)), np.zeros((len(station) - 1, 2)), period, False, False)
+    return of_states(Places(np.asarray(position), np.asarray(heading), np.asarray(station)), len(station), period)
+
+
+def of_states(states, n, period=0.1):
+    """A trace of `n` rows of which the states alone are looked at."""
+    nothing = np.zeros(n - 1)
+    seen, poses = np.zeros((n, 18)), np.zeros((n, 0, 19))
+    return Trace(states, seen, np.zeros((n - 1, 5)), nothing, nothing, np.zeros((n, 0, 3)), poses, period)
 
 
 def test_on_a_grade_the_robot_is_pitched_by_it_and_facing_back_it_looks_down():
@@ -89,7 +95,7 @@ def test_a_sector_that_drops_out_is_as_wide_in_the_dense_scan():
         states.faults, severity=0.0 * four, dropout_left=four, dropout_first=four, dropout_count=four
     )
     states = states.replace(faults=faults)
-    trace = Trace(jax.device_get(states), np.zeros((2, 18)), np.zeros((1, 2)), 0.1, False, False)
+    trace = of_states(jax.device_get(states), 2)
     found = dense_scans(trace, env, params, 64, seed=0)
     assert (found[:, 16:32] == 30.0).all()
     assert (found[:, [8, 12]] < 30.0).all()

@@ -84,4 +84,4 @@ def test_the_points_of_a_lidar_in_three_dimensions_are_recorded_and_shown():
 
 
 def test_baselines_and_released_policies_are_offered():
-    assert {"particle-filter", "oracle", "policy:Traverse-v1"} <= set(library.register_agents(()))
+    assert {"particle-filter", "oracle", "policy:Traverse-v1", "policy:B2Traverse-v1"} <= set(library.driver_names())

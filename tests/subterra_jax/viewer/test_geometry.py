@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, dead_reckon, planar_shapes
+from subterra_jax.recorder.trace import reckon
+from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, planar_shapes
 from subterra_jax.viewer.panel import error_series, progress_series
 from subterra_jax.viewer.player import Player
 from tests.subterra_jax import tunnels
@@ -49,7 +50,7 @@ def test_what_hangs_on_the_robot_is_given_in_its_frame(centreline):
 def test_odometry_that_turns_too_much_drives_a_circle():
     turn = np.linspace(0.0, np.pi, 2001)
     odometry = np.stack([5.0 * turn, turn], axis=-1)
-    way = dead_reckon(np.array([1.0, 2.0]), 0.0, odometry)
+    way, _ = reckon(odometry, np.array([1.0, 2.0]))
     np.testing.assert_allclose(way[-1], [1.0, 12.0], atol=1e-4)
     np.testing.assert_allclose(np.hypot(*(way - [1.0, 7.0]).T), 5.0, atol=1e-4)
 

@@ -11,7 +11,7 @@ from subterra_jax.b2.constants import HIP_X, STAND_HEIGHT
 from subterra_jax.b2.kinematics import standing_pose
 from subterra_jax.viewer import library
 from subterra_jax.viewer.geometry import Centreline, EpisodeGeometry, Moment
-from subterra_jax.viewer.recording import N_POSE, load, save
+from subterra_jax.viewer.recording import N_POSE
 from subterra_jax.viewer.scene import LeggedRobot
 from tests.subterra_jax import tunnels
 from tests.subterra_jax.viewer.episodes import straight
@@ -59,18 +59,8 @@ def test_between_two_rows_the_legs_move(plan_of):
     assert [episode.moment(at).pose[0] for at in (0.0, 0.3, 0.99, 1.0, 1.6, 2.0)] == [4.0, 5.0, 7.0, 8.0, 10.0, 11.0]
 
 
-def test_an_episode_from_before_anybody_walked_still_opens(tmp_path):
-    path, episode = tmp_path / "old.npz", straight(5)
-    save(episode, path)
-    with np.load(path) as data:
-        old = {name: data[name] for name in data.files if name not in ("trunk", "pose")}
-    np.savez(path, **old)
-    assert load(path).pose.shape == (5, 0, N_POSE)
-
-
 @pytest.mark.slow
 def test_a_b2_is_driven_and_its_legs_are_recorded():
-    library.register_agents(())
     plan = st.load_tunnel()
     parts = library.drive_episode(plan, "0", "t", "pockets", "Subterra/B2Traverse-v1", "policy:B2Traverse-v1", 3)
     recording = list(itertools.islice(parts, 6))[-1]
@@ -82,7 +72,6 @@ def test_a_b2_is_driven_and_its_legs_are_recorded():
 
 @pytest.mark.slow
 def test_what_a_lidar_on_the_trunk_sees_is_shown_about_the_robot():
-    library.register_agents(())
     plan = st.load_tunnel()
     parts = library.drive_episode(plan, "0", "t", "smooth", "Subterra/B2Traverse-v1", "dead-reckoning", 3, "spin16x64")
     points = list(itertools.islice(parts, 2))[-1].points

@@ -1,0 +1,217 @@
+"""What the recorder makes of an episode: poses in three dimensions, and further sensors along them.
+
+Frames as in REP 105: `map` is the tunnel frame, `base_link` stands on the track under the LiDARs, x ahead, y to the
+left, z square to the track; `odom` is `base_link` at the start. Both LiDARs and the IMU sit at LiDAR height above it.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from subterra_jax import lidar3d
+from subterra_jax.lidar3d import Relief
+from subterra_jax.recorder.trace import Trace, reckon
+from subterra_jax.state import EnvParams, State
+from subterra_jax.tunnel.plan import TunnelPlan
+from subterra_jax.tunnel_env import TunnelEnv
+
+
+@dataclasses.dataclass(frozen=True)
+class Poses:
+    """Poses over time.
+
+    Attributes:
+        time: Time since the start, s, `(n,)`.
+        position: Positions, m, `(n, 3)`.
+        rotation: Rotations from the body to the fixed frame, `n` of them.
+    """
+
+    time: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    rotation: Rotation
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def lift(self, height: float) -> "Poses":
+        """Return the poses of a sensor `height` metres above the body's origin."""
+        return dataclasses.replace(self, position=self.position + self.rotation.apply([0.0, 0.0, height]))
+
+
+def true_poses(trace: Trace, plan: TunnelPlan) -> Poses:
+    """Return the poses of `base_link` in the tunnel frame: on the track, pitched by its grade, never rolled.
+
+    Args:
+        trace: The episode.
+        plan: Its tunnel.
+    """
+    state = trace.state
+    station = np.asarray(state.station, np.float64)
+    tangent = np.stack([np.interp(station, plan.station, plan.tangent[:, i]) for i in range(2)], axis=-1)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    grade = np.interp(station, plan.station, np.gradient(plan.elevation, plan.station))
+    along = np.column_stack([tangent, grade]) / np.sqrt(1.0 + grade * grade)[:, None]
+    left = np.column_stack([-tangent[:, 1], tangent[:, 0], np.zeros(len(station))])
+    turn = np.asarray(state.heading, np.float64) - np.arctan2(tangent[:, 1], tangent[:, 0])
+    ahead = np.cos(turn)[:, None] * along + np.sin(turn)[:, None] * left
+    up = np.cross(along, left)
+    axes = np.stack([ahead, np.cross(up, ahead), up], axis=-1)
+    height = np.interp(station, plan.station, plan.elevation)
+    position = np.column_stack([np.asarray(state.position, np.float64), height])
+    return Poses(trace.time, position, Rotation.from_matrix(axes))
+
+
+def reckoned_poses(trace: Trace, reading: Float[np.ndarray, "n 2"]) -> Poses:
+    """Return the poses of `base_link` in `odom`: the odometer's distance (m) along its heading (rad), level.
+
+    Args:
+        trace: The episode.
+        reading: Odometer as observed by the agent, with the task's delay.
+    """
+    place, heading = reckon(reading)
+    level, about_z = np.column_stack([place, np.zeros(len(place))]), np.array([0.0, 0.0, 1.0])
+    return Poses(trace.time, level, Rotation.from_rotvec(heading[:, None] * about_z))
+
+
+def axis_rows(plan: TunnelPlan) -> Float[np.ndarray, "n 4"]:
+    """Return station (m) and position (m) of the track's centre, for scoring along and across."""
+    return np.column_stack([plan.station, plan.centre, plan.elevation])
+
+
+def tum_rows(poses: Poses, epoch: float) -> Float[np.ndarray, "n 8"]:
+    """Return rows `t x y z qx qy qz qw`, t in s since 1970."""
+    return np.column_stack([epoch + poses.time, poses.position, poses.rotation.as_quat(canonical=True)])
+
+
+IMU_RATE = 100.0  # Hz
+GRAVITY = 9.80665  # m/s²
+# Standard deviations of a sample, random walks and constant biases of an MTi-30. Source: GEODE dataset, calibration
+# of its γ rack (`acc_n`, `gyr_n`, `acc_w`, `gyr_w`); the biases are the data sheet's order of magnitude.
+ACCEL_SIGMA, ACCEL_WALK, ACCEL_BIAS = 5.574e-3, 1.208e-4, 0.02  # m/s², m/s²/√s, m/s²
+GYRO_SIGMA, GYRO_WALK, GYRO_BIAS = 5.144e-3, 1.088e-4, 0.003  # rad/s, rad/s/√s, rad/s
+_HALF_STEP = 1e-3  # s, of the central difference of the attitude
+
+
+@dataclasses.dataclass(frozen=True)
+class Inertial:
+    """Samples of the IMU in its own frame, which is oriented like `base_link`.
+
+    Attributes:
+        time: Time since the start, s, `(n,)`.
+        gyro: Rates, rad/s, `(n, 3)`.
+        accel: Specific force, m/s², `(n, 3)`; +9.8 upwards at rest.
+    """
+
+    time: Float[np.ndarray, " n"]
+    gyro: Float[np.ndarray, "n 3"]
+    accel: Float[np.ndarray, "n 3"]
+
+
+def measure_imu(poses: Poses, seed: int, noise: float = 1.0) -> Inertial:
+    """Simulate IMU samples along cubic splines through poses.
+
+    Commands change the speed at once; the splines spread that over a control period or two.
+
+    Args:
+        poses: Poses of the IMU, at least two.
+        seed: Seed of noise and biases.
+        noise: Factor on all errors; 0 gives the truth.
+    """
+    n = int(np.floor(poses.time[-1] * IMU_RATE + 1e-6)) + 1
+    time = np.arange(n) / IMU_RATE
+    angles = np.unwrap(poses.rotation.as_euler("ZYX"), axis=0)
+    place, turn = CubicSpline(poses.time, poses.position), CubicSpline(poses.time, angles)
+
+    def attitude(at: Float[np.ndarray, " n"]) -> Rotation:
+        return Rotation.from_euler("ZYX", turn(at))
+
+    gyro = (attitude(time - _HALF_STEP).inv() * attitude(time + _HALF_STEP)).as_rotvec() / (2.0 * _HALF_STEP)
+    accel = attitude(time).inv().apply(place(time, 2) + np.array([0.0, 0.0, GRAVITY]))
+    rng = np.random.default_rng([seed, 0x1A1])
+    walk = rng.standard_normal((2, n, 3)).cumsum(axis=1) / np.sqrt(IMU_RATE)
+    white, bias = rng.standard_normal((2, n, 3)), rng.standard_normal((2, 1, 3))
+    gyro = gyro + noise * (GYRO_SIGMA * white[0] + GYRO_WALK * walk[0] + GYRO_BIAS * bias[0])
+    accel = accel + noise * (ACCEL_SIGMA * white[1] + ACCEL_WALK * walk[1] + ACCEL_BIAS * bias[1])
+    return Inertial(time, gyro, accel)
+
+
+CLOUD_RANGE = 100.0  # m
+CLOUD_SIGMA = 0.01  # m. Source: VLP-16 user manual, "up to ±3 cm (typical)", taken as three standard deviations
+_SCANS = 128  # planar scans in one batch
+_RAYS = 200_000  # rays of clouds in one batch
+_DENSE_STREAM = 0x5CA7  # a separate key: the episode's draws stay as they are
+
+
+def dense_scans(
+    trace: Trace, env: TunnelEnv, params: EnvParams, n_beams: int, seed: int
+) -> Float[np.ndarray, "n n_beams"]:
+    """Take planar scans of more beams, with the same range, noise, boxes and faults as the task's own.
+
+    A sector that drops out is as wide as that of the task's LiDAR.
+
+    Args:
+        trace: The episode.
+        env: Its environment.
+        params: Its task.
+        n_beams: Beams, the first straight ahead, the others counter-clockwise.
+        seed: Seed of the episode.
+    """
+    n, wider = len(trace.observation), n_beams / params.lidar.n_beams
+    dense = params.replace(lidar=dataclasses.replace(params.lidar, n_beams=n_beams))
+    state = trace.state.replace(
+        **{part.name: part.with_beams(trace.state.parts[part.name], wider) for part in env.parts}
+    )
+    key = jax.random.fold_in(jax.random.key(jnp.uint32(seed)), _DENSE_STREAM)
+    rows = np.minimum(np.arange(-(-n // _SCANS) * _SCANS), n - 1).reshape(-1, _SCANS)
+    parts = [_perceive(env, jax.tree.map(lambda leaf, some=some: leaf[some], state), key, some, dense) for some in rows]
+    return np.concatenate([np.asarray(part) for part in parts])[:n]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _perceive(env: TunnelEnv, state: State, key: Array, index: Array, params: EnvParams) -> Float[Array, "n n_beams"]:
+    def one(state: State, index: Array) -> Array:
+        noise = env.draw_step(jax.random.fold_in(key, index), (), params)
+        return env.observe(state, noise, params)[env.fields(params)["ranges"]]
+
+    return jax.vmap(one)(state, index)
+
+
+def clouds(
+    relief: Relief, poses: Poses, station: Float[np.ndarray, " n"], directions: Float[np.ndarray, "m 3"], seed: int
+) -> Iterator[Float[np.ndarray, " m"]]:
+    """Yield the noisy ranges of each sweep, m; NaN for a beam that meets nothing within `CLOUD_RANGE`.
+
+    A sweep is taken at one instant: the robot's motion during a turn of the head is not simulated.
+
+    Args:
+        relief: The bore's surface.
+        poses: Poses of the LiDAR in the tunnel frame.
+        station: Stations of the LiDAR, m.
+        directions: Beams of the LiDAR.
+        seed: Seed of the noise; sweep k depends on the seed and k alone.
+    """
+    size = max(1, min(len(poses), _RAYS // len(directions)))
+    beams = jnp.asarray(directions, jnp.float32)
+    quaternion = poses.rotation.as_quat()[:, [3, 0, 1, 2]]
+    for first in range(0, len(poses), size):
+        # The last batch is filled up, so that all have one shape.
+        rows = np.minimum(np.arange(first, first + size), len(poses) - 1)
+        there = (np.asarray(values[rows], np.float32) for values in (poses.position, quaternion, station))
+        ranges = np.asarray(_cast()(relief, *there, beams, CLOUD_RANGE))
+        for k in range(first, min(first + size, len(poses))):
+            noise = np.random.default_rng([seed, k]).normal(0.0, CLOUD_SIGMA, len(directions))
+            exact = ranges[k - first]
+            yield np.where(exact < CLOUD_RANGE, exact + noise, np.nan).astype(np.float32)
+
+
+@functools.cache
+def _cast() -> Any:
+    return jax.jit(jax.vmap(lidar3d.scan, in_axes=(None, 0, 0, 0, None, None)))
