@@ -1,7 +1,7 @@
 """Speed of the walking robot: `python -m benchmarks.b2 --robots 8192`.
 
 Measures physics steps per second of MJX alone and of the whole environment (random actions, observation, reward,
-resets) for each variant of solver and contacts, in one run.
+resets).
 """
 
 import dataclasses
@@ -15,37 +15,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from rich.console import Console
-from rich.table import Table
 
 import subterra_jax as st
 from benchmarks.command import require_least, run_main
+from benchmarks.results import write_file
 from subterra_jax.b2 import tasks
 from subterra_jax.b2.physics import Physics
-from subterra_jax.b2.track import WindowConfig
 from subterra_jax.host.files import require_file
-
-_COLUMNS = ("variant", "contacts", "rows", "MJX alone, M/s", "environment, M/s", "share", "compile, s", "falls in 20 s")
-VARIANTS: dict[str, Physics] = {
-    "as shipped": Physics(),
-    "2 iterations": Physics(iterations=2),
-    "line search 4": Physics(ls_iterations=4),
-    "6 contacts": Physics(window=WindowConfig(max_contacts=6)),
-    "12 contacts": Physics(window=WindowConfig(max_contacts=12)),
-    "all contacts": Physics(window=WindowConfig(max_contacts=0)),
-    "no rails": Physics(window=WindowConfig(rails=False)),
-}
+from train.log import print_table
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Measures physics steps per second of the B2 on its window of track.
 
-    Example: python -m benchmarks.b2 --robots 8192 --variants all
+    Example: python -m benchmarks.b2 --robots 8192
 
     Attributes:
         robots: Robots in the batch.
-        variants: Variants to measure, or `all`.
         tunnel: Tunnel file or name; its length does not change the speed.
         control_steps: Control periods of 5 physics steps in one timed call.
         repeats: Timed calls; the median is reported.
@@ -53,15 +40,15 @@ class Command:
     """
 
     robots: int = 8192
-    variants: tuple[str, ...] = ("as shipped",)
     tunnel: str | None = None
     control_steps: int = 20
     repeats: int = 10
     out: Path | None = None
 
 
-def measure(physics: Physics, command: Command) -> dict[str, Any]:
-    """Measures both speeds of one variant, in physics steps per second."""
+def measure(command: Command) -> dict[str, Any]:
+    """Measures both speeds, in physics steps per second."""
+    physics = Physics()
     env, params = tasks.make(tunnel=command.tunnel, physics=physics)
     batch, n = st.AutoReset(env), command.robots
     key = jax.random.key(0)
@@ -115,34 +102,19 @@ def _time(function: Callable[..., Any], state: Any, command: Command) -> tuple[f
 
 
 def command(arguments: Command) -> int:
-    """Measures and prints; returns 1 where a number is not finite.
+    """Measures, prints and writes; returns 1 where a number is not finite.
 
     Raises:
-        ValueError: There is no such variant.
         SubterraError: A number is too small, there is no such tunnel, or the output cannot be written.
     """
-    names = tuple(VARIANTS) if arguments.variants == ("all",) else arguments.variants
-    for name in names:
-        if name not in VARIANTS:
-            raise ValueError(f"no variant {name!r}; there are {', '.join(VARIANTS)}, all")
     require_least(arguments, robots=1, control_steps=1, repeats=1)
     if arguments.out is not None:
         require_file(arguments.out)
-    device = jax.devices()[0]
-    table = Table(*_COLUMNS, title=f"{arguments.robots} robots, {device.device_kind}, physics steps")
-    results = {}
-    for name in names:
-        figures = results[name] = measure(VARIANTS[name], arguments)
-        table.add_row(
-            name, str(figures["contacts"]), str(figures["rows"]), f"{figures['alone'] / 1e6:.2f}",
-            f"{figures['environment'] / 1e6:.2f}", f"{figures['environment'] / figures['alone']:.0%}",
-            f"{figures['compile']:.0f}", f"{figures['falls']:.2f}",
-        )  # fmt: skip
-    Console(width=110).print(table)
+    figures = {"device": jax.devices()[0].device_kind, **measure(arguments)}
+    print_table(f"{arguments.robots} robots, physics steps per second", figures)
     if arguments.out is not None:
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps({"device": device.device_kind, "variants": results}, indent=1) + "\n")
-    return 0 if all(figures["finite"] for figures in results.values()) else 1
+        write_file(arguments.out, (json.dumps(figures, indent=1) + "\n").encode())
+    return 0 if figures["finite"] else 1
 
 
 def main(words: list[str] | None = None) -> int:

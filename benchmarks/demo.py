@@ -16,6 +16,7 @@ from benchmarks.report import write_report
 from benchmarks.truth import Truth, compare, load_truth, start_placement
 from scene.survey.config import SurveyConfig, check_survey
 from subterra_jax.host.files import require_folder
+from subterra_jax.pictures.renderer import import_mujoco
 
 TASK = "Subterra/TraverseShort-v1"
 
@@ -39,28 +40,24 @@ class DemoConfig:
     point_rate: int = 240_000
 
 
-class Stages:
-    """Announces and times the stages of the demo.
-
-    Attributes:
-        seconds: Wall-clock time of each finished stage.
-    """
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str, text: str) -> Iterator[None]:
-        """Times one stage; the time is kept under `name`."""
-        print(f"\n=== {text}", flush=True)
-        started = time.monotonic()
-        yield
-        self.seconds[name] = time.monotonic() - started
-        print(f"--- {self.seconds[name]:.1f} s", flush=True)
+@contextmanager
+def timed(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
+    """Announces a stage, times it, and keeps its wall-clock time under `name`."""
+    print(f"\n=== {text}", flush=True)
+    started = time.monotonic()
+    yield
+    seconds[name] = time.monotonic() - started
+    print(f"--- {seconds[name]:.1f} s", flush=True)
 
 
 def run_module(module: str, *inputs: Path, may_fail: bool = False, **options: object) -> str | None:
-    """Runs `python -m MODULE INPUTS --OPTION VALUE ...` as a user would; an option that is `True` has no value.
+    """Runs `python -m MODULE INPUTS --OPTION VALUE ...` as a user would.
+
+    Args:
+        module: Module to run.
+        *inputs: Its positional words.
+        may_fail: Whether an error is an answer too.
+        **options: Its options; `True` has no value, a tuple several.
 
     Returns:
         The error sentence of a command that may fail and did, else `None`.
@@ -70,7 +67,8 @@ def run_module(module: str, *inputs: Path, may_fail: bool = False, **options: ob
     """
     words = [module, *map(str, inputs)]
     for name, value in options.items():
-        words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
+        values = () if value is True else value if isinstance(value, tuple) else (value,)
+        words += [f"--{name.replace('_', '-')}", *map(str, values)]
     print(f"$ python -m {' '.join(words)}", flush=True)
     done = subprocess.run([sys.executable, "-m", *words], stderr=subprocess.PIPE if may_fail else None, text=True)
     if done.returncode == 0:
@@ -83,16 +81,14 @@ def run_module(module: str, *inputs: Path, may_fail: bool = False, **options: ob
 def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
     """Steps a scene once in MuJoCo and MJX; returns versions, sizes and MJX's compile time."""
     import jax
-    import mujoco
     import numpy as np
 
-    # Hides the message about the optional Warp backend.
-    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+    mujoco = import_mujoco("the demo")
+    with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):  # a message about the optional Warp backend
         from mujoco import mjx
 
     model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_step(model, data)
+    mujoco.mj_step(model, mujoco.MjData(model))
     started = time.monotonic()
     stepped = jax.jit(mjx.step)(mjx.put_model(model), mjx.make_data(model))
     finite = bool(np.isfinite(np.asarray(stepped.qpos)).all())
@@ -112,29 +108,25 @@ def main(config: DemoConfig) -> None:
         ValueError: A number is out of range.
         SubterraError: The folder cannot be written.
     """
-    require_folder(config.out)
-    check_survey(
-        SurveyConfig(config.out / "survey", length=config.length, seed=config.seed, point_rate=config.point_rate)
-    )
-    started = time.monotonic()
-    out, stages = config.out, Stages()
+    out, started, seconds = config.out, time.monotonic(), dict[str, float]()
+    require_folder(out)
+    size: dict[str, Any] = {"length": config.length, "seed": config.seed, "point_rate": config.point_rate}
+    check_survey(SurveyConfig(out / "survey", **size))
     survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))
-    with stages.stage("survey", f"1/6 Simulating a survey of {config.length:g} m (a ROS1 bag in GEODE's layout)"):
-        size: dict[str, Any] = {"length": config.length, "seed": config.seed, "point_rate": config.point_rate}
+    bag, trajectory = survey / "survey.bag", survey / "groundtruth.tum"
+    with timed(seconds, "survey", f"1/6 Simulating a survey of {config.length:g} m (a ROS1 bag in GEODE's layout)"):
         run_module("scene.survey", **size, out=survey)
-    with stages.stage("build", "2/6 Reconstructing the bore from the bag, poses given"):
-        bag, trajectory = survey / "survey.bag", survey / "groundtruth.tum"
+    with timed(seconds, "build", "2/6 Reconstructing the bore from the bag, poses given"):
         run_module("scene.build", bag, trajectory=trajectory, provenance="simulated", out=scene)
-    with stages.stage("build_odometry", "3/6 The same without poses: LiDAR odometry alone"):
+    with timed(seconds, "build_odometry", "3/6 The same without poses: LiDAR odometry alone"):
         failure = run_module("scene.build", bag, may_fail=True, provenance="simulated", out=blind)
         print(failure or "")
-    with stages.stage("load", "4/6 Loading the scene into MuJoCo and MJX"):
+    with timed(seconds, "load", "4/6 Loading the scene into MuJoCo and MJX"):
         loaded = step_in_mujoco_and_mjx(scene)
         print(", ".join(f"{name} {value}" for name, value in loaded.items()))
-    with stages.stage("train", f"5/6 Training on the reconstructed bore ({TASK})"):
-        tunnel = scene / "tunnel.npz"
-        run_module("train", task=TASK, tunnel=tunnel, seed=config.seed, overwrite=True, out=run)
-    with stages.stage("report", "6/6 Writing the report"):
+    with timed(seconds, "train", f"5/6 Training on the reconstructed bore ({TASK})"):
+        run_module("train", task=TASK, tunnel=scene / "tunnel.npz", seed=config.seed, overwrite=True, out=run)
+    with timed(seconds, "report", "6/6 Writing the report"):
         truth = load_truth(survey / "truth.json")
         summary: dict[str, Any] = {
             "provenance": "simulated",
@@ -143,12 +135,12 @@ def main(config: DemoConfig) -> None:
             "odometry": _odometry_figures(survey, blind, truth, failure),
             **_training_figures(run),
             **loaded,
+            "stage_seconds": seconds,
+            "seconds": time.monotonic() - started,
         }
-        summary["stage_seconds"] = stages.seconds
-        summary["seconds"] = time.monotonic() - started
         report = write_report(out, summary, truth)
         (out / "summary.json").write_text(json.dumps(summary, indent=2, sort_keys=True) + "\n")
-    print(f"\n{len(stages.seconds)} stages in {time.monotonic() - started:.0f} s: {report}")
+    print(f"\n{len(seconds)} stages in {time.monotonic() - started:.0f} s: {report}")
 
 
 def _training_figures(run: Path) -> dict[str, Any]:

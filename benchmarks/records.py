@@ -12,14 +12,13 @@ holds a table's template in a comment, with ids in braces, and the rendered tabl
 import dataclasses
 import json
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks.command import BenchmarkError
-from benchmarks.results import environment_facts, write_file
+from benchmarks.results import UNKNOWN, environment_facts, write_file
 from subterra_jax.host.command import INPUT_ERRORS, run_command
 
 ROOT = Path(__file__).parents[1]
@@ -48,7 +47,7 @@ class Record:
         versions: Versions of Python and packages.
         date: Day of the measurement.
         command: Words after `python -m`.
-        commit: Commit that was measured; None where it is not known.
+        commit: Commit that was measured; `unknown` where it was not kept, as before 26 November 2026.
         bound: Whether a measurement again must be near it, or may be larger (`at least`) or smaller (`at most`).
         tolerance: Difference in the wrong direction that is none, in its unit.
     """
@@ -64,7 +63,7 @@ class Record:
     versions: dict[str, str]
     date: str
     command: str
-    commit: str | None
+    commit: str
     bound: Literal["near", "at least", "at most"] = "near"
     tolerance: float = 0.0
 
@@ -98,26 +97,16 @@ def measured(id: str, value: float, unit: str, command: str, **further: Any) -> 
         command: Words after `python -m`.
         **further: Other fields of `Record`; `interval`, `n`, `split` and `seed` are empty if not given.
     """
-    facts = environment_facts()
     fields = {"interval": None, "n": None, "split": "", "seed": None, **further}
-    return Record(id, value, unit, command=command, commit=commit(), **of_facts(facts), **fields)
+    return Record(id, value, unit, command=command, **of_facts(environment_facts()), **fields)
 
 
 def of_facts(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return hardware, versions and date of a record from what `environment_facts` returned."""
+    """Return hardware, versions, date and commit of a record from what `environment_facts` returned."""
     hardware = facts["device"] if facts["platform"] != "cpu" else f"{facts['cpu_cores']} CPU cores"
     versions = {name: str(facts[name]) for name in _VERSIONS if facts.get(name)}
-    return {"hardware": hardware, "versions": versions, "date": facts["date"][:10]}
-
-
-def commit() -> str | None:
-    """Return the commit of this checkout; None where there is none."""
-    words = ["git", "-C", str(ROOT), "rev-parse", "--short=12", "HEAD"]
-    try:
-        done = subprocess.run(words, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
+    commit = facts.get("commit") or UNKNOWN
+    return {"hardware": hardware, "versions": versions, "date": facts["date"][:10], "commit": commit}
 
 
 def write_records(path: Path, records: Iterable[Record]) -> None:
@@ -222,11 +211,6 @@ def board(split: str) -> str:
     return screen_markdown(cells) if split == "screen" else kinds_markdown(cells, split)
 
 
-def pages() -> list[Path]:
-    """Return the pages that may hold tables."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-
-
 def render(write: bool) -> int:
     """Render the tables of all pages.
 
@@ -237,7 +221,7 @@ def render(write: bool) -> int:
         0, or 1 where a page is stale and was not written.
     """
     records, stale = on_record(), []
-    for page in pages():
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         text = page.read_text()
         name = str(page.relative_to(ROOT))
         if (fresh := rendered(text, records, name)) != text:
@@ -251,19 +235,19 @@ def render(write: bool) -> int:
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line: `render`, `check`, or `keep FILE…`; returns 2 for a user's mistake."""
-    words = sys.argv[1:] if words is None else words
+    command, *rest = (sys.argv[1:] if words is None else words) or [""]
     commands: dict[str, Callable[[], int | None]] = {
         "render": lambda: render(write=True),
         "check": lambda: render(write=False),
-        "keep": lambda: keep([Path(word) for word in words[1:]]),
+        "keep": lambda: keep([Path(word) for word in rest]),
     }
-    if words and words[0] in ("-h", "--help"):
+    if command in ("-h", "--help"):
         print(__doc__)
         return 0
-    if not words or words[0] not in commands:
+    if command not in commands:
         print(f"error: say one of {', '.join(commands)}; --help says what they do", file=sys.stderr)
         return 2
-    return run_command(commands[words[0]], "interrupted", INPUT_ERRORS)
+    return run_command(commands[command], "interrupted", INPUT_ERRORS)
 
 
 if __name__ == "__main__":

@@ -4,29 +4,28 @@ import base64
 import html
 import io
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-import trimesh
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from PIL import Image
 
-from benchmarks.draw import scene as drawing
-from benchmarks.truth import Comparison, Truth, centreline, compare, start_placement
+from benchmarks.draw.scene import picture
+from benchmarks.results import png_bytes
+from benchmarks.truth import Comparison, Truth, centreline, compare, scene_points, start_placement
+from subterra_jax.pictures.renderer import PictureError
 
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1d2b36; --line: #d5dbe1; --soft: #f4f6f8; --paper: #ffffff; }
 @media (prefers-color-scheme: dark) { :root { --ink: #dfe6ec; --line: #3a4753; --soft: #1c252d; --paper: #131a20; } }
 body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 68rem;
   margin: 2rem auto; padding: 0 1rem; }
-h1 { margin-bottom: .2rem; }
 h2 { margin-top: 2.4rem; border-bottom: 1px solid var(--line); padding-bottom: .2rem; }
 figure { margin: 1rem 0; }
 figure img { width: 100%; background: #fff; border: 1px solid var(--line); border-radius: 6px; }
@@ -50,63 +49,42 @@ def html_page(title: str, parts: Iterable[str]) -> str:
     )
 
 
-def html_heading(text: str, level: int = 2) -> str:
-    """Returns a heading; the text is escaped."""
-    return f"<h{level}>{html.escape(text)}</h{level}>"
-
-
-def html_paragraph(text: str, kind: str = "note") -> str:
-    """Returns a paragraph; the text is escaped."""
-    return f'<p class="{kind}">{html.escape(text)}</p>'
+def html_text(text: str, tag: str = "p", kind: str = "note") -> str:
+    """Returns a paragraph or heading; the text is escaped."""
+    return f'<{tag} class="{kind}">{html.escape(text)}</{tag}>'
 
 
 def html_figure(content: Figure | np.ndarray | bytes, caption: str) -> str:
-    """Embeds a figure, an `(h, w, 3)` picture or PNG bytes."""
-    data = base64.b64encode(_png(content)).decode()
-    return (
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-    )
+    """Embeds a figure, which is closed, an `(h, w, 3)` picture or PNG bytes."""
+    if isinstance(content, Figure):
+        content = png_bytes(content, dpi=130)
+    elif isinstance(content, np.ndarray):
+        buffer = io.BytesIO()
+        Image.fromarray(content).save(buffer, format="png")
+        content = buffer.getvalue()
+    data, text = base64.b64encode(content).decode(), html.escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
 
 
 def html_table(columns: tuple[str, ...], rows: Iterable[tuple[tuple[str, ...], bool]]) -> str:
     """Returns a table of strings; a row's flag marks a missed goal. The second column is set as numbers."""
-    kinds = ["number" if k == 1 else "text" for k in range(len(columns))]
-    head = "".join(f'<th class="{kind}">{html.escape(name)}</th>' for kind, name in zip(kinds, columns, strict=True))
-    lines = []
-    for cells, missed in rows:
-        data = "".join(f'<td class="{kind}">{html.escape(cell)}</td>' for kind, cell in zip(kinds, cells, strict=True))
-        lines.append(f'<tr class="{"missed" if missed else "met"}">{data}</tr>')
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(lines)}</tbody></table>"
 
+    def line(cells: tuple[str, ...], tag: str) -> str:
+        kinds = ("number" if k == 1 else "text" for k in range(len(columns)))
+        marked = (f'<{tag} class="{kind}">{html.escape(cell)}</{tag}>' for kind, cell in zip(kinds, cells, strict=True))
+        return "".join(marked)
 
-def _png(content: Figure | np.ndarray | bytes) -> bytes:
-    if isinstance(content, bytes):
-        return content
-    buffer = io.BytesIO()
-    if isinstance(content, Figure):
-        content.savefig(buffer, format="png", dpi=130)
-    else:
-        Image.fromarray(content).save(buffer, format="png")
-    return buffer.getvalue()
+    body = (f'<tr class="{"missed" if missed else "met"}">{line(cells, "td")}</tr>' for cells, missed in rows)
+    return f"<table><thead><tr>{line(columns, 'th')}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
 _INK, _TRUTH, _ODOMETRY, _POINTS = "#1b4965", "#c1121f", "#e09f3e", "#8d99ae"
-_SLICE = 0.15
+_SLICE = 0.15  # m either side of a section
 _MOST_POINTS = 6_000
 
 
-@dataclass(frozen=True)
-class Axis:
-    """A centreline to draw: label, stations (m) and positions in the survey frame (m)."""
-
-    label: str
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-
-
-def plan_and_profile(truth: Truth, given: Axis, odometry: Axis | None) -> Figure:
-    """Draws centrelines from above and from the side."""
+def plan_and_profile(truth: Truth, built: dict[str, tuple[np.ndarray, np.ndarray]]) -> Figure:
+    """Draws centrelines from above and from the side; `built` holds stations and positions, m, by their labels."""
     figure, (plan, profile) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     start = truth.position[0]
     direction = truth.position[-1, :2] - start[:2]
@@ -119,9 +97,8 @@ def plan_and_profile(truth: Truth, given: Axis, odometry: Axis | None) -> Figure
         profile.plot(station, position[:, 2] - start[2], **style)
 
     draw(truth.station, truth.position, color=_TRUTH, lw=4, alpha=0.4, label="truth (simulated)")
-    draw(given.station, given.position, color=_INK, lw=1.4, label=given.label)
-    if odometry is not None:
-        draw(odometry.station, odometry.position, color=_ODOMETRY, lw=1.4, ls="--", label=odometry.label)
+    for (label, line), colour in zip(built.items(), (_INK, _ODOMETRY), strict=False):
+        draw(*line, color=colour, lw=1.4, label=label)
     plan.set(title="Plan", xlabel="along the chord, m", ylabel="across, m")
     plan.set_aspect("equal", adjustable="datalim")
     profile.set(title="Profile", xlabel="station, m", ylabel="height above the start, m")
@@ -132,13 +109,7 @@ def plan_and_profile(truth: Truth, given: Axis, odometry: Axis | None) -> Figure
 
 
 def section_overlays(bore_path: Path, points: Float[np.ndarray, "p 3"], count: int = 4) -> Figure:
-    """Draws sections of the bore over the registered points within 15 cm.
-
-    Args:
-        bore_path: `bore.npz`.
-        points: Registered cloud in the tunnel frame, m.
-        count: Number of sections, evenly spread.
-    """
+    """Draws sections of the bore, evenly spread, over the registered points within 15 cm (tunnel frame, m)."""
     with np.load(bore_path) as data:
         bore = {name: data[name] for name in data.files}
     rows = np.linspace(0, len(bore["station"]) - 1, count + 2).astype(int)[1:-1]
@@ -188,48 +159,32 @@ def plan_of_walls(tunnel_path: Path, lining: str = "pockets", stretch: float = 2
         return figure
 
 
-def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
-    """Reads the registered cloud of a scene folder, thinned, in the tunnel frame, m."""
-    cloud = trimesh.load(scene / "cloud.ply")
-    assert isinstance(cloud, trimesh.PointCloud)  # for the type checker; the builder writes no faces
-    return np.asarray(cloud.vertices)
+class Row(NamedTuple):
+    """A row of the report: key in `summary.json`, text, unit with its factor, decimals, goal and its direction."""
+
+    key: str
+    text: str
+    unit: str
+    factor: float = 1.0
+    decimals: int = 2
+    goal: float | None = None
+    less: bool = True
 
 
-def bore_in_perspective(bore_path: Path, eye: float = 2.0, reach: float = 40.0) -> Figure:
-    """Draws the bore's sections in perspective from `eye` m inside; used where nothing can be rendered."""
-    with np.load(bore_path) as data:
-        bore = {name: data[name] for name in data.files}
-    start = int(np.searchsorted(bore["station"], eye))
-    frame = np.stack([bore["lateral"][start], bore["up"][start], bore["tangent"][start]])
-    figure, axes = plt.subplots(figsize=(8, 6), layout="constrained")
-    for row in range(start + 4, len(bore["station"]), 4):
-        if bore["station"][row] > eye + reach:
-            break
-        across, along = bore["radius"][row] * np.cos(bore["angle"]), bore["radius"][row] * np.sin(bore["angle"])
-        ring = bore["position"][row] + across[:, None] * bore["lateral"][row] + along[:, None] * bore["up"][row]
-        left, up, ahead = frame @ (ring - bore["position"][start]).T
-        shown = ahead > 0.5
-        axes.plot(-left[shown] / ahead[shown], up[shown] / ahead[shown], color=_INK, lw=0.6, alpha=0.8)
-    axes.set(xlim=(-1.4, 1.4), ylim=(-1.05, 1.05), aspect="equal")
-    axes.set_axis_off()
-    return figure
-
-
-# Key in summary.json, text, unit, factor, decimals, goal, and whether less is better.
-_ROWS: tuple[tuple[str, str, str, float, int, float | None, bool], ...] = (
-    ("length", "Length of the true centreline", "m", 1, 2, None, True),
-    ("length_error", "Reconstructed less true length", "cm", 100, 1, None, True),
-    ("centreline_rmse", "Centreline RMSE, poses given", "cm", 100, 2, 5.0, True),
-    ("width_rmse", "Width RMSE, poses given", "cm", 100, 2, 4.0, True),
-    ("height_rmse", "Height RMSE, poses given", "cm", 100, 2, 4.0, True),
-    ("coverage_mean_100", "Coverage, mean of the last 100 training episodes", "%", 100, 2, 90.0, False),
-    ("success_mean_100", "Success in the last 100 training episodes", "%", 100, 1, None, False),
-    ("evaluation_coverage", "Coverage in evaluation, noise-free policy", "%", 100, 2, None, False),
-    ("evaluation_success", "Success in evaluation", "%", 100, 1, None, False),
-    ("train_steps", "Environment steps of training", "million", 1e-6, 2, None, True),
-    ("geoms", "Geoms in the scene", "", 1, 0, None, True),
-    ("mesh_faces", "Triangles in the scene", "", 1, 0, None, True),
-    ("seconds", "The whole demo", "s", 1, 0, 720.0, True),
+_ROWS = (
+    Row("length", "Length of the true centreline", "m"),
+    Row("length_error", "Reconstructed less true length", "cm", 100, 1),
+    Row("centreline_rmse", "Centreline RMSE, poses given", "cm", 100, goal=5.0),
+    Row("width_rmse", "Width RMSE, poses given", "cm", 100, goal=4.0),
+    Row("height_rmse", "Height RMSE, poses given", "cm", 100, goal=4.0),
+    Row("coverage_mean_100", "Coverage, mean of the last 100 training episodes", "%", 100, goal=90.0, less=False),
+    Row("success_mean_100", "Success in the last 100 training episodes", "%", 100, 1),
+    Row("evaluation_coverage", "Coverage in evaluation, noise-free policy", "%", 100),
+    Row("evaluation_success", "Success in evaluation", "%", 100, 1),
+    Row("train_steps", "Environment steps of training", "million", 1e-6),
+    Row("geoms", "Geoms in the scene", "", decimals=0),
+    Row("mesh_faces", "Triangles in the scene", "", decimals=0),
+    Row("seconds", "The whole demo", "s", decimals=0, goal=720.0),
 )
 
 
@@ -241,24 +196,22 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
         summary: Figures in SI units.
         truth: Truth of the simulated survey.
     """
+    seen = "The first 20 m as the environment's LiDAR sees them: walls and bolt pockets at its height."
+    learnt = "Coverage of each training episode and their mean of 100."
+    seconds = [((name, f"{value:.1f}"), False) for name, value in summary["stage_seconds"].items()]
     parts = [
-        html_heading("Subterra: from a recording to a trained agent", 1),
-        html_paragraph("simulated survey: nothing here was measured in a real tunnel", "simulated"),
-        html_heading("Figures"),
+        html_text("Subterra: from a recording to a trained agent", "h1"),
+        html_text("simulated survey: nothing here was measured in a real tunnel", kind="simulated"),
+        html_text("Figures", "h2"),
         html_table(("Figure", "Value", "Unit", "Goal"), _figure_rows(summary)),
-        html_paragraph(_odometry_sentence(summary["odometry"])),
-        html_heading("The bore"),
+        html_text(_odometry_sentence(summary["odometry"])),
+        html_text("The bore", "h2"),
         *_bore_parts(out, summary, truth),
-        html_heading("The environment and what was learnt in it"),
-        html_figure(
-            _closed(plan_of_walls(out / "scene" / "tunnel.npz")),
-            "The first 20 m as the environment's LiDAR sees them: walls and bolt pockets at its height.",
-        ),
-        html_figure(
-            (out / "training" / "curve.png").read_bytes(), "Coverage of each training episode and their mean of 100."
-        ),
-        html_heading("Where the time went"),
-        html_table(("Stage", "Seconds"), [((k, f"{v:.1f}"), False) for k, v in summary["stage_seconds"].items()]),
+        html_text("The environment and what was learnt in it", "h2"),
+        html_figure(plan_of_walls(out / "scene" / "tunnel.npz"), seen),
+        html_figure((out / "training" / "curve.png").read_bytes(), learnt),
+        html_text("Where the time went", "h2"),
+        html_table(("Stage", "Seconds"), seconds),
     ]
     path = out / "report.html"
     path.write_text(html_page("Subterra demo", parts))
@@ -267,32 +220,23 @@ def write_report(out: Path, summary: dict[str, Any], truth: Truth) -> Path:
 
 def _bore_parts(out: Path, summary: dict[str, Any], truth: Truth) -> list[str]:
     scene, blind = out / "scene", out / "scene-odometry"
-    given = Axis("reconstructed, poses given", *centreline(scene))
-    odometry = None
+    built = {"reconstructed, poses given": centreline(scene)}
     if "failure" not in summary["odometry"]:
         placement = start_placement(blind / "odometry.tum", out / "survey" / "groundtruth.tum")
-        odometry = Axis("reconstructed, odometry alone", *centreline(blind, placement))
-    parts = []
-    view = drawing.picture(scene)
-    if view is not None:
-        parts.append(html_figure(view, "The scene in MuJoCo, from the camera of its scout robot."))
-    else:
-        drawn = _closed(bore_in_perspective(scene / "bore.npz"))
-        parts.append(html_figure(drawn, "The bore, drawn section by section; without OpenGL nothing can be rendered."))
-    plan = _closed(plan_and_profile(truth, given, odometry))
-    sections = _closed(section_overlays(scene / "bore.npz", scene_points(scene)))
-    errors = _closed(section_errors(compare(scene, truth)))
+        built["reconstructed, odometry alone"] = centreline(blind, placement)
+    try:
+        view = html_figure(picture(scene, "scout"), "The scene in MuJoCo, from the camera of its scout robot.")
+    except PictureError as error:
+        view = html_text(f"No picture of the scene: {error}")
+    line = "Plan and profile of the centreline. Nothing is aligned: odometry starts at the true pose."
+    sections = "Sections over the registered points within 15 cm, looking along the tunnel."
+    errors = "Error of the axis (above) and of the section's size (below) against the truth."
     return [
-        *parts,
-        html_figure(plan, "Plan and profile of the centreline. Nothing is aligned: odometry starts at the true pose."),
-        html_figure(sections, "Sections over the registered points within 15 cm, looking along the tunnel."),
-        html_figure(errors, "Error of the axis (above) and of the section's size (below) against the truth."),
+        view,
+        html_figure(plan_and_profile(truth, built), line),
+        html_figure(section_overlays(scene / "bore.npz", scene_points(scene)), sections),
+        html_figure(section_errors(compare(scene, truth)), errors),
     ]
-
-
-def _closed(figure: Any) -> Any:
-    plt.close(figure)  # so that figures do not pile up; a closed figure can still be saved
-    return figure
 
 
 def _odometry_sentence(odometry: dict[str, Any]) -> str:
@@ -307,13 +251,13 @@ def _odometry_sentence(odometry: dict[str, Any]) -> str:
 
 def _figure_rows(summary: dict[str, Any]) -> list[tuple[tuple[str, ...], bool]]:
     rows: list[tuple[tuple[str, ...], bool]] = []
-    for key, text, unit, factor, decimals, goal, less in _ROWS:
-        value = summary.get(key)
+    for row in _ROWS:
+        value = summary.get(row.key)
+        goal = "" if row.goal is None else f"{'≤' if row.less else '≥'} {row.goal:g}"
         if value is None or not np.isfinite(value):
-            rows.append(((text, "-", unit, ""), goal is not None))
+            rows.append(((row.text, "-", row.unit, goal), row.goal is not None))
             continue
-        shown = factor * value
-        missed = goal is not None and (shown > goal if less else shown < goal)
-        sign = "≤" if less else "≥"
-        rows.append(((text, f"{shown:,.{decimals}f}", unit, "" if goal is None else f"{sign} {goal:g}"), missed))
+        shown = row.factor * value
+        missed = row.goal is not None and (shown > row.goal if row.less else shown < row.goal)
+        rows.append(((row.text, f"{shown:,.{row.decimals}f}", row.unit, goal), missed))
     return rows

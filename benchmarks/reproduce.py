@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -20,8 +20,7 @@ from benchmarks.results import environment_facts, write_file
 from subterra_jax.host.files import require_folder
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """Commands that measure records on a CPU.
 
     Attributes:
@@ -39,6 +38,13 @@ class Job:
     read: Callable[[Any], dict[str, float]] | None = None
 
 
+def _verdict(report: Any) -> dict[str, float]:
+    names = {"subterra-351/global": "global", "subterra-351/null-tube": "global_null"}
+    return {f"fidelity/{id}": report[name] for id, name in names.items()} | {
+        "fidelity/categories": len(report["categories"])
+    }
+
+
 _METRO, _DIRTY = "{shared}/data/metro_asbuilt", "{shared}/data/dirty_clouds"
 _SURVEY_351 = (
     "scene.survey --truth metro --length 351 --seed 0 --sensors avia os1 --scan-every 10 --out {out}/survey",
@@ -49,24 +55,11 @@ _FIDELITY = (
     "benchmarks.fidelity run --scene {out}/scene --recording {out}/survey/survey_os1.bag "
     "--trajectory {out}/survey/groundtruth_os1.tum --truth {out}/survey --out {out}/report"
 )
-
-
-def _length(manifest: Any) -> dict[str, float]:
-    return {"reconstruction/metro/length": manifest["bore"]["length"]}
-
-
-def _verdict(report: Any) -> dict[str, float]:
-    return {
-        "fidelity/subterra-351/global": report["global"],
-        "fidelity/subterra-351/null-tube": report["global_null"],
-        "fidelity/categories": len(report["categories"]),
-    }
-
-
 JOBS = {
     "speed": Job(("benchmarks.throughput --n 1 1024 --peers none --poses 200000 --out {out}",), 2.0),
     "metro": Job(
-        (f"scene.build {_METRO} --out {{out}}/scene",), 2.0, "scene/manifest.json", _METRO, _length
+        (f"scene.build {_METRO} --out {{out}}/scene",), 2.0, "scene/manifest.json", _METRO,
+        lambda manifest: {"reconstruction/metro/length": manifest["bore"]["length"]},
     ),
     "dirty": Job((f"benchmarks.dirty {_DIRTY} --out {{out}}",), 3.0, needs=_DIRTY),
     "rays": Job((*_SURVEY_351, "benchmarks.rays --scene {out}/scene --out {out}/rays.json"), 8.0),
@@ -76,7 +69,6 @@ JOBS = {
         ("benchmarks.board.again --agents dead-reckoning fused ring-filter scan-matching --out {out}",), 20.0
     ),
 }  # fmt: skip
-_QUICK = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)
 
 
 @dataclass(frozen=True)
@@ -89,18 +81,13 @@ class ReproduceConfig:
         shared: Folder that holds surveys that are not packaged.
     """
 
-    jobs: tuple[str, ...] = _QUICK
+    jobs: tuple[str, ...] = tuple(name for name, job in JOBS.items() if job.minutes <= 15.0)
     out: Path = Path("out/reproduce")
     shared: Path = Path("../shared")
 
 
 def run_job(job: Job, folder: Path, shared: Path) -> dict[str, float] | None:
-    """Run a job unless its result is there.
-
-    Args:
-        job: Job to run.
-        folder: Its folder.
-        shared: Folder of the surveys that are not packaged.
+    """Runs a job in its folder unless its result is there.
 
     Returns:
         Its figures by the ids of records; None where its input is missing.
@@ -125,35 +112,6 @@ def run_job(job: Job, folder: Path, shared: Path) -> dict[str, float] | None:
     return {record.id: record.value for record in read_records(result)}
 
 
-def compare(records: dict[str, Record], figures: dict[str, float]) -> list[dict[str, Any]]:
-    """Return a row for each figure that is on record, with the verdict `same` or `differs`."""
-    return [
-        {
-            "id": id,
-            "recorded": records[id].value,
-            "measured": value,
-            "unit": records[id].unit,
-            "verdict": "same" if records[id].holds(value) else "differs",
-        }
-        for id, value in figures.items()
-        if id in records
-    ]
-
-
-def show(rows: list[dict[str, Any]], others: list[Record], console: Console) -> None:
-    """Print what was measured, then what is only listed, each command once."""
-    table = Table("record", "recorded", "measured", "unit", "verdict")
-    for row in rows:
-        table.add_row(row["id"], number(row["recorded"]), number(row["measured"]), row["unit"], row["verdict"])
-    console.print(table)
-    console.print("Not measured here:")
-    for command in dict.fromkeys(record.command for record in others):
-        mine = [record for record in others if record.command == command]
-        console.print(f"  python -m {command}", soft_wrap=True, markup=False)
-        for record in mine:
-            console.print(f"    {record.id}: {record.text} ({record.hardware}, {record.date})", soft_wrap=True)
-
-
 def run(config: ReproduceConfig) -> int:
     """Measures, prints and writes; returns 0 where every figure is the same, 1 where one differs.
 
@@ -171,12 +129,32 @@ def run(config: ReproduceConfig) -> int:
         figures = run_job(JOBS[name], config.out / name, config.shared)
         if figures is None:
             console.print(f"{name}: not measured, {JOBS[name].needs.format(shared=config.shared)} is not there")
-        rows += compare(records, figures or {})
+        for id, value in (figures or {}).items():
+            if id in records:
+                verdict = "same" if records[id].holds(value) else "differs"
+                rows.append({"id": id, "measured": value, "verdict": verdict})
     content = {"config": asdict(config), "environment": environment_facts(), "rows": rows}
     write_file(config.out / "reproduce.json", (json.dumps(content, indent=1, default=str) + "\n").encode())
-    measured = {row["id"] for row in rows}
-    show(rows, [record for record in records.values() if record.id not in measured], console)
+    _show(rows, records, console)
     return int(any(row["verdict"] == "differs" for row in rows))
+
+
+def _show(rows: list[dict[str, Any]], records: dict[str, Record], console: Console) -> None:
+    """Prints what was measured, then what is only listed, each command once."""
+    table = Table("record", "recorded", "measured", "unit", "verdict")
+    for row in rows:
+        record = records[row["id"]]
+        table.add_row(record.id, number(record.value), number(row["measured"]), record.unit, row["verdict"])
+    console.print(table)
+    console.print("Not measured here:")
+    others: dict[str, list[Record]] = {}
+    for record in records.values():
+        if record.id not in {row["id"] for row in rows}:
+            others.setdefault(record.command, []).append(record)
+    for command, some in others.items():
+        console.print(f"  python -m {command}", soft_wrap=True, markup=False)
+        for record in some:
+            console.print(f"    {record.id}: {record.text} ({record.hardware}, {record.date})", soft_wrap=True)
 
 
 def main(words: list[str] | None = None) -> int:

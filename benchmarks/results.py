@@ -1,8 +1,10 @@
-"""Facts that every result file carries, figures as PNG, and files written whole or not at all."""
+"""What every result is written with: facts of the machine, tables, pictures, files whole or not at all."""
 
 import io
 import os
 import platform
+import subprocess
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -18,11 +20,12 @@ from matplotlib.figure import Figure
 from subterra_jax import tasks
 from subterra_jax.host.files import replace_file
 
+UNKNOWN = "unknown"
 _PACKAGES = ("jax", "jaxlib", "flax", "numpy", "mujoco", "jaxmarl", "gymnax", "subterra-jax")
 
 
 def environment_facts() -> dict[str, Any]:
-    """Returns date (UTC), hardware and versions; `None` for a package that is not installed."""
+    """Returns date (UTC), hardware, commit and versions; `None` for a package that is not installed."""
     device = jax.devices()[0]
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -32,8 +35,18 @@ def environment_facts() -> dict[str, Any]:
         "processor": _processor(),
         "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "python": platform.python_version(),
+        "commit": commit(),
         **{name: version(name) for name in _PACKAGES},
     }
+
+
+def commit() -> str:
+    """Returns the commit of this checkout; `unknown` where there is none."""
+    words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=12", "HEAD"]
+    try:
+        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return UNKNOWN
 
 
 def constants_facts() -> dict[str, str]:
@@ -60,6 +73,12 @@ def write_file(path: Path, content: bytes) -> None:
         fresh.write_bytes(content)
 
 
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Returns a Markdown table that ends with a line break; a `|` in a cell becomes a slash."""
+    lines = [f"| {' | '.join(cell.replace('|', '/') for cell in row)} |" for row in (head, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:], ""])
+
+
 def png_bytes(figure: Figure, dpi: int, **options: Any) -> bytes:
     """Returns a figure as a PNG file and closes it; `options` go to `savefig`."""
     buffer = io.BytesIO()
@@ -69,7 +88,6 @@ def png_bytes(figure: Figure, dpi: int, **options: Any) -> bytes:
 
 
 def _processor() -> str:
-    """Returns the processor's name, as far as the system gives it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]

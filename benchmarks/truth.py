@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
@@ -19,10 +20,10 @@ class Truth:
     """True centreline and section sizes in the survey frame.
 
     Attributes:
-        station: Stations, m, `(n,)`.
-        position: Points of the centreline, m, `(n, 3)`.
-        width: Largest inner width, m, `(n,)`.
-        height: Floor to crown on the axis, m, `(n,)`.
+        station: Stations, m.
+        position: Points of the centreline, m.
+        width: Largest inner width, m.
+        height: Floor to crown on the axis, m.
     """
 
     station: Float[np.ndarray, " n"]
@@ -36,11 +37,11 @@ class Comparison:
     """Errors of a bore against the truth, station by station.
 
     Attributes:
-        station: True station of each compared section, m, `(k,)`.
-        lateral: Offset of the axis to the left, m, `(k,)`.
-        vertical: Offset upwards, m, `(k,)`.
-        width: Width error, m, `(k,)`.
-        height: Height error, m, `(k,)`.
+        station: True station of each compared section, m.
+        lateral: Offset of the axis to the left, m.
+        vertical: Offset upwards, m.
+        width: Width error, m.
+        height: Height error, m.
         length_error: Reconstructed less true length, m.
     """
 
@@ -99,6 +100,13 @@ def centreline(scene: Path, placement: Placement = SAME_FRAME) -> tuple[np.ndarr
     with np.load(scene / "bore.npz") as bore:
         origin = np.asarray(json.loads((scene / "manifest.json").read_text())["frame"]["origin"])
         return bore["station"], (bore["position"] + origin) @ placement.rotation.T + placement.shift
+
+
+def scene_points(scene: Path) -> Float[np.ndarray, "p 3"]:
+    """Returns the registered cloud of a scene, thinned, in the tunnel frame, m."""
+    cloud = trimesh.load(scene / "cloud.ply")
+    assert isinstance(cloud, trimesh.PointCloud)  # for the type checker; the builder writes no faces
+    return np.asarray(cloud.vertices)
 
 
 def compare(scene: Path, truth: Truth, placement: Placement = SAME_FRAME) -> Comparison:

@@ -16,7 +16,7 @@ from benchmarks.board.drive import BoardConfig, check, conditions_of_parts, driv
 from benchmarks.board.records import records_of
 from benchmarks.command import run_main
 from benchmarks.records import write_records
-from benchmarks.results import write_file
+from benchmarks.results import png_bytes, write_file
 from subterra_jax.host.files import require_folder
 from subterra_jax.host.loading import load_file
 
@@ -38,7 +38,7 @@ def run(config: BoardConfig) -> None:
     cells = read_cells(config.cells or config.out / "cells", conditions_of_parts(config))
     write_file(config.out / "cells.jsonl", "".join(json.dumps(cell) + "\n" for cell in cells).encode())
     write_file(config.out / "board.md", tables.as_markdown(cells).encode())
-    write_file(config.out / "board.png", picture.as_png(cells))
+    write_file(config.out / "board.png", png_bytes(picture.draw(cells), dpi=110))
     write_records(config.out / "records.json", records_of(cells))
     if table := tables.screen_markdown(cells):
         print(table)

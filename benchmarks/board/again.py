@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from benchmarks.board.cells import read_cells, setting_of
-from benchmarks.board.columns import Column, Setting, draw_episodes, tunnel_names
+from benchmarks.board.cells import Cell, read_cells, setting_of
+from benchmarks.board.columns import Column, draw_episodes, tunnel_names
 from benchmarks.board.drive import BoardConfig, Job, conditions_of_parts, enter
 from benchmarks.board.roster import make_agent
 from benchmarks.command import BenchmarkError, require_least, run_main
@@ -57,16 +57,18 @@ def run(config: AgainConfig) -> int:
     """
     require_least(config, episodes=1)
     cells = read_cells(config.cells, conditions_of_parts(BoardConfig(config.out)))
-    cells = [cell for cell in cells if not config.tasks or cell["task"] in config.tasks]
-    cells = [cell for cell in cells if not config.agents or cell["agent"] in config.agents]
+    cells = [cell for cell in cells if (not config.tasks or cell["task"] in config.tasks)
+             and (not config.agents or cell["agent"] in config.agents)]  # fmt: skip
     if not cells:
         raise BenchmarkError(f"{config.cells}: holds no cell of these tasks and agents")
     require_folder(config.out)
     found = []
     for cell in cells:
         started = time.monotonic()
-        found.append(compare(cell, config))
-        _progress.print(f"{describe(found[-1])} ({time.monotonic() - started:.0f} s)")
+        row = compare(cell, config)
+        found.append(row)
+        verdict = "the same" if row["same"] else f"{row['differ']} of {row['episodes']} differ"
+        _progress.print(f"{row['task']}, {row['agent']}: {verdict} ({time.monotonic() - started:.0f} s)")
         content = {"facts": environment_facts(), "cells": found}
         write_file(config.out / "again.json", (json.dumps(content) + "\n").encode())
     same = sum(row["same"] for row in found)
@@ -77,21 +79,27 @@ def run(config: AgainConfig) -> int:
     return int(same < len(found))
 
 
-def compare(cell: dict[str, Any], config: AgainConfig) -> dict[str, Any]:
+def compare(cell: Cell, config: AgainConfig) -> dict[str, Any]:
     """Drive some episodes of a cell again.
 
     Returns:
         Task, agent, whether successes and contacts are the same, how many are not, and the largest difference of the
         distance from the goal, m; that is rounded to 1 mm in cells.
     """
-    setting = setting_of(cell)
+    setting, columns = setting_of(cell), [Column(**column) for column in cell["columns"]]
     rows = np.unique(np.linspace(0, len(cell["success"]) - 1, config.episodes).round().astype(int))
-    env, params, episodes = _enter(cell, setting, rows, config)
+    size = len(cell["success"]) // len(columns)
+    drawn = draw_episodes(setting, columns, cell["tunnels"], size, setting.task == "Faulted")
+    used = np.unique(drawn.tunnel[rows])  # the tunnels of these episodes alone are made
+    names = tunnel_names(columns, cell["tunnels"])
+    made = load([names[i] for i in used], cache=config.cache, sensor=cell["sensor"])
+    env, params = enter(Job(setting, cell["agent"], cell["sensor"]), made if len(made) > 1 else made[0])
+    some = {name: values[rows] for name, values in vars(drawn).items()}
+    episodes = Episodes(**{**some, "tunnel": np.searchsorted(used, some["tunnel"]).astype(np.int32)})
     records = evaluate(env, params, make_agent(cell["agent"], env, params), episodes, len(rows))
     then = {name: [cell[name][row] for row in rows] for name in ("success", "contact", "goal_error")}
     differ = (records.success.astype(int) != then["success"]) | (records.contact.astype(int) != then["contact"])
-    stopped = np.array([np.nan if error is None else error for error in then["goal_error"]])
-    apart = np.abs(records.goal_error - stopped)
+    apart = np.abs(records.goal_error - np.array([np.nan if e is None else e for e in then["goal_error"]]))
     return {
         "task": setting.words,
         "agent": cell["agent"],
@@ -99,28 +107,7 @@ def compare(cell: dict[str, Any], config: AgainConfig) -> dict[str, Any]:
         "differ": int(differ.sum()),
         "episodes": len(rows),
         "apart": float(np.nanmax(apart)) if np.isfinite(apart).any() else None,
-        "rounded_alike": int(np.sum(np.round(records.goal_error, 3) == stopped) + np.sum(np.isnan(stopped))),
     }
-
-
-def _enter(cell: dict[str, Any], setting: Setting, rows: np.ndarray, config: AgainConfig) -> tuple[Any, Any, Episodes]:
-    """Return environment, params and episodes of some rows of a cell, with the tunnels of these alone."""
-    columns = [Column(**column) for column in cell["columns"]]
-    size = len(cell["success"]) // len(columns)
-    drawn = draw_episodes(setting, columns, cell["tunnels"], size, setting.task == "Faulted")
-    used = np.unique(drawn.tunnel[rows])
-    names = tunnel_names(columns, cell["tunnels"])
-    made = load([names[i] for i in used], cache=config.cache, sensor=cell["sensor"])
-    env, params = enter(Job(setting, cell["agent"], cell["sensor"]), made if len(made) > 1 else made[0])
-    some = {name: values[rows] for name, values in vars(drawn).items()}
-    return env, params, Episodes(**{**some, "tunnel": np.searchsorted(used, some["tunnel"]).astype(np.int32)})
-
-
-def describe(row: dict[str, Any]) -> str:
-    """Return the comparison of a cell in a line."""
-    apart = "" if row["apart"] is None else f", stops at most {row['apart']:.3f} m apart"
-    verdict = "the same" if row["same"] else f"{row['differ']} of {row['episodes']} differ"
-    return f"{row['task']}, {row['agent']}: {verdict}{apart}"
 
 
 def main(words: list[str] | None = None) -> int:

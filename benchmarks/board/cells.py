@@ -45,9 +45,11 @@ class Score:
 
 
 Key = tuple[str, str]  # split, kind
+Cell = dict[str, Any]
+Cells = Sequence[Cell]
 
 
-def read_cells(source: Path, conditions: Collection[str] | None = None) -> list[dict[str, Any]]:
+def read_cells(source: Path, conditions: Collection[str] | None = None) -> list[Cell]:
     """Read the cells that were driven under some conditions, in the order of tasks and agents.
 
     Args:
@@ -69,28 +71,28 @@ def read_cells(source: Path, conditions: Collection[str] | None = None) -> list[
     return sorted(cells, key=_place)
 
 
-def _place(cell: dict[str, Any]) -> tuple[Any, ...]:
+def _place(cell: Cell) -> tuple[Any, ...]:
     place = lambda names, name: names.index(name) if name in names else len(names)  # noqa: E731
     return cell["hidden_start"], place(_ORDER, cell["task"]), cell["task"], place(_AGENTS, cell["agent"]), cell["agent"]
 
 
-def setting_of(cell: dict[str, Any]) -> Setting:
+def setting_of(cell: Cell) -> Setting:
     """Return what was driven."""
     return Setting(cell["task"], cell["hidden_start"])
 
 
-def settings_of(cells: Sequence[dict[str, Any]]) -> list[Setting]:
+def settings_of(cells: Cells) -> list[Setting]:
     """Return all that was driven, in order."""
     return list(dict.fromkeys(setting_of(cell) for cell in cells))
 
 
-def keys_of(cells: Sequence[dict[str, Any]]) -> list[Key]:
+def keys_of(cells: Cells) -> list[Key]:
     """Return split and kind of all columns, those of the cell with most of them first."""
     widest = sorted(cells, key=lambda cell: -len(cell["columns"]))
     return list(dict.fromkeys((column["split"], column["kind"]) for cell in widest for column in cell["columns"]))
 
 
-def summarise(cell: dict[str, Any], chosen: Collection[Key] | None = None) -> Score | None:
+def summarise(cell: Cell, chosen: Collection[Key] | None = None) -> Score | None:
     """Sum up the columns of a cell that are chosen, each counted alike.
 
     Args:
@@ -134,7 +136,7 @@ def _ends(success: bytes, group: bytes) -> tuple[float, float]:
     return interval(rows, lambda drawn: drawn.mean(axis=(-2, -1)))
 
 
-def scores_of(cells: Sequence[dict[str, Any]], setting: Setting) -> dict[str, dict[Key, Score]]:
+def scores_of(cells: Cells, setting: Setting) -> dict[str, dict[Key, Score]]:
     """Return the scores of each agent of a task by split and kind, of all splits that it was driven in."""
     found: dict[str, dict[Key, Score]] = {}
     for cell in cells:
@@ -147,7 +149,7 @@ def scores_of(cells: Sequence[dict[str, Any]], setting: Setting) -> dict[str, di
     return found
 
 
-def over_split(cells: Sequence[dict[str, Any]], setting: Setting, agent: str, split: str) -> Score | None:
+def over_split(cells: Cells, setting: Setting, agent: str, split: str) -> Score | None:
     """Return the score of an agent over all kinds of a split; None where it was not driven in all of them."""
     wanted = {key for key in keys_of(cells) if key[0] == split}
     for cell in cells:
@@ -157,7 +159,7 @@ def over_split(cells: Sequence[dict[str, Any]], setting: Setting, agent: str, sp
     return None
 
 
-def find_leaks(cells: Sequence[dict[str, Any]]) -> list[str]:
+def find_leaks(cells: Cells) -> list[str]:
     """Name the figures beyond a bound: a blind agent above the floor, or any agent above the ceiling.
 
     A figure is beyond where the difference is more than four standard errors of the two: a table has some hundred.

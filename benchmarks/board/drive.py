@@ -112,7 +112,7 @@ def jobs_of(config: BoardConfig) -> list[Job]:
     for name in config.tasks:
         task = _task_name(name)
         for hidden in _STARTS[config.start]:
-            if hidden and not _may_hide(task):
+            if hidden and task not in _HIDES:
                 continue
             for agent in config.agents or tuple(entry.name for entry in ROSTER):
                 entry, asked = entry_of(agent), bool(config.agents)
@@ -129,10 +129,6 @@ def _task_name(name: str) -> str:
     return id.removeprefix("Subterra/").removesuffix("-v1") if id.startswith("Subterra/") else id
 
 
-def _may_hide(task: str) -> bool:
-    return task in _HIDES
-
-
 def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
     """Return environment and params of a cell."""
     name = job.setting.task
@@ -143,9 +139,7 @@ def enter(job: Job, tunnel: Any) -> tuple[Any, Any]:
 
 def conditions(config: BoardConfig, sensor: str) -> str:
     """Return a digest of what a cell depends on: constants, world, tunnels, episodes and LiDAR."""
-    content: list[Any] = [
-        st.constants_digest(), config.splits, config.episodes, config.tunnels, FIRST
-    ]  # fmt: skip
+    content: list[Any] = [st.constants_digest(), config.splits, config.episodes, config.tunnels, FIRST]
     if sensor != PLANAR:
         content.append(sensor)
     if config.further:

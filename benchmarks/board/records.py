@@ -1,15 +1,14 @@
 """The board's figures as records: each agent on each task, over all kinds of a split, and the best of each group."""
 
-from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.board.cells import Score, keys_of, over_split, setting_of
+from benchmarks.board.cells import Cells, Score, keys_of, over_split, setting_of
 from benchmarks.board.columns import OWN, Setting
 from benchmarks.board.tables import HEADINGS, SPLIT, screen
 from benchmarks.records import Record, of_facts
 
 
-def records_of(cells: Sequence[dict[str, Any]]) -> list[Record]:
+def records_of(cells: Cells) -> list[Record]:
     """Return the records of cells: `board/TASK/SPLIT/AGENT`, and `board/TASK/best/HEADING` of the table of a screen."""
     found = []
     for cell in cells:

@@ -1,6 +1,7 @@
 """Cases: an input of the builder, and the truth that it is judged by."""
 
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,25 @@ def find_cases(folder: Path, only: tuple[str, ...] = ()) -> list[Case]:
     return cases
 
 
+def _pair(value: Any) -> tuple[float, float]:
+    return float(value[0]), float(value[1])
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    return tuple(map(str, value))
+
+
+_READ: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys(("span", "ends", "trouble", "band"), _pair),
+    **dict.fromkeys(("track", "expect"), str),
+    **dict.fromkeys(("proud", "gauge"), float),
+    **dict.fromkeys(("bulge", "cause"), _words),
+    **dict.fromkeys(("plain", "must_say"), bool),
+    **dict.fromkeys(("axis", "wall", "sleepers"), np.asarray),
+}
+_ALONG = ("axis_above_floor", "width", "height", "middle")  # at each point of the axis, or one for all
+
+
 def load_truth(case: Case) -> Truth:
     """Reads the truth of a case; sizes that it does not hold are measured where its kind is described.
 
@@ -101,30 +121,19 @@ def load_truth(case: Case) -> Truth:
         BenchmarkError: The file is no truth.
     """
     with _opened(case.truth) as data:
-        missing = {"axis", "wall", "span"} - set(data)
-        if missing:
+        if missing := {"axis", "wall", "span"} - set(data):
             raise BenchmarkError(f"{case.truth}: has no {' and no '.join(sorted(missing))}")
-        values = {name: data[name] for name in data}
-    count = len(values["axis"])
-    told = DESCRIBED.get(case.kind) if "width" not in values and case.source.suffix == ".laz" else None
-    if told is not None:
-        values |= measure_sizes(case.source, values["axis"], values["wall"], told)
-    names = ("axis_above_floor", "width", "height")
-    given: dict[str, Any] = {
-        name: np.broadcast_to(np.asarray(values.get(name, np.nan), float), count) for name in names
-    }
-    given["middle"] = np.broadcast_to(np.asarray(values.get("middle", 0.0), float), count)
-    given |= {name: str(values[name]) for name in ("track", "expect") if name in values}
-    given |= {name: float(values[name]) for name in ("proud", "gauge") if name in values}
-    given |= {name: tuple(float(v) for v in values[name]) for name in ("ends", "trouble", "band") if name in values}
-    given |= {name: tuple(str(v) for v in values[name]) for name in ("bulge", "cause") if name in values}
-    if told is not None:
-        gauge = GAUGE if told.track != "none" else float("nan")
-        given = {"track": told.track, "proud": told.proud, "gauge": gauge, "bulge": told.bulge, "band": BAND} | given
-    start, end = (float(v) for v in values["span"])
-    given |= {name: values[name] for name in ("sleepers",) if name in values}
-    given |= {name: bool(values.get(name, False)) for name in ("plain", "must_say")}
-    return Truth(values["axis"], values["wall"], (start, end), **given)
+        values: dict[str, Any] = {name: data[name] for name in data}
+    known = DESCRIBED.get(case.kind) if "width" not in values and case.source.suffix == ".laz" else None
+    if known is not None:
+        facts = {"track": known.track, "proud": known.proud, "bulge": known.bulge, "band": BAND}
+        values = facts | {"gauge": GAUGE if known.track != "none" else np.nan} | values
+        values |= measure_sizes(case.source, values["axis"], values["wall"], known)
+    values = {**dict.fromkeys(_ALONG[:3], np.nan), **values}
+    given = {name: read(values[name]) for name, read in _READ.items() if name in values}
+    count = len(given["axis"])
+    along = {name: np.broadcast_to(np.asarray(values[name], float), count) for name in _ALONG if name in values}
+    return Truth(**given, **along)
 
 
 def _opened(path: Path) -> "np.lib.npyio.NpzFile":

@@ -1,1 +1,1 @@
-"""Pictures of tunnels: `kinds` of lining, an `atlas` of where walls tell the station, and a `scene` off screen."""
+"""Pictures: `kinds` of lining, an `atlas` of where walls tell the station, a `scene`, and the `paper`'s figures."""

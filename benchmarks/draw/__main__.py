@@ -1,21 +1,20 @@
-"""Draws kinds of lining, an atlas of a tunnel, or a scene.
+"""Draws kinds of lining, an atlas of a tunnel, a scene, or the paper's figures.
 
-`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas` and `scene`.
+`python -m benchmarks.draw kinds --out out/kinds`; likewise `atlas`, `scene` and `paper`.
 `--help` after one of them says more.
 """
 
 import sys
+from importlib import import_module
 
-from benchmarks.draw import atlas, kinds, scene
-
-COMMANDS = {"kinds": kinds.main, "atlas": atlas.main, "scene": scene.main}
+COMMANDS = ("kinds", "atlas", "scene", "paper")
 
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
     words = sys.argv[1:] if words is None else words
     if words and words[0] in COMMANDS:
-        return COMMANDS[words[0]](words[1:])
+        return int(import_module(f"benchmarks.draw.{words[0]}").main(words[1:]))
     if words and words[0] in ("-h", "--help"):
         print(__doc__)
         return 0

@@ -75,7 +75,7 @@ def run(config: AtlasConfig) -> None:
         if "slip" not in params.parts:
             raise BenchmarkError(f"{config.task} has no slip, so that commands alone tell the station: take StopAt")
         for sensor in config.sensors:
-            solid = None if sensor == "planar" else Solid(Relief.from_plan(plan, lining), plan, spin16x64())
+            solid = None if sensor == "planar" else Solid(Relief.from_plan(plan, lining), plan, beams.vlp16(64))
             title = f"{lining}, {sensor}"
             found[title] = st.localisability(params, step=config.step, solid=solid)
             print(f"{plan.name}, {title}: {describe(found[title])}")
@@ -90,11 +90,6 @@ def run(config: AtlasConfig) -> None:
         write_file(config.out / "atlas.json", (json.dumps(content) + "\n").encode())
         write_file(config.out / "atlas.png", png_bytes(draw_atlas(plan.name, found), 110))
         print(config.out / "atlas.png")
-
-
-def spin16x64() -> np.ndarray:
-    """Returns 16 rings of the VLP-16 with 64 columns."""
-    return beams.vlp16(64)
 
 
 def describe(found: Localisability) -> str:

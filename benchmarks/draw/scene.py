@@ -1,32 +1,57 @@
 """Renders a scene off screen: `python -m benchmarks.draw scene SCENE --out PNG`."""
 
-import os
-import subprocess
-import sys
-import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
+from jaxtyping import Float, UInt8
 from PIL import Image
 
-from benchmarks.command import run_main
+from benchmarks.command import BenchmarkError, require_least, run_main
 from subterra_jax.host.files import require_file
+from subterra_jax.pictures.renderer import import_mujoco, light_near, open_renderer
 
-# MuJoCo chooses its OpenGL backend when it is imported, so each is tried in a process of its own.
-BACKENDS = ("egl", "osmesa", "glfw")
-_TIMEOUT = 120.0  # s
-_LIT = 7  # OpenGL lights a scene with eight lights, the headlight among them
-_MOST_PIXELS = 8192
 _LOOK_AHEAD = 8.0  # m
+_OWN = "own"  # name of a camera that the scene does not have
+
+Picture = UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose and size of an upright pinhole camera.
+
+    Attributes:
+        position: Position in the tunnel frame, m.
+        ahead: Unit vector of its optical axis, not vertical.
+        fov: Vertical field of view, rad.
+        width: Width, pixels.
+        height: Height, pixels.
+    """
+
+    position: Float[np.ndarray, "3"]
+    ahead: Float[np.ndarray, "3"]
+    fov: float
+    width: int
+    height: int
+
+    @property
+    def axes(self) -> Float[np.ndarray, "3 3"]:
+        """Unit vectors to the right, up and ahead in the tunnel frame, as rows."""
+        right = np.cross(self.ahead, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(right, self.ahead), self.ahead])
+
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return 0.5 * self.height / float(np.tan(0.5 * self.fov))
 
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """Renders a scene as one of its cameras sees it.
+    """Renders a scene as one of its cameras, or a camera anywhere, sees it.
 
     Example: python -m benchmarks.draw scene build/tunnel --camera chase --out view.png
 
@@ -34,104 +59,72 @@ class RenderConfig:
         scene: Scene folder, or an MJCF file.
         out: PNG file to write.
         camera: Camera of the scene: scout, chase, portal_start, middle, wall or portal_end.
-        width: Width, pixels.
-        height: Height, pixels.
+        at: Position of a camera of your own in place of it, tunnel frame, m.
+        ahead: Its viewing direction, of any length.
+        fov_deg: Its vertical field of view, degrees.
+        width: Width, 1 to 8192 pixels.
+        height: Height, 1 to 8192 pixels.
     """
 
     scene: tyro.conf.Positional[Path]
     out: Path = Path("view.png")
     camera: str = "scout"
+    at: tuple[float, float, float] | None = None
+    ahead: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    fov_deg: float = 60.0
     width: int = 960
     height: int = 540
 
 
-def picture(scene: Path) -> np.ndarray | None:
-    """Renders a view down the bore, `(height, width, 3)` uint8; `None` where no OpenGL backend works."""
-    return render_in_subprocess(["benchmarks.draw", "scene", str(scene)], BACKENDS, _TIMEOUT)[0]
-
-
-def render_in_subprocess(
-    words: Sequence[str], backends: Sequence[str], timeout: float
-) -> tuple[np.ndarray | None, str]:
-    """Runs a rendering command with one OpenGL backend after another until one leaves a picture.
-
-    Args:
-        words: Words after `python -m`; `--out` is added.
-        backends: Values of `MUJOCO_GL` to try.
-        timeout: Time limit of each try, s.
-
-    Returns:
-        The picture, `(height, width, 3)` uint8, or `None`; and why the last backend failed.
-    """
-    reason = ""
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "view.png"
-        command = [sys.executable, "-m", *words, "--out", str(out)]
-        for backend in backends:
-            environment = {**os.environ, "MUJOCO_GL": backend}
-            try:
-                done = subprocess.run(
-                    command, env=environment, capture_output=True, text=True, timeout=timeout, check=False
-                )
-            except subprocess.TimeoutExpired:
-                reason = f"{backend}: no picture within {timeout:g} s"
-                continue
-            if done.returncode == 0 and out.exists():
-                with Image.open(out) as image:
-                    return np.asarray(image.convert("RGB")), ""
-            reason = (done.stderr.strip().splitlines() or [""])[-1]
-    return None, reason
-
-
-def light_up(model: Any, data: Any, camera: str) -> None:
-    """Switches on the lamps nearest to a camera's view and all others off, since OpenGL allows only a few.
-
-    Args:
-        model: An `MjModel`.
-        data: Its `MjData`, after `mj_forward`.
-        camera: Name of the camera.
-    """
-    eye = model.camera(camera).id
-    ahead = data.cam_xpos[eye] - _LOOK_AHEAD * data.cam_xmat[eye].reshape(3, 3)[:, 2]
-    nearest = np.argsort(np.linalg.norm(data.light_xpos - ahead, axis=1))[:_LIT]
-    model.light_active[:] = False
-    model.light_active[nearest] = True
-
-
-def render(config: RenderConfig) -> None:
-    """Renders once, with the backend that `MUJOCO_GL` names."""
-    import mujoco
-
-    path = config.scene / "scene.xml" if config.scene.is_dir() else config.scene
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    light_up(model, data, config.camera)
-    renderer = mujoco.Renderer(model, config.height, config.width)
-    renderer.update_scene(data, camera=config.camera)
-    Image.fromarray(renderer.render()).save(config.out)
-    renderer.close()
-
-
-def check_and_render(config: RenderConfig) -> None:
-    """Checks the settings, then renders.
+def picture(scene: Path, camera: str | Pose, width: int = 960, height: int = 540) -> Picture:
+    """Renders a scene folder, or an MJCF file, as one of its cameras, or a camera anywhere, sees it.
 
     Raises:
-        ValueError: A number is out of range, or MuJoCo cannot render the scene.
-        SubterraError: The picture cannot be written.
+        BenchmarkError: MuJoCo cannot read the scene, or it has no such camera.
+        PictureError: There is no OpenGL.
     """
-    import mujoco
-
-    for name in ("width", "height"):
-        if not 1 <= getattr(config, name) <= _MOST_PIXELS:
-            raise ValueError(f"{name} must be 1 to {_MOST_PIXELS}, got {getattr(config, name)}")
-    require_file(config.out, ".png")
+    mujoco = import_mujoco("pictures of a scene")
+    name = camera if isinstance(camera, str) else _OWN
     try:
-        render(config)
+        spec = mujoco.MjSpec.from_file(str(scene / "scene.xml" if scene.is_dir() else scene))
+        if isinstance(camera, Pose):
+            width, height = camera.width, camera.height
+            right, up, ahead = camera.axes
+            quaternion = np.zeros(4)
+            mujoco.mju_mat2Quat(quaternion, np.stack([right, up, -ahead], axis=1).ravel())  # cameras look backwards
+            fov_deg = np.rad2deg(camera.fov)
+            spec.worldbody.add_camera(name=_OWN, pos=camera.position, quat=quaternion, fovy=fov_deg)
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        eye = model.camera(name).id
     except (OSError, ValueError, KeyError, mujoco.FatalError) as fault:
-        raise ValueError(f"{config.scene}: {fault}") from fault
+        raise BenchmarkError(f"{scene}: {fault}") from fault
+    light_near(model, data, data.cam_xpos[eye] - _LOOK_AHEAD * data.cam_xmat[eye].reshape(3, 3)[:, 2])
+    renderer = open_renderer(model, width, height)
+    renderer.update_scene(data, camera=name)
+    pixels: Picture = renderer.render().copy()
+    renderer.close()
+    return pixels
+
+
+def run(config: RenderConfig) -> None:
+    """Checks the settings, renders, and writes the picture.
+
+    Raises:
+        SubterraError: A number is out of range, MuJoCo cannot render the scene, or the picture cannot be written.
+    """
+    require_least(config, width=1, height=1)
+    if max(config.width, config.height) > 8192:
+        raise BenchmarkError(f"width and height must be at most 8192, got {config.width} x {config.height}")
+    require_file(config.out, ".png")
+    camera: str | Pose = config.camera
+    if config.at is not None:
+        ahead = np.array(config.ahead) / max(float(np.linalg.norm(config.ahead)), 1e-9)
+        camera = Pose(np.array(config.at), ahead, float(np.deg2rad(config.fov_deg)), config.width, config.height)
+    Image.fromarray(picture(config.scene, camera, config.width, config.height)).save(config.out)
 
 
 def main(words: list[str] | None = None) -> int:
     """Runs the command line; returns 2 for a user's mistake."""
-    return run_main("draw scene", RenderConfig, check_and_render, words=words)
+    return run_main("draw scene", RenderConfig, run, words=words)

@@ -32,7 +32,7 @@ from evalio.datasets.loaders import (
 )
 from evalio.types import SE3, SO3, ImuMeasurement, ImuParams, LidarParams, Stamp, Trajectory
 
-from benchmarks.slam.sweep_points import livox_points
+from benchmarks.slam.reading import livox_points
 
 SET = "SUBTERRA_SET"
 _LIVOX_FIELDS = [("x", 7, 0), ("y", 7, 4), ("z", 7, 8), ("intensity", 7, 12), ("t", 6, 16), ("ring", 4, 20)]

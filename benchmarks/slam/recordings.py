@@ -1,22 +1,15 @@
-"""Sets of evaluation recordings, and the sweeps that SLAM programs read from them."""
+"""Sets of recorded episodes: the recordings to hand out, the truth to keep."""
 
 import dataclasses
 import hashlib
 import json
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
-import yaml
-from jaxtyping import Float
-from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
+from typing import Literal
 
 from benchmarks.command import BenchmarkError
 from benchmarks.results import write_file
-from scene.reading.scans import parse_pointcloud2
+from benchmarks.slam.reading import INDEX, RECORDINGS, TRUTH
 from subterra_jax.evaluation.episodes import N_LISTED
 from subterra_jax.host.task_ids import no_task
 from subterra_jax.recorder import RecorderConfig, record
@@ -24,7 +17,6 @@ from subterra_jax.recorder.config import check_config, open_world
 from subterra_jax.tasks import TASKS
 
 SCHEMA = "subterra.recording-set/1"
-RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"
 # The oracle brings every episode to its end; on Relocalise it would not move, so the particle filter drives there.
 _DRIVER, _SEEKER = "oracle", "particle-filter"
 _WITHOUT_CLOUD = ("Obstructed", "Faulted")  # clouds show neither boxes nor faults
@@ -112,11 +104,13 @@ def make_set(config: SetConfig) -> Iterator[tuple[str, bool]]:
         SubterraError: A recording cannot be made.
     """
     plan = plan_set(config)
-    _check(plan)
+    for _, one in plan:
+        if not one.recording_folder.is_dir():
+            check_config(one)
+    for one in {(one.task, one.lining): one for _, one in plan}.values():
+        open_world(one)
     settings = {key: value for key, value in dataclasses.asdict(config).items() if key not in ("out", "tasks")}
-    _keep_settings(
-        config.out / TRUTH / INDEX, json.dumps({"schema": SCHEMA, "config": settings}, indent=1, default=str)
-    )
+    keep_settings(config.out, json.dumps({"schema": SCHEMA, "config": settings}, indent=1, default=str))
     for name, one in plan:
         exists = one.recording_folder.is_dir() and one.truth_folder.is_dir()
         if not exists:
@@ -127,127 +121,13 @@ def make_set(config: SetConfig) -> Iterator[tuple[str, bool]]:
     (config.out / INDEX).write_text(json.dumps(content, indent=1, default=str) + "\n")
 
 
-def _check(plan: list[tuple[str, RecorderConfig]]) -> None:
-    """Checks numbers, folders, and each task with each lining before anything is written."""
-    for _, one in plan:
-        if not one.recording_folder.is_dir():
-            check_config(one)
-    for one in {(one.task, one.lining): one for _, one in plan}.values():
-        open_world(one)
+def keep_settings(folder: Path, settings: str) -> None:
+    """Keeps the settings of a set with its truth.
 
-
-def _keep_settings(path: Path, settings: str) -> None:
-    """Keeps the settings of a set with the truth; refuses other settings later."""
+    Raises:
+        BenchmarkError: The set was recorded with others.
+    """
+    path = folder / TRUTH / INDEX
     if path.is_file() and path.read_text() != settings:
-        raise BenchmarkError(f"{path.parent.parent}: was recorded with other settings; choose another folder")
+        raise BenchmarkError(f"{folder}: was recorded with other settings; choose another folder")
     write_file(path, settings.encode())
-
-
-def recordings_in(folder: Path) -> list[tuple[str, Path]]:
-    """Returns names and bags of the recordings in a set or in its `recordings/`.
-
-    Raises:
-        BenchmarkError: The folder holds no recordings.
-    """
-    inside = folder / RECORDINGS if (folder / RECORDINGS).is_dir() else folder
-    bags = sorted(path for path in inside.glob("*/recording") if path.is_dir()) if inside.is_dir() else []
-    if not bags:
-        raise BenchmarkError(f"{folder}: holds no recordings (`python -m benchmarks.slam record` makes some)")
-    return [(bag.parent.name, bag) for bag in bags]
-
-
-Sweep = tuple[float, Float[np.ndarray, "n 3"]]  # stamp, s; points in the sensor's frame, m
-CLOUDS, PLANAR = "/points", "/scan_dense"
-
-
-def read_clouds(folder: Path, topic: str = CLOUDS) -> Iterator[Sweep]:
-    """Reads the sweeps of the 3-D LiDAR.
-
-    Args:
-        folder: Bag of the recording.
-        topic: Topic of `sensor_msgs/PointCloud2`.
-
-    Raises:
-        BenchmarkError: The folder holds no bag, a damaged one, or one without this topic.
-    """
-    for message in _messages(folder, topic):
-        scan = parse_pointcloud2(message, _stamp(message))
-        yield scan.stamp, np.asarray(scan.points, np.float64)
-
-
-def read_planar(folder: Path, topic: str = PLANAR) -> Iterator[Sweep]:
-    """Reads planar scans as points at height 0; beams that hit nothing are left out.
-
-    Args:
-        folder: Bag of the recording.
-        topic: Topic of `sensor_msgs/LaserScan`.
-
-    Raises:
-        BenchmarkError: As for `read_clouds`.
-    """
-    for message in _messages(folder, topic):
-        ranges = np.asarray(message.ranges, np.float64)
-        bearing = message.angle_min + message.angle_increment * np.arange(len(ranges))
-        hit = (ranges >= message.range_min) & (ranges < message.range_max)
-        level = ranges[hit, None] * np.column_stack([np.cos(bearing[hit]), np.sin(bearing[hit])])
-        yield _stamp(message), np.column_stack([level, np.zeros(len(level))])
-
-
-def count_messages(folder: Path) -> dict[str, int]:
-    """Returns the number of messages of each topic of a bag.
-
-    Raises:
-        BenchmarkError: The folder holds no bag or a damaged one.
-    """
-    with closing(_open_bag(folder)) as reader:
-        return {connection.topic: connection.msgcount for connection in reader.connections}
-
-
-CALIBRATION = "calibration.yaml"
-
-
-def check_recording(folder: Path) -> None:
-    """Checks that a recording of the arena is whole: its bag, its calibration, and the topics that this names.
-
-    Raises:
-        BenchmarkError: A file is missing or damaged, or the bag lacks a topic.
-    """
-    held, path = count_messages(folder / "recording"), folder / CALIBRATION
-    try:
-        facts = yaml.safe_load(path.read_text())
-        topics = [facts[part]["topic"] for part in ("lidar", "imu")]
-    except OSError as error:
-        raise BenchmarkError(f"{path}: is missing; it names topics, extrinsics and noise") from error
-    except (yaml.YAMLError, KeyError, TypeError) as error:
-        raise BenchmarkError(f"{path}: is no calibration: it must name the topics of lidar and imu") from error
-    for topic in topics:
-        if not held.get(topic):
-            raise BenchmarkError(f"{folder / 'recording'}: has no topic {topic}; it has {', '.join(sorted(held))}")
-
-
-def _messages(folder: Path, topic: str) -> Iterator[Any]:
-    types = get_typestore(Stores.ROS2_JAZZY)
-    with closing(_open_bag(folder)) as reader:
-        some = [connection for connection in reader.connections if connection.topic == topic]
-        if not some:
-            held = ", ".join(sorted(connection.topic for connection in reader.connections))
-            raise BenchmarkError(f"{folder}: has no topic {topic}; it has {held}")
-        for connection, _, raw in reader.messages(connections=some):
-            yield types.deserialize_cdr(raw, connection.msgtype)
-
-
-def _open_bag(folder: Path) -> Any:
-    if not (folder / "metadata.yaml").is_file():
-        other = " (programs here read bags of ROS 2, as `--formats mcap` writes them)"
-        ros1 = folder.with_suffix(".bag").is_file()
-        raise BenchmarkError(f"{folder}: is no recording: metadata.yaml is missing{other if ros1 else ''}")
-    try:
-        reader = Reader(folder)
-        reader.open()
-    except Exception as error:  # the library raises many kinds of errors for a damaged file
-        raise BenchmarkError(f"{folder}: not a whole recording ({error})") from error
-    return reader
-
-
-def _stamp(message: Any) -> float:
-    return float(message.header.stamp.sec + message.header.stamp.nanosec * 1e-9)

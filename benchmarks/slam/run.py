@@ -1,136 +1,34 @@
-"""Runs LiDAR odometry libraries, or the robot's own odometer, on recordings; poses go to `OUT/NAME.tum`.
+"""Runs programs on recordings, each in a process of its own, and keeps poses and facts of every run."""
 
-The libraries are optional (`pip install 'subterra-jax[slam]'`); each runs with its own defaults.
-"""
-
-import dataclasses
-import importlib
 import json
+import os
 import shutil
-import time
-from collections.abc import Callable, Iterable, Iterator
-from importlib.metadata import PackageNotFoundError, version
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
-from jaxtyping import Float
+from typing import Any
 
 from benchmarks.command import BenchmarkError
 from benchmarks.results import environment_facts, write_file
-from benchmarks.slam.inertial import PROGRAMS, find_program, run_program
-from benchmarks.slam.recordings import (
+from benchmarks.slam.programs import PROGRAMS, WHEELS, find_program
+from benchmarks.slam.reading import (
     CALIBRATION,
-    CLOUDS,
-    PLANAR,
-    Sweep,
+    ODOMETRY,
+    TRUTH,
+    TRUTH_FILE,
     check_recording,
     count_messages,
-    read_clouds,
-    read_planar,
     recordings_in,
 )
-from benchmarks.slam.tum import save_tum
 from subterra_jax.host.files import replace_file
 
-Step = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "4 4"]]
-_PLANAR_VOXEL = 0.3  # m: planar scans reach 30 m where the clouds reach 100 m
+_ALONE = "import sys; from benchmarks.slam.programs import main; sys.exit(main(sys.argv[1:]))"
+_SAYS = '{"poses"'  # beginning of the line in which the process reports
 
 
-class Library(NamedTuple):
-    """A LiDAR odometry program.
-
-    Attributes:
-        package: Package on PyPI.
-        topic: Topic that it reads.
-        make: Starts an odometry: a function from a sweep's points to the pose of the sensor.
-    """
-
-    package: str
-    topic: str
-    make: Callable[[], Step]
-
-
-def _kiss(voxel: float | None, max_range: float) -> Step:
-    config = importlib.import_module("kiss_icp.config")
-    made = config.KISSConfig()
-    made.data.max_range, made.data.deskew = max_range, False
-    made.mapping.voxel_size = made.data.max_range / 100.0 if voxel is None else voxel
-    made.registration.max_num_threads = 1  # sums of several threads differ from run to run
-    odometry: Any = importlib.import_module("kiss_icp.kiss_icp").KissICP(made)
-
-    def step(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-        odometry.register_frame(points, np.zeros(len(points)))
-        return np.array(odometry.last_pose)
-
-    return step
-
-
-def _genz() -> Step:
-    made = importlib.import_module("genz_icp.config").GenZConfig()
-    made.registration.max_num_threads = 1
-    odometry: Any = importlib.import_module("genz_icp.genz_icp").GenZICP(made)
-
-    def step(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
-        odometry.register_frame(points, np.zeros(0))
-        return np.array(odometry.last_pose)
-
-    return step
-
-
-LIBRARIES = {
-    "kiss-icp": Library("kiss-icp", CLOUDS, lambda: _kiss(None, 100.0)),
-    "genz-icp": Library("genz-icp", CLOUDS, _genz),
-    "kiss-icp-planar": Library("kiss-icp", PLANAR, lambda: _kiss(_PLANAR_VOXEL, 30.0)),
-}
-
-
-def find_library(name: str) -> tuple[Library, str]:
-    """Returns a library by name, and its version.
-
-    Raises:
-        BenchmarkError: There is no such library, or it is not installed.
-    """
-    if name not in LIBRARIES:
-        raise BenchmarkError(f"no library {name!r}; there are {', '.join([*LIBRARIES, *PROGRAMS, WHEELS])}")
-    library = LIBRARIES[name]
-    try:
-        return library, version(library.package)
-    except PackageNotFoundError as error:
-        raise BenchmarkError(f"{name} needs {library.package}, which is not installed: pip install {library.package}"
-                        ) from error  # fmt: skip
-
-
-def estimate_poses(
-    library: Library, sweeps: Iterable[Sweep]
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4 4"]]:
-    """Runs a library; returns times, s, and poses of the sensor in the frame of its first sweep.
-
-    Raises:
-        BenchmarkError: There is no sweep, a sweep holds no point, or a pose is not finite.
-    """
-    step = library.make()
-    times: list[float] = []
-    poses: list[np.ndarray] = []
-    for stamp, points in sweeps:
-        if not len(points):
-            raise BenchmarkError(f"{library.package}: sweep {len(times)} holds no point")
-        pose = step(np.ascontiguousarray(points, np.float64))
-        if not np.isfinite(pose).all():
-            raise BenchmarkError(f"{library.package}: the pose of sweep {len(times)} is not finite")
-        times.append(stamp)
-        poses.append(pose)
-    if not times:
-        raise BenchmarkError(f"{library.package}: there is no sweep to run on")
-    return np.array(times), np.stack(poses)
-
-
-SCHEMA = "subterra.slam-run/1"
-WHEELS = "wheel-odometry"
-RUN_FILE = "run.json"
-
-
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class RunConfig:
     """Settings of a run.
 
@@ -139,8 +37,8 @@ class RunConfig:
             `liosam`, `dlio`, `form`, or `rko-lio`, `ring-filter`, `particle-filter`, on recordings of the arena; or
             `wheel-odometry`, which copies the robot's own odometry.
         recordings: Set of recordings, or its `recordings/`.
-        out: Folder for the poses, `NAME.tum`; files there already are kept.
-        limit: Time after which a program of the arena counts as failed on a recording, s.
+        out: Folder for poses, `NAME.tum`, and facts, `NAME.json`; what is there is kept.
+        limit: Time after which a program counts as failed on a recording, s.
     """
 
     library: str
@@ -149,84 +47,122 @@ class RunConfig:
     limit: float = 3600.0
 
 
+@dataclass(frozen=True)
+class Case:
+    """One program on one recording.
+
+    Attributes:
+        program: Name of the program.
+        recording: Folder of the recording.
+        place: Folder of the poses and facts.
+    """
+
+    program: str
+    recording: Path
+    place: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the recording."""
+        return self.recording.name
+
+    @property
+    def facts(self) -> Path:
+        """File of what is known of the run."""
+        return self.place / f"{self.name}.json"
+
+    @property
+    def poses(self) -> Path:
+        """File of the estimated poses; missing where the program failed."""
+        return self.place / f"{self.name}.tum"
+
+    @property
+    def truth(self) -> Path:
+        """File of the true poses."""
+        return self.recording.parent.parent / TRUTH / self.name / TRUTH_FILE
+
+
+def run_case(case: Case, limit: float) -> dict[str, Any]:
+    """Runs a case unless its facts are there, for `limit` s at most.
+
+    Returns:
+        `seconds` that the program took, `share` of the recording's duration, `poses`, or `failed` with the reason;
+        `version`, `date` and `machine`.
+    """
+    if case.facts.is_file():
+        return json.loads(case.facts.read_text())
+    case.place.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {}
+    if case.program == WHEELS:
+        with replace_file(case.poses) as fresh:
+            shutil.copyfile(case.recording / "recording" / ODOMETRY, fresh)
+    else:
+        result = _run_alone(case, limit)
+    facts = environment_facts()
+    result |= {"version": find_program(case.program), "date": facts["date"]}
+    result["machine"] = f"{facts['cpu_cores']} cores, {facts['processor']}"
+    write_file(case.facts, (json.dumps(result) + "\n").encode())
+    return result
+
+
+def _run_alone(case: Case, limit: float) -> dict[str, Any]:
+    """Runs a program in a process of its own: one that crashes takes no other with it."""
+    words = [sys.executable, "-c", _ALONE, case.program]
+    paths = [str(case.recording.resolve()), str(case.poses.resolve())]
+    path = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]))
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    try:
+        done = subprocess.run([*words, *paths], capture_output=True, text=True, timeout=limit, env=environment)
+    except subprocess.TimeoutExpired:
+        return {"failed": f"did not finish within {limit:g} s"}
+    if done.returncode:
+        last = done.stderr.strip().splitlines()[-1:] or [f"ended with status {done.returncode}"]
+        return {"failed": last[0] if done.returncode > 0 else f"crashed with signal {-done.returncode}: {last[0]}"}
+    said = [line for line in done.stdout.splitlines() if line.startswith(_SAYS)]  # libraries print too
+    return json.loads(said[-1])
+
+
+def describe(result: dict[str, Any]) -> str:
+    """Returns a line about a run."""
+    if "failed" in result:
+        return f"failed: {result['failed']}"
+    if "poses" not in result:
+        return "copied"
+    return f"{result['poses']} poses in {result['seconds']:.0f} s, {100.0 * result['share']:.0f} % of real time"
+
+
 def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
-    """Runs on every recording with the library's topic; yields each name and a line about its result.
+    """Runs a program on every recording that it can read; yields each name and a line about its result.
 
     Raises:
-        BenchmarkError: The library is unknown or not installed, a bag is missing or damaged, or no recording has its
-            topic.
+        BenchmarkError: The program is unknown or not installed, a bag is missing or damaged, or no recording has what
+            it reads.
     """
-    if config.library in PROGRAMS:
-        yield from _run_inertial(config)
-        return
-    library, number = (None, "") if config.library == WHEELS else find_library(config.library)
-    bags, ran = recordings_in(config.recordings), []
-    for name, bag in bags:
-        target = config.out / f"{name}.tum"
-        if library is not None and library.topic not in count_messages(bag):
-            yield name, f"has no {library.topic}"
-            continue
-        ran.append(name)
-        if target.is_file():
-            yield name, "there already"
-        elif library is None:
-            with replace_file(target) as fresh:
-                shutil.copyfile(bag / "odometry.tum", fresh)
-            yield name, "copied"
-        else:
-            yield name, _run_one(library, bag, target)
-    if not ran:
+    find_program(config.library)
+    folders, topic = recordings_in(config.recordings), ""
+    if config.library != WHEELS:
+        topic = PROGRAMS[config.library].topic
+        if not topic:
+            _check_arena(config, folders)
+    some = [folder for folder in folders if not topic or topic in count_messages(folder)]
+    if not some:
         raise BenchmarkError(f"{config.recordings}: no recording has what {config.library} reads")
-    facts = {"schema": SCHEMA, "library": config.library, "version": number, "recordings": ran, **environment_facts()}
-    write_file(config.out / RUN_FILE, (json.dumps(facts, indent=1, default=str) + "\n").encode())
+    for folder in folders:
+        case = Case(config.library, folder, config.out)
+        if folder not in some:
+            yield folder.name, f"has no {topic}"
+        elif case.facts.is_file():
+            yield folder.name, "there already"
+        else:
+            yield folder.name, describe(run_case(case, config.limit))
 
 
-def _run_inertial(config: RunConfig) -> Iterator[tuple[str, str]]:
-    """Runs a program that needs the times of points; those that fail are listed in `run.json` with the reason."""
-    number, results = find_program(config.library), _results_so_far(config.out / RUN_FILE)
-    bags = [(name, bag.parent) for name, bag in recordings_in(config.recordings)]
-    if not any((folder / CALIBRATION).is_file() for _, folder in bags):
+def _check_arena(config: RunConfig, folders: list[Path]) -> None:
+    """Checks that recordings are those of the arena, and whole: a damaged bag is no failure of a program."""
+    if not any((folder / CALIBRATION).is_file() for folder in folders):
         raise BenchmarkError(
             f"{config.recordings}: holds no {CALIBRATION}, which {config.library} needs "
             "(`python -m benchmarks.slam arena` makes such recordings)"
         )
-    for _, folder in bags:
-        check_recording(folder)  # a damaged bag is no failure of the program
-    for name, folder in bags:
-        target = config.out / f"{name}.tum"
-        if target.is_file():
-            yield name, "there already"
-            continue
-        target.parent.mkdir(parents=True, exist_ok=True)
-        results[name] = run_program(config.library, folder, target, config.limit)
-        _write_facts(config, number, [name for name, _ in bags], results)
-        yield name, describe_run(results[name])
-    _write_facts(config, number, [name for name, _ in bags], results)
-
-
-def describe_run(result: dict[str, Any]) -> str:
-    """Returns a line about a program's run on one recording."""
-    if "failed" in result:
-        return f"failed: {result['failed']}"
-    return f"{result['poses']} poses in {result['seconds']:.0f} s, {100.0 * result['share']:.0f} % of real time"
-
-
-def _results_so_far(path: Path) -> dict[str, dict[str, Any]]:
-    try:
-        return json.loads(path.read_text())["results"]
-    except (OSError, ValueError, KeyError):
-        return {}
-
-
-def _write_facts(config: RunConfig, number: str, names: list[str], results: dict[str, dict[str, Any]]) -> None:
-    facts = {"schema": SCHEMA, "library": config.library, "version": number, "recordings": names, "results": results}
-    write_file(config.out / RUN_FILE, (json.dumps(facts | environment_facts(), indent=1, default=str) + "\n").encode())
-
-
-def _run_one(library: Library, bag: Path, target: Path) -> str:
-    read_sweeps = read_clouds if library.topic == CLOUDS else read_planar
-    started = time.monotonic()
-    times, poses = estimate_poses(library, read_sweeps(bag))
-    seconds = time.monotonic() - started
-    save_tum(target, times, poses)
-    return f"{len(times)} sweeps in {seconds:.0f} s"
+    for folder in folders:
+        check_recording(folder)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from benchmarks.command import BenchmarkError
+from benchmarks.slam.reading import TRUTH_FILE
 from benchmarks.slam.tracks import Alignment, Axis, Track, align, axis_from_file, axis_from_path, read_track
 
 
@@ -127,10 +128,6 @@ class Score:
     ape_turn: Spread
     reach: float | None = None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the score for JSON."""
-        return dataclasses.asdict(self)
-
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
@@ -165,7 +162,7 @@ def score_files(
     if not piece > 0.0:
         raise BenchmarkError(f"piece must be above 0 m, got {piece}")
     track = read_track(estimate, truth, alignment)
-    _check_rate(estimate, track)
+    check_rate(estimate, track)
     if alignment == "origin":
         _check_frame(estimate, track)
     elif alignment == "none":
@@ -177,10 +174,15 @@ def score_files(
 
 
 LEAST_RATE = 1.0  # poses a second; fewer leave out where a program errs
+LEAST_COVERED = 0.9  # share of a recording below which an estimate is none
 
 
-def _check_rate(estimate: Path, track: Track) -> None:
-    """Refuses an estimate of so few poses that the way between them is not scored."""
+def check_rate(estimate: Path, track: Track) -> None:
+    """Refuses an estimate of so few poses that the way between them is not scored.
+
+    Raises:
+        BenchmarkError: It has less than one pose a second.
+    """
     count, run = len(track.time), float(track.time[-1] - track.time[0])
     if count < LEAST_RATE * run:
         raise BenchmarkError(
@@ -254,9 +256,6 @@ def _pieces(track: Track, axis: Axis, piece: float) -> dict[str, Any]:
         "piece_turn": float(np.degrees(rms(turn / length[:, 0]))),
         "rpe": Spread.of(np.linalg.norm(error, axis=1)),
     }
-
-
-TRUTH_FILE = "lidar.tum"
 
 
 @dataclasses.dataclass(frozen=True)

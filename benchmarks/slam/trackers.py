@@ -22,8 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from benchmarks.slam.arena.record import Scene
 from benchmarks.slam.arena.sets import redraw
 from benchmarks.slam.arena.wheels import SCALE, SCALE_PIECE, SCALE_SIGMA
-from benchmarks.slam.sweep_points import read_samples
-from benchmarks.slam.tum import Poses
+from benchmarks.slam.reading import CALIBRATION, Poses, read_samples
 from scene.poses.trajectory import Trajectory, load_tum
 from scene.survey.cast import Caster
 from scene.survey.sizes import DESIGN
@@ -35,7 +34,6 @@ from subterra_jax.baselines.wallmap import WallMap
 from subterra_jax.parts.wander import WanderParams
 
 N_BEAMS = 40
-NAMES = ("ring-filter", "particle-filter")
 _RANGE_MAX = 30.0  # m, reported by a beam without an echo
 _HALF = np.deg2rad(0.7)  # rad to either side of a beam, within which the median echo counts
 SLICE, _SLICE_HALF = 0.76, 0.09  # m over the floor, and to either side: the lowest row of pockets of `scene.survey`
@@ -104,7 +102,7 @@ def read_steps(recording: Path, odometer: Trajectory) -> Iterator[tuple[float, S
 
 def read_height(recording: Path) -> float:
     """Returns the height of the LiDAR over the floor, m, as `/tf_static` says."""
-    frame = yaml.safe_load((recording / "calibration.yaml").read_text())["lidar"]["frame"]
+    frame = yaml.safe_load((recording / CALIBRATION).read_text())["lidar"]["frame"]
     with AnyReader([recording / "recording"]) as reader:
         wanted = [one for one in reader.connections if one.topic == "/tf_static"]
         connection, _, raw = next(reader.messages(wanted))

@@ -74,26 +74,28 @@ def test_figures_beyond_a_bound_are_named_and_others_are_not():
     assert above == ["ring-filter, StopAt, cast of val: 100 % is above the ceiling, 50 %"]
 
 
-def test_tables_picture_and_records_hold_every_agent():
+def test_tables_and_records_hold_every_agent():
     both = {"splits": SPLITS}
     some = [cell("fused", 0.4, **both), cell("locate-transformer", 0.7, **both), cell("ceiling", 0.95, **both)]
     text = tables.as_markdown(some)
-    assert "| floor, in theory | | 30 |" in text
-    assert "| locate-transformer | `open:…:train` | 70 (" in text
-    assert picture.as_png(some)[:4] == b"\x89PNG"
+    assert "| *floor* | 30 |" in text
+    assert "| locate-transformer | 70 (" in text
+    assert tables.kinds_markdown(some, "val").splitlines()[0] == "| **StopAt** | cast |"
+    assert "| locate-transformer | 70 |" in tables.kinds_markdown(some, "val")
     values = {record.id: record.value for record in records_of(some)}
     assert values["board/StopAt/test-unseen/locate-transformer"] == 70.0
     assert values["board/StopAt/best/best-written"] == 40.0
     assert values["board/StopAt/best/floor"] == 30.0
 
 
-def test_every_group_of_agents_has_its_own_mark_in_the_picture():
-    some = [cell(name, 0.5, splits=SPLITS) for name in ("fused", "ring-filter", "locate-map", "locate-transformer")]
-    figure = picture.draw(some)
-    marks = {line.get_marker() for line in figure.axes[0].lines}
-    assert len(marks) == 4
-    assert "below the floor" in figure.get_suptitle()
-    assert "above the ceiling" in figure.get_suptitle()
+def test_the_picture_names_every_agent_between_floor_and_ceiling_and_marks_its_group():
+    names = ("fused", "ring-filter", "locate-map", "locate-transformer")
+    figure = picture.draw([cell(name, 0.5, splits=SPLITS) for name in (*names, "ceiling", "oracle")])
+    (axes,) = figure.axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == list(names)
+    assert [text.get_text() for text in axes.texts] == ["floor 30", "ceiling 50"]
+    handles, groups = axes.get_legend_handles_labels()
+    assert len(set(groups)) == len({handle[0].get_marker() for handle in handles}) == 4
 
 
 def test_the_best_of_a_group_is_chosen_on_val_and_not_where_it_is_shown():
@@ -116,8 +118,8 @@ def test_a_hidden_start_is_a_row_of_its_own():
 def test_a_cell_of_some_of_the_splits_stands_where_it_was_driven():
     wide, narrow = cell("fused", 0.4, splits=SPLITS), cell("ceiling", 0.9, splits=("test-unseen",))
     text = tables.as_markdown([narrow, wide])
-    assert text.index("## val by kind") < text.index("## test-unseen by kind") < text.index("| ceiling | nothing")
-    assert text.count("| ceiling | nothing") == 1
+    assert text.index("## val by kind") < text.index("## test-unseen by kind") < text.index("| *ceiling* |")
+    assert text.count("| *ceiling* |") == 1
     above = cells.find_leaks([narrow, {**wide, "agent": "ring-filter", "success": [1] * 80}])
     assert above == []
     narrow = {**narrow, "success": [0] * 40}

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.util
 import json
+import math
 import shlex
 
 import pytest
@@ -119,12 +120,23 @@ def test_the_worst_of_all_dirty_clouds_is_the_record_and_a_refused_one_has_none(
 
 
 def test_the_figures_of_a_reconstruction_are_records_of_its_first_seed():
-    from benchmarks.reconstruction import GOALS, ReconstructionConfig, records_of
+    from benchmarks.reconstruction import FIGURES, ReconstructionConfig, records_of
 
-    row = {"poses": "given", **dict.fromkeys(GOALS, 0.01), "length_error": -0.02, "seconds": 90.0}
+    row = {
+        "poses": "given",
+        **dict.fromkeys(FIGURES, 0.01),
+        "length_error": -0.02,
+        "seconds": 90.0,
+        "gauge_error": math.nan,
+    }
     found = {
         one.id: one.value for one in records_of(ReconstructionConfig((7, 8)), [{**row, "seed": s} for s in (7, 8)])
     }
     assert found["reconstruction/given/centreline"] == 1.0
     assert found["reconstruction/given/length"] == 0.02
     assert found["reconstruction/given/time"] == 1.5
+    assert "reconstruction/given/gauge" not in found, "what was not measured is no figure"
+    assert FIGURES["hold_within_10cm"].met(0.98, "given")
+    assert not FIGURES["hold_within_10cm"].met(0.97, "given")
+    assert not FIGURES["gauge_error"].met(-0.004, "given")
+    assert not FIGURES["gauge_error"].met(math.nan, "control")

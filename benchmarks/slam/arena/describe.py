@@ -13,7 +13,7 @@ import yaml
 
 from benchmarks.results import version, write_file
 from benchmarks.slam.arena.record import REST, Course, make_sensor
-from benchmarks.slam.recordings import RECORDINGS
+from benchmarks.slam.reading import RECORDINGS
 from scene.survey.carrier import ACCEL_BIAS, GYRO_BIAS
 
 CROISSANT, DATASHEET = "croissant.json", "datasheet.md"

@@ -19,7 +19,8 @@ from benchmarks.slam.arena.describe import describe_set
 from benchmarks.slam.arena.drives import CARRIERS
 from benchmarks.slam.arena.record import Course, Scene, SensorName, draw_scene, write_recording, write_truth
 from benchmarks.slam.arena.walls import WALLS
-from benchmarks.slam.recordings import INDEX, RECORDINGS, TRUTH
+from benchmarks.slam.reading import INDEX, RECORDINGS, TRUTH
+from benchmarks.slam.recordings import keep_settings
 
 SCHEMA = "subterra.arena/1"
 _DIAL = tuple(Course(f"walls-{name}", name) for name in WALLS)
@@ -93,11 +94,7 @@ def make_arena(config: ArenaConfig) -> Iterator[tuple[str, bool]]:
     """
     plan = plan_arena(config)
     settings = {"schema": SCHEMA, "distance": config.distance, "formats": config.formats, "seed": config.seed}
-    kept = json.dumps(settings | {"secret": config.secret}, indent=1)
-    path = config.out / TRUTH / INDEX
-    if path.is_file() and path.read_text() != kept:
-        raise BenchmarkError(f"{config.out}: was recorded with other settings; choose another folder")
-    write_file(path, kept.encode())
+    keep_settings(config.out, json.dumps(settings | {"secret": config.secret}, indent=1))
     missing = [one for one in plan if not (config.out / RECORDINGS / one.name).is_dir()]
     yield from ((one.name, True) for one in plan if one not in missing)
     for name in _record_all(config, missing):

@@ -98,24 +98,6 @@ def test_an_arch_with_outliers_is_right_and_is_judged_once(tmp_path: Path, capsy
     assert row.stat().st_mtime_ns == before
 
 
-@pytest.mark.slow
-def test_cases_judged_side_by_side_have_the_rows_of_those_judged_in_turn(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    truth = {"axis": np.zeros((2, 3)), "wall": np.empty((0, 3)), "span": (0.0, 1.0), "width": np.nan}
-    for name in ("a", "b", "c"):
-        write_laz(tmp_path / "set" / f"{name}.laz", rng.uniform(0.0, (30.0, 20.0, 0.01), (4000, 3)))
-        write_truth(tmp_path / "set" / f"{name}_truth.npz", "bare", {**truth, "expect": "refused", "cause": ["plane"]})
-    for jobs in ("1", "2"):
-        assert judge([str(tmp_path / "set"), "--out", str(tmp_path / jobs), "--jobs", jobs]) == 0
-    one, two = (json.loads((tmp_path / jobs / "dirty.json").read_text())["rows"] for jobs in ("1", "2"))
-    for row in (*one, *two):
-        assert row.pop("seconds") > 0.0
-        assert row.pop("memory") > 0.0
-    assert one == two
-    assert [row["verdict"] for row in two] == ["refused"] * 3
-    assert judge([str(tmp_path / "set"), "--out", str(tmp_path / "3"), "--jobs", "0"]) == 2
-
-
 def test_a_niche_is_no_wall_and_a_lay_by_is() -> None:
     station = np.arange(0.0, 40.1, 0.25)
     truth = {

@@ -14,13 +14,16 @@ from benchmarks.dirty.verdict import (
     FAILED,
     MISLED,
     REFUSED,
+    RIGHT,
     SILENT,
     VAGUE,
     WARNED,
-    judge_row,
+    Fault,
+    judge_build,
     list_faults,
     untold_faults,
 )
+from scene.judging.codes import Code
 
 _ROW: dict[str, Any] = {"status": 0, "message": "", "from": 2.0, "to": 18.0, "reversed": False}
 LENGTH, HALF, WALL = 20.0, 2.5, 2.5  # a straight arch 5 m wide and 5 m high
@@ -73,6 +76,7 @@ def test_a_scene_that_is_the_truth_has_no_errors(tmp_path: Path, truth: Truth) -
     for name in ("width", "height", "floor", "aside"):
         assert abs(row[f"{name}_worst"]) < 1e-6, name
     assert not list_faults(row, replace(truth, track="single"))
+    assert judge_build({**row, "status": 0, "warnings": []}, [], truth) == RIGHT
 
 
 @pytest.mark.parametrize(
@@ -88,7 +92,8 @@ def test_a_scene_that_is_the_truth_has_no_errors(tmp_path: Path, truth: Truth) -
 def test_each_fault_of_a_scene_is_named(tmp_path: Path, truth: Truth, spoil: dict, named: str) -> None:
     length = spoil.pop("length", LENGTH)
     row = judge_scene(scene_folder(tmp_path / "scene", outline(**spoil), length), truth)
-    assert any(named in fault for fault in list_faults(row, truth)), list_faults(row, truth)
+    faults = [fault.text for fault in list_faults(row, truth)]
+    assert any(named in fault for fault in faults), faults
 
 
 def test_rough_walls_are_as_wide_as_they_stand_apart_and_no_wider(tmp_path: Path, truth: Truth) -> None:
@@ -111,109 +116,63 @@ def test_an_axis_is_judged_by_where_the_true_walls_stand(tmp_path: Path, truth: 
     assert abs(judge_scene(folder, replace(truth, middle=np.full(len(truth.axis), 0.05)))["aside"]) < 1e-6
 
 
-def test_a_wrong_scene_needs_a_warning_that_names_place_and_cause(truth: Truth) -> None:
-    truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
-    row = {**_ROW, "faults": ["floor +70 cm"]}
-    said = "a vehicle hides the floor from 12.5 to 13.9 m"
-    assert judge_row({**row, "warnings": []}, truth) == SILENT
-    assert judge_row({**row, "warnings": ["something is odd"]}, truth) == VAGUE
-    assert judge_row({**row, "warnings": ["a vehicle hides the floor from 0.5 to 1.0 m"]}, truth) == VAGUE
-    assert judge_row({**row, "warnings": [said]}, truth) == WARNED
+def warning(code: str, start: float | None = None, end: float = 0.0, text: str = "") -> dict[str, Any]:
+    return {"code": code, "text": text} | ({} if start is None else {"start": start, "end": end})
 
 
 @pytest.mark.parametrize(
-    ("fault", "warning", "told"),
+    ("fault", "said", "told"),
     [
-        ("floor -4 cm at 10 m", "from 7 to 9 m hardly a return lies on the floor (40% of the girth)", True),
-        ("floor -4 cm at 10 m", "from 12 to 15 m hardly a return lies on the floor (40% of the girth)", False),
-        ("floor -4 cm at 10 m", "from 7 to 9 m hardly a return lies on the crown (40% of the girth)", False),
-        ("width +9 cm at 10 m", "from 7 to 9 m, floor: 9% of the returns there are not the wall that was built", False),
-        ("width +9 cm at 10 m", "from 7 to 9 m, left wall: 9% inside it: something along the wall", True),
-        ("floor -4 cm at 10 m", "from 7 to 9 m, left wall: 9% inside it: a box on the floor", False),
-        ("no sleeper seen", "3 sleepers lie where a spacing of 0.60 m asks for them, and none of them was seen", True),
-        ("no sleeper seen", "from 7 to 9 m hardly a return lies on the crown (40% of the girth)", False),
-        ("gauge -33 mm", "from 7 to 9 m, floor: 9% of the returns there are not the wall that was built", False),
-        ("0.17 m too long", "from 15 to 16 m hardly a return lies on the crown (40% of the girth)", False),
-        ("90.0 % within 10 cm", "11% of the returns lie further than 10 cm from the tunnel that was built", True),
-        ("floor -4 cm at 10 m", "the bore climbs at up to 30%: is z up (--axes)?", True),
+        (Fault("floor", "floor -4 cm", 10.0), warning(Code.UNSEEN, 7.0, 9.0), True),
+        (Fault("floor", "floor -4 cm", 10.0), warning(Code.UNSEEN, 12.0, 15.0), False),
+        (Fault("floor", "floor -4 cm", 10.0), warning(Code.GRADE), False),
+        (Fault("floor", "floor -4 cm", 10.0), warning(Code.AXES), True),
+        (Fault("width", "width +9 cm", 10.0), warning(Code.PLACE, 8.0, 8.5), True),
+        (Fault("walls", "walls 5.0 cm"), warning(Code.POSES), True),
+        (Fault("sleepers", "no sleeper seen"), warning(Code.SLEEPERS), True),
+        (Fault("sleepers", "no sleeper seen"), warning(Code.UNSEEN), False),
+        (Fault("gauge", "gauge -33 mm"), warning(Code.ROUNDED), True),
+        (Fault("gauge", "gauge -33 mm"), warning(Code.PLACE, 8.0, 8.5), False),
+        (Fault("too long", "0.17 m too long"), warning(Code.CUT_SHORT, 15.0, 16.0), True),
+        (Fault("too long", "0.17 m too long"), warning(Code.UNSEEN, 15.0, 16.0), False),
+        (Fault("rings", "2 rings measured"), warning(Code.POSES), False),
+        (Fault("pockets", "4 pockets by standard"), warning(Code.BY_STANDARD), True),
     ],
 )
-def test_a_warning_excuses_the_fault_that_it_speaks_of_and_no_other(
-    truth: Truth, fault: str, warning: str, told: bool
+def test_a_warning_excuses_the_faults_of_its_code_at_its_place_and_no_other(
+    truth: Truth, fault: Fault, said: dict, told: bool
 ) -> None:
-    row = {**_ROW, "faults": [fault], "warnings": [warning]}
-    assert judge_row(row, truth) == (WARNED if told else VAGUE)
-    assert untold_faults(row, truth) == ([] if told else [fault])
-    both = {**row, "faults": [fault, "2 rings measured that do not exist"]}
-    assert "2 rings measured that do not exist" in untold_faults(both, truth)
+    row = {**_ROW, "warnings": [said]}
+    assert judge_build(row, [fault], truth) == (WARNED if told else VAGUE)
+    assert untold_faults(row, [fault], truth) == ([] if told else [fault])
+    assert judge_build({**row, "warnings": []}, [fault], truth) == SILENT
 
 
-_BLUR = "the poses blur the walls: 20 mm thick where a single sweep has 10 mm; {}"
-_UNKNOWN = _BLUR.format("the poses, their clock or the mount of the LiDAR may be wrong")
-_CLOCK = _BLUR.format("with the poses 0.1 s later they are thin: two clocks differ")
-_TWICE = "from 5 to 15 m the wall shows twice, up to 7 cm apart, at 60% of its places: two passes do not fit"
-
-
-@pytest.mark.parametrize(
-    ("warning", "told", "untold"),
-    [
-        (_UNKNOWN, ("walls 5.0 cm in the mean", "floor -4 cm at 10 m", "gauge -33 mm", "no sleeper seen"),
-         ("width +83 cm at 10 m", "92.0 % within 10 cm", "0.40 m too long", "45 rings measured that do not exist")),
-        (_CLOCK, ("width +83 cm at 10 m", "92.0 % within 10 cm"),
-         ("0.40 m too long", "only 80 % of the span built", "26 pockets measured that do not exist")),
-        (_TWICE, ("width +12 cm at 10 m", "walls 4.0 cm in the mean"),
-         ("width +12 cm at 2 m", "width +40 cm at 10 m", "0.40 m too long")),
-        ("--control came without --calibration: all is off", ("aside +33 cm at 10 m", "height -9 cm at 4 m"),
-         ("no sleeper seen", "3 rings measured that do not exist")),
-        ("the coordinates of the cloud are rounded to 3.0 cm", ("floor +5 cm at 10 m",), ("floor +7 cm at 10 m",)),
-        ("nothing measured the length: along smooth walls LiDAR odometry does not", ("0.40 m too long",),
-         ("width +9 cm at 10 m", "walls 5.0 cm in the mean")),
-        ("from 0 to 18 m floor and walls lean together by 2.0°, left side up", ("height +9 cm at 4 m",),
-         ("height +40 cm at 4 m", "gauge -33 mm")),
-        ("it would be 18 m wide: --unit ft makes it 5.5 m by 5.4 m", ("width +900 cm at 9 m", "30.00 m too long"),
-         ("4 pockets measured that do not exist",)),
-    ],
-)  # fmt: skip
-def test_a_cause_without_a_place_excuses_what_it_can_do_and_no_more(
-    truth: Truth, warning: str, told: tuple[str, ...], untold: tuple[str, ...]
-) -> None:
-    row = {**_ROW, "faults": [*told, *untold], "warnings": [warning]}
-    assert untold_faults(row, truth) == list(untold)
-    assert judge_row({**row, "faults": list(told)}, truth) == WARNED
-    assert all(judge_row({**row, "faults": [fault]}, truth) == VAGUE for fault in untold)
-    known = replace(truth, cause=tuple(warning.split()[:2]))  # a trouble of the whole cloud excuses no more than that
-    assert untold_faults(row, known) == list(untold)
-
-
-def test_a_known_trouble_excuses_the_shape_there_and_nothing_else(truth: Truth) -> None:
+def test_a_known_trouble_excuses_the_shape_there_where_a_warning_names_its_cause_and_place(truth: Truth) -> None:
     truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
-    row = {**_ROW, "warnings": ["a vehicle hides the rest, from 10 to 12 m"]}
-    for fault in ("45 rings measured that do not exist", "0.40 m too long", "gauge -33 mm", "no sleeper seen"):
-        assert untold_faults({**row, "faults": [fault, "walls 4.0 cm in the mean"]}, truth) == [fault]
+    there, elsewhere, other = Fault("floor", "x", 13.0), Fault("floor", "x", 3.0), Fault("gauge", "x")
+    said = warning(Code.BEYOND, 10.0, 12.0, "a vehicle hides the rest")
+    row = {**_ROW, "warnings": [said]}
+    assert judge_build(row, [there], truth) == WARNED
+    assert untold_faults(row, [there, elsewhere, other], truth) == [elsewhere, other]
+    for vague in ({**said, "text": "something is odd"}, {**said, "start": 0.5, "end": 1.0}):
+        assert judge_build({**row, "warnings": [vague]}, [there], truth) == VAGUE
+    assert judge_build({**row, "warnings": []}, [], replace(truth, must_say=True)) == SILENT
+    assert judge_build(row, [], replace(truth, must_say=True)) == RIGHT
 
 
 def test_a_scene_may_count_from_the_other_end(truth: Truth) -> None:
-    row = {**_ROW, "faults": ["floor -4 cm at 4 m"], "warnings": ["from 13 to 15 m, floor: 9% of the returns"]}
-    assert judge_row(row, truth) == VAGUE
-    assert judge_row({**row, "reversed": True}, truth) == WARNED
-    assert not untold_faults({key: value for key, value in row.items() if key != "reversed"})  # rows of before
-
-
-def test_a_known_trouble_excuses_no_fault_elsewhere(truth: Truth) -> None:
-    truth = replace(truth, trouble=(12.0, 14.0), cause=("vehicle",))
-    row = {**_ROW, "warnings": ["a vehicle hides the rest, from 10 to 12 m"]}
-    assert judge_row({**row, "faults": ["floor +70 cm at 13 m"]}, truth) == WARNED
-    assert judge_row({**row, "faults": ["floor +70 cm at 13 m", "floor +70 cm at 3 m"]}, truth) == VAGUE
-    row["warnings"] = ["a vehicle stands in the bore at 1 m", "from 10 to 12 m the pipes were cut"]
-    assert judge_row({**row, "faults": ["floor +70 cm at 13 m"]}, truth) == VAGUE  # cause here, place there
+    fault, row = Fault("floor", "floor -4 cm", 4.0), {**_ROW, "warnings": [warning(Code.PLACE, 13.0, 15.0)]}
+    assert judge_build(row, [fault], truth) == VAGUE
+    assert judge_build({**row, "reversed": True}, [fault], truth) == WARNED
 
 
 def test_a_refusal_must_name_the_cause_and_the_name_of_the_file_does_not_count(truth: Truth) -> None:
     truth = replace(truth, expect="refused", cause=("room",))
-    row = {"status": 2, "faults": [], "warnings": []}
-    assert judge_row({**row, "message": "error: out/room.laz: only 1.9 m long"}, truth) == MISLED
-    assert judge_row({**row, "message": "error: out/room.laz: a room, not a tunnel"}, truth) == REFUSED
-    assert judge_row({**row, "status": 1, "message": "ValueError: room"}, truth) == FAILED
+    row = {"status": 2, "warnings": []}
+    assert judge_build({**row, "message": "error: out/room.laz: only 1.9 m long"}, [], truth) == MISLED
+    assert judge_build({**row, "message": "error: out/room.laz: a room, not a tunnel"}, [], truth) == REFUSED
+    assert judge_build({**row, "status": 1, "message": "ValueError: room"}, [], truth) == FAILED
 
 
 def test_cases_are_found_with_their_arguments_and_missing_clouds_are_said(tmp_path: Path, truth: Truth) -> None:

@@ -18,7 +18,7 @@ from benchmarks.slam.arena import bags, describe, record, sets, wheels
 from benchmarks.slam.arena.drives import CARRIERS, REST
 from benchmarks.slam.arena.dust import draw_dust
 from benchmarks.slam.arena.walls import draw_walls
-from benchmarks.slam.sweep_points import livox_points, sweep_points
+from benchmarks.slam.reading import livox_points, sweep_points
 from scene.survey.carrier import ACCEL_BIAS, GRAVITY, Poses
 from scene.survey.cast import Hits
 

@@ -10,8 +10,7 @@ import trimesh
 
 from benchmarks.command import BenchmarkError
 from benchmarks.fidelity.derive.surface import Caster
-from benchmarks.slam import recordings
-from benchmarks.slam import run as libraries
+from benchmarks.slam import programs, reading
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.recordings import SetConfig, plan_set
 from scene.poses.trajectory import load_tum
@@ -38,31 +37,37 @@ def landmarks(ways: np.ndarray, k: int) -> np.ndarray:
     return 12.0 * ways * np.linspace(0.2, 1.0, len(ways))[:, None] - [STEP * k, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("name", ["kiss-icp", "genz-icp"])
-def test_an_odometry_that_is_right_among_landmarks_does_not_move_along_a_bare_bore(name):
-    library, version = libraries.find_library(name)
-    assert version
+@pytest.mark.parametrize("make", [lambda: programs.make_kiss(None, 100.0), programs.make_genz])
+def test_an_odometry_that_is_right_among_landmarks_does_not_move_along_a_bare_bore(make):
     ways = np.random.default_rng(0).normal(size=(6000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
     ends = [
-        libraries.estimate_poses(library, [(EPOCH + 0.1 * k, world(ways, k)) for k in range(16)])[1][-1, :3, 3]
+        programs.estimate_poses(make(), [(EPOCH + 0.1 * k, world(ways, k)) for k in range(16)])[1][-1, :3, 3]
         for world in (landmarks, bare)
     ]
     np.testing.assert_allclose(ends[0], [15 * STEP, 0.0, 0.0], atol=0.05)
     np.testing.assert_allclose(ends[1], 0.0, atol=0.05)
 
 
-def test_unknown_and_missing_libraries_are_named(monkeypatch):
-    with pytest.raises(BenchmarkError, match="no library 'fast'; there are kiss-icp, genz-icp"):
-        libraries.find_library("fast")
-    missing = libraries.Library("no-such-package", recordings.CLOUDS, lambda: None)
-    monkeypatch.setitem(libraries.LIBRARIES, "absent", missing)
-    with pytest.raises(BenchmarkError, match="sweep 0 holds no point"):
-        libraries.estimate_poses(missing._replace(make=lambda: np.eye), [(EPOCH, np.zeros((0, 3)))])
-    with pytest.raises(BenchmarkError, match="there is no sweep"):
-        libraries.estimate_poses(missing, [])
+def test_unknown_and_missing_programs_are_named(monkeypatch):
+    with pytest.raises(BenchmarkError, match="no program 'fast'; there are wheel-odometry, evalio-kiss"):
+        programs.find_program("fast")
+    monkeypatch.setitem(programs.PROGRAMS, "absent", programs.Program("no-such-package", lambda at: None))
     with pytest.raises(BenchmarkError, match="absent needs no-such-package, which is not installed"):
-        libraries.find_library("absent")
+        programs.find_program("absent")
+
+
+@pytest.mark.parametrize(("poses", "reason"), [
+    ((np.zeros(1), np.zeros((1, 4, 4)), 0.0), "gives 1 poses"),
+    ((np.arange(3.0), np.full((3, 4, 4), np.nan), 0.0), "gives poses that are not finite"),
+    ([(EPOCH, np.zeros((0, 3)))], "sweep 0 holds no point"),
+])  # fmt: skip
+def test_a_program_that_gives_no_track_says_why(poses, reason, tmp_path, monkeypatch, capsys):
+    run = (lambda at: poses) if isinstance(poses, tuple) else (lambda at: programs.estimate_poses(np.eye, poses))
+    monkeypatch.setitem(programs.PROGRAMS, "mine", programs.Program("jax", run))
+    assert programs.main(["mine", str(tmp_path), str(tmp_path / "poses.tum")]) == 1
+    assert capsys.readouterr().err == f"{reason}\n"
+    assert not (tmp_path / "poses.tum").exists()
 
 
 @pytest.fixture(scope="module")
@@ -85,11 +90,11 @@ def made(tmp_path_factory) -> Path:
 
 
 def test_a_set_keeps_truth_apart_and_its_clouds_lie_on_the_walls(made):
-    recording = made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording"
+    recording = made / "set" / "recordings" / "TraverseShort-pockets-000"
     assert not list((made / "set" / "recordings").rglob("*truth*"))
     assert "secret" not in (made / "set" / "set.json").read_text()
     assert (made / "set" / "truth" / "TraverseShort-pockets-000" / "lidar.tum").is_file()
-    clouds, flat = list(recordings.read_clouds(recording)), list(recordings.read_planar(recording))
+    clouds, flat = list(reading.read_clouds(recording)), list(reading.read_planar(recording))
     assert len(clouds) == len(flat) == 31
     surface = read_scene(made / "scene", "pockets")
     caster = Caster(trimesh.Trimesh(surface.vertices, surface.faces, process=False))
@@ -132,7 +137,7 @@ def test_a_truncated_or_foreign_recording_is_one_sentence(made, tmp_path, capsys
     bag = tmp_path / "recordings" / "one" / "recording"
     shutil.copytree(made / "set" / "recordings" / "TraverseShort-pockets-000" / "recording", bag)
     with pytest.raises(BenchmarkError, match=r"has no topic /other; it has /cmd_vel, /imu"):
-        next(recordings.read_clouds(bag, "/other"))
+        next(reading.read_clouds(bag.parent, "/other"))
     data = (bag / "recording.mcap").read_bytes()
     (bag / "recording.mcap").write_bytes(data[: len(data) // 2])
     out = ("--out", str(tmp_path / "out"))

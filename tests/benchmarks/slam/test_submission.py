@@ -54,7 +54,7 @@ def cut(path: Path) -> None:
 
 
 @pytest.mark.parametrize(("spoil", "sentence"), [
-    (late, "do not overlap those of the recording"), (few, "3 poses in 40 s; at least 1 a second"),
+    (late, "shares 0 of its 401 times"), (few, "has 3 poses in 40 s; at least 1 a second"),
     (half, "covers 50 % of the recording; 90 % are needed"), (camera, "looks 90° away from where it drives"),
     (cut, "two.tum"), (Path.unlink, "two.tum is missing"),
 ])  # fmt: skip

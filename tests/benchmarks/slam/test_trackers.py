@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.slam import trackers
 from benchmarks.slam.arena.record import Course, Scene, draw_scene
-from benchmarks.slam.sweep_points import POINT
+from benchmarks.slam.reading import POINT
 from scene.survey.cast import Caster
 
 SPEED, BEHIND, WAY = 1.5, 20.0, 12.0  # m/s; m

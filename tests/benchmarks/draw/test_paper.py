@@ -1,14 +1,16 @@
-"""A camera sees what stands before it, and a frame is taken where and when the LiDAR looked along the bore."""
+"""A camera sees what stands before it, a frame is taken where the LiDAR looked along the bore, figures are written."""
+
+import json
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
-from benchmarks.fidelity.derive.distances import Occupied
-from benchmarks.paper.camera import Pose
-from benchmarks.paper.figures import classify_side_view, depth_image
-from benchmarks.paper.material import Stretch, load_frame
+from benchmarks.demo import run_module
+from benchmarks.draw.frame import Stretch, load_frame
+from benchmarks.draw.paper import depth_image, main
+from benchmarks.draw.scene import Pose
 from tests.scene.bags import write_bag, write_tum
 
 POSE = Pose(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0]), np.pi / 2, 120, 90)
@@ -62,9 +64,31 @@ def test_a_frame_where_nothing_was_recorded_is_one_sentence(recorded, tmp_path):
         load_frame(late, recorded[1], np.zeros(3), Stretch(np.zeros(3), np.array([1.0, 0.0, 0.0]), 4.0), 1.0)
 
 
-def test_seen_from_the_side_voxels_of_one_surface_and_of_both_are_told_apart():
-    real, scene = np.zeros((4, 2, 1), bool), np.zeros((4, 2, 1), bool)
-    real[[0, 1], [0, 1], 0] = True
-    scene[[0, 2], [1, 1], 0] = True  # in slice 0 on the other side: one pixel from the side all the same
-    classes = classify_side_view(Occupied(np.stack([real, scene, scene]), real | scene, np.arange(4.0)))
-    np.testing.assert_array_equal(classes[:, 0], [0.0, 2.0, 1.0, np.nan])
+def write_run(folder, coverage):
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"task": "Subterra/TraverseShort-v1"}))
+    rows = [f"{k + 1},{10 * (k + 1)},{value:.9g},{int(value >= 0.9)},10,0" for k, value in enumerate(coverage)]
+    (folder / "episodes.csv").write_text("\n".join(["episode,step,coverage,success,length,contact", *rows]) + "\n")
+
+
+def test_learning_curves_of_several_seeds_are_one_figure(tmp_path):
+    for seed in (2, 10):
+        write_run(tmp_path / "runs" / f"seed-{seed}", [0.1] * 120 + [0.9] * 190)
+    assert main(["--runs", str(tmp_path / "runs"), "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "fig4.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_the_figures_of_a_short_survey(tmp_path):
+    survey, scene = tmp_path / "survey", tmp_path / "scene"
+    size = {"truth": "metro", "length": 30, "seed": 0, "scan_every": 10, "out": survey}
+    run_module("scene.survey", **size, sensors=("avia", "os1"))
+    given = {"trajectory": survey / "groundtruth.tum", "provenance": "simulated", "out": scene}
+    run_module("scene.build", survey / "survey.bag", **given)
+    assert main(["--survey", str(survey), "--scene", str(scene), "--out", str(tmp_path)]) == 0
+    captions = json.loads((tmp_path / "figures.json").read_text())
+    assert list(captions) == ["fig1", "fig2", "fig3a", "fig3b"]
+    assert float(captions["fig1"].partition(" cm from")[0].split()[-1]) < 3.0
+    for name in captions:
+        assert b"/FontFile2" in (tmp_path / f"{name}.pdf").read_bytes()  # TrueType, embedded
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000

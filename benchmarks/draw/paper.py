@@ -1,0 +1,322 @@
+"""The paper's figures: recording beside bore (1), pipeline (2), occupancy (3), learning curves (4).
+
+`python -m benchmarks.draw paper --survey build/survey --scene build/tunnel --out out/figures`; `make figures` makes
+survey, scene and runs as well.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch
+
+from benchmarks.command import BenchmarkError, run_main
+from benchmarks.draw.frame import Frame, Stretch, load_frame
+from benchmarks.draw.scene import Picture, Pose, picture
+from benchmarks.fidelity.candidate import load_candidate
+from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.beams import cast_beams
+from benchmarks.fidelity.derive.surface import surface_caster
+from benchmarks.fidelity.figures.errors import draw_mismatch, draw_projections
+from benchmarks.fidelity.figures.sheet import BLUE, GREY, INK, Sheet
+from benchmarks.fidelity.references import HoldConfig, load_hold
+from benchmarks.results import write_file
+from benchmarks.truth import scene_points
+from subterra_jax.host.files import replace_file, require_folder
+from train.curve import write_curve
+
+SURVEY_FILES = ("survey.bag", "groundtruth.tum", "survey_os1.bag", "groundtruth_os1.tum")
+SCENE_FILES = ("scene.xml", "bore.npz", "cloud.ply", "manifest.json")
+_PAGE = 7.16  # in; width of two columns, IEEE's guide for authors
+_STYLE: dict[Any, Any] = {
+    "font.family": "STIXGeneral",  # as narrow as Times, and comes with Matplotlib
+    "mathtext.fontset": "stix",
+    "font.size": 8.0, "axes.labelsize": 8.0, "axes.titlesize": 8.0, "legend.fontsize": 7.0,
+    "xtick.labelsize": 7.0, "ytick.labelsize": 7.0, "axes.linewidth": 0.6,
+    "pdf.fonttype": 42,  # TrueType: text stays text, and publishers take it
+}  # fmt: skip
+_FRAME_SHARE, _FRAME_RADIUS = 0.3, 8.0  # of the bore's length where the frame is taken; m around it
+_DURATION = 1.5  # s of a frame: enough for the Avia's pattern to close most of its gaps
+_FOV = np.deg2rad(58.0)  # at 4:3 inside the Avia's 70 by 77 degrees
+_NEAREST, _RETURN = 0.3, 0.016  # m; nearer returns are not drawn; radius of a drawn one, never less than a pixel
+_LARGEST = 9  # pixels across a drawn return, at most
+
+
+@dataclass(frozen=True)
+class PaperConfig:
+    """Draws the paper's figures as PDF and PNG, with captions and numbers in `figures.json`.
+
+    Attributes:
+        survey: Folder of a simulated survey with the sensors Avia and OS1, for figures 1 to 3.
+        scene: Scene folder built from its `survey.bag`; the OS1 is held out.
+        runs: Folder with run folders `seed-*` of `train`, for figure 4.
+        out: Output folder.
+    """
+
+    survey: Path | None = None
+    scene: Path | None = None
+    runs: Path | None = None
+    out: Path = Path("out/figures")
+
+
+@dataclass(frozen=True)
+class Material:
+    """A survey and the scene built from its Avia, with the OS1 held out; each part is read on first use."""
+
+    survey: Path
+    scene: Path
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """Manifest of the scene."""
+        return dict(json.loads((self.scene / "manifest.json").read_text()))
+
+    @cached_property
+    def case(self) -> Case:
+        """Scene with the held-out OS1."""
+        candidate, held_out = load_candidate(self.scene), (self.survey / name for name in SURVEY_FILES[2:])
+        return Case(candidate, load_hold(*held_out, candidate.origin, HoldConfig(scan_spacing=0.5, sigma=0.03)))
+
+    @cached_property
+    def residual(self) -> Float[np.ndarray, " k"]:
+        """Range in the scene less held-out range of every held-out beam that meets the scene, m."""
+        pairs = cast_beams(self.case)
+        return pairs.difference[pairs.hit]
+
+    @cached_property
+    def row(self) -> int:
+        """Index of the bore's section where the frame is taken."""
+        return round(_FRAME_SHARE * (len(self.case.candidate.bore.station) - 1))
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Frame of the recording that the builder read."""
+        bore = self.case.candidate.bore
+        stretch = Stretch(bore.position[self.row], bore.tangent[self.row], _FRAME_RADIUS)
+        recording, poses = (self.survey / name for name in SURVEY_FILES[:2])
+        return load_frame(recording, poses, self.case.candidate.origin, stretch, _DURATION)
+
+    @cached_property
+    def pose(self) -> Pose:
+        """Camera at the LiDAR, looking along the bore in the LiDAR's direction."""
+        frame, bore = self.frame, self.case.candidate.bore
+        tangent = bore.tangent[np.argmin(np.linalg.norm(bore.position - frame.position, axis=1))]
+        ahead = tangent * np.sign(((frame.points - frame.origin) @ tangent).mean() or 1.0)
+        return Pose(frame.position, ahead, float(_FOV), 1400, 1050)
+
+    @cached_property
+    def view(self) -> Picture:
+        """Scene rendered by MuJoCo from that pose."""
+        return picture(self.scene, self.pose)
+
+    @cached_property
+    def cloud(self) -> Float[np.ndarray, "p 3"]:
+        """Registered cloud, thinned, tunnel frame, m."""
+        return scene_points(self.scene)
+
+
+Drawn = tuple[Figure, str]
+
+
+def draw_bore_view(material: Material) -> Drawn:
+    """Draws figure 1: recorded returns by depth on the left, MuJoCo's picture on the right."""
+    frame = material.frame
+    figure, (left, right) = plt.subplots(1, 2, figsize=(_PAGE, 2.72), layout="constrained")
+    depth = depth_image(material.pose, in_camera(material.pose, frame.points))
+    shown = left.imshow(depth, cmap="viridis_r", norm=LogNorm(2.0, 40.0), interpolation="nearest")
+    left.set_title(f"(a) recording, {frame.duration:g} s of {frame.topic}")
+    right.imshow(material.view)
+    right.set_title("(b) reconstructed bore in MuJoCo, same pose")
+    for axes in (left, right):
+        axes.set(xticks=[], yticks=[])
+    bar = figure.colorbar(shown, ax=left, location="left", shrink=0.9, pad=0.02, ticks=(2, 5, 10, 20, 40), extend="max")
+    bar.set_label("depth, m")
+    bar.ax.minorticks_off()
+    bar.ax.set_yticklabels(("2", "5", "10", "20", "40"))
+    beam = frame.points - frame.origin
+    reach = np.linalg.norm(beam, axis=1)
+    cast, _ = surface_caster(material.case).first(frame.origin, beam / np.maximum(reach, 1e-9)[:, None])
+    error = np.abs(cast - reach)[np.isfinite(cast)]
+    return figure, (
+        f"{frame.duration:g} s of the recording, coloured by depth (a), and the MuJoCo scene from the same pose (b). "
+        f"Along the recorded beams the scene is {100 * np.median(error):.1f} cm from the returns (median; "
+        f"{100 * np.mean(error < 0.10):.1f} % within 10 cm)."
+    )
+
+
+def depth_image(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "height width"]:
+    """Returns the depth of the nearest return in each pixel, m; NaN where there is none.
+
+    Args:
+        pose: Camera.
+        points: Returns to the right, up and ahead of it, m; each is drawn at its size for its distance.
+    """
+    image = np.full((pose.height, pose.width), np.inf)
+    column = np.round(0.5 * pose.width + pose.focal * points[:, 0] / points[:, 2]).astype(int)
+    row = np.round(0.5 * pose.height - pose.focal * points[:, 1] / points[:, 2]).astype(int)
+    reach = np.clip(pose.focal * _RETURN / points[:, 2], 1, _LARGEST // 2).astype(int)
+    for down in range(-(_LARGEST // 2), _LARGEST // 2 + 1):
+        for across in range(-(_LARGEST // 2), _LARGEST // 2 + 1):
+            covers = reach >= max(abs(down), abs(across))
+            y, x = row[covers] + down, column[covers] + across
+            inside = (y >= 0) & (y < pose.height) & (x >= 0) & (x < pose.width)
+            np.minimum.at(image, (y[inside], x[inside]), points[covers][inside, 2])
+    return np.where(np.isfinite(image), image, np.nan)
+
+
+def in_camera(pose: Pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
+    """Returns the points inside a camera's picture: right, up and ahead of it, m."""
+    local = (points - pose.position) @ pose.axes.T
+    local = local[local[:, 2] > _NEAREST]
+    half = 0.5 * np.array([pose.width, pose.height]) / pose.focal
+    return local[(np.abs(local[:, :2] / local[:, 2:]) <= half).all(axis=1)]
+
+
+_SLICE = 0.15  # m either side of a section
+_HISTOGRAM = 10.0  # cm, largest error in the histogram
+_STRETCH, _WALL, _KNEE = 4.0, 0.25, -1.3  # m of the view from above: either side, left out beside walls, height limit
+_TOP, _BOTTOM, _GAP, _EDGE = 0.87, 0.32, 0.033, 0.008  # shares of the figure
+
+
+def draw_pipeline(material: Material) -> Drawn:
+    """Draws figure 2: five stages from the recording to the validated scene, with arrows between them."""
+    facts, bore, count = (material.manifest[name] for name in ("detected", "bore", "count"))
+    error = 100.0 * np.abs(material.residual)
+    size = f"{bore['width_mean']:.2f} $\\times$ {bore['height_mean']:.2f} m"
+    track = f"{count['pockets']:,} pockets, {count['sleepers']:,} sleepers"
+    stages: tuple[tuple[str, Callable[[Material, Any], None], list[str]], ...] = (
+        ("recording", _scan, [f"{facts['scans']:,} scans", f"{facts['returns'] / 1e6:.1f} M returns"]),
+        ("cloud", _plan, [f"{facts['points'] / 1e6:.2f} M voxels", f"by {facts['length_fixed_by']}"]),
+        ("bore", _section, [f"{bore['length']:.1f} m", size]),
+        ("MuJoCo scene", _view, [f"{count['lining_faces'] / 1e3:.0f} k faces", track]),
+        ("held-out LiDAR", _errors, [f"median {np.median(error):.1f} cm",
+                                     f"{100 * np.mean(error < _HISTOGRAM):.1f} % in 10 cm"]),
+    )  # fmt: skip
+    figure = plt.figure(figsize=(_PAGE, 1.6))
+    width = (1.0 - 2 * _EDGE - (len(stages) - 1) * _GAP) / len(stages)
+    for k, (title, paint, lines) in enumerate(stages):
+        left = _EDGE + k * (width + _GAP)
+        axes = figure.add_axes((left, _BOTTOM, width, _TOP - _BOTTOM))
+        paint(material, axes)
+        axes.set(xticks=[], yticks=[])
+        figure.text(left + 0.5 * width, _TOP + 0.03, title, ha="center", va="bottom", weight="bold", fontsize=7.5)
+        figure.text(left + 0.5 * width, _BOTTOM - 0.03, "\n".join(lines), ha="center", va="top", fontsize=6.5)
+        if k:
+            ends = ((left - _GAP, 0.5 * (_TOP + _BOTTOM)), (left, 0.5 * (_TOP + _BOTTOM)))
+            figure.add_artist(FancyArrowPatch(*ends, transform=figure.transFigure, arrowstyle="-|>",
+                                              mutation_scale=8, color=INK, lw=0.9))  # fmt: skip
+    return (
+        figure,
+        "From the recording to the scene; the last stage compares it with a LiDAR that the builder never read.",
+    )
+
+
+def _scan(material: Material, axes: Any) -> None:
+    """Draws one raw scan from the side."""
+    frame, pose = material.frame, material.pose
+    local = (frame.points[frame.single] - pose.position) @ pose.axes.T
+    local = local[local[:, 2] < 30.0]
+    axes.scatter(local[:, 2], local[:, 1], c=local[:, 2], cmap="viridis_r", s=0.4, lw=0.0, rasterized=True)
+    axes.set(xlim=(-1.0, 30.0), ylim=(-8.0, 10.0))
+
+
+def _plan(material: Material, axes: Any) -> None:
+    """Draws the cloud of floor and track from above, coloured by height."""
+    bore, row = material.case.candidate.bore, material.row
+    offset = material.cloud - bore.position[row]
+    along, left, up = (offset @ axis[row] for axis in (bore.tangent, bore.lateral, bore.up))
+    shown = (np.abs(along) < _STRETCH) & (np.abs(left) < 0.5 * bore.width[row] - _WALL) & (up < _KNEE)
+    along, left, up = (values[shown][np.argsort(up[shown])] for values in (along, left, up))
+    low, high = np.percentile(up, (1, 99))
+    axes.scatter(along, left, c=up, cmap="cividis", s=0.8, lw=0.0, vmin=low, vmax=high, rasterized=True)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _section(material: Material, axes: Any) -> None:
+    """Draws the section at the frame's place over the cloud around it."""
+    bore, row = material.case.candidate.bore, material.row
+    offset = material.cloud - bore.position[row]
+    near = offset[np.abs(offset @ bore.tangent[row]) < _SLICE]
+    near = near[np.linalg.norm(near, axis=1) < 2.0 * bore.radius[row].max()]
+    axes.plot(near @ -bore.lateral[row], near @ bore.up[row], ".", ms=0.8, color=GREY, rasterized=True)
+    angle, radius = np.append(bore.angle, bore.angle[0]), np.append(bore.radius[row], bore.radius[row][0])
+    axes.plot(-radius * np.cos(angle), radius * np.sin(angle), color=BLUE, lw=1.0)
+    axes.set_aspect("equal", adjustable="datalim")
+
+
+def _view(material: Material, axes: Any) -> None:
+    axes.imshow(material.view, aspect="auto")
+
+
+def _errors(material: Material, axes: Any) -> None:
+    """Draws the histogram of ranges in the scene less those of the held-out LiDAR, cm."""
+    axes.hist(100.0 * material.residual, np.linspace(-_HISTOGRAM, _HISTOGRAM, 41), color=BLUE)
+    axes.axvline(0.0, color=INK, lw=0.6)
+    axes.set_xlim(-_HISTOGRAM, _HISTOGRAM)
+    axes.set_title("from $-$10 to 10 cm", fontsize=5.5, y=0.85)
+
+
+def _drawings(material: Material) -> dict[str, Callable[[], Drawn | None]]:
+    """Returns what draws figures 1 to 3 by name; the third is that of a fidelity report."""
+    report = {"seed": 0, "split": {"hold": {"file": SURVEY_FILES[2]}, "rule": "by sensor"}}
+    sheet = Sheet(material.case, material.case, report, [], [])
+    return {
+        "fig1": lambda: draw_bore_view(material),
+        "fig2": lambda: draw_pipeline(material),
+        "fig3a": lambda: draw_projections(sheet),
+        "fig3b": lambda: draw_mismatch(sheet),
+    }
+
+
+def run(config: PaperConfig) -> None:
+    """Draws the figures that the inputs allow.
+
+    Raises:
+        SubterraError: An input is missing or broken, or the folder cannot be written.
+    """
+    if config.runs is None and (config.survey is None or config.scene is None):
+        raise BenchmarkError("figures 1 to 3 need --survey and --scene, figure 4 needs --runs")
+    for folder, files in ((config.survey, SURVEY_FILES), (config.scene, SCENE_FILES)):
+        for file in files if folder is not None else ():
+            if not (folder / file).exists():
+                raise BenchmarkError(f"{folder / file}: no such file")
+    runs = [] if config.runs is None else sorted(config.runs.glob("seed-*"), key=lambda run: (len(run.name), run.name))
+    if config.runs is not None and not runs:
+        raise BenchmarkError(f"{config.runs}: holds no run folders seed-0, seed-1, ... of train")
+    require_folder(config.out)
+    captions = {}
+    if config.survey is not None and config.scene is not None:
+        material = Material(config.survey, config.scene)
+        provenance = f"Survey {config.survey.name}, {material.manifest.get('input_provenance')}."
+        with plt.rc_context(_STYLE):
+            for name, draw in _drawings(material).items():
+                if (drawn := draw()) is not None:
+                    captions[name] = f"{drawn[1]} {provenance}"
+                    _save(drawn[0], config.out / name)
+        write_file(config.out / "figures.json", (json.dumps(captions, indent=1) + "\n").encode())
+    if runs:
+        config.out.mkdir(parents=True, exist_ok=True)
+        write_curve(runs, config.out / "fig4.png")
+        print(config.out / "fig4.png")
+
+
+def _save(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for kind in ("pdf", "png"):
+        with replace_file(path.with_suffix(f".{kind}")) as fresh:
+            figure.savefig(fresh, dpi=300, format=kind, metadata={"CreationDate": None} if kind == "pdf" else {})
+    plt.close(figure)
+    print(path.with_suffix(".pdf"))
+
+
+def main(words: list[str] | None = None) -> int:
+    """Runs the command line; returns 2 for a user's mistake."""
+    return run_main("draw paper", PaperConfig, run, description=__doc__, words=words)

@@ -1,0 +1,192 @@
+"""Programs for SLAM, with their own defaults and one thread: `evalio`'s, `rko-lio`, KISS-ICP, GenZ-ICP, our trackers.
+
+`main` runs one in this process: it reads the bag, feeds sweeps and IMU samples in order, writes the LiDAR's poses and
+prints one line of JSON. The libraries are optional (`pip install 'subterra-jax[slam]'`).
+"""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable
+from functools import partial
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from benchmarks.command import BenchmarkError
+from benchmarks.slam.reading import (
+    CALIBRATION,
+    CLOUDS,
+    PLANAR,
+    Poses,
+    Sweep,
+    read_clouds,
+    read_planar,
+    read_samples,
+    save_tum,
+)
+
+Step = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "4 4"]]
+WHEELS = "wheel-odometry"
+_PLANAR_VOXEL = 0.3  # m: planar scans reach 30 m where the clouds reach 100 m
+# What is not left at a program's defaults: sums of several threads differ from run to run; points are undistorted by
+# their times, which evalio leaves out; no sweep is skipped to keep up with real time.
+_CHANGES = {"max_num_threads": 1, "num_threads": 1, "ls_num_threads": 1, "numberOfCores": 1, "deskew": True,
+            "realtime": False}  # fmt: skip
+
+
+class Program(NamedTuple):
+    """A program that gives poses.
+
+    Attributes:
+        package: Package that it comes with.
+        run: Runs it on the folder of a recording.
+        topic: Topic of the bag that it reads; empty where it reads recordings of the arena.
+    """
+
+    package: str
+    run: Callable[[Path], Poses]
+    topic: str = ""
+
+
+def make_kiss(voxel: float | None, max_range: float) -> Step:
+    """Starts KISS-ICP: a function from a sweep's points, m, to the pose of the sensor."""
+    made = import_module("kiss_icp.config").KISSConfig()
+    made.data.max_range, made.data.deskew = max_range, False
+    made.mapping.voxel_size = max_range / 100.0 if voxel is None else voxel
+    made.registration.max_num_threads = 1
+    return _stepping(import_module("kiss_icp.kiss_icp").KissICP(made), np.zeros_like)
+
+
+def make_genz() -> Step:
+    """Starts GenZ-ICP: a function from a sweep's points, m, to the pose of the sensor."""
+    made = import_module("genz_icp.config").GenZConfig()
+    made.registration.max_num_threads = 1
+    return _stepping(import_module("genz_icp.genz_icp").GenZICP(made), lambda column: np.zeros(0))
+
+
+def _stepping(odometry: Any, times: Callable[[np.ndarray], np.ndarray]) -> Step:
+    def step(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "4 4"]:
+        odometry.register_frame(points, times(points[:, 0]))
+        return np.array(odometry.last_pose)
+
+    return step
+
+
+def estimate_poses(step: Step, sweeps: Iterable[Sweep]) -> Poses:
+    """Feeds sweeps to an odometry; its poses are in the frame of the first one.
+
+    Raises:
+        BenchmarkError: A sweep holds no point.
+    """
+    times, poses, started = [], [], time.perf_counter()
+    for stamp, points in sweeps:
+        if not len(points):
+            raise BenchmarkError(f"sweep {len(times)} holds no point")
+        times.append(stamp)
+        poses.append(step(np.ascontiguousarray(points, np.float64)))
+    return np.array(times), np.array(poses).reshape(-1, 4, 4), time.perf_counter() - started
+
+
+def _run_evalio(name: str, recording: Path) -> Poses:
+    from evalio.pipelines import get_pipeline
+    from evalio.types import ImuMeasurement
+
+    from benchmarks.slam.evalio_sets import open_set
+
+    dataset = next(iter(open_set(recording.parent.parent, [recording.name])))
+    kind: Any = get_pipeline(name)
+    program = kind()
+    settings = kind.default_params()
+    program.set_params(settings | {key: value for key, value in _CHANGES.items() if key in settings})
+    program.set_imu_params(dataset.imu_params())
+    program.set_lidar_params(dataset.lidar_params())
+    program.set_imu_T_lidar(dataset.imu_T_lidar())
+    program.initialize()
+    mount, seconds, rows = dataset.imu_T_lidar().to_mat(), 0.0, []
+    for sample in dataset.data_iter():
+        started = time.perf_counter()
+        (program.add_imu if isinstance(sample, ImuMeasurement) else program.add_lidar)(sample)
+        seconds += time.perf_counter() - started
+        rows += [(stamp.sec + 1e-9 * stamp.nsec, pose.to_mat() @ mount) for stamp, pose in program.saved_estimates()]
+        program.saved_features_matrix(), program.saved_maps_matrix()  # what is not taken piles up
+    return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]).reshape(-1, 4, 4), seconds
+
+
+def _run_rko(recording: Path) -> Poses:
+    from rko_lio.config import LIOConfig
+    from rko_lio.lio import LIO
+
+    mount = np.eye(4)
+    mount[:3, 3] = -np.array(yaml.safe_load((recording / CALIBRATION).read_text())["imu"]["shift_from_lidar"])
+    program, seconds, rows = LIO(LIOConfig(max_num_threads=1)), 0.0, []
+    for stamp, content in read_samples(recording):
+        started = time.perf_counter()
+        if isinstance(content, tuple):
+            program.add_imu_measurement(*content, stamp, extrinsic_imu2base=mount)
+        else:
+            seen = content[(content["x"] != 0.0) | (content["y"] != 0.0)]
+            xyz = np.column_stack([seen["x"], seen["y"], seen["z"]]).astype(np.float64)
+            program.register_scan(xyz, stamp + seen["t"].astype(np.int64), np.eye(4), stamp, stamp + 100_000_000)
+            rows.append((1e-9 * stamp + 0.1, np.array(program.pose())))
+        seconds += time.perf_counter() - started
+    return np.array([t for t, _ in rows]), np.array([pose for _, pose in rows]), seconds
+
+
+def _run_tracker(name: str, recording: Path) -> Poses:
+    from benchmarks.slam.trackers import run_tracker
+
+    return run_tracker(name, recording)
+
+
+PROGRAMS = {
+    **{f"evalio-{name}": Program("evalio", partial(_run_evalio, name))
+       for name in ("kiss", "genz", "mad", "ct", "loam", "liosam", "dlio", "form")},
+    "rko-lio": Program("rko-lio", _run_rko),
+    **{name: Program("jax", partial(_run_tracker, name)) for name in ("ring-filter", "particle-filter")},
+    "kiss-icp": Program("kiss-icp", lambda at: estimate_poses(make_kiss(None, 100.0), read_clouds(at)), CLOUDS),
+    "genz-icp": Program("genz-icp", lambda at: estimate_poses(make_genz(), read_clouds(at)), CLOUDS),
+    "kiss-icp-planar": Program(
+        "kiss-icp", lambda at: estimate_poses(make_kiss(_PLANAR_VOXEL, 30.0), read_planar(at)), PLANAR
+    ),
+}  # fmt: skip
+ARENA = tuple(name for name, program in PROGRAMS.items() if not program.topic)
+
+
+def find_program(name: str) -> str:
+    """Returns the version of a program's package; empty for the robot's own odometry.
+
+    Raises:
+        BenchmarkError: There is no such program, or it is not installed.
+    """
+    if name == WHEELS:
+        return ""
+    if name not in PROGRAMS:
+        raise BenchmarkError(f"no program {name!r}; there are {', '.join([WHEELS, *PROGRAMS])}")
+    package = PROGRAMS[name].package
+    try:
+        return version(package)
+    except PackageNotFoundError as error:
+        raise BenchmarkError(f"{name} needs {package}, which is not installed: pip install {package}") from error
+
+
+def main(words: list[str]) -> int:
+    """Runs `NAME RECORDING TARGET` and prints one line of JSON; returns 1 with a reason where the program fails."""
+    try:
+        times, poses, seconds = PROGRAMS[words[0]].run(Path(words[1]))
+    except (BenchmarkError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    if len(times) < 2 or not np.isfinite(poses).all():
+        problem = "gives poses that are not finite" if len(times) >= 2 else f"gives {len(times)} poses"
+        print(problem, file=sys.stderr)
+        return 1
+    save_tum(Path(words[2]), times, poses)
+    share = seconds / float(times[-1] - times[0])
+    print(json.dumps({"poses": len(times), "seconds": round(seconds, 2), "share": round(share, 3)}))
+    return 0
