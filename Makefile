@@ -30,8 +30,14 @@ reproduce: $(STAMP)  ## the results on record again, those that a CPU can measur
 arena: $(STAMP)    ## recordings for LiDAR-inertial programs into out/arena, 8 to 10 minutes and 2.2 GB; goes on where it stopped
 	$(BIN)/python -m benchmarks.slam arena --jobs 2 --out out/arena
 
-figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores; goes on where it stopped
-	$(BIN)/python -m benchmarks.paper --out out/figures
+FIGURES := out/figures
+figures: $(STAMP)  ## the paper's figures at print size into out/figures, about 5 minutes on 2 cores
+	test -e $(FIGURES)/survey/truth.json || $(BIN)/python -m scene.survey --truth metro --length 60 --sensors avia os1 --scan-every 10 --out $(FIGURES)/survey
+	test -e $(FIGURES)/scene/manifest.json || $(BIN)/python -m scene.build $(FIGURES)/survey/survey.bag \
+		--trajectory $(FIGURES)/survey/groundtruth.tum --provenance simulated --out $(FIGURES)/scene
+	test -e $(FIGURES)/runs/seeds.json || $(BIN)/python -m train --task TraverseShort-v1 --seeds 0 1 2 3 4 --preset cpu \
+		--tunnel $(FIGURES)/scene/tunnel.npz --overwrite --out $(FIGURES)/runs
+	$(BIN)/python -m benchmarks.draw paper --survey $(FIGURES)/survey --scene $(FIGURES)/scene --runs $(FIGURES)/runs --out $(FIGURES)
 
 docs: $(STAMP)   ## the documentation into build/site, its tables checked against the records, warnings as errors
 	$(BIN)/python -m benchmarks.records check

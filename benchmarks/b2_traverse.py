@@ -15,14 +15,12 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks.command import require_least, run_main
-from subterra_jax import policies
 from subterra_jax.b2 import tasks, transfer
 from subterra_jax.b2.gait import RELEASED
-from subterra_jax.baselines import registry
 from subterra_jax.host.files import require_file
+from subterra_jax.policies.opening import open_agent
 from subterra_jax.tunnel.sources import load_tunnel
 from train.log import print_table
-from train.policies import open_agent
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,8 @@ class Command:
     Attributes:
         robots: Number of robots.
         seed: Seed for their draws.
-        agent: Driver: a baseline, a run folder of `train --embodiment b2`, or a policy's file or name.
+        agent: Driver: a baseline, a run folder of `train --embodiment b2`, a policy's file or name, or code as
+            `FILE.py:Class`.
         policy: Gait: a file, the name of a released gait, or `trot`.
         engine: `mjx`, or `mujoco` in C on the host.
         tunnel: Tunnel file or name; the packaged tunnel if not given.
@@ -59,15 +58,6 @@ class Command:
     odometer: Literal["legs", "drift"] = "legs"
     speed: float = tasks.VEHICLE.speed_max
     out: Path | None = None
-
-
-def load_driver(name: str, env: Any, params: Any) -> Any:
-    """Loads an agent by name, file or run folder, and checks that it fits the task."""
-    if name in registry.names():
-        return registry.make_agent(name, params)
-    agent, _ = open_agent(Path(name), None)
-    policies.check_fits(agent, env, params, name)
-    return agent
 
 
 def show_progress(now: transfer.Walk) -> None:
@@ -112,7 +102,7 @@ def command(arguments: Command) -> None:
         goal_coverage=arguments.coverage,
         vehicle=replace(tasks.VEHICLE, speed_max=arguments.speed),
     )
-    agent, started = load_driver(arguments.agent, env, params), time.perf_counter()
+    agent, started = open_agent(arguments.agent, env, params), time.perf_counter()
     walks = transfer.walk_robots(env, params, agent, arguments.robots, arguments.seed, show_progress)
     figures = transfer.figures(*walks, params)
     print(file=sys.stderr)

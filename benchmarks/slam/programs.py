@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from benchmarks.slam.reading import (
@@ -28,8 +29,8 @@ from benchmarks.slam.reading import (
     read_clouds,
     read_planar,
     read_samples,
-    save_tum,
 )
+from scene.poses.trajectory import Trajectory, save_tum
 
 Step = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "4 4"]]
 WHEELS = "wheel-odometry"
@@ -186,7 +187,8 @@ def main(words: list[str]) -> int:
         problem = "gives poses that are not finite" if len(times) >= 2 else f"gives {len(times)} poses"
         print(problem, file=sys.stderr)
         return 1
-    save_tum(Path(words[2]), times, poses)
+    turns = Rotation.from_matrix(poses[:, :3, :3])
+    save_tum(Trajectory(times, poses[:, :3, 3], turns, words[0]), Path(words[2]))
     share = seconds / float(times[-1] - times[0])
     print(json.dumps({"poses": len(times), "seconds": round(seconds, 2), "share": round(share, 3)}))
     return 0

@@ -11,11 +11,9 @@ from jaxtyping import Float
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
-from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
 from scene.reading.scans import parse_pointcloud2
-from subterra_jax.host.files import replace_file
 
 RECORDINGS, TRUTH, INDEX = "recordings", "truth", "set.json"  # folders and file of a set
 CALIBRATION, TRUTH_FILE, ODOMETRY = "calibration.yaml", "lidar.tum", "odometry.tum"
@@ -34,13 +32,6 @@ _LIVOX_CDR = np.dtype({
     "names": ["t", "x", "y", "z", "intensity", "ring"], "formats": ["<u4", "<f4", "<f4", "<f4", "u1", "u1"],
     "offsets": [0, 4, 8, 12, 16, 18], "itemsize": 20,
 })  # fmt: skip
-
-
-def save_tum(path: Path, times: Float[np.ndarray, " n"], poses: Float[np.ndarray, "n 4 4"]) -> None:
-    """Writes poses as rows `t x y z qx qy qz qw`."""
-    rows = np.column_stack([times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)])
-    with replace_file(path) as fresh:
-        np.savetxt(fresh, rows, fmt="%.9f")
 
 
 def recordings_in(folder: Path) -> list[Path]:

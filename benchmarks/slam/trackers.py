@@ -6,10 +6,11 @@ rings, whether the walls have any or not. The particle filter is told the walls,
 beside the truth.
 """
 
+import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,12 +50,7 @@ class Step(NamedTuple):
     distance: float
 
 
-class Tracker(Protocol):
-    """A tracker."""
-
-    def __call__(self, step: Step) -> float:
-        """Advances by a sweep; returns the station less that of the start, m."""
-        ...
+Tracker = Callable[[Step], float]  # advances by a sweep; returns the station less that of the start, m
 
 
 def run_tracker(name: str, recording: Path) -> Poses:
@@ -144,41 +140,39 @@ def _sees_walls(ranges: Float[np.ndarray, "n_beams"]) -> bool:
 
 
 def _make(name: str, recording: Path) -> Tracker:
-    return RingTracker() if name == "ring-filter" else MapTracker(redraw(recording.parent.parent, recording.name))
+    return track_rings() if name == "ring-filter" else track_map(redraw(recording.parent.parent, recording.name))
 
 
-class RingTracker:
-    """The ring filter of `subterra_jax.baselines`."""
+def track_rings() -> Tracker:
+    """Begins the ring filter of `subterra_jax.baselines`, without a pattern, on dry rail."""
+    track = grid.start((), N_BEAMS, wet=False)
 
-    def __init__(self) -> None:
-        """Begins without a pattern, on dry rail."""
-        self._track = grid.start((), N_BEAMS, wet=False)
-
-    def __call__(self, step: Step) -> float:
-        """Advances by a sweep; returns the station less that of the start, m."""
+    def advance(step: Step) -> float:
+        nonlocal track
         distance, one = jnp.float32(step.distance), jnp.ones(())
         moved, ranges = StepDistances(distance, distance), jnp.asarray(step.ranges, jnp.float32)
-        self._track = _count_rings(self._track, ranges, moved, one, jnp.float32(DESIGN.ring_width), jnp.zeros(()))
-        return float(self._track.station)
+        track = _count_rings(track, ranges, moved, one, jnp.float32(DESIGN.ring_width), jnp.zeros(()))
+        return float(track.station)
+
+    return advance
 
 
-class MapTracker:
-    """The particle filter of `subterra_jax.baselines` on the mapped walls of a scene."""
+def track_map(scene: Scene) -> Tracker:
+    """Begins the particle filter of `subterra_jax.baselines` at the start, on the mapped walls of a scene."""
+    walls, begin = map_walls(scene), scene.drive.begin
+    cloud: particles.Cloud | None = None
+    count = itertools.count()
 
-    def __init__(self, scene: Scene) -> None:
-        """Begins at the start, which is known."""
-        self._walls, self._begin = map_walls(scene), scene.drive.begin
-        self._cloud: particles.Cloud | None = None
-        self._step = 0
+    def advance(step: Step) -> float:
+        nonlocal cloud
+        key = jax.random.fold_in(jax.random.key(_SEED), next(count))
+        ranges = jnp.asarray(step.ranges, jnp.float32)
+        if cloud is None:
+            cloud = _spread_cloud(key, walls, begin, ranges)
+        station, cloud = _move_cloud(key, cloud, walls, ranges, step.distance)
+        return float(station) - begin
 
-    def __call__(self, step: Step) -> float:
-        """Advances by a sweep; returns the station less that of the start, m."""
-        key, ranges = jax.random.fold_in(jax.random.key(_SEED), self._step), jnp.asarray(step.ranges, jnp.float32)
-        if self._cloud is None:
-            self._cloud = _spread_cloud(key, self._walls, self._begin, ranges)
-        station, self._cloud = _move_cloud(key, self._cloud, self._walls, ranges, step.distance)
-        self._step += 1
-        return float(station) - self._begin
+    return advance
 
 
 _count_rings = jax.jit(grid.advance)

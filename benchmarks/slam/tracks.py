@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from benchmarks.command import BenchmarkError
@@ -16,7 +17,6 @@ _HEADER = "station,x,y,z"
 _SPACING = 0.25  # m between points of an axis made from a path
 _SMOOTHED = 8  # points to either side over which such an axis is smoothed
 _LEAST_STRETCH = 0.2  # least length of 1 m of station at a point's offset: it has no meaning beyond a bend's centre
-_ROWS = 1000  # positions looked up at a time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Axis:
     """A tunnel's axis as a polyline; it continues straight beyond its ends.
 
     Attributes:
-        station: Stations of its points, increasing, m, `(n,)`.
-        position: Positions of its points, m, `(n, 3)`.
-        frames: Unit vectors along, left and up as rows, `(n, 3, 3)`.
+        station: Stations of its points, increasing, m.
+        position: Positions of its points, m.
+        frames: Unit vectors along, left and up as rows.
         source: Origin of the axis, for the report.
     """
 
@@ -37,9 +37,7 @@ class Axis:
 
     def nearest(self, position: Float[np.ndarray, "k 3"]) -> Int[np.ndarray, " k"]:
         """Returns the index of the axis' point nearest to each position."""
-        parts = np.split(position, range(_ROWS, len(position), _ROWS))
-        squares = [np.sum((part[:, None] - self.position) ** 2, axis=2) for part in parts]
-        return np.concatenate([np.argmin(square, axis=1) for square in squares])
+        return cKDTree(self.position).query(position)[1]
 
     def coordinates(self, position: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
         """Returns station, offset to the left and height over the axis of each position, m."""
@@ -97,9 +95,8 @@ def axis_from_path(position: Float[np.ndarray, "n 3"]) -> Axis:
 
 def _smooth(line: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Returns means over neighbours, as many on one side as on the other."""
-    total, n = np.concatenate([np.zeros((1, 3)), np.cumsum(line, axis=0)]), len(line)
-    index = np.arange(n)
-    reach = np.minimum(np.minimum(index, n - 1 - index), _SMOOTHED)
+    total, index = np.concatenate([np.zeros((1, 3)), np.cumsum(line, axis=0)]), np.arange(len(line))
+    reach = np.minimum(np.minimum(index, index[::-1]), _SMOOTHED)
     return (total[index + reach + 1] - total[index - reach]) / (2 * reach + 1)[:, None]
 
 
@@ -121,10 +118,10 @@ class Track:
     """Estimated and true poses at the same times.
 
     Attributes:
-        time: Times, increasing, s, `(n,)`.
-        position: Estimated positions, m, `(n, 3)`.
+        time: Times, increasing, s.
+        position: Estimated positions, m.
         rotation: Estimated attitudes, `n` of them.
-        true_position: True positions, m, `(n, 3)`.
+        true_position: True positions, m.
         true_rotation: True attitudes, `n` of them.
         covered: Share of the truth's duration between the first and the last of these times.
     """

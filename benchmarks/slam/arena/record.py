@@ -161,11 +161,8 @@ def _odometry(scene: Scene) -> tuple[list[Message], Float[np.ndarray, "n"], Pose
     rng = np.random.default_rng(scene.seeds["wheels"])
     position, quaternion = wheels.measure_wheels(rng, scene.drive.station(time), scene.drive.poses(time))
     rows = zip(np.rint(time * 1e9).astype(np.int64), position, quaternion, strict=True)
-    return (
-        [bags.odometry_message(int(t), p, q, scene.sensor.frame) for t, p, q in rows],
-        time,
-        Poses(position, quaternion),
-    )
+    stamped = [bags.odometry_message(int(t), p, q, scene.sensor.frame) for t, p, q in rows]
+    return stamped, time, Poses(position, quaternion)
 
 
 def write_recording(scene: Scene, folder: Path, formats: tuple[FormatName, ...]) -> Iterator[Message]:
@@ -208,10 +205,7 @@ def write_truth(scene: Scene, folder: Path) -> None:
     station = np.arange(0.0, drive.bore.alignment.length + 1e-9, _AXIS_STEP)
     above = np.full_like(station, drive.carrier.height) - 0.5 * drive.bore.section.height(station)
     points = drive.bore.alignment.frames(station).point(np.zeros_like(station), above)
-    rows = [
-        "station,x,y,z",
-        *(f"{s:.6f},{x:.6f},{y:.6f},{z:.6f}" for s, (x, y, z) in zip(station, points, strict=True)),
-    ]
-    write_file(folder / "axis.csv", ("\n".join(rows) + "\n").encode())
+    rows = np.column_stack([station, points])
+    np.savetxt(folder / "axis.csv", rows, fmt="%.6f", delimiter=",", header="station,x,y,z", comments="")
     facts = {"provenance": "simulated", **asdict(scene.course), "duration": drive.duration}
     write_file(folder / "course.json", (json.dumps(facts, indent=1) + "\n").encode())

@@ -85,7 +85,7 @@ def test_the_map_holds_what_stands_at_the_height_of_the_slice(scene):
 
 @pytest.mark.parametrize(("name", "within"), [("particle-filter", 0.1), ("ring-filter", 0.2)])
 def test_trackers_take_out_the_error_of_the_odometer(scene, steps, name, within):
-    tracker = trackers.MapTracker(scene) if name == "particle-filter" else trackers.RingTracker()
+    tracker = trackers.track_map(scene) if name == "particle-filter" else trackers.track_rings()
     way = (len(steps) - 1) * 0.1
     error = [tracker(step) for step in steps][-1] - way
     assert abs(error) < within
