@@ -12,13 +12,12 @@ from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from benchmarks.command import BenchmarkError
 from benchmarks.slam.__main__ import command
 from benchmarks.slam.arena import bags, describe, record, sets, wheels
 from benchmarks.slam.arena.drives import CARRIERS, REST
 from benchmarks.slam.arena.dust import draw_dust
 from benchmarks.slam.arena.walls import draw_walls
-from benchmarks.slam.reading import livox_points, sweep_points
+from benchmarks.slam.reading import read_samples, sweep_points
 from scene.survey.carrier import ACCEL_BIAS, GRAVITY, Poses
 from scene.survey.cast import Hits
 
@@ -63,33 +62,27 @@ def test_both_bags_hold_the_same_messages_and_other_readers_agree(made):
     clouds = [[sweep_points(one) for topic, _, one in rows if topic == TOPICS[name]] for rows in (first, second)]
     foreign = [sweep_points(row.ros_msg) for row in read_ros2_messages(folder / bags.MCAP / "recording.mcap")
                if row.channel.topic == TOPICS[name]]  # fmt: skip
+    ours = [points for _, points in read_samples(_recording(folder, name)) if not isinstance(points, tuple)]
     assert len(clouds[0]) >= 2
-    for one, two, three in zip(*clouds, foreign, strict=True):
-        np.testing.assert_array_equal(one, two)
-        np.testing.assert_array_equal(one, three)
+    for one, *others in zip(*clouds, foreign, ours, strict=True):
+        for other in others:
+            np.testing.assert_array_equal(one, other)
 
 
-def test_livox_points_are_read_from_the_bytes_as_from_the_objects(made):
-    name, folder = made
-    if name != "avia":
-        return
-    with AnyReader([folder / bags.MCAP]) as reader:
-        for connection, _, raw in reader.messages():
-            if connection.topic == TOPICS[name]:
-                message = reader.deserialize(raw, connection.msgtype)
-                stamp, points = livox_points(raw)
-                assert stamp == message.timebase
-                np.testing.assert_array_equal(points, sweep_points(message))
+def _recording(folder: Path, name: str) -> Path:
+    """The folder of a recording of the arena: bag and calibration."""
+    place = folder / "set" / "recordings" / "one"
+    if not place.exists():
+        place.mkdir(parents=True)
+        (place / "recording").symlink_to(folder / bags.MCAP)
+        scene = record.draw_scene(record.Course("one", "smooth", name, distance=1.0), SEED)
+        (place / "calibration.yaml").write_text(json.dumps(record.calibration(scene)))
+    return place
 
 
 def test_evalio_loads_a_recording_with_its_own_classes(made, monkeypatch):
     name, folder = made
-    (folder / "set" / "recordings" / "one").mkdir(parents=True, exist_ok=True)
-    place = folder / "set" / "recordings" / "one"
-    if not (place / "recording").exists():
-        (place / "recording").symlink_to(folder / bags.MCAP)
-    scene = record.draw_scene(record.Course("one", "smooth", name, distance=1.0), SEED)
-    (place / "calibration.yaml").write_text(json.dumps(record.calibration(scene)))
+    _recording(folder, name)
     from evalio.types import ImuMeasurement
 
     from benchmarks.slam import evalio_sets
@@ -264,17 +257,6 @@ def test_a_set_is_planned_from_its_seed_and_a_secret_hides_it():
     secret = [sets.course_seed(replace(config, secret=5), one).entropy for one in plan]
     assert len(set(secret)) == len(plan)
     assert secret != [sets.course_seed(replace(config, secret=6), one).entropy for one in plan]
-
-
-@pytest.mark.parametrize(("change", "sentence"), [
-    ({"courses": ("moon",)}, "no course 'moon'; there are walls-smooth"), ({"courses": ()}, "nothing to record"),
-    ({"formats": ()}, "nothing to record"), ({"distance": float("nan")}, "distance must lie"),
-    ({"seed": -1}, "seed must be at least 0"), ({"jobs": 0}, "jobs must be at least 1"),
-])  # fmt: skip
-def test_wrong_settings_are_refused_before_anything_is_written(tmp_path, change, sentence):
-    with pytest.raises(BenchmarkError, match=sentence):
-        list(sets.make_arena(replace(sets.ArenaConfig(tmp_path / "o"), **change)))
-    assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.slow

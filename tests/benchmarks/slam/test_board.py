@@ -105,14 +105,3 @@ def test_poses_are_scored_without_bags_and_what_was_not_run_is_left_out(sets, tm
         board.plan_board(board.BoardConfig(tmp_path / "other", tuple(sets), config.programs, run=False))
     with pytest.raises(BenchmarkError, match="needs no-such-package"):
         board.plan_board(board.BoardConfig(tmp_path, tuple(sets), config.programs))
-
-
-@pytest.mark.parametrize(("words", "sentence"), [
-    ({"sets": ()}, "must name at least one"), ({"jobs": 0}, "jobs must be at least 1"),
-    ({"programs": ("moon",)}, "no program 'moon'; there are wheel-odometry"),
-    ({"sets": (Path("a/x"), Path("b/x"))}, "differ in the last part"),
-])  # fmt: skip
-def test_wrong_settings_of_a_board_are_refused(tmp_path, words, sentence):
-    settings = {"sets": (tmp_path,), "out": tmp_path / "o"} | words
-    with pytest.raises(BenchmarkError, match=sentence):
-        board.plan_board(board.BoardConfig(**settings))

@@ -3,14 +3,17 @@
 Each takes a generator of random numbers, and returns points (m, survey frame) and the fields of the truth.
 """
 
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from manifold3d import Manifold, OpType
 
 from tests.benchmarks.dirty.clouds.air import Arch, box, draw_alignment, prism, trapezoid
+from tests.benchmarks.dirty.clouds.files import write_laz, write_truth
 from tests.benchmarks.dirty.clouds.scanner import HEIGHT, Scan, choose
 from tests.benchmarks.dirty.clouds.site import LENGTH, Site, bore
 
@@ -47,15 +50,6 @@ def outliers(rng: np.random.Generator) -> Cloud:
     return np.concatenate([points, rng.uniform(low, high, (len(points) // 100, 3))]), truth
 
 
-def ghosts(rng: np.random.Generator) -> Cloud:
-    """Return the arch with the trail of a walker: 11 % of all points, within reach of the axis up to 1.9 m."""
-    site = bore(draw_alignment(rng)).telling(cause=(*CLEARED, "ghost", "moving", "walk", "person", "people"))
-    points, truth = finish(rng, site)
-    count = round(len(points) * 0.11 / 0.89)
-    trail = np.stack([rng.uniform(0, LENGTH, count), rng.normal(0, 0.22, count), rng.uniform(0.05, 1.9, count)], axis=1)
-    return np.concatenate([points, site.alignment.place(trail)]), truth
-
-
 def _beside(site: Site, left: float) -> Site:
     tripods = site.tripods.copy()
     tripods[:, 1] = left
@@ -72,14 +66,6 @@ def vehicle(rng: np.random.Generator) -> Cloud:
     return finish(rng, site.telling(trouble=(at, at + 6.0), cause=THINGS))
 
 
-def train(rng: np.random.Generator) -> Cloud:
-    """Return the arch with a train of 20 m on its axis."""
-    at = rng.uniform(15.0, 25.0)
-    body = box((at, -1.4, 0.9), (at + 20.0, 1.4, 3.6)) + box((at + 1.0, -0.8, 0.0), (at + 19.0, 0.8, 0.95))
-    site = _beside(bore(draw_alignment(rng)), rng.choice([-2.1, 2.1])).without(body)
-    return finish(rng, site.telling(trouble=(at, at + 20.0), cause=THINGS))
-
-
 def _hidden(rng: np.random.Generator, site: Site, kept: Callable[[np.ndarray], np.ndarray]) -> Cloud:
     whole = site.scanned(rng)
     return choose(whole, kept(whole.local)).point, site.truth(rng, whole)
@@ -89,12 +75,6 @@ def left_wall(rng: np.random.Generator) -> Cloud:
     """Return the arch whose left wall nobody saw up to the springing."""
     site = bore(draw_alignment(rng)).telling(cause=(*UNSEEN, "wall"))
     return _hidden(rng, site, lambda p: (p[:, 1] < HALF - 0.05) | (p[:, 2] > site.arch.springing))
-
-
-def low_floor(rng: np.random.Generator) -> Cloud:
-    """Return the arch of which nothing below 1.2 m was seen."""
-    site = bore(draw_alignment(rng)).telling(cause=("floor",))
-    return _hidden(rng, site, lambda p: p[:, 2] > 1.2)
 
 
 def gap(rng: np.random.Generator) -> Cloud:
@@ -110,17 +90,13 @@ def crown(rng: np.random.Generator) -> Cloud:
     return _hidden(rng, site, lambda p: p[:, 2] < site.arch.springing + 0.6)
 
 
-def niche(depth: float) -> Callable[[np.random.Generator], Cloud]:
-    """Return a maker of the arch with a niche 3 m wide and `depth` m deep in a wall."""
-
-    def make(rng: np.random.Generator) -> Cloud:
-        at, side = rng.uniform(20.0, 36.0), rng.choice([-1.0, 1.0])
-        low, high = sorted([side * (HALF - 0.3), side * (HALF + depth)])
-        site = bore(draw_alignment(rng))
-        site = replace(site, air=site.air + box((at, low, 0.0), (at + 3.0, high, 2.4)))
-        return finish(rng, site.telling(trouble=(at, at + 3.0), cause=OPENINGS))
-
-    return make
+def niche(rng: np.random.Generator) -> Cloud:
+    """Return the arch with a niche 3 m wide and 2.5 m deep in a wall."""
+    at, side = rng.uniform(20.0, 36.0), rng.choice([-1.0, 1.0])
+    low, high = sorted([side * (HALF - 0.3), side * (HALF + 2.5)])
+    site = bore(draw_alignment(rng))
+    site = replace(site, air=site.air + box((at, low, 0.0), (at + 3.0, high, 2.4)))
+    return finish(rng, site.telling(trouble=(at, at + 3.0), cause=OPENINGS))
 
 
 def duct(rng: np.random.Generator) -> Cloud:
@@ -141,47 +117,30 @@ def pillars(rng: np.random.Generator) -> Cloud:
     return finish(rng, site.telling(cause=("pillar", "column", *UNEXPLAINED), must_say=True))
 
 
-def _with_cutting(rng: np.random.Generator, run: float, arch: Arch | None = None) -> Site:
-    """The arch, whose last mouth opens into a cutting of a length, m, with slopes."""
-    site = bore(draw_alignment(rng), arch)
-    top, end = 9.0, site.length + run
-    outline = trapezoid(0.5 * site.arch.width + rng.uniform(0.2, 1.0), rng.uniform(0.7, 1.2), top)
-    stands = np.arange(site.length + 1.5, end, 4.0)
+def cutting(rng: np.random.Generator) -> Cloud:
+    """Return the arch, whose last mouth opens into 10 m of a cutting with slopes."""
+    site = bore(draw_alignment(rng))
+    top, end = 9.0, LENGTH + 10.0
+    outline = trapezoid(HALF + rng.uniform(0.2, 1.0), rng.uniform(0.7, 1.2), top)
+    stands = np.arange(LENGTH + 1.5, end, 4.0)
     more = np.stack([stands, 0 * stands, np.full_like(stands, HEIGHT)], axis=1)
 
     def sky(local: np.ndarray) -> np.ndarray:
         return (local[:, 0] < 1e-3) | (local[:, 0] > end - 1e-3) | (local[:, 2] > top - 1e-3)
 
-    return replace(
-        site, air=site.air + prism(outline, site.length, end), sky=sky, tripods=np.concatenate([site.tripods, more])
-    ).telling(cause=OUTSIDE)
+    air = site.air + prism(outline, LENGTH, end)
+    site = replace(site, air=air, sky=sky, tripods=np.concatenate([site.tripods, more]))
+    return finish(rng, site.telling(cause=OUTSIDE))
 
 
-def cutting(run: float) -> Callable[[np.random.Generator], Cloud]:
-    """Return a maker of the arch with `run` m of a cutting before its last mouth."""
-    return lambda rng: finish(rng, _with_cutting(rng, run))
-
-
-def vegetation(rng: np.random.Generator) -> Cloud:
-    """Return the arch with a bush of 3 m before its last mouth."""
-    site = bore(draw_alignment(rng)).telling(cause=(*OUTSIDE, *CLEARED))
-    bush = rng.normal([LENGTH + 2.0, rng.uniform(-2.0, 2.0), 1.5], [0.8, 1.2, 0.8], (6000, 3))
-    return finish(rng, site, extra=site.alignment.place(bush[bush[:, 2] > 0.0]))
-
-
-def road(rng: np.random.Generator, radius: float | None = None) -> Cloud:
+def road(rng: np.random.Generator) -> Cloud:
     """Return a road bore of 11.5 m with kerbs on both sides."""
     arch = Arch(11.5, 7.5, 2.2)
     kerbs = [
         box((-1.0, *low), (LENGTH + 1.0, *high)) for low, high in (((-6, -1), (-4.6, 0.18)), ((4.6, -1), (6, 0.18)))
     ]
-    site = bore(draw_alignment(rng, radius), arch).without(kerbs[0] + kerbs[1])
-    return finish(rng, site.telling(track="none", cause=("kerb", "walkway", "radius")))
-
-
-def road_bend(rng: np.random.Generator) -> Cloud:
-    """Return the road bore at a radius of 80 m."""
-    return road(rng, 80.0)
+    site = bore(draw_alignment(rng), arch).without(kerbs[0] + kerbs[1])
+    return finish(rng, site.telling(track="none", cause=("kerb", "walkway")))
 
 
 def skewed(rng: np.random.Generator) -> Cloud:
@@ -197,3 +156,31 @@ def skewed(rng: np.random.Generator) -> Cloud:
 
     site = replace(site, air=air, sky=outside, tripods=site.tripods[site.tripods[:, 0] < at - HALF])
     return finish(rng, site.telling(span=(2.0, at - HALF * lean - 1.0), cause=(*OUTSIDE, "skew")))
+
+
+def room(rng: np.random.Generator) -> Cloud:
+    """Return a room of 12 × 10 × 4 m, which is no tunnel."""
+    alignment = draw_alignment(rng)
+    tripods = np.array([(4.0, 0.0, HEIGHT), (8.0, 1.0, HEIGHT)])
+    site = Site(alignment, Arch(), 20.0, box((0, -5, 0), (12, 5, 4)), tripods, lambda local: np.zeros(len(local), bool))
+    axis = alignment.place(np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]]))
+    told = {"expect": "refused", "cause": ("room",), "span": np.array([0.0, 20.0]), "width": np.nan}
+    return site.scanned(rng).point, {"axis": axis, "wall": np.empty((0, 3)), **told}
+
+
+def y_up(rng: np.random.Generator) -> Cloud:
+    """Return the arch with y up, as modelling programs have it: x, z, -y."""
+    points, truth = clean(rng)
+    return points[:, [0, 2, 1]] * (1.0, 1.0, -1.0), {**truth, "cause": ("axes", "y up")}
+
+
+MAKERS = (clean, outliers, vehicle, left_wall, gap, crown, niche, duct, pillars, cutting, road, skewed, room, y_up)
+
+
+def make_troubles(folder: Path, seed: int = 0, only: tuple[str, ...] = ()) -> None:
+    """Writes the cloud of each maker, or of those of some names, with its truth."""
+    for make in MAKERS:
+        if not only or make.__name__ in only:
+            points, truth = make(np.random.default_rng([seed, zlib.crc32(make.__name__.encode())]))
+            write_laz(folder / f"{make.__name__}.laz", points)
+            write_truth(folder / f"{make.__name__}_truth.npz", "trouble", truth)
