@@ -22,7 +22,7 @@ from benchmarks.slam.reading import (
     count_messages,
     recordings_in,
 )
-from subterra_jax.host.files import replace_file
+from subterra_jax.host.files import replace_file, require_folder
 
 _ALONE = "import sys; from benchmarks.slam.programs import main; sys.exit(main(sys.argv[1:]))"
 _SAYS = '{"poses"'  # beginning of the line in which the process reports
@@ -139,6 +139,7 @@ def run_all(config: RunConfig) -> Iterator[tuple[str, str]]:
             it reads.
     """
     find_program(config.library)
+    require_folder(config.out)
     folders, topic = recordings_in(config.recordings), ""
     if config.library != WHEELS:
         topic = PROGRAMS[config.library].topic

@@ -20,17 +20,18 @@ CROISSANT, DATASHEET = "croissant.json", "datasheet.md"
 _LICENCE = "https://spdx.org/licenses/Apache-2.0.html"
 _ENCODINGS = {".mcap": "application/x-mcap", ".bag": "application/x-rosbag", ".yaml": "application/yaml",
               ".tum": "text/plain"}  # fmt: skip
-_OF_CROISSANT = (
-    "citeAs column extract field fileProperty fileObject fileSet format equivalentProperty samplingRate includes "
-    "isLiveDataset jsonPath key md5 parentField path recordSet references regex repeated replace separator source "
-    "subField transform"
-).split()
 _CONTEXT = {
     "@language": "en", "@vocab": "https://schema.org/", "sc": "https://schema.org/",
     "cr": "http://mlcommons.org/croissant/", "rai": "http://mlcommons.org/croissant/RAI/",
-    "dct": "http://purl.org/dc/terms/", "conformsTo": "dct:conformsTo",
+    "dct": "http://purl.org/dc/terms/", "citeAs": "cr:citeAs", "column": "cr:column", "conformsTo": "dct:conformsTo",
     "data": {"@id": "cr:data", "@type": "@json"}, "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "examples": {"@id": "cr:examples", "@type": "@json"}, **{name: f"cr:{name}" for name in _OF_CROISSANT},
+    "examples": {"@id": "cr:examples", "@type": "@json"}, "extract": "cr:extract", "field": "cr:field",
+    "fileProperty": "cr:fileProperty", "fileObject": "cr:fileObject", "fileSet": "cr:fileSet", "format": "cr:format",
+    "equivalentProperty": "cr:equivalentProperty", "samplingRate": "cr:samplingRate",
+    "includes": "cr:includes", "isLiveDataset": "cr:isLiveDataset", "jsonPath": "cr:jsonPath", "key": "cr:key",
+    "md5": "cr:md5", "parentField": "cr:parentField", "path": "cr:path", "recordSet": "cr:recordSet",
+    "references": "cr:references", "regex": "cr:regex", "repeated": "cr:repeated", "replace": "cr:replace",
+    "separator": "cr:separator", "source": "cr:source", "subField": "cr:subField", "transform": "cr:transform",
 }  # fmt: skip
 _FIELDS = {
     "name": ("sc:Text", "Name of the recording and of its folder"),
