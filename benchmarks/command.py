@@ -1,7 +1,12 @@
-"""Command lines of this room: settings from words, mistakes as one sentence with status 2."""
+"""Command lines of this room: settings from words, mistakes as one sentence with status 2, other commands run."""
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
-from typing import Any, TypeVar
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
 import tyro
 
@@ -40,6 +45,35 @@ def run_main(
     prog = f"python -m benchmarks.{name}"
     config = parse(lambda given: tyro.cli(settings, args=given, prog=prog, description=description), words)
     return run_command(lambda: act(config), interrupted, INPUT_ERRORS)
+
+
+class Ran(NamedTuple):
+    """How a command ended.
+
+    Attributes:
+        status: Exit status.
+        message: Where it failed, the last line of its log, which is the sentence of an error; empty where it did not.
+        memory: Peak memory, GiB.
+    """
+
+    status: int
+    message: str
+    memory: float
+
+
+def run_module(module: str, *words: object, log: Path | None = None) -> Ran:
+    """Runs `python -m MODULE WORDS` as a user would; what it prints goes to the end of `log` if that is given."""
+    command = [sys.executable, "-m", module, *map(str, words)]
+    print(f"$ python -m {' '.join(command[2:])}", flush=True)
+    if log is not None:
+        log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") if log is not None else nullcontext() as out:
+        process = subprocess.Popen(command, stdout=out, stderr=None if out is None else subprocess.STDOUT)
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    text = "" if log is None else log.read_text(errors="replace").replace("\r", "\n").strip()
+    last = text.splitlines()[-1].strip() if text else f"ended with status {process.returncode}"
+    return Ran(process.returncode, last if process.returncode else "", usage.ru_maxrss / 2**20)
 
 
 def require_least(settings: Any, **least: int) -> None:

@@ -2,7 +2,6 @@
 
 import io
 import json
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.command import run_main
+from benchmarks.command import run_main, run_module
 from benchmarks.report import write_report
 from benchmarks.truth import Truth, compare, load_truth, start_placement
 from scene.survey.config import SurveyConfig, check_survey
@@ -50,32 +49,10 @@ def timed(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
     print(f"--- {seconds[name]:.1f} s", flush=True)
 
 
-def run_module(module: str, *inputs: Path, may_fail: bool = False, **options: object) -> str | None:
-    """Runs `python -m MODULE INPUTS --OPTION VALUE ...` as a user would.
-
-    Args:
-        module: Module to run.
-        *inputs: Its positional words.
-        may_fail: Whether an error is an answer too.
-        **options: Its options; `True` has no value, a tuple several.
-
-    Returns:
-        The error sentence of a command that may fail and did, else `None`.
-
-    Raises:
-        SystemExit: A command failed that may not fail.
-    """
-    words = [module, *map(str, inputs)]
-    for name, value in options.items():
-        values = () if value is True else value if isinstance(value, tuple) else (value,)
-        words += [f"--{name.replace('_', '-')}", *map(str, values)]
-    print(f"$ python -m {' '.join(words)}", flush=True)
-    done = subprocess.run([sys.executable, "-m", *words], stderr=subprocess.PIPE if may_fail else None, text=True)
-    if done.returncode == 0:
-        return None
-    if not may_fail:
-        sys.exit(done.returncode)
-    return (done.stderr or "").strip().splitlines()[-1]
+def _run(module: str, *words: object) -> None:
+    """Runs a command; one that fails ends the demo."""
+    if status := run_module(module, *words).status:
+        sys.exit(status)
 
 
 def step_in_mujoco_and_mjx(scene: Path) -> dict[str, Any]:
@@ -110,22 +87,23 @@ def main(config: DemoConfig) -> None:
     """
     out, started, seconds = config.out, time.monotonic(), dict[str, float]()
     require_folder(out)
-    size: dict[str, Any] = {"length": config.length, "seed": config.seed, "point_rate": config.point_rate}
-    check_survey(SurveyConfig(out / "survey", **size))
     survey, scene, blind, run = (out / name for name in ("survey", "scene", "scene-odometry", "training"))
-    bag, trajectory = survey / "survey.bag", survey / "groundtruth.tum"
+    check_survey(SurveyConfig(survey, length=config.length, seed=config.seed, point_rate=config.point_rate))
+    bag, seed = survey / "survey.bag", ("--seed", config.seed)
+    simulated = ("--provenance", "simulated", "--out")
     with timed(seconds, "survey", f"1/6 Simulating a survey of {config.length:g} m (a ROS1 bag in GEODE's layout)"):
-        run_module("scene.survey", **size, out=survey)
+        size = ("--length", config.length, "--point-rate", config.point_rate)
+        _run("scene.survey", *size, *seed, "--out", survey)
     with timed(seconds, "build", "2/6 Reconstructing the bore from the bag, poses given"):
-        run_module("scene.build", bag, trajectory=trajectory, provenance="simulated", out=scene)
+        _run("scene.build", bag, "--trajectory", survey / "groundtruth.tum", *simulated, scene)
     with timed(seconds, "build_odometry", "3/6 The same without poses: LiDAR odometry alone"):
-        failure = run_module("scene.build", bag, may_fail=True, provenance="simulated", out=blind)
-        print(failure or "")
+        failure = run_module("scene.build", bag, *simulated, blind, log=out / "build-odometry.txt").message
+        print(failure)
     with timed(seconds, "load", "4/6 Loading the scene into MuJoCo and MJX"):
         loaded = step_in_mujoco_and_mjx(scene)
         print(", ".join(f"{name} {value}" for name, value in loaded.items()))
     with timed(seconds, "train", f"5/6 Training on the reconstructed bore ({TASK})"):
-        run_module("train", task=TASK, tunnel=scene / "tunnel.npz", seed=config.seed, overwrite=True, out=run)
+        _run("train", "--task", TASK, "--tunnel", scene / "tunnel.npz", *seed, "--overwrite", "--out", run)
     with timed(seconds, "report", "6/6 Writing the report"):
         truth = load_truth(survey / "truth.json")
         summary: dict[str, Any] = {
@@ -156,7 +134,7 @@ def _training_figures(run: Path) -> dict[str, Any]:
     }
 
 
-def _odometry_figures(survey: Path, scene: Path, truth: Truth, failure: str | None) -> dict[str, Any]:
+def _odometry_figures(survey: Path, scene: Path, truth: Truth, failure: str) -> dict[str, Any]:
     if failure:
         return {"failure": failure}
     placement = start_placement(scene / "odometry.tum", survey / "groundtruth.tum")

@@ -5,8 +5,6 @@
 
 import json
 import math
-import os
-import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -19,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from benchmarks.command import run_main
+from benchmarks.command import run_main, run_module
 from benchmarks.fidelity.candidate import load_candidate
 from benchmarks.fidelity.derive.surface import Nearest, visible_mesh
 from benchmarks.fidelity.references import HoldConfig, load_hold
@@ -152,15 +150,12 @@ def show(rows: list[dict[str, Any]], console: Console) -> None:
     console.print(table)
 
 
-def _run(module: str, *arguments: object) -> float:
-    """Runs `python -m module …`; returns its peak memory, GiB."""
-    words = [sys.executable, "-m", module, *(str(argument) for argument in arguments)]
-    print(f"$ python -m {' '.join(words[2:])}", flush=True)
-    process = subprocess.Popen(words)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        sys.exit(os.waitstatus_to_exitcode(status))
-    return usage.ru_maxrss / 2**20
+def _run(module: str, *words: object) -> float:
+    """Runs a command and returns its peak memory, GiB; one that fails ends this one too."""
+    ran = run_module(module, *words)
+    if ran.status:
+        sys.exit(ran.status)
+    return ran.memory
 
 
 def check(config: ReconstructionConfig) -> None:

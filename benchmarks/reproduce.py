@@ -4,7 +4,6 @@ Example: python -m benchmarks.reproduce --jobs speed metro --out out/reproduce
 """
 
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command import BenchmarkError, run_main
+from benchmarks.command import BenchmarkError, run_main, run_module
 from benchmarks.records import Record, number, on_record, read_records
 from benchmarks.results import environment_facts, write_file
 from subterra_jax.host.files import require_folder
@@ -99,14 +98,11 @@ def run_job(job: Job, folder: Path, shared: Path) -> dict[str, float] | None:
     if not result.exists():
         if job.needs and not Path(job.needs.format(shared=shared)).exists():
             return None
-        folder.mkdir(parents=True, exist_ok=True)
         for command in job.commands:
             words = [word.format(out=folder, shared=shared) for word in command.split()]
-            print(f"$ python -m {' '.join(words)}", flush=True)
-            with (folder / "log.txt").open("a") as log:
-                code = subprocess.run([sys.executable, "-m", *words], stdout=log, stderr=log, check=False).returncode
-            if code and not result.exists():  # a missed goal also ends with a status
-                raise BenchmarkError(f"{folder / 'log.txt'}: python -m {words[0]} ended with status {code}")
+            status = run_module(*words, log=folder / "log.txt").status
+            if status and not result.exists():  # a missed goal also ends with a status
+                raise BenchmarkError(f"{folder / 'log.txt'}: python -m {words[0]} ended with status {status}")
     if job.read is not None:
         return job.read(json.loads(result.read_text()))
     return {record.id: record.value for record in read_records(result)}

@@ -6,7 +6,6 @@ Example: python -m benchmarks.dirty ../shared/data/dirty_clouds --out out/dirty
 import json
 import math
 import shutil
-import subprocess
 import sys
 import time
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from benchmarks.command import run_main
+from benchmarks.command import run_main, run_module
 from benchmarks.dirty.figures import judge_scene
 from benchmarks.dirty.truth import Case, find_cases, load_truth
 from benchmarks.dirty.verdict import judge_build, list_faults, untold_faults
@@ -73,17 +72,13 @@ def judge(config: JudgeConfig) -> None:
 def judge_case(case: Case, config: JudgeConfig) -> dict[str, Any]:
     """Builds a case by the command line, as a user would, and returns its row of results."""
     scene, log = config.out / "scenes" / case.name, config.out / "logs" / f"{case.name}.txt"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    words = [sys.executable, "-m", "scene.build", *case.words, "--out", str(scene), "--fresh", *config.flags.split()]
     started = time.monotonic()
-    with log.open("wb") as out:
-        status = subprocess.run(words, stdout=out, stderr=subprocess.STDOUT).returncode
+    ran = run_module("scene.build", *case.words, "--out", scene, "--fresh", *config.flags.split(), log=log)
     seconds, truth = time.monotonic() - started, load_truth(case)
-    lines = [line for line in log.read_text(errors="replace").replace("\r", "\n").splitlines() if line.strip()]
-    row: dict[str, Any] = {"name": case.name, "kind": case.kind, "status": status, "seconds": seconds}
-    row |= {"message": lines[-1].strip() if status and lines else "", "warnings": [], "faults": [], "untold": []}
+    row: dict[str, Any] = {"name": case.name, "kind": case.kind, "seconds": seconds, **ran._asdict()}
+    row |= {"warnings": [], "faults": [], "untold": []}
     faults = []
-    if status == 0:
+    if ran.status == 0:
         row["warnings"] = json.loads((scene / "manifest.json").read_text()).get("judgement", {}).get("warnings", [])
         row |= judge_scene(scene, truth)
         faults = list_faults(row, truth)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.command import BenchmarkError
-from benchmarks.demo import run_module
+from benchmarks.command import BenchmarkError, run_module
 from benchmarks.draw.frame import Stretch, load_frame
 from benchmarks.draw.paper import depth_image, main
 from benchmarks.draw.scene import Pose
@@ -81,10 +80,10 @@ def test_learning_curves_of_several_seeds_are_one_figure(tmp_path):
 @pytest.mark.slow
 def test_the_figures_of_a_short_survey(tmp_path):
     survey, scene = tmp_path / "survey", tmp_path / "scene"
-    size = {"truth": "metro", "length": 30, "seed": 0, "scan_every": 10, "out": survey}
-    run_module("scene.survey", **size, sensors=("avia", "os1"))
-    given = {"trajectory": survey / "groundtruth.tum", "provenance": "simulated", "out": scene}
-    run_module("scene.build", survey / "survey.bag", **given)
+    size = ["--truth", "metro", "--length", "30", "--seed", "0", "--scan-every", "10", "--sensors", "avia", "os1"]
+    assert run_module("scene.survey", *size, "--out", survey).status == 0
+    given = ("--trajectory", survey / "groundtruth.tum", "--provenance", "simulated")
+    assert run_module("scene.build", survey / "survey.bag", *given, "--out", scene).status == 0
     assert main(["--survey", str(survey), "--scene", str(scene), "--out", str(tmp_path)]) == 0
     captions = json.loads((tmp_path / "figures.json").read_text())
     assert list(captions) == ["fig1", "fig2", "fig3a", "fig3b"]
