@@ -52,7 +52,6 @@ def _record(id: str, score: Score, cell: dict[str, Any], split: str) -> Record:
         split=split,
         seed=None,
         command=f"benchmarks.board --tasks {cell['task']} --start {start} --agents {cell['agent']} --out out/board",
-        commit=cell["facts"].get("commit"),
         tolerance=share(score.high - score.low) / 2.0 if score.n else 0.1,
         **of_facts(cell["facts"]),
     )
