@@ -5,6 +5,7 @@
 
 import json
 import math
+import re
 import sys
 import time
 from dataclasses import asdict, dataclass
@@ -230,19 +231,22 @@ def sleeper_figures(scene: Path, survey: Path) -> dict[str, float]:
     Returns:
         `sleeper_f1`, and `gauge_error`: measured less true gauge, m; NaN where none was measured.
     """
-    import mujoco
-
     truth: dict[str, Any] = json.loads((survey / "truth.json").read_text())
-    model = mujoco.MjModel.from_xml_path(str(scene / "scene.xml"))
-    names = [model.geom(i).name for i in range(model.ngeom)]
-    built = model.geom_pos[[i for i, name in enumerate(names) if name.startswith("sleeper_")], :2]
-    true = np.asarray(truth["sleepers"]["position"], float).reshape(-1, 3)[:, :2]
-    i, _ = one_to_one(built + _origin(scene)[:2], true)
+    built = sleepers_of(scene)
+    true = np.asarray(truth["sleepers"]["position"], float).reshape(-1, 3)
+    i, _ = one_to_one(built[:, :2] + _origin(scene)[:2], true[:, :2])
     gauge = json.loads((scene / "manifest.json").read_text())["track"].get("gauge_seen")
     return {
         "sleeper_f1": f1(len(i), len(built), len(true)),
         "gauge_error": float("nan") if gauge is None else gauge - truth["rails"]["gauge"],
     }
+
+
+def sleepers_of(scene: Path) -> Float[np.ndarray, "n 3"]:
+    """Returns the middles of the sleepers in `scene.xml`, m."""
+    geoms = re.findall(r'<geom[^>]*name="sleeper_[^>]*>', (scene / "scene.xml").read_text())
+    places = [re.search(r'pos="([^"]*)"', geom) for geom in geoms]
+    return np.array([place[1].split() for place in places if place], float).reshape(-1, 3)
 
 
 def f1(hits: int, built: int, true: int) -> float:

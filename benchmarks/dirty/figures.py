@@ -1,7 +1,6 @@
 """Figures of a built scene against truth, read off its meshes; nothing is aligned, fitted or scaled."""
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from scipy.ndimage import median_filter
 
 from benchmarks.dirty.truth import Truth
 from benchmarks.fidelity.derive.surface import Caster, Nearest
-from benchmarks.reconstruction import f1, one_to_one
+from benchmarks.reconstruction import f1, one_to_one, sleepers_of
 
 NEAR = 0.10  # m within which a wall point counts as met
 _STEP = 0.5  # m between the stations at which sizes are read
@@ -174,15 +173,9 @@ def project_station(point: Float[np.ndarray, "3"], truth: Truth) -> float:
     return float(truth.station[row] + (point - truth.axis[row]) @ along)
 
 
-_SLEEPER = re.compile(r'<geom[^>]*name="sleeper_[^>]*>')
-_PLACE = re.compile(r'pos="([^"]*)"')
-
-
 def track_figures(scene: Path, manifest: dict[str, Any], origin: np.ndarray, truth: Truth) -> dict[str, Any]:
     """Return what track was built, and how well it meets a true one."""
-    text = (scene / "scene.xml").read_text()
-    places = [_PLACE.search(geom) for geom in _SLEEPER.findall(text)]
-    built = np.array([place[1].split() for place in places if place], float).reshape(-1, 3)
+    built = sleepers_of(scene)
     facts = manifest.get("track", {})
     figures = {
         "sleepers": len(built),
