@@ -103,8 +103,8 @@ def test_what_is_there_is_not_measured_again_and_is_held_against_the_records(tmp
 def test_a_job_that_fails_names_its_log_and_one_without_its_input_is_left_out(tmp_path):
     missing = reproduce.Job(("scene.build x",), 1.0, needs="{shared}/nowhere")
     assert reproduce.run_job(missing, tmp_path / "a", tmp_path) is None
-    failing = reproduce.Job(("benchmarks.draw moon",), 1.0)
-    with pytest.raises(BenchmarkError, match=r"log.txt: python -m benchmarks.draw ended with status 2"):
+    failing = reproduce.Job(("json.tool nowhere.json",), 1.0)
+    with pytest.raises(BenchmarkError, match=r"log.txt: python -m json.tool ended with status"):
         reproduce.run_job(failing, tmp_path / "b", tmp_path)
 
 
