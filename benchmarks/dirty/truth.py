@@ -126,14 +126,14 @@ def load_truth(case: Case) -> Truth:
         values: dict[str, Any] = {name: data[name] for name in data}
     known = DESCRIBED.get(case.kind) if "width" not in values and case.source.suffix == ".laz" else None
     if known is not None:
-        facts = {"track": known.track, "proud": known.proud, "bulge": known.bulge, "band": BAND}
+        facts: dict[str, Any] = {"track": known.track, "proud": known.proud, "bulge": known.bulge, "band": BAND}
         values = facts | {"gauge": GAUGE if known.track != "none" else np.nan} | values
         values |= measure_sizes(case.source, values["axis"], values["wall"], known)
     values = {**dict.fromkeys(_ALONG[:3], np.nan), **values}
     given = {name: read(values[name]) for name, read in _READ.items() if name in values}
     count = len(given["axis"])
-    along = {name: np.broadcast_to(np.asarray(values[name], float), count) for name in _ALONG if name in values}
-    return Truth(**given, **along)
+    given |= {name: np.broadcast_to(np.asarray(values[name], float), count) for name in _ALONG if name in values}
+    return Truth(**given)
 
 
 def _opened(path: Path) -> "np.lib.npyio.NpzFile":

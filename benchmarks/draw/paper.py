@@ -82,8 +82,8 @@ class Material:
     @cached_property
     def case(self) -> Case:
         """Scene with the held-out OS1."""
-        candidate, held_out = load_candidate(self.scene), (self.survey / name for name in SURVEY_FILES[2:])
-        return Case(candidate, load_hold(*held_out, candidate.origin, HoldConfig(scan_spacing=0.5, sigma=0.03)))
+        candidate, (bag, poses) = load_candidate(self.scene), (self.survey / name for name in SURVEY_FILES[2:])
+        return Case(candidate, load_hold(bag, poses, candidate.origin, HoldConfig(scan_spacing=0.5, sigma=0.03)))
 
     @cached_property
     def residual(self) -> Float[np.ndarray, " k"]:
@@ -285,9 +285,9 @@ def run(config: PaperConfig) -> None:
     if config.runs is None and (config.survey is None or config.scene is None):
         raise BenchmarkError("figures 1 to 3 need --survey and --scene, figure 4 needs --runs")
     for folder, files in ((config.survey, SURVEY_FILES), (config.scene, SCENE_FILES)):
-        for file in files if folder is not None else ():
-            if not (folder / file).exists():
-                raise BenchmarkError(f"{folder / file}: no such file")
+        missing = [folder / file for file in files if not (folder / file).exists()] if folder is not None else []
+        if missing:
+            raise BenchmarkError(f"{missing[0]}: no such file")
     runs = [] if config.runs is None else sorted(config.runs.glob("seed-*"), key=lambda run: (len(run.name), run.name))
     if config.runs is not None and not runs:
         raise BenchmarkError(f"{config.runs}: holds no run folders seed-0, seed-1, ... of train")

@@ -85,7 +85,8 @@ def estimate_poses(step: Step, sweeps: Iterable[Sweep]) -> Poses:
     Raises:
         BenchmarkError: A sweep holds no point.
     """
-    times, poses, started = [], [], time.perf_counter()
+    times: list[float] = []
+    poses, started = [], time.perf_counter()
     for stamp, points in sweeps:
         if not len(points):
             raise BenchmarkError(f"sweep {len(times)} holds no point")

@@ -23,7 +23,7 @@ def as_rows(scores: list[ProgramScore]) -> list[tuple[str, ...]]:
     def cell(value: float | None, digits: int = 2) -> str:
         return "" if value is None else f"{value:.{digits}f}"
 
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for one in sorted(scores, key=lambda one: (one.score.name, one.program)):
         s = one.score
         rows.append((
