@@ -59,8 +59,9 @@ def judge(config: JudgeConfig) -> None:
     rows: list[dict[str, Any]] = []
     for case in find_cases(config.folder, config.only):
         file = config.out / "rows" / f"{case.name}.json"
-        rows.append(json.loads(file.read_text()) if file.is_file() else judge_case(case, config))
-        write_file(file, (json.dumps(rows[-1], indent=1) + "\n").encode())
+        if not file.is_file():
+            write_file(file, (json.dumps(judge_case(case, config), indent=1) + "\n").encode())
+        rows.append(json.loads(file.read_text()))
         _progress.print(f"{case.name}: {rows[-1]['verdict']}", markup=False)
         facts = {"schema": SCHEMA, **environment_facts(), "rows": rows}
         write_file(config.out / "dirty.json", (json.dumps(facts, indent=1) + "\n").encode())
