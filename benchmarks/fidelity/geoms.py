@@ -26,17 +26,11 @@ def load_model(scene: Path) -> mujoco.MjModel:
 
 @dataclass(frozen=True)
 class Geoms:
-    """Geoms of a compiled scene at the model's first pose.
+    """Geoms of a compiled scene at the model's first pose."""
 
-    Attributes:
-        model: The scene.
-        data: Its placed data.
-        names: Name of each geom, by number.
-    """
-
-    model: mujoco.MjModel
-    data: mujoco.MjData
-    names: tuple[str, ...]
+    model: mujoco.MjModel  # The scene
+    data: mujoco.MjData  # Its placed data
+    names: tuple[str, ...]  # Name of each geom, by number
 
     @classmethod
     def of(cls, model: mujoco.MjModel) -> "Geoms":

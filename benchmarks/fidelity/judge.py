@@ -39,26 +39,17 @@ Values = dict[str, Value]
 
 @dataclass(frozen=True)
 class Judgement:
-    """The result of a run.
+    """The result of a run."""
 
-    Attributes:
-        values: Raw values of `base`, `null`, `null_bare`, and `ceiling` where there is a truth.
-        scored: Their scores.
-        skill: Median skill over the null tube.
-        leaks: Findings of the leak detector.
-        reasons: Reasons for FAIL; empty for PASS.
-        outside: Scores of suite and metrics from outside together, by candidate; empty without such metrics. The
-            verdict does not read them.
-        windows: The worst windows, and the stated faults that they must notice.
-    """
-
-    values: dict[str, Values]
-    scored: dict[str, Scored]
-    skill: float | None
-    leaks: list[str]
-    reasons: list[str]
+    values: dict[str, Values]  # Raw values of `base`, `null`, `null_bare`, and `ceiling` where there is a truth
+    scored: dict[str, Scored]  # Their scores
+    skill: float | None  # Median skill over the null tube
+    leaks: list[str]  # Findings of the leak detector
+    reasons: list[str]  # Reasons for FAIL; empty for PASS
+    # Scores of suite and metrics from outside together, by candidate; empty without such metrics. The verdict does not
+    # read them
     outside: dict[str, Scored] = field(default_factory=dict)
-    windows: Windows = field(default_factory=Windows)
+    windows: Windows = field(default_factory=Windows)  # The worst windows, and the stated faults that they must notice
 
     @property
     def verdict(self) -> str:

@@ -32,36 +32,22 @@ Values = dict[str, Value]
 
 @dataclass(frozen=True)
 class Score:
-    """The score of one metric.
+    """The score of one metric."""
 
-    Attributes:
-        metric: Its row.
-        value: Its raw value.
-        score: 0 to 100; `None` where logged or missing.
-    """
-
-    metric: Metric
-    value: Value
-    score: float | None
+    metric: Metric  # Its row
+    value: Value  # Its raw value
+    score: float | None  # 0 to 100; `None` where logged or missing
 
 
 @dataclass(frozen=True)
 class Scored:
-    """The scores of one candidate.
+    """The scores of one candidate."""
 
-    Attributes:
-        scores: Scores by id, in the order of the table.
-        categories: Score by category; `None` where too much of it is missing.
-        failed_gates: Ids of gates below 50.
-        overall: Mean of the categories that have a score; `None` where none has.
-        saturated: Share of scored metrics at exactly 100.
-    """
-
-    scores: dict[str, Score]
-    categories: dict[str, float | None]
-    failed_gates: tuple[str, ...]
-    overall: float | None
-    saturated: float
+    scores: dict[str, Score]  # Scores by id, in the order of the table
+    categories: dict[str, float | None]  # Score by category; `None` where too much of it is missing
+    failed_gates: tuple[str, ...]  # Ids of gates below 50
+    overall: float | None  # Mean of the categories that have a score; `None` where none has
+    saturated: float  # Share of scored metrics at exactly 100
 
     @property
     def evaluated(self) -> int:

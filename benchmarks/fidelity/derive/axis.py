@@ -154,20 +154,13 @@ _ICP_REACH = 0.5  # m; correspondences farther apart are none
 
 @dataclass(frozen=True)
 class AxisPair:
-    """Two axes at the same reference stations.
+    """Two axes at the same reference stations."""
 
-    Attributes:
-        station: Stations on the reference axis, every metre, `(n,)`.
-        left, up: Offset of the lining's axis, m, `(n,)`.
-        judged: Points of the lining's axis, m, `(n, 3)`.
-        reference: Points of the reference axis, m, `(n, 3)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    left: Float[np.ndarray, " n"]
+    station: Float[np.ndarray, " n"]  # Stations on the reference axis, every metre
+    left: Float[np.ndarray, " n"]  # left, up: Offset of the lining's axis, m
     up: Float[np.ndarray, " n"]
-    judged: Float[np.ndarray, "n 3"]
-    reference: Float[np.ndarray, "n 3"]
+    judged: Float[np.ndarray, "n 3"]  # Points of the lining's axis, m
+    reference: Float[np.ndarray, "n 3"]  # Points of the reference axis, m
 
 
 @per_case

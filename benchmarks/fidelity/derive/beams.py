@@ -69,42 +69,25 @@ _NEAR = 1.0  # m over which the path's frame is taken as straight: less than a m
 
 @dataclass(frozen=True)
 class Returns:
-    """Held-out beams that came back, in the order of time.
+    """Held-out beams that came back, in the order of time."""
 
-    Attributes:
-        scan: Number of the scan, `(n,)`.
-        origin: Position of the sensor, m, `(n, 3)`.
-        direction: Unit vectors, `(n, 3)`.
-        range: Measured range, m, `(n,)`.
-        points: Points of the returns, m, `(n, 3)`.
-        local: Station, left and up of the points along `sensor_path`, m, `(n, 3)`.
-        heading: `direction` in the path's frame at the points, `(n, 3)`.
-    """
-
-    scan: Int[np.ndarray, " n"]
-    origin: Float[np.ndarray, "n 3"]
-    direction: Float[np.ndarray, "n 3"]
-    range: Float[np.ndarray, " n"]
-    points: Float[np.ndarray, "n 3"]
-    local: Float[np.ndarray, "n 3"]
-    heading: Float[np.ndarray, "n 3"]
+    scan: Int[np.ndarray, " n"]  # Number of the scan
+    origin: Float[np.ndarray, "n 3"]  # Position of the sensor, m
+    direction: Float[np.ndarray, "n 3"]  # Unit vectors
+    range: Float[np.ndarray, " n"]  # Measured range, m
+    points: Float[np.ndarray, "n 3"]  # Points of the returns, m
+    local: Float[np.ndarray, "n 3"]  # Station, left and up of the points along `sensor_path`, m
+    heading: Float[np.ndarray, "n 3"]  # `direction` in the path's frame at the points
 
 
 @dataclass(frozen=True)
 class CastBeams:
-    """The beams of `Returns`, cast in the candidate.
+    """The beams of `Returns`, cast in the candidate."""
 
-    Attributes:
-        range: Range in the candidate, m; `inf` where the beam leaves it, `(n,)`.
-        face: Face of `visible_surface`; -1 where nothing is hit, `(n,)`.
-        cosine: Cosine between beam and face normal, 0 to 1, 0 where nothing is hit, `(n,)`.
-        difference: Range in the candidate less range measured, m, `(n,)`.
-    """
-
-    range: Float[np.ndarray, " n"]
-    face: Int[np.ndarray, " n"]
-    cosine: Float[np.ndarray, " n"]
-    difference: Float[np.ndarray, " n"]
+    range: Float[np.ndarray, " n"]  # Range in the candidate, m; `inf` where the beam leaves it
+    face: Int[np.ndarray, " n"]  # Face of `visible_surface`; -1 where nothing is hit
+    cosine: Float[np.ndarray, " n"]  # Cosine between beam and face normal, 0 to 1, 0 where nothing is hit
+    difference: Float[np.ndarray, " n"]  # Range in the candidate less range measured, m
 
     @property
     def hit(self) -> Bool[np.ndarray, " n"]:
@@ -207,15 +190,10 @@ def station_bins(case: Case, station: Float[np.ndarray, " n"]) -> Int[np.ndarray
 
 @dataclass(frozen=True)
 class Silence:
-    """Beams without a return, measured and expected.
+    """Beams without a return, measured and expected."""
 
-    Attributes:
-        silent: True where nothing came back, `(n,)`.
-        expected_silent: True where the candidate gives no return within reach, `(n,)`.
-    """
-
-    silent: Bool[np.ndarray, " n"]
-    expected_silent: Bool[np.ndarray, " n"]
+    silent: Bool[np.ndarray, " n"]  # True where nothing came back
+    expected_silent: Bool[np.ndarray, " n"]  # True where the candidate gives no return within reach
 
 
 @per_case
@@ -249,15 +227,10 @@ _QUANTILES = (5, 25, 50, 75, 95)
 
 @dataclass(frozen=True)
 class BeamDirections:
-    """Direction of every returned beam, relative to the tunnel at the sensor.
+    """Direction of every returned beam, relative to the tunnel at the sensor."""
 
-    Attributes:
-        azimuth: Angle from the tunnel's axis ahead, to the left, rad, `(n,)`.
-        elevation: Angle above the tunnel's axis, rad, `(n,)`.
-    """
-
-    azimuth: Float[np.ndarray, " n"]
-    elevation: Float[np.ndarray, " n"]
+    azimuth: Float[np.ndarray, " n"]  # Angle from the tunnel's axis ahead, to the left, rad
+    elevation: Float[np.ndarray, " n"]  # Angle above the tunnel's axis, rad
 
 
 @per_hold

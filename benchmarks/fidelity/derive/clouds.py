@@ -23,21 +23,13 @@ _ENTROPY_POINTS = 4000
 
 @dataclass(frozen=True)
 class Planes:
-    """Planes through the neighbours of chosen points.
+    """Planes through the neighbours of chosen points."""
 
-    Attributes:
-        point: Chosen points, m, `(n, 3)`.
-        normal: Normals, unit vectors, `(n, 3)`.
-        residual: Distance of the point from its plane, freed of the plane's three parameters, m, `(n,)`.
-        sigma: Standard deviation of the neighbours about it, m, `(n,)`.
-        planarity: (middle - smallest) / largest spread: near 0 for a line or a ball, `(n,)`.
-    """
-
-    point: Float[np.ndarray, "n 3"]
-    normal: Float[np.ndarray, "n 3"]
-    residual: Float[np.ndarray, " n"]
-    sigma: Float[np.ndarray, " n"]
-    planarity: Float[np.ndarray, " n"]
+    point: Float[np.ndarray, "n 3"]  # Chosen points, m
+    normal: Float[np.ndarray, "n 3"]  # Normals, unit vectors
+    residual: Float[np.ndarray, " n"]  # Distance of the point from its plane, freed of the plane's three parameters, m
+    sigma: Float[np.ndarray, " n"]  # Standard deviation of the neighbours about it, m
+    planarity: Float[np.ndarray, " n"]  # (middle - smallest) / largest spread: near 0 for a line or a ball
 
 
 def fit_planes(cloud: Float[np.ndarray, "m 3"], tree: cKDTree, query: Float[np.ndarray, "n 3"]) -> Planes:
@@ -163,17 +155,11 @@ FEWEST_IN_VOXEL = 10  # points of either cloud in a voxel that is compared
 
 @dataclass(frozen=True)
 class VoxelMap:
-    """Normal distributions of a cloud in voxels.
+    """Normal distributions of a cloud in voxels."""
 
-    Attributes:
-        key: Indices of the voxels, sorted, `(v, 3)`.
-        mean: Mean of the points, m, `(v, 3)`.
-        covariance: Covariance of the points, m², `(v, 3, 3)`.
-    """
-
-    key: Int[np.ndarray, "v 3"]
-    mean: Float[np.ndarray, "v 3"]
-    covariance: Float[np.ndarray, "v 3 3"]
+    key: Int[np.ndarray, "v 3"]  # Indices of the voxels, sorted
+    mean: Float[np.ndarray, "v 3"]  # Mean of the points, m
+    covariance: Float[np.ndarray, "v 3 3"]  # Covariance of the points, m²
 
 
 def voxel_map(local: Float[np.ndarray, "n 3"], edge: float) -> VoxelMap:
@@ -267,19 +253,12 @@ _CLOSE_PAIR = 0.05  # m; two returns so near to each other differ by their noise
 
 @dataclass(frozen=True)
 class Patches:
-    """Smooth pieces of wall in the held-out recording.
+    """Smooth pieces of wall in the held-out recording."""
 
-    Attributes:
-        beam: Numbers of the beams on each plane, `(planes, at most _MOST)`, -1 as padding.
-        roughness: Variance about the planes, noise taken off, m²; may come out below 0 where there is hardly any.
-        noise: Variance of the returns along the normals, m².
-        resolved: True where the roughness stands out of its own standard error.
-    """
-
-    beam: Int[np.ndarray, "p k"]
-    roughness: float
-    noise: float
-    resolved: bool
+    beam: Int[np.ndarray, "p k"]  # Numbers of the beams on each plane, -1 as padding
+    roughness: float  # Variance about the planes, noise taken off, m²; may come out below 0 where there is hardly any
+    noise: float  # Variance of the returns along the normals, m²
+    resolved: bool  # True where the roughness stands out of its own standard error
 
     @property
     def planes(self) -> int:

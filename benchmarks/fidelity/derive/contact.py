@@ -153,17 +153,11 @@ _LIFT = (-0.01, 0.02)  # m about where the robot stands at first
 
 @dataclass(frozen=True)
 class Stepper:
-    """One compiled step of the scene.
+    """One compiled step of the scene."""
 
-    Attributes:
-        step: Function from MJX data to MJX data.
-        model: Model of MuJoCo.
-        data: MJX data of the model's first pose.
-    """
-
-    step: Callable[[mjx.Data], mjx.Data]
-    model: mujoco.MjModel
-    data: mjx.Data
+    step: Callable[[mjx.Data], mjx.Data]  # Function from MJX data to MJX data
+    model: mujoco.MjModel  # Model of MuJoCo
+    data: mjx.Data  # MJX data of the model's first pose
 
     def at(self, qpos: np.ndarray, qvel: np.ndarray) -> mjx.Data:
         """Return the MJX data of a state."""

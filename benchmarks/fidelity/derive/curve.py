@@ -16,15 +16,10 @@ _FINE = 0.1  # m
 
 @dataclass(frozen=True)
 class Curve:
-    """Centreline with upright frames: `left` is horizontal, `up` completes it.
+    """Centreline with upright frames: `left` is horizontal, `up` completes it."""
 
-    Attributes:
-        station: Arc length, growing, m, `(n,)`.
-        position: Points of the curve, m, `(n, 3)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
+    station: Float[np.ndarray, " n"]  # Arc length, growing, m
+    position: Float[np.ndarray, "n 3"]  # Points of the curve, m
     _fine: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @property

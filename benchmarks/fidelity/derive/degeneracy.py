@@ -25,23 +25,15 @@ _EIGEN_FLOOR = 1e-6  # of an eigenvalue; less than the noise of any normal
 
 @dataclass(frozen=True)
 class ScanInformation:
-    """Information of the scans, per point.
+    """Information of the scans, per point."""
 
-    Attributes:
-        station: Station of the sensor, m, `(s,)`.
-        axial: Information about a shift along the tunnel: mean of (normal · axis)², `(s,)`.
-        translation: Eigenvalues of the translation block, growing, `(s, 3)`.
-        weakest: Direction of the smallest of them, `(s, 3)`.
-        rotation: Smallest eigenvalue of the rotation block, arms in units of the scan's mean range, `(s,)`.
-        strong: Share of points whose normal lies within 60° of the axis, `(s,)`.
-    """
-
-    station: Float[np.ndarray, " s"]
-    axial: Float[np.ndarray, " s"]
-    translation: Float[np.ndarray, "s 3"]
-    weakest: Float[np.ndarray, "s 3"]
+    station: Float[np.ndarray, " s"]  # Station of the sensor, m
+    axial: Float[np.ndarray, " s"]  # Information about a shift along the tunnel: mean of (normal · axis)²
+    translation: Float[np.ndarray, "s 3"]  # Eigenvalues of the translation block, growing
+    weakest: Float[np.ndarray, "s 3"]  # Direction of the smallest of them
+    # Smallest eigenvalue of the rotation block, arms in units of the scan's mean range
     rotation: Float[np.ndarray, " s"]
-    strong: Float[np.ndarray, " s"]
+    strong: Float[np.ndarray, " s"]  # Share of points whose normal lies within 60° of the axis
 
 
 @per_hold

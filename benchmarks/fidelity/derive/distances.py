@@ -39,32 +39,20 @@ _AXIS_SECTORS = 8
 
 @dataclass(frozen=True)
 class MeshDistances:
-    """Distances of held-out points to the candidate.
+    """Distances of held-out points to the candidate."""
 
-    Attributes:
-        distance: Distance to the nearest point of the candidate, m, `(n,)`.
-        signed: Distance, positive where the point is on the sensor's side of the surface, m, `(n,)`.
-        station: Station along the sensor's path, m, `(n,)`.
-        sector: One of eight about the candidate's axis: 0 to its left, 2 its crown, 6 its floor, `(n,)`.
-    """
-
-    distance: Float[np.ndarray, " n"]
-    signed: Float[np.ndarray, " n"]
-    station: Float[np.ndarray, " n"]
-    sector: Int[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]  # Distance to the nearest point of the candidate, m
+    signed: Float[np.ndarray, " n"]  # Distance, positive where the point is on the sensor's side of the surface, m
+    station: Float[np.ndarray, " n"]  # Station along the sensor's path, m
+    sector: Int[np.ndarray, " n"]  # One of eight about the candidate's axis: 0 to its left, 2 its crown, 6 its floor
 
 
 @dataclass(frozen=True)
 class CloudDistances:
-    """Distances of observed samples of the candidate to the held-out points.
+    """Distances of observed samples of the candidate to the held-out points."""
 
-    Attributes:
-        distance: Distance to the nearest held-out point, m, `(n,)`.
-        station: Station along the sensor's path, m, `(n,)`.
-    """
-
-    distance: Float[np.ndarray, " n"]
-    station: Float[np.ndarray, " n"]
+    distance: Float[np.ndarray, " n"]  # Distance to the nearest held-out point, m
+    station: Float[np.ndarray, " n"]  # Station along the sensor's path, m
 
 
 @per_hold
@@ -180,17 +168,11 @@ M3C2_REGISTRATION = 0.01  # m: what poses that are given to a centimetre leave b
 
 @dataclass(frozen=True)
 class M3C2Distances:
-    """M3C2 at each core point that has both clouds in its cylinder.
+    """M3C2 at each core point that has both clouds in its cylinder."""
 
-    Attributes:
-        significant: 1 where |distance| exceeds the level of detection, else 0, `(n,)`.
-        distance: Signed distance, m, `(n,)`.
-        station: Station along the sensor's path, m, `(n,)`.
-    """
-
-    significant: Float[np.ndarray, " n"]
-    distance: Float[np.ndarray, " n"]
-    station: Float[np.ndarray, " n"]
+    significant: Float[np.ndarray, " n"]  # 1 where |distance| exceeds the level of detection, else 0
+    distance: Float[np.ndarray, " n"]  # Signed distance, m
+    station: Float[np.ndarray, " n"]  # Station along the sensor's path, m
 
 
 @per_hold
@@ -242,15 +224,10 @@ _MOST_SELF_CAST = 30_000
 
 @dataclass(frozen=True)
 class SelfCast:
-    """Distances of a noisy cloud to the mesh that it was cast in.
+    """Distances of a noisy cloud to the mesh that it was cast in."""
 
-    Attributes:
-        distance: Distance to the mesh, m, `(n,)`.
-        noise_alone: σ·√(2/π)·mean|cos incidence|, m: the mean distance that noise gives on planes.
-    """
-
-    distance: Float[np.ndarray, " n"]
-    noise_alone: float
+    distance: Float[np.ndarray, " n"]  # Distance to the mesh, m
+    noise_alone: float  # σ·√(2/π)·mean|cos incidence|, m: the mean distance that noise gives on planes
 
 
 @per_case
@@ -278,18 +255,12 @@ _FEWEST_TOGETHER = 4  # points of two clouds in a cell that counts in any case
 
 @dataclass(frozen=True)
 class Occupied:
-    """Points by voxel on one grid, axes station, left, up.
+    """Points by voxel on one grid, axes station, left, up."""
 
-    Attributes:
-        points: Number of held-out points and of those of two noisy draws in the candidate, which differ in noise alone,
-            `(3, i, j, k)`.
-        known: Voxels that held-out beams show, or that hold one of the surfaces, `(i, j, k)`.
-        station: Station of the middle of each slice, m, `(i,)`.
-    """
-
+    # Number of held-out points and of those of two noisy draws in the candidate, which differ in noise alone
     points: Shaped[np.ndarray, "3 i j k"]
-    known: Bool[np.ndarray, "i j k"]
-    station: Float[np.ndarray, " i"]
+    known: Bool[np.ndarray, "i j k"]  # Voxels that held-out beams show, or that hold one of the surfaces
+    station: Float[np.ndarray, " i"]  # Station of the middle of each slice, m
 
     @property
     def real(self) -> Bool[np.ndarray, "i j k"]:

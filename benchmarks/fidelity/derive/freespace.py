@@ -24,17 +24,11 @@ CARVE_MARGIN = 0.20  # m before the return where a beam's air ends
 
 @dataclass(frozen=True)
 class Carved:
-    """Samples along held-out beams.
+    """Samples along held-out beams."""
 
-    Attributes:
-        passed: Points that beams went through, tunnel frame, m, `(k, 3)`.
-        beam: Number of the beam of each point, `(k,)`.
-        ended: Returns of the same beams, m, `(b, 3)`.
-    """
-
-    passed: Float[np.ndarray, "k 3"]
-    beam: Int[np.ndarray, " k"]
-    ended: Float[np.ndarray, "b 3"]
+    passed: Float[np.ndarray, "k 3"]  # Points that beams went through, tunnel frame, m
+    beam: Int[np.ndarray, " k"]  # Number of the beam of each point
+    ended: Float[np.ndarray, "b 3"]  # Returns of the same beams, m
 
 
 @kept_until("F3D")
@@ -81,19 +75,12 @@ HIT_RETURNS = 2
 
 @dataclass(frozen=True)
 class Lattice:
-    """Cells about a curve.
+    """Cells about a curve."""
 
-    Attributes:
-        curve: Axis of the lattice.
-        low: Corner of the first cell: station, left, up, m.
-        shape: Number of cells each way.
-        edge: Edge of a cell, m.
-    """
-
-    curve: Curve
-    low: Float[np.ndarray, "3"]
-    shape: tuple[int, int, int]
-    edge: float
+    curve: Curve  # Axis of the lattice
+    low: Float[np.ndarray, "3"]  # Corner of the first cell: station, left, up, m
+    shape: tuple[int, int, int]  # Number of cells each way
+    edge: float  # Edge of a cell, m
 
     def local(self) -> Float[np.ndarray, "k 3"]:
         """Return the middles of all cells: station, left, up, m."""
@@ -121,22 +108,14 @@ class Lattice:
 
 @dataclass(frozen=True)
 class Air:
-    """Air of candidate and reference in the same voxels.
+    """Air of candidate and reference in the same voxels."""
 
-    Attributes:
-        lattice: Lattice of the voxels.
-        judged, reference: Voxels of air that can be reached from a mouth, `(n, m, k)`.
-        known: Voxels that the reference knows, `(n, m, k)`.
-        blocked: Voxels inside the candidate's lining that are not its air, `(n, m, k)`.
-        filled: Blocked voxels that its extra surfaces take or close off, not its track, `(n, m, k)`.
-    """
-
-    lattice: Lattice
-    judged: Bool[np.ndarray, "n m k"]
+    lattice: Lattice  # Lattice of the voxels
+    judged: Bool[np.ndarray, "n m k"]  # judged, reference: Voxels of air that can be reached from a mouth
     reference: Bool[np.ndarray, "n m k"]
-    known: Bool[np.ndarray, "n m k"]
-    blocked: Bool[np.ndarray, "n m k"]
-    filled: Bool[np.ndarray, "n m k"]
+    known: Bool[np.ndarray, "n m k"]  # Voxels that the reference knows
+    blocked: Bool[np.ndarray, "n m k"]  # Voxels inside the candidate's lining that are not its air
+    filled: Bool[np.ndarray, "n m k"]  # Blocked voxels that its extra surfaces take or close off, not its track
 
 
 @per_case
@@ -255,15 +234,10 @@ _TIGHTER = (0.0, 0.05, 0.10)  # m that the reference's own median outline is dra
 
 @dataclass(frozen=True)
 class Clearances:
-    """Distances to the nearest surface around the axis.
+    """Distances to the nearest surface around the axis."""
 
-    Attributes:
-        station: Stations of the sections, m, `(n,)`.
-        judged, reference: Distances by section and place in it, m, `(n, k)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    judged: Float[np.ndarray, "n k"]
+    station: Float[np.ndarray, " n"]  # Stations of the sections, m
+    judged: Float[np.ndarray, "n k"]  # judged, reference: Distances by section and place in it, m
     reference: Float[np.ndarray, "n k"]
 
 

@@ -34,23 +34,14 @@ _LEVELS = (0.3, 0.7)  # m above the ground at which the robot would run into som
 
 @dataclass(frozen=True)
 class Ground:
-    """Ground under the robot and headroom over it, in cells whose middles lie closer across than a cell is wide.
+    """Ground under the robot and headroom over it, in cells whose middles lie closer across than a cell is wide."""
 
-    Attributes:
-        cell: Edge of a cell, m.
-        station: Stations of the rows, one cell apart, m, `(n,)`.
-        left: Offsets of the columns, m, `(m,)`.
-        height: Height of the ground above the axis, m; NaN where none is seen, `(n, m)`.
-        headroom: Headroom above the ground, m, `(n, m)`.
-        step: Largest difference of height to the cells before, behind and beside, m; NaN beside what is not seen,
-            `(n, m)`.
-    """
-
-    cell: float
-    station: Float[np.ndarray, " n"]
-    left: Float[np.ndarray, " m"]
-    height: Float[np.ndarray, "n m"]
-    headroom: Float[np.ndarray, "n m"]
+    cell: float  # Edge of a cell, m
+    station: Float[np.ndarray, " n"]  # Stations of the rows, one cell apart, m
+    left: Float[np.ndarray, " m"]  # Offsets of the columns, m
+    height: Float[np.ndarray, "n m"]  # Height of the ground above the axis, m; NaN where none is seen
+    headroom: Float[np.ndarray, "n m"]  # Headroom above the ground, m
+    # Largest difference of height to the cells before, behind and beside, m; NaN beside what is not seen
     step: Float[np.ndarray, "n m"]
 
     @property

@@ -30,21 +30,14 @@ _BLUR = np.ones((3, 3))
 
 @dataclass(frozen=True)
 class Unrolled:
-    """Map of depths of the unrolled lining.
+    """Map of depths of the unrolled lining."""
 
-    Attributes:
-        station: Stations of the rows, m, `(n,)`.
-        angle: Angles of the columns, from left towards up, rad, `(m,)`.
-        depth: Depth behind the smooth section along the ray from the axis, m; NaN where not known, `(n, m)`.
-        smooth: Radius of the typical smooth section, m, `(m,)`.
-        wall: Columns that are wall or roof, not floor, `(m,)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    angle: Float[np.ndarray, " m"]
+    station: Float[np.ndarray, " n"]  # Stations of the rows, m
+    angle: Float[np.ndarray, " m"]  # Angles of the columns, from left towards up, rad
+    # Depth behind the smooth section along the ray from the axis, m; NaN where not known
     depth: Float[np.ndarray, "n m"]
-    smooth: Float[np.ndarray, " m"]
-    wall: Bool[np.ndarray, " m"]
+    smooth: Float[np.ndarray, " m"]  # Radius of the typical smooth section, m
+    wall: Bool[np.ndarray, " m"]  # Columns that are wall or roof, not floor
 
     @property
     def arc(self) -> Float[np.ndarray, " m"]:
@@ -292,19 +285,12 @@ _EIGHT = np.ones((3, 3), int)
 
 @dataclass(frozen=True)
 class Pockets:
-    """Recesses of the lining.
+    """Recesses of the lining."""
 
-    Attributes:
-        station: Station, m, `(p,)`.
-        arc: Position along the section, m, `(p,)`.
-        depth: Depth normal to the wall, m, `(p,)`.
-        area: Area of the opening, m², `(p,)`.
-    """
-
-    station: Float[np.ndarray, " p"]
-    arc: Float[np.ndarray, " p"]
-    depth: Float[np.ndarray, " p"]
-    area: Float[np.ndarray, " p"]
+    station: Float[np.ndarray, " p"]  # Station, m
+    arc: Float[np.ndarray, " p"]  # Position along the section, m
+    depth: Float[np.ndarray, " p"]  # Depth normal to the wall, m
+    area: Float[np.ndarray, " p"]  # Area of the opening, m²
 
     def __len__(self) -> int:
         return len(self.station)

@@ -22,17 +22,11 @@ _AXIS_RAYS = 60_000
 
 @dataclass(frozen=True)
 class Edges:
-    """Undirected edges of a welded mesh.
+    """Undirected edges of a welded mesh."""
 
-    Attributes:
-        ends: Vertex numbers, `(e, 2)`.
-        faces: Number of faces at the edge, `(e,)`.
-        length: m, `(e,)`.
-    """
-
-    ends: Int[np.ndarray, "e 2"]
-    faces: Int[np.ndarray, " e"]
-    length: Float[np.ndarray, " e"]
+    ends: Int[np.ndarray, "e 2"]  # Vertex numbers
+    faces: Int[np.ndarray, " e"]  # Number of faces at the edge
+    length: Float[np.ndarray, " e"]  # m
 
 
 def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -118,18 +112,12 @@ def face_parts(mesh: trimesh.Trimesh) -> Int[np.ndarray, " f"]:
 
 @dataclass(frozen=True)
 class AxisHits:
-    """First hits of rays from the axis.
+    """First hits of rays from the axis."""
 
-    Attributes:
-        origin: m, less `weld_offset`, `(k, 3)`.
-        direction: Unit vectors, `(k, 3)`.
-        distance: m; `inf` where nothing was hit, `(k,)`.
-        cosine: Cosine between ray and normal of the face; negative where the face looks at the eye, `(k,)`.
-    """
-
-    origin: Float[np.ndarray, "k 3"]
-    direction: Float[np.ndarray, "k 3"]
-    distance: Float[np.ndarray, " k"]
+    origin: Float[np.ndarray, "k 3"]  # m, less `weld_offset`
+    direction: Float[np.ndarray, "k 3"]  # Unit vectors
+    distance: Float[np.ndarray, " k"]  # m; `inf` where nothing was hit
+    # Cosine between ray and normal of the face; negative where the face looks at the eye
     cosine: Float[np.ndarray, " k"]
 
 
@@ -174,19 +162,12 @@ Diagrams = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class Grid:
-    """Box along a curve.
+    """Box along a curve."""
 
-    Attributes:
-        curve: Curve of the box.
-        cell: Sizes along, left and up, m.
-        low: Station, left and up of its first corner, m.
-        shape: Cells each way.
-    """
-
-    curve: Curve
-    cell: Float[np.ndarray, "3"]
-    low: Float[np.ndarray, "3"]
-    shape: tuple[int, int, int]
+    curve: Curve  # Curve of the box
+    cell: Float[np.ndarray, "3"]  # Sizes along, left and up, m
+    low: Float[np.ndarray, "3"]  # Station, left and up of its first corner, m
+    shape: tuple[int, int, int]  # Cells each way
 
     def occupied(self, points: Float[np.ndarray, "k 3"]) -> Bool[np.ndarray, "a b c"]:
         """Return True for cells with a point in them; points outside the box are left out."""

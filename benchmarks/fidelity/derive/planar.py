@@ -26,19 +26,12 @@ _NOISE_DRAWS = 100_000
 
 @dataclass(frozen=True)
 class LidarPoses:
-    """Poses of the environment's LiDAR.
+    """Poses of the environment's LiDAR."""
 
-    Attributes:
-        station: Station, m, `(k,)`.
-        position: Position in the tunnel frame, m, `(k, 3)`.
-        heading: Heading, rad, `(k,)`.
-        way: Directions of the beams in the plane that follows the grade, unit vectors, `(k, b, 3)`.
-    """
-
-    station: Float[np.ndarray, " k"]
-    position: Float[np.ndarray, "k 3"]
-    heading: Float[np.ndarray, " k"]
-    way: Float[np.ndarray, "k b 3"]
+    station: Float[np.ndarray, " k"]  # Station, m
+    position: Float[np.ndarray, "k 3"]  # Position in the tunnel frame, m
+    heading: Float[np.ndarray, " k"]  # Heading, rad
+    way: Float[np.ndarray, "k b 3"]  # Directions of the beams in the plane that follows the grade, unit vectors
 
     def ranges_in_plan(self, reach: Float[np.ndarray, " n"], most: float) -> Float[np.ndarray, "k b"]:
         """Return the ranges along the beams in plan, at most `most`, m."""

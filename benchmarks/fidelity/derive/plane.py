@@ -32,20 +32,13 @@ _SPUR = 3  # cells; pockets narrower than twice this grow no branch of the media
 
 @dataclass(frozen=True)
 class Plane:
-    """Free cells of candidate and reference at the height of the sensor.
+    """Free cells of candidate and reference at the height of the sensor."""
 
-    Attributes:
-        lattice: Lattice of one layer.
-        judged, reference: Free cells, `(n, m)`.
-        known: Cells that the reference knows, `(n, m)`.
-        height: Height of the plane above the reference axis, m.
-    """
-
-    lattice: Lattice
-    judged: Bool[np.ndarray, "n m"]
+    lattice: Lattice  # Lattice of one layer
+    judged: Bool[np.ndarray, "n m"]  # judged, reference: Free cells
     reference: Bool[np.ndarray, "n m"]
-    known: Bool[np.ndarray, "n m"]
-    height: float
+    known: Bool[np.ndarray, "n m"]  # Cells that the reference knows
+    height: float  # Height of the plane above the reference axis, m
 
     @property
     def station(self) -> Float[np.ndarray, " n"]:

@@ -21,17 +21,11 @@ _EIGHT = np.ones((3, 3), int)
 
 @dataclass(frozen=True)
 class Route:
-    """Route of the robot over the ground.
+    """Route of the robot over the ground."""
 
-    Attributes:
-        cells: Row and column of each cell, `(k, 2)`.
-        place: Station and left of each cell, m, `(k, 2)`.
-        clearance: Distance to the nearest obstacle, m, `(k,)`.
-    """
-
-    cells: Int[np.ndarray, "k 2"]
-    place: Float[np.ndarray, "k 2"]
-    clearance: Float[np.ndarray, " k"]
+    cells: Int[np.ndarray, "k 2"]  # Row and column of each cell
+    place: Float[np.ndarray, "k 2"]  # Station and left of each cell, m
+    clearance: Float[np.ndarray, " k"]  # Distance to the nearest obstacle, m
 
     @property
     def length(self) -> float:

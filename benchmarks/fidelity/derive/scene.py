@@ -173,17 +173,11 @@ _RAYS_PER_EYE = 1000
 
 @dataclass(frozen=True)
 class RayPairs:
-    """Ranges of the same rays in scene and mesh.
+    """Ranges of the same rays in scene and mesh."""
 
-    Attributes:
-        scene: Ranges by MuJoCo, m; `inf` for none, `(k,)`.
-        mesh: Ranges by embree in lining and track, m; `inf` for none, `(k,)`.
-        comparable: True where MuJoCo hit a part of those meshes, `(k,)`.
-    """
-
-    scene: Float[np.ndarray, " k"]
-    mesh: Float[np.ndarray, " k"]
-    comparable: Bool[np.ndarray, " k"]
+    scene: Float[np.ndarray, " k"]  # Ranges by MuJoCo, m; `inf` for none
+    mesh: Float[np.ndarray, " k"]  # Ranges by embree in lining and track, m; `inf` for none
+    comparable: Bool[np.ndarray, " k"]  # True where MuJoCo hit a part of those meshes
 
 
 @per_release("scene", "mesh")
@@ -250,15 +244,10 @@ def count_assets(case: Case) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Pieces:
-    """Connected pieces of a mesh.
+    """Connected pieces of a mesh."""
 
-    Attributes:
-        middle: Middle of each piece, m, `(k, 3)`.
-        height: Vertical extent, m, `(k,)`.
-    """
-
-    middle: Float[np.ndarray, "k 3"]
-    height: Float[np.ndarray, " k"]
+    middle: Float[np.ndarray, "k 3"]  # Middle of each piece, m
+    height: Float[np.ndarray, " k"]  # Vertical extent, m
 
 
 def fastening_pieces(mesh: trimesh.Trimesh) -> Pieces:

@@ -34,21 +34,13 @@ _CLOSED_SHARE = 0.7  # share of the directions that must meet the lining
 
 @dataclass(frozen=True)
 class Sections:
-    """Sections every metre of the reference axis.
+    """Sections every metre of the reference axis."""
 
-    Attributes:
-        station: Stations, m, `(n,)`.
-        angle: Angles from left towards up, rad, `(m,)`.
-        judged: Polar radius of the lining, m; 0 in a section that is not closed, `(n, m)`.
-        reference: Polar radius of the reference, m; NaN where it is not known, `(n, m)`.
-        judged_outline, reference_outline: Polygons in (left, up), `(n,)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    angle: Float[np.ndarray, " m"]
-    judged: Float[np.ndarray, "n m"]
-    reference: Float[np.ndarray, "n m"]
-    judged_outline: np.ndarray
+    station: Float[np.ndarray, " n"]  # Stations, m
+    angle: Float[np.ndarray, " m"]  # Angles from left towards up, rad
+    judged: Float[np.ndarray, "n m"]  # Polar radius of the lining, m; 0 in a section that is not closed
+    reference: Float[np.ndarray, "n m"]  # Polar radius of the reference, m; NaN where it is not known
+    judged_outline: np.ndarray  # judged_outline, reference_outline: Polygons in (left, up)
     reference_outline: np.ndarray
 
     @property
@@ -185,19 +177,12 @@ COLUMNS = 360
 
 @dataclass(frozen=True)
 class Radii:
-    """Bore seen from its axis.
+    """Bore seen from its axis."""
 
-    Attributes:
-        curve: Axis of the bore.
-        station: Stations of the rows, m, `(n,)`.
-        radius: Distance to the first surface, m; NaN where there is none, `(n, 360)`.
-        filled: Radius with holes closed by their nearest neighbour, m, `(n, 360)`.
-    """
-
-    curve: Curve
-    station: Float[np.ndarray, " n"]
-    radius: Float[np.ndarray, "n m"]
-    filled: Float[np.ndarray, "n m"]
+    curve: Curve  # Axis of the bore
+    station: Float[np.ndarray, " n"]  # Stations of the rows, m
+    radius: Float[np.ndarray, "n m"]  # Distance to the first surface, m; NaN where there is none
+    filled: Float[np.ndarray, "n m"]  # Radius with holes closed by their nearest neighbour, m
 
     def depth(self, points: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, " k"]:
         """Return the depth of points inside the bore, along the ray from the axis, m; negative outside."""

@@ -84,23 +84,15 @@ _RAIL_STEP = 1.0  # m between places of the rails
 
 @dataclass(frozen=True)
 class Railway:
-    """Track to be matched.
+    """Track to be matched."""
 
-    Attributes:
-        curve: Curve in whose coordinates offsets are taken.
-        sleeper: Middle of the top of each sleeper, m, `(s, 3)`; empty where none is known.
-        rail: Top of both rails, left before right, at the same stations, m, `(2, k, 3)`; `k` is 0 where none is known.
-        gauge: Gauge, m; `None` where it is not measured.
-        start: First station of which something is known, m.
-        end: Last one, m.
-    """
-
-    curve: Curve
-    sleeper: Float[np.ndarray, "s 3"]
+    curve: Curve  # Curve in whose coordinates offsets are taken
+    sleeper: Float[np.ndarray, "s 3"]  # Middle of the top of each sleeper, m; empty where none is known
+    # Top of both rails, left before right, at the same stations, m; `k` is 0 where none is known
     rail: Float[np.ndarray, "2 k 3"]
-    gauge: float | None
-    start: float
-    end: float
+    gauge: float | None  # Gauge, m; `None` where it is not measured
+    start: float  # First station of which something is known, m
+    end: float  # Last one, m
 
 
 def reference_railway(case: Case) -> Railway:

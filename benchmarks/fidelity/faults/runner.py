@@ -51,17 +51,11 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a control.
+    """Result of a control."""
 
-    Attributes:
-        job: Control and dose.
-        values: Values of all 199 metrics.
-        leaks: Findings of the leak detector.
-    """
-
-    job: Job
-    values: dict[str, Value]
-    leaks: list[str]
+    job: Job  # Control and dose
+    values: dict[str, Value]  # Values of all 199 metrics
+    leaks: list[str]  # Findings of the leak detector
 
 
 def read_outcome(folder: Path | None, job: Job, key: str) -> Outcome | None:
@@ -89,23 +83,14 @@ Evaluate = Callable[..., dict[str, Value]]
 
 @dataclass(frozen=True)
 class Bench:
-    """Start of every control: the base case, its values and where results are kept.
+    """Start of every control: the base case, its values and where results are kept."""
 
-    Attributes:
-        case: The base case.
-        base: Values of the base case.
-        folder: Folder for finished controls; `None` keeps nothing.
-        foreign: Scene folder of another tunnel, for N33.
-        compute: `evaluate`, or a part of it in tests.
-        more: File of a user's own metrics and faults, which every process reads.
-    """
-
-    case: Case
-    base: dict[str, Value]
-    folder: Path | None = None
-    foreign: Path | None = None
-    compute: Evaluate = evaluate
-    more: Path | None = None
+    case: Case  # The base case
+    base: dict[str, Value]  # Values of the base case
+    folder: Path | None = None  # Folder for finished controls; `None` keeps nothing
+    foreign: Path | None = None  # Scene folder of another tunnel, for N33
+    compute: Evaluate = evaluate  # `evaluate`, or a part of it in tests
+    more: Path | None = None  # File of a user's own metrics and faults, which every process reads
 
     def key(self, job: Job) -> str:
         """Return the SHA-256 of base, code and, for N33, the foreign scene: a kept result of others is not read."""

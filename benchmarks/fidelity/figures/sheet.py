@@ -16,21 +16,13 @@ from benchmarks.fidelity.case import Case
 
 @dataclass(frozen=True)
 class Sheet:
-    """Material of all figures.
+    """Material of all figures."""
 
-    Attributes:
-        case: Case of the reconstruction.
-        null: Case of the null tube on the same references.
-        report: Content of the report.
-        controls: Rows of controls; may be empty.
-        sweep: Rows of the sweep; may be empty.
-    """
-
-    case: Case
-    null: Case
-    report: dict[str, Any]
-    controls: list[dict[str, Any]]
-    sweep: list[dict[str, Any]]
+    case: Case  # Case of the reconstruction
+    null: Case  # Case of the null tube on the same references
+    report: dict[str, Any]  # Content of the report
+    controls: list[dict[str, Any]]  # Rows of controls; may be empty
+    sweep: list[dict[str, Any]]  # Rows of the sweep; may be empty
 
     def note(self, n: int | None = None) -> str:
         """Return the end of every caption: samples, seed, split."""

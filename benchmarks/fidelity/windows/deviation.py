@@ -27,21 +27,13 @@ _MOUTH = 0.5  # m at the mouths that the truth's rays leave out
 
 @dataclass(frozen=True)
 class Unrolled:
-    """Radius of the reference about the middle of its section, and what the candidate's surface lies beyond it.
+    """Radius of the reference about the middle of its section, and what the candidate's surface lies beyond it."""
 
-    Attributes:
-        curve: Curve that stations count along.
-        middle: Middle of the section to the left of and above the curve, m.
-        low: Station where the first cells begin, m.
-        radius: Median radius of the reference, m; NaN where it is not known, `(n, SECTORS)`.
-        offset: Median offset of the candidate, m, outward positive; NaN where it is not known, `(n, SECTORS)`.
-    """
-
-    curve: Curve
-    middle: tuple[float, float]
-    low: float
-    radius: Float[np.ndarray, "n m"]
-    offset: Float[np.ndarray, "n m"]
+    curve: Curve  # Curve that stations count along
+    middle: tuple[float, float]  # Middle of the section to the left of and above the curve, m
+    low: float  # Station where the first cells begin, m
+    radius: Float[np.ndarray, "n m"]  # Median radius of the reference, m; NaN where it is not known
+    offset: Float[np.ndarray, "n m"]  # Median offset of the candidate, m, outward positive; NaN where it is not known
 
     def place(self, station: float) -> Float[np.ndarray, "3"]:
         """Return the middle of the section at a station, tunnel frame, m."""
@@ -63,22 +55,14 @@ def is_floor(angle: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
 
 @dataclass(frozen=True)
 class Frame:
-    """Held-out returns about the middle of the section, along the sensor's path.
+    """Held-out returns about the middle of the section, along the sensor's path."""
 
-    Attributes:
-        local: Station along the path, left and up of the section's middle, m, `(n, 3)`.
-        angle: Angle about the middle from left towards up, rad, `(n,)`.
-        middle: Middle of the section to the left of and above the path, m.
-        low, high: Stations between which returns lie, m.
-        cell: Number of the cell of each return; -1 outside these stations, `(n,)`.
-    """
-
-    local: Float[np.ndarray, "n 3"]
-    angle: Float[np.ndarray, " n"]
-    middle: tuple[float, float]
-    low: float
+    local: Float[np.ndarray, "n 3"]  # Station along the path, left and up of the section's middle, m
+    angle: Float[np.ndarray, " n"]  # Angle about the middle from left towards up, rad
+    middle: tuple[float, float]  # Middle of the section to the left of and above the path, m
+    low: float  # low, high: Stations between which returns lie, m
     high: float
-    cell: Int[np.ndarray, " n"]
+    cell: Int[np.ndarray, " n"]  # Number of the cell of each return; -1 outside these stations
 
     @property
     def rows(self) -> int:
@@ -149,15 +133,10 @@ def hold_map(case: Case) -> Unrolled:
 
 @dataclass(frozen=True)
 class Relief:
-    """Radii of one surface about a curve: rows every `FINE` metres, columns every `COLUMNS`-th of a turn.
+    """Radii of one surface about a curve: rows every `FINE` metres, columns every `COLUMNS`-th of a turn."""
 
-    Attributes:
-        station: m, `(n,)`.
-        radius: m; NaN where a ray meets nothing, `(n, COLUMNS)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    radius: Float[np.ndarray, "n m"]
+    station: Float[np.ndarray, " n"]  # m
+    radius: Float[np.ndarray, "n m"]  # m; NaN where a ray meets nothing
 
 
 def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], station: Float[np.ndarray, " n"]) -> Relief:

@@ -25,34 +25,21 @@ from benchmarks.fidelity.windows.measures import (
 
 @dataclass(frozen=True)
 class Worst:
-    """The worst window of one measure.
+    """The worst window of one measure."""
 
-    Attributes:
-        id: Measure.
-        words: Measure for people.
-        source: `recording` or `truth`.
-        unit: Unit of value and limit.
-        value: Value there; `None` where nothing could be judged.
-        limit: Largest value that passes.
-        start, end: Stations of the window on the candidate's centreline, m; `None` without a value.
-        where: Part of the section; empty for all of it.
-        judged: Share of the windows that have a value.
-        error: Cause why there is no value, if the computation broke.
-        foreign: Topic of a recording by a sensor that the limit was not set with; empty otherwise.
-    """
-
-    id: str
-    words: str
-    source: Source
-    unit: str
-    value: float | None
-    limit: float
+    id: str  # Measure
+    words: str  # Measure for people
+    source: Source  # `recording` or `truth`
+    unit: str  # Unit of value and limit
+    value: float | None  # Value there; `None` where nothing could be judged
+    limit: float  # Largest value that passes
+    # start, end: Stations of the window on the candidate's centreline, m; `None` without a value
     start: float | None = None
     end: float | None = None
-    where: str = ""
-    judged: float = 0.0
-    error: str = ""
-    foreign: str = ""
+    where: str = ""  # Part of the section; empty for all of it
+    judged: float = 0.0  # Share of the windows that have a value
+    error: str = ""  # Cause why there is no value, if the computation broke
+    foreign: str = ""  # Topic of a recording by a sensor that the limit was not set with; empty otherwise
 
     @property
     def beyond(self) -> bool:
@@ -114,16 +101,11 @@ def stations_on_candidate(case: Case, source: Source, series: Series, k: int) ->
 
 @dataclass(frozen=True)
 class Noticed:
-    """A stated fault, put into the candidate.
+    """A stated fault, put into the candidate."""
 
-    Attributes:
-        name: Fault in words.
-        by: Windows `id.source` that are beyond their limits with it and not without it.
-        needed: False where nothing at hand could show it: a gauge without a truth, a mirror where left is as right.
-    """
-
-    name: str
-    by: tuple[str, ...]
+    name: str  # Fault in words
+    by: tuple[str, ...]  # Windows `id.source` that are beyond their limits with it and not without it
+    # False where nothing at hand could show it: a gauge without a truth, a mirror where left is as right
     needed: bool = True
 
 
@@ -156,15 +138,10 @@ def noticed_by(spoilt: Case, before: list[Worst]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Windows:
-    """Result of the windows of a candidate.
+    """Result of the windows of a candidate."""
 
-    Attributes:
-        worst: The worst window of each measure.
-        noticed: The stated faults; empty where they were not put in.
-    """
-
-    worst: tuple[Worst, ...] = ()
-    noticed: tuple[Noticed, ...] = ()
+    worst: tuple[Worst, ...] = ()  # The worst window of each measure
+    noticed: tuple[Noticed, ...] = ()  # The stated faults; empty where they were not put in
 
     def reasons(self) -> list[str]:
         """Return the reasons for FAIL, in sentences; empty for PASS."""

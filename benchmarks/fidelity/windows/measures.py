@@ -41,19 +41,12 @@ _FAINT = 0.0015  # m; where left and right of the candidate differ by less, no s
 
 @dataclass(frozen=True)
 class Series:
-    """Values of one measure, window by window.
+    """Values of one measure, window by window."""
 
-    Attributes:
-        start: Starts of the windows along the source's own curve, m, `(n,)`.
-        value: Values; larger is worse, NaN where too little is known, `(n,)`.
-        where: Part of the section that each value belongs to; empty for all of it, `(n,)`.
-        window: Length of the windows, m.
-    """
-
-    start: Float[np.ndarray, " n"]
-    value: Float[np.ndarray, " n"]
-    where: tuple[str, ...]
-    window: float
+    start: Float[np.ndarray, " n"]  # Starts of the windows along the source's own curve, m
+    value: Float[np.ndarray, " n"]  # Values; larger is worse, NaN where too little is known
+    where: tuple[str, ...]  # Part of the section that each value belongs to; empty for all of it
+    window: float  # Length of the windows, m
 
     @property
     def judged(self) -> float:
@@ -63,23 +56,14 @@ class Series:
 
 @dataclass(frozen=True)
 class Measure:
-    """A measure by window.
+    """A measure by window."""
 
-    Attributes:
-        id: Name.
-        words: Name for people.
-        unit: `m` or `1`.
-        floor: Least limit: what a good reconstruction may have, whatever calibration finds.
-        gate: Largest limit, whatever calibration finds.
-        compute: Function from case and source to values.
-    """
-
-    id: str
-    words: str
-    unit: str
-    floor: float
-    gate: float
-    compute: Callable[[Case, Source], Series]
+    id: str  # Name
+    words: str  # Name for people
+    unit: str  # `m` or `1`
+    floor: float  # Least limit: what a good reconstruction may have, whatever calibration finds
+    gate: float  # Largest limit, whatever calibration finds
+    compute: Callable[[Case, Source], Series]  # Function from case and source to values
 
 
 def unrolled(case: Case, source: Source) -> Unrolled:

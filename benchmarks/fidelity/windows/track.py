@@ -33,15 +33,10 @@ _RIM = 0.08  # m from the edge of a pocket to where the wall beside it is measur
 
 @dataclass(frozen=True)
 class Profile:
-    """Values along the tunnel.
+    """Values along the tunnel."""
 
-    Attributes:
-        station: m, `(n,)`.
-        value: In the unit of its measure, `(n,)`.
-    """
-
-    station: Float[np.ndarray, " n"]
-    value: Float[np.ndarray, " n"]
+    station: Float[np.ndarray, " n"]  # m
+    value: Float[np.ndarray, " n"]  # In the unit of its measure
 
 
 NOTHING = Profile(np.empty(0), np.empty(0))
