@@ -10,7 +10,7 @@ from functools import cache as run_once
 from functools import wraps
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import trimesh
@@ -19,7 +19,6 @@ from benchmarks.fidelity import table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.references import Hold, Truth
 
-Result = TypeVar("Result")
 SHARED: dict[tuple[Any, ...], Any] = {}  # results from released files, for all cases of this process
 _KEPT_UNTIL: dict[tuple[str, str], str] = {}
 
@@ -75,49 +74,59 @@ class Case:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(id.encode()),)))
 
 
-Function = Callable[[Case], Result]
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def kept_until(category: str) -> Callable[[Function[Result]], Function[Result]]:
-    """Marks a large result as not needed after a category; asked for again, it is computed again.
+def kept_until(category: str, keep: Callable[[Function], Function]) -> Callable[[Function], Function]:
+    """Keeps a large result, by `per_case` or another, until a category is done; asked for again it is computed again.
 
-    Stands above `per_case`, `per_hold` or `per_truth`. A wrong mark costs time and nothing else.
+    A wrong category costs time and nothing else.
     """
 
-    def mark(function: Function[Result]) -> Function[Result]:
+    def mark(function: Function) -> Function:
         _KEPT_UNTIL[function.__module__, function.__qualname__] = category
-        return function
+        return keep(function)
 
     return mark
 
 
-def per_case(function: Function[Result]) -> Function[Result]:
-    """Keeps the result of a function once per case."""
-    return _kept_in(function, lambda case: (case.cache, ()))
+def per_case(function: Function) -> Function:
+    """Keeps the result of a function, for each of its arguments after the case, once per case."""
+    return kept_in(function, lambda case, *_: (case.cache, ()))
 
 
-def per_hold(function: Function[Result]) -> Function[Result]:
+def per_hold(function: Function) -> Function:
     """Keeps the result of a function of recording, seed and tolerance once for all candidates."""
-    return _kept_in(function, lambda case: _reference_cache(case, case.hold))
+    return kept_in(function, lambda case, *_: _reference_cache(case, case.hold))
 
 
-def per_truth(function: Function[Result]) -> Function[Result]:
+def per_truth(function: Function) -> Function:
     """Keeps the result of a function of truth, seed and tolerance once for all candidates."""
-    return _kept_in(function, lambda case: _reference_cache(case, case.truth))
+    return kept_in(function, lambda case, *_: _reference_cache(case, case.truth))
 
 
-def _kept_in(
-    function: Function[Result], place: Callable[[Case], tuple[dict[Any, Any], tuple[Any, ...]]]
-) -> Function[Result]:
+def per_reference(function: Function) -> Function:
+    """Keeps the result of a function of the truth, or of the recording where there is none, for all candidates."""
+    return kept_in(function, lambda case, *_: _reference_cache(case, case.truth or case.hold))
+
+
+def per_side(function: Function) -> Function:
+    """Keeps the result of a function of a case and `real`: for all candidates where `real`, else once per case."""
+    return kept_in(function, lambda case, real: _reference_cache(case, case.hold) if real else (case.cache, ()))
+
+
+def kept_in(function: Function, place: Callable[..., tuple[dict[Any, Any], tuple[Any, ...]]]) -> Function:
+    """Keeps the results of a function in the dictionary that `place` gives, by its arguments and the given settings."""
+
     @wraps(function)
-    def once(case: Case) -> Result:
-        results, settings = place(case)
-        key = (function.__module__, function.__qualname__, *settings)
+    def once(case: Case, *args: Any) -> Any:
+        results, settings = place(case, *args)
+        key = (function.__module__, function.__qualname__, *settings, *args)
         if key not in results:
-            results[key] = function(case)
+            results[key] = function(case, *args)
         return results[key]
 
-    return once
+    return cast(Function, once)
 
 
 def _reference_cache(case: Case, reference: Hold | Truth | None) -> tuple[dict[Any, Any], tuple[Any, ...]]:

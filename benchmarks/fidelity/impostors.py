@@ -7,7 +7,7 @@ import trimesh
 from jaxtyping import Float
 
 from benchmarks.fidelity.candidate import Bore, Candidate, Track
-from benchmarks.fidelity.derive.curve import Curve
+from benchmarks.fidelity.derive.curve import Curve, interpolate_rows
 from benchmarks.fidelity.derive.surface import Caster
 from benchmarks.fidelity.meshes import without_faces
 from benchmarks.fidelity.references import Truth
@@ -28,9 +28,8 @@ def null_tube(candidate: Candidate, sleepers: bool = True) -> Candidate:
     station = np.linspace(bore.station[0], bore.station[-1], count)
     angle = np.linspace(-np.pi, np.pi, NULL_CORNERS, endpoint=False)
     radius = np.interp(angle, bore.angle, np.median(bore.radius, axis=0), period=2.0 * np.pi)
-    position, left, up = (
-        _interpolate(station, bore.station, values) for values in (bore.position, bore.lateral, bore.up)
-    )
+    frames = (bore.position, bore.lateral, bore.up)
+    position, left, up = (interpolate_rows(station, bore.station, rows) for rows in frames)
     lining, solid = sweep_section(position, left, up, radius, angle)
     constant = replace(
         bore,
@@ -88,10 +87,6 @@ def no_track() -> Track:
 def _fan(ring: np.ndarray, middle: int, reverse: bool) -> np.ndarray:
     fan = np.stack([np.full(len(ring), middle), ring, np.roll(ring, -1)], axis=1)
     return fan[:, ::-1] if reverse else fan
-
-
-def _interpolate(at: np.ndarray, station: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, station, column) for column in values.T], axis=1)
 
 
 # The truth as a candidate: the score of a perfect reconstruction, and so where thresholds can be met.

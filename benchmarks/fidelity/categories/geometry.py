@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import shapely
+from scipy.spatial.transform import Rotation
 
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.axis import (
@@ -15,9 +16,8 @@ from benchmarks.fidelity.derive.axis import (
     longitudinal_slope,
     plan_curvature,
     registration,
-    rotation_angle,
 )
-from benchmarks.fidelity.derive.curve import truth_curve
+from benchmarks.fidelity.derive.curve import interpolate_rows, truth_curve
 from benchmarks.fidelity.derive.lining import (
     PHASE_PITCHES,
     RING_BAND,
@@ -118,7 +118,7 @@ def cl_axial_drift_slope(case: Case) -> Value:
     """Drift of the ring joints along the true axis, of the sleepers where there are no joints, m per 100 m."""
     assert case.truth is not None
     curve, bore, furniture = truth_curve(case), case.candidate.bore, case.truth.furniture
-    joints = np.stack([np.interp(bore.ring_station, bore.station, axis) for axis in bore.position.T], axis=1)
+    joints = interpolate_rows(bore.ring_station, bore.station, bore.position)
     pairs = [
         (joints, np.asarray(furniture.get("rings", {}).get("station", ()), float)),
         (case.candidate.track.sleeper, np.asarray(furniture.get("sleepers", {}).get("station", ()), float)),
@@ -133,7 +133,7 @@ def cl_axial_drift_slope(case: Case) -> Value:
 @metric("cl_icp_rotation", "CEN", D(0.0416, 1.5), "deg", needs="hold")
 def cl_icp_rotation(case: Case) -> Value:
     """Angle of the best rigid motion onto the held-out cloud, degrees; the motion is not applied."""
-    return number(rotation_angle(registration(case)), 1)
+    return number(np.rad2deg(Rotation.from_matrix(registration(case)[:3, :3]).magnitude()), 1)
 
 
 @metric("cl_icp_translation", "CEN", unit="m", needs="hold")

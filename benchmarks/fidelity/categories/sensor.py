@@ -26,13 +26,10 @@ from benchmarks.fidelity.derive.clouds import (
 )
 from benchmarks.fidelity.derive.degeneracy import (
     ScanInformation,
+    alias_ratios,
+    icp_errors,
+    information,
     localised_stations,
-    real_alias,
-    real_icp,
-    real_information,
-    synthetic_alias,
-    synthetic_icp,
-    synthetic_information,
 )
 from benchmarks.fidelity.derive.distances import BOOTSTRAP_SAMPLES, self_cast
 from benchmarks.fidelity.registry import (
@@ -286,7 +283,7 @@ def c2st_auc(case: Case) -> Value:
 
 
 def _both_information(case: Case) -> tuple[ScanInformation, ScanInformation]:
-    return real_information(case), synthetic_information(case)
+    return information(case, True), information(case, False)
 
 
 def _condition(scans: ScanInformation) -> np.ndarray:
@@ -301,7 +298,7 @@ def information_logratio(case: Case, id: str, quantity) -> Value:
     real, synthetic = (quantity(scans) for scans in _both_information(case))
     log = np.abs(np.log10(synthetic / real))
     log = np.where(np.isfinite(real) & ~np.isfinite(synthetic), LOST, log)
-    return estimate(np.median, log, real_information(case).station, case.rng(id))
+    return estimate(np.median, log, information(case, True).station, case.rng(id))
 
 
 @metric("deg_weak_angle_diff", "DEG", D(0.083, 25), "deg", needs="hold")
@@ -367,20 +364,20 @@ def deg_landmark_diff(case: Case) -> Value:
         known = np.isfinite(scans.axial)
         excess = np.log10(CONDITION * scans.axial[known] / scans.translation[known, 2])
         counts.append(100.0 * float(norm.cdf(excess / SPREAD).sum()) / len(known))
-    return number(abs(counts[0] - counts[1]), len(real_information(case).axial))
+    return number(abs(counts[0] - counts[1]), len(information(case, True).axial))
 
 
 @metric("deg_alias_diff", "DEG", D(0.105, 0.6), needs="hold")
 def deg_alias_diff(case: Case) -> Value:
     """Difference of the median alias ratios."""
-    real, synthetic = real_alias(case), synthetic_alias(case)
+    real, synthetic = alias_ratios(case, True), alias_ratios(case, False)
     return number(abs(float(np.median(real)) - float(np.median(synthetic))), len(real))
 
 
 @metric("deg_icp_axial_logratio", "DEG", needs="hold")
 def deg_icp_axial_logratio(case: Case) -> Value:
     """|log10| of the ratio of median axial errors of scan-to-scan registration."""
-    real, synthetic = real_icp(case), synthetic_icp(case)
+    real, synthetic = icp_errors(case, True), icp_errors(case, False)
     if not len(real):
         return missing("no two scans with enough returns")
     return number(abs(float(np.log10(np.median(synthetic) / np.median(real)))), len(real))

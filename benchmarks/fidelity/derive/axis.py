@@ -7,7 +7,6 @@ import small_gicp
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
-from scipy.spatial.transform import Rotation
 from scipy.stats import theilslopes
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold
@@ -60,11 +59,11 @@ def seed_path(case: Case) -> Curve:
             kept.append(here)
     if len(kept) < 4:
         raise ValueError("the held-out recording moves too little to show an axis")
-    path = curve_through(np.array(kept))
+    path = Curve.through(np.array(kept))
     station = np.linspace(0.0, path.length, max(int(path.length), 4) + 1)
     even = path.frames(station)[0]
     # A vehicle sways; frames that sway with it would cut the bore askew.
-    return curve_through(smooth_along(even, station[1], _SEED_CALM))
+    return Curve.through(smooth_along(even, station[1], _SEED_CALM))
 
 
 @per_hold
@@ -88,7 +87,7 @@ def hold_curve(case: Case) -> Curve:
         keep = slice(np.flatnonzero(complete)[0], np.flatnonzero(complete)[-1] + 1)
         offset = smooth_along(section_middle(profile[keep], angle), SLICE, _AXIS_SMOOTH)
         floor = float(np.nanmedian(crown_and_floor(profile[keep], angle)[1])) - float(np.median(offset[:, 1]))
-        curve = curve_through(curve.point(np.column_stack([station[keep], offset])))
+        curve = Curve.through(curve.point(np.column_stack([station[keep], offset])))
     return curve
 
 
@@ -98,8 +97,7 @@ def hold_local(case: Case) -> Float[np.ndarray, "k 3"]:
     return hold_curve(case).local(hold_points(case))
 
 
-@kept_until("LIN")
-@per_case
+@kept_until("LIN", per_case)
 def lining_caster(case: Case) -> Caster:
     """Return the caster of rays into the lining alone."""
     return Caster(case.candidate.lining)
@@ -136,13 +134,7 @@ def lining_curve(case: Case) -> Curve:
     inner[0], inner[-1] = station[0] + 0.01, station[-1] - 0.01  # a ray in the very plane of the mouth may miss
     profile = running_median(cast_profile(lining_caster(case), declared, inner, angle), step)
     offset = smooth_along(section_middle(profile, angle), step, _AXIS_SMOOTH / 2)
-    return curve_through(declared.point(np.column_stack([station, offset])))
-
-
-def curve_through(position: Float[np.ndarray, "n 3"]) -> Curve:
-    """Return the curve through points; stations are sums of chords from 0."""
-    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    return Curve(np.concatenate([[0.0], np.cumsum(steps)]), position)
+    return Curve.through(declared.point(np.column_stack([station, offset])))
 
 
 # Offset and registration between the two axes, and drift of features along them.
@@ -244,8 +236,3 @@ def registration(case: Case) -> Float[np.ndarray, "4 4"]:
         downsampling_resolution=_ICP_SPACING, max_correspondence_distance=_ICP_REACH, num_threads=1,
     )  # fmt: skip
     return np.asarray(result.T_target_source)
-
-
-def rotation_angle(motion: Float[np.ndarray, "4 4"]) -> float:
-    """Return the angle of a rigid motion, degrees."""
-    return float(np.rad2deg(Rotation.from_matrix(motion[:3, :3]).magnitude()))

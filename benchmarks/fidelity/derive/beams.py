@@ -38,9 +38,7 @@ def sensor_path(case: Case) -> Curve:
         raise ValueError(f"the held-out sensor passed {len(nodes)} positions {NODE_STEP} m apart; 4 are needed")
     strung = _string_nodes(np.asarray(nodes))
     window = min(_SWAY_WINDOW, len(nodes) - (len(nodes) + 1) % 2)
-    smooth = savgol_filter(strung, window, min(2, window - 1), axis=0, mode="interp")
-    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
-    return Curve(station, smooth)
+    return Curve.through(savgol_filter(strung, window, min(2, window - 1), axis=0, mode="interp"))
 
 
 def _string_nodes(nodes: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -110,8 +108,7 @@ def returns(case: Case) -> Returns:
     return Returns(hold.scan[order], hold.origin[order], direction, hold.range[order], points, local, heading)
 
 
-@kept_until("LIN")
-@per_case
+@kept_until("LIN", per_case)
 def cast_beams(case: Case) -> CastBeams:
     """Casts every held-out beam with a return in everything visible of the candidate."""
     real, rays = returns(case), surface_caster(case)
@@ -140,12 +137,7 @@ def local_at(case: Case, reach: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n
     return local
 
 
-@kept_until("OCC")
-@per_case
-def _noise_draws(case: Case) -> dict[str, Float[np.ndarray, " n"]]:
-    return {}
-
-
+@kept_until("OCC", per_case)
 def noisy_ranges(case: Case, draw: str) -> Float[np.ndarray, " n"]:
     """Return the ranges that the sensor would have measured in the candidate, m; `inf` where a beam leaves it.
 
@@ -154,16 +146,19 @@ def noisy_ranges(case: Case, draw: str) -> Float[np.ndarray, " n"]:
         draw: Name of the draw; the same name gives the same noise.
     """
     assert case.hold is not None
-    if draw not in _noise_draws(case):
-        noise = case.rng(f"range noise {draw}").standard_normal(len(cast_beams(case).range))
-        _noise_draws(case)[draw] = cast_beams(case).range + case.hold.sigma * noise
-    return _noise_draws(case)[draw]
+    noise = case.rng(f"range noise {draw}").standard_normal(len(cast_beams(case).range))
+    return cast_beams(case).range + case.hold.sigma * noise
 
 
 @per_case
 def synthetic_points(case: Case) -> Float[np.ndarray, "n 3"]:
     """Return the noisy points of the cast beams, m, `(n, 3)`; NaN where a beam leaves the candidate."""
     return points_at(case, noisy_ranges(case, "first"))
+
+
+def side_points(case: Case, real: bool) -> Float[np.ndarray, "n 3"]:
+    """Return the held-out points or, in the same order, the synthetic ones, m."""
+    return returns(case).points if real else synthetic_points(case)
 
 
 # Bins along the observed stretch of the path.

@@ -80,8 +80,7 @@ def real_planes(case: Case) -> Planes:
     return fit_planes(points, cloud_tree(case), points[plane_rows(case)])
 
 
-@kept_until("DIS")
-@per_case
+@kept_until("DIS", per_case)
 def synthetic_tree(case: Case) -> tuple[Float[np.ndarray, "m 3"], cKDTree]:
     """Return the finite synthetic points and their tree."""
     points = synthetic_points(case)

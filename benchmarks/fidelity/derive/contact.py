@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from benchmarks.fidelity.case import Case, kept_until
+from benchmarks.fidelity.derive.curve import interpolate_rows
 from benchmarks.fidelity.derive.scene import (
     lidar_elevation,
     per_release,
@@ -71,7 +72,7 @@ def probe_free(case: Case) -> Bool[np.ndarray, " k"]:
     station = np.arange(
         bore.station[0] + _PROBE_SPACING, bore.station[-1] - _PROBE_SPACING, _PROBE_SPACING * case.tolerance
     )
-    middle = np.stack([np.interp(station, bore.station, column) for column in bore.position.T], axis=1)
+    middle = interpolate_rows(station, bore.station, bore.position)
     return np.array([probe.depth(place) >= 0.0 for place in middle])
 
 
@@ -164,8 +165,7 @@ class Stepper:
         return self.data.replace(qpos=jax.numpy.asarray(qpos), qvel=jax.numpy.asarray(qvel))
 
 
-@kept_until("PAR")
-@per_release("scene")
+@kept_until("PAR", per_release("scene"))
 def stepper(case: Case) -> Stepper:
     """Puts the scene on the device and compiles a step."""
     model = scene_model(case)

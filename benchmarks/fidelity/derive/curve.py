@@ -14,13 +14,19 @@ from benchmarks.fidelity.derive.surface import Caster
 _FINE = 0.1  # m
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """Centreline with upright frames: `left` is horizontal, `up` completes it."""
 
     station: Float[np.ndarray, " n"]  # Arc length, growing, m
     position: Float[np.ndarray, "n 3"]  # Points of the curve, m
     _fine: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    @classmethod
+    def through(cls, position: Float[np.ndarray, "n 3"]) -> "Curve":
+        """Return the curve through points; stations are sums of chords from 0."""
+        steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        return cls(np.concatenate([[0.0], np.cumsum(steps)]), position)
 
     @property
     def length(self) -> float:
@@ -54,19 +60,24 @@ class Curve:
         # One more step: the frame turns on the way from the nearest node to the foot of the perpendicular.
         share = np.clip(np.nan_to_num(along / _FINE), -0.5, 0.5)[:, None]
         ahead = np.clip(nearest + np.where(share[:, 0] >= 0, 1, -1), 0, len(fine["station"]) - 1)
-        frame = {name: self._mixed(name, nearest, ahead, np.abs(share)) for name in ("left", "up")}
+        share = np.abs(share)
+        frame = {name: (1.0 - share) * fine[name][nearest] + share * fine[name][ahead] for name in ("left", "up")}
         inside = np.clip(station, fine["station"][0], fine["station"][-1])
-        foot = np.stack([np.interp(inside, fine["station"], axis) for axis in fine["position"].T], axis=1)
+        foot = interpolate_rows(inside, fine["station"], fine["position"])
         away = points - foot
         return np.column_stack([station, *(np.einsum("ij,ij->i", away, frame[name]) for name in ("left", "up"))])
-
-    def _mixed(self, name: str, here: np.ndarray, there: np.ndarray, share: np.ndarray) -> np.ndarray:
-        return (1.0 - share) * self._fine[name][here] + share * self._fine[name][there]
 
     def point(self, local: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "k 3"]:
         """Return the points at station, left and up, m."""
         position, _, left, up = self.frames(local[:, 0])
         return position + local[:, 1:2] * left + local[:, 2:3] * up
+
+
+def interpolate_rows(
+    at: Float[np.ndarray, " k"], station: Float[np.ndarray, " n"], rows: Float[np.ndarray, "n c"]
+) -> Float[np.ndarray, "k c"]:
+    """Return rows between those known at stations; the first and the last beyond the ends."""
+    return np.stack([np.interp(at, station, column) for column in rows.T], axis=1)
 
 
 @per_case
@@ -101,12 +112,19 @@ def section_angles(count: int) -> Float[np.ndarray, " m"]:
 
 
 def cast_profile(
-    caster: Caster, curve: Curve, station: Float[np.ndarray, " n"], angle: Float[np.ndarray, " m"]
+    caster: Caster,
+    curve: Curve,
+    station: Float[np.ndarray, " n"],
+    angle: Float[np.ndarray, " m"],
+    middle: tuple[float, float] = (0.0, 0.0),
 ) -> Float[np.ndarray, "n m"]:
-    """Return the distance from the curve to the first surface in its normal plane, m; NaN where there is none."""
+    """Return the distance from the curve to the first surface in its normal plane, m; NaN where there is none.
+
+    Rays start `middle` (left, up) beside the curve, m.
+    """
     position, _, left, up = curve.frames(station)
     direction = np.cos(angle)[:, None] * left[:, None] + np.sin(angle)[:, None] * up[:, None]
-    origin = np.repeat(position, len(angle), axis=0)
+    origin = np.repeat(position + middle[0] * left + middle[1] * up, len(angle), axis=0)
     reach, _ = caster.first(origin, direction.reshape(-1, 3))
     return np.where(np.isfinite(reach), reach, np.nan).reshape(len(station), len(angle))
 

@@ -8,16 +8,16 @@ from jaxtyping import Bool, Float
 from scipy.signal import find_peaks
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, per_case, per_hold
-from benchmarks.fidelity.derive.beams import returns, sensor_path, synthetic_points
+from benchmarks.fidelity.case import Case, per_case, per_side
+from benchmarks.fidelity.derive.beams import returns, sensor_path, side_points
 from benchmarks.fidelity.derive.clouds import (
-    Planes,
     few_rows,
     plane_rows,
     real_planes,
     smooth_normals,
     synthetic_planes,
 )
+from benchmarks.fidelity.derive.curve import interpolate_rows
 
 _FEWEST_POINTS = 20  # points of a scan
 _EIGEN_FLOOR = 1e-6  # of an eigenvalue; less than the noise of any normal
@@ -36,26 +36,14 @@ class ScanInformation:
     strong: Float[np.ndarray, " s"]  # Share of points whose normal lies within 60° of the axis
 
 
-@per_hold
-def real_information(case: Case) -> ScanInformation:
-    """Return the information of the held-out scans."""
-    return _information(case, returns(case).points)
-
-
-@per_case
-def synthetic_information(case: Case) -> ScanInformation:
-    """Return the information of the same scans taken in the candidate."""
-    return _information(case, synthetic_points(case))
-
-
-def _information(case: Case, points: Float[np.ndarray, "n 3"]) -> ScanInformation:
-    """Return Hessians of point-to-plane registration about the sensor, of points on the returned beams."""
-    real, pick, normal = returns(case), few_rows(case)[1], smooth_normals(case, points)
-    arm = points[pick] - real.origin[pick]
-    scan = real.scan[pick]
+@per_side
+def information(case: Case, real: bool) -> ScanInformation:
+    """Return Hessians of point-to-plane registration about the sensor, of the held-out scans or the candidate's."""
+    points, beams, pick = side_points(case, real), returns(case), few_rows(case)[1]
+    normal, arm, scan = smooth_normals(case, points), points[pick] - beams.origin[pick], beams.scan[pick]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(scan) != 0]))
     bounds = np.append(starts, len(scan))
-    station = sensor_path(case).local(real.origin[pick[starts]])[:, 0]
+    station = sensor_path(case).local(beams.origin[pick[starts]])[:, 0]
     axis = sensor_path(case).frames(station)[1]
     rows = [_scan_information(arm[a:b], normal[a:b], axis[k]) for k, (a, b) in enumerate(itertools.pairwise(bounds))]
     columns = [np.asarray(column) for column in zip(*rows, strict=True)]
@@ -88,24 +76,14 @@ _COST_CLIP = 0.3  # m; a point farther from its plane has no counterpart
 _ICP_PAIRS = 16
 
 
-@per_hold
-def real_alias(case: Case) -> Float[np.ndarray, " s"]:
-    """Return the alias ratios of the held-out scans."""
-    return _alias_ratios(case, real_planes(case))
-
-
-@per_case
-def synthetic_alias(case: Case) -> Float[np.ndarray, " s"]:
-    """Return the alias ratios of the same scans taken in the candidate."""
-    return _alias_ratios(case, synthetic_planes(case))
-
-
-def _alias_ratios(case: Case, planes: Planes) -> Float[np.ndarray, " s"]:
+@per_side
+def alias_ratios(case: Case, real: bool) -> Float[np.ndarray, " s"]:
     """Return the cost at the best shift of 0.2 to 3 m over the cost without shift, per scan; 1 is a perfect alias.
 
     The cost is the mean distance from the planes of the nearest map points, cut off at 0.3 m. Scans without a
     minimum of the cost among the shifts count with the smallest cost there.
     """
+    planes = real_planes(case) if real else synthetic_planes(case)
     numbers, scan = np.unique(returns(case).scan[plane_rows(case)], return_inverse=True)
     known = np.isfinite(planes.normal[:, 0])
     rows = np.flatnonzero(known & (scan % 2 == 1))  # the map: no scan meets itself in it
@@ -133,23 +111,12 @@ def _alias_ratios(case: Case, planes: Planes) -> Float[np.ndarray, " s"]:
     return np.asarray(ratios)
 
 
-@per_hold
-def real_icp(case: Case) -> Float[np.ndarray, " p"]:
-    """Return the axial errors of scan-to-scan registration of held-out scans, m."""
-    return _icp_errors(case, returns(case).points)
-
-
-@per_case
-def synthetic_icp(case: Case) -> Float[np.ndarray, " p"]:
-    """Return the axial errors of the same scans taken in the candidate, m."""
-    return _icp_errors(case, synthetic_points(case))
-
-
-def _icp_errors(case: Case, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " p"]:
+@per_side
+def icp_errors(case: Case, real: bool) -> Float[np.ndarray, " p"]:
     """Return the axial shift by generalised ICP of scans that lie on their predecessors already, m."""
     import small_gicp
 
-    scan = returns(case).scan
+    points, scan = side_points(case, real), returns(case).scan
     numbers = np.unique(scan)
     bounds = np.searchsorted(scan, np.append(numbers, numbers[-1] + 1))
     errors = []
@@ -187,7 +154,7 @@ def localised_stations(case: Case) -> Bool[np.ndarray, " s"]:
         station, centre, tangent = (data[name] for name in ("station", "centre", "tangent"))
     start, end = (np.concatenate([wall[part] for wall in walls]) for part in (slice(None, -1), slice(1, None)))
     places = np.arange(station[0] + 0.5 * _STATION_SPACING, station[-1], _STATION_SPACING)
-    centres, tangents = (np.stack([np.interp(places, station, a) for a in xy.T], axis=1) for xy in (centre, tangent))
+    centres, tangents = (interpolate_rows(places, station, rows) for rows in (centre, tangent))
     information = [
         _axial_information(c, t / np.linalg.norm(t), start, end) for c, t in zip(centres, tangents, strict=True)
     ]

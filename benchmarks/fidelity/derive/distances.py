@@ -62,8 +62,7 @@ def thinned_rows(case: Case) -> Int[np.ndarray, " k"]:
     return np.linspace(0, count - 1, min(count, MOST_POINTS)).astype(int)
 
 
-@kept_until("CMP")
-@per_case
+@kept_until("CMP", per_case)
 def mesh_distances(case: Case) -> MeshDistances:
     """Return the distances of held-out points to everything visible of the candidate, without registration."""
     pick, real = thinned_rows(case), returns(case)
@@ -273,8 +272,7 @@ class Occupied:
         return self.points[1] > 0
 
 
-@kept_until("OCC")
-@per_case
+@kept_until("OCC", per_case)
 def occupied_voxels(case: Case) -> Occupied:
     """Return the voxels of held-out and synthetic points, and the known voxels near them."""
     edge = VOXEL_EDGE * case.tolerance

@@ -31,8 +31,7 @@ class Carved:
     ended: Float[np.ndarray, "b 3"]  # Returns of the same beams, m
 
 
-@kept_until("F3D")
-@per_hold
+@kept_until("F3D", per_hold)
 def carve_beams(case: Case) -> Carved:
     """Samples about 300 beams a metre every 15 cm, from the sensor to 20 cm before the return or 25 m."""
     real = returns(case)
@@ -57,8 +56,7 @@ def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Fl
     return kept[id(curve)][1:]
 
 
-@kept_until("F3D")
-@per_hold
+@kept_until("F3D", per_hold)
 def _carved_about(case: Case) -> dict[int, tuple[Curve, Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]]:
     """Return what `carved_about` has placed, by the curve."""
     return {}
@@ -135,8 +133,7 @@ def make_lattice(case: Case, edge: float) -> Lattice:
     return Lattice(curve, start, (int(curve.length / edge), int(count[0]), int(count[1])), edge)
 
 
-@kept_until("F3D")
-@per_case
+@kept_until("F3D", per_case)
 def air_voxels(case: Case) -> Air:
     """Return the air of candidate and reference in voxels."""
     cells = air_lattice(case)

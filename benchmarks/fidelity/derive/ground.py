@@ -91,8 +91,7 @@ def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Flo
     return station, cell / LATTICES * np.arange(-columns, columns + 1)
 
 
-@kept_until("NAV")
-@per_case
+@kept_until("NAV", per_case)
 def judged_ground(case: Case) -> Ground:
     """Return the candidate's ground, by rays."""
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
@@ -202,8 +201,7 @@ _WALL_FOOT = 0.3  # m above the floor where the wall's distance is taken
 _FLOOR_BELOW = -1.0  # m above the axis; returns below it are of the ground
 
 
-@kept_until("NAV")
-@per_case
+@kept_until("NAV", per_case)
 def both_grounds(case: Case) -> tuple[Ground, Ground]:
     """Return the grounds to compare: by rays against the truth, else both by the same held-out beams.
 
@@ -222,15 +220,13 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
     return left_out[0], left_out[1]
 
 
-@kept_until("NAV")
-@per_case
+@kept_until("NAV", per_case)
 def _observed_ground(case: Case) -> Ground:
     curve, points = reference_curve(case), synthetic_points(case)
     return _ground_of_points(curve, GROUND_CELL * case.tolerance, curve.local(points[np.isfinite(points).all(axis=1)]))
 
 
-@kept_until("NAV")
-@per_hold
+@kept_until("NAV", per_hold)
 def _seen_ground(case: Case) -> Ground:
     return _ground_of_points(hold_curve(case), GROUND_CELL * case.tolerance, hold_local(case))
 

@@ -12,7 +12,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
 from benchmarks.fidelity.derive.axis import hold_curve
-from benchmarks.fidelity.derive.curve import Curve, candidate_curve, truth_curve
+from benchmarks.fidelity.derive.curve import Curve, candidate_curve, interpolate_rows, truth_curve
 from benchmarks.fidelity.derive.surface import sample_surface, surface_caster, visible_surface
 
 _WELD_DIGITS = 6  # a format with float32 keeps corners together and moves them by less
@@ -56,29 +56,25 @@ def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
     return Edges(ends, count, np.linalg.norm(mesh.vertices[ends[:, 0]] - mesh.vertices[ends[:, 1]], axis=1))
 
 
-@kept_until("TOP")
-@per_case
+@kept_until("TOP", per_case)
 def welded_lining(case: Case) -> trimesh.Trimesh:
     """Return the welded lining."""
     return weld(case.candidate.lining)
 
 
-@kept_until("TOP")
-@per_case
+@kept_until("TOP", per_case)
 def welded_solid(case: Case) -> trimesh.Trimesh:
     """Return the welded solid."""
     return weld(case.candidate.solid)
 
 
-@kept_until("TOP")
-@per_case
+@kept_until("TOP", per_case)
 def lining_edges(case: Case) -> Edges:
     """Return the edges of the welded lining."""
     return mesh_edges(welded_lining(case))
 
 
-@kept_until("MSH")
-@per_case
+@kept_until("MSH", per_case)
 def solid_edges(case: Case) -> Edges:
     """Return the edges of the welded solid."""
     return mesh_edges(welded_solid(case))
@@ -121,13 +117,12 @@ class AxisHits:
     cosine: Float[np.ndarray, " k"]
 
 
-@kept_until("TOP")
-@per_case
+@kept_until("TOP", per_case)
 def axis_hits(case: Case) -> AxisHits:
     """Casts rays in random directions from random places of the axis, into the lining alone."""
     bore, rng = case.candidate.bore, case.rng("axis_hits")
     station = rng.uniform(bore.station[0] + 0.2, bore.station[-1] - 0.2, _AXIS_RAYS)
-    middle = np.stack([np.interp(station, bore.station, axis) for axis in bore.position.T], axis=1)
+    middle = interpolate_rows(station, bore.station, bore.position)
     direction = rng.normal(size=(_AXIS_RAYS, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     origin, mesh = middle - weld_offset(case), welded_lining(case)
@@ -205,15 +200,13 @@ def _make_grid(case: Case, curve: Curve, points: Float[np.ndarray, "k 3"]) -> Gr
     return Grid(curve, cell, low, (int(shape[0]), int(shape[1]), int(shape[2])))
 
 
-@kept_until("TOP")
-@per_case
+@kept_until("TOP", per_case)
 def surface_samples(case: Case) -> Float[np.ndarray, "k 3"]:
     """Return points all over the candidate's visible surface, m."""
     return sample_surface(visible_surface(case), _SAMPLE_SPACING)[0]
 
 
-@kept_until("TOP")
-@per_truth
+@kept_until("TOP", per_truth)
 def _truth_samples(case: Case) -> Float[np.ndarray, "k 3"]:
     assert case.truth is not None
     return sample_surface(case.truth.surface, _SAMPLE_SPACING)[0]

@@ -6,10 +6,9 @@ then cost SCN and PAR nothing.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import wraps
 from hashlib import sha256
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 from xml.etree import ElementTree
 
 import mujoco
@@ -21,17 +20,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.candidate import Track, track_of
-from benchmarks.fidelity.case import SHARED, Case, per_case
-from benchmarks.fidelity.derive.curve import candidate_curve
+from benchmarks.fidelity.case import SHARED, Case, Function, kept_in, per_case
+from benchmarks.fidelity.derive.curve import candidate_curve, interpolate_rows
 from benchmarks.fidelity.derive.mesh import face_parts
-from benchmarks.fidelity.derive.surface import Caster, surface_caster
+from benchmarks.fidelity.derive.surface import Caster, surface_caster, visible_bodies
 from benchmarks.fidelity.geoms import Geoms, load_model
 from benchmarks.fidelity.meshes import concatenate_meshes
 
-Result = TypeVar("Result")
 
-
-def per_release(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[Case], Result]]:
+def per_release(*reads: str) -> Callable[[Function], Function]:
     """Keeps the result of a function of released files in this process for as long as the files stay the same.
 
     Args:
@@ -39,18 +36,10 @@ def per_release(*reads: str) -> Callable[[Callable[[Case], Result]], Callable[[C
             centreline).
     """
 
-    def decorate(function: Callable[[Case], Result]) -> Callable[[Case], Result]:
-        @wraps(function)
-        def once(case: Case) -> Result:
-            hashes = tuple(_HASHES[name](case) for name in reads)
-            key = (function.__module__, function.__qualname__, case.seed, case.tolerance, hashes)
-            if key not in SHARED:
-                SHARED[key] = function(case)
-            return SHARED[key]
+    def place(case: Case) -> tuple[dict[Any, Any], tuple[Any, ...]]:
+        return SHARED, (case.seed, case.tolerance, tuple(_HASHES[name](case) for name in reads))
 
-        return once
-
-    return decorate
+    return lambda function: kept_in(function, place)
 
 
 @per_case
@@ -72,10 +61,8 @@ def tunnel_hash(case: Case) -> str:
 @per_case
 def mesh_hash(case: Case) -> str:
     """Return the SHA-256 of the visible surface and the centreline in memory."""
-    digest, judged = sha256(case.candidate.bore.position.tobytes()), case.candidate
-    track = judged.track
-    laid = (track.sleeper_mesh, track.rail_mesh, track.fastening_mesh)
-    for mesh in (judged.lining, *laid, judged.extra, judged.nails, judged.bed):
+    digest = sha256(case.candidate.bore.position.tobytes())
+    for mesh in visible_bodies(case.candidate).values():
         digest.update(np.ascontiguousarray(mesh.vertices).tobytes() + np.ascontiguousarray(mesh.faces).tobytes())
     return digest.hexdigest()
 
@@ -148,10 +135,7 @@ def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tupl
     """
     bore = case.candidate.bore
     station = np.sort(case.rng(id).uniform(bore.station[0] + inset, bore.station[-1] - inset, count))
-    position, left = (
-        np.stack([np.interp(station, bore.station, column) for column in rows.T], axis=1)
-        for rows in (bore.position, bore.lateral)
-    )
+    position, left = (interpolate_rows(station, bore.station, rows) for rows in (bore.position, bore.lateral))
     return station, position, left / np.linalg.norm(left, axis=1, keepdims=True)
 
 

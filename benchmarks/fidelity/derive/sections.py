@@ -57,8 +57,7 @@ def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
     return trimesh.Trimesh(truth.surface.vertices, truth.surface.faces[kept], process=False)
 
 
-@kept_until("SEC")
-@per_truth
+@kept_until("SEC", per_truth)
 def truth_bore_caster(case: Case) -> Caster:
     """Return the caster of rays into the true bore: lining with joints and pockets, floor; no track."""
     return Caster(true_part(case, SHELL_PARTS))
@@ -235,8 +234,7 @@ def truth_radii(case: Case) -> Radii:
     return cast_radii(truth_curve(case), truth_bore_caster(case))
 
 
-@kept_until("NAV")
-@per_truth
+@kept_until("NAV", per_truth)
 def truth_caster(case: Case) -> Caster:
     """Return the caster of rays into all of the true surface."""
     assert case.truth is not None

@@ -143,16 +143,17 @@ def sample_surface(mesh: trimesh.Trimesh, cell: float) -> tuple[Float[np.ndarray
 
 def visible_mesh(candidate: Candidate) -> trimesh.Trimesh:
     """Return everything that a sensor can see of a candidate: lining, nails, track, bed, extra surfaces."""
-    return concatenate_meshes([part for part in _visible(candidate).values() if len(part.faces)])
+    return concatenate_meshes([part for part in visible_bodies(candidate).values() if len(part.faces)])
 
 
 def visible_parts(candidate: Candidate) -> Shaped[np.ndarray, " f"]:
     """Return the name of the part that each face of `visible_mesh` belongs to."""
-    parts = _visible(candidate)
+    parts = visible_bodies(candidate)
     return np.repeat(list(parts), [len(part.faces) for part in parts.values()])
 
 
-def _visible(candidate: Candidate) -> dict[str, trimesh.Trimesh]:
+def visible_bodies(candidate: Candidate) -> dict[str, trimesh.Trimesh]:
+    """Return the meshes of what a sensor can see of a candidate, by part; some may be empty."""
     track = candidate.track
     return {
         "lining": candidate.lining, "sleeper": track.sleeper_mesh, "rail": track.rail_mesh,
@@ -160,22 +161,19 @@ def _visible(candidate: Candidate) -> dict[str, trimesh.Trimesh]:
     }  # fmt: skip
 
 
-@kept_until("NAV")
-@per_case
+@kept_until("NAV", per_case)
 def visible_surface(case: Case) -> trimesh.Trimesh:
     """Return everything visible of the candidate, tunnel frame."""
     return visible_mesh(case.candidate)
 
 
-@kept_until("NAV")
-@per_case
+@kept_until("NAV", per_case)
 def surface_caster(case: Case) -> Caster:
     """Return the caster of rays into `visible_surface`."""
     return Caster(visible_surface(case))
 
 
-@kept_until("BEA")  # F3D and SCN make it anew: 0.2 GiB of 351 m
-@per_case
+@kept_until("BEA", per_case)  # F3D and SCN make it anew: 0.2 GiB of 351 m
 def surface_nearest(case: Case) -> Nearest:
     """Return the distances to `visible_surface`."""
     return Nearest(visible_surface(case))

@@ -215,7 +215,7 @@ def warp_mesh(mesh: trimesh.Trimesh, move: PointMap) -> trimesh.Trimesh:
 def warp_bore(bore: Bore, move: PointMap) -> Bore:
     """Moves axis and frames; width, height and radii grow as the map stretches a section at its axis."""
     position = move(bore.position)
-    station = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))])
+    station = Curve.through(position).station
     tangent = _unit(np.gradient(position, station, axis=0))
     lateral = _unit(np.cross([0.0, 0.0, 1.0], tangent))
     wide, high = (_stretch(bore, axis, move) for axis in (bore.lateral, bore.up))

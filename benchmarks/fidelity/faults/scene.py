@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 from benchmarks.fidelity.candidate import Candidate
+from benchmarks.fidelity.derive.curve import interpolate_rows
 from benchmarks.fidelity.faults.kinds import Fault, Site, fault_kind
 from benchmarks.fidelity.meshes import without_faces
 
@@ -126,7 +127,7 @@ def widen_plan(site: Site, fault: Fault) -> Candidate:
     for side, sign in (("left", 0.5), ("right", -0.5)):
         for lining in arrays["lining"]:
             at = arrays[f"{side}_station_{lining}"]
-            away = np.stack([np.interp(at, arrays["station"], column) for column in normal.T], axis=1)
+            away = interpolate_rows(at, arrays["station"], normal)
             arrays[f"{side}_{lining}"] = arrays[f"{side}_{lining}"] + sign * wider * away
     arrays["half_width"] = arrays["half_width"] + 0.5 * wider
     np.savez(copy.tunnel, **arrays)

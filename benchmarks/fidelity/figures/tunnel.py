@@ -10,7 +10,7 @@ from benchmarks.fidelity.derive.axis import reference_curve
 from benchmarks.fidelity.derive.beams import cast_beams, noisy_ranges, returns
 from benchmarks.fidelity.derive.clouds import plane_rows, real_planes, synthetic_planes
 from benchmarks.fidelity.derive.curve import candidate_curve
-from benchmarks.fidelity.derive.degeneracy import real_information, synthetic_information
+from benchmarks.fidelity.derive.degeneracy import information
 from benchmarks.fidelity.derive.mesh import candidate_diagrams, reference_diagrams
 from benchmarks.fidelity.derive.plane import free_plane
 from benchmarks.fidelity.figures.sheet import (
@@ -132,9 +132,9 @@ def draw_degeneracy(sheet: Sheet) -> Drawn | None:
     if sheet.case.hold is None:
         return None
     frames = (
-        (real_information(sheet.case), BLUE, "recorded"),
-        (synthetic_information(sheet.case), ORANGE, "in the reconstruction"),
-        (synthetic_information(sheet.null), GREY, "in the null tube"),
+        (information(sheet.case, True), BLUE, "recorded"),
+        (information(sheet.case, False), ORANGE, "in the reconstruction"),
+        (information(sheet.null, False), GREY, "in the null tube"),
     )
     figure, (axial, strong) = plt.subplots(2, 1, figsize=(12, 4.6), layout="constrained", sharex=True)
     for scans, colour, label in frames:

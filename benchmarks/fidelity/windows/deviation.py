@@ -85,8 +85,7 @@ def hold_frame(case: Case) -> Frame:
     return Frame(local, angle, (float(middle[0]), float(middle[1])), low, high, cell)
 
 
-@kept_until("LIN")
-@per_case
+@kept_until("LIN", per_case)
 def beam_offsets(case: Case) -> Float[np.ndarray, " n"]:
     """Return the offset of the candidate's surface along its normal at each return, m; NaN where a beam only grazes it.
 
@@ -97,8 +96,7 @@ def beam_offsets(case: Case) -> Float[np.ndarray, " n"]:
     return np.where(~cast.hit | (cast.cosine > _STEEPEST), np.clip(offset, -CAP, CAP), np.nan)
 
 
-@kept_until("LIN")
-@per_case
+@kept_until("LIN", per_case)
 def parts_hit(case: Case) -> np.ndarray:
     """Return the name of the candidate's part that each beam meets; empty where it meets nothing, `(n,)`."""
     face = cast_beams(case).face
@@ -149,8 +147,7 @@ def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], stati
     return Relief(station, np.where(np.isfinite(reach), reach, np.nan).reshape(len(station), COLUMNS))
 
 
-@kept_until("LIN")
-@per_case
+@kept_until("LIN", per_case)
 def bore_caster(case: Case) -> Caster:
     """Return the caster of rays into lining, bed and further bodies of the candidate, without its track."""
     one = case.candidate
