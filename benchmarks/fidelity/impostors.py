@@ -9,7 +9,6 @@ from jaxtyping import Float
 from benchmarks.fidelity.candidate import Bore, Candidate, Track
 from benchmarks.fidelity.derive.curve import Curve, interpolate_rows
 from benchmarks.fidelity.derive.surface import Caster
-from benchmarks.fidelity.meshes import without_faces
 from benchmarks.fidelity.references import Truth
 
 NULL_CORNERS = 72  # of the swept polygon
@@ -105,18 +104,18 @@ def truth_candidate(truth: Truth, base: Candidate) -> Candidate:
         truth: Truth of the simulated survey.
         base: Candidate whose scene folder and names are kept.
     """
-    wall = true_faces(truth, WALL_PARTS)
+    wall = _true_mesh(truth, *WALL_PARTS)
     wall.merge_vertices(digits_vertex=6)
     return replace(
         base, name="truth", lining=wall, solid=cap_rims(wall), bore=_true_bore(truth),
-        track=_true_track(truth, base.track), nails=true_faces(truth, ("nail",)), bed=trimesh.Trimesh(),
+        track=_true_track(truth, base.track), nails=_true_mesh(truth, "nail"), bed=trimesh.Trimesh(),
     )  # fmt: skip
 
 
-def true_faces(truth: Truth, names: tuple[str, ...]) -> trimesh.Trimesh:
-    """Return the faces of some parts of the true surface."""
-    numbers = [truth.parts.index(name) for name in names if name in truth.parts]
-    return without_faces(truth.surface, ~np.isin(truth.part, numbers))
+def _true_mesh(truth: Truth, *names: str) -> trimesh.Trimesh:
+    mesh = truth.faces(*names)
+    mesh.remove_unreferenced_vertices()
+    return mesh
 
 
 def cap_rims(lining: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -141,7 +140,7 @@ def _true_bore(truth: Truth) -> Bore:
     angle = np.linspace(-np.pi, np.pi, BORE_ANGLES, endpoint=False) + np.pi / BORE_ANGLES
     away = np.cos(angle)[None, :, None] * left[:, None] + np.sin(angle)[None, :, None] * up[:, None]
     origin = np.repeat(position[:, None], BORE_ANGLES, axis=1)
-    reach, _ = Caster(true_faces(truth, WALL_PARTS)).first(origin.reshape(-1, 3), away.reshape(-1, 3))
+    reach, _ = Caster(_true_mesh(truth, *WALL_PARTS)).first(origin.reshape(-1, 3), away.reshape(-1, 3))
     radius = reach.reshape(len(position), BORE_ANGLES)
     median = np.nanmedian(np.where(np.isfinite(radius), radius, np.nan), axis=0)
     radius = np.where(np.isfinite(radius), radius, median)
@@ -167,8 +166,8 @@ def _true_track(truth: Truth, base: Track) -> Track:
     curve = Curve(truth.station, truth.position)
     inner = {side: _move_inward(points, curve, aside) for side, points in heads.items()}
     return Track(
-        np.asarray(sleepers["position"], float).reshape(-1, 3) - truth.origin, true_faces(truth, ("sleeper",)), inner,
-        true_faces(truth, ("rail",)), true_faces(truth, ("fastening",)),
+        np.asarray(sleepers["position"], float).reshape(-1, 3) - truth.origin, _true_mesh(truth, "sleeper"), inner,
+        _true_mesh(truth, "rail"), _true_mesh(truth, "fastening"),
     )  # fmt: skip
 
 

@@ -188,6 +188,11 @@ class Truth:
     origin: Float[np.ndarray, "3"]
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
+    def faces(self, *names: str) -> trimesh.Trimesh:
+        """Return some parts of the true surface, with all of its vertices."""
+        kept = np.isin(self.part, [self.parts.index(name) for name in names if name in self.parts])
+        return trimesh.Trimesh(self.surface.vertices, self.surface.faces[kept], process=False)
+
 
 @dataclass(frozen=True)
 class HoldConfig:

@@ -67,6 +67,11 @@ def mean(values: np.ndarray) -> float:
     return float(np.mean(values))
 
 
+def mean_absolute(values: np.ndarray) -> float:
+    """Return the mean of the magnitudes."""
+    return float(np.mean(np.abs(values)))
+
+
 def mean_magnitude(values: np.ndarray) -> float:
     """Return the magnitude of the mean."""
     return abs(mean(values))

@@ -38,6 +38,7 @@ from benchmarks.fidelity.registry import (
     Value,
     estimate,
     mean,
+    mean_absolute,
     mean_magnitude,
     missing,
     number,
@@ -252,17 +253,14 @@ def lin_pocket_count_rel_err(case: Case) -> Value:
     return number(100.0 * abs(len(judged) / len(reference) - 1.0), len(reference))
 
 
-def _mean_abs(errors: np.ndarray) -> float:
-    return float(np.mean(np.abs(errors)))
-
-
-def _median_abs(errors: np.ndarray) -> float:
+def _median_absolute(errors: np.ndarray) -> float:
     return float(np.median(np.abs(errors)))
 
 
 @metric("lin_pocket_depth_bias", "LIN", D(0.00262, 0.08), "m", needs="reference", args=("depth", mean_magnitude))
-@metric("lin_pocket_depth_mae", "LIN", D(0.00324, 0.08), "m", gate=True, needs="reference", args=("depth", _mean_abs))
-@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", args=("area", _median_abs))
+@metric("lin_pocket_depth_mae", "LIN", D(0.00324, 0.08), "m", gate=True, needs="reference",
+        args=("depth", mean_absolute))  # fmt: skip
+@metric("lin_pocket_area_rel_err", "LIN", D(12.2, 60), "%", needs="reference", args=("area", _median_absolute))
 def matched_pocket_error(case: Case, id: str, name: str, statistic: Statistic) -> Value:
     """Error of depth (m) or area (%) of the matched pockets."""
     if not len(reference_pockets(case)):

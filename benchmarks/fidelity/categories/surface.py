@@ -20,7 +20,7 @@ from benchmarks.fidelity.derive.distances import (
     told_together,
     tolerant_f1,
 )
-from benchmarks.fidelity.registry import Statistic, Value, estimate, missing, number, percentile, rms
+from benchmarks.fidelity.registry import Statistic, Value, estimate, mean_magnitude, missing, number, percentile, rms
 from benchmarks.fidelity.table import LOGGED_UP, D, U, metric
 
 _FEWEST_IN_GROUP = 50  # points of a bin or sector that counts
@@ -57,7 +57,7 @@ def mesh_precision(case: Case, id: str, within: float) -> Value:
 def c2m_signed_bias(case: Case) -> Value:
     """Magnitude of the mean distance, signed by the side of the sensor, m."""
     distances, rng = mesh_distances(case), case.rng("c2m_signed_bias")
-    return estimate(lambda d: float(abs(np.mean(d))), distances.signed, distances.station, rng, BOOTSTRAP_SAMPLES)
+    return estimate(mean_magnitude, distances.signed, distances.station, rng, BOOTSTRAP_SAMPLES)
 
 
 @metric("c2m_chainage_worst", "C2M", D(0.0109, 0.049), "m", needs="hold")

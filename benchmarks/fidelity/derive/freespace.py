@@ -1,5 +1,6 @@
 """Free space in voxels along the reference axis, and clearances near it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +9,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 from scipy.spatial import cKDTree
 
-from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_reference
 from benchmarks.fidelity.derive.axis import hold_local, hold_points, reference_curve
 from benchmarks.fidelity.derive.beams import returns
 from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian
-from benchmarks.fidelity.derive.sections import lining_radii, sections, true_part, truth_caster, truth_radii
-from benchmarks.fidelity.derive.surface import Nearest, sample_surface, surface_caster, surface_nearest
+from benchmarks.fidelity.derive.sections import lining_radii, sections, truth_caster, truth_radii
+from benchmarks.fidelity.derive.surface import Caster, Nearest, sample_surface, surface_caster, surface_nearest
 from benchmarks.fidelity.meshes import concatenate_meshes
 
 _BEAMS_PER_METRE = 300  # beams followed for each metre of chainage
@@ -47,19 +48,11 @@ def carve_beams(case: Case) -> Carved:
     return Carved(passed, beam, real.points[back])
 
 
-def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
-    """Return passed and ended points as station, left and up about a curve, m; kept with the recording."""
-    kept = _carved_about(case)
-    if id(curve) not in kept:
-        samples = carve_beams(case)
-        kept[id(curve)] = (curve, curve.local(samples.passed), curve.local(samples.ended))
-    return kept[id(curve)][1:]
-
-
 @kept_until("F3D", per_hold)
-def _carved_about(case: Case) -> dict[int, tuple[Curve, Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]]:
-    """Return what `carved_about` has placed, by the curve."""
-    return {}
+def carved_about(case: Case, curve: Curve) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "b 3"]]:
+    """Return passed and ended points as station, left and up about a curve, m."""
+    samples = carve_beams(case)
+    return curve.local(samples.passed), curve.local(samples.ended)
 
 
 # Air in voxels of (station, left, up), 20 cm, so that nothing is aligned with the world.
@@ -141,7 +134,7 @@ def air_voxels(case: Case) -> Air:
     track = cells.marked(cells.curve.local(track_points(case, cells.edge)))
     extra = cells.marked(cells.curve.local(sample_surface(case.candidate.extra, cells.edge / 2)[0]))
     judged = reachable(inside & ~track & ~extra)
-    reference, known = reference_air(case, cells)
+    reference, known = reference_air(case)
     return Air(cells, judged, reference, known, inside & ~judged, inside & ~judged & ~track)
 
 
@@ -159,34 +152,42 @@ def track_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
 
 def true_object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
     """Return samples of the objects in the true bore, m."""
-    return sample_surface(true_part(case, _OBJECTS), edge / 2)[0]
+    assert case.truth is not None
+    return sample_surface(case.truth.faces(*_OBJECTS), edge / 2)[0]
 
 
-def reference_air(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
+@per_reference
+def reference_air(case: Case) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
     """Return the air of the reference and where it is known.
 
-    The truth is known to 0.6 m behind its surface. Held-out beams know the cells that they pass; a cell in which at
-    least two of them end is air where its middle lies nearer to the axis than their ends do.
+    The truth is known to 0.6 m behind its surface, a recording where its beams pass or end.
     """
-    if case.truth is not None:
-        return _true_air(case)
-    passed, ended = carved_about(case, cells.curve)
-    cell, kept = cells.cell(ended)
-    size = int(np.prod(cells.shape))
-    ends = np.bincount(cell[kept], minlength=size)
-    far = np.bincount(cell[kept], np.hypot(ended[kept, 1], ended[kept, 2]), size) / np.maximum(ends, 1)
-    middle = cells.local()
-    hit = ends >= HIT_RETURNS
-    free = np.where(hit, np.hypot(middle[:, 1], middle[:, 2]) < far, cells.marked(passed).ravel())
-    return free.reshape(cells.shape), (free | hit).reshape(cells.shape)
-
-
-@per_truth
-def _true_air(case: Case) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
     cells = air_lattice(case)
+    if case.truth is None:
+        passed, ended = carved_about(case, cells.curve)
+        return carved_cells(cells, passed, ended, lambda local: np.hypot(local[:, 1], local[:, 2]))
     inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape)
     free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge))))
     return free, binary_dilation(inside, iterations=max(int(KNOWN_AROUND / cells.edge), 1))
+
+
+def carved_cells(
+    cells: Lattice,
+    passed: Float[np.ndarray, "k 3"],
+    ended: Float[np.ndarray, "b 3"],
+    away: Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, " n"]],
+) -> tuple[Bool[np.ndarray, "n m k"], Bool[np.ndarray, "n m k"]]:
+    """Return free and known cells by the points that beams passed, and by those where they ended; `away` from the axis.
+
+    A cell in which at least two beams end is free where its middle lies nearer to the axis than their ends do.
+    """
+    cell, kept = cells.cell(ended)
+    size = int(np.prod(cells.shape))
+    ends = np.bincount(cell[kept], minlength=size)
+    far = np.bincount(cell[kept], away(ended[kept]), size) / np.maximum(ends, 1)
+    hit = ends >= HIT_RETURNS
+    free = np.where(hit, away(cells.local()) < far, cells.marked(passed).ravel())
+    return free.reshape(cells.shape), (free | hit).reshape(cells.shape)
 
 
 def reachable(free: Bool[np.ndarray, "n m k"]) -> Bool[np.ndarray, "n m k"]:
@@ -245,20 +246,18 @@ def _places_near_axis(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.nda
     return station, reference_curve(case).point(grid.reshape(-1, 3))
 
 
-@per_truth
-def _true_clearances(case: Case) -> Float[np.ndarray, " k"]:
-    assert case.truth is not None
-    return Nearest(case.truth.surface).query(_places_near_axis(case)[1])[0]
+@per_reference
+def _reference_clearances(case: Case) -> Float[np.ndarray, " k"]:
+    nearest = Nearest(case.truth.surface) if case.truth is not None else cKDTree(hold_points(case))
+    return nearest.query(_places_near_axis(case)[1])[0]
 
 
 @per_case
 def axis_clearances(case: Case) -> Clearances:
     """Return the clearances of candidate and reference; a recording's is the distance to its nearest return."""
     station, points = _places_near_axis(case)
-    judged = surface_nearest(case).query(points)[0]
-    reference = _true_clearances(case) if case.truth is not None else cKDTree(hold_points(case)).query(points)[0]
-    shape = (len(station), -1)
-    return Clearances(station, judged.reshape(shape), reference.reshape(shape))
+    both = surface_nearest(case).query(points)[0], _reference_clearances(case)
+    return Clearances(station, *(distance.reshape(len(station), -1) for distance in both))
 
 
 @per_case
@@ -267,50 +266,40 @@ def headrooms(case: Case) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n
 
     Medians over 0.5 m of chainage, so that a sleeper a centimetre off counts by its centimetre.
     """
+    station = _lane_stations(case)
+    judged = _cast_headroom(surface_caster(case), reference_curve(case), station)
+    return station, judged, _reference_headroom(case)
+
+
+def _lane_stations(case: Case) -> Float[np.ndarray, " n"]:
     curve = reference_curve(case)
-    station = _lane_stations(curve)
-    judged = _cast_headroom(surface_caster(case).first, curve, station)
-    if case.truth is not None:
-        return station, judged, _true_headroom(case)
-    return station, judged, _seen_headroom(case)(station)
-
-
-def _lane_stations(curve: Curve) -> Float[np.ndarray, " n"]:
     return np.arange(curve.station[0] + _LANE_BIN, curve.station[-1] - _LANE_BIN, _LANE_BIN)
 
 
-@per_truth
-def _true_headroom(case: Case) -> Float[np.ndarray, "n 3"]:
-    curve = reference_curve(case)
-    return _cast_headroom(truth_caster(case).first, curve, _lane_stations(curve))
-
-
-def _cast_headroom(first, curve: Curve, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def _cast_headroom(caster: Caster, curve: Curve, station: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     fine = (station[:, None] + np.linspace(-0.4, 0.4, 5) * _LANE_BIN).ravel()
     position, _, left, up = curve.frames(fine)
     lanes = []
     for lane in LANES:
         eye = position + lane * left
-        total = first(eye, up)[0] + first(eye, -up)[0]
+        total = caster.first(eye, up)[0] + caster.first(eye, -up)[0]
         lanes.append(nanmedian(np.where(np.isfinite(total), total, np.nan).reshape(len(station), -1)))
     return np.column_stack(lanes)
 
 
-@per_hold
-def _seen_headroom(case: Case):
-    local = hold_local(case)
-
-    def at(station: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-        row = np.floor((local[:, 0] - station[0]) / _LANE_BIN + 0.5).astype(int)
-        lanes = []
-        for lane in LANES:
-            near = (np.abs(local[:, 1] - lane) < _LANE_HALF) & (row >= 0) & (row < len(station))
-            ends = [near & (sign * local[:, 2] > 1.0) for sign in (1, -1)]
-            top, bottom = (grouped_median(row[kept], local[kept, 2], len(station), 5) for kept in ends)
-            lanes.append(top - bottom)
-        return np.column_stack(lanes)
-
-    return at
+@per_reference
+def _reference_headroom(case: Case) -> Float[np.ndarray, "n 3"]:
+    station = _lane_stations(case)
+    if case.truth is not None:
+        return _cast_headroom(truth_caster(case), reference_curve(case), station)
+    local, lanes = hold_local(case), []
+    row = np.floor((local[:, 0] - station[0]) / _LANE_BIN + 0.5).astype(int)
+    for lane in LANES:
+        near = (np.abs(local[:, 1] - lane) < _LANE_HALF) & (row >= 0) & (row < len(station))
+        ends = [near & (sign * local[:, 2] > 1.0) for sign in (1, -1)]
+        top, bottom = (grouped_median(row[kept], local[kept, 2], len(station), 5) for kept in ends)
+        lanes.append(top - bottom)
+    return np.column_stack(lanes)
 
 
 @per_case

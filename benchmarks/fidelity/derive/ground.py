@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import distance_transform_edt
 
-from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_reference
 from benchmarks.fidelity.derive.axis import hold_curve, hold_local, lining_curve, reference_curve
 from benchmarks.fidelity.derive.beams import synthetic_points
 from benchmarks.fidelity.derive.curve import Curve, grouped_median
@@ -70,13 +70,11 @@ class Ground:
     def lattices(self) -> "list[Ground]":
         """Return the grounds of cells side by side that this one is made of."""
         return [
-            Ground(self.cell, self.station, self.left[k::LATTICES], *(grid[:, k::LATTICES] for grid in self._grids))
+            Ground(self.cell, self.station, self.left[k::LATTICES], *(
+                grid[:, k::LATTICES] for grid in (self.height, self.headroom, self.step)
+            ))
             for k in range(LATTICES)
-        ]
-
-    @property
-    def _grids(self) -> tuple[Float[np.ndarray, "n m"], ...]:
-        return self.height, self.headroom, self.step
+        ]  # fmt: skip
 
 
 def ground_curve(case: Case) -> Curve:
@@ -95,12 +93,6 @@ def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Flo
 def judged_ground(case: Case) -> Ground:
     """Return the candidate's ground, by rays."""
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
-
-
-@per_truth
-def true_ground(case: Case) -> Ground:
-    """Return the true ground, by rays."""
-    return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, truth_caster(case), truth_radii(case))
 
 
 def _cast_ground(curve: Curve, cell: float, caster: Caster, radii: Radii) -> Ground:
@@ -208,10 +200,8 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
     Beams that graze the ground leave gaps and blur steps; with the same beams and noise they do so on both sides.
     The last 25 cm before the reference's wall are left out: the robot's middle cannot get there.
     """
-    if case.truth is not None:
-        judged, reference = judged_ground(case), true_ground(case)
-    else:
-        judged, reference = _observed_ground(case), _seen_ground(case)
+    judged = judged_ground(case) if case.truth is not None else _observed_ground(case)
+    reference = _reference_ground(case)
     cut = sections(case)
     low = shapely.bounds(cut.reference_outline)[:, 1] + _WALL_FOOT
     reach = np.interp(reference.station, cut.station, widths(cut.reference_outline, low) / 2 - _WALL_MARGIN)
@@ -220,15 +210,17 @@ def both_grounds(case: Case) -> tuple[Ground, Ground]:
     return left_out[0], left_out[1]
 
 
-@kept_until("NAV", per_case)
 def _observed_ground(case: Case) -> Ground:
     curve, points = reference_curve(case), synthetic_points(case)
     return _ground_of_points(curve, GROUND_CELL * case.tolerance, curve.local(points[np.isfinite(points).all(axis=1)]))
 
 
-@kept_until("NAV", per_hold)
-def _seen_ground(case: Case) -> Ground:
-    return _ground_of_points(hold_curve(case), GROUND_CELL * case.tolerance, hold_local(case))
+@kept_until("NAV", per_reference)
+def _reference_ground(case: Case) -> Ground:
+    cell = GROUND_CELL * case.tolerance
+    if case.truth is None:
+        return _ground_of_points(hold_curve(case), cell, hold_local(case))
+    return _cast_ground(ground_curve(case), cell, truth_caster(case), truth_radii(case))
 
 
 def _ground_of_points(curve: Curve, cell: float, local: Float[np.ndarray, "k 3"]) -> Ground:

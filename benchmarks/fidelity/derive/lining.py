@@ -9,7 +9,7 @@ from scipy.signal import correlate, find_peaks
 from scipy.spatial import cKDTree
 from skimage.measure import regionprops
 
-from benchmarks.fidelity.case import Case, per_case, per_truth
+from benchmarks.fidelity.case import Case, per_case, per_hold, per_reference, per_truth
 from benchmarks.fidelity.derive.axis import hold_local, hold_points, lining_caster, reference_curve
 from benchmarks.fidelity.derive.beams import cast_beams, points_at
 from benchmarks.fidelity.derive.curve import (
@@ -91,16 +91,14 @@ def truth_map(case: Case) -> Unrolled:
     return map_of_radii(truth_radii(case))
 
 
-@per_case
 def hold_map(case: Case) -> Unrolled:
     """Return the map of the held-out recording, from the same axis; the mean of the returns in each cell."""
-    assert case.hold is not None
-    curve = reference_curve(case)
-    key = ("unrolled.hold_map", case.truth is None)
-    if key not in case.hold.cache:
-        local = hold_local(case) if case.truth is None else curve.local(hold_points(case))
-        case.hold.cache[key] = map_of_points(curve, local)
-    return case.hold.cache[key]
+    return _hold_map(case, reference_curve(case))
+
+
+@per_hold
+def _hold_map(case: Case, curve: Curve) -> Unrolled:
+    return map_of_points(curve, hold_local(case) if case.truth is None else curve.local(hold_points(case)))
 
 
 def map_of_points(curve: Curve, local: Float[np.ndarray, "k 3"]) -> Unrolled:
@@ -149,11 +147,6 @@ def blur(depth: Float[np.ndarray, "n m"], known: Bool[np.ndarray, "n m"]) -> Flo
     return np.where(weight > 0, total / np.maximum(weight, 1.0), np.nan)
 
 
-def common_rows(first: Unrolled, second: Unrolled) -> int:
-    """Return the number of rows that two maps of one axis share."""
-    return min(len(first.station), len(second.station))
-
-
 @per_case
 def paired_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
     """Return stations, and depths of candidate and recording in the cells that beams show of both, m.
@@ -161,7 +154,7 @@ def paired_depths(case: Case) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray
     Both are averaged over the same cells of three by three, so that range noise of single returns does not decide.
     """
     judged, hold = observed_map(case), hold_map(case)
-    rows = common_rows(judged, hold)
+    rows = min(len(judged.station), len(hold.station))
     known = np.isfinite(hold.depth[:rows]) & np.isfinite(judged.depth[:rows]) & hold.wall & judged.wall
     both = [blur(side.depth[:rows], known)[known] for side in (judged, hold)]
     return np.repeat(hold.station[:rows], known.sum(axis=1)), both[0], both[1]
@@ -186,16 +179,10 @@ def relief(unrolled: Unrolled) -> Float[np.ndarray, "n m"]:
     return np.where((depth > _RELIEF) & unrolled.wall, depth, 0.0)
 
 
-def relief_along(unrolled: Unrolled) -> Float[np.ndarray, " n"]:
-    """Return the mean relief by station, where the wall is known, m."""
-    known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=1)
-    return relief(unrolled).sum(axis=1) / np.maximum(known, 1)
-
-
-def relief_around(unrolled: Unrolled) -> Float[np.ndarray, " m"]:
-    """Return the mean relief by direction, m."""
-    known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=0)
-    return relief(unrolled).sum(axis=0) / np.maximum(known, 1)
+def relief_along(unrolled: Unrolled, axis: int = 1) -> Float[np.ndarray, " n"]:
+    """Return the mean relief by station, or by direction with `axis` 0, where the wall is known, m."""
+    known = (np.isfinite(unrolled.depth) & unrolled.wall).sum(axis=axis)
+    return relief(unrolled).sum(axis=axis) / np.maximum(known, 1)
 
 
 def coarse_pitch(signal: Float[np.ndarray, " n"]) -> float | None:
@@ -226,22 +213,10 @@ def ring_pitch(unrolled: Unrolled, near: float, band: float) -> float | None:
     return float(tried[np.argmax(power)])
 
 
+@per_reference
 def reference_pitch(case: Case) -> float | None:
     """Return the pitch of the reference's rings, m; `None` where it shows none."""
-    return _true_pitch(case) if case.truth is not None else _seen_pitch(case)
-
-
-@per_truth
-def _true_pitch(case: Case) -> float | None:
-    return _fine_pitch(truth_map(case))
-
-
-@per_case
-def _seen_pitch(case: Case) -> float | None:
-    return _fine_pitch(hold_map(case))
-
-
-def _fine_pitch(unrolled: Unrolled) -> float | None:
+    unrolled = truth_map(case) if case.truth is not None else hold_map(case)
     coarse = coarse_pitch(relief_along(unrolled))
     return None if coarse is None else ring_pitch(unrolled, coarse, 0.1)
 
@@ -260,7 +235,7 @@ def ring_phases(unrolled: Unrolled, length: float) -> Float[np.ndarray, " w"]:
 
 def pocket_rows(unrolled: Unrolled, arc: Float[np.ndarray, " m"]) -> Float[np.ndarray, " r"]:
     """Return the positions along the section of rows of recesses, m."""
-    signal = relief_around(unrolled)
+    signal = relief_along(unrolled, axis=0)
     smooth = np.convolve(np.concatenate([signal[-2:], signal, signal[:2]]), np.ones(5) / 5, mode="valid")
     if smooth.max() < _FAINT:
         return np.zeros(0)

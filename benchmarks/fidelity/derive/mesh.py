@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
+from benchmarks.fidelity.case import Case, kept_until, per_case, per_reference
 from benchmarks.fidelity.derive.axis import hold_curve
 from benchmarks.fidelity.derive.curve import Curve, candidate_curve, interpolate_rows, truth_curve
 from benchmarks.fidelity.derive.surface import sample_surface, surface_caster, visible_surface
@@ -206,10 +206,12 @@ def surface_samples(case: Case) -> Float[np.ndarray, "k 3"]:
     return sample_surface(visible_surface(case), _SAMPLE_SPACING)[0]
 
 
-@kept_until("TOP", per_truth)
-def _truth_samples(case: Case) -> Float[np.ndarray, "k 3"]:
-    assert case.truth is not None
-    return sample_surface(case.truth.surface, _SAMPLE_SPACING)[0]
+@kept_until("TOP", per_reference)
+def _reference_samples(case: Case) -> Float[np.ndarray, "k 3"]:
+    if case.truth is not None:
+        return sample_surface(case.truth.surface, _SAMPLE_SPACING)[0]
+    assert case.hold is not None
+    return case.hold.points
 
 
 @per_case
@@ -225,57 +227,38 @@ def free_components(case: Case) -> tuple[int, int]:
     return len(np.setdiff1d(np.unique(numbers), [0])), int((numbers > 0).sum())
 
 
-@per_truth
-def truth_grid(case: Case) -> Grid:
-    """Return the grid of the comparison with the truth."""
-    return _make_grid(case, truth_curve(case), _truth_samples(case))
+@per_reference
+def _reference_grid(case: Case) -> Grid:
+    curve = truth_curve(case) if case.truth is not None else hold_curve(case)
+    return _make_grid(case, curve, _reference_samples(case))
 
 
-@per_hold
-def hold_grid(case: Case) -> Grid:
-    """Return the grid of the comparison with the held-out recording."""
-    assert case.hold is not None
-    return _make_grid(case, hold_curve(case), case.hold.points)
-
-
-@per_truth
-def truth_diagrams(case: Case) -> Diagrams:
-    """Return the persistence of the true clearance."""
-    grid = truth_grid(case)
-    return persistence_diagrams(grid.clearance(grid.occupied(_truth_samples(case))))
-
-
-@per_hold
-def hold_diagrams(case: Case) -> Diagrams:
-    """Return the persistence of the clearance that the held-out returns leave."""
-    assert case.hold is not None
-    grid = hold_grid(case)
-    return persistence_diagrams(grid.clearance(_close_gaps(grid.occupied(case.hold.points))))
+@per_reference
+def reference_diagrams(case: Case) -> Diagrams:
+    """Return the persistence of the true clearance, or of that which the held-out returns leave."""
+    return _diagrams(case, _reference_samples(case))
 
 
 @per_case
 def candidate_diagrams(case: Case) -> Diagrams:
     """Return the persistence of the candidate's clearance, sampled as the reference is."""
     if case.truth is not None:
-        grid = truth_grid(case)
-        return persistence_diagrams(grid.clearance(grid.occupied(surface_samples(case))))
-    assert case.hold is not None
-    hold, grid = case.hold, hold_grid(case)
+        return _diagrams(case, surface_samples(case))
+    hold = case.hold
+    assert hold is not None
     distance = surface_caster(case).first(hold.origin, hold.direction)[0]
     hit = np.isfinite(distance) & hold.returned
     distance = distance[hit] + hold.sigma * case.rng("clearance").normal(size=int(hit.sum()))
-    points = hold.origin[hit] + distance[:, None] * hold.direction[hit]
-    return persistence_diagrams(grid.clearance(_close_gaps(grid.occupied(points))))
+    return _diagrams(case, hold.origin[hit] + distance[:, None] * hold.direction[hit])
 
 
-def _close_gaps(occupied: Bool[np.ndarray, "a b c"]) -> Bool[np.ndarray, "a b c"]:
-    """Closes gaps of one cell, which lie between the beams of a recording."""
-    return binary_closing(np.pad(occupied, 1, mode="edge"), np.ones((3, 3, 3)))[1:-1, 1:-1, 1:-1]
-
-
-def reference_diagrams(case: Case) -> Diagrams:
-    """Return the diagrams of the truth where there is one, else of the held-out recording."""
-    return truth_diagrams(case) if case.truth is not None else hold_diagrams(case)
+def _diagrams(case: Case, points: Float[np.ndarray, "k 3"]) -> Diagrams:
+    """Return the persistence of the clearance between points; gaps of one cell between the beams are closed."""
+    grid = _reference_grid(case)
+    occupied = grid.occupied(points)
+    if case.truth is None:
+        occupied = binary_closing(np.pad(occupied, 1, mode="edge"), np.ones((3, 3, 3)))[1:-1, 1:-1, 1:-1]
+    return persistence_diagrams(grid.clearance(occupied))
 
 
 def persistence_diagrams(clearance: Float[np.ndarray, "a b c"]) -> Diagrams:

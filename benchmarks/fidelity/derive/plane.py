@@ -12,10 +12,10 @@ from benchmarks.fidelity.case import Case, per_case
 from benchmarks.fidelity.derive.axis import hold_local, reference_curve
 from benchmarks.fidelity.derive.curve import grouped_median
 from benchmarks.fidelity.derive.freespace import (
-    HIT_RETURNS,
     KNOWN_AROUND,
     Lattice,
     carved_about,
+    carved_cells,
     make_lattice,
     object_points,
     reachable,
@@ -63,33 +63,25 @@ def free_plane(case: Case) -> Plane:
     objects = cells.marked(cells.curve.local(object_points(case, cells.edge)))[..., 0]
     judged = reachable(inside & ~objects)
     if case.truth is None:
-        free, known = carved_cells(case, cells)
+        free, known = _cells_near_plane(case, cells)
         return Plane(cells, judged, free, known, height)
     inside = (truth_radii(case).depth_local(cells.local()) > 0).reshape(cells.shape[:2])
     free = reachable(inside & ~cells.marked(cells.curve.local(true_object_points(case, cells.edge)))[..., 0])
     return Plane(cells, judged, free, binary_dilation(inside, iterations=int(KNOWN_AROUND / cells.edge)), height)
 
 
-def carved_cells(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
-    """Return free and known cells by the held-out beams that run or end within 15 cm of the plane.
-
-    A cell in which at least two beams end is free where its middle lies nearer to the axis than their ends do.
-    """
+def _cells_near_plane(case: Case, cells: Lattice) -> tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, "n m"]]:
+    """Return free and known cells by the held-out beams that run or end within 15 cm of the plane."""
     middle = cells.low[2] + cells.edge / 2
     near = [local[np.abs(local[:, 2] - middle) < _SLAB] for local in carved_about(case, cells.curve)]
     passed, ended = (np.column_stack([local[:, :2], np.full(len(local), middle)]) for local in near)
-    cell, kept = cells.cell(ended)
-    size = int(np.prod(cells.shape))
-    ends = np.bincount(cell[kept], minlength=size)
-    far = np.bincount(cell[kept], np.abs(ended[kept, 1]), size) / np.maximum(ends, 1)
-    hit = ends >= HIT_RETURNS
-    free = np.where(hit, np.abs(cells.local()[:, 1]) < far, cells.marked(passed).ravel())
-    return free.reshape(cells.shape[:2]), (free | hit).reshape(cells.shape[:2])
+    free, known = carved_cells(cells, passed, ended, lambda local: np.abs(local[:, 1]))
+    return free[..., 0], known[..., 0]
 
 
 def unknown_share(case: Case) -> float:
     """Return the share of the candidate's free cells that no held-out beam shows."""
-    _, known = carved_cells(case, free_plane(case).lattice)
+    _, known = _cells_near_plane(case, free_plane(case).lattice)
     return float(1.0 - known[free_plane(case).judged].mean())
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label
 from skimage.graph import MCP_Geometric
 
-from benchmarks.fidelity.case import Case, per_case, per_truth
+from benchmarks.fidelity.case import Case, per_case, per_reference
 from benchmarks.fidelity.derive.ground import Ground, both_grounds, judged_ground
 
 ROBOT_RADIUS = 0.40  # m of the robot
@@ -73,12 +73,11 @@ def judged_route(case: Case) -> Route | None:
 @per_case
 def both_routes(case: Case) -> tuple[Route | None, Route | None]:
     """Return the routes on the two grounds that are compared."""
-    judged, reference = both_grounds(case)
-    return find_route(judged), find_route(reference) if case.truth is None else _true_route(case)
+    return find_route(both_grounds(case)[0]), _reference_route(case)
 
 
-@per_truth
-def _true_route(case: Case) -> Route | None:
+@per_reference
+def _reference_route(case: Case) -> Route | None:
     return find_route(both_grounds(case)[1])
 
 

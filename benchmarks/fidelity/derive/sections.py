@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-import trimesh
 from jaxtyping import Bool, Float
 from scipy.ndimage import distance_transform_edt
 from scipy.signal import detrend
@@ -49,18 +48,11 @@ class Sections:
         return shapely.intersection(self.judged_outline, self.reference_outline)
 
 
-def true_part(case: Case, names: tuple[str, ...]) -> trimesh.Trimesh:
-    """Return some parts of the true surface."""
-    truth = case.truth
-    assert truth is not None
-    kept = np.isin(truth.part, [truth.parts.index(name) for name in names if name in truth.parts])
-    return trimesh.Trimesh(truth.surface.vertices, truth.surface.faces[kept], process=False)
-
-
 @kept_until("SEC", per_truth)
 def truth_bore_caster(case: Case) -> Caster:
     """Return the caster of rays into the true bore: lining with joints and pockets, floor; no track."""
-    return Caster(true_part(case, SHELL_PARTS))
+    assert case.truth is not None
+    return Caster(case.truth.faces(*SHELL_PARTS))
 
 
 def row_stations(curve: Curve) -> Float[np.ndarray, " n"]:

@@ -19,13 +19,6 @@ BELOW_TOP = 0.014  # m; EN 13848 measures there
 _GAUGE_STEP = 0.5  # m
 
 
-def measure_gauge(
-    curve: Curve, mesh: trimesh.Trimesh, left: Float[np.ndarray, "k 3"], right: Float[np.ndarray, "k 3"]
-) -> Float[np.ndarray, " n"]:
-    """Return the distance between the inner faces of the rails, every half metre; see `gauge_along`."""
-    return gauge_along(curve, mesh, left, right)[1]
-
-
 def gauge_along(
     curve: Curve, mesh: trimesh.Trimesh, left: Float[np.ndarray, "k 3"], right: Float[np.ndarray, "k 3"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -111,9 +104,7 @@ def truth_railway(case: Case) -> Railway:
     if not rails:
         return Railway(curve, sleeper, np.zeros((2, 0, 3)), None, 0.0, curve.length)
     rail = np.array([rails["left"], rails["right"]]) - truth.origin
-    faces = truth.surface.faces[truth.part == truth.parts.index("rail")]
-    mesh = trimesh.Trimesh(truth.surface.vertices, faces, process=False)
-    gauge = float(np.mean(measure_gauge(curve, mesh, rail[0], rail[1])))
+    gauge = float(np.mean(gauge_along(curve, truth.faces("rail"), rail[0], rail[1])[1]))
     return Railway(curve, sleeper, rail, gauge, 0.0, curve.length)
 
 
@@ -246,7 +237,7 @@ def sleeper_spacings(sleeper: Float[np.ndarray, "s 3"]) -> Float[np.ndarray, " d
 def candidate_gauge(case: Case) -> Float[np.ndarray, " k"]:
     """Return the gauge along the candidate's exported rails, m."""
     track = case.candidate.track
-    return measure_gauge(candidate_curve(case), track.rail_mesh, track.rail["left"], track.rail["right"])
+    return gauge_along(candidate_curve(case), track.rail_mesh, track.rail["left"], track.rail["right"])[1]
 
 
 @per_case

@@ -7,7 +7,14 @@ from jaxtyping import Bool, Float, Int
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_hold, per_truth
 from benchmarks.fidelity.derive.beams import cast_beams, observed_extent, returns, sensor_path
-from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian, truth_curve
+from benchmarks.fidelity.derive.curve import (
+    Curve,
+    cast_profile,
+    grouped_median,
+    nanmedian,
+    section_angles,
+    truth_curve,
+)
 from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.derive.surface import Caster, visible_parts
 from benchmarks.fidelity.meshes import concatenate_meshes
@@ -18,6 +25,7 @@ CAP = 0.5  # m; larger offsets count as this
 LEAST = 4  # returns that make a cell known
 FINE = 0.05  # m along the tunnel between rays of a relief
 COLUMNS = 216  # rays of a relief around the tunnel
+ANGLES = section_angles(COLUMNS)
 TRACK = ("sleeper", "rail", "fastening")  # parts of a candidate that are no bore
 TRACK_SIDE = np.deg2rad(50.0)  # from straight down: what lies there may be track
 _STEEPEST = np.cos(np.deg2rad(80.0))  # beams that graze more steeply say little about where a surface is
@@ -38,11 +46,6 @@ class Unrolled:
     def place(self, station: float) -> Float[np.ndarray, "3"]:
         """Return the middle of the section at a station, tunnel frame, m."""
         return self.curve.point(np.array([[station, *self.middle]]))[0]
-
-
-def sector_angles(count: int = SECTORS) -> Float[np.ndarray, " m"]:
-    """Return the middle angles of the sectors, from left towards up, rad."""
-    return (np.arange(count) + 0.5) * 2.0 * np.pi / count - np.pi
 
 
 def is_floor(angle: Float[np.ndarray, "*shape"]) -> Bool[np.ndarray, "*shape"]:
@@ -137,16 +140,6 @@ class Relief:
     radius: Float[np.ndarray, "n m"]  # m; NaN where a ray meets nothing
 
 
-def cast_relief(caster: Caster, curve: Curve, middle: tuple[float, float], station: Float[np.ndarray, " n"]) -> Relief:
-    """Casts rays from the middle of the section, in the planes of the sections at some stations, m."""
-    angle = sector_angles(COLUMNS)
-    position, _, left, up = curve.frames(station)
-    origin = np.repeat(position + middle[0] * left + middle[1] * up, COLUMNS, axis=0)
-    away = np.cos(angle)[:, None] * left[:, None] + np.sin(angle)[:, None] * up[:, None]
-    reach, _ = caster.first(origin, away.reshape(-1, 3))
-    return Relief(station, np.where(np.isfinite(reach), reach, np.nan).reshape(len(station), COLUMNS))
-
-
 @kept_until("LIN", per_case)
 def bore_caster(case: Case) -> Caster:
     """Return the caster of rays into lining, bed and further bodies of the candidate, without its track."""
@@ -159,13 +152,14 @@ def truth_relief(case: Case) -> Relief:
     """Return the relief of the true bore about its own axis."""
     curve = truth_curve(case)
     stations = np.arange(_MOUTH + FINE / 2, curve.length - _MOUTH, FINE)
-    return cast_relief(truth_bore_caster(case), curve, (0.0, 0.0), stations)
+    return Relief(stations, cast_profile(truth_bore_caster(case), curve, stations, ANGLES))
 
 
 @per_case
 def relief_on_truth(case: Case) -> Relief:
     """Return the relief of the candidate about the true axis."""
-    return cast_relief(bore_caster(case), truth_curve(case), (0.0, 0.0), truth_relief(case).station)
+    stations = truth_relief(case).station
+    return Relief(stations, cast_profile(bore_caster(case), truth_curve(case), stations, ANGLES))
 
 
 @per_case
@@ -173,7 +167,7 @@ def relief_on_path(case: Case) -> Relief:
     """Return the relief of the candidate along the sensor's path."""
     frame = hold_frame(case)
     stations = np.arange(frame.low + FINE / 2, frame.high, FINE)
-    return cast_relief(bore_caster(case), sensor_path(case), frame.middle, stations)
+    return Relief(stations, cast_profile(bore_caster(case), sensor_path(case), stations, ANGLES, frame.middle))
 
 
 def relief_cells(relief: Relief, values: Float[np.ndarray, "n m"] | None = None) -> Float[np.ndarray, "k s"]:

@@ -1,7 +1,7 @@
 """Measures by window: values along the tunnel that a mean over all of it would hide, each with its limit."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from benchmarks.fidelity.case import Case
+from benchmarks.fidelity.derive.curve import section_angles
+from benchmarks.fidelity.registry import mean_absolute, rms
 from benchmarks.fidelity.windows import track
 from benchmarks.fidelity.windows.deviation import (
     CELL,
@@ -20,7 +22,6 @@ from benchmarks.fidelity.windows.deviation import (
     relief_cells,
     relief_on_path,
     relief_on_truth,
-    sector_angles,
     truth_map,
 )
 from benchmarks.fidelity.windows.shift import handedness, hold_shift, truth_shift
@@ -71,46 +72,28 @@ def unrolled(case: Case, source: Source) -> Unrolled:
     return hold_map(case) if source == "recording" else truth_map(case)
 
 
-def _cells(offset: Float[np.ndarray, "n m"], low: float) -> Iterator[tuple[float, Float[np.ndarray, "k m"]]]:
-    """Yields start and cells of each short window; of one that is longer than the map, all of it."""
-    rows, step = round(SHORT / CELL), round(STEP / CELL)
-    for row in range(0, max(len(offset) - rows, 0) + 1, step):
-        yield low + row * CELL, offset[row : row + rows]
-
-
 def _by_cells(
     statistic: Callable[[Float[np.ndarray, "k m"]], tuple[float, str]],
 ) -> Callable[[Case, Source], Series]:
     def compute(case: Case, source: Source) -> Series:
-        one = unrolled(case, source)
-        starts, values, places = [], [], []
-        for start, cells in _cells(one.offset, one.low):
-            known = np.isfinite(cells).mean() >= _LEAST_CELLS
-            value, place = statistic(cells) if known else (np.nan, "")
-            starts.append(start)
-            values.append(value)
-            places.append(place)
-        return Series(np.asarray(starts), np.asarray(values, float), tuple(places), SHORT)
+        one, rows = unrolled(case, source), round(SHORT / CELL)
+        firsts = np.arange(0, max(len(one.offset) - rows, 0) + 1, round(STEP / CELL))  # one window where it is longer
+        windows = [one.offset[row : row + rows] for row in firsts]
+        found = [statistic(w) if np.isfinite(w).mean() >= _LEAST_CELLS else (np.nan, "") for w in windows]
+        values, places = zip(*found, strict=True)
+        return Series(one.low + firsts * CELL, np.asarray(values, float), places, SHORT)
 
     return compute
 
 
-def _mean_magnitude(cells: np.ndarray) -> tuple[float, str]:
-    return float(np.nanmean(np.abs(cells))), ""
-
-
-def _share_off(cells: np.ndarray) -> tuple[float, str]:
-    return float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""
-
-
 def _worst_spot(cells: np.ndarray) -> tuple[float, str]:
     worst = np.unravel_index(np.nanargmax(np.abs(cells)), cells.shape)
-    octant = int(np.round(sector_angles()[worst[1]] / (np.pi / 4))) % 8
+    octant = int(np.round(section_angles(SECTORS)[worst[1]] / (np.pi / 4))) % 8
     return abs(float(cells[worst])), PLACES[octant]
 
 
 def _worst_sector(cells: np.ndarray) -> tuple[float, str]:
-    octant = np.round(sector_angles() / (np.pi / 4)).astype(int) % 8
+    octant = np.round(section_angles(SECTORS) / (np.pi / 4)).astype(int) % 8
     means = []
     for k in range(8):
         part = cells[:, octant == k]
@@ -182,21 +165,15 @@ def _gauge_change(case: Case) -> Profile:
     return Profile(profile.station, profile.value - np.median(profile.value)) if len(profile.value) else profile
 
 
-def _root_mean_square(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _mean_of_magnitudes(values: np.ndarray) -> float:
-    return float(np.mean(np.abs(values)))
-
-
-_ANGLE = sector_angles(SECTORS)
+_ANGLE = section_angles(SECTORS)
 MEASURES = tuple(Measure(*row) for row in (
-    ("wall", "mean distance of the walls", "m", 0.02, 0.05, _by_cells(_mean_magnitude)),
+    ("wall", "mean distance of the walls", "m", 0.02, 0.05,
+     _by_cells(lambda cells: (float(np.nanmean(np.abs(cells))), ""))),
     ("sector", "mean offset of one part of the section", "m", 0.03, 0.08, _by_cells(_worst_sector)),
     ("aside", "section moved to one side", "m", 0.025, 0.05, _by_cells(_moved(np.cos(_ANGLE)))),
     ("lift", "section moved up or down", "m", 0.03, 0.05, _by_cells(_moved(np.sin(_ANGLE)))),
-    ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.02, 0.2, _by_cells(_share_off)),
+    ("cells", f"share of the surface more than {100 * OFF_CELL:g} cm off", "1", 0.02, 0.2,
+     _by_cells(lambda cells: (float(np.mean(np.abs(cells[np.isfinite(cells)]) > OFF_CELL)), ""))),
     ("spot", f"one spot of {CELL:g} m by {360 // SECTORS:d} degrees", "m", 0.08, 0.3, _by_cells(_worst_spot)),
     ("shift", "relief of the walls moved along the tunnel", "m", 0.08, 0.15, _shift),
     ("hand", "left and right exchanged (0 not, 2 mirrored)", "1", 1.2, 1.2, _hand),
@@ -208,9 +185,9 @@ MEASURES = tuple(Measure(*row) for row in (
     ("rail_height", "rails above or below their place", "m", 0.012, 0.02,
      _by_profile(lambda case: track.true_rail_offsets(case)[1], track.seen_rail_height, np.median, SHORT, 8)),
     ("bed", "height of bed and sleepers, root mean square", "m", 0.03, 0.05,
-     _by_profile(track.true_bed_error, track.seen_bed_error, _root_mean_square, SHORT, 15)),
+     _by_profile(track.true_bed_error, track.seen_bed_error, rms, SHORT, 15)),
     ("pockets", "mean error of the pockets' depth", "m", 0.03, 0.06,
-     _by_profile(track.true_pocket_error, None, _mean_of_magnitudes, SHORT, 8)),
+     _by_profile(track.true_pocket_error, None, mean_absolute, SHORT, 8)),
 ))  # fmt: skip
 
 

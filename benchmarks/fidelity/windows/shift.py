@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.curve import nanmedian
+from benchmarks.fidelity.derive.curve import nanmedian, section_angles
 from benchmarks.fidelity.windows.deviation import (
     COLUMNS,
     FINE,
@@ -15,7 +15,6 @@ from benchmarks.fidelity.windows.deviation import (
     parts_hit,
     relief_on_path,
     relief_on_truth,
-    sector_angles,
     truth_relief,
 )
 
@@ -145,7 +144,7 @@ def hold_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Fl
 def truth_shift(case: Case, starts: Float[np.ndarray, " k"], window: float) -> Float[np.ndarray, " k"]:
     """Return the shift of the candidate against the truth, m; ahead positive."""
     real = truth_relief(case)
-    angle = sector_angles(COLUMNS)
+    angle = section_angles(COLUMNS)
     wall = ~is_floor(angle)
     station, around = np.meshgrid(real.station, angle[wall], indexing="ij")
     radius = real.radius[:, wall]
@@ -172,7 +171,7 @@ def handedness(reference: Float[np.ndarray, "n m"], judged: Float[np.ndarray, "n
 
 def _one_sided(radius: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n h"]:
     """Return half the difference of left and right by cell, without each row's shift and each direction's median."""
-    angle = sector_angles()
+    angle = section_angles(SECTORS)
     left = np.flatnonzero((np.abs(angle) < np.pi / 2) & ~is_floor(angle))
     mirror = np.argmin(np.abs(np.angle(np.exp(1j * (angle[None] - (np.pi - angle[left])[:, None])))), axis=1)
     half = (radius[:, left] - radius[:, mirror]) / 2.0
@@ -189,9 +188,6 @@ def _shift_template(radius: Float[np.ndarray, " m"], angle: Float[np.ndarray, " 
     known = np.isfinite(radius)
     x, y = radius[known] * np.cos(angle[known]) + _NUDGE, radius[known] * np.sin(angle[known])
     turned, grown = np.arctan2(y, x), np.hypot(x, y)
-    return np.where(known, (np.interp(angle, *_sorted(turned, grown), period=2.0 * np.pi) - radius) / _NUDGE, np.nan)
-
-
-def _sorted(key: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    order = np.argsort(key)
-    return key[order], values[order]
+    order = np.argsort(turned)
+    moved = np.interp(angle, turned[order], grown[order], period=2.0 * np.pi)
+    return np.where(known, (moved - radius) / _NUDGE, np.nan)

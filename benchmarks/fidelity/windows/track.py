@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from benchmarks.fidelity.case import Case, per_case, per_truth
 from benchmarks.fidelity.derive.beams import cast_beams, returns, sensor_path
 from benchmarks.fidelity.derive.curve import Curve, grouped_median, nanmedian, truth_curve
-from benchmarks.fidelity.derive.sections import true_part, truth_caster
+from benchmarks.fidelity.derive.sections import truth_caster
 from benchmarks.fidelity.derive.surface import face_normals, surface_caster
 from benchmarks.fidelity.derive.track import gauge_along, sort_along, truth_railway
 from benchmarks.fidelity.windows.deviation import (
@@ -57,7 +57,8 @@ def _rails_on(case: Case, curve: Curve) -> dict[str, Float[np.ndarray, "k 3"]]:
 @per_truth
 def _true_gauge(case: Case) -> tuple[np.ndarray, np.ndarray]:
     rail = truth_railway(case).rail
-    return gauge_along(truth_curve(case), true_part(case, ("rail",)), rail[0], rail[1])
+    assert case.truth is not None
+    return gauge_along(truth_curve(case), case.truth.faces("rail"), rail[0], rail[1])
 
 
 @per_case
