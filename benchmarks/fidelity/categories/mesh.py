@@ -294,11 +294,7 @@ def topo_chi_err(case: Case) -> Value:
 
 @metric("topo_genus", "TOP", D(0, 3), "count")
 def topo_genus(case: Case) -> Value:
-    """Handles of the solid.
-
-    Raises:
-        ValueError: manifold3d does not accept it as a solid.
-    """
+    """Handles of the solid."""
     solid = _manifold(welded_solid(case))
     if solid.status() != Error.NoError or solid.is_empty():
         raise ValueError(f"the solid is none: {solid.status().name}")

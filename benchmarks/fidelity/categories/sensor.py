@@ -341,11 +341,7 @@ def deg_class_kappa(case: Case) -> Value:
 
 
 def _axial_pairs(case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """Axial information of the scans, real and synthetic; 0 where the candidate returns too little of a scan.
-
-    Raises:
-        ValueError: Too few scans.
-    """
+    """Axial information of the scans, real and synthetic; 0 where the candidate returns too little of a scan."""
     real, synthetic = _both_information(case)
     known = np.isfinite(real.axial)
     if known.sum() < _FEWEST_FRAMES:

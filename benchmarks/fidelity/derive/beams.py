@@ -22,9 +22,6 @@ def sensor_path(case: Case) -> Curve:
 
     The positions are strung by nearness, not by time: a way back adds nothing, and poses in a wrong order leave the
     path where it is.
-
-    Raises:
-        ValueError: The sensor passed fewer than four positions `NODE_STEP` apart.
     """
     hold = case.hold
     assert hold is not None

@@ -210,11 +210,7 @@ def real_map(case: Case) -> VoxelMap:
 
 @per_case
 def map_distances(case: Case) -> tuple[Int[np.ndarray, "v 3"], Float[np.ndarray, " v"]]:
-    """Return voxels and Wasserstein distances between held-out and synthetic map.
-
-    Raises:
-        ValueError: They share no voxel.
-    """
+    """Return voxels and Wasserstein distances between held-out and synthetic map."""
     local = local_at(case, noisy_ranges(case, "first"))
     local = local[np.isfinite(local[:, 0])]
     key, distance = voxel_wasserstein(real_map(case), voxel_map(local, MAP_VOXEL * case.tolerance))

@@ -86,9 +86,6 @@ def first_contacts(case: Case) -> tuple[list[Float[np.ndarray, " k"]], Float[np.
     Returns:
         Offsets in MuJoCo for each bit that stands for walls, that of the most geoms first, and offsets at which the
         mesh is one radius away, m.
-
-    Raises:
-        ValueError: No bit stands for walls.
     """
     station, start, left = random_stations(case, "mj_wall_contact_err", _WALL_STATIONS)
     start[:, 2] = lidar_elevation(case, station)

@@ -30,11 +30,7 @@ class Edges:
 
 
 def weld(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a copy in which corners at one place are one vertex, about a whole-metre origin.
-
-    Raises:
-        ValueError: Vertices that are not finite, or faces that name none.
-    """
+    """Return a copy in which corners at one place are one vertex, about a whole-metre origin."""
     if not is_sound(mesh):
         raise ValueError("vertices are not finite or faces name none")
     origin = np.floor(mesh.vertices.mean(axis=0)) if len(mesh.vertices) else np.zeros(3)

@@ -123,11 +123,7 @@ def edge_cells(free: Bool[np.ndarray, "n m"]) -> Bool[np.ndarray, "n m"]:
 
 
 def cell_distances(from_cells: Bool[np.ndarray, "n m"], to: Bool[np.ndarray, "n m"], edge: float) -> np.ndarray:
-    """Return the distance from each of some cells to the nearest of others, m.
-
-    Raises:
-        ValueError: There are none to go to.
-    """
+    """Return the distance from each of some cells to the nearest of others, m."""
     if not to.any():
         raise ValueError("no free space at the height of the sensor")
     return distance_transform_edt(~to, edge)[from_cells]

@@ -102,11 +102,7 @@ def feasible_trips(ground: Ground, triples: Int[np.ndarray, "t 3"]) -> Bool[np.n
 
 
 def draw_trips(ground: Ground, rng: np.random.Generator) -> Int[np.ndarray, "t 3"]:
-    """Draws random start, goal and inflation on traversable ground.
-
-    Raises:
-        ValueError: There is none.
-    """
+    """Draws random start, goal and inflation on traversable ground."""
     places = np.flatnonzero(ground.traversable)
     if not len(places):
         raise ValueError("the reference has no traversable ground")

@@ -110,11 +110,7 @@ def placed_data(model: mujoco.MjModel) -> mujoco.MjData:
 
 
 def robot_body(model: mujoco.MjModel) -> int:
-    """Return the number of the first body that moves freely.
-
-    Raises:
-        ValueError: None does.
-    """
+    """Return the number of the first body that moves freely."""
     for joint in range(model.njnt):
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
             return int(model.jnt_bodyid[joint])
@@ -272,11 +268,7 @@ _BED_ASIDE = 0.3  # m from the track's middle, where the bed is looked for
 
 @per_case
 def seat_mismatches(case: Case) -> Float[np.ndarray, " k"]:
-    """Return overlaps (below 0) and gaps of pad on sleeper, rail on pad, and sleepers over the bed, m.
-
-    Raises:
-        ValueError: There is no track.
-    """
+    """Return overlaps (below 0) and gaps of pad on sleeper, rail on pad, and sleepers over the bed, m."""
     track, curve = case.candidate.track, candidate_curve(case)
     if not len(track.sleeper) or min(len(rail) for rail in track.rail.values()) < 2:
         raise ValueError("there is no track")

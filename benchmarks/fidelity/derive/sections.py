@@ -85,9 +85,6 @@ def sections(case: Case) -> Sections:
 
     Pockets and joints fall to the median over 1.5 m. Against a held-out recording the lining is measured in the same
     5 degree sectors as the points, and only sectors that they show count.
-
-    Raises:
-        ValueError: The reference is shorter than two sections.
     """
     curve, angle = reference_curve(case), section_angles(360)
     raw = cast_profile(lining_caster(case), curve, row_stations(curve), angle)
@@ -191,11 +188,7 @@ class Radii:
 
 
 def cast_radii(curve: Curve, caster: Caster) -> Radii:
-    """Casts rays from a curve.
-
-    Raises:
-        ValueError: Less than half of them meet anything.
-    """
+    """Casts rays from a curve."""
     count = max(int(curve.length / ROW), 2)
     station = curve.station[0] + (np.arange(count) + 0.5) * curve.length / count
     radius = cast_profile(caster, curve, station, section_angles(COLUMNS))

@@ -81,11 +81,7 @@ class Nearest:
     def query(
         self, points: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-        """Return distance, m, closest point, and its face.
-
-        Raises:
-            ValueError: The mesh has no triangle.
-        """
+        """Return distance, m, closest point, and its face."""
         if not len(self._face):
             raise ValueError("no surface to measure distances to")
         parts = [self._query(points[start : start + _POINTS]) for start in range(0, max(len(points), 1), _POINTS)]

@@ -29,9 +29,6 @@ def gauge_along(
         mesh: Mesh of the rails.
         left: Points of the left rail at the height of its top, in any order.
         right: Points of the right rail.
-
-    Raises:
-        ValueError: There are no two rails.
     """
     if min(len(left), len(right)) < 2 or not len(mesh.faces):
         raise ValueError("there are no two rails")
@@ -242,11 +239,7 @@ def candidate_gauge(case: Case) -> Float[np.ndarray, " k"]:
 
 @per_case
 def rail_offsets(case: Case) -> Float[np.ndarray, "k 3"]:
-    """Return stations of the reference's rails, and the candidate track's offset left and above, m.
-
-    Raises:
-        ValueError: The candidate has no two rails.
-    """
+    """Return stations of the reference's rails, and the candidate track's offset left and above, m."""
     reference, rail = reference_railway(case), case.candidate.track.rail
     if min(len(top) for top in rail.values()) < 2:
         raise ValueError("the candidate has no two rails")

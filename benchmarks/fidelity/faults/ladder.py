@@ -51,11 +51,7 @@ _COLUMNS = (
 
 
 def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
-    """Refuses a ladder that cannot be climbed anywhere.
-
-    Raises:
-        FidelityError: In one sentence.
-    """
+    """Refuses a ladder that cannot be climbed anywhere."""
     if places < 1:
         raise FidelityError(f"places must be at least 1, got {places}")
     if draw < 0:
@@ -87,9 +83,6 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
         places: Number of places of each kind.
         draw: Seed that draws them.
         folder: Folder that keeps `ladder.json`.
-
-    Raises:
-        FidelityError: The tunnel is too short for one of the kinds.
     """
     kinds, length = kinds or tuple(asked_faults()), case.candidate.length
     least = max(asked_faults()[name].length for name in kinds) + 2.0 * _EDGE + 1.0

@@ -18,11 +18,7 @@ _THINNED = 200_000  # returns that are looked at
 
 
 def check_length(candidate: Candidate, scene: Path) -> None:
-    """Refuses a tunnel that is shorter than a window.
-
-    Raises:
-        FidelityError: In one sentence.
-    """
+    """Refuses a tunnel that is shorter than a window."""
     if candidate.length < LONG:
         raise FidelityError(
             f"{scene}: its tunnel is {candidate.length:.1f} m long, and a window along it {LONG:g} m; "
@@ -39,9 +35,6 @@ def check_recording(candidate: Candidate, hold: Hold, scene: Path, recording: Pa
         scene: Folder of the scene, for the sentence.
         recording: File of the recording, for the sentence.
         partial: Accept a recording of a part.
-
-    Raises:
-        FidelityError: In one sentence.
     """
     line = Curve(candidate.bore.station, candidate.bore.position)
     first = np.unique(hold.scan, return_index=True)[1]
