@@ -4,7 +4,6 @@ Example: python -m benchmarks.fidelity run --scene build/tunnel --recording held
 """
 
 import functools
-import json
 import math
 import sys
 from collections.abc import Callable
@@ -17,7 +16,7 @@ import tyro
 from benchmarks.fidelity import judge, outside, scoring
 from benchmarks.fidelity.case import Case, case_hash
 from benchmarks.fidelity.faults.runner import Bench, Job, is_bold, is_ranked, judge_outcomes, list_jobs, run_jobs
-from benchmarks.fidelity.files import FidelityError, write_json
+from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.inputs import (
     FOREIGN,
     Inputs,
@@ -228,33 +227,28 @@ def run_split(config: SplitCommand) -> None:
 def _write_report(opened: OpenCase) -> dict[str, Any]:
     """Writes the report over all results for this case in `--out`."""
     inputs, folder = opened.inputs, opened.inputs.out
-    controls = _kept_result(folder / "controls.json", opened.case)
-    swept = _kept_result(folder / "sweep.json", opened.case)
-    rows = controls["rows"] if controls else None
+    key = case_hash(opened.case)
+    swept = read_kept(folder / "sweep.json", SWEEP_SCHEMA, key) or None
+    rows = read_kept(folder / "controls.json", CONTROLS_SCHEMA, key).get("rows")
     leaks = find_leaks(opened.case, opened.values["base"])
     judgement = judge.make_judgement(opened.values, leaks, rows, inputs.strict, opened.judgement.windows)
     judgement = judge.add_outside(judgement, opened.case, folder, inputs.strict)
     return write_report(folder, opened.case, inputs, judgement, rows, swept)
 
 
-def _kept_result(path: Path, case: Case) -> dict[str, Any] | None:
-    """Return the result of an earlier command for the same case, else nothing."""
-    content = json.loads(path.read_text()) if path.exists() else {}
-    return content if content.get("key") == case_hash(case) else None
-
-
 def _print_summary(report: dict[str, Any]) -> None:
-    overall = report["global"]
-    text = "none" if overall is None else f"{overall:.1f} %"
+    text = _percent(report["global"])
     print(f"{report['title']} of {report['name']}: {report['verdict']}, global {text} "
           f"over {report['categories_evaluated']} of {len(report['categories'])} categories")  # fmt: skip
     for reason in report["reasons"]:
         print(f"  {reason}")
     if (more := report["outside"]) is not None:
-        overall = more["global"]
-        text = "none" if overall is None else f"{overall:.1f} %"
         print(f"  {more['count']} of {more['count_with_suite']} metrics from outside ({', '.join(more['files'])}): "
-              f"global with them {text}; the verdict is that of the suite alone")  # fmt: skip
+              f"global with them {_percent(more['global'])}; the verdict is that of the suite alone")  # fmt: skip
+
+
+def _percent(value: float | None) -> str:
+    return "none" if value is None else f"{value:.1f} %"
 
 
 def main() -> int:

@@ -45,6 +45,11 @@ class Case:
     tolerance: float = 1.0
     cache: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
+    def has(self, need: table.Need | None) -> bool:
+        """Return True where the reference that something cannot do without is at hand."""
+        present = {"hold": self.hold is not None, "truth": self.truth is not None}
+        return need is None or (any(present.values()) if need == "reference" else present[need])
+
     def fresh(self) -> "Case":
         """Return a copy without any kept result, its references included."""
         bare: dict[str, Any] = {
@@ -155,7 +160,6 @@ def case_hash(case: Case) -> str:
 
 
 def candidate_hash(candidate: Candidate) -> str:
-    """Return the SHA-256 of a candidate's geometry and scene."""
     digest = sha256(json.dumps(candidate.manifest, sort_keys=True, default=str).encode())
     track = candidate.track
     for mesh in (candidate.lining, candidate.solid, candidate.extra, candidate.nails, candidate.bed,

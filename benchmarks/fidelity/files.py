@@ -1,5 +1,7 @@
 """Files: errors of requests, hashes, JSON and text that appear whole or not at all."""
 
+import csv
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -38,19 +40,27 @@ def write_json(path: Path, content: Any, digits: int = 9) -> Path:
     return write_text(path, json.dumps(round_floats(content, digits), indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
-def read_json(path: Path, schema: str) -> dict[str, Any]:
-    """Reads a file written by `write_json`.
+def write_csv(path: Path, columns: tuple[str, ...], rows: list[dict[str, Any]]) -> Path:
+    """Writes a CSV file; numbers with 6 significant digits, missing ones empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({c: f"{v:.6g}" if isinstance(v := row.get(c), float) else v for c in columns})
+    return write_text(path, text.getvalue())
+
+
+def read_kept(path: Path, schema: str, key: str) -> dict[str, Any]:
+    """Return what an earlier command kept of the same case; nothing where there is no such file, or one of another.
 
     Raises:
-        FidelityError: Missing, broken, or of another schema.
+        FidelityError: It is broken.
     """
     try:
-        content = json.loads(path.read_text())
+        content: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     except (OSError, ValueError) as error:
-        raise FidelityError(f"{path}: cannot be read ({error})") from error
-    if not isinstance(content, dict) or content.get("schema") != schema:
-        raise FidelityError(f"{path}: schema is not {schema}")
-    return content
+        raise FidelityError(f"{path}: cannot be read ({error}); delete it to compute anew") from error
+    return content if (content.get("schema"), content.get("key")) == (schema, key) else {}
 
 
 def round_floats(content: Any, digits: int = 9) -> Any:

@@ -78,7 +78,6 @@ def sweep_section(
 
 
 def no_track() -> Track:
-    """Return a track without sleepers and rails."""
     none = {"left": np.zeros((0, 3)), "right": np.zeros((0, 3))}
     return Track(np.zeros((0, 3)), trimesh.Trimesh(), none, trimesh.Trimesh(), trimesh.Trimesh())
 

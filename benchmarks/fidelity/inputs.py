@@ -113,9 +113,10 @@ def read_case(inputs: Inputs) -> Case:
                 f"{inputs.fit_recording}: is not what {inputs.scene} was built from; its manifest has another SHA-256"
             )
     truth = None if inputs.truth is None else load_truth(inputs.truth, candidate.origin)
-    if hold is not None or truth is not None:
+    case = Case(candidate, hold, fit, truth, inputs.seed)
+    if case.has("reference"):
         check_length(candidate, inputs.scene)
-    return Case(candidate, hold, fit, truth, inputs.seed)
+    return case
 
 
 def with_sigma(config: HoldConfig, recording: Path) -> HoldConfig:

@@ -17,7 +17,7 @@ from benchmarks.fidelity import outside, scoring, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash, release_memory
 from benchmarks.fidelity.faults import rows as faults
-from benchmarks.fidelity.files import write_json
+from benchmarks.fidelity.files import read_kept, write_json
 from benchmarks.fidelity.impostors import null_tube, truth_candidate
 from benchmarks.fidelity.leaks import MEDIAN_FLOOR, NOISE_BAND, find_leaks
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values, missing
@@ -74,8 +74,7 @@ def judge_case(case: Case, folder: Path, strict: bool = False, processes: int = 
 def compute_windows(case: Case, folder: Path) -> Windows:
     """Return the worst windows and the stated faults; those of an earlier run of the same case are read again."""
     path, key = folder / "windows.json", case_hash(case)
-    content = json.loads(path.read_text()) if path.exists() else {}
-    if content.get("schema") == WINDOWS_SCHEMA and content.get("key") == key:
+    if content := read_kept(path, WINDOWS_SCHEMA, key):
         return load_windows(content)
     found = judge_windows(replace(case, cache={}))
     write_json(path, {"schema": WINDOWS_SCHEMA, "key": key, **dump_windows(found)}, digits=17)
@@ -104,7 +103,7 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
             derived from a reference serves all candidates, and is mostly derived in one of the processes alone.
     """
     path, key = folder / "values.json", case_hash(case)
-    values = _kept_values(path, key)
+    values = {name: load_values(kept) for name, kept in read_kept(path, VALUES_SCHEMA, key).get("values", {}).items()}
     gc.freeze()  # what was imported stays: memory is released after every category, and to walk all of it takes long
     names = [name for name in make_candidates(case) if name not in values]
     mine: dict[str, Values] = {}
@@ -117,8 +116,12 @@ def open_values(case: Case, folder: Path, processes: int = 1) -> Iterator[dict[s
                 continue
             if name not in mine or (name in theirs and name not in wait and not theirs[name].done()):
                 return
-            found = mine[name] | (_chosen(theirs[name].result(), SECOND_HALF) if name in theirs else {})
-            values[name] = _with_reused(name, found, values)
+            found, half = mine[name], theirs[name].result() if name in theirs else {}
+            found |= {id: half[id] for id, row in table.load().items() if half and row.category in SECOND_HALF}
+            chosen, other = _what_differs(name)
+            values[name] = {
+                id: found[id] if row.category in chosen else values[other][id] for id, row in table.load().items()
+            }
             dumped = {one: dump_values(values[one]) for one in make_candidates(case) if one in values}
             write_json(path, {"schema": VALUES_SCHEMA, "key": key, "values": dumped}, digits=17)
 
@@ -156,10 +159,6 @@ def _value_candidate(
     return found
 
 
-def _chosen(values: Values, categories: tuple[str, ...]) -> Values:
-    return {id: values[id] for id, row in table.load().items() if row.category in categories}
-
-
 _second: dict[str, Case] = {}
 
 
@@ -184,14 +183,6 @@ def make_candidates(case: Case) -> dict[str, Callable[[], Candidate]]:
     return makers
 
 
-def _kept_values(path: Path, key: str) -> dict[str, Values]:
-    """Return the values of an earlier run of the same case; nothing where there was none."""
-    content = json.loads(path.read_text()) if path.exists() else {}
-    if content.get("schema") != VALUES_SCHEMA or content.get("key") != key:
-        return {}
-    return {name: load_values(entry) for name, entry in content["values"].items()}
-
-
 def _what_differs(name: str) -> tuple[tuple[str, ...], str]:
     """Return the categories to compute for a candidate, and the candidate that the others are taken from."""
     if name == "base":
@@ -199,12 +190,6 @@ def _what_differs(name: str) -> tuple[tuple[str, ...], str]:
     if name == "null_bare":
         return tuple(c for c in geometry_categories() if c not in WITHOUT_TRACK), "null"
     return geometry_categories(), "base"
-
-
-def _with_reused(name: str, found: Values, values: dict[str, Values]) -> Values:
-    """Return the values of a candidate with those of another where it does not differ from it."""
-    chosen, other = _what_differs(name)
-    return {id: found[id] if row.category in chosen else values[other][id] for id, row in table.load().items()}
 
 
 def geometry_categories() -> tuple[str, ...]:

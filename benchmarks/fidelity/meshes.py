@@ -28,15 +28,20 @@ def without_faces(mesh: trimesh.Trimesh, gone: Bool[np.ndarray, " f"]) -> trimes
     return left
 
 
+def connected_groups(count: int, pairs: Int[np.ndarray, "k 2"]) -> Int[np.ndarray, " count"]:
+    """Return the number of the group of each of `count` things; those of a pair belong together."""
+    graph = coo_array((np.ones(len(pairs), bool), tuple(pairs.T)), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
 def find_bodies(mesh: trimesh.Trimesh) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "b 3"]]:
     """Return the number of the body of each vertex, and the middle of each body, m."""
     count = len(mesh.vertices)
     if not count:
         return np.zeros(0, int), np.zeros((0, 3))
     welded = np.unique(np.round(mesh.vertices, 6), axis=0, return_inverse=True)[1].ravel()
-    first, second = welded[mesh.faces[:, [0, 0]].ravel()], welded[mesh.faces[:, [1, 2]].ravel()]
-    graph = coo_array((np.ones(len(first), bool), (first, second)), shape=(count, count))
-    label = np.unique(connected_components(graph, directed=False)[1][welded], return_inverse=True)[1]
+    pairs = welded[mesh.faces[:, [[0, 1], [0, 2]]].reshape(-1, 2)]
+    label = np.unique(connected_groups(count, pairs)[welded], return_inverse=True)[1]
     size = np.maximum(np.bincount(label), 1)[:, None]
     return label, np.stack([np.bincount(label, axis) for axis in mesh.vertices.T], axis=1) / size
 

@@ -3,7 +3,6 @@
 Metrics are computed, scored and listed beside the 199 of the suite. The verdict stays the verdict of the suite alone.
 """
 
-import json
 import runpy
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +12,7 @@ from pathlib import Path
 from benchmarks.fidelity import faults, table
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case, case_hash
-from benchmarks.fidelity.files import FidelityError, write_json
+from benchmarks.fidelity.files import FidelityError, read_kept, write_json
 from benchmarks.fidelity.registry import Value, compute_metric, dump_values, load_values
 from benchmarks.fidelity.table import Metric
 from subterra_jax.host.loading import file_digest
@@ -46,7 +45,6 @@ def load_file(path: Path) -> None:
 
 
 def clear() -> None:
-    """Forgets all metrics from outside, and the faults of the file."""
     table.forget(set(metrics()))
     for name in _LOADED & set(faults.KINDS):
         del faults.KINDS[name]
@@ -60,7 +58,6 @@ def metrics() -> dict[str, Metric]:
 
 
 def files() -> dict[str, str]:
-    """Return the SHA-256 of the file that they come from, by its name."""
     return dict(_FILES)
 
 
@@ -78,8 +75,7 @@ def compute_values(
     if not rows:
         return {}
     path, key = folder / "outside.json", sha256(f"{case_hash(case)} {sorted(_FILES.items())}".encode()).hexdigest()
-    content = json.loads(path.read_text()) if path.exists() and _FILES else {}
-    if content.get("schema") == SCHEMA and content.get("key") == key:
+    if _FILES and (content := read_kept(path, SCHEMA, key)):
         return {name: load_values(values) for name, values in content["values"].items()}
     values: dict[str, dict[str, Value]] = {}
     for name, make in candidates.items():

@@ -63,32 +63,26 @@ def missing(reason: str) -> Value:
 
 
 def mean(values: np.ndarray) -> float:
-    """Return the arithmetic mean."""
     return float(np.mean(values))
 
 
 def mean_absolute(values: np.ndarray) -> float:
-    """Return the mean of the magnitudes."""
     return float(np.mean(np.abs(values)))
 
 
 def mean_magnitude(values: np.ndarray) -> float:
-    """Return the magnitude of the mean."""
     return abs(mean(values))
 
 
 def rms(values: np.ndarray) -> float:
-    """Return the root of the mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
 def root_of_mean(squares: np.ndarray) -> float:
-    """Return the root of the mean of squares."""
     return float(np.sqrt(np.mean(squares)))
 
 
 def percentile(percent: float) -> Statistic:
-    """Return the function that takes a percentile."""
     return lambda values: float(np.percentile(values, percent))
 
 
@@ -143,12 +137,7 @@ def _extremes(
 
 def compute_metric(case: Case, row: Metric) -> Value:
     """Return the value of one metric; a computation that breaks counts as failed, with its reason."""
-    present = {
-        "hold": case.hold is not None,
-        "truth": case.truth is not None,
-        "reference": case.truth is not None or case.hold is not None,
-    }
-    if row.needs is not None and not present[row.needs]:
+    if row.needs is not None and not case.has(row.needs):
         return missing(_ABSENT[row.needs])
     try:
         found = row.compute(case)
@@ -189,12 +178,10 @@ def evaluate(
 
 
 def dump_values(values: dict[str, Value]) -> dict[str, Any]:
-    """Return values as plain data."""
     return {id: asdict(value) for id, value in values.items()}
 
 
 def load_values(content: dict[str, Any]) -> dict[str, Value]:
-    """Return the values that `dump_values` wrote."""
     return {
         id: Value(**{
             **entry,

@@ -5,8 +5,6 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
 from manifold3d import Error, Manifold, Mesh64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from benchmarks.fidelity.case import Case
@@ -27,6 +25,7 @@ from benchmarks.fidelity.derive.mesh import (
     welded_lining,
     welded_solid,
 )
+from benchmarks.fidelity.meshes import connected_groups
 from benchmarks.fidelity.registry import Value, missing, number, pass_or_fail
 from benchmarks.fidelity.table import B, D, P, U, metric
 
@@ -309,9 +308,8 @@ def topo_mouth_err(case: Case) -> Value:
     if not len(rim):
         return number(2.0, 0)
     vertex, ends = np.unique(rim, return_inverse=True)
-    ends = ends.reshape(-1, 2)
-    graph = coo_array((np.ones(len(ends), bool), (ends[:, 0], ends[:, 1])), shape=(len(vertex), len(vertex)))
-    return number(abs(connected_components(graph, directed=False)[0] - 2), len(rim))
+    rims = int(connected_groups(len(vertex), ends.reshape(-1, 2)).max()) + 1
+    return number(abs(rims - 2), len(rim))
 
 
 @metric("topo_free_b0", "TOP", B(1, 0, 1), "count", gate=True)

@@ -99,7 +99,6 @@ def hold_local(case: Case) -> Float[np.ndarray, "k 3"]:
 
 @kept_until("LIN", per_case)
 def lining_caster(case: Case) -> Caster:
-    """Return the caster of rays into the lining alone."""
     return Caster(case.candidate.lining)
 
 

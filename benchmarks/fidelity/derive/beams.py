@@ -276,5 +276,4 @@ def _describe_scan(reach: Float[np.ndarray, " n"], sector: Int[np.ndarray, " n"]
 
 @per_hold
 def cloud_tree(case: Case) -> cKDTree:
-    """Return the tree of all held-out returns."""
     return cKDTree(returns(case).points, balanced_tree=False)

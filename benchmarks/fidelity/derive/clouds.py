@@ -75,7 +75,6 @@ def _planes_per_scan(scans: int) -> int:
 
 @per_hold
 def real_planes(case: Case) -> Planes:
-    """Return the planes of the held-out cloud at `plane_rows`."""
     points = returns(case).points
     return fit_planes(points, cloud_tree(case), points[plane_rows(case)])
 
@@ -204,7 +203,6 @@ def spatial_consistency(key: Int[np.ndarray, "v 3"], distance: Float[np.ndarray,
 
 @per_hold
 def real_map(case: Case) -> VoxelMap:
-    """Return the voxel map of the held-out points."""
     return voxel_map(returns(case).local, MAP_VOXEL * case.tolerance)
 
 

@@ -82,13 +82,11 @@ def interpolate_rows(
 
 @per_case
 def candidate_curve(case: Case) -> Curve:
-    """Return the candidate's centreline."""
     return Curve(case.candidate.bore.station, case.candidate.bore.position)
 
 
 @per_truth
 def truth_curve(case: Case) -> Curve:
-    """Return the true centreline."""
     assert case.truth is not None
     return Curve(case.truth.station, case.truth.position)
 

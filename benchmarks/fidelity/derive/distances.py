@@ -330,7 +330,6 @@ def shell_voxels(grids: Occupied) -> Bool[np.ndarray, "i j k"]:
 
 
 def iou(a: Bool[np.ndarray, "..."], b: Bool[np.ndarray, "..."]) -> float:
-    """Return the intersection over union."""
     return float((a & b).sum() / max((a | b).sum(), 1))
 
 

@@ -111,7 +111,6 @@ class Air:
 
 @per_case
 def air_lattice(case: Case) -> Lattice:
-    """Return voxels of 20 cm around the reference's sections."""
     return make_lattice(case, AIR_VOXEL * case.tolerance)
 
 
@@ -151,7 +150,6 @@ def track_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
 
 
 def true_object_points(case: Case, edge: float) -> Float[np.ndarray, "k 3"]:
-    """Return samples of the objects in the true bore, m."""
     assert case.truth is not None
     return sample_surface(case.truth.faces(*_OBJECTS), edge / 2)[0]
 

@@ -91,7 +91,6 @@ def ground_axes(curve: Curve, cell: float) -> tuple[Float[np.ndarray, " n"], Flo
 
 @kept_until("NAV", per_case)
 def judged_ground(case: Case) -> Ground:
-    """Return the candidate's ground, by rays."""
     return _cast_ground(ground_curve(case), GROUND_CELL * case.tolerance, surface_caster(case), lining_radii(case))
 
 

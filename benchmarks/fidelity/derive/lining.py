@@ -81,13 +81,11 @@ def _stretch(coarse: Float[np.ndarray, "c m"], rows: int, step: int, first: floa
 
 @per_case
 def lining_map(case: Case) -> Unrolled:
-    """Return the map of the candidate's lining, from the reference axis."""
     return map_of_radii(cast_radii(reference_curve(case), lining_caster(case)))
 
 
 @per_truth
 def truth_map(case: Case) -> Unrolled:
-    """Return the map of the true lining, from the same axis."""
     return map_of_radii(truth_radii(case))
 
 

@@ -6,14 +6,13 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_closing, distance_transform_edt, label
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from benchmarks.fidelity.case import Case, kept_until, per_case, per_reference
 from benchmarks.fidelity.derive.axis import hold_curve
 from benchmarks.fidelity.derive.curve import Curve, candidate_curve, interpolate_rows, truth_curve
 from benchmarks.fidelity.derive.surface import sample_surface, surface_caster, visible_surface
+from benchmarks.fidelity.meshes import connected_groups
 
 _WELD_DIGITS = 6  # a format with float32 keeps corners together and moves them by less
 _MOUTH_RIM = 0.15  # m from the plane of a mouth: its rim need not be cut straight
@@ -54,25 +53,21 @@ def mesh_edges(mesh: trimesh.Trimesh) -> Edges:
 
 @kept_until("TOP", per_case)
 def welded_lining(case: Case) -> trimesh.Trimesh:
-    """Return the welded lining."""
     return weld(case.candidate.lining)
 
 
 @kept_until("TOP", per_case)
 def welded_solid(case: Case) -> trimesh.Trimesh:
-    """Return the welded solid."""
     return weld(case.candidate.solid)
 
 
 @kept_until("TOP", per_case)
 def lining_edges(case: Case) -> Edges:
-    """Return the edges of the welded lining."""
     return mesh_edges(welded_lining(case))
 
 
 @kept_until("MSH", per_case)
 def solid_edges(case: Case) -> Edges:
-    """Return the edges of the welded solid."""
     return mesh_edges(welded_solid(case))
 
 
@@ -97,9 +92,8 @@ def face_parts(mesh: trimesh.Trimesh) -> Int[np.ndarray, " f"]:
     ends, edge = np.unique(mesh.edges_sorted, axis=0, return_inverse=True)
     count = len(mesh.faces)
     face = mesh.edges_face
-    graph = coo_array((np.ones(len(face), bool), (face, count + edge.ravel())), shape=(count + len(ends),) * 2)
-    label = connected_components(graph, directed=False)[1][:count]
-    return np.unique(label, return_inverse=True)[1]
+    group = connected_groups(count + len(ends), np.column_stack([face, count + edge.ravel()]))
+    return np.unique(group[:count], return_inverse=True)[1]
 
 
 @dataclass(frozen=True)

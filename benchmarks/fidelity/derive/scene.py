@@ -14,9 +14,7 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from benchmarks.fidelity.candidate import Track, track_of
@@ -25,7 +23,7 @@ from benchmarks.fidelity.derive.curve import candidate_curve, interpolate_rows
 from benchmarks.fidelity.derive.mesh import face_parts
 from benchmarks.fidelity.derive.surface import Caster, surface_caster, visible_bodies
 from benchmarks.fidelity.geoms import Geoms, load_model
-from benchmarks.fidelity.meshes import concatenate_meshes
+from benchmarks.fidelity.meshes import concatenate_meshes, connected_groups
 
 
 def per_release(*reads: str) -> Callable[[Function], Function]:
@@ -54,7 +52,6 @@ def scene_hash(case: Case) -> str:
 
 @per_case
 def tunnel_hash(case: Case) -> str:
-    """Return the SHA-256 of the planar tunnel."""
     return sha256(case.candidate.tunnel.read_bytes()).hexdigest()
 
 
@@ -92,7 +89,6 @@ def scene_model(case: Case) -> mujoco.MjModel:
 
 @per_release("scene")
 def scene_geoms(case: Case) -> Geoms:
-    """Return the geoms of the compiled scene where they stand."""
     return Geoms.of(scene_model(case))
 
 
@@ -252,9 +248,7 @@ def cluster_points(middle: Float[np.ndarray, "p 3"], reach: float) -> Float[np.n
     """Return the mean of each group of points that hang together by steps of at most `reach`, m."""
     if not len(middle):
         return middle
-    pair = cKDTree(middle).query_pairs(reach, output_type="ndarray")
-    graph = coo_array((np.ones(len(pair), bool), (pair[:, 0], pair[:, 1])), shape=(len(middle),) * 2)
-    label: Int[np.ndarray, " p"] = connected_components(graph, directed=False)[1]
+    label = connected_groups(len(middle), cKDTree(middle).query_pairs(reach, output_type="ndarray"))
     weight = np.bincount(label)[:, None]
     return np.stack([np.bincount(label, column) for column in middle.T], axis=1) / weight
 

@@ -215,7 +215,6 @@ def lining_radii(case: Case) -> Radii:
 
 @per_truth
 def truth_radii(case: Case) -> Radii:
-    """Return the radii of the true bore from the true axis, with pockets and without track."""
     return cast_radii(truth_curve(case), truth_bore_caster(case))
 
 

@@ -20,7 +20,6 @@ YAW = np.radians(30.0)
 
 @fault_kind("permuted", "vertices and faces in another order", signed=False)
 def permute(site: Site, fault: Fault) -> Candidate:
-    """Puts vertices and faces into another order."""
 
     def mixed(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         order = site.rng.permutation(len(mesh.vertices))
@@ -32,7 +31,6 @@ def permute(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("subdivided", "every face in four", signed=False)
 def subdivide(site: Site, fault: Fault) -> Candidate:
-    """Cuts every face in four at the middles of its edges."""
 
     def cut(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
         vertices, faces = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
@@ -53,7 +51,6 @@ def move_together(site: Site, fault: Fault) -> Case:
 
 @fault_kind("reversed", "chainage from the other end", signed=False)
 def reverse_axis(site: Site, fault: Fault) -> Candidate:
-    """Counts stations of the reconstruction from the other end."""
     bore, track = site.candidate.bore, site.candidate.track
     angle = np.pi - bore.angle
     angle = (angle + np.pi) % (2.0 * np.pi) - np.pi
@@ -106,5 +103,4 @@ def shuffle_beams(site: Site, fault: Fault) -> Case:
 
 @fault_kind("thinned", "share of the held-out beams missing", signed=False)
 def thin_beams(site: Site, fault: Fault) -> Case:
-    """Leaves out beams at random."""
     return _with_beams(site.case, lambda hold: np.flatnonzero(site.rng.random(len(hold.scan)) < 1.0 - fault.size))

@@ -58,7 +58,6 @@ def add_box(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("obstacle", "a cube on the track in the middle of every 36 m", "m", signed=False)
 def add_obstacles(site: Site, fault: Fault) -> Candidate:
-    """Puts cubes on the track."""
     low = -0.5 * float(np.median(site.candidate.bore.height))
     size = (fault.size,) * 3
     boxes = [place_box(site, at, 0.0, low + 0.1 + 0.5 * fault.size, size) for at in _middles(site.candidate)]
@@ -67,7 +66,6 @@ def add_obstacles(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("barrier", "walls across the section in every 36 m", "count", signed=False)
 def add_barriers(site: Site, fault: Fault) -> Candidate:
-    """Puts walls across the whole section."""
     bore = site.candidate.bore
     size = (_WALL_THICKNESS, float(bore.width.max()) + 0.5, float(bore.height.max()) + 0.5)
     return add_bodies(site.candidate, [place_box(site, at, 0.0, 0.0, size) for at in _middles(site.candidate)])
@@ -75,7 +73,6 @@ def add_barriers(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("debris", "floating blobs in every 36 m", "count", signed=False)
 def add_debris(site: Site, fault: Fault) -> Candidate:
-    """Puts pieces of debris that float into the bore."""
     count = int(fault.size) * _as_long_as(site.candidate)
     station = site.rng.uniform(1.0, site.candidate.length - 1.0, count)
     local = np.column_stack([station, site.rng.uniform(-1.5, 1.5, count), site.rng.uniform(-1.0, 1.5, count)])
@@ -98,7 +95,6 @@ def add_pillars(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("mouth", "mouth closed by an end wall", signed=False)
 def close_mouth(site: Site, fault: Fault) -> Candidate:
-    """Puts an end wall where the tunnel goes on."""
     lining, bore = site.candidate.lining.copy(), site.candidate.bore
     lining.merge_vertices(digits_vertex=6)
     edges, count = np.unique(lining.edges_sorted, axis=0, return_counts=True)

@@ -17,6 +17,7 @@ from benchmarks.fidelity.files import FidelityError
 RAMP = 0.5  # m before and after a local fault over which it grows
 MESHES = ("lining", "solid", "nails", "bed", "extra")
 TRACK = ("sleeper_mesh", "rail_mesh", "fastening_mesh")
+RAILS = ("rail_mesh", "fastening_mesh", "rail")
 EVERYTHING = (*MESHES, *TRACK, "rail", "sleeper", "bore")
 _RAIL_EDGE = 0.5  # m
 _ARM = 1.0  # m from the axis at which a section's stretch is measured

@@ -1,8 +1,5 @@
 """Smallest faults noticed: at each of many places sizes are halved in on, and a detection curve is fitted to them."""
 
-import csv
-import io
-import json
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
@@ -21,7 +18,7 @@ from benchmarks.fidelity.case import Case, case_hash, release_memory
 from benchmarks.fidelity.faults import Fault, Site, put_in
 from benchmarks.fidelity.faults.kinds import KINDS, local_site
 from benchmarks.fidelity.faults.rows import asked_faults
-from benchmarks.fidelity.files import FidelityError, write_json, write_text
+from benchmarks.fidelity.files import FidelityError, read_kept, write_csv, write_json
 from benchmarks.fidelity.windows.judge import Worst, noticed_by, worst_windows
 from scene.progress import Stages
 
@@ -35,19 +32,8 @@ _BELOW, _ABOVE = 12, 3  # rungs below and above the size asked for
 _EDGE = 4.0  # m that a fault keeps from the mouths: what is squeezed before it lies inside
 _LEAST_SPREAD = np.log(_RUNG) / 4.0  # of the logarithms of sizes: finer than a rung nothing is known
 _DRAWS = 400  # of places, for the interval
-_COLUMNS = (
-    "kind",
-    "words",
-    "unit",
-    "length",
-    "places",
-    "asked",
-    "noticed_at_asked",
-    "size_50",
-    "size_95",
-    "low",
-    "high",
-)
+_COLUMNS = ("kind", "words", "unit", "length", "places", "asked", "noticed_at_asked", "size_50", "size_95", "low",
+            "high")  # fmt: skip
 
 
 def check_ladder(kinds: tuple[str, ...], places: int, draw: int = 0) -> None:
@@ -90,9 +76,7 @@ def climb_ladders(case: Case, kinds: tuple[str, ...], places: int, draw: int, fo
         raise FidelityError(f"a ladder of these faults needs {least:g} m of tunnel, this one has {length:.1f} m")
     key = sha256(f"{case_hash(case)} {draw}".encode()).hexdigest()
     path = folder / "ladder.json"
-    content = json.loads(path.read_text()) if path.exists() else {}
-    kept: list[dict[str, Any]] = content["rows"] if content.get("key") == key else []
-    done = {(row["kind"], row["number"]): row for row in kept}
+    done = {(row["kind"], row["number"]): row for row in read_kept(path, SCHEMA, key).get("rows", [])}
     wanted = [(kind, number) for number in range(places) for kind in kinds]
     site = local_site(case)
     before = worst_windows(case)
@@ -202,11 +186,7 @@ def share_noticed(rung: np.ndarray, count: int) -> Float[np.ndarray, "3 r"]:
 def write_ladder(folder: Path, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Writes `ladder.csv` and `ladder.png`, and returns the table."""
     table = sum_up(rows)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, _COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
-    write_text(folder / "ladder.csv", text.getvalue())
+    write_csv(folder / "ladder.csv", _COLUMNS, table)
     _draw(folder / "ladder.png", rows, table)
     return table
 

@@ -25,7 +25,6 @@ def change_both(candidate: Candidate, change: Callable[[trimesh.Trimesh], trimes
 
 @fault_kind("holes", "share of the faces missing, of the released scene too", signed=False)
 def drop_faces(site: Site, fault: Fault) -> Candidate:
-    """Removes random faces."""
     rng = site.rng
     holed = drop_scene_faces(site.candidate, fault.size, rng, site.scratch)
     return change_both(holed, lambda mesh: without_faces(mesh, rng.random(len(mesh.faces)) < fault.size))
@@ -33,7 +32,6 @@ def drop_faces(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("hole", "one round hole in a wall", "m2", signed=False)
 def cut_hole(site: Site, fault: Fault) -> Candidate:
-    """Cuts one round hole into a wall."""
     bore = site.candidate.bore
     row = int(site.rng.integers(len(bore.station) // 4, 3 * len(bore.station) // 4))
     column = int(np.argmin(np.abs(bore.angle - 0.3)))

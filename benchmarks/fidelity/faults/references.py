@@ -27,7 +27,6 @@ def turn_beams(site: Site, fault: Fault) -> Case:
 
 @fault_kind("shuffled", "scans at each other's places", signed=False)
 def permute_poses(site: Site, fault: Fault) -> Case:
-    """Puts every scan at the place of another."""
     hold = _require_hold(site.case)
     scans, first, index = np.unique(hold.scan, return_index=True, return_inverse=True)
     place = hold.origin[first][site.rng.permutation(len(scans))]
@@ -48,7 +47,6 @@ def judge_foreign(site: Site, fault: Fault) -> Case:
 
 @fault_kind("tube", "null tube; 1 with sleepers, 2 without", signed=False)
 def judge_tube(site: Site, fault: Fault) -> Candidate:
-    """Judges the null tube."""
     return null_tube(site.candidate, sleepers=fault.size < 2)
 
 

@@ -27,7 +27,7 @@ from benchmarks.fidelity.faults.rows import (
     Control,
     load_controls,
 )
-from benchmarks.fidelity.files import read_json, write_json
+from benchmarks.fidelity.files import read_kept, write_json
 from benchmarks.fidelity.judge import Judgement
 from benchmarks.fidelity.leaks import find_leaks
 from benchmarks.fidelity.registry import Value, dump_values, evaluate, load_values
@@ -60,13 +60,8 @@ class Outcome:
 
 def read_outcome(folder: Path | None, job: Job, key: str) -> Outcome | None:
     """Return the kept outcome of a job for the same base; `None` where there is none."""
-    path = None if folder is None else folder / f"{job.name}.json"
-    if path is None or not path.exists():
-        return None
-    content = read_json(path, OUTCOME_SCHEMA)
-    if content["key"] != key:
-        return None
-    return Outcome(job, load_values(content["values"]), content["leaks"])
+    content = {} if folder is None else read_kept(folder / f"{job.name}.json", OUTCOME_SCHEMA, key)
+    return Outcome(job, load_values(content["values"]), content["leaks"]) if content else None
 
 
 def write_outcome(folder: Path | None, outcome: Outcome, key: str) -> None:
@@ -97,18 +92,17 @@ class Bench:
         other = "" if self.foreign is None or job.control != "N33" else candidate_hash(_foreign_candidate(self))
         if load_controls()[job.control].kind == "outside":
             other = str(outside.files())
-        return sha256(f"{self._own} {other}".encode()).hexdigest()
+        return sha256(f"{self.own} {other}".encode()).hexdigest()
 
     @cached_property
-    def _own(self) -> str:
+    def own(self) -> str:
+        """Hash of the base case."""
         return case_hash(self.case)
 
     def kept(self) -> list[Outcome]:
         """Return the kept outcomes of this base, in the order of `list_jobs`."""
-        outcomes = (
-            read_outcome(self.folder, job, self.key(job)) for job in list_jobs(foreign=self.foreign is not None)
-        )
-        return [outcome for outcome in outcomes if outcome is not None]
+        jobs = list_jobs(foreign=self.foreign is not None)
+        return [kept for job in jobs if (kept := read_outcome(self.folder, job, self.key(job))) is not None]
 
 
 def list_jobs(only: tuple[str, ...] = (), foreign: bool = True) -> list[Job]:
@@ -124,14 +118,9 @@ def is_bold(job: Job) -> bool:
 
 def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]:
     """Does the jobs, in their order; those kept from an earlier run of the same base are read."""
-    done: dict[Job, Outcome] = {}
-    todo = []
-    for job in jobs:
-        known = read_outcome(bench.folder, job, bench.key(job))
-        if known is None:
-            todo.append(job)
-        else:
-            done[job] = known
+    known = {job: read_outcome(bench.folder, job, bench.key(job)) for job in jobs}
+    done = {job: outcome for job, outcome in known.items() if outcome is not None}
+    todo = [job for job in jobs if job not in done]
     with Stages() as progress:
         stage = progress.start("controls", len(jobs))
         if done:
@@ -221,7 +210,8 @@ def _outcome_row(outcome: Outcome, base: Judgement) -> dict[str, Any]:
     reasons = scoring.reasons_against(
         scored, base.scored["null"], judge.median_skill(outcome.values, base.values), [], [], outcome.leaks
     )
-    falls = {c: _fall(base.scored["base"].categories[c], scored.categories[c]) for c in base.scored["base"].categories}
+    pairs = {c: (before, scored.categories[c]) for c, before in base.scored["base"].categories.items()}
+    falls = {c: None if a is None or b is None else a - b for c, (a, b) in pairs.items()}
     new = sorted(without_figures(reasons) - without_figures(base.reasons))
     gates = set(scored.failed_gates) - set(base.scored["base"].failed_gates)
     row = {
@@ -255,10 +245,6 @@ def _invariance_row(row: dict[str, Any], control: Control) -> dict[str, Any]:
     limit = GLOBAL_LIMIT if control.limit < THINNED_LIMIT else THINNED_LIMIT
     quiet = not moved and known and (bool(control.exempt) or abs(row["overall"] - row["base"]) <= limit)
     return {"bold": True, "short": {}, "detected": False, "quiet": quiet, "moved": moved}
-
-
-def _fall(before: float | None, after: float | None) -> float | None:
-    return None if before is None or after is None else before - after
 
 
 def _spearman(same: list[dict[str, Any]], control: Control, base: Judgement) -> float | None:

@@ -99,7 +99,6 @@ def collide_whole_mesh(site: Site, fault: Fault) -> Candidate:
 
 @fault_kind("panels", "collision boxes of the walls outwards", "m")
 def move_panels(site: Site, fault: Fault) -> Candidate:
-    """Moves the collision panels of the walls outwards."""
     copy = copy_scene(site.candidate, site.scratch)
     axis = site.candidate.bore.position
 

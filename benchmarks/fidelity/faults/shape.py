@@ -1,5 +1,6 @@
 """Faults of size and shape: walls, floor, place, roll, length, curvature."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +11,9 @@ from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.case import Case
 from benchmarks.fidelity.derive.curve import Curve
 from benchmarks.fidelity.faults.kinds import (
+    EVERYTHING,
     MESHES,
+    RAILS,
     TRACK,
     Fault,
     Points,
@@ -37,12 +40,12 @@ def bulge(site: Site, fault: Fault) -> Candidate:
     """Moves the part of the lining around an angle of the section."""
     way = np.array([0.0, np.cos(fault.side), np.sin(fault.side)])
 
-    def shift(local: Points) -> Points:
+    def push(local: Points) -> Points:
         away = np.abs(np.angle(np.exp(1j * (np.arctan2(local[:, 2], local[:, 1]) - fault.side))))
         near = smooth_step((_RIM - away) / (_RIM - _CORE))
         return (fault.size * fault.share(local[:, 0]) * near)[:, None] * way
 
-    return site.moved(shift, ("lining", "solid", "nails"))
+    return site.moved(push, ("lining", "solid", "nails"))
 
 
 @fault_kind("floor", "floor with its track too high or too low", "m")
@@ -51,26 +54,25 @@ def raise_floor(site: Site, fault: Fault) -> Candidate:
     bore = site.candidate.bore
     bottom = -0.5 * float(np.median(bore.height))
 
-    def shift(local: Points) -> Points:
+    def raised(local: Points) -> Points:
         fade = np.interp(local[:, 2] - bottom, _FLOOR_RISE, [1.0, 0.0])
         return along(2, fault.size * fault.share(local[:, 0]) * fade)
 
     rise = fault.size * fault.share(bore.station)
     down = np.where(np.sin(bore.angle) < -0.5, np.sin(bore.angle), 0.0)
     floor = replace(bore, height=bore.height - rise, radius=bore.radius + rise[:, None] * down)
-    return replace(site.moved(shift), bore=floor)
+    return replace(site.moved(raised), bore=floor)
 
 
-@fault_kind("aside", "everything to one side", "m")
-def move_aside(site: Site, fault: Fault) -> Candidate:
-    """Moves everything to the left."""
-    return site.moved(lambda local: along(1, fault.size * fault.share(local[:, 0])))
+def shift(axis: int, parts: tuple[str, ...] = EVERYTHING) -> Callable[[Site, Fault], Candidate]:
+    """Return the change that moves parts to the left (axis 1) or up (2)."""
+    return lambda site, fault: site.moved(lambda local: along(axis, fault.size * fault.share(local[:, 0])), parts)
 
 
-@fault_kind("lift", "everything up or down", "m")
-def lift(site: Site, fault: Fault) -> Candidate:
-    """Moves everything up."""
-    return site.moved(lambda local: along(2, fault.size * fault.share(local[:, 0])))
+fault_kind("aside", "everything to one side", "m")(shift(1))
+fault_kind("lift", "everything up or down", "m")(shift(2))
+fault_kind("rails", "rails floating or sunk", "m")(shift(2, RAILS))
+fault_kind("track", "track to one side of its place", "m")(shift(1, (*TRACK, "rail", "sleeper")))
 
 
 @fault_kind("along", "everything along the tunnel", "m")
@@ -85,18 +87,17 @@ def move_along(site: Site, fault: Fault) -> Candidate:
 def roll(site: Site, fault: Fault) -> Candidate:
     """Turns sections about the axis, from left towards up."""
 
-    def shift(local: Points) -> Points:
+    def turned(local: Points) -> Points:
         turn = fault.size * fault.share(local[:, 0])
         left = local[:, 1] * np.cos(turn) - local[:, 2] * np.sin(turn)
         up = local[:, 1] * np.sin(turn) + local[:, 2] * np.cos(turn)
         return np.column_stack([np.zeros(len(local)), left - local[:, 1], up - local[:, 2]])
 
-    return site.moved(shift)
+    return site.moved(turned)
 
 
 @fault_kind("mirror", "left and right exchanged", signed=False)
 def mirror(site: Site, fault: Fault) -> Candidate:
-    """Exchanges left and right of everything."""
     mirrored = site.moved(lambda local: along(1, -2.0 * local[:, 1]))
     track = mirrored.track
     flipped: dict[str, Any] = {name: _inside_out(getattr(mirrored, name)) for name in MESHES}
@@ -109,21 +110,19 @@ def _inside_out(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False) if len(mesh.faces) else mesh
 
 
-@fault_kind("section", "sections too large, as a share of width and height")
-def scale_section(site: Site, fault: Fault) -> Candidate:
-    """Scales width and height of every section about its axis."""
-    return site.moved(lambda local: fault.size * fault.share(local[:, 0])[:, None] * local * [0.0, 1.0, 1.0])
+def scale(*axes: float) -> Callable[[Site, Fault], Candidate]:
+    """Return the change that scales every section about its axis: 1 for those of station, left and up that grow."""
+    return lambda site, fault: site.moved(
+        lambda local: fault.size * fault.share(local[:, 0])[:, None] * local * list(axes)
+    )
 
 
-@fault_kind("width", "sections too wide, as a share of the width")
-def widen_section(site: Site, fault: Fault) -> Candidate:
-    """Scales the width of every section about its axis."""
-    return site.moved(lambda local: fault.size * fault.share(local[:, 0])[:, None] * local * [0.0, 1.0, 0.0])
+fault_kind("section", "sections too large, as a share of width and height")(scale(0.0, 1.0, 1.0))
+fault_kind("width", "sections too wide, as a share of the width")(scale(0.0, 1.0, 0.0))
 
 
 @fault_kind("wave", "a sideways wave of 100 m length", "m")
 def add_wave(site: Site, fault: Fault) -> Candidate:
-    """Adds a sideways wave."""
     return site.moved(lambda local: along(1, fault.size * np.sin(2.0 * np.pi * local[:, 0] / _WAVE)))
 
 

@@ -9,10 +9,9 @@ import trimesh
 
 from benchmarks.fidelity.candidate import Candidate
 from benchmarks.fidelity.derive.curve import Curve
-from benchmarks.fidelity.faults.kinds import TRACK, Fault, Points, Site, along, fault_kind
+from benchmarks.fidelity.faults.kinds import RAILS, TRACK, Fault, Points, Site, along, fault_kind
 from benchmarks.fidelity.meshes import keep_bodies, move_bodies
 
-RAILS = ("rail_mesh", "fastening_mesh", "rail")
 _NEAR = 0.3  # m along the track within which a fastening belongs to a sleeper
 _MARGIN = 0.03  # m around a pocket's footprint
 _RAMP = 3.0  # m at the mouths over which a shifted pattern comes to rest
@@ -31,18 +30,6 @@ def spread_rails(site: Site, fault: Fault) -> Candidate:
         return along(1, 0.5 * fault.size * fault.share(local[:, 0]) * np.sign(local[:, 1] - middle))
 
     return site.moved(shift, RAILS)
-
-
-@fault_kind("rails", "rails floating or sunk", "m")
-def lift_rails(site: Site, fault: Fault) -> Candidate:
-    """Moves rails and fastenings up."""
-    return site.moved(lambda local: along(2, fault.size * fault.share(local[:, 0])), RAILS)
-
-
-@fault_kind("track", "track to one side of its place", "m")
-def move_track(site: Site, fault: Fault) -> Candidate:
-    """Moves the track to the left."""
-    return site.moved(lambda local: along(1, fault.size * fault.share(local[:, 0])), (*TRACK, "rail", "sleeper"))
 
 
 @fault_kind("sleepers", "sleepers along the track", "m")

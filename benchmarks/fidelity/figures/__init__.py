@@ -24,28 +24,29 @@ from benchmarks.fidelity.figures.tunnel import (
     draw_sensor_distributions,
 )
 from benchmarks.fidelity.figures.windows import draw_unrolled, draw_worst_places
+from benchmarks.fidelity.table import Need
 
 matplotlib.use("Agg")
 
-FIGURES: tuple[tuple[str, Draw], ...] = (
-    ("F17-unrolled", draw_unrolled),
-    ("F18-worst-places", draw_worst_places),
-    ("F13-categories", draw_categories),
-    ("F14-controls", draw_controls),
-    ("F15-sweep", draw_sweep),
-    ("F01-voxels", draw_projections),
-    ("F02-mismatch", draw_mismatch),
-    ("F03-signed-error", draw_signed_errors),
-    ("F04-along-chainage", draw_errors_along),
-    ("F05-sections", draw_sections),
-    ("F06-depth-maps", draw_depth_maps),
-    ("F07-distribution", draw_error_distribution),
-    ("F08-range-image", draw_range_image),
-    ("F09-sensor", draw_sensor_distributions),
-    ("F10-persistence", draw_persistence),
-    ("F11-free-space", draw_free_space),
-    ("F12-degeneracy", draw_degeneracy),
-    ("F16-axis", draw_axis),
+FIGURES: tuple[tuple[str, Draw, Need | None], ...] = (  # with the reference that each cannot do without
+    ("F17-unrolled", draw_unrolled, "reference"),
+    ("F18-worst-places", draw_worst_places, "reference"),
+    ("F13-categories", draw_categories, None),
+    ("F14-controls", draw_controls, None),
+    ("F15-sweep", draw_sweep, None),
+    ("F01-voxels", draw_projections, "hold"),
+    ("F02-mismatch", draw_mismatch, "hold"),
+    ("F03-signed-error", draw_signed_errors, "hold"),
+    ("F04-along-chainage", draw_errors_along, "hold"),
+    ("F05-sections", draw_sections, "reference"),
+    ("F06-depth-maps", draw_depth_maps, "hold"),
+    ("F07-distribution", draw_error_distribution, "hold"),
+    ("F08-range-image", draw_range_image, "hold"),
+    ("F09-sensor", draw_sensor_distributions, "hold"),
+    ("F10-persistence", draw_persistence, "reference"),
+    ("F11-free-space", draw_free_space, "reference"),
+    ("F12-degeneracy", draw_degeneracy, "hold"),
+    ("F16-axis", draw_axis, "reference"),
 )
 
 
@@ -64,7 +65,9 @@ def draw_all(folder: Path, sheet: Sheet) -> dict[str, tuple[Path, str]]:
     with plt.rc_context(
         {"svg.hashsalt": "subterra", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
     ):
-        for name, draw in FIGURES:
+        for name, draw, need in FIGURES:
+            if not sheet.case.has(need):
+                continue
             try:
                 drawn = draw(sheet)
             except Exception as error:  # a recording that shows too little, or a spoilt candidate, costs its own figure

@@ -2,33 +2,34 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import ListedColormap, LogNorm
-from matplotlib.patches import Patch
+from matplotlib.colors import LogNorm
 
 from benchmarks.fidelity.derive.axis import reference_curve
 from benchmarks.fidelity.derive.beams import Returns, cast_beams, returns, synthetic_points
 from benchmarks.fidelity.derive.clouds import real_planes
+from benchmarks.fidelity.derive.curve import running_median
 from benchmarks.fidelity.derive.distances import VOXEL_EDGE, Occupied, mesh_distances, occupied_voxels, thinned_rows
 from benchmarks.fidelity.derive.sections import sections
 from benchmarks.fidelity.derive.surface import surface_nearest
 from benchmarks.fidelity.figures.sheet import (
-    AGREE,
     BLUE,
+    CLASSES,
     DIVERGING,
     GREY,
     INK,
-    ONLY_CLOUD,
-    ONLY_MESH,
     ORANGE,
     RED,
     Drawn,
     Sheet,
     bin_along,
+    legend_classes,
+    show_map,
 )  # fmt: skip  # isort: skip
 
 _LIMIT = 5.0  # cm
 _SLICE = 0.15  # m
 _MAP_CELL = (0.10, 2.0)  # m, deg
+_SMOOTHED = 2.4  # m along the tunnel
 _PLANES = (("station, m", "left, m", 2), ("station, m", "up, m", 1), ("left, m", "up, m", 0))
 _TURN = (-180, -90, 0, 90, 180)  # deg
 
@@ -36,10 +37,7 @@ _TURN = (-180, -90, 0, 90, 180)  # deg
 # Distances of held-out points to the mesh.
 
 
-def draw_signed_errors(sheet: Sheet) -> Drawn | None:
-    """Draws F3: signed distance over station and angle."""
-    if sheet.case.hold is None:
-        return None
+def draw_signed_errors(sheet: Sheet) -> Drawn:
     distances, local = mesh_distances(sheet.case), returns(sheet.case).local[thinned_rows(sheet.case)]
     figure, axes = plt.subplots(figsize=(12, 3.6), layout="constrained")
     angle = np.degrees(np.arctan2(local[:, 2] - np.median(local[:, 2]), local[:, 1]))
@@ -54,10 +52,7 @@ def draw_signed_errors(sheet: Sheet) -> Drawn | None:
     return figure, caption + sheet.note(len(angle))
 
 
-def draw_errors_along(sheet: Sheet) -> Drawn | None:
-    """Draws F4: mean and 95th percentile of the distance along the tunnel, with the null tube."""
-    if sheet.case.hold is None:
-        return None
+def draw_errors_along(sheet: Sheet) -> Drawn:
     figure, axes = plt.subplots(figsize=(12, 3.2), layout="constrained")
     width = max(1.0, float(np.ptp(mesh_distances(sheet.case).station)) / 120)
     for case, colour, name in ((sheet.case, BLUE, ""), (sheet.null, GREY, "null tube, ")):
@@ -77,10 +72,7 @@ def draw_errors_along(sheet: Sheet) -> Drawn | None:
     return figure, caption + sheet.note(len(mesh_distances(sheet.case).distance))
 
 
-def draw_error_distribution(sheet: Sheet) -> Drawn | None:
-    """Draws F7: histogram and distribution of the distance, with the recording's own noise and the self-cast curve."""
-    if sheet.case.hold is None:
-        return None
+def draw_error_distribution(sheet: Sheet) -> Drawn:
     own = synthetic_points(sheet.case)[thinned_rows(sheet.case)]
     own = own[np.isfinite(own).all(axis=1)][:20_000]
     curves = (
@@ -107,10 +99,7 @@ def draw_error_distribution(sheet: Sheet) -> Drawn | None:
 # Cross-sections, and the lining unrolled.
 
 
-def draw_sections(sheet: Sheet) -> Drawn | None:
-    """Draws F5: reconstruction, reference and held-out points at eight stations."""
-    if sheet.case.hold is None and sheet.case.truth is None:
-        return None
+def draw_sections(sheet: Sheet) -> Drawn:
     cut = sections(sheet.case)
     rows = np.linspace(0, len(cut.station) - 1, 10).astype(int)[1:-1]
     local = None if sheet.case.hold is None else reference_curve(sheet.case).local(returns(sheet.case).points)
@@ -139,23 +128,19 @@ def draw_sections(sheet: Sheet) -> Drawn | None:
     return figure, caption + sheet.note(count)
 
 
-def draw_depth_maps(sheet: Sheet) -> Drawn | None:
-    """Draws F6: radii along held-out beams unrolled: candidate, recording, difference; the smooth part removed."""
-    if sheet.case.hold is None:
-        return None
+def draw_depth_maps(sheet: Sheet) -> Drawn:
     real, cast = returns(sheet.case), cast_beams(sheet.case)
     longer = np.where(cast.hit, cast.range, np.nan) - real.range
     height = real.local[:, 2] - np.median(real.local[:, 2])
     radius, angle = np.hypot(real.local[:, 1], height), np.degrees(np.arctan2(height, real.local[:, 1]))
     outward = radius + longer * np.clip(_outward_share(real), 0, 1)
     maps = [_cell_means(real.local[:, 0], angle, values) for values in (outward, radius)]
-    smooth = [m - _running_median(m) for m in maps]
+    smooth = [m - running_median(m, _MAP_CELL[0], _SMOOTHED) for m in maps]
     figure, axes = plt.subplots(3, 1, figsize=(12, 7), layout="constrained", sharex=True)
     pictures = (("reconstruction", smooth[0]), ("recording", smooth[1]), ("difference", maps[0] - maps[1]))
     extent = (real.local[:, 0].min(), real.local[:, 0].max(), -180, 180)
     for axis, (name, picture) in zip(axes, pictures, strict=True):
-        shown = axis.imshow(100 * picture.T, origin="lower", extent=extent, aspect="auto", cmap=DIVERGING,
-                            vmin=-12, vmax=12, interpolation="nearest")  # fmt: skip
+        shown = show_map(axis, 100 * picture, extent, cmap=DIVERGING, vmin=-12, vmax=12)
         axis.set_facecolor(GREY)
         axis.set(ylabel=f"{name}\nangle, deg", yticks=_TURN)
     axes[-1].set(xlabel="station, m")
@@ -181,56 +166,36 @@ def _cell_means(station: np.ndarray, angle: np.ndarray, values: np.ndarray) -> n
     return np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(shape)
 
 
-def _running_median(values: np.ndarray, half: int = 12) -> np.ndarray:
-    padded = np.pad(values, ((half, half), (0, 0)), constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1, axis=0)
-    known = np.isfinite(windows).any(axis=-1)
-    return np.where(known, np.nanmedian(np.where(known[..., None], windows, 0.0), axis=-1), np.nan)
-
-
 # Voxels of the bore's shell, and the voxels in which cloud and mesh disagree (the paper's Fig. 3).
 
 
-def draw_projections(sheet: Sheet) -> Drawn | None:
-    """Draws F1: occupied voxels of the mesh as held-out beams see it, summed along each axis."""
-    if sheet.case.hold is None:
-        return None
+def draw_projections(sheet: Sheet) -> Drawn:
     grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance
     low = _low_corner(sheet, grids)
     figure, axes = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained", width_ratios=(3, 3, 1.4))
     for axis, (x, y, along) in zip(axes, _PLANES, strict=True):
         total = grids.first.sum(axis=along).astype(float)
         rest = [k for k in range(3) if k != along]
-        picture = axis.imshow(np.where(total > 0, total, np.nan).T, origin="lower",
-                              extent=_extent(low[rest], edge, total.shape), cmap="viridis", norm=LogNorm(1),
-                              aspect="equal" if along == 0 else "auto")  # fmt: skip
+        picture = show_map(axis, np.where(total > 0, total, np.nan), _extent(low[rest], edge, total.shape),
+                           cmap="viridis", norm=LogNorm(1), aspect="equal" if along == 0 else "auto")  # fmt: skip
         axis.set(xlabel=x, ylabel=y)
         figure.colorbar(picture, ax=axis, shrink=0.8, label="voxels" if along == 0 else None)
     caption = f"Occupied voxels of {edge * 100:.0f} cm of the bore's shell, summed along the third axis."
     return figure, caption + sheet.note(int(grids.first.sum()))
 
 
-def draw_mismatch(sheet: Sheet) -> Drawn | None:
-    """Draws F2: agreement by voxel from the side, and unrolled."""
-    if sheet.case.hold is None:
-        return None
+def draw_mismatch(sheet: Sheet) -> Drawn:
     grids, edge = occupied_voxels(sheet.case), VOXEL_EDGE * sheet.case.tolerance
     low = _low_corner(sheet, grids)
     figure, (side, unrolled) = plt.subplots(2, 1, figsize=(12, 5.4), layout="constrained", sharex=True)
     flat = _agreement_classes(np.asarray(grids.real.any(axis=1)), np.asarray(grids.first.any(axis=1)))
     rolled = _unroll_classes(grids, low, edge)
-    colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
     end = low[0] + edge * rolled.shape[0]
-    for axis, picture, extent in (
-        (side, flat, _extent(low[[0, 2]], edge, flat.shape)), (unrolled, rolled, (low[0], end, -180, 180)),
-    ):  # fmt: skip
-        axis.imshow(picture.T, origin="lower", extent=extent, aspect="auto", cmap=colours, vmin=0, vmax=2,
-                    interpolation="nearest")  # fmt: skip
+    show_map(side, flat, _extent(low[[0, 2]], edge, flat.shape), cmap=CLASSES, vmin=0, vmax=2)
+    show_map(unrolled, rolled, (low[0], end, -180, 180), cmap=CLASSES, vmin=0, vmax=2)
     side.set(ylabel="up, m")
     unrolled.set(ylabel="angle from left\ntowards up, deg", xlabel="station, m", yticks=_TURN)
-    names = (("both", AGREE), ("mesh only", ONLY_MESH), ("held-out cloud only", ONLY_CLOUD))
-    patches = [Patch(color=colour, label=name) for name, colour in names]
-    side.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncol=3, frameon=False)
+    legend_classes(side, ("both", "mesh only", "held-out cloud only"))
     both, either = int((grids.real & grids.first).sum()), int((grids.real | grids.first).sum())
     caption = f"Voxels of {edge * 100:.0f} cm: from the side and unrolled. {both / max(either, 1):.1%} agree."
     return figure, caption + sheet.note(either)

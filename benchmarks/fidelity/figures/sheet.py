@@ -7,8 +7,10 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
 
 from benchmarks.fidelity import scoring
 from benchmarks.fidelity.case import Case
@@ -27,12 +29,9 @@ class Sheet:
     def note(self, n: int | None = None) -> str:
         """Return the end of every caption: samples, seed, split."""
         hold = self.report["split"]["hold"]
-        split = (
-            f"held out: {hold['file']}" if hold and hold["file"] else "held-out beams" if hold else "nothing held out"
-        )
-        return (
-            f" n = {n:,}." if n is not None else ""
-        ) + f" Seed {self.report['seed']}; {split}; split {self.report['split']['rule']}."
+        split = (f"held out: {hold['file']}" if hold["file"] else "held-out beams") if hold else "nothing held out"
+        count = "" if n is None else f" n = {n:,}."
+        return f"{count} Seed {self.report['seed']}; {split}; split {self.report['split']['rule']}."
 
 
 Drawn = tuple[Figure, str]
@@ -54,11 +53,25 @@ def bin_along(
     return middle, np.array([statistic(values[group]) for group in kept])
 
 
+CLASSES = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])  # of a map of agreement
+
+
+def show_map(axes: plt.Axes, values: Float[np.ndarray, "n m"], extent: tuple[float, ...], **style: Any) -> AxesImage:
+    """Draws a map with the tunnel along x, as it is: no cell is blended with another."""
+    style = {"aspect": "auto", "interpolation": "nearest"} | style
+    return axes.imshow(values.T, origin="lower", extent=extent, **style)
+
+
+def legend_classes(axes: plt.Axes, names: tuple[str, str, str], alpha: float = 1.0) -> None:
+    """Draws the legend of a map of agreement over it: names of both, of the first alone and of the second alone."""
+    patches = [Patch(color=CLASSES(k), alpha=alpha, label=name) for k, name in enumerate(names)]
+    axes.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncol=3, frameon=False)
+
+
 _KINDS = ("common", "category", "independent", "tolerance", "seed")
 
 
 def draw_categories(sheet: Sheet) -> Drawn:
-    """Draws F13: bars of the categories, sorted, with the null tube and the truth as candidate."""
     entries = sheet.report["categories"]
     order = sorted(entries, key=lambda c: -1.0 if entries[c]["score"] is None else entries[c]["score"])
     failed = {m["category"] for m in sheet.report["metrics"] if m["status"] == "gate failed"}
@@ -74,13 +87,8 @@ def draw_categories(sheet: Sheet) -> Drawn:
         if ceiling is not None:
             axes.plot(ceiling, row, "|", color=GREEN, ms=13, mew=2.5)
     axes.axvline(scoring.PASS_CATEGORY, color=INK, lw=0.8, ls=":")
-    axes.set(
-        yticks=range(len(order)),
-        yticklabels=[f"{c}  {entries[c]['name']}" for c in order],
-        xlim=(0, 103),
-        ylim=(-0.7, len(order) - 0.3),
-        xlabel="score",
-    )
+    axes.set(yticks=range(len(order)), yticklabels=[f"{c}  {entries[c]['name']}" for c in order])
+    axes.set(xlim=(0, 103), ylim=(-0.7, len(order) - 0.3), xlabel="score")
     line = plt.Line2D
     marks = [
         line([], [], color=BLUE, lw=7, label="reconstruction"),
@@ -90,13 +98,11 @@ def draw_categories(sheet: Sheet) -> Drawn:
     ]
     axes.legend(handles=marks, loc="upper center", bbox_to_anchor=(0.4, -0.09), ncol=4, frameon=False)
     scored = sum(m["score"] is not None for m in sheet.report["metrics"])
-    return figure, "Categories, sorted; dotted: least score for PASS." + sheet.note(scored).replace(
-        "n =", "Scored metrics n ="
-    )
+    note = sheet.note(scored).replace("n =", "Scored metrics n =")
+    return figure, "Categories, sorted; dotted: least score for PASS." + note
 
 
 def draw_controls(sheet: Sheet) -> Drawn | None:
-    """Draws F14: points lost by each category under each control at its bold dose."""
     rows = [row for row in sheet.controls if row["bold"]]
     if not rows:
         return None
@@ -109,15 +115,8 @@ def draw_controls(sheet: Sheet) -> Drawn | None:
             if name in row.get("short", {}):
                 axes.text(x, y, "x", ha="center", va="center", color=RED, fontsize=12, fontweight="bold")
             elif np.isfinite(drop[y, x]) and abs(drop[y, x]) >= 0.5:
-                axes.text(
-                    x,
-                    y,
-                    f"{drop[y, x]:.0f}",
-                    ha="center",
-                    va="center",
-                    fontsize=7,
-                    color="white" if drop[y, x] > 45 else INK,
-                )
+                color = "white" if drop[y, x] > 45 else INK
+                axes.text(x, y, f"{drop[y, x]:.0f}", ha="center", va="center", fontsize=7, color=color)
     axes.set(xticks=range(len(names)), xticklabels=names, yticks=range(len(rows)))
     axes.set_yticklabels([f"{row['id']} {row['corruption'][:44]} · {row['dose']:g}" for row in rows], fontsize=7)
     axes.xaxis.tick_top()
@@ -127,7 +126,6 @@ def draw_controls(sheet: Sheet) -> Drawn | None:
 
 
 def draw_sweep(sheet: Sheet) -> Drawn | None:
-    """Draws F15: moves of the global score under thresholds, tolerances and seeds."""
     if not sheet.sweep:
         return None
     figure, axes = plt.subplots(figsize=(8, 3.2), layout="constrained")
@@ -137,7 +135,5 @@ def draw_sweep(sheet: Sheet) -> Drawn | None:
         axes.plot(delta, row + rng.uniform(-0.22, 0.22, len(delta)), "o", color=BLUE, ms=4, alpha=0.6)
     axes.axvline(0, color=INK, lw=0.8)
     axes.set(yticks=range(len(_KINDS)), yticklabels=_KINDS, xlabel="move of the global score, points")
-    caption = (
-        "Global score under thresholds ±10 % (common, by category, independent), tolerances ±10 % and other seeds."
-    )
+    caption = "Global score under thresholds ±10 % (common, by category, independent), tolerances ±10 %, other seeds."
     return figure, caption + sheet.note(len(sheet.sweep))

@@ -2,8 +2,6 @@
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.colors import ListedColormap
-from matplotlib.patches import Patch
 from scipy.ndimage import distance_transform_edt
 
 from benchmarks.fidelity.derive.axis import reference_curve
@@ -14,23 +12,20 @@ from benchmarks.fidelity.derive.degeneracy import information
 from benchmarks.fidelity.derive.mesh import candidate_diagrams, reference_diagrams
 from benchmarks.fidelity.derive.plane import free_plane
 from benchmarks.fidelity.figures.sheet import (
-    AGREE,
     BLUE,
+    CLASSES,
     DIVERGING,
     GREY,
     INK,
-    ONLY_CLOUD,
-    ONLY_MESH,
     ORANGE,
     Drawn,
     Sheet,
-)
+    legend_classes,
+    show_map,
+)  # fmt: skip  # isort: skip
 
 
-def draw_axis(sheet: Sheet) -> Drawn | None:
-    """Draws F16: reconstruction and reference in plan and profile, and the offset along the tunnel."""
-    if sheet.case.hold is None and sheet.case.truth is None:
-        return None
+def draw_axis(sheet: Sheet) -> Drawn:
     ours, reference = candidate_curve(sheet.case), reference_curve(sheet.case)
     start, chord = reference.position[0], reference.position[-1] - reference.position[0]
     chord = chord[:2] / np.linalg.norm(chord[:2])
@@ -57,10 +52,7 @@ def draw_axis(sheet: Sheet) -> Drawn | None:
 # Beams: recorded, and cast in the candidate.
 
 
-def draw_range_image(sheet: Sheet) -> Drawn | None:
-    """Draws F8: ranges of one held-out scan, the same beams in the candidate, and the difference."""
-    if sheet.case.hold is None:
-        return None
+def draw_range_image(sheet: Sheet) -> Drawn:
     real, cast = returns(sheet.case), cast_beams(sheet.case)
     scans = np.unique(real.scan)
     rows = real.scan == scans[len(scans) // 2]
@@ -80,10 +72,7 @@ def draw_range_image(sheet: Sheet) -> Drawn | None:
     return figure, caption + sheet.note(int(rows.sum()))
 
 
-def draw_sensor_distributions(sheet: Sheet) -> Drawn | None:
-    """Draws F9: ranges, incidences and ranges by elevation, real and synthetic."""
-    if sheet.case.hold is None:
-        return None
+def draw_sensor_distributions(sheet: Sheet) -> Drawn:
     real, synthetic = returns(sheet.case), noisy_ranges(sheet.case, "first")
     by = {entry["id"]: entry["value"] for entry in sheet.report["metrics"]}
     figure, (ranges, incidence, elevation) = plt.subplots(1, 3, figsize=(13, 3.4), layout="constrained")
@@ -93,44 +82,32 @@ def draw_sensor_distributions(sheet: Sheet) -> Drawn | None:
         (synthetic[np.isfinite(synthetic)], ORANGE, "in the reconstruction"),
     ):
         ranges.hist(np.clip(values, 0, top), bins=120, density=True, histtype="step", color=colour, label=label)
-    ranges.set(
-        xlabel="range, m",
-        ylabel="density, 1/m",
-        title=_statistics_title("KS", by["range_ks"], "W1", by["range_w1"], "m"),
-    )
+    title = _statistics_title({"KS": by["range_ks"], "W1": by["range_w1"]}, "m")
+    ranges.set(xlabel="range, m", ylabel="density, 1/m", title=title)
     ranges.legend(frameon=False)
     direction = real.direction[plane_rows(sheet.case)]
     for planes, colour in ((real_planes(sheet.case), BLUE), (synthetic_planes(sheet.case), ORANGE)):
         angle = np.degrees(np.arccos(np.clip(np.abs(np.einsum("ij,ij->i", direction, planes.normal)), 0, 1)))
         incidence.hist(angle[np.isfinite(angle)], bins=60, density=True, histtype="step", color=colour)
-    incidence.set(
-        xlabel="incidence, deg",
-        ylabel="density, 1/deg",
-        title=_statistics_title("W1", by["incidence_w1"], "", None, "deg"),
-    )
+    title = _statistics_title({"W1": by["incidence_w1"]}, "deg")
+    incidence.set(xlabel="incidence, deg", ylabel="density, 1/deg", title=title)
     rise = np.degrees(np.arcsin(np.clip(real.heading[:, 2], -1, 1)))
     edges = np.linspace(rise.min(), rise.max() + 1e-6, 25)
     group = np.digitize(rise, edges) - 1
     for values, colour in ((real.range, BLUE), (synthetic, ORANGE)):
         medians = [np.median(v) if len(v := values[(group == k) & np.isfinite(values)]) else np.nan for k in range(24)]
         elevation.step(edges[:-1], medians, where="post", color=colour)
-    elevation.set(
-        xlabel="elevation, deg",
-        ylabel="median range, m",
-        title=_statistics_title("W1", by["elevation_w1"], "", None, "m"),
-    )
+    title = _statistics_title({"W1": by["elevation_w1"]}, "m")
+    elevation.set(xlabel="elevation, deg", ylabel="median range, m", title=title)
     return figure, "Distributions of held-out beams, recorded and cast with range noise." + sheet.note(len(real.range))
 
 
-def _statistics_title(first: str, a: float | None, second: str, b: float | None, unit: str) -> str:
-    parts = [f"{name} {value:.3g}" for name, value in ((first, a), (second, b)) if value is not None]
+def _statistics_title(values: dict[str, float | None], unit: str) -> str:
+    parts = [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
     return ", ".join(parts) + (f" {unit}" if parts else "")
 
 
-def draw_degeneracy(sheet: Sheet) -> Drawn | None:
-    """Draws F12: axial information along the tunnel."""
-    if sheet.case.hold is None:
-        return None
+def draw_degeneracy(sheet: Sheet) -> Drawn:
     frames = (
         (information(sheet.case, True), BLUE, "recorded"),
         (information(sheet.case, False), ORANGE, "in the reconstruction"),
@@ -144,15 +121,11 @@ def draw_degeneracy(sheet: Sheet) -> Drawn | None:
     axial.set(ylabel="axial information a point", yscale="log")
     axial.legend(frameon=False, ncol=3, loc="upper center", bbox_to_anchor=(0.5, 1.22))
     strong.set(xlabel="station, m", ylabel="points whose normal lies\nwithin 60° of the axis, %", ylim=(0, None))
-    return figure, "Axial share of the point-to-plane Hessian of each held-out scan." + sheet.note(
-        len(frames[0][0].station)
-    )
+    count = len(frames[0][0].station)
+    return figure, "Axial share of the point-to-plane Hessian of each held-out scan." + sheet.note(count)
 
 
-def draw_free_space(sheet: Sheet) -> Drawn | None:
-    """Draws F11: free cells of both, the route of most clearance, clearance along it."""
-    if sheet.case.hold is None and sheet.case.truth is None:
-        return None
+def draw_free_space(sheet: Sheet) -> Drawn:
     plane = free_plane(sheet.case)
     lattice, edge = plane.lattice, plane.lattice.edge
     only = np.where(plane.judged, 1.0, np.where(plane.reference, 2.0, np.nan))
@@ -160,32 +133,24 @@ def draw_free_space(sheet: Sheet) -> Drawn | None:
     left = lattice.low[1] + edge * (np.arange(lattice.shape[1]) + 0.5)
     ends = [low + edge * n for low, shape in zip(lattice.low[:2], lattice.shape, strict=False) for n in (0, shape)]
     figure, (map_axis, room) = plt.subplots(2, 1, figsize=(12, 5), layout="constrained", sharex=True)
-    colours = ListedColormap([AGREE, ONLY_MESH, ONLY_CLOUD])
-    map_axis.imshow(classes.T, origin="lower", extent=ends, aspect="auto", cmap=colours, vmin=0, vmax=2, alpha=0.55,
-                    interpolation="nearest")  # fmt: skip
+    show_map(map_axis, classes, ends, cmap=CLASSES, vmin=0, vmax=2, alpha=0.55)
     for free, colour, label in ((plane.reference, INK, "reference"), (plane.judged, BLUE, "reconstruction")):
         clearance = distance_transform_edt(np.pad(free, ((0, 0), (1, 1))))[:, 1:-1] * edge
         map_axis.plot(plane.station, left[np.argmax(clearance, axis=1)], color=colour, lw=1)
         room.plot(plane.station, clearance.max(axis=1), color=colour, lw=1.2, label=label)
     names = ("free in both", "free in the reconstruction only", "free in the reference only")
-    patches = [Patch(color=colours(k), alpha=0.55, label=name) for k, name in enumerate(names)]
-    map_axis.legend(handles=patches, loc="upper center", bbox_to_anchor=(0.5, 1.2), ncol=3, frameon=False)
+    legend_classes(map_axis, names, alpha=0.55)
     map_axis.set(ylabel="left, m")
     room.set(xlabel="station, m", ylabel="largest clearance, m", ylim=(0, 1.1 * room.dataLim.y1))
     room.legend(frameon=False, loc="lower right")
-    caption = (
-        f"Free cells of {edge * 100:.0f} cm at sensor height, places of most clearance (lines), and that clearance."
-    )
+    caption = f"Free cells of {edge * 100:.0f} cm at sensor height, places of most clearance (lines), and how much."
     return figure, caption + sheet.note(int(plane.known.sum()))
 
 
 _DIAGRAMS = ("components", "loops", "voids")
 
 
-def draw_persistence(sheet: Sheet) -> Drawn | None:
-    """Draws F10: birth and death of components, loops and voids, reconstruction and reference."""
-    if sheet.case.hold is None and sheet.case.truth is None:
-        return None
+def draw_persistence(sheet: Sheet) -> Drawn:
     ours, reference = candidate_diagrams(sheet.case), reference_diagrams(sheet.case)
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.8), layout="constrained")
     count = 0

@@ -8,7 +8,7 @@ from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.figures.sheet import BLUE, DIVERGING, INK, RED, Drawn, Sheet
 from benchmarks.fidelity.windows.deviation import CELL, Unrolled, bore_caster
-from benchmarks.fidelity.windows.measures import Source, sources, unrolled
+from benchmarks.fidelity.windows.measures import Source, unrolled
 
 _LIMIT = 5.0  # cm
 _PLACES = 3
@@ -28,10 +28,7 @@ def worst_places(sheet: Sheet) -> list[dict]:
     return places[:_PLACES]
 
 
-def draw_unrolled(sheet: Sheet) -> Drawn | None:
-    """Draws F17: how far the candidate lies from truth or recording, by station and angle, with the worst places."""
-    if not sources(sheet.case):
-        return None
+def draw_unrolled(sheet: Sheet) -> Drawn:
     source: Source = "truth" if sheet.case.truth is not None else "recording"
     one = unrolled(sheet.case, source)
     station = _stations(sheet.case, one)
@@ -60,8 +57,7 @@ def draw_unrolled(sheet: Sheet) -> Drawn | None:
 
 
 def draw_worst_places(sheet: Sheet) -> Drawn | None:
-    """Draws F18: the sections in the middle of the three worst windows."""
-    places = worst_places(sheet) if sources(sheet.case) else []
+    places = worst_places(sheet)
     if not places:
         return None
     figure, panels = plt.subplots(1, len(places), figsize=(4 * len(places), 4.6), layout="constrained", squeeze=False)

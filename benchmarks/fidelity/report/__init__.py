@@ -189,8 +189,7 @@ def _outside_entry(judgement: Judgement) -> dict[str, Any] | None:
 
 
 def report_title(case: Case) -> str:
-    """Return `Fidelity` where there is a held-out recording or a truth, else `Self-consistency`."""
-    return "Fidelity" if case.hold is not None or case.truth is not None else "Self-consistency"
+    return "Fidelity" if case.has("reference") else "Self-consistency"
 
 
 def _all_bold(rows: list[dict[str, Any]]) -> bool:

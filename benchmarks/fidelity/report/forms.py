@@ -1,8 +1,6 @@
 """CSV files, JUnit XML, HTML and Markdown of a report."""
 
 import base64
-import csv
-import io
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -10,7 +8,7 @@ from xml.etree import ElementTree
 from jinja2 import Environment, FileSystemLoader, select_autoescape
 
 from benchmarks.fidelity import scoring, table
-from benchmarks.fidelity.files import write_text
+from benchmarks.fidelity.files import write_csv, write_text
 
 HERE = Path(__file__).parent
 METRIC_COLUMNS = ("id", "category", "value", "unit", "score", "role", "evidence", "status", "ci_low", "ci_high", "n",
@@ -45,7 +43,6 @@ def write_categories(folder: Path, report: dict[str, Any]) -> Path:
 
 
 def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
-    """Writes `controls.csv`: a row per control and dose."""
     flat = [
         {
             **row,
@@ -64,26 +61,9 @@ def write_controls(folder: Path, rows: list[dict[str, Any]]) -> Path:
 
 
 def write_sweep(folder: Path, rows: list[dict[str, Any]]) -> Path:
-    """Writes `sweep.csv`: a row per run."""
     columns = ("kind", "run", "global", "delta", "category", "category_delta", "meets", "order_kept", "tau",
                "saturated")  # fmt: skip
     return write_csv(folder / "sweep.csv", columns, rows)
-
-
-def write_csv(path: Path, columns: tuple[str, ...], rows: list[dict[str, Any]]) -> Path:
-    """Writes a CSV file; numbers with 6 significant digits, missing ones empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({column: _csv_cell(row.get(column)) for column in columns})
-    return write_text(path, text.getvalue())
-
-
-def _csv_cell(value: Any) -> Any:
-    if value is None:
-        return ""
-    return f"{value:.6g}" if isinstance(value, float) else value
 
 
 def _join_pairs(entries: dict[str, str]) -> str:
@@ -146,7 +126,6 @@ def write_html(
 
 
 def write_markdown(folder: Path, report: dict[str, Any]) -> Path:
-    """Writes `report.md`, the short form for logs."""
     return write_text(folder / "report.md", _render("report.md.j2", report, figures=[], controls=[]))
 
 

@@ -34,7 +34,7 @@ def run_windows(inputs: Inputs) -> None:
     """
     require_folder(inputs.out)
     case = read_case(complete_inputs(inputs))
-    if case.hold is None and case.truth is None:
+    if not case.has("reference"):
         raise FidelityError("windows need a reference: give --recording with --trajectory, or --truth")
     found = judge_windows(case)
     content = {"schema": SCHEMA, "key": case_hash(case), **dump_windows(found)}
@@ -53,7 +53,7 @@ def run_faults(config: FaultsConfig) -> None:
     require_folder(config.out)
     ladder.check_ladder(config.kinds, config.places, config.draw)
     case = read_case(complete_inputs(config))
-    if case.hold is None and case.truth is None:
+    if not case.has("reference"):
         raise FidelityError("faults need a reference: give --recording with --trajectory, or --truth")
     rows = ladder.climb_ladders(case, config.kinds, config.places, config.draw, config.out)
     print(

@@ -149,7 +149,6 @@ def bore_caster(case: Case) -> Caster:
 
 @per_truth
 def truth_relief(case: Case) -> Relief:
-    """Return the relief of the true bore about its own axis."""
     curve = truth_curve(case)
     stations = np.arange(_MOUTH + FINE / 2, curve.length - _MOUTH, FINE)
     return Relief(stations, cast_profile(truth_bore_caster(case), curve, stations, ANGLES))
@@ -157,14 +156,12 @@ def truth_relief(case: Case) -> Relief:
 
 @per_case
 def relief_on_truth(case: Case) -> Relief:
-    """Return the relief of the candidate about the true axis."""
     stations = truth_relief(case).station
     return Relief(stations, cast_profile(bore_caster(case), truth_curve(case), stations, ANGLES))
 
 
 @per_case
 def relief_on_path(case: Case) -> Relief:
-    """Return the relief of the candidate along the sensor's path."""
     frame = hold_frame(case)
     stations = np.arange(frame.low + FINE / 2, frame.high, FINE)
     return Relief(stations, cast_profile(bore_caster(case), sensor_path(case), stations, ANGLES, frame.middle))
@@ -181,7 +178,6 @@ def relief_cells(relief: Relief, values: Float[np.ndarray, "n m"] | None = None)
 
 @per_case
 def truth_map(case: Case) -> Unrolled:
-    """Return the map against the truth; where the candidate is open it counts as `CAP` too far."""
     real, judged = truth_relief(case), relief_on_truth(case)
     offset = np.where(np.isfinite(judged.radius), judged.radius - real.radius, CAP)
     offset = np.where(np.isfinite(real.radius), np.clip(offset, -CAP, CAP), np.nan)

@@ -167,7 +167,6 @@ def dump_windows(found: Windows) -> dict[str, Any]:
 
 
 def load_windows(content: dict[str, Any]) -> Windows:
-    """Return the windows that `dump_windows` wrote."""
     worst = ({key: value for key, value in row.items() if key != "beyond"} for row in content["worst"])
     faults = ({**row, "by": tuple(row["by"])} for row in content["faults"])
     return Windows(tuple(Worst(**row) for row in worst), tuple(Noticed(**row) for row in faults))
