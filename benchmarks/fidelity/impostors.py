@@ -7,7 +7,7 @@ import trimesh
 from jaxtyping import Float
 
 from benchmarks.fidelity.candidate import Bore, Candidate, Track
-from benchmarks.fidelity.derive.curve import Curve, interpolate_rows
+from benchmarks.fidelity.derive.curve import Curve, cast_profile, interpolate_rows
 from benchmarks.fidelity.derive.surface import Caster
 from benchmarks.fidelity.references import Truth
 
@@ -137,12 +137,8 @@ def _true_bore(truth: Truth) -> Bore:
     curve = Curve(truth.station, truth.position)
     position, tangent, left, up = curve.frames(truth.station)
     angle = np.linspace(-np.pi, np.pi, BORE_ANGLES, endpoint=False) + np.pi / BORE_ANGLES
-    away = np.cos(angle)[None, :, None] * left[:, None] + np.sin(angle)[None, :, None] * up[:, None]
-    origin = np.repeat(position[:, None], BORE_ANGLES, axis=1)
-    reach, _ = Caster(_true_mesh(truth, *WALL_PARTS)).first(origin.reshape(-1, 3), away.reshape(-1, 3))
-    radius = reach.reshape(len(position), BORE_ANGLES)
-    median = np.nanmedian(np.where(np.isfinite(radius), radius, np.nan), axis=0)
-    radius = np.where(np.isfinite(radius), radius, median)
+    radius = cast_profile(Caster(_true_mesh(truth, *WALL_PARTS)), curve, truth.station, angle)
+    radius = np.where(np.isfinite(radius), radius, np.nanmedian(radius, axis=0))
     rows = [
         (p["station"], p["angle"], p["length"], p["width"], p["depth"], 1.0, True)
         for p in truth.furniture.get("pockets", [])

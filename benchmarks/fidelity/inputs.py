@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -262,7 +263,8 @@ def _copy_messages(reader: Any, folder: Path, config: SplitConfig, recording: Pa
         raise FidelityError(f"{recording}: is shorter than five blocks of {config.block:g} s")
     dealt, counts = deal_blocks(duration, config), dict.fromkeys((*SPLIT_PARTS, "guard"), 0)
     with ExitStack() as stack, Stages() as progress:
-        writers = [stack.enter_context(_make_writer(folder / _part_name(name, recording))) for name in SPLIT_PARTS]
+        make = Writer1 if recording.suffix == ".bag" else partial(Writer2, version=9)
+        writers = [stack.enter_context(make(folder / _part_name(name, recording))) for name in SPLIT_PARTS]
         channels = [{c.id: _add_channel(writer, c) for c in reader.connections} for writer in writers]
         stage = progress.start("split", reader.message_count)
         for connection, stamp, raw in reader.messages():
@@ -278,16 +280,10 @@ def _file_record(path: Path) -> dict[str, str]:
     return {"file": path.name, "sha256": file_hash(path)}
 
 
-def _make_writer(path: Path) -> Any:
-    return Writer1(path) if path.suffix == ".bag" else Writer2(path, version=9)
-
-
 def _add_channel(writer: Any, connection: Any) -> Any:
     """Adds the recording's channel with its own message definition."""
-    name, kind, definition = connection.topic, connection.msgtype, connection.msgdef.data
-    if isinstance(writer, Writer1):
-        return writer.add_connection(name, kind, msgdef=definition, md5sum=connection.digest)
-    return writer.add_connection(name, kind, msgdef=definition, rihs01=connection.digest)
+    digest = {"md5sum" if isinstance(writer, Writer1) else "rihs01": connection.digest}
+    return writer.add_connection(connection.topic, connection.msgtype, msgdef=connection.msgdef.data, **digest)
 
 
 def _part_name(part: str, recording: Path) -> str:

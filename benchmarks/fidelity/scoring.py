@@ -174,12 +174,6 @@ def threshold_maps(seed: int = 0) -> Iterator[tuple[str, str, Maps]]:
         yield "independent", f"draw {number}", {id: rows[id].map.scaled(k) for id, k in zip(scored, draw, strict=True)}
 
 
-def sweepable_share() -> float:
-    """Return the share of the scored metrics whose map a factor moves at all."""
-    rows = [row for row in table.load().values() if row.scored]
-    return float(np.mean([row.map.scaled(1.1) != row.map for row in rows]))
-
-
 def sweep_thresholds(candidates: dict[str, Values]) -> list[dict[str, Any]]:
     """Scores all candidates through every run's maps.
 
@@ -201,8 +195,9 @@ def compare_runs(kind: str, runs: dict[str, Values], base: Values) -> list[dict[
 
 
 def summarise(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the largest moves by kind, and whether each kind keeps its limit."""
-    kinds: dict[str, Any] = {"sweepable": sweepable_share()}
+    """Return the largest moves by kind, and whether each keeps its limit; `sweepable` scored metrics move at all."""
+    maps = [row.map for row in table.load().values() if row.scored]
+    kinds: dict[str, Any] = {"sweepable": float(np.mean([map.scaled(1.1) != map for map in maps]))}
     for kind in ("common", "category", "independent", "tolerance", "seed"):
         own = [row for row in rows if row["kind"] == kind]
         if not own:

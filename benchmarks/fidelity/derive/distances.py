@@ -20,7 +20,7 @@ from benchmarks.fidelity.derive.beams import (
     sensor_path,
 )
 from benchmarks.fidelity.derive.clouds import Planes, plane_rows, real_planes
-from benchmarks.fidelity.derive.curve import Curve
+from benchmarks.fidelity.derive.curve import candidate_curve
 from benchmarks.fidelity.derive.surface import (
     cell_numbers,
     face_normals,
@@ -70,20 +70,15 @@ def mesh_distances(case: Case) -> MeshDistances:
     distance, closest, face = surface_nearest(case).query(points)
     normal = face_normals(visible_surface(case), face)
     side = np.einsum("ij,ij->i", normal, points - closest) * np.einsum("ij,ij->i", normal, real.origin[pick] - closest)
-    bore = case.candidate.bore
-    local = Curve(bore.station, bore.position).local(points)
+    local = candidate_curve(case).local(points)
     sector = np.round(np.arctan2(local[:, 2], local[:, 1]) / (2.0 * np.pi / _AXIS_SECTORS)).astype(int) % _AXIS_SECTORS
     return MeshDistances(distance, np.copysign(distance, side), real.local[pick, 0], sector)
 
 
 def mean_distance(case: Case, other: Hold) -> float:
     """Return the mean distance of another recording's points to the candidate, m."""
-    points = other.points
-    return float(
-        surface_nearest(case)
-        .query(points[np.linspace(0, len(points) - 1, min(len(points), MOST_POINTS)).astype(int)])[0]
-        .mean()
-    )
+    pick = np.linspace(0, len(other.points) - 1, min(len(other.points), MOST_POINTS)).astype(int)
+    return float(surface_nearest(case).query(other.points[pick])[0].mean())
 
 
 @per_case
@@ -103,9 +98,7 @@ def cloud_distances(case: Case) -> CloudDistances:
     gap, _ = cKDTree(hits, balanced_tree=False).query(samples, distance_upper_bound=0.05 * case.tolerance)
     samples = samples[np.isfinite(gap)]
     local = sensor_path(case).local(samples)
-    even = np.unique(cell_numbers(local, _MESH_CELL), return_index=True)[
-        1
-    ]  # small triangles have more samples than their area's
+    _, even = np.unique(cell_numbers(local, _MESH_CELL), return_index=True)  # small triangles have too many samples
     even = even[np.linspace(0, len(even) - 1, min(len(even), MOST_POINTS)).astype(int)]
     distance, _ = cloud_tree(case).query(samples[even])
     return CloudDistances(distance, local[even, 0])
@@ -340,12 +333,8 @@ def tolerant_f1(grids: Occupied, group: Int[np.ndarray, " i"]) -> Float[np.ndarr
         grids: Both surfaces.
         group: Number of the group of each slice.
     """
-    counts = [
-        np.bincount(group, grid.sum(axis=(1, 2)))
-        for grid in (
-            grids.real, grids.first, grids.real & dilate(grids.first), grids.first & dilate(grids.real)
-        )
-    ]  # fmt: skip
+    near = (grids.real & dilate(grids.first), grids.first & dilate(grids.real))
+    counts = [np.bincount(group, grid.sum(axis=(1, 2))) for grid in (grids.real, grids.first, *near)]
     recall, precision = counts[2] / np.maximum(counts[0], 1), counts[3] / np.maximum(counts[1], 1)
     return 2.0 * precision * recall / np.maximum(precision + recall, 1e-12)
 

@@ -135,14 +135,7 @@ def random_stations(case: Case, id: str, count: int, inset: float = 1.0) -> tupl
 
 LINING_NAMES = ("lining", "recess", "floor")  # what pieces of the lining are called
 VISIBLE_GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)  # groups that a camera draws
-_MESH_NAMES = {
-    "bed",
-    *LINING_NAMES,
-    "sleeper",
-    "rail",
-    "fastening",
-    "fastenings",
-}  # what geoms of lining and track are called
+_MESH_NAMES = {"bed", *LINING_NAMES, "sleeper", "rail", "fastening", "fastenings"}  # geoms of lining and track
 _EYES = 100
 _RAYS_PER_EYE = 1000
 

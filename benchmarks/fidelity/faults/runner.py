@@ -64,13 +64,6 @@ def read_outcome(folder: Path | None, job: Job, key: str) -> Outcome | None:
     return Outcome(job, load_values(content["values"]), content["leaks"]) if content else None
 
 
-def write_outcome(folder: Path | None, outcome: Outcome, key: str) -> None:
-    """Keeps an outcome; without a folder nothing is kept."""
-    if folder is not None:
-        content = {"schema": OUTCOME_SCHEMA, "key": key, "values": dump_values(outcome.values), "leaks": outcome.leaks}
-        write_json(folder / f"{outcome.job.name}.json", content, digits=17)
-
-
 # The runner.
 
 Evaluate = Callable[..., dict[str, Value]]
@@ -127,7 +120,10 @@ def run_jobs(bench: Bench, jobs: list[Job], processes: int = 2) -> list[Outcome]
             stage.resume(len(done))
         for outcome in _compute_outcomes(bench, todo, processes):
             done[outcome.job] = outcome
-            write_outcome(bench.folder, outcome, bench.key(outcome.job))
+            content = {"schema": OUTCOME_SCHEMA, "key": bench.key(outcome.job), "leaks": outcome.leaks}
+            if bench.folder is not None:
+                content["values"] = dump_values(outcome.values)
+                write_json(bench.folder / f"{outcome.job.name}.json", content, digits=17)
             stage.advance()
     return [done[job] for job in jobs]
 

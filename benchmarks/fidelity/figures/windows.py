@@ -4,7 +4,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.fidelity.case import Case
-from benchmarks.fidelity.derive.curve import candidate_curve
+from benchmarks.fidelity.derive.curve import candidate_curve, cast_profile
 from benchmarks.fidelity.derive.sections import truth_bore_caster
 from benchmarks.fidelity.figures.sheet import BLUE, DIVERGING, INK, RED, Drawn, Sheet
 from benchmarks.fidelity.windows.deviation import CELL, Unrolled, bore_caster
@@ -77,28 +77,18 @@ def draw_worst_places(sheet: Sheet) -> Drawn | None:
 
 def _draw_section(axes: plt.Axes, case: Case, station: float) -> None:
     bore = case.candidate.bore
-    position, _, left, up = candidate_curve(case).frames(np.array([station]))
+    curve = candidate_curve(case)
     if case.hold is not None:
-        local = candidate_curve(case).local(case.hold.points)
+        local = curve.local(case.hold.points)
         near = np.abs(local[:, 0] - station) < _SLICE
         axes.plot(local[near, 1], local[near, 2], ".", ms=1.5, color=BLUE, alpha=0.5)
     angle = np.append(bore.angle, bore.angle[0])
-    lines = [(False, "-", RED)] + ([(True, "--", INK)] if case.truth is not None else [])
-    for true, style, color in lines:
-        radius = _outline(case, true, position[0], left[0], up[0], angle)
+    lines = [(bore_caster, "-", RED)] + ([(truth_bore_caster, "--", INK)] if case.truth is not None else [])
+    for caster, style, color in lines:
+        radius = cast_profile(caster(case), curve, np.array([station]), angle)[0]
         axes.plot(radius * np.cos(angle), radius * np.sin(angle), style, lw=1.2, color=color)
     axes.set(aspect="equal", xlabel="left, m")
     axes.invert_xaxis()
-
-
-def _outline(
-    case: Case, true: bool, origin: np.ndarray, left: np.ndarray, up: np.ndarray, angle: np.ndarray
-) -> np.ndarray:
-    """Return the distance from the axis to candidate or truth in each direction, m; NaN where there is nothing."""
-    caster = truth_bore_caster(case) if true else bore_caster(case)
-    away = np.cos(angle)[:, None] * left + np.sin(angle)[:, None] * up
-    reach, _ = caster.first(np.repeat(origin[None], len(angle), axis=0), away)
-    return np.where(np.isfinite(reach), reach, np.nan)
 
 
 def _stations(case: Case, one: Unrolled) -> np.ndarray:

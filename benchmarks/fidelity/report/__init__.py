@@ -29,42 +29,34 @@ SOURCE = "Subterra: An Open-Source Validated Benchmark for GNSS-Denied Tunnel Na
 
 def paper_rows(judgement: Judgement, controls: list[dict[str, Any]] | None = None) -> list[dict[str, Any]]:
     """Return a row per number of the paper: its name, the paper's figure, ours, unit, evidence class and a note."""
-    base = judgement.values["base"]
-    scored = judgement.scored["base"]
+    scored, null = judgement.scored["base"], judgement.scored["null"].overall
 
-    def ours(id: str, factor: float = 1.0) -> float | None:
-        value = base[id].value
-        return None if value is None else factor * value
+    def ours(id: str, name: str = "base") -> float | None:
+        value = judgement.values[name][id].value
+        return None if value is None else 100.0 * value
 
-    null = judgement.scored["null"].overall
-    counts = f"{len(scored.categories)} / {len(base)}"
+    counts, text = (
+        f"{len(scored.categories)} / {len(judgement.values['base'])}",
+        "none" if null is None else f"{null:.1f}",
+    )
     return [
         _paper_row("global score", 97.1, scored.overall, "%", "mixed", f"over {scored.evaluated} of "
-                   f"{len(scored.categories)} categories; the null tube has {_score_text(null)}"),
+                   f"{len(scored.categories)} categories; the null tube has {text}"),
         _paper_row("categories / metrics", "18 / 199", counts, "", "-", "same counts"),
-        _paper_row("cloud to mesh, mean, cloud cast in the same mesh", 2.46, ours("selfcast_p2s_mean", 100.0), "cm",
+        _paper_row("cloud to mesh, mean, cloud cast in the same mesh", 2.46, ours("selfcast_p2s_mean"), "cm",
                    "C", "by construction: range noise alone, alike for any mesh; logged, never scored"),
-        _paper_row("the same within 10 cm", 97.5, ours("selfcast_within_10cm", 100.0), "%", "C",
+        _paper_row("the same within 10 cm", 97.5, ours("selfcast_within_10cm"), "%", "C",
                    "by construction, as above"),
-        _paper_row("cloud to mesh, mean, held-out points", 2.46, ours("c2m_mean", 100.0), "cm", "H",
+        _paper_row("cloud to mesh, mean, held-out points", 2.46, ours("c2m_mean"), "cm", "H",
                    "the comparable claim, on points that the builder never read"),
-        _paper_row("the same within 10 cm", 97.5, ours("c2m_within_10cm", 100.0), "%", "H", "held-out points"),
-        _paper_row("the same, null tube", None, _value_of(judgement, "null", "c2m_mean", 100.0), "cm", "H",
+        _paper_row("the same within 10 cm", 97.5, ours("c2m_within_10cm"), "%", "H", "held-out points"),
+        _paper_row("the same, null tube", None, ours("c2m_mean", "null"), "cm", "H",
                    "what a constant tube on the right axis gets"),
     ]  # fmt: skip
 
 
 def _paper_row(what: str, paper: Any, here: Any, unit: str, evidence: str, note: str) -> dict[str, Any]:
     return {"what": what, "paper": paper, "here": here, "unit": unit, "evidence": evidence, "note": note}
-
-
-def _value_of(judgement: Judgement, name: str, id: str, factor: float) -> float | None:
-    value = judgement.values[name][id].value
-    return None if value is None else factor * value
-
-
-def _score_text(value: float | None) -> str:
-    return "none" if value is None else f"{value:.1f}"
 
 
 SCHEMA = "subterra.fidelity/1"

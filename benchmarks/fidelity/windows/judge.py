@@ -1,6 +1,6 @@
 """The worst windows of a case, the reasons that they give, and the stated faults that they must notice."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,22 +70,21 @@ def worst_windows(case: Case) -> list[Worst]:
 def _worst(case: Case, one: Measure, source: Source) -> Worst:
     topic = case.hold.sensor if source == "recording" and case.hold is not None else ""
     sensor = sensor_of(topic) if topic else STANDARD_SENSOR
-    limit, foreign = limits(sensor or STANDARD_SENSOR)[f"{one.id}.{source}"], "" if sensor else topic
+    limit = limits(sensor or STANDARD_SENSOR)[f"{one.id}.{source}"]
+    nothing = Worst(one.id, one.words, source, one.unit, None, one.gate)
     if limit is None:
-        return Worst(one.id, one.words, source, one.unit, None, one.gate)
+        return nothing
+    nothing = replace(nothing, limit=limit, foreign="" if sensor else topic)
     try:
         series = one.compute(case, source)
     except Exception as error:  # a spoilt candidate may break any library
-        reason = f"{type(error).__name__}: {error}"[:200]
-        return Worst(one.id, one.words, source, one.unit, None, limit, error=reason, foreign=foreign)
+        return replace(nothing, error=f"{type(error).__name__}: {error}"[:200])
     if not np.isfinite(series.value).any():
-        return Worst(one.id, one.words, source, one.unit, None, limit, foreign=foreign)
+        return nothing
     k = int(np.nanargmax(series.value))
     start, end = stations_on_candidate(case, source, series, k)
-    return Worst(
-        one.id, one.words, source, one.unit, float(series.value[k]), limit, start, end, series.where[k], series.judged,
-        foreign=foreign,
-    )  # fmt: skip
+    found = {"value": float(series.value[k]), "where": series.where[k], "judged": series.judged}
+    return replace(nothing, start=start, end=end, **found)
 
 
 def stations_on_candidate(case: Case, source: Source, series: Series, k: int) -> tuple[float, float]:

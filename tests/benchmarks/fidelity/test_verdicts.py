@@ -212,7 +212,7 @@ def test_a_figure_that_cannot_be_drawn_costs_no_other(
     def broken(sheet: Sheet) -> None:
         raise ValueError("too little of the section")
 
-    monkeypatch.setattr(figures, "FIGURES", (("F00-broken", broken), ("F13", draw_categories)))
+    monkeypatch.setattr(figures, "FIGURES", (("F00-broken", broken, None), ("F13", draw_categories, None)))
     case = replace(tube.case(), hold=None, truth=None, cache={})
     judgement = judge.make_judgement({"base": values(0.98), "null": values(0.7)}, [])
     write_report(tmp_path, case, Inputs(), judgement, None, None)
